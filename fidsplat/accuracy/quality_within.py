@@ -59,7 +59,8 @@ def quality_within(
         ms: milliseconds for nine frames of ten, with splats and image on the device; needs a scene and a
             camera.
         scene: scene to measure with. For a store, half of the error is allowed for levels of detail
-            (`Quality.detail_error`), if theirs was measured; with `ms` alone, several such errors are tried.
+            (`Quality.detail_error`), if the store's errors are measured; with `ms` alone, several such errors
+            are tried.
         capture: capture or camera to measure with; default: the Scene's own.
         device: name of a device, or a Renderer; default: that of `Renderer()`.
         layers, colors: class of scenes, without a scene.
@@ -229,7 +230,7 @@ def _best_in(search: CandidateSearch, ms: float) -> str:
 
 
 def _with_detail(splats: ChunkedSplats, quality: Quality, error: float) -> Quality:
-    """The quality with an error allowed for levels of detail, if theirs was measured."""
+    """The quality with this `detail_error`, or with 0 if the errors of the stores were not measured."""
     detailed = quality.with_(detail_error=error)
     try:
         sizes = splats.cell_sizes(detailed)

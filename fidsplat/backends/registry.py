@@ -89,7 +89,7 @@ def _prepare(family: str, selector: str = "") -> None:
     """Check that a family's driver can be used in this process, and provide folders for its caches."""
     if family == "reference":
         return
-    if (family, selector.lower()) != ("warp", "cpu"):  # it has no driver
+    if (family, selector.lower()) != ("warp", "cpu"):  # warp:cpu has no driver
         _check_driver(family)
     check_driver(family)
     ensure_caches()

@@ -196,7 +196,7 @@ class Fisheye:
         return min(math.sqrt(_first_root(slope)), FISHEYE_LIMIT)
 
     def distance(self, angle):
-        """Distance from the middle of a ray at that angle (radians) from the axis."""
+        """Distance from the image centre at which a ray with that angle (radians) from the axis appears."""
         q = angle * angle
         return angle * (1 + q * (self.k1 + q * (self.k2 + q * (self.k3 + q * self.k4))))
 

@@ -184,7 +184,7 @@ class Camera(PickledByFields, Summarised):
 
     @staticmethod
     def from_colmap(camera, world_to_camera=None) -> "Camera":
-        """A camera of COLMAP, whose axes and pixels are ours.
+        """Camera from COLMAP, which uses the same axes and pixel coordinates.
 
         Args:
             camera: a `pycolmap.Camera`, or (model, width, height, parameters) as in cameras.txt.

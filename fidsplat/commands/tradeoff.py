@@ -153,7 +153,7 @@ class Tradeoff:
         points = sum(len(sweep.points) for sweep in sweeps)
         left = sum(len(sweep.left) for sweep in sweeps)
         lines = [*(f"not measured: {line}" for line in refused), *files]
-        if left > len(refused):  # by the time limit
+        if left > len(refused):  # the time limit ended the sweep
             lines.append(f"{left} of {points} points are not measured yet; the same command continues")
         lines.append(f"a page of them: fidsplat tradeoff report {' '.join(map(str, folders))}")
         return report(self.json, {"files": files, "points": points, "refused": refused}, *lines)

@@ -147,7 +147,7 @@ class Sweep:
 
     @property
     def records(self) -> list[Record]:
-        """Records of its points, also of earlier runs."""
+        """Records of the sweep's points, also those of earlier runs."""
         done = self.results.done
         return [done[name] for name in map(name_of, self.points) if name in done]
 

@@ -163,7 +163,7 @@ def _frames(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.n
 def _known(
     path: Path, extensions: bytes, n: int
 ) -> tuple[tuple[int, int, int], np.ndarray | None, np.ndarray | None]:
-    """Signs of the axes, labels and coplanar groups of the extensions; others are skipped."""
+    """Read the extensions for axes (as signs), labels and coplanar groups; others are skipped."""
     axes, whole, place = _TO_RDF[0], {}, 0
     while place < len(extensions):
         if len(extensions) - place < _RECORD.size:

@@ -129,8 +129,8 @@ class RobotLog:
     def camera_pose(self, time: float, camera: str, pose: Any) -> None:
         """Pose of a camera in the scene (4, 4), with OpenCV's axes, as `/tf`.
 
-        With `up` of the log: of CAMERA_link, whose x axis points forward and z up, in the world, of
-        CAMERA_optical_frame in it, and of the scene in the world. Without it: of CAMERA in the world.
+        If the log has `up`, three transforms are written: world to scene, world to CAMERA_link (x forward,
+        z up), and CAMERA_link to CAMERA_optical_frame. Otherwise one: world to CAMERA.
         """
         if self._world_from_scene is None:
             return self.transform(time, camera, pose)
@@ -183,8 +183,8 @@ class RobotLog:
         frame: str = "imu",
         topic: str = "/imu",
     ) -> None:
-        """Angular velocity (3,) in rad/s and acceleration (3,) in m/s^2, None if not measured; without
-        orientation."""
+        """An IMU message without orientation. Angular velocity (3,) is in rad/s, acceleration (3,) in m/s^2;
+        None: not measured."""
         vector, none = self._of("geometry_msgs/msg/Vector3"), np.zeros(9)
         unknown = np.array([-1.0, *np.zeros(8)])  # ROS's value for a missing reading
         message = self._of("sensor_msgs/msg/Imu")(

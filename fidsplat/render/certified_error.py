@@ -168,7 +168,7 @@ def ideal_of(data: Any, capture: Capture, backend: Backend) -> Ideal:
 def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -> tuple[FeatureSet, View]:
     """Features and view of the second rendering.
 
-    It is in float32 with the output `rounding` if the kernels bound the rounding, else in float64.
+    If the kernels can bound their rounding, it uses float32 and the output `rounding`, else float64.
     """
     plain = capture.with_(outputs=("rgb",), quality=quality)
     info = backend.info

@@ -54,7 +54,7 @@ def hard_scene(seed: int = 0) -> tuple[SplatCloud, Camera]:
 
 
 def cell_window(number: int) -> tuple[slice, slice]:
-    """Rows and columns of a cell."""
+    """Rows and columns of the image that a cell covers."""
     row, column = divmod(number, COLUMNS)
     return slice(row * CELL[1], (row + 1) * CELL[1]), slice(column * CELL[0], (column + 1) * CELL[0])
 

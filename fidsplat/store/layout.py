@@ -174,7 +174,7 @@ def _check(header: Header) -> None:
     if missing := types.keys() - {"labels", "coplanar_groups", "thickness"} - header.columns.keys():
         raise ValueError(f"no column {min(missing)}")
     if header.ellipsoids not in ("none", "some", "all"):
-        raise ValueError("ellipsoids must be none, some or all")
+        raise ValueError(f"ellipsoids must be none, some or all, got {header.ellipsoids!r}")
     if header.ellipsoids != "none" and "thickness" not in header.columns:
         raise ValueError("3D Gaussians need a column thickness")
     if not isinstance(header.store, (str, type(None))):

@@ -55,7 +55,7 @@ class Band:
     rows: tuple[int, int]
     """pixels [first, end)"""
     subset: NodeMasks | None = None
-    """nodes from which it is rendered; None: all visible nodes"""
+    """nodes from which the band is rendered; None: all visible nodes"""
     subchunks: tuple[tuple[Subchunks, np.ndarray], ...] | None = None
     """subchunks of these nodes, and a mask (k,) bool of those from which it is rendered; None: all"""
 
@@ -132,7 +132,7 @@ class Band:
 
     @property
     def nodes(self) -> NodeMasks:
-        """Nodes from which it is rendered."""
+        """The nodes from which the band is rendered."""
         return self.visible if self.subset is None else self.subset
 
     @property

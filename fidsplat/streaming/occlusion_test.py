@@ -160,7 +160,7 @@ class _RangeMaximum:
         return self._tables[down, across]
 
     def within(self, top: np.ndarray, bottom: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """(n,) maximum over rows [top, bottom) and columns [left, right); -inf for an empty rectangle."""
+        """Maximum (n,) in rows [top, bottom) and columns [left, right); -inf for an empty rectangle."""
         maxima = np.full(len(top), -np.inf)
         some = np.flatnonzero((bottom > top) & (right > left))
         tall, wide = (np.frexp(size[some])[1] - 1 for size in (bottom - top, right - left))

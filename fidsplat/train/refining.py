@@ -3,7 +3,7 @@
 Templates fit one rectangle each. Here all splats of a marker are optimised in position (within its plane),
 scale, opacity and colour. Each iteration renders the marker in the order of centres, as other renderers do,
 with a random tilt axis (which changes the order), a random sub-pixel shift and a random grey background. The
-loss compares the image with the print and penalises transmitted light.
+loss compares the image with the printed marker and penalises transmitted light.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def _share(done: float) -> float:
 
 
 class _Sheet:
-    """The print as ground truth, in modules around its centre."""
+    """Image of the printed marker, which is the ground truth; coordinates are modules from its centre."""
 
     def __init__(self, made: Marker, leak: float) -> None:
         self._leak, self._shape = leak, np.array(made.grid.shape)
@@ -167,7 +167,8 @@ class _Sheet:
         return by_images, psnr, float(transmittance[inside].max())
 
     def _target(self, camera: Camera, grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The print at pixel centres (h, w, 3), and the mask (h, w) of the sheet."""
+        """Colours (h, w, 3) of the printed marker at pixel centres, and the mask (h, w) of its sheet of
+        paper."""
         x, y = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
         to_plane = np.linalg.inv(camera.matrix @ camera.world_to_camera[:3, [0, 1, 3]])
         u, v, scale = np.einsum("ij,jyx->iyx", to_plane, np.stack(np.broadcast_arrays(x, y[:, None], 1.0)))

@@ -60,7 +60,7 @@ def load_npz(file: Path, names: Collection[str] | None = None) -> dict[str, np.n
 def _array(content: bytes) -> np.ndarray:
     length = int.from_bytes(content[8:10], "little")
     if content[:8] != _MAGIC:
-        raise ValueError("it must hold a NumPy array of format version 1.0")
+        raise ValueError("its arrays must have the NumPy format version 1.0")
     try:
         header = ast.literal_eval(content[10 : 10 + length].decode("latin-1").strip())
         dtype, shape = np.lib.format.descr_to_dtype(header["descr"]), header["shape"]

@@ -22,12 +22,10 @@ _POINTS = 3  # the pattern is averaged over 3 x 3 points of each pixel
 _LARGE = 150_000  # pixels above which the image is downsampled before the comparison
 _SMALL = 10_000  # the same for a grid search
 _COARSE_MODULE = 4.0  # pixels: smallest module after downsampling
-# the code spans [-1, 1]: well-conditioned parameters
+# the code spans [-1, 1], so that the fitted parameters have similar magnitudes
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float64)
 _LARGEST_MODULE = 64  # samples of the pattern for each module
-_QUIET = (
-    1  # width in modules of the surroundings in the model, in the colour that the code's corners do not have
-)
+_QUIET = 1  # width in modules of the model's border, whose colour is the opposite of the code's corners
 
 
 def align(

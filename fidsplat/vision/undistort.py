@@ -23,7 +23,7 @@ def pinhole_towards(camera: Camera, target, width: int, height: int, fov_x: floa
     """
     if not 0 < fov_x <= MAX_FIELD:
         raise InputError(f"fov_x must be more than 0 and at most 150 degrees, got {math.degrees(fov_x):.6g}")
-    # down is the camera's down, unless the target is in that direction
+    # the image's down is that of the camera, unless the target is in that direction
     down, along = camera.world_to_camera[1, :3], np.asarray(target, np.float64) - camera.position
     if np.linalg.norm(np.cross(down, along)) < 1e-3 * np.linalg.norm(along):
         down = camera.world_to_camera[2, :3]

@@ -1,4 +1,5 @@
-// Projection: frustum culling, the forms of the ray-splat intersection, tile bounds and sort key of each splat.
+// Projection: frustum culling, and for each splat the affine forms of the ray-splat intersection (splat.cl), its tile bounds and its
+// sort key.
 // Index space: one work-item per splat and view. `view` has one record per view; `splats`, `keys` and `windows` have `count` per view.
 // Reads:  view, means, quats, scales, opacities, and the inputs of the colour effect and of the outputs.
 // Writes: splats[at], windows[at] (tile bits) of visible splats; keys[at]: depth key, CULLED or OUT_OF_BAND; big, big_bounds
@@ -9,8 +10,8 @@
 // [m]; invisible, and large enough that quotients are not float32 denormals
 #define MIN_SCALE 1e-20f
 
-// Box of a regular polygon around the R-sigma circle, clipped at the near plane and projected: bounds of a disk that crosses
-// the near plane. Returns false if nothing is left.
+// Bounds of a disk that crosses the near plane: the box of a regular polygon around the R-sigma circle, clipped at the near
+// plane and projected. Returns false if nothing is left.
 #define POLYGON 16
 //@@ polygon
 static inline bool clipped_box(real3_ tu, real3_ tv, real3_ tw, real radius, real near, real *box) {
@@ -102,7 +103,7 @@ kernel void project(
     p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
     wide log_opacity = (wide)ln((real)opacity);
     wide half_r2 = log_opacity - (wide)view->log_cut;
-    if (!(half_r2 > 0.0f && opacity > 0.0f && opacity < INFINITY)) return;        // a NaN culls
+    if (!(half_r2 > 0.0f && opacity > 0.0f && opacity < INFINITY)) return;        // also culls NaN
 
     // columns of the rotation of an unnormalised quaternion
     real w = quat.x, x = quat.y, y = quat.z, z = quat.w;
@@ -140,7 +141,7 @@ kernel void project(
     bounds_rows(&bounds, height, &y0, &y1);
     float x0, x1;
     bounds_span(&bounds, (float)y0 + 0.5f, (float)y1 - 0.5f, &x0, &x1);
-    // culls also a splat between two columns of samples; a NaN culls
+    // also culls a splat between two columns of samples, and NaN
     int first = pixel_above(x0 - 0.5f, width), last = pixel_below(x1 - 0.5f, width);
     if (!(y0 < y1 && x0 <= x1 && first < width && last >= 0 && first <= last)) return;
 
@@ -191,7 +192,7 @@ kernel void project(
     UNROLLED for (uint n = 0; n < sizeof(Bounds) / 4; n++) batch->bounds[n][k] = bounds_words.scalars[n];
 }
 
-// Writes a splat that is set up.
+// Writes the record, window and keys of a splat after its set-up.
 INLINE void write_splat(
 //@@ arguments project
     , uint i, uint number, const Batch *batch, uint k) {

@@ -1,6 +1,6 @@
 // Backward pass of the projection: from gradients of a splat's record, summed over its tiles, to gradients of its mean,
 // rotation, scales, opacity and colour, and of the camera pose. Branches are taken as in project.cl. The common factor of a
-// record's forms has no gradient, since nothing depends on it.
+// record's affine forms (splat.cl) has no gradient, since nothing depends on it.
 
 #define MIN_SCALE 1e-20f   // as in project.cl
 

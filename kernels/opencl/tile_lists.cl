@@ -21,7 +21,7 @@ static inline ulong scan_group(local ulong *partial, uint item, ulong mine, ulon
 // Indices in the buffer `counts`, which the host reads: numbers of big splats, of pairs (64 bits), of visible splats.
 enum { COUNT_BIG = 0, COUNT_PAIRS = 1, COUNT_VISIBLE = 3 };
 
-// Classes of lists by decreasing length, of which there are SCAN_ITEMS.
+// Class of a list by its length, 0 for the longest; there are SCAN_ITEMS classes.
 static inline uint length_class(uint length) { return SCAN_ITEMS - 1 - min(length / 4, SCAN_ITEMS - 1u); }
 
 // Lengths of the lists of four tiles from `first` on; 0 from tile `end` on.
@@ -31,8 +31,8 @@ static inline uint4 tile_lengths(global const uint *tallies, uint first, uint en
     return (uint4)(length[0], length[1], length[2], length[3]);
 }
 
-// Index space: work-groups of SCAN_ITEMS. The first one orders the tiles, the others have a share of the tiles each; each adds up the
-// lists of all tiles, so that none waits for another.
+// Index space: work-groups of SCAN_ITEMS. The first one orders the tiles; each of the others computes the starts of its share of the
+// tiles. Each adds up the lengths of all lists itself, so that none waits for another.
 // Reads: tallies. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles] (the same), counts, to which `emit` adds the number of visible
 // splats; tile_order[tiles]: tiles by the classes of their lists, so that blending begins with the longest, in any order within a class.
 // All lists are empty if there are more pairs than `capacity`, unless that is 2^32 - 1.
@@ -123,13 +123,13 @@ static inline int rect_tile(const TileRect *rect, int cell, const Bounds *b, int
 #define NO_OFFSET 0xFFFFFFFFu
 #define NO_ENTRY 0xFFFFFFFFu
 #define WINDOW_TILES (WINDOW_W * WINDOW_H)
-#define QUEUED 0xFFFFu          // bits of a length of at most BIN_ITEMS * WINDOW_TILES;
-#define ONE_VISIBLE 0x10000u    // further bits count splats
+#define QUEUED 0xFFFFu          // mask of the queue's length, which is at most BIN_ITEMS * WINDOW_TILES
+#define ONE_VISIBLE 0x10000u    // the bits above count visible splats
 #define UNROLL 4                // atomics in flight per work-item
 #define TEAM 64                 // work-items that share a big splat
 #define TEAMS (BIN_ITEMS / TEAM)
-#define TEAM_CELLS (8 * TEAM)   // a splat of more cells is left to the complete group,
-#define TEAM_DEFERRED 16        // up to this many of each team
+#define TEAM_CELLS (8 * TEAM)   // a splat of more cells is listed by the complete group,
+#define TEAM_DEFERRED 16        // for at most this many splats of each team
 
 // Lists of the tiles of a band [band_first, band_end), at most `capacity` pairs.
 typedef struct {
@@ -299,7 +299,7 @@ static inline uint bucket_of(ulong pair, float nearest, float scale) {
 }
 
 typedef struct {             // state of the bucket sort, in local memory
-    uint lowest, highest, overfull;    // keys; whether a bucket is
+    uint lowest, highest, overfull;    // lowest and highest key; whether any bucket is overfull
     uint rows[ROW];                   // pairs of each row of work-items
     uint starts[BUCKETS];              // number of pairs of each bucket, then its start
 } Buckets;

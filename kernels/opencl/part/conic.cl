@@ -35,8 +35,8 @@ static inline Conic conic_of(local const Splat *s, float h, float far_x, float f
     float u = fabs(u0) + fabs(ux) * far_x + fabs(uy) * far_y, v = fabs(v0) + fabs(vx) * far_x + fabs(vy) * far_y;
     float d = fabs(d0) + fabs(dx) * far_x + fabs(dy) * far_y;
     float steep = ux * ux + vx * vx, bent = h * dx * dx, aa = steep - bent, inverse = FAST_RECIPROCAL(aa);
-    float ud = ux * d0 - dx * u0, vd = vx * d0 - dx * v0, uv = ux * v0 - vx * u0;               // of a x b: at y = 0,
-    float ud_y = ux * dy - dx * uy, vd_y = vx * dy - dx * vy, uv_y = ux * vy - vx * uy;         // per y
+    float ud = ux * d0 - dx * u0, vd = vx * d0 - dx * v0, uv = ux * v0 - vx * u0;               // components of a x b: at y = 0,
+    float ud_y = ux * dy - dx * uy, vd_y = vx * dy - dx * vy, uv_y = ux * vy - vx * uy;         // and their change per y
     // q = q0 + 2 q1 y - q2 y^2
     float q0 = h * (ud * ud + vd * vd) - uv * uv + CONIC_SLACK * (u * u + v * v + h * d * d) * aa;
     float q1 = h * (ud * ud_y + vd * vd_y) - uv * uv_y, grows = h * (ud_y * ud_y + vd_y * vd_y), q2 = uv_y * uv_y - grows;

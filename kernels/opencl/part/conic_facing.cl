@@ -2,7 +2,7 @@
 // half the squared cut-off radius, and n_u depends on columns only. With a = (n_u, n_v) per x and b = (n_u, n_v) at x = 0, the squared
 // half chord of a row is (h - (a x b)^2 / <a, a>) / <a, a>, and a x b is affine in y.
 //@ blocks_functions
-#define BLOCKS_SLACK 1e-6f              // relative to the forms' terms: exceeds rounding, here and in the per-pixel test
+#define BLOCKS_SLACK 1e-6f              // above the rounding error here and in the per-pixel test, relative to the terms of the affine forms
 //@ blocks_touched
     // n_u^2 + n_v^2 >= h in all of a block for these lower bounds
     const float half_x = 0.5f * (BLOCK_W - 1), half_y = 0.5f * (BLOCK_H - 1);

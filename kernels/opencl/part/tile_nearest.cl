@@ -1,6 +1,6 @@
 // Minimum depth of a splat's fragments in a tile, for GPUs.
 //@ cross_functions
-#define BLOCKS_SLACK 1e-6f              // relative to the forms' terms: exceeds rounding
+#define BLOCKS_SLACK 1e-6f              // above the rounding error, relative to the terms of the affine forms
 static inline float tile_nearest(const Splat splat, int left, int top) {
     const Splat *s = &splat;
     const wide half_r2 = 1.0f;                  // hooks change it for 3D Gaussians only
