@@ -153,13 +153,15 @@ def reversals(group: Group, groups: Iterable[Group]) -> dict[str, list[str]]:
 
 
 def scaling(device: Device) -> list[dict[str, Any]]:
-    """Exponent of the fastest times by renderer and series."""
+    """Exponent of the fastest times by renderer and series; of processor times where they are known and the
+    device is a processor, which others may use too."""
     rows = []
+    on_cpu = device.name.endswith(" cpu")
     for renderer in dict.fromkeys(one["renderer"] for one in device.results):
         row: dict[str, Any] = {"renderer": renderer}
         for series in SERIES:
             points = sorted(
-                (device.scenes[one["scene"]]["x"], one["fastest_ms"])
+                (device.scenes[one["scene"]]["x"], one.get("cpu_ms" if on_cpu else "", one["fastest_ms"]))
                 for one in device.results
                 if one["renderer"] == renderer and one["scene"].startswith(f"{series}@")
             )
