@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.splats.rotations import check_similarity
+from fidsplat.splats.rotations import check_similarity, pose_matrix
 from fidsplat.store.layout import MAX_SPLATS, PLACES
 from fidsplat.store.staging import clear, refuse_existing, staged, store_folder
 from fidsplat.store.store import Store
@@ -48,7 +48,8 @@ def place_store(
     Args:
         store: the store to repeat; it must not be instanced itself.
         out: the new store's folder; its name ends with .fss.
-        poses: (p, 4, 4), rigid: world motion from the store's own pose to each instance.
+        poses: p rigid matrices (4, 4), or pairs (position, quaternion): world motion from the store's own
+            pose to each instance.
         overwrite: whether an existing store is replaced.
 
     Raises:
@@ -63,7 +64,7 @@ def place_store(
             f"{source.path} has coplanar groups, which cannot be instanced; put markers into a scene file"
         )
     try:
-        given = np.stack([real_array("a pose", pose) for pose in poses])
+        given = np.stack([real_array("a pose", pose_matrix(pose, "a pose")) for pose in poses])
     except (TypeError, ValueError):
         given = np.empty(0)
     if given.ndim != 3 or not len(given):

@@ -11,7 +11,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera, Orthographic
 from fidsplat.scenes import PlacedMarker, Scene
-from fidsplat.splats.rotations import check_similarity
+from fidsplat.splats.rotations import check_similarity, pose_matrix
 from fidsplat.util.arguments import instance, invalid, real_array
 from fidsplat.util.errors import InputError
 from fidsplat.vision.visible import visible
@@ -192,6 +192,7 @@ def optical_flow(
     if motions and label is None:
         raise InputError("motions need a label image, got None; render with 'label'")
     for value, motion in (motions or {}).items():
+        motion = pose_matrix(motion, f"the motion of label {value}")
         check_similarity(motion, f"the motion of label {value}", rigid=True)
         if label is not None:
             matrix, own = np.asarray(motion, np.float64), label == value

@@ -10,6 +10,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
+from fidsplat.vision.truth import optical_flow
 
 POINTS = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 3)) + np.array((0, 0, 2))
 POSE = rigid_matrix(
@@ -180,6 +181,15 @@ def test_what_is_no_camera(make, words):
         make()
 
 
+def test_a_store_is_placed_by_pairs(tmp_path):
+    fs.save_ply(
+        fs.marker("apriltag:36h11:5", size=0.16).gaussians.with_coplanar_groups(-1), tmp_path / "a.ply"
+    )
+    fs.build_store([tmp_path / "a.ply"], tmp_path / "a.fss")
+    placed = fs.Store(fs.place_store(tmp_path / "a.fss", tmp_path / "b.fss", [PAIR, np.eye(4)]))
+    np.testing.assert_allclose(placed.poses, [rigid_matrix(*PAIR), np.eye(4)], atol=1e-12)
+
+
 def test_poses_are_matrices_or_pairs():
     camera = fs.Camera.pinhole(64, 48, 50, 50, 32, 24, PAIR)
     np.testing.assert_allclose(camera.world_to_camera, POSE, atol=1e-12)
@@ -194,6 +204,11 @@ def test_poses_are_matrices_or_pairs():
     np.testing.assert_array_equal(
         tag.cloud.transformed(PAIR).means, tag.cloud.transformed(rigid_matrix(*PAIR)).means
     )
+    depth, label = np.ones((48, 64)), np.ones((48, 64), int)
+    flows = [
+        optical_flow(depth, camera, camera, label, {1: motion}) for motion in (PAIR, rigid_matrix(*PAIR))
+    ]
+    np.testing.assert_array_equal(*flows)
     motion = fs.Motion(lambda time: PAIR)
     np.testing.assert_allclose(motion.camera_at(0.0), POSE, atol=1e-12)
 
