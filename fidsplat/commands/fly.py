@@ -98,8 +98,8 @@ class Fly(RenderInput):
         scene = self.load(size=self.size)
         path = path or _camera_motion(self.source, scene, self.smooth)
         times = path.sampled(self.rate).times if self.times is None else _parse_times(self.times)
-        bop = None if self.bop is None else self._open_bop(scene)
         flight = Flight(scene, path, times, scene.capture.with_(outputs=self.outputs, quality=self.quality))
+        bop = None if self.bop is None else self._open_bop(self.bop, flight)
         with self._engine(flight) as (title, render):
             log_is_complete = self._log_is_complete(flight.key(title))
             folder = FlightFolder(self.out, flight, title, self.overwrite, self.source)
@@ -115,24 +115,26 @@ class Fly(RenderInput):
             list(show_progress("log", frames, len(flight)))
         if self.coco is not None:
             annotations = CocoAnnotations()
-            add = lambda file, _, truth: annotations.add(file, truth)  # noqa: E731
-            list(show_progress("truth", write_truth(folder, add), len(flight)))
+            frames = write_truth(folder, lambda file, _, truth: annotations.add(file, truth))
+            list(show_progress("truth", frames, len(flight)))
             annotations.save(self.coco)
         if bop is not None:
             with bop:
-                add = lambda _, images, truth: bop.add(images, truth)  # noqa: E731
-                list(show_progress("BOP", write_truth(folder, add), len(flight)))
+                frames = write_truth(folder, lambda _, images, truth: bop.add(images, truth))
+                list(show_progress("BOP", frames, len(flight)))
         return self._report(folder, sheet, left, seconds)
 
-    def _open_bop(self, scene: Scene) -> BopScene:
+    @staticmethod
+    def _open_bop(path: str, flight: Flight) -> BopScene:
         """The BOP scene to write; raises InputError for flights that it cannot represent."""
         from fidsplat.vision.bop import BopScene, check_bop_camera
 
-        if scene.camera is not None:
-            check_bop_camera(scene.camera)
-        if "rgb" not in self.outputs:
-            raise InputError(f"--bop must have rgb among --outputs, got {','.join(self.outputs)}")
-        return BopScene(str(self.bop))
+        camera, outputs = flight.capture.camera, flight.capture.outputs
+        if camera is not None:
+            check_bop_camera(camera)
+        if "rgb" not in outputs:
+            raise InputError(f"--bop must have rgb among --outputs, got {','.join(outputs)}")
+        return BopScene(path)
 
     def _log_is_complete(self, source: str) -> bool:
         """Whether an interrupted run of the same flight has already written the log."""

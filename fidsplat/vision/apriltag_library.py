@@ -47,7 +47,8 @@ def _detector(family: str):
 
     # the constructor would add the family with a table for two wrong bits
     detector = Detector(families="tag16h5", nthreads=1, quad_decimate=1.0)
-    library, pointer = detector.libc, detector.tag_detector_ptr
+    library: Any = detector.libc
+    pointer = detector.tag_detector_ptr
     library.apriltag_detector_clear_families.restype = None
     library.apriltag_detector_clear_families(pointer)
     create = getattr(library, f"tag{family.capitalize()}_create")

@@ -136,6 +136,8 @@ def test_a_flight_is_written_as_bop_and_a_compressed_log(here, capsys):
     assert first.name.startswith("/camera/image_raw/compressed")
     np.testing.assert_array_equal(second.image, read_image("out/rgb/000001.png"))
     capsys.readouterr()
+    assert fly("--times", "0", "-o", "alone", "--bop", "set/train/000001") == 0  # with the scene's outputs
+    assert (here / "set" / "train" / "000001" / "scene_gt.json").is_file()
     for options, says in ((words, "must not have a scene yet"), (("--outputs", "depth"), "must have rgb")):
         assert fly(*options, "--bop", "set/train/000000") == 2
         assert says in capsys.readouterr().err
