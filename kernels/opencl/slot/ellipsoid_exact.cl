@@ -1,4 +1,4 @@
-// 3D Gaussians by their maximum along each ray (docs/primitives.md). Let W whiten the covariance, p be the centre, m = |W p|, and
+// 3D Gaussians by their maximum along each ray (devlog/primitives.md). Let W whiten the covariance, p be the centre, m = |W p|, and
 // t the angle between W p and W r for a ray r from the camera. The minimum squared distance on the ray is rho = (m sin t)^2. The
 // ray intersects the disk through p that is perpendicular to W p after whitening at rho_disk = (m tan t)^2. The Gaussian is thus
 // rendered as that disk, whose tangents a, b and p / m are conjugate half axes of the ellipsoid, with
