@@ -53,7 +53,7 @@ def relocate_and_grow(splats: Splats, settings: TrainSettings, iteration: int) -
 
 
 def add_noise(splats: Splats, settings: TrainSettings, iteration: int, rate: float) -> None:
-    """Add noise to the means within the plane of each splat, more to transparent splats.
+    """Add noise with the covariance of each splat to its mean, more to transparent splats.
 
     rate: learning rate of the means [m].
     """
