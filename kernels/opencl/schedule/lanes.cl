@@ -4,6 +4,7 @@
 // tiles; the images where resolving is fused.
 // Splats are scattered in memory, so the next ones are prefetched.
 #define PREFETCH_SPLATS 8
+#define ROWS_TOGETHER 8         // of tiles
 
 kernel void blend(
 //@@ arguments blend
@@ -11,8 +12,16 @@ kernel void blend(
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
     uint tile = band_first + get_global_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
-    uint number = tile / (uint)(tiles_x * tiles_y), here = tile - number * (uint)(tiles_x * tiles_y);
-    int x0 = (int)(here % (uint)tiles_x) * TILE_W, y0 = (int)(here / (uint)tiles_x) * TILE_H;
+    const uint each = (uint)(tiles_x * tiles_y), number = tile / each, across = (uint)tiles_x;
+    uint here = tile - number * each, column = here % across, row = here / across;
+    if (band_first % each == 0 && get_global_size(0) % each == 0) {
+        // complete views: bands of rows column by column, since neighbours share splats in the cache
+        uint first = here / (ROWS_TOGETHER * across) * ROWS_TOGETHER, rows = min((uint)ROWS_TOGETHER, (uint)tiles_y - first);
+        column = (here - first * across) / rows;
+        row = first + (here - first * across) % rows;
+        tile = number * each + row * across + column;
+    }
+    int x0 = (int)column * TILE_W, y0 = (int)row * TILE_H;
 
     // in a tile without splats all blocks are equal, so only one is computed
     const uint base = starts[band_first];
