@@ -50,6 +50,10 @@ def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
     assert main([*solid, str(tmp_path / "a.ply")]) == 0
     assert (fs.load_ply(tmp_path / "d.ply").thickness > 0).all()
     assert main([*solid, str(tmp_path / "none.ply"), "--overwrite"]) == 2
+    solid[3] = str(tmp_path / "e.ply")
+    assert main([*solid, str(tmp_path / "a.ply"), "--iterations", "2"]) == 0
+    assert main([*solid, str(tmp_path / "a.ply")]) == 0  # goes on
+    assert (tmp_path / "e.ply").read_bytes() == (tmp_path / "d.ply").read_bytes()
     for wrong, said in (
         (["-o", "a.png"], "-o must be a .ply file, got a.png"),
         (["--random-points", "-1"], "--random-points must be"),
