@@ -88,10 +88,22 @@ class Group:
     """ranking with the limit on the mean error"""
 
     @property
+    def complete(self) -> list[Entry]:
+        """Renderers within the error in every scene, the fastest first."""
+        return [entry for entry in self.ranking if entry.scenes == len(self.scenes)]
+
+    @property
     def winner(self) -> Entry | None:
         """Fastest renderer within the error in every scene."""
-        complete = [entry for entry in self.ranking if entry.scenes == len(self.scenes)]
-        return complete[0] if complete else None
+        return self.complete[0] if self.complete else None
+
+    @property
+    def next(self) -> tuple[str, float] | None:
+        """The next renderer, and its time over the winner's."""
+        if len(self.complete) < 2:
+            return None
+        first, second = self.complete[:2]
+        return second.renderer, second.ratio / first.ratio
 
 
 def best_of(results: Iterable[dict[str, Any]], error: str) -> dict[tuple[str, str], float]:
@@ -265,21 +277,33 @@ def write_site(files: Sequence[Path], folder: Path) -> Path:
     return folder / "index.html"
 
 
+def readme_cell(group: Group) -> str:
+    """Fastest renderer at 1/255, the next one with its time over the fastest, and the fastest by mean
+    error, if it is another."""
+    found = [f"{group.kind}: none"]
+    if group.winner is not None:
+        found = [f"{group.kind}: **{group.winner.renderer}**"]
+        if group.next is not None:
+            found.append("then {} ({:.2g} x)".format(*group.next))
+    if group.by_mean and (group.winner is None or group.by_mean[0].renderer != group.winner.renderer):
+        found.append(f"by mean error {group.by_mean[0].renderer}")
+    return ", ".join(found)
+
+
 def readme_table(devices: Sequence[Device]) -> str:
-    """Markdown table with one line per regime: the fastest renderer at 1/255 on each device."""
-    groups, rows = groups_of(devices), []
-    for regime in dict.fromkeys(group.regime for group in groups):
-        row = {"regime": regime}
-        for device in devices:
-            own = [group for group in groups if group.regime == regime and group.device is device]
-            cells = [
-                f"{group.kind}: {group.winner.renderer}, {ms(group.winner.milliseconds)} ms"
-                for group in own
-                if group.winner is not None
-            ]
-            row[device.title] = "; ".join(cells) or "-"
-        rows.append(row)
-    return markdown(rows)
+    """Markdown table with one line per regime."""
+    groups = groups_of(devices)
+    return markdown(
+        {"scenes": regime}
+        | {
+            device.title: "; ".join(
+                readme_cell(group) for group in groups if group.regime == regime and group.device is device
+            )
+            or "-"
+            for device in devices
+        }
+        for regime in dict.fromkeys(group.regime for group in groups)
+    )
 
 
 def main() -> None:

@@ -175,6 +175,25 @@ def test_scenes_by_name_regime_and_machine():
         suite_scenes(["hazy"], False, False)
 
 
+def test_generated_scenes_are_in_view_and_of_their_kind():
+    made = {name: regimes.SUITE[name].make() for name in ("huge", "clusters_3d", "needles", "haze_3d")}
+    assert {name: one.kind for name, one in made.items()} == {
+        "huge": "disks", "clusters_3d": "ellipsoids", "needles": "disks", "haze_3d": "ellipsoids"
+    }  # fmt: skip
+    assert made["haze_3d"].cloud.opacities.max() < 1 / 50
+    assert (made["needles"].cloud.scales[:, 0] > made["needles"].cloud.scales[:, 1]).mean() > 0.99
+    assert (made["huge"].cloud.scales > 0.3).mean() > 0.005
+    shown = made["clusters_3d"].camera.project(made["clusters_3d"].cloud.means)
+    assert ((shown > 0) & (shown < (1280, 720))).all(1).mean() > 0.8
+    flight = regimes.street(1000, 3)
+    assert flight.poses.shape == (3, 4, 4)
+    assert flight.kind == "disks"
+    around = regimes.agents(4)
+    for pose in around.poses:
+        seen = around.camera.with_pose(pose).project(np.array([[0.0, 0.0, 6.0]]))
+        np.testing.assert_allclose(seen, [[64, 64]], atol=1e-6)
+
+
 def test_energy_of_a_processor(tmp_path):
     for name, value in (("intel-rapl:0", 5_000_000), ("intel-rapl:1", 1_000_000), ("intel-rapl:0:0", 9)):
         (tmp_path / name).mkdir()

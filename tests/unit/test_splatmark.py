@@ -89,4 +89,7 @@ def test_the_page_answers_first_and_escapes_names(file, tmp_path):
 
 def test_the_readme_has_a_line_for_each_regime(file):
     text = splatmark.readme_table(splatmark.load([file]))
-    assert text.splitlines()[2:] == ["| uniform | disks: a, 6 ms |", "| haze | disks: b, 20 ms |"]
+    assert text.splitlines()[2:] == [
+        "| uniform | disks: **a**, then b (1.3 x) |",
+        "| haze | disks: **b**, then a (2.5 x) |",
+    ]
