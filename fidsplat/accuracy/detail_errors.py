@@ -76,9 +76,13 @@ def _larger(one: float | None, other: float | None) -> float | None:
 def errors_of(
     store: Store, renderer: Renderer, capture: Capture, sizes: Sequence[float], level: int
 ) -> list[float | None]:
-    """Largest rgb difference from the exact frame for each size [samples], rising, with nodes up to a level.
+    """Largest difference of rgb from the exact frame, for each cell size below which cells are merged.
 
-    None where a size merges no more cells than the one below it, or none that are visible.
+    None for a size that merges no other cells than the next smaller size, or changes nothing visible.
+
+    Args:
+        sizes: ascending, in samples.
+        level: the coarsest level of detail that may be used.
     """
     splats = ChunkedSplats([store])
     features, view = prepare(splats, capture)

@@ -93,7 +93,8 @@ def choose(
     requested = replace(requested, camera=requested.camera or own.camera, outputs=("rgb",), sensor=Sensor())
     for name, given in (("scene", scene), ("camera", requested.camera)):
         if given is None and (ms is not None or scene is not None or requested.camera is not None):
-            raise InputError(f"this budget needs a {name} to measure with: give scene=... and capture=...")
+            what = "ms" if ms is not None else "an error that is to be measured"
+            raise InputError(f"{what} needs a {name}, got none; give scene=... and capture=...")
     renderer = device if isinstance(device, Renderer) else Renderer(device or default_device())
     front = candidates.load(renderer.device.kind)
     if scene is None:

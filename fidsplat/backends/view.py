@@ -125,7 +125,7 @@ class View:
         around = self.surroundings
         match name:
             case "ray" if self.along_ray or self.parallel:
-                # depths are distances already: a ray is 1 m long per metre of depth
+                # depths are distances along the ray already
                 return math.inf, math.inf, 0.0, 0.0
             case "ray":
                 return self.focal_x, self.focal_y, self.center_x, self.center_y

@@ -48,7 +48,7 @@ class Greenhouse:
         writable_folder(folder)
         with atomic_write(model) as stream:
             stream.write(made.mjcf().encode())
-        scene.save(scene_file)  # last: it marks a complete greenhouse
+        scene.save(scene_file)  # last, since the scene file marks a complete greenhouse
         plants, splats, markers = settings.rows * settings.plants, len(scene.cloud()), len(made.markers)
         facts = {"scene": str(scene_file), "model": str(model), "splats": splats, "markers": markers}
         facts |= {"rows": settings.rows, "plants": plants, "length_m": made.length}

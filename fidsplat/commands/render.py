@@ -34,7 +34,7 @@ _OTHER_IMAGES = (".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".gi
 
 @dataclass
 class Render(RenderInput):
-    """Render a scene file, a splat file or a store to images.
+    """Render a scene file, a splat file or a store (a folder .fss with splats on disk) to images.
 
     A splat file has no camera: it is framed as a whole, with the up axis that `fidsplat info` guesses.
     --up, --position, --look-at and --size set the camera of any scene. With -o OUT.png the colour image is
@@ -47,11 +47,11 @@ class Render(RenderInput):
 
     Quality: standard, fast, reference, gsplat or surfel, then settings of fs.Quality as key=value; settings
     without a preset change standard: fast,samples=2,alpha_cutoff=1e-3. On NVIDIA's GPUs through OpenCL,
-    arithmetic=approximate saves time at an error of 1e-6, and blend_precision=float16 at one of 0.01.
+    arithmetic=approximate and blend_precision=float16 save time, and add errors of up to 1e-6 and 0.01.
     Markers of a scene file use marker.mixture, marker.levels, marker.density, marker.growth and
     marker.template of the quality where the file does not state them.
 
-    Lenses, shutters and motion, fog, backgrounds, sensors and boxes are tables of a scene file
+    Lenses, shutters and motion, fog, backgrounds and sensors are tables of a scene file
     (docs/scene-files.md) and can be combined.
 
     Examples:

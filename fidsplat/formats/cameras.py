@@ -28,7 +28,8 @@ def load_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
     found = [one for one in (file, *(file / name for name in _TRANSFORMS)) if one.is_file()]
     if not found:
         raise InputError(
-            f"path must be a COLMAP model (cameras.bin) or a transforms.json, got {file}; give its folder"
+            "path must be a transforms.json, or a folder with one or with a COLMAP model (cameras.bin), "
+            f"got {file}"
         )
     try:
         transforms = from_json(read_text(found[0]))

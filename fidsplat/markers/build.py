@@ -153,7 +153,10 @@ class Marker(PickledByFields):
 
     @cached_property
     def gaussians(self) -> SplatCloud:
-        """Gaussians for other renderers: `cloud`, or the mixture `fitted` instead of the boxes of `exact`.
+        """The marker as Gaussians, for renderers and files without boxes.
+
+        This is `cloud`, except where the mixture is `exact`, which consists of boxes: then it is the mixture
+        `fitted` of the same marker.
 
         Raises:
             InputError: more than `max_splats`.

@@ -169,7 +169,7 @@ class Rig:
         for marker in self.scene.markers:
             name = self.labels.get(marker.label)
             if name is not None and name not in bodies:
-                raise invalid("bodies", f"poses of all bodies, with {name!r}", sorted(bodies))
+                raise InputError(f"bodies must have a pose for {name!r}, got poses for {sorted(bodies)}")
             if name is not None:
                 pose = compose(bodies[name], self._rest.get(name, IDENTITY))
                 marker = replace(marker, pose=matrix_of(pose) @ marker.pose)
@@ -342,7 +342,7 @@ def _bodies_of(bodies: Mapping[int, str], cloud: SplatCloud) -> dict[int, str]:
         if label not in known:
             listed = ", ".join(map(str, sorted(known)[:20]))
             raise InputError(
-                f"the label of the body {name!r} must be a label of splats, got {label}; known: "
+                f"the label of the body {name!r} must be the label of a splat, got {label}; known: "
                 f"{listed or 'none'}"
             )
         found[int(label)] = name

@@ -30,7 +30,7 @@ def is_supported(view: View, features: FeatureSet) -> bool:
 def minimum_keys(view: View, features: FeatureSet, boxes: Boxes) -> np.ndarray:
     """(n,) metres: lower bound on the sort keys of the splats in each box."""
     extent = _extent(view, features)
-    assert extent is not None  # `is_supported`
+    assert extent is not None  # the caller has checked `is_supported`
     if not {"compose_ordered", "compose_coplanar"}.isdisjoint(features.names):
         return CameraBoxes(view, *boxes(0.0)).nearest(view)
     return extent.nearest(view, CameraBoxes(view, *boxes(extent.depths)))
@@ -107,7 +107,7 @@ def _projected_extent(
     """Bounds on x, y of the splats of each box on the image, (n, 2) samples each, by a pinhole or parallel
     rays; infinite where a box reaches the camera."""
     extent = _extent(view, features)
-    assert extent is not None  # `is_supported`
+    assert extent is not None  # the caller has checked `is_supported`
     radius, margin = extent.radius, extent.margin
     low, high = _projected(view, *boxes(radius))
     wide = ewa_reach(view, features, radius, reach[:, None])

@@ -33,11 +33,12 @@ def parameter_gradients(
     """Gradients with respect to the raw parameters, from those with respect to the activated values.
 
     Args:
-        gradients: `means`, `quats`, `scales`, `opacities`, and `colors` or `sh`, of a
-            gradient pipeline.
+        gradients: the result of a gradient pipeline: `means`, `quats`, `scales`, `opacities`, and `colors`
+            or `sh`.
 
     Returns:
-        arrays by the names of a `Splats`; `sh` (n, k, 3) has the rendered coefficients.
+        an array for each parameter in `Splats.values`, by its name; `sh` (n, k, 3) contains only the k
+        coefficients that were rendered.
     """
     scales, opacities = splats.scales, splats.opacities
     by_scale, by_opacity = gradients["scales"], gradients["opacities"]

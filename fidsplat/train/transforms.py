@@ -35,7 +35,7 @@ class DatasetContents(NamedTuple):
 
 
 def has_transforms(path: Path) -> bool:
-    """Whether this is a JSON file, or a folder with a transforms.json."""
+    """Whether `path` is a JSON file, or a folder with a transforms.json."""
     named = path.suffix.lower() == ".json" and path.is_file()
     return named or any((path / name).is_file() for name in _NAMES)
 

@@ -47,8 +47,8 @@ def check_total(what: str, need: int, remedy: str) -> None:
     limit = input_limit(0) if VARIABLE in os.environ else _half_of_memory()
     if need > limit:
         raise InputError(
-            f"{what} must take at most {bytes_words(limit)}, got {bytes_words(need)} and more; {remedy}, or "
-            f"set {VARIABLE}"
+            f"{what} must take at most {bytes_words(limit)}, got at least {bytes_words(need)}; {remedy}, or "
+            f"set {VARIABLE} to a larger number of bytes"
         )
 
 

@@ -219,7 +219,7 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
     if (item == 0) queued = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     uint groups = get_num_groups(0) - splat_groups, i = get_global_id(0) - groups * BIN_ITEMS;
-    if (get_group_id(0) < groups) {     // first, since they may take long
+    if (get_group_id(0) < groups) {     // the groups of big splats start first, since they may take long
         const BigSplats shared = {count, width, height, big, big_bounds, keys
 //@@ big_record_arguments
         };

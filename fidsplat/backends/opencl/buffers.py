@@ -195,8 +195,8 @@ class RayBuffers:
         )
 
     def of(self, raster: RayRaster, rows: int, columns: int, slopes: bool = False) -> dict[str, cl.Buffer]:
-        """Buffers by name, for a sample grid padded to rows x columns. slopes: add the derivatives of rays,
-        which boxes need."""
+        """Buffers by name, for a sample grid padded to rows x columns. slopes: also the derivatives of the
+        ray directions with respect to the sample position, which box primitives need."""
         sizes = self._held.setdefault(raster, {})
         if (rows, columns) not in sizes:
             sizes[rows, columns] = {"rays": self._planar("rays", raster.rays, rows, columns)}

@@ -175,7 +175,8 @@ class DeviceFrame:
         self.stats: Callable[[], dict[str, int]] = dict
 
     def sub_frame(self, view: View) -> DeviceFrame:
-        """The frame of one pose of a shutter."""
+        """The device frame of `view`, one of the poses of a moving camera whose images the shutter
+        averages."""
         views = ViewBatch.single(view)
         frame = DeviceFrame(self.workspace, self.commands, self.shape, self.resident, views, self.plan)
         frame.is_sub_frame = True

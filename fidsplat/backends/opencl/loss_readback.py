@@ -33,7 +33,7 @@ class LossReadback:
         return self._next, self._slots[self._next]
 
     def submitted(self, slot: int, event: cl.Event) -> None:
-        """Store the event that completes with the sums of a slot."""
+        """Mark a slot as unread. event: of the kernel that writes its sums."""
         self._last = event
         self._unread.add(slot)
 

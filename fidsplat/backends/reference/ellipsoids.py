@@ -1,8 +1,9 @@
 """3D Gaussians as disks with the same image (docs/primitives.md).
 
-`exact`: W maps the covariance to the unit matrix. In that space the disk goes through the centre p,
-perpendicular to W p. The minimum squared distance of a ray is rho / (1 + rho / |W p|^2) for the disk's rho.
-`ewa`: a disk that faces the camera, whose image has the covariance of 3DGS.
+`exact`: W maps the covariance to the unit matrix. In that space the disk contains the centre W p and is
+perpendicular to it. A ray that meets the disk at the squared distance rho from the centre has the minimum
+squared distance rho / (1 + rho / |W p|^2) from it. `ewa`: a disk parallel to the image plane; the image of
+this disk has the covariance that 3DGS computes.
 """
 
 from __future__ import annotations

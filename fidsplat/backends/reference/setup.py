@@ -111,9 +111,10 @@ class Setup:
         ahead = self.pz >= view.near
         middle_x, middle_y = optics.centers_of(view, p, ahead)
         ahead &= np.isfinite(middle_x)
-        self.disc = ahead & ~unfiltered[order]  # the low-pass disc belongs to the centre of a Gaussian
+        self.disc = ahead & ~unfiltered[order]  # boxes and EWA Gaussians have no low-pass disc
         self.center_x, self.center_y = (np.where(self.disc, at, np.inf) for at in (middle_x, middle_y))
-        # devices store the forms about the pixel nearest to the centre; unknown if that is behind the camera
+        # devices store the affine forms relative to the pixel nearest to the centre's image; there is none if
+        # the centre is behind the camera
         self.anchor_x = _anchor(middle_x, ahead, view.width)
         self.anchor_y = _anchor(middle_y, ahead, view.height)
         self.anchors = optics.anchors_of(view, self.anchor_x, self.anchor_y)

@@ -14,9 +14,14 @@ from fidsplat.backends.warp.uniforms import memory_bytes
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.util.errors import DeviceError, bytes_words
 
-# bytes of a splat's bounds; of its window, key, counts and sums; of a visible splat in the sort and the
-# lists; of a pair, including scratch memory of the sort
-_BOUNDS, _PROJECTED, _VISIBLE, _PAIR = 44, 36, 40, 24
+_BOUNDS = 44
+"""bytes of the image bounds of a splat"""
+_PROJECTED = 36
+"""bytes of its rectangle of tiles, its sort key, counts and sums"""
+_VISIBLE = 40
+"""bytes of a visible splat in the sort and in the lists"""
+_PAIR = 24
+"""bytes of a pair of splat and tile, including scratch memory of the sort"""
 _MAX_PART_BYTES = {True: 1 << 31, False: 1 << 28}
 """maximum bytes of a part of a batch on CUDA and on the CPU; larger parts are not faster"""
 _MAX_NUMBERED = 1 << 30
@@ -57,8 +62,8 @@ class MemoryPlanner:
         if pairs < 1:
             raise DeviceError(
                 f"a memory budget of {bytes_words(workspace.memory_budget)} is too small for "
-                f"{resident.count} splats in this frame, which take {bytes_words(fixed)} before their "
-                "lists; raise memory_budget, or use an OpenCL device, which renders a cloud in chunks"
+                f"a frame of {resident.count} splats, which takes {bytes_words(fixed)} and the lists "
+                "of the tiles; raise memory_budget, or use an OpenCL device, which renders a cloud in chunks"
             )
         return min(workspace.pair_budget, pairs)
 

@@ -76,7 +76,7 @@ class WarpProbe(Probe):
 
     @contextmanager
     def poisoned(self) -> Iterator[None]:
-        """A context in which arrays are first filled with 0xFF: NaN, or -1."""
+        """A context in which new arrays are filled with bytes 0xFF: NaN as floats, -1 as integers."""
         pool = self._workspace.pool
         self._workspace.pool = PoisonedPool(self._workspace.device)
         try:

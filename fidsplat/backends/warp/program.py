@@ -188,7 +188,7 @@ class Program:
         """Compile a kernel for the device. block: its threads on a GPU.
 
         Raises:
-            DeviceError: the compiler refuses.
+            DeviceError: the kernels cannot be compiled.
         """
         # compiled here, not at the first launch, as several threads may launch it
         try:
@@ -211,7 +211,7 @@ class GradientKernels:
     def __init__(self, program: Program) -> None:
         """
         Raises:
-            DeviceError: the compiler refuses.
+            DeviceError: the kernels cannot be compiled.
         """
         features, needs, shape = program.features, program.needs, program.shape
         rendered = {"rgb", *features.outputs}

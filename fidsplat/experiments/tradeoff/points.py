@@ -207,7 +207,7 @@ def _variation(setting: str, value: Any) -> Point:
 
 
 def value_text(value: Any) -> str:
-    """Value as text, with well-known numbers such as 1/255."""
+    """Value as text; well-known numbers as fractions, such as 1/255."""
     return _TEXTS.get(value) or (f"{value:g}" if isinstance(value, float) else str(value))
 
 

@@ -2,8 +2,8 @@
 // part of the output `error` (fidsplat/render/certified_error.py has the derivation). By interval arithmetic on a fragment's forms,
 // as in fidsplat/backends/reference/error_bounds.py: opacity is between `low` and `high`, and colour changes by at most the
 // transmittance times the difference of the blended opacity from the further bound. Fragments that rounding may discard (near
-// plane, horizon, rim) count, so all listed fragments are evaluated. Each blended fragment rounds transmittance and the colour sum,
-// together by UNIT, and this sum by half of that.
+// plane, horizon, rim) count, so all listed fragments are evaluated. Each blended fragment adds 1.5 UNIT: UNIT
+// for the rounding of the transmittance and the product with the colour, UNIT / 2 for that of the colour sum.
 //@ state
     vfloat rounding;
 //@ start

@@ -18,7 +18,7 @@
 static inline vfloat add_depth(Sums *sums, const Splat *s, const Geometry *g, vfloat by_z, vfloat screen, vfloat x, vfloat y,
                                vfloat *by_nu, vfloat *by_nv) {
     vfloat by_numerator = VSELECT((vfloat)0.0f, by_z * g->inverse_d, g->hit), by_d = -by_numerator * g->z;
-    vfloat by_center = VSELECT(by_z, (vfloat)0.0f, g->hit), by_q = 0.0f;     // by n_u over n_u, by n_v over n_v
+    vfloat by_center = VSELECT(by_z, (vfloat)0.0f, g->hit), by_q = 0.0f;     // by_q n_u, by_q n_v: gradients with respect to n_u, n_v
 //@@ disc_add_depth
 //@@ footprint_add_depth
     sums->z_numerator += by_numerator;

@@ -37,8 +37,8 @@ static inline Projected widened(real3_ across, real3_ down, real spread) {
     }
 //@ ellipsoid_normal
     if (THICK_HERE) {
-        // Inverse covariance times the ray direction at the centre (ellipsoid_exact.cl): the normal of the surface of largest
-        // values along rays. Relative to the shortest axis, so that nothing overflows.
+        // Inverse covariance times the ray direction at the centre (ellipsoid_exact.cl): the normal of the surface on which
+        // the Gaussian is largest along each ray. Lengths are relative to the shortest axis, so that nothing overflows.
         real3_ first = rotate_to_camera(view, tangent_u), second = rotate_to_camera(view, tangent_v), towards = p;
         bool parallel = false;
 //@@ camera_ellipsoid

@@ -40,7 +40,7 @@
             outside &= VMASK(FMA(disc_x, disc_x, disc_y * disc_y) * filter > half_r2);
         }
 //@ cross_functions
-#define HAS_DISC(s) ((s)->disc_x < 1e17f)       // without a disc it is far away, or NaN where the lens does not image the centre
+#define HAS_DISC(s) ((s)->disc_x < 1e17f)       // disc_x is huge without a low-pass disc, NaN where the lens has no image of the centre
 //@ fragment_mask
 // Vectors of pixels skip splats without a disc; for single pixels the test costs as much as it saves.
 #if LANES > 1
