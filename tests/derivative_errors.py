@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import pickle
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -10,6 +12,7 @@ import numpy as np
 from fidsplat.backends.gradients import on_host
 from fidsplat.backends.interface import Backend
 from fidsplat.backends.prepare import prepare
+from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
@@ -111,6 +114,19 @@ def derivatives(
     found = pipeline.backward(images, given)
     # the reference's stay float64
     return {name: one if isinstance(one, np.ndarray) else on_host(one) for name, one in found.items()}
+
+
+_TRUTHS: dict[bytes, dict[str, np.ndarray]] = {}
+
+
+def reference_derivatives(
+    cloud: SplatCloud, capture: Capture, by_images: Mapping[str, np.ndarray] | None = None
+) -> dict[str, np.ndarray]:
+    """The derivatives of the reference, cached for all devices and schedules."""
+    key = hashlib.sha256(pickle.dumps((cloud, capture, by_images))).digest()
+    if key not in _TRUTHS:
+        _TRUTHS[key] = derivatives(ReferenceBackend(), cloud, capture, by_images)
+    return _TRUTHS[key]
 
 
 def last_place(cloud: SplatCloud) -> SplatCloud:

@@ -14,6 +14,7 @@ from derivative_errors import (
     last_place,
     random_loss,
     random_picture,
+    reference_derivatives,
 )
 
 import fidsplat as fs
@@ -27,13 +28,13 @@ BACKEND = ("opencl", "warp")
 
 def assert_same(backend, cloud, capture, by_images=None, **build):
     found = derivatives(backend, cloud, capture, by_images, **build)
-    expected = derivatives(ReferenceBackend(), cloud, capture, by_images)
+    expected = reference_derivatives(cloud, capture, by_images)
     assert found.keys() == expected.keys()
     for name, array in found.items():
         assert array.shape == expected[name].shape, name
     off = list(differences(found, expected))
     if any(one.norm > NORM or one.turned > COSINE for one in off):
-        moved = derivatives(ReferenceBackend(), last_place(cloud), capture, by_images)
+        moved = reference_derivatives(last_place(cloud), capture, by_images)
         known = differences(moved, expected)
         for one, place in zip(off, known, strict=True):
             assert one.norm <= max(NORM, 2 * place.norm), (one, place)

@@ -93,7 +93,9 @@ def test_fog_does_not_depend_on_the_cut_off(renderer, order):
     camera, cut_off = fs.Camera.pinhole(65, 49, 60.0, 60.0, 32.5, 24.5), 1e-4
     for tilt in (5e-9, 1e-5, 1e-3, 0.02):
         wide, narrow = (
-            renderer.render(edge_on(tilt), fs.Capture(camera, quality=quality, fog=fs.Fog(0.5)))["rgb"]
+            renderer.render(edge_on(tilt), fs.Capture(camera, ("rgb", "depth"), quality, fog=fs.Fog(0.5)))[
+                "rgb"
+            ]
             for quality in (fs.Quality(order=order, alpha_cutoff=cut) for cut in (1e-12, cut_off))
         )
         assert np.abs(wide - narrow).max() <= cut_off + 2e-5

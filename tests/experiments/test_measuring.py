@@ -62,7 +62,7 @@ def test_scans_of_the_ideal_texture_find_its_ceiling(pool):
 def test_scans_do_not_hang_on_the_number_of_threads(renderer):
     markers = MarkerRenderer(renderer)
     parts = angles.angles_points(
-        [CATEGORIES["apriltag"]], ["fixed-plane"], [IDEAL, "fitted/best"], "0:88:11", 1
+        [CATEGORIES["apriltag"]], ["fixed-plane"], [IDEAL, "fitted/best"], "0:88:22", 1
     )
     for point in parts:
         results = []
