@@ -121,7 +121,9 @@ def nerfstudio_parts(transforms: Any, frame: Any) -> Parts:
     try:
         width, height = int(given["w"]), int(given["h"])
     except (KeyError, TypeError, ValueError, OverflowError):
-        raise InputError("w and h must be the size of the images in pixels") from None
+        raise InputError(
+            f"w and h must be the size of the images in pixels, got {given.get('w')!r} and {given.get('h')!r}"
+        ) from None
     try:
         if "fl_x" in given:
             fx = float(given["fl_x"])

@@ -79,7 +79,7 @@ def load_colmap(folder: Path) -> ColmapModel:
 def byte_colors(name: str, values: np.ndarray) -> np.ndarray:
     """Convert colours of points to uint8. Raises InputError for numbers outside 0 to 255."""
     if not ((values >= 0) & (values <= 255)).all():
-        raise InputError(f"{name} must have colours from 0 to 255; check the file")
+        raise InputError(f"{name} must have colours from 0 to 255, got {values.min():g} to {values.max():g}")
     return values.astype(np.uint8)
 
 

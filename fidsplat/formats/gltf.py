@@ -88,9 +88,10 @@ def save_gltf(cloud: SplatCloud, path: Path) -> None:
     ):
         if whole is None:
             continue
-        if np.abs(whole.astype(np.int64)).max() >= 2**24:
+        if (largest := np.abs(whole.astype(np.int64)).max()) >= 2**24:
             raise InputError(
-                f"{name}s in glTF must be less than 2^24, since they are floats; use smaller ones"
+                f"{name}s in glTF must be less than 2^24, since they are floats, got {largest}; "
+                "use smaller ones"
             )
         arrays[f"_{name.upper()}"] = whole[:, None].astype(np.float32)
     views, accessors, chunks, place = [], [], [], 0

@@ -40,7 +40,7 @@ def _parse(text: str, head: str, rest: str) -> BoardSpec:
     columns, rows = int(found[1]), int(found[2])
     smallest = 2 if kind == "charuco" else 1
     if not (smallest <= columns <= MAX_TAGS and smallest <= rows <= MAX_TAGS):
-        raise InputError(f"{text!r}: columns and rows must be from {smallest} to {MAX_TAGS}")
+        raise InputError(f"a board must have {smallest} to {MAX_TAGS} columns and rows, got {text!r}")
     return BoardSpec(text=text, kind=kind, family=canonical_family(found[3]), columns=columns, rows=rows)
 
 

@@ -108,7 +108,8 @@ def _modules(spec: DrawingSpec) -> tuple[Spec, np.ndarray]:
         points += sum(map(len, rings))
         if len(colors) > MAX_COLORS or points > MAX_POINTS:
             raise InputError(
-                f"{name} must have at most {MAX_COLORS} colours and {MAX_POINTS} points; simplify the drawing"
+                f"{name} must have at most {MAX_COLORS} colours and {MAX_POINTS} points, got more; simplify "
+                "the drawing"
             )
         outlines.append((rings, rule, colors.index(color)))
     refuse_tangles([ring for rings, _, _ in outlines for ring in rings], name)

@@ -109,7 +109,9 @@ def whole_numbers(labels, n: int, name: str = "labels") -> np.ndarray:
         raise InputError(f"{name} must be one int or have the shape ({n},), got shape {array.shape}")
     limits = np.iinfo(np.int32)
     if array.size and (int(array.min()) < limits.min or int(array.max()) > limits.max):
-        raise InputError(f"{name} must lie in {limits.min} to {limits.max}")
+        raise InputError(
+            f"{name} must be from {limits.min} to {limits.max}, got {array.min():.0f} to {array.max():.0f}"
+        )
     return np.full(n, array, np.int32) if array.ndim == 0 else array.astype(np.int32)
 
 

@@ -73,8 +73,8 @@ def test_april_grids():
     [
         ("charuco:7x5", "charuco:7x5:4x4_50"),
         ("charuco:7:4x4_50", "COLUMNSxROWS"),
-        ("charuco:1x5:4x4_50", "from 2 to 64"),
-        ("gridboard:0x5:4x4_50", "from 1 to 64"),
+        ("charuco:1x5:4x4_50", "must have 2 to 64 columns and rows"),
+        ("gridboard:0x5:4x4_50", "must have 1 to 64 columns and rows"),
         ("gridboard:5x5:4x4_51", "unknown tag family"),
         ("gridboard:8x8:4x4_50", "needs 64 tags, but 4x4_50 has 50"),
         ("aprilgrid:6x6:4x4_50", "the family of an AprilGrid must be AprilTags, got 'aprilgrid:6x6:4x4_50';"),

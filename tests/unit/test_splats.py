@@ -96,7 +96,7 @@ def test_read_only_float32_is_shared_but_a_view_of_writable_memory_is_copied():
         ({"colors": None, "sh": np.ones((5, 4, 3))}, r"sh.*\(5, 4, 3\)"),
         ({"labels": np.zeros(5, int)}, r"labels.*\(5,\)"),
         ({"labels": np.zeros(6)}, "labels must be ints"),
-        ({"labels": 2**31}, "labels must lie in"),
+        ({"labels": 2**31}, "labels must be from"),
         ({"means": [["a"] * 3] * 6}, "means must be an array of real numbers"),
         ({"means": [[1, 2, 3], [4]]}, "means must be an array"),
         ({"opacities": np.ones(6, complex)}, "opacities must be an array of real"),

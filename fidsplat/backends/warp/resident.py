@@ -86,7 +86,7 @@ class Resident(ResidentData):
             known = [(degree + 1) ** 2 for degree in range(1, MAX_DEGREE + 1)]
             if count and terms not in known:
                 raise InputError(
-                    f"sh holds {terms} coefficients per splat; on a device it must be one of {known}"
+                    f"the number of sh coefficients per splat must be one of {known}, got {terms}"
                 )
         if "labels" not in arrays:
             arrays["labels"] = pool.fresh("labels", count, load().int32)
@@ -168,7 +168,7 @@ def _adopted(name: str, value: Any, pool: ArrayPool) -> Any:
         typed = value.astype(np.int32 if dtype is wp.int32 else np.float32, copy=False)
         if width > 1 and (typed.ndim < 2 or typed.shape[-1] != width):
             expected = "2 or 3" if name == "scales" else width
-            raise InputError(f"{name} has the shape {typed.shape}; its last axis must be {expected}")
+            raise InputError(f"the last axis of {name} must be {expected}, got shape {typed.shape}")
         return _uploaded(name, typed, pool, dtype)
     array: Any = value if isinstance(value, wp.array) else wp.from_dlpack(value)
     if array.device != pool.device:
@@ -184,7 +184,7 @@ def _adopted(name: str, value: Any, pool: ArrayPool) -> Any:
         or getattr(array.dtype, "_wp_scalar_type_", array.dtype) != scalar
     ):
         raise InputError(
-            f"{name} has the type {wp.types.type_repr(array.dtype)} and the shape {array.shape}; it must "
-            f"hold {scalar.__name__}, {width} to an element"
+            f"an element of {name} must be {width} x {scalar.__name__}, got the type "
+            f"{wp.types.type_repr(array.dtype)} and the shape {array.shape}"
         )
     return array.flatten()
