@@ -14,5 +14,6 @@ class Adapter(TorchAdapter):
         splats = self.means, self.quats, self.scales, self.opacities
         colors = self.colors.expand(len(views), *self.colors.shape)
         cameras = self.viewmats[views], self.K.expand(len(views), 3, 3), self.width, self.height
-        images, *_ = gsplat.rasterization_2dgs(*splats, colors, *cameras, packed=False)
+        # 1.6 refuses several cameras unpacked
+        images, *_ = gsplat.rasterization_2dgs(*splats, colors, *cameras, packed=len(views) > 1)
         return images

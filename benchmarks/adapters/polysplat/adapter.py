@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 from example import Rasterizer
+from polysplat import ops  # noqa: F401 an ImportError where the extension was not built
 from torch_gpu import TorchAdapter, pinned
 
 C0 = 0.28209479177387814  # value of the constant spherical harmonic
