@@ -74,13 +74,16 @@ typedef union {
 
 INLINE void set_up(
 //@@ arguments project
-    , uint i, uint number, Batch *batch, uint k, bool crossing) {
+    , uint i, uint number, Batch *batch, uint k, bool crossing)
 #else
 #define KEY keys[at]
 
 kernel void project(
 //@@ arguments project
-) {
+)
+#endif
+{
+#if BATCH == 1
     uint i = get_global_id(0), number = get_global_id(1);
     if (i >= count) return;
 #endif

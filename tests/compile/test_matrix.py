@@ -27,9 +27,8 @@ def assert_well_formed(names, shapes=SHAPES):
         assert "//" not in source.text
         assert source.text.count("{") == source.text.count("}")
         assert source.records["Splat"].itemsize % 16 == 0
-        heads = dict(
-            re.findall(r"^kernel\b.*?\bvoid (\w+)\((.*?)\) \{", source.text, re.MULTILINE | re.DOTALL)
-        )
+        head = r"^kernel\b.*?\bvoid (\w+)\((.*?)\)\s(?:#endif\s)?\{"
+        heads = dict(re.findall(head, source.text, re.MULTILINE | re.DOTALL))
         assert heads.keys() == source.arguments.keys()
         for kernel, arguments in source.arguments.items():
             lines = [line.strip(" ,") for line in heads[kernel].splitlines() if line and line[0] != "#"]

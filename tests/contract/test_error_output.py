@@ -221,7 +221,7 @@ def test_the_bound_holds_for_ellipsoids(reference, backend, parts):
             "with a camera whose far is inf",
         ),
         ({"camera": replace(SMALL, lens=fs.Fisheye())}, "a distorted or non-pinhole camera", "a pinhole"),
-        ({"background": fs.Gradient((0, 0, 1), (1, 1, 1))}, "a gradient or panorama", "of one color"),
+        ({"background": fs.Gradient((0, 0, 1), (1, 1, 1))}, "a gradient or panorama", "of one colour"),
     ],
 )
 def test_effects_without_a_bound_are_refused(renderer, parts, effect, remedy):
