@@ -195,7 +195,16 @@ kernel void project(
     UNROLLED for (uint n = 0; n < sizeof(Bounds) / 4; n++) batch->bounds[n][k] = bounds_words.scalars[n];
 }
 
-// Writes the record, window and keys of a splat after its set-up.
+static inline Bounds bounds_of(const Batch *batch, uint k) {
+    BoundsWords words;
+    for (uint n = 0; n < sizeof(Bounds) / 4; n++) words.scalars[n] = batch->bounds[n][k];
+    return words.bounds;
+}
+
+// Writes the record, window and keys of a splat after its set-up. No copies in memory: reading four words that were written one by one
+// would stall.
+#define record splats[at]
+#define bounds bounds_of(batch, k)
 INLINE void write_splat(
 //@@ arguments project
     , uint i, uint number, const Batch *batch, uint k) {
@@ -205,23 +214,17 @@ INLINE void write_splat(
     view += number;
 //@@ splat_view
     real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
-    SplatWords words;
-    BoundsWords bounds_words;
-    for (uint n = 0; n < sizeof(Splat) / 4; n++) words.scalars[n] = batch->records[n][k];
-    for (uint n = 0; n < sizeof(Bounds) / 4; n++) bounds_words.scalars[n] = batch->bounds[n][k];
-    Splat record = words.splat;
-    Bounds bounds = bounds_words.bounds;
+    const uint (*word)[BATCH] = batch->records;
+    for (uint n = 0; n < sizeof(Splat) / 4; n += 4)
+        ((global uint4 *)(splats + at))[n / 4] = (uint4)(word[n][k], word[n + 1][k], word[n + 2][k], word[n + 3][k]);
 //@@ color
+    uint corner = batch->corners[k], window = batch->windows[k];
 #else
 //@@ color
 //@@ project
-#endif
     // vector stores
     SplatWords packed = {record};
     for (uint part = 0; part < sizeof(Splat) / 16; part++) ((global float4 *)(splats + at))[part] = packed.words[part];
-#if BATCH > 1
-    uint corner = batch->corners[k], window = batch->windows[k];
-#else
     uint corner, window = tile_window(&bounds, record.x0, record.x1, y0, y1, width, height, &corner);
 #endif
     if (window == 0) {
@@ -243,6 +246,8 @@ INLINE void write_splat(
 }
 
 #if BATCH > 1
+#undef record
+#undef bounds
 // Key of a splat that is culled by its bounding sphere; 0 for others.
 #undef RETURN_CULLED
 #define RETURN_CULLED return CULLED
