@@ -33,7 +33,7 @@ class Controls:
     """The panel of a viser page (its `gui`).
 
     Args:
-        devices: names of the selector, including the session's device.
+        devices: names in the menu of devices, including the session's device.
     """
 
     def __init__(self, gui: Any, session: Session, devices: list[str], actions: Actions) -> None:

@@ -173,7 +173,7 @@ def _changed(**changes):
         (lambda: fs.Camera.from_ros_camera_info(_changed(distortion_model="bob")), "distortion_model"),
         (lambda: fs.Camera.from_ros_camera_info(_changed(binning_x=2)), "got binning"),
         (lambda: fs.Camera.from_ros_camera_info(_changed(d=np.ones(8))), "rectify the images"),
-        (lambda: fs.load_cameras("/nowhere"), "COLMAP model .* or a transforms.json"),
+        (lambda: fs.load_cameras("/nowhere"), "must be a transforms.json, or a folder"),
     ],
 )
 def test_what_is_no_camera(make, words):

@@ -152,7 +152,8 @@ class _Ellipsoids(_Solid):
 
 
 class _Projected(_Solid):
-    """EWA: the covariance of the axes' images under the Jacobian at the centre, widened."""
+    """3D Gaussians by EWA: their covariance on the image by the Jacobian at the centre, plus 0.3 square
+    pixels."""
 
     def __init__(self, placed: Placed, view: View, antialiased: bool, x: np.ndarray, y: np.ndarray) -> None:
         super().__init__(placed)

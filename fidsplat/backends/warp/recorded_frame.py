@@ -138,7 +138,7 @@ class FrameRenderer:
         into: ImageArrays,
         reserved: int,
     ) -> Rendered:
-        """A submitted frame whose counts are checked later."""
+        """A submitted frame whose numbers of splats and pairs are compared with the capacities later."""
         workspace, pool = self._workspace, frame.pool
         counts = pool.lend("totals", 2, load().int64)
         load().copy(counts, frame.named["totals"])

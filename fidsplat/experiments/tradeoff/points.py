@@ -193,7 +193,7 @@ def preset(name: str) -> Quality:
 
 
 def ablation(changes: dict[str, Any]) -> Point:
-    """A constant changed in `EXACT`."""
+    """Point with the quality `EXACT`, except for one constant."""
     setting, value = next(iter(changes.items()))
     return Point(ABLATION, f"{setting} {value_text(value)}", EXACT.with_(**changes))
 
