@@ -285,7 +285,8 @@ class OpenCLTraining(TrainingKernels):
         self._step(taken, given | {"move": 1, "sparse": int(numbers["sparse"])}, camera, origin)
 
     def _step(self, taken: Any, given: Mapping[str, Any], camera: Camera | None, origin: np.ndarray) -> None:
-        taken.compile_step()  # compiling takes seconds: it is first, so that an interrupt leaves the statistics unchanged
+        # compiling takes seconds: it is first, so that an interrupt leaves the statistics unchanged
+        taken.compile_step()
         if camera is not None:
             self._count_visible(camera, origin)
         taken.step({**self._bound, **given, "counted": int(camera is not None)})
