@@ -1,9 +1,9 @@
 // rounding (h, w): upper bound of the float32 rounding error in rgb, per unit of colour, for frames without a transmittance stop;
 // part of the output `error` (fidsplat/render/certified_error.py has the derivation). By interval arithmetic on a fragment's forms,
 // as in fidsplat/backends/reference/error_bounds.py: opacity is between `low` and `high`, and colour changes by at most the
-// transmittance times the difference of the blended opacity from the further bound. Fragments that rounding may discard (near
-// plane, horizon, rim) count, so all listed fragments are evaluated. Each blended fragment adds 1.5 UNIT: UNIT
-// for the rounding of the transmittance and the product with the colour, UNIT / 2 for that of the colour sum.
+// transmittance times the larger of high - opacity and opacity - low. Fragments that rounding may discard (at the near plane, at the
+// horizon of the splat's plane, at the splat's rim) count, so all listed fragments are evaluated. Each blended fragment adds
+// 1.5 UNIT for the rounding of transmittance and colour sum (step 4 of the derivation).
 //@ state
     vfloat rounding;
 //@ start
