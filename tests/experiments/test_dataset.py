@@ -138,5 +138,5 @@ def test_models_with_several_lenses_and_names_that_cannot_be(tmp_path):
     for bad in ("with blank.png", "", "two\nlines.png"):
         with pytest.raises(fs.InputError, match="the name of a COLMAP image must"):
             save_colmap(tmp_path / "n", [bad], cameras[:1], np.zeros((0, 3)), np.zeros((0, 3)))
-    with pytest.raises(fs.InputError, match="as many names as cameras"):
+    with pytest.raises(fs.InputError, match="a name for each camera"):
         save_colmap(tmp_path / "n", names, cameras[:2], np.zeros((0, 3)), np.zeros((0, 3)))
