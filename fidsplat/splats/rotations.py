@@ -1,5 +1,7 @@
 """Quaternions (w, x, y, z) and 4x4 rigid transforms, in float64."""
 
+from typing import Any
+
 import numpy as np
 
 from fidsplat.util.arguments import LARGEST, real_array
@@ -106,7 +108,7 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
     return rotation, scale, m[:3, 3]
 
 
-def pose_matrix(pose, name: str) -> np.ndarray:
+def pose_matrix(pose: Any, name: str) -> Any:
     """The matrix of a pose: a 4x4 matrix, which is returned unchecked, a pair (position, quaternion w, x, y,
     z), or both in 7 numbers.
 
@@ -127,7 +129,7 @@ def pose_matrix(pose, name: str) -> np.ndarray:
         )
     if abs(np.linalg.norm(parts[1]) - 1) > 1e-3:
         raise InputError(f"the quaternion w, x, y, z of {name} must have length 1, got {parts[1].tolist()}")
-    return rigid_matrix(*parts)
+    return rigid_matrix(parts[0], parts[1])
 
 
 def rigid_matrix(position, quaternion=(1.0, 0.0, 0.0, 0.0), scale: float = 1.0) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,8 @@ from fidsplat.cameras.raster import RayRaster
 from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import DeviceError
 
+MIN_BATCHED = 1 << 14
+"""splats of clouds whose set-up is vectorised on CPUs"""
 _KINDS = 32
 """maximum number of kinds of frames that are cached for a cloud"""
 _RASTERS = 4
@@ -59,12 +62,19 @@ class OpenCLPipeline(Pipeline):
     ) -> None:
         """other: function that returns the pipeline with another shape."""
         self.workspace, self.source, self.features, self.shape = workspace, source, features, shape
-        self.program = Program(workspace, source)
         self.outputs = {output.name: output for output in features.images}
-        self._commands = CommandList(self.program)
-        """command list of frames that are not replayed"""
         self._planner = MemoryPlanner(workspace, source, features, shape)
         self._other = other
+
+    @cached_property
+    def program(self) -> Program:
+        """The compiled kernels. Raises DeviceError if compilation fails."""
+        return Program(self.workspace, self.source)
+
+    @cached_property
+    def _commands(self) -> CommandList:
+        """Command list of frames that are not replayed."""
+        return CommandList(self.program)
 
     def render_view(self, resident: Resident, view: View) -> OpenCLImages:
         """Render one view. Frames of a kind that was rendered before are replayed; on a GPU without waiting.
@@ -72,6 +82,8 @@ class OpenCLPipeline(Pipeline):
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
+        if self._vectorises_too_few(resident):
+            return self._unbatched().render_view(resident, view)
         with self.workspace.rendering():
             key = self._key(view)
             cached = resident.cached_frames.get(key) if view.band is None else None
@@ -93,6 +105,8 @@ class OpenCLPipeline(Pipeline):
         """Render views, as many at once as memory allows. Raises DeviceError if the device fails."""
         if views.is_single:
             return self.render_view(resident, views.one(0))
+        if self._vectorises_too_few(resident):
+            return self._unbatched().render(resident, views)
         workspace, rendered = self.workspace, []
         with workspace.rendering():
             workspace.switch_to(workspace.queue)
@@ -122,6 +136,8 @@ class OpenCLPipeline(Pipeline):
         Raises:
             DeviceError: the device fails, or the frame exceeds the memory budget without chunks or bands.
         """
+        if self._vectorises_too_few(resident):
+            return self._unbatched().render_complete(resident, view)
         with self.workspace.rendering():
             plan, frame = self._planner.frame(resident, view), None
             if not plan.chunk:
@@ -268,6 +284,14 @@ class OpenCLPipeline(Pipeline):
     def _listing(self, lists: str) -> OpenCLPipeline:
         """The pipeline with another tile-binning strategy."""
         return self._other(self.features, replace(self.shape, lists=lists))
+
+    def _vectorises_too_few(self, resident: Resident) -> bool:
+        """Whether a frame of the cloud saves less by vectorised set-up than that takes to compile."""
+        return self.shape.batch > 1 and resident.count < MIN_BATCHED
+
+    def _unbatched(self) -> OpenCLPipeline:
+        """The pipeline that sets up splats one by one."""
+        return self._other(self.features, replace(self.shape, batch=1))
 
     def _for_part(self, resident: Resident, plan: MemoryPlan, views: ViewBatch) -> OpenCLPipeline:
         """The pipeline with the fastest tile-binning strategy for a part of a batch."""
