@@ -227,7 +227,7 @@ def test_compiler_errors_name_the_kernel_file_and_line(renderer, toys):
         patch.setitem(LAYOUTS, "nearest", layout)
         features = select(random_splats(3, seed=1), fs.Capture(outputs=("nearest",)))
         with pytest.raises(fs.DeviceError, match=r"wrong\.cl:3:\d+: .*no_such_name"):
-            renderer.backend.pipeline(features)
+            _ = renderer.backend.pipeline(features).program
 
 
 def test_line_directives_match_the_lines_of_the_files():

@@ -135,11 +135,11 @@ class OpenCLBackend(Workspace, Backend):
         )
 
     def pipeline(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLPipeline:
-        """The stages compiled for these features; `shape` replaces the device's own build constants (tests).
+        """The stages for these features, compiled on first use; `shape` replaces the device's own build
+        constants (tests).
 
         Raises:
-            DeviceError: the device does not support a feature, or compilation fails (the message has the
-                log).
+            DeviceError: the device does not support a feature.
         """
         if shape is None and self._own[0] is self.shape and (known := self._own[1].get(features)) is not None:
             return known
