@@ -49,7 +49,7 @@ class Bench:
     --suite compares renderers by time and error on scenes of every regime: uniform, skewed, haze, street,
     markers, captured, batches, scaling. Each renderer runs in a process of its own: fidsplat on every device
     of this machine (or --device), and the renderers of --adapters. Images are compared with float64
-    references. It takes about 10 minutes on two cores, with --quick 90 s. Results are written after each
+    references. It takes about 10 minutes on two cores, with --quick under 3. Results are written after each
     scene; an interrupted run resumes. --scenes selects scenes or regimes. benchmarks/splatmark.py makes a
     site of the results.
 
