@@ -83,7 +83,7 @@ class OpenCLPipeline(Pipeline):
             DeviceError: the device runs out of memory or fails.
         """
         if self._vectorises_too_few(resident):
-            return self._unbatched().render_view(resident, view)
+            return self._unbatched.render_view(resident, view)
         with self.workspace.rendering():
             key = self._key(view)
             cached = resident.cached_frames.get(key) if view.band is None else None
@@ -106,7 +106,7 @@ class OpenCLPipeline(Pipeline):
         if views.is_single:
             return self.render_view(resident, views.one(0))
         if self._vectorises_too_few(resident):
-            return self._unbatched().render(resident, views)
+            return self._unbatched.render(resident, views)
         workspace, rendered = self.workspace, []
         with workspace.rendering():
             workspace.switch_to(workspace.queue)
@@ -137,7 +137,7 @@ class OpenCLPipeline(Pipeline):
             DeviceError: the device fails, or the frame exceeds the memory budget without chunks or bands.
         """
         if self._vectorises_too_few(resident):
-            return self._unbatched().render_complete(resident, view)
+            return self._unbatched.render_complete(resident, view)
         with self.workspace.rendering():
             plan, frame = self._planner.frame(resident, view), None
             if not plan.chunk:
@@ -289,6 +289,7 @@ class OpenCLPipeline(Pipeline):
         """Whether a frame of the cloud saves less by vectorised set-up than that takes to compile."""
         return self.shape.batch > 1 and resident.count < MIN_BATCHED
 
+    @cached_property
     def _unbatched(self) -> OpenCLPipeline:
         """The pipeline that sets up splats one by one."""
         return self._other(self.features, replace(self.shape, batch=1))
