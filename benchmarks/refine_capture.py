@@ -16,6 +16,7 @@ from real_scene import extent
 
 import fidsplat as fs
 from fidsplat.images.files import to_uint8
+from fidsplat.splats.harmonics import C0
 from fidsplat.train import Dataset, Trainer, TrainingView
 from fidsplat.train.pose_offset import offset_camera
 
@@ -82,7 +83,7 @@ def disturbed(cloud: fs.SplatCloud) -> fs.SplatCloud:
     random, n = np.random.default_rng(0), len(cloud)
     scales = np.column_stack([cloud.scales, cloud.thickness])
     means = cloud.means + NOISE["means"] * scales.mean(axis=1, keepdims=True) * random.normal(size=(n, 3))
-    sh = (cloud.colors[:, None] - 0.5) / 0.28209479177387814 if cloud.sh is None else cloud.sh.copy()
+    sh = (cloud.colors[:, None] - 0.5) / C0 if cloud.sh is None else cloud.sh.copy()
     sh = sh + NOISE["colors"] * random.normal(size=(n, 1, 3)) * (np.arange(sh.shape[1]) == 0)[:, None]
     return fs.SplatCloud(
         means,

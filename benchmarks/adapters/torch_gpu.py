@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+C0 = 0.28209479177387814  # value of the constant spherical harmonic
+
 
 def pinned(adapter):
     """Commit after the last @ of an adapter's requirements.txt, for packages without a version."""

@@ -27,6 +27,7 @@ import fidsplat as fs
 from fidsplat.capture.quality import Quality
 from fidsplat.formats import load_splats
 from fidsplat.scenes.random_clouds import SCENES, load_scene
+from fidsplat.splats.harmonics import C0
 from fidsplat.util.timing import Timer, frame_timer, ratios, time_interleaved
 from fidsplat.vision.metrics import psnr
 
@@ -52,7 +53,7 @@ def captured(file: str) -> Iterator[tuple[str, fs.SplatCloud, fs.Camera]]:
     means = cloud.means + cloud.origin.astype(np.float32)
     colors = cloud.colors
     if colors is None:
-        colors = np.clip(cloud.sh[:, 0] * 0.28209479177387814 + 0.5, 0, None)  # Y_0^0
+        colors = np.clip(cloud.sh[:, 0] * C0 + 0.5, 0, None)
     thickness = np.zeros(len(cloud)) if cloud.thickness is None else cloud.thickness
     scales = np.column_stack([cloud.scales, thickness])
     plain = fs.SplatCloud(means, cloud.quats, scales, cloud.opacities, colors=colors)

@@ -4,9 +4,7 @@ in a call."""
 import numpy as np
 import torch
 from FasterGSCudaBackend.torch_bindings import RasterizerSettings, rasterize
-from torch_gpu import TorchAdapter, pinned
-
-C0 = 0.28209479177387814  # value of the constant spherical harmonic
+from torch_gpu import C0, TorchAdapter, pinned
 
 
 class Adapter(TorchAdapter):

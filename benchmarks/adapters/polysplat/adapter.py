@@ -7,9 +7,7 @@ import numpy as np
 import torch
 from example import Rasterizer
 from polysplat import ops  # noqa: F401 an ImportError where the extension was not built
-from torch_gpu import TorchAdapter, pinned
-
-C0 = 0.28209479177387814  # value of the constant spherical harmonic
+from torch_gpu import C0, TorchAdapter, pinned
 
 
 class Adapter(TorchAdapter):
