@@ -71,7 +71,7 @@ def prepare_batch(cloud: Origined, views: Views) -> tuple[FeatureSet, ViewBatch]
         if other != features:
             differing = ", ".join(sorted(other.names ^ features.names)) or "samples or precision"
             raise InputError(
-                f"the views of a batch must have the same effects, but views 0 and {number} differ in "
+                f"the views of a batch must have the same effects, got views 0 and {number} that differ in "
                 f"{differing}; render them in separate batches"
             )
     every = [own[number][1] for number in rendered]

@@ -102,7 +102,8 @@ def nerfstudio_parts(transforms: Any, frame: Any) -> Parts:
         paths = [one.get("file_path") for one in frames]
     except (TypeError, KeyError, IndexError, AttributeError):
         raise InputError(
-            "transforms must be the content of a transforms.json, with frames; fs.load_cameras reads files"
+            "transforms must be the content of a transforms.json, with a list of frames, got "
+            f"{str(transforms)[:80]!r}; fs.load_cameras reads files"
         ) from None
     number = paths.index(frame) if isinstance(frame, str) and frame in paths else frame
     if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < len(frames):
@@ -117,7 +118,9 @@ def nerfstudio_parts(transforms: Any, frame: Any) -> Parts:
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
             raise ValueError
     except (KeyError, TypeError, ValueError, OverflowError):
-        raise InputError("transform_matrix must be 4 x 4 finite numbers") from None
+        raise InputError(
+            f"transform_matrix must be 4 x 4 finite numbers, got {given.get('transform_matrix')!r}"
+        ) from None
     try:
         width, height = int(given["w"]), int(given["h"])
     except (KeyError, TypeError, ValueError, OverflowError):
@@ -135,7 +138,10 @@ def nerfstudio_parts(transforms: Any, frame: Any) -> Parts:
         fy = float(given.get("fl_y", fx))
         cx, cy = float(given.get("cx", width / 2)), float(given.get("cy", height / 2))
     except (KeyError, TypeError, ValueError, OverflowError):
-        raise InputError("fl_x, or camera_angle_x, must be a finite number") from None
+        raise InputError(
+            "fl_x, or camera_angle_x, must be a finite number, got "
+            f"{given.get('fl_x')!r} and {given.get('camera_angle_x')!r}"
+        ) from None
     pose = matrix @ OPENGL
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3], world_to_camera[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]

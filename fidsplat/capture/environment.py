@@ -83,9 +83,11 @@ class Panorama(PickledByFields):
         whole = np.iinfo(given.dtype).max if given.dtype in (np.uint8, np.uint16) else 1
         with np.errstate(over="ignore"):  # an overflow of float32 is rejected below
             image = np.array(given, np.float32, order="C") / np.float32(whole)
-        if not np.isfinite(image).all():
+        if wrong := np.count_nonzero(~np.isfinite(image)):
             which = f"the panorama {self.file}" if self.file else "the panorama"
-            raise InputError(f"background: {which} must have finite numbers; replace the others")
+            raise InputError(
+                f"background: {which} must have finite numbers, got {wrong:,} others; replace them"
+            )
         image.flags.writeable = False
         object.__setattr__(self, "image", image)
 
@@ -124,10 +126,17 @@ class ExternalDepth(PickledByFields):
                 f"{depth.shape}"
             )
         whole = 255 if rgb.dtype == np.uint8 else 1
-        if not np.isfinite(rgb).all() or (depth < 0).any():
-            raise InputError("external_depth must have finite colours and depths of at least 0")
+        if wrong := np.count_nonzero(~np.isfinite(rgb)):
+            raise InputError(f"external_depth must have finite colours, got {wrong:,} other numbers")
+        if (depth < 0).any():
+            raise InputError(
+                f"external_depth must have depths of at least 0, got {np.nanmin(depth):g}; 0 means no surface"
+            )
         if label.dtype.kind not in "iu" or label.shape not in ((), depth.shape):
-            raise InputError(f"label of external_depth must be integers {depth.shape}, or one for all")
+            raise InputError(
+                f"label of external_depth must be integers {depth.shape}, or one for all, got {label.dtype} "
+                f"{label.shape}"
+            )
         here = np.isfinite(depth) & (depth > 0)
         made = {
             "rgb": np.array(rgb, np.float32, order="C") / np.float32(whole),

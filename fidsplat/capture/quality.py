@@ -230,7 +230,9 @@ class Quality:
         for part in [first, *rest] if "=" in first else rest:
             name, equals, value = (piece.strip() for piece in part.partition("="))
             if not equals:
-                raise InputError(f"quality: {part!r} must be a setting as key=value, e.g. alpha_cutoff=1e-3")
+                raise InputError(
+                    f"quality must be settings as key=value, e.g. alpha_cutoff=1e-3, got {part!r}"
+                )
             if name.startswith("marker."):
                 own = name.removeprefix("marker.")
                 changes.setdefault("marker", {})[own] = _read(MarkerQuality, own, value)
@@ -268,7 +270,9 @@ def _check_known(kind: type[Quality] | type[MarkerQuality], name: str) -> None:
 def _read(kind: type[Quality] | type[MarkerQuality], name: str, text: str) -> Any:
     """Parse the value of a setting."""
     if name == "marker":
-        raise InputError("quality: marker must be given by its settings, e.g. marker.template=9")
+        raise InputError(
+            f"quality: marker must be given by its settings, e.g. marker.template=9, got marker={text}"
+        )
     _check_known(kind, name)
     wanted = setting_types(kind)[name]
     if wanted.endswith("| None") and text.lower() == "none":

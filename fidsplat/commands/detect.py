@@ -161,7 +161,7 @@ def _load_scene(path: str) -> "Scene":
     with delayed_progress() as progress:
         scene = fs.Scene.load(path, progress=progress)
     if scene.camera is None:
-        raise InputError(f"{path} must have a [camera] table, which the poses of its markers need")
+        raise InputError(f"{path} must have a [camera] table for the poses of its markers, got none; add one")
     return scene
 
 

@@ -182,7 +182,9 @@ def _camera_motion(source: str, scene: Scene, smooth: bool) -> Trajectory:
     from fidsplat.cameras import Trajectory
 
     if not isinstance(scene.camera_motion, Trajectory):
-        raise InputError(f"{source} must have [[camera.motion]] to fly along; or give --trajectory FILE")
+        raise InputError(
+            f"{source} must have [[camera.motion]] to fly along, got none; or give --trajectory FILE"
+        )
     inverse = scene.camera_motion.inverse()
     return Trajectory(inverse.times, inverse.poses, smooth)
 

@@ -95,8 +95,10 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
     lens = None if capture.camera is None else capture.camera.lens
     ellipsoid = _ellipsoid(cloud, quality, lens)
     if capture.external_depth is not None and capture.exposed:
+        shutter = capture.shutter
         raise InputError(
-            "a capture with external_depth must have a shutter with exposure_time=0 and readout=0"
+            "a capture with external_depth must have a shutter with exposure_time=0 and readout=0, got "
+            f"{shutter.exposure_time:g} and {shutter.readout:g}"
         )
     # boxes and EWA have their own filter
     ewa_only = cloud.ellipsoids == "all" and ellipsoid != "exact"
@@ -108,7 +110,7 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
         _refuse_float64(lens, capture.foggy)
     if half and capture.foggy:
         raise InputError(
-            "blend_precision='float16' must have a capture without fog, whose light is summed in float32; "
+            "blend_precision must be 'float32' with fog, whose light is summed in float32, got 'float16'; "
             "use blend_precision='float32'"
         )
     flat = cloud.footprint == "gaussian" and not ellipsoid

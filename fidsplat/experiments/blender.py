@@ -125,7 +125,10 @@ def marker_job(category: Category, index: int, seed: int, folder: Path, view: st
 def image_job(file: Path, camera: Camera) -> dict:
     """File and camera of an image. Raises InputError unless the pixels of the camera are square."""
     if camera.fx != camera.fy:
-        raise InputError("fx and fy of a Blender camera must be equal; use square pixels")
+        raise InputError(
+            f"fx and fy of a Blender camera must be equal, got {camera.fx:g} and {camera.fy:g}; use "
+            "square pixels"
+        )
     facts = {name: getattr(camera, name) for name in ("width", "height", "fx", "cx", "cy")}
     return {"file": str(file.absolute()), **facts, "matrix": camera.world_to_camera.tolist()}
 

@@ -165,8 +165,11 @@ def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, _Intrinsics]]:
 def _text_cameras(lines: list[str]) -> Iterator[tuple[int, _Intrinsics]]:
     for line in filter(None, lines):
         number, model, width, height, *parameters = line.split()
-        if len(parameters) != dict(_MODELS.values()).get(model, len(parameters)):
-            raise ValueError(f"camera {number} of model {model} must not have {len(parameters)} parameters")
+        expected = dict(_MODELS.values()).get(model, len(parameters))
+        if len(parameters) != expected:
+            raise ValueError(
+                f"camera {number} of model {model} must have {expected} parameters, got {len(parameters)}"
+            )
         yield int(number), (model, int(width), int(height), tuple(map(float, parameters)))
 
 

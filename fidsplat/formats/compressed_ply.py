@@ -105,7 +105,8 @@ def _check(header: Header, name: str, properties, kind: str, count: int) -> None
     missing = [p for p in properties if p not in element.properties]
     if missing:
         raise InputError(
-            f"{header.path}: the element {name} of a compressed PLY must have {', '.join(missing)}"
+            f"{header.path}: the element {name} of a compressed PLY must have {', '.join(missing)}, got "
+            f"{', '.join(element.properties) or 'no properties'}"
         )
     wrong = [p for p in properties if element.dtype[p] != np.dtype(kind)]
     if wrong:

@@ -206,7 +206,8 @@ class _Reader:
         """Splat primitives of a node and its descendants, with their poses (4, 4)."""
         if number in self._visited:
             raise InputError(
-                f"{self._path}: node {number} must have one parent and not be its own descendant"
+                f"{self._path}: node {number} must have one parent and not be its own descendant, got two "
+                "paths to it"
             )
         self._visited.add(number)
         node = self._document["nodes"][number]
@@ -267,8 +268,11 @@ class _Reader:
         if name not in arrays:
             return None
         values = arrays[name][:, 0]
-        if not (np.abs(values) < 2**24).all() or (values % 1).any():
-            raise InputError(f"{self._path}: its attribute {name} must hold whole numbers below 2^24")
+        wrong = values[~(np.abs(values) < 2**24) | (values % 1 != 0)]
+        if len(wrong):
+            raise InputError(
+                f"{self._path}: its attribute {name} must have whole numbers below 2^24, got {wrong[0]:.9g}"
+            )
         return values.astype(np.int32)
 
     def _array(self, number: int, plain: bool = False) -> np.ndarray:
@@ -291,7 +295,7 @@ class _Reader:
         if plain and not accessor.get("normalized"):
             return values.astype(np.float32)
         if not accessor.get("normalized"):
-            raise InputError(f"{self._path}: integers of accessor {number} must be normalized")
+            raise InputError(f"{self._path}: accessor {number} must be normalized, got plain {kind.name}")
         return np.maximum(values.astype(np.float32) / np.iinfo(kind).max, -1)
 
     def _buffer(self, number: int) -> bytes | memoryview:

@@ -118,7 +118,8 @@ def _check_properties(header: Header, element: Element) -> int:
     used = [name for name in (*_NEEDED, "scale_2", *rest) if name in names]
     wrong = [name for name in used if element.dtype[name].kind != "f"]
     if wrong:
-        raise InputError(f"{header.path}: these properties must be float or double: {', '.join(wrong)}")
+        got = ", ".join(f"{name} of {element.dtype[name]}" for name in wrong)
+        raise InputError(f"{header.path}: properties of splats must be float or double, got {got}")
     return int(np.sqrt(len(rest) // 3 + 1)) - 1
 
 
@@ -149,6 +150,9 @@ def _origin(header: Header) -> np.ndarray | None:
             except ValueError:
                 origin = np.empty(0)
             if origin.shape != (3,) or not np.isfinite(origin).all():
-                raise InputError(f"{header.path}: the comment {comment!r} must hold three finite numbers")
+                raise InputError(
+                    f"{header.path}: the comment of the origin must have three finite numbers, got "
+                    f"{comment!r}"
+                )
             return origin
     return None

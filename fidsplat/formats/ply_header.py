@@ -172,7 +172,7 @@ def _count(file: Path, line: str, word: str) -> int:
 
 def _field(file: Path, line: str, words: list[str], before: list[tuple[str, str]]) -> tuple[str, str]:
     if len(words) > 1 and words[1] == "list":
-        raise InputError(f"{file}: the PLY header's line {line[:60]!r} must not be a list property")
+        raise InputError(f"{file}: properties of the PLY header must be scalars, got the list {line[:60]!r}")
     if len(words) != 3 or words[1] not in _TYPES:
         raise InputError(
             f"{file}: the PLY header's line {line[:60]!r} is not 'property TYPE NAME' of a known type"

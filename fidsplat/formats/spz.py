@@ -91,7 +91,9 @@ def _gzip(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.nda
         head = zlib.decompressobj(31).decompress(data, _HEAD.size)
         magic, version, n, degree, point, _, _ = _HEAD.unpack(head)
     except (zlib.error, struct.error):
-        raise InputError(f"{path} is not an SPZ file: it must begin with a gzip header or NGSP") from None
+        raise InputError(
+            f"{path}: an SPZ file must begin with a gzip header or NGSP, got {data[:4]!r}"
+        ) from None
     if magic != _MAGIC:
         raise InputError(f"{path} is not an SPZ file: its magic number differs")
     _check_head(path, version, degree, point)
@@ -128,7 +130,7 @@ def _frames(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.n
     _, version, n, degree, point, flags, streams, table = _HEAD_4.unpack_from(data)
     _check_head(path, version, degree, point)
     if version != 4:
-        raise InputError(f"{path}: SPZ of version {version} must be compressed by gzip; it is damaged")
+        raise InputError(f"{path}: an NGSP file must have SPZ version 4, got {version}; it is damaged")
     widths = {name: width for name, width in _widths(version, degree).items() if width}
     if n == 0:  # a file without splats has no arrays
         widths = {}

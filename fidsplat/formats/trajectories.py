@@ -213,7 +213,8 @@ def _numbers(where: str, words: Sequence[Any]) -> list[float]:
             f"{where}: a line must have numbers, got {' '.join(map(str, words))[:80]!r}"
         ) from None
     if not all(map(math.isfinite, values)):
-        raise InputError(f"{where}: numbers must be finite")
+        wrong = next(value for value in values if not math.isfinite(value))
+        raise InputError(f"{where}: numbers must be finite, got {wrong}")
     return values
 
 
@@ -231,7 +232,9 @@ def _rigid(where: str, matrix: np.ndarray) -> np.ndarray:
         scales = ", ".join(f"{size:.7g}" for size in sizes)
         raise InputError(f"{where}: the matrix must be a rotation, whose scales are 1, got {scales}")
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 0:
-        raise InputError(f"{where}: the matrix must have the last row (0, 0, 0, 1)")
+        raise InputError(
+            f"{where}: the matrix must have the last row (0, 0, 0, 1), got {tuple(matrix[3].tolist())}"
+        )
     return rigid_matrix(matrix[:3, 3], matrix_to_quaternion(u @ v))
 
 
@@ -242,7 +245,7 @@ def _transforms(file: Path, text: str) -> tuple[list[float] | None, list[np.ndar
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise InputError(
             f'{file} must have "frames", a list of objects with a '
-            f'"transform_matrix" of 4 x 4 numbers ({type(error).__name__}: {error})'
+            f'"transform_matrix" of 4 x 4 numbers, got {type(error).__name__}: {error}'
         ) from None
     poses = []
     for k, (_, matrix) in enumerate(pairs):
@@ -250,7 +253,7 @@ def _transforms(file: Path, text: str) -> tuple[list[float] | None, list[np.ndar
         if matrix.shape == (3, 4):
             matrix = np.vstack([matrix, (0, 0, 0, 1)])
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-            raise InputError(f"{where} must be 4 x 4 finite numbers")
+            raise InputError(f"{where} must be 4 x 4 finite numbers, got {matrix.tolist()}")
         poses.append(_rigid(where, matrix) @ OPENGL)
     if any(time is None for time, _ in pairs):
         return None, poses

@@ -303,7 +303,9 @@ def decode_rgb(content: bytes) -> np.ndarray:
     exceeds `input_limit`."""
     image = _decode(content, "a compressed image", cv2.IMREAD_COLOR)
     if image is None:
-        raise InputError("cannot decode a compressed image; it must be a JPEG or PNG")
+        raise InputError(
+            f"a compressed image must be a JPEG or PNG, got {len(content):,} bytes, {content[:8]!r}..."
+        )
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 

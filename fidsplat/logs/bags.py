@@ -105,8 +105,12 @@ def _sqlite_messages(path: Path) -> Iterator[Message]:
         connection.execute("PRAGMA trusted_schema = OFF")
         # a view instead of a table may compute endlessly
         kinds = connection.execute("SELECT type FROM sqlite_master WHERE name IN ('messages', 'topics')")
-        if sorted(kind for (kind,) in kinds) != ["table", "table"]:
-            raise InputError(f"{path} must have the tables messages and topics; give a rosbag2 database")
+        found = sorted(kind for (kind,) in kinds)
+        if found != ["table", "table"]:
+            raise InputError(
+                f"{path} must have the tables messages and topics, got {', '.join(found) or 'none'}; give a "
+                "rosbag2 database"
+            )
         cursor = connection.execute(
             "SELECT name, type, timestamp, data FROM messages JOIN topics ON messages.topic_id = topics.id "
             "WHERE serialization_format = 'cdr' ORDER BY timestamp"

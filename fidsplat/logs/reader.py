@@ -71,7 +71,7 @@ def log_images(path: str | os.PathLike[str], topic: str | None = None) -> Iterat
                 )
     if not found:
         on_topic = f" on {topic}" if topic else ""
-        raise InputError(f"{file} must have colour images{on_topic}; none was found")
+        raise InputError(f"{file} must have colour images{on_topic}, got none; give another file or topic")
 
 
 def log_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int], np.ndarray]:

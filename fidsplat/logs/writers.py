@@ -101,9 +101,12 @@ def _target(path: str | os.PathLike[str], overwrite: bool) -> Path:
     if target.exists() and not overwrite:
         raise InputError(f"{target} already exists; give another name, or --overwrite")
     if target.exists() and target.is_dir() != (target.suffix != ".mcap"):
-        raise InputError(f"{target} exists and must be a log to be overwritten; give another name")
+        kind = "folder" if target.is_dir() else "file"
+        raise InputError(f"{target} must be a log to be overwritten, got another {kind}; give another name")
     if target.is_dir() and not (target / "metadata.yaml").exists():
-        raise InputError(f"{target} must have metadata.yaml to be overwritten as a bag; give another name")
+        raise InputError(
+            f"{target} must have metadata.yaml to be overwritten as a bag, got none; give another name"
+        )
     return target
 
 

@@ -73,7 +73,7 @@ def path_rings(text: str) -> Rings:
     for command, v in _commands(text):
         kind, base = command.upper(), here if command.islower() else np.zeros(2)
         if not before and kind != "M":
-            raise ValueError("a path must begin with M")
+            raise ValueError(f"a path must begin with M, got {command}")
         if kind in "MZ":
             if len(points) > 2:
                 rings.append(np.array(points))
@@ -112,7 +112,9 @@ def _commands(text: str) -> Iterator[tuple[str, np.ndarray]]:
         in_flag = command in ("A", "a") and len(numbers) % 7 in (3, 4)
         found = (_FLAG if in_flag else _TOKEN).match(text, place)
         if found is None and place < len(text):
-            raise ValueError(f"a path must not have {text[place : place + 10].split()[0]!r}")
+            raise ValueError(
+                f"a path must have commands and numbers, got {text[place : place + 10].split()[0]!r}"
+            )
         letter, digits = ("Z", "") if found is None else found.groups(default="")
         place = len(text) + 1 if found is None else _skip(text, found.end())
         if not letter:
@@ -121,14 +123,15 @@ def _commands(text: str) -> Iterator[tuple[str, np.ndarray]]:
         if command:
             size = _NUMBERS[command.upper()]
             if (len(numbers) % size if size else numbers) or (size and not numbers):
-                raise ValueError(f"{command} must not have {len(numbers)} numbers")
+                expected = f"a multiple of {size}" if size else "0"
+                raise ValueError(f"{command} must have {expected} numbers, got {len(numbers)}")
             if not size:
                 yield command, np.zeros(0)
             for i in range(0, len(numbers), size or 1):
                 yield command, np.array(numbers[i : i + size])
                 command = "L" if command == "M" else "l" if command == "m" else command
         elif numbers:
-            raise ValueError("numbers of a path must follow a command")
+            raise ValueError(f"a path must begin with M, got {numbers[0]:g}")
         command, numbers = letter, []
 
 

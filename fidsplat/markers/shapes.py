@@ -44,12 +44,13 @@ def refuse_tangles(rings: Rings, name: str | None) -> None:
             crossings += int(_crosses(pieces[one], pieces[other]).sum())
         if crossings > MAX_CROSSINGS:
             raise InputError(
-                f"outlines of {name} must cross in at most {MAX_CROSSINGS} places; simplify the drawing"
+                f"outlines of {name} must cross in at most {MAX_CROSSINGS} places, got more; simplify the "
+                "drawing"
             )
         if neighbors > MAX_NEIGHBORS:
             raise InputError(
-                f"{name} must have outlines with at most {MAX_NEIGHBORS:,} pairs of pieces near each other; "
-                "simplify the drawing"
+                f"{name} must have outlines with at most {MAX_NEIGHBORS:,} pairs of pieces near each other, "
+                "got more; simplify the drawing"
             )
 
 
@@ -93,7 +94,7 @@ def visible(
     tree, sheet = shapely.STRtree(geometries), shapely.box(0, 0, shape[1], shape[0])
     if tree.query(geometries).shape[1] > 2 * MAX_OVERLAPS:
         raise InputError(
-            f"a drawing must have at most {MAX_OVERLAPS} pairs of overlapping shapes; simplify it"
+            f"a drawing must have at most {MAX_OVERLAPS} pairs of overlapping shapes, got more; simplify it"
         )
     parts: list[list[shapely.Geometry]] = [[] for _ in range(1 + max((v for _, v in shapes), default=0))]
     for number, (painted, value) in enumerate(shapes):

@@ -136,7 +136,10 @@ def _view(root: ElementTree.Element, name: str | None) -> tuple[float, float, fl
         sides = [re.match(_NUMBER, root.get(side, "")) for side in ("width", "height")]
         box = [0.0, 0.0, *(float(side[0]) for side in sides if side)]
     if len(box) != 4 or not (min(box[2:]) >= 1 / FARTHEST and np.abs(box).max() <= FARTHEST):
-        raise InputError(f"{name} must have a viewBox, or width and height, above 0 and at most {FARTHEST:g}")
+        raise InputError(
+            f"{name} must have a viewBox, or width and height, above 0 and at most {FARTHEST:g}, got "
+            f"{' '.join(f'{side:g}' for side in box[2:]) or 'none'}"
+        )
     return box[0], box[1], box[2], box[3]
 
 
@@ -164,12 +167,15 @@ def _shapes(
     if depth > 100:
         raise InputError(f"{name}: groups must be nested at most 100 deep, got more; flatten them")
     if tag == "svg" and depth and any(key in element.attrib for key in _PLACES):
-        raise InputError(f"{name}: an <svg> must not be nested; make it a group")
+        raise InputError(
+            f"{name}: an <svg> must be the outermost element, got one in another; make it a group"
+        )
     for what in _REFUSED:
         if look.get(what, "none") not in ("none", "normal"):
-            raise InputError(f"{name}: <{tag}> must not have a {what}; convert it to filled paths")
-    if any(not _is_one(look.get(what, "1")) for what in ("opacity", "fill-opacity")):
-        raise InputError(f"{name}: <{tag}> must be opaque; remove its opacity")
+            raise InputError(f"{name}: <{tag}> must be filled paths, got a {what}; convert it")
+    for what in ("opacity", "fill-opacity"):
+        if not _is_one(look.get(what, "1")):
+            raise InputError(f"{name}: <{tag}> must be opaque, got {what} {look[what]}; remove it")
     style = _inherited(style, look)
     with np.errstate(all="ignore"):  # checked below
         to_modules = to_modules @ _transform(element.get("transform", ""), name)
@@ -182,7 +188,11 @@ def _shapes(
         with np.errstate(all="ignore"):
             moved = [ring @ to_modules[:2, :2].T + to_modules[:2, 2] for ring in rings]
         if not all((np.abs(ring) <= FARTHEST).all() for ring in moved):
-            raise InputError(f"{name}: <{tag}> must not extend so far beyond the drawing")
+            farthest = max(float(np.abs(ring).max(initial=0)) for ring in moved)
+            raise InputError(
+                f"{name}: <{tag}> must be within {FARTHEST:g} modules of the drawing, got {farthest:g}; "
+                "shrink it"
+            )
         yield moved, _color(style.color if style.fill == "currentColor" else style.fill, name), style.rule
 
 
@@ -220,7 +230,7 @@ def _rings(element: ElementTree.Element, tag: str, name: str | None) -> Rings:
             return circle_rings(side("cx"), side("cy"), rx, ry)
     except ValueError as error:
         raise InputError(f"{name}: cannot read <{tag}>: {error}") from None
-    raise InputError(f"{name}: <{tag}> must be a filled shape; convert it to a path")
+    raise InputError(f"{name} must have filled shapes, got <{tag}>; convert it to a path")
 
 
 def _look(element: ElementTree.Element, tag: str, file: _File) -> dict[str, str]:
@@ -228,7 +238,7 @@ def _look(element: ElementTree.Element, tag: str, file: _File) -> dict[str, str]
     try:
         said = styled(file.sheet, tag, element.attrib)
     except ValueError as error:
-        raise InputError(f"{file.name}: the style of <{tag}> must not have {error}") from None
+        raise InputError(f"{file.name}: the style of <{tag}> must be plain properties, got {error}") from None
     for key in (*_MOVES, *(() if tag in _GROUPS else _OF_SHAPES)):
         if key in said or (key == "transform-origin" and key in element.attrib):
             raise InputError(f"{file.name}: {key} of <{tag}> must be an attribute, got a style property")

@@ -33,7 +33,8 @@ class ExperimentWork:
         options.check()
         if counts.NAME in self.names:
             raise InputError(
-                "--ray must not be used for counts, which times one idle machine; run it without --ray"
+                "experiments with --ray must be independent of the machine, got counts, which times one idle "
+                "machine; run it without --ray"
             )
         local = [options.trained]
         if isinstance(options, ViewSettings):

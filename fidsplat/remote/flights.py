@@ -56,13 +56,13 @@ class PackedWork:
                 same = Store(path).identity == identity
             except InputError as error:
                 raise InputError(
-                    f"workers must share the disk of stores, and on {socket.gethostname()} {error}; copy the "
-                    "store there, or render without --ray"
+                    f"workers must share the disk of stores, got on {socket.gethostname()}: {error}; copy "
+                    "the store there, or render without --ray"
                 ) from None
             if not same:
                 raise InputError(
-                    f"{path} on {socket.gethostname()} must be the same store as here; copy it there, or "
-                    "render without --ray"
+                    f"{path} on {socket.gethostname()} must be the same store as here, got another; copy it "
+                    "there, or render without --ray"
                 )
         return FlightWork(pickle.loads(self.flight), self.device, self.memory_budget)()
 

@@ -53,8 +53,8 @@ def environment_tables(scene: SceneParts, folder: Path) -> dict[str, dict]:
     elif isinstance(around, Panorama):
         if around.file is None:
             raise InputError(
-                "a background panorama must be loaded from a file to be saved; write it as an image and use "
-                "Panorama.load"
+                "a background panorama must be loaded from a file to be saved, got an array; write it as an "
+                "image and use Panorama.load"
             )
         tables["background"] = {"image": os.path.relpath(around.file, folder)}
     if scene.fog is not None:

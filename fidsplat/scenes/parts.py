@@ -111,7 +111,10 @@ class SceneParts(PickledByFields):
         Motion(self.camera_motion)  # reports an invalid motion here rather than when rendering
         moving = self.cloud_motions
         if not isinstance(moving, Mapping) or not all(map(callable, moving.values())):
-            raise InputError("cloud_motions must be {number of the cloud: fs.Trajectory or function of time}")
+            raise InputError(
+                "cloud_motions must be {number of the cloud: fs.Trajectory or function of time}, got "
+                f"{str(moving)[:80]}"
+            )
         for number in moving:
             if isinstance(number, bool) or number not in range(len(self.clouds)):
                 raise InputError(

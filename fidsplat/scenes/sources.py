@@ -88,8 +88,8 @@ def load_source(
         scene = Scene.load(source, quality, progress)
         if scene.camera is None:
             raise InputError(
-                f"{source} must have a [camera] table; add one with width, height, fov_x_deg, position, "
-                "look_at"
+                f"{source} must have a [camera] table, got none; add one with width, height, fov_x_deg, "
+                "position, look_at"
             )
         camera = scene.camera if size is None else scene.camera.with_size(*size)
         if pose != OWN_POSE:  # a moving camera would not be there

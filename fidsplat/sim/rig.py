@@ -81,7 +81,7 @@ class Rig:
     ) -> None:
         self.scene = scene if isinstance(scene, Scene) else Scene((scene,))
         if not self.scene.motion.is_still:
-            raise InputError("the scene of a rig must not have motion; the simulator moves the bodies")
+            raise InputError("the scene of a rig must be still, got motion; the simulator moves the bodies")
         self.cameras = _cameras_of(cameras)
         """RigCamera by name, in the order of the images' axis `camera`"""
         cloud = self.scene.cloud()

@@ -79,9 +79,9 @@ def real_numbers(name: str, value) -> np.ndarray:
     try:
         array = np.asarray(value)
     except ValueError:
-        raise InputError(f"{name} must be an array, but its rows differ in length") from None
+        raise InputError(f"{name} must be an array, got rows of different lengths") from None
     if array.dtype.kind not in "fiu" or array.dtype.itemsize > 8:
-        raise InputError(f"{name} must be an array of real numbers, not of {array.dtype}")
+        raise InputError(f"{name} must be an array of real numbers, got {array.dtype}")
     return array
 
 
@@ -194,7 +194,8 @@ def check_one_footprint(groups: np.ndarray | None, boxes: np.ndarray | None) -> 
     both = np.intersect1d(groups[(groups >= 0) & boxes], groups[~boxes])
     if len(both):
         raise InputError(
-            f"coplanar group {both[0]} must hold only boxes or only Gaussians; give each kind its own group"
+            f"coplanar group {both[0]} must have only boxes or only Gaussians, got both; give each kind its "
+            "own group"
         )
 
 

@@ -317,8 +317,8 @@ class SplatCloud(PickledByFields, Summarised):
         within = all(rows_beyond(array, LARGEST) is None for array in (means, scales))
         if not (within and (scales > 0).all()):
             raise InputError(
-                f"the transform takes splats out of range (its scale is {scale:g}): means and scales may be "
-                f"at most {LARGEST:g}, and scales must stay above 0"
+                f"transformed means and scales must be at most {LARGEST:g}, and scales above 0, got others "
+                f"from a transform of scale {scale:g}"
             )
         return self._replaced(
             means=means, quats=quats, scales=scales, thickness=thickness, sh=sh, origin=origin
@@ -339,7 +339,8 @@ class SplatCloud(PickledByFields, Summarised):
         check_one_footprint(ids, self.boxes)
         if self.thickness is not None and ((ids >= 0) & (self.thickness > 0)).any():
             raise InputError(
-                "splats in coplanar groups must have a thickness of 0; give 3D Gaussians the group -1"
+                "splats in coplanar groups must have a thickness of 0, got up to "
+                f"{self.thickness[ids >= 0].max():g}; give 3D Gaussians the group -1"
             )
         return self._replaced(coplanar_groups=ids if (ids >= 0).any() else None)
 
@@ -352,10 +353,13 @@ class SplatCloud(PickledByFields, Summarised):
         """
         try:
             mask = np.asarray(boxes)
-        except ValueError:  # rows that differ in length
-            mask = np.empty(0)
+        except ValueError:
+            raise InputError("boxes must be an array, got rows of different lengths") from None
         if mask.dtype != bool or mask.shape not in ((), (len(self),)):
-            raise InputError(f"boxes must be one bool or have the shape ({len(self)},) and the type bool")
+            raise InputError(
+                f"boxes must be one bool or have the shape ({len(self)},) and the type bool, got "
+                f"{mask.dtype} of shape {mask.shape}"
+            )
         mask = np.full(len(self), mask) if mask.ndim == 0 else mask.copy()
         check_one_footprint(self.coplanar_groups, mask)
         if self.thickness is not None and (self.thickness[np.flatnonzero(mask)] > 0).any():

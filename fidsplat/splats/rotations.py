@@ -88,14 +88,14 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
     with np.errstate(over="ignore"):  # an overflow is rejected below
         scale = float(np.linalg.norm(linear)) / np.sqrt(3.0)
     if not scale > 0 or not np.isfinite(scale):
-        raise InputError(f"{name} must be a rotation with a positive scale, but its scale is {scale:g}")
+        raise InputError(f"{name} must be a rotation with a positive scale, got scale {scale:g}")
     rotation = linear / scale
     off = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if off > 1e-6:
         rounded = "; give more digits" if off < 0.01 else ""
         raise InputError(
-            f"{name} must be a rotation with one uniform scale; its columns are skew or of unequal length, "
-            f"by {off:.1g} where 1e-06 is allowed{rounded}"
+            f"{name} must be a rotation with one uniform scale, got columns that are skew or of unequal "
+            f"length, by {off:.1g} where 1e-06 is allowed{rounded}"
         )
     if np.linalg.det(rotation) < 0:
         raise InputError(
@@ -103,7 +103,7 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
         )
     if rigid:
         if abs(scale - 1.0) > 1e-6:
-            raise InputError(f"{name} must be rigid (rotation and translation), but it scales by {scale:g}")
+            raise InputError(f"{name} must be rigid (rotation and translation), got scale {scale:g}")
         return linear, 1.0, m[:3, 3]
     return rotation, scale, m[:3, 3]
 

@@ -68,7 +68,7 @@ def place_store(
     except (TypeError, ValueError):
         given = np.empty(0)
     if given.ndim != 3 or not len(given):
-        raise InputError("poses must be a list of at least one rigid 4x4 matrix")
+        raise InputError(f"poses must be a list of at least one rigid 4x4 matrix, got {str(poses)[:80]}")
     for number, pose in enumerate(given):
         check_similarity(pose, f"pose {number}", rigid=True)
     if len(given) * len(source) > MAX_SPLATS:

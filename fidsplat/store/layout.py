@@ -169,7 +169,8 @@ def _check(header: Header) -> None:
     types = _TYPES | {"colors" if header.sh_degree < 0 else "sh": ("<f2", "<f4")}
     for name, kind in header.columns.items():
         if kind not in types.get(name, ()):
-            raise ValueError(f"the column {name} must not have the type {kind}")
+            allowed = " or ".join(types.get(name, ())) or "none"
+            raise ValueError(f"the column {name} must have the type {allowed}, got {kind}")
     # all but three columns are in every store
     if missing := types.keys() - {"labels", "coplanar_groups", "thickness"} - header.columns.keys():
         raise ValueError(f"no column {min(missing)}")
@@ -277,15 +278,15 @@ def _misfit(nodes: np.ndarray, header: Header) -> str:
     )
     chunk, ends = level == 0, np.cumsum(count)
     if (count < 1).any() or (count[chunk] > header.chunk).any():
-        return f"a node must have 1 to {header.chunk} splats"
+        return f"a node must have 1 to {header.chunk} splats, got {int(count.min())} to {int(count.max())}"
     if count.max(initial=0) > _MAX_NODE:
-        return f"a node of the levels of detail must have at most {_MAX_NODE} splats"
+        return f"a node of the levels of detail must have at most {_MAX_NODE} splats, got {int(count.max())}"
     if ends.max(initial=0) != header.rows or (first != ends - count).any():
         return f"its nodes must be {header.rows} rows, one after the other"
     if not np.isin(np.diff(level, prepend=0), (0, 1)).all():
         return "levels must rise from 0, one by one"
     if count[chunk].sum() != header.splats:
-        return f"its chunks must have {header.splats} splats"
+        return f"its chunks must have {header.splats} splats, got {int(count[chunk].sum())}"
     if header.pinned not in {*first[chunk].tolist(), header.splats}:
         return "splats of coplanar groups must begin with a chunk"
     above = np.flatnonzero(parent != -1)

@@ -83,7 +83,8 @@ class Store(Summarised):
                 )
             if (rows["coplanar_groups"] < 0).any():
                 raise InputError(
-                    f"coplanar group ids of {self._folder} must be at least 0; build the store again"
+                    f"coplanar group ids of {self._folder} must be at least 0, got "
+                    f"{int(rows['coplanar_groups'].min())}; build the store again"
                 )
 
     def __reduce__(self):

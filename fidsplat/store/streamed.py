@@ -45,7 +45,10 @@ def import_streamed(path: Path, folder: Path, progress: Progress) -> None:
     scene = read_streamed(path)
     scene.check_memory()
     if scene.environment is not None:
-        raise InputError(f"{path} must have no environment for a store; add it to a scene file next to it")
+        raise InputError(
+            f"{path} must have no environment for a store, got {scene.environment}; add it to a scene file "
+            "next to it"
+        )
     depths = [next(k for k in range(scene.levels + 1) if k not in leaf) for leaf in scene.leaves]
     clouds = [dict(scene.load(level)) for level in range(max(depths))]
     degree = max(cloud.sh_degree for level in clouds for cloud in level.values())
@@ -125,7 +128,10 @@ def export_streamed(store: Store, path: Path) -> None:
     Raises InputError for an instanced store or a file that cannot be written.
     """
     if store.poses is not None:
-        raise InputError("a store written as streamed SOG must have no instances; write the one it places")
+        raise InputError(
+            f"a store written as streamed SOG must have no instances, got {len(store.poses):,}; write the "
+            "one it places"
+        )
     nodes, origin = store.nodes, np.array(store.origin)
     level, parent = nodes["level"], nodes["parent"]
     scene = np.where(level == 0, nodes["count"], 0).astype(np.int64)

@@ -81,7 +81,10 @@ def splats_of(file: Path) -> tuple[SplatCloud, tuple[float, float, float]]:
         facts = _facts(arrays)
         origin, background = (np.array(facts[name], np.float64) for name in ("origin", "background"))
         if not (origin.shape == background.shape == (3,) and np.isfinite([origin, background]).all()):
-            raise ValueError("the origin and the background must be three finite numbers each")
+            raise ValueError(
+                f"the origin and the background must be three finite numbers each, got {facts['origin']} and "
+                f"{facts['background']}"
+            )
         degree = whole_number("sh_degree", facts["settings"]["sh_degree"], 0, MAX_DEGREE)
         axes = 3 if facts["settings"]["primitive"] == "3d" else 2
         splats = Splats.of(_group(arrays, "values", len(arrays["values.means"]), degree, axes))
@@ -148,7 +151,7 @@ def _state(arrays: Arrays, settings: TrainSettings, iteration: int) -> tuple[Spl
     gradients, seen = (_checked(arrays, name, (count,)) for name in ("gradients", "seen"))
     for name, array in (second | {"gradients": gradients, "seen": seen}).items():
         if (array < 0).any():
-            raise ValueError(f"{name} must not be negative")
+            raise ValueError(f"{name} must be at least 0, got {array.min():g}")
     history = {name: _checked(arrays, name, (iteration,), dtype) for name, dtype in _HISTORY.items()}
     return Splats(values, first, second, gradients, seen), history
 
@@ -164,8 +167,8 @@ def _checked(arrays: Arrays, name: str, shape: tuple[int, ...], dtype: type = np
     if array.dtype != dtype or array.shape != shape:
         expected = f"{np.dtype(dtype)} of the shape {shape}"
         raise ValueError(f"{name} must be {expected}, got {array.dtype} of the shape {array.shape}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite")
+    if wrong := np.count_nonzero(~np.isfinite(array)):
+        raise ValueError(f"{name} must be finite, got {wrong:,} other numbers")
     return np.array(array, order="C")
 
 

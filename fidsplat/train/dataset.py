@@ -107,8 +107,10 @@ class Dataset:
                 f"the {len(self.views)} cameras of {self.name} must be at different positions, got one, "
                 "which determines no depth; give views from different positions"
             )
-        if len(self.points) and not np.isfinite(self.points).all():
-            raise InputError(f"the points of {self.name} must be finite; export the model again")
+        if wrong := np.count_nonzero(~np.isfinite(self.points).all(axis=-1)):
+            raise InputError(
+                f"the points of {self.name} must be finite, got {wrong:,} others; export the model again"
+            )
         for view in self.views if len(self.points) else ():
             if not (_depths(view.camera, self.points) > view.camera.near).any():
                 raise InputError(

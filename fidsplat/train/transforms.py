@@ -61,8 +61,9 @@ def load_transforms(path: Path, progress: Callable[[str, float], None]) -> Datas
 def _table(file: Path) -> dict[str, Any]:
     try:
         table = from_json(read_text(file))
-        if not isinstance(table, dict) or not isinstance(table.get("frames"), list):
-            raise ValueError("frames must be a list")
+        frames = table.get("frames") if isinstance(table, dict) else None
+        if not isinstance(frames, list):
+            raise ValueError(f"frames must be a list, got {str(frames)[:80]!r}")
     except InputError:
         raise
     except ValueError as error:
@@ -79,7 +80,8 @@ def _views(file: Path, table: dict, progress: Callable[[str, float], None], word
             name, _ = str(frame["file_path"]), frame["transform_matrix"]
         except (KeyError, TypeError):
             raise InputError(
-                f"{file}: frame {number} must have a file_path and a transform_matrix of 4 x 4 finite numbers"
+                f"{file}: frame {number} must have a file_path and a transform_matrix of 4 x 4 finite "
+                f"numbers, got {str(frame)[:80]!r}"
             ) from None
         image, mask = _image(file, name, others), None
         if "mask_path" in frame:
@@ -96,7 +98,10 @@ def _divided(
     for split in ("train", "val", "test"):
         names = table.get(f"{split}_filenames") or []
         if not isinstance(names, list):
-            raise InputError(f"{file}: {split}_filenames must be a list of the file_path of frames")
+            raise InputError(
+                f"{file}: {split}_filenames must be a list of the file_path of frames, got "
+                f"{str(names)[:80]!r}"
+            )
         named[split] = {PurePath(str(name)) for name in names}
         if unknown := named[split] - known:
             raise InputError(f"{file}: {split}_filenames must be file_paths of frames, got {min(unknown)}")
@@ -139,7 +144,8 @@ def _points(file: Path, table: dict) -> tuple[np.ndarray, np.ndarray]:
     header = read_header(file.parent / str(table["ply_file_path"]), text=True)
     element = header.elements.get("vertex")
     if element is None or not {"x", "y", "z"} <= set(element.properties):
-        raise InputError(f"{header.path} must have an element vertex with x, y and z for points")
+        got = "none" if element is None else ", ".join(element.properties) or "no properties"
+        raise InputError(f"{header.path} must have an element vertex with x, y and z for points, got {got}")
     rows = header.rows("vertex", 0, element.count)
     points = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
     named = [name for name in ("red", "green", "blue") if name in element.properties]

@@ -54,7 +54,10 @@ def ordinary_file(path: str | os.PathLike[str]) -> Path:
     """
     target = path_of(path)
     if target.exists() and not target.is_file():
-        raise InputError(f"cannot write {target}: it must be a regular file; give the name of a file")
+        raise InputError(
+            f"cannot write {target}: it must be a regular file, got {kind_of(target)}; give the "
+            "name of a file"
+        )
     return target
 
 

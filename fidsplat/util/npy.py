@@ -46,9 +46,11 @@ def load_npz(file: Path, names: Collection[str] | None = None) -> dict[str, np.n
             with ZipFile(stream) as members:
                 entries = members.infolist()
                 if any(entry.compress_type != ZIP_STORED for entry in entries):
-                    raise ValueError("it must not be compressed; write it with numpy.savez")
+                    raise ValueError(
+                        "it must be uncompressed, got compressed arrays; write it with numpy.savez"
+                    )
                 if sum(entry.file_size for entry in entries) > os.fstat(stream.fileno()).st_size:
-                    raise ValueError("its arrays must not be larger than the file")
+                    raise ValueError("its arrays must be smaller than the file, got larger ones")
                 found = {entry.filename.removesuffix(".npy"): entry for entry in entries}
                 return {name: _array(members.read(found[name])) for name in names or found}
         except KeyError as error:
@@ -60,7 +62,7 @@ def load_npz(file: Path, names: Collection[str] | None = None) -> dict[str, np.n
 def _array(content: bytes) -> np.ndarray:
     length = int.from_bytes(content[8:10], "little")
     if content[:8] != _MAGIC:
-        raise ValueError("its arrays must have the NumPy format version 1.0")
+        raise ValueError(f"its arrays must have the NumPy format version 1.0, got {content[:8]!r}")
     try:
         header = ast.literal_eval(content[10 : 10 + length].decode("latin-1").strip())
         dtype, shape = np.lib.format.descr_to_dtype(header["descr"]), header["shape"]

@@ -102,8 +102,8 @@ def with_pose(text: str, number: int, pose: np.ndarray, name: str, kind: str = "
         new = text[: heads[k].end()] + table + text[end:]
     if _parsed(new) != _expected(text, kind, number, position, quaternion):
         raise InputError(
-            f"{name}: {_NAMES[kind]} {number} must be a plain [[{kind}]] table; write position = {position}, "
-            f"quaternion = {quaternion} there yourself"
+            f"{name}: {_NAMES[kind]} {number} must be a plain [[{kind}]] table, got another form; write "
+            f"position = {position}, quaternion = {quaternion} there yourself"
         )
     return new
 

@@ -51,7 +51,7 @@ def save_page(scene: Scene, path: str | os.PathLike[str], title: str = "fidsplat
     that cannot be written.
     """
     if scene.camera is None:
-        raise InputError("a scene for a page must have a camera; add a [camera] table")
+        raise InputError("a scene for a page must have a camera, got none; add a [camera] table")
     count = sum(map(len, (*scene.stores, *scene.clouds)))
     if count > MAX_SPLATS:
         raise InputError(

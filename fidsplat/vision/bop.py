@@ -123,7 +123,8 @@ def check_bop_camera(camera: Camera) -> None:
     """Raise InputError for a camera with a lens."""
     if camera.lens is not None:
         raise InputError(
-            "a BOP scene must have a pinhole camera without lens; render without one, or undistort"
+            f"a BOP scene must have a pinhole camera without lens, got {camera.lens.kind}; render without "
+            "one, or undistort"
         )
 
 

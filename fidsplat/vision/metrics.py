@@ -115,11 +115,15 @@ def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
         }
         for name, shape in shapes.items():
             if name not in weights or weights[name].shape != shape:
+                got = f"shape {weights[name].shape}" if name in weights else "none"
                 raise InputError(
-                    f"{file} must have an array {name} of shape {shape}; see docs/experiments.md"
+                    f"{file} must have an array {name} of shape {shape}, got {got}; see docs/experiments.md"
                 )
-            if not np.isfinite(weights[name]).all():
-                raise InputError(f"the array {name} of {file} must be finite; see docs/experiments.md")
+            if wrong := np.count_nonzero(~np.isfinite(weights[name])):
+                raise InputError(
+                    f"the array {name} of {file} must be finite, got {wrong:,} other numbers; see "
+                    "docs/experiments.md"
+                )
 
     def measure(image: np.ndarray, truth: np.ndarray) -> float:
         total = 0.0

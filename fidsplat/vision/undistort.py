@@ -45,7 +45,8 @@ def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
     """
     if isinstance(camera.lens, Orthographic):
         raise InputError(
-            "the camera must not be orthographic, since it has no pinhole equivalent; use its image unchanged"
+            "the camera must have rays from one point, got Orthographic, which has no pinhole equivalent; "
+            "use its image unchanged"
         )
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
@@ -53,7 +54,10 @@ def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
             f"{image.shape[1]} x {image.shape[0]}; give the camera that took the image"
         )
     if not np.allclose(pinhole.position, camera.position, rtol=0, atol=1e-9):
-        raise InputError("the pinhole must have the position of the image's camera")
+        raise InputError(
+            f"the pinhole must have the position of the image's camera, {camera.position.tolist()}, got "
+            f"{pinhole.position.tolist()}"
+        )
     y, x = np.mgrid[0.5 : pinhole.height, 0.5 : pinhole.width]
     rays = pinhole.rays(np.stack([x.ravel(), y.ravel()], 1)) @ pinhole.world_to_camera[:3, :3]
     at = camera.project(camera.position + rays).astype(np.float32) - np.float32(0.5)

@@ -175,7 +175,7 @@ def load_plants(folder: str | Path) -> dict[str, list[SplatCloud]]:
         found.setdefault(kind, []).append(_plain(load_ply(file)))
     if not found:
         raise InputError(
-            f"{folder} must hold plants as KIND-NUMBER.ply, e.g. tomato-0.ply; "
+            f"{folder} must have plants as KIND-NUMBER.ply, e.g. tomato-0.ply, got none; "
             "`fidsplat experiment plants` writes them"
         )
     return found

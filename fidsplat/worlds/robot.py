@@ -150,7 +150,7 @@ def drive(mjcf: str, path: np.ndarray, speed: float = 0.5, errors: Errors | None
             if len(times) > limit:
                 at = tuple(np.round(poses[-1][:2, 3], 2).tolist())
                 raise InputError(
-                    f"the robot must be able to follow its path, but is stuck at {at}; remove obstacles"
+                    f"the robot must be able to follow its path, got stuck at {at}; remove obstacles"
                 )
     return _measured(np.array(times), np.array(poses), np.array(rolled), np.array(turned), errors or Errors())
 

@@ -171,7 +171,10 @@ def test_a_scene_without_a_surface_has_none_of_its_kernel_text(shape):
     ("make", "words"),
     [
         (lambda: fs.ExternalDepth(np.zeros((4, 5)), np.zeros((4, 5))), r"got \(4, 5\) and \(4, 5\)"),
-        (lambda: fs.ExternalDepth(np.zeros((4, 5, 3)), np.full((4, 5), -1.0)), "depths of at least 0"),
+        (
+            lambda: fs.ExternalDepth(np.zeros((4, 5, 3)), np.full((4, 5), -1.0)),
+            "depths of at least 0, got -1",
+        ),
         (lambda: fs.ExternalDepth(np.full((4, 5, 3), np.nan), np.ones((4, 5))), "must have finite colours"),
         (lambda: fs.ExternalDepth(np.zeros((4, 5, 3)), np.ones((4, 5)), 0.5), "must be integers"),
         (lambda: fs.ExternalDepth(np.zeros((4, 5, 3)), np.ones((4, 5)), [1, 2]), "must be integers"),

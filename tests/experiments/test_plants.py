@@ -98,7 +98,7 @@ def test_a_stock_of_sampled_plants_fills_a_greenhouse(tmp_path, capsys):
         assert main([*words, *more]) == 2
         assert message in capsys.readouterr().err
     assert main(["greenhouse", "-o", str(tmp_path / "h"), "--plants-from", str(tmp_path)]) == 2
-    assert "must hold plants as KIND-NUMBER.ply" in capsys.readouterr().err
+    assert "must have plants as KIND-NUMBER.ply" in capsys.readouterr().err
     with pytest.raises(fs.InputError, match="must have at least one plant of each kind"):
         Greenhouse(1, 1, stock={"tomato": []})
 

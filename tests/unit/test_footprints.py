@@ -40,9 +40,9 @@ def test_boxes_are_bools(boxes):
 
 def test_a_coplanar_group_has_one_footprint():
     mask = np.array([True, False, True, False])
-    with pytest.raises(fs.InputError, match="coplanar group 0 must hold only boxes"):
+    with pytest.raises(fs.InputError, match="coplanar group 0 must have only boxes"):
         cloud().with_coplanar_groups(0).with_boxes(mask)
-    with pytest.raises(fs.InputError, match="coplanar group 5 must hold only boxes"):
+    with pytest.raises(fs.InputError, match="coplanar group 5 must have only boxes"):
         cloud().with_boxes(mask).with_coplanar_groups([1, -1, 5, 5])
     assert cloud().with_boxes(mask).with_coplanar_groups([1, 2, 1, -1]).has_coplanar_groups
 

@@ -33,8 +33,8 @@ def test_splats_of_planes_come_back_on_them(tmp_path, suffix):
 @pytest.mark.parametrize(
     ("thick", "plane", "words"),
     [
-        (False, 0.5, "_PLANE must hold whole numbers"),
-        (False, math.nan, "_PLANE must hold whole numbers"),
+        (False, 0.5, r"_PLANE must have whole numbers below 2\^24, got 0.5"),
+        (False, math.nan, r"_PLANE must have whole numbers below 2\^24, got nan"),
         (False, -2.0, "coplanar groups must be ids of at least 0"),
         (True, 1.0, "must have a thickness of 0"),
     ],

@@ -86,13 +86,22 @@ DAMAGES = {
     "property before the element": (swap(b"element vertex 300\n", b""), "property before its first element"),
     "list property": (
         swap(b"end_header", b"element face 1\nproperty list uchar int vertex_indices\nend_header"),
-        "the PLY header's line 'property list uchar int vertex_indices' must not be",
+        "must be scalars, got the list 'property list uchar int vertex_indices'",
     ),
     "unknown type": (swap(b"property float x\n", b"property half x\n"), "known type"),
     "short property line": (swap(b"property float x\n", b"property float\n"), "known type"),
-    "integer position": (swap(b"property float x\n", b"property int x\n"), "must be float or double: x"),
-    "integer SH": (swap(b"float f_rest_4\n", b"int f_rest_4\n"), "must be float or double: f_rest_4"),
-    "integer third scale": (swap(b"float scale_2\n", b"int scale_2\n"), "must be float or double: scale_2"),
+    "integer position": (
+        swap(b"property float x\n", b"property int x\n"),
+        "must be float or double, got x of int32",
+    ),
+    "integer SH": (
+        swap(b"float f_rest_4\n", b"int f_rest_4\n"),
+        "must be float or double, got f_rest_4 of int32",
+    ),
+    "integer third scale": (
+        swap(b"float scale_2\n", b"int scale_2\n"),
+        "must be float or double, got scale_2 of int32",
+    ),
     "repeated property": (swap(b"property float y\n", b"property float x\n"), "property x twice"),
     "missing properties": (
         lambda c: c.replace(b"rot_2", b"rat_2").replace(b"opacity", b"density"),

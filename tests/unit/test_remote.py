@@ -150,7 +150,7 @@ def test_workers_read_stores_at_the_same_path(tmp_path):
     assert ours == here
     store.path.rename(tmp_path / "b.fss")
     with pytest.raises(
-        fs.InputError, match=r"must share the disk of stores, and on .*a\.fss must be the folder of a store"
+        fs.InputError, match=r"must share the disk of stores, got on .*a\.fss must be the folder of a store"
     ):
         pickle.loads(sent)()
     fs.save_ply(fs.marker("aruco:4x4_50:3", size=0.4, mixture="fitted").cloud, tmp_path / "a.ply")

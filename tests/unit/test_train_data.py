@@ -192,7 +192,7 @@ def test_cameras_of_a_model_that_cannot_be_used_are_named(folder):
     for other, words in (
         (
             f"{number} PINHOLE 24 18 20",
-            "cannot read .*cameras.txt as COLMAP's: camera 1 of model PINHOLE must not have 1 parameters",
+            "cannot read .*cameras.txt as COLMAP's: camera 1 of model PINHOLE must have 4 parameters, got 1",
         ),
         (
             f"{number} FOV 24 18 20 20 12 9 0.1",
@@ -382,7 +382,7 @@ def test_files_that_are_missing_or_damaged_are_named(made, folder, tmp_path):
         (
             "cameras",
             "1 PINHOLE 64 48 50",
-            "cannot read .*cameras.txt as COLMAP's: camera 1 of model PINHOLE must not have 1 parameters",
+            "cannot read .*cameras.txt as COLMAP's: camera 1 of model PINHOLE must have 4 parameters, got 1",
         ),
         ("points3D", "1 0 0 0 9", "not enough"),
         ("images", "1 1 0 0 0 0", "must have 10 words, got '1 1 0 0 0 0'"),

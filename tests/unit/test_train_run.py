@@ -270,7 +270,7 @@ def test_a_checkpoint_whose_arrays_do_not_fit_is_refused(dataset, tmp_path):
         if name != "values.means":
             refused(f"{name} must be .* of the shape", {name: array[:-1]}, shown)
         if name in ("gradients", "seen") or name.startswith("second."):
-            refused("must not be negative", {name: np.full_like(array, -1)})
+            refused("must be at least 0, got -1", {name: np.full_like(array, -1)})
     for change in (
         {"iteration": 2.5},
         {"iteration": -1},

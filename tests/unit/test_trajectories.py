@@ -205,7 +205,7 @@ def test_rounded_files_are_read(tmp_path):
     ("name", "content", "words"),
     [
         ("a.tum", "1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "line 2: times must increase, got 1 after 1"),
-        ("a.tum", "1 0 0 nan 0 0 0 1\n", "line 1: numbers must be finite"),
+        ("a.tum", "1 0 0 nan 0 0 0 1\n", "line 1: numbers must be finite, got nan"),
         ("a.tum", "1 0 0 0 0 0 0 2\n", "line 1: the length of the quaternion must be 1, got 2"),
         ("a.tum", "1 0 0 0 0 0 0\n", r"line 1: a line must have 8 \(TUM\) or 12 \(KITTI\) numbers, got 7"),
         ("a.tum", "1 0 0 0 0 0 0 1\n" + "0 " * 12, "line 2: a line must have 8 numbers, got 12"),

@@ -210,8 +210,8 @@ def split_rows(frame: DeviceFrame, top: int, end: int, count: int) -> list[tuple
     capacity = frame.plan.capacity
     if end - top == 1:
         raise DeviceError(
-            f"the splats of a row of tiles must be at most {capacity:,} within the memory budget; raise "
-            "memory_budget or render fewer splats"
+            f"the splats of a row of tiles must be at most {capacity:,} within the memory budget, got "
+            f"{count:,}; raise memory_budget or render fewer splats"
         )
     parts = min(max(2, -(-count * 11 // (10 * capacity))), end - top)
     cuts = np.linspace(top, end, parts + 1).round().astype(int).tolist()

@@ -176,7 +176,7 @@ def _adopted(name: str, value: Any, pool: ArrayPool) -> Any:
             f"{name} must be on {pool.device}, the device of this renderer, got {array.device}; move it there"
         )
     if not array.is_contiguous:
-        raise InputError(f"{name} must be contiguous; give a contiguous copy")
+        raise InputError(f"{name} must be contiguous, got strides {array.strides}; give a contiguous copy")
     if array.dtype == scalar and width > 1 and array.shape[-1] == width:
         array = wp.from_dlpack(array, dtype=dtype)
     if (

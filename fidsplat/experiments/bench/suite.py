@@ -285,8 +285,12 @@ class Suite:
         self._reference = reference_renderer(Renderer(), Capture())
 
     def _resume(self, earlier: Any) -> None:
-        if not isinstance(earlier, dict) or earlier.get("schema") != SCHEMA:
-            raise InputError(f"{self._file} must hold results of bench --suite; give another file")
+        schema = earlier.get("schema") if isinstance(earlier, dict) else None
+        if schema != SCHEMA:
+            raise InputError(
+                f"{self._file} must have results of bench --suite, schema {SCHEMA!r}, got {schema!r}; give "
+                "another file"
+            )
         run = self.found["run"]
         differ = differences(earlier["run"], run)
         differ += [name for name in ("machine", "effort") if earlier["run"].get(name) != run[name]]
