@@ -49,6 +49,8 @@ _HOME = {
     "Frame": "fidsplat.render.frame",
     "DifferentiableFrame": "fidsplat.render.differentiable_frame",
     "FrameBatch": "fidsplat.render.batch",
+    "Surface": "fidsplat.scenes.surface",
+    "surface_at": "fidsplat.render.surface",
     "devices": "fidsplat.backends",
     "FidsplatError": "fidsplat.util.errors",
     "InputError": "fidsplat.util.errors",

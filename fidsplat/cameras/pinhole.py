@@ -341,6 +341,19 @@ class Camera(PickledByFields, Summarised):
             )
         return self.lens.rays(image)
 
+    def unproject(self, pixels, depths) -> np.ndarray:
+        """World points (n, 3) float64 at depths (n,) in metres of pixel coordinates (n, 2), NaN outside the
+        field of view. The inverse of `project`, for depths as in the output `depth`."""
+        depths = real_array("depths", depths)
+        if depths.ndim != 1:
+            raise InputError(f"depths must have the shape (n,), got {depths.shape}")
+        if isinstance(self.lens, Orthographic):
+            image = (real_array("pixels", pixels) - (self.cx, self.cy)) / (self.fx, self.fy)
+            points = np.column_stack([image, depths])
+        else:
+            points = self.rays(pixels) * depths[:, None]
+        return points @ self.world_to_camera[:3, :3] + self.position
+
 
 def fisheye_focal_length(width: int, fov_x: float, lens: Fisheye) -> float:
     """Focal length of a fisheye in pixels, from its width in pixels and horizontal field of view in radians.

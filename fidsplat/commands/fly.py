@@ -201,7 +201,7 @@ def _parse_times(text: str) -> list[float]:
 def write_log(folder: FlightFolder, path: str, overwrite: bool, compress: str | None = None) -> Iterator[int]:
     """Write rgb, outputs that are arrays, intrinsics and poses to a log; yields the number of each frame."""
     from fidsplat.logs import RobotLog
-    from fidsplat.scenes.sources import scene_up
+    from fidsplat.scenes.up import scene_up
 
     flight = folder.flight
     camera = flight.capture.camera

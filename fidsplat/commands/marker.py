@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -18,8 +19,72 @@ if TYPE_CHECKING:
 
 
 @dataclass
+class Placing:
+    """Place of a marker in a scene."""
+
+    scene: Annotated[
+        str | None, option("SCENE.toml|FILE.ply|STORE.fss", "scene to place the marker in; prints its table")
+    ] = None
+    at_pixel: Annotated[
+        tuple[float, float] | None, option("X Y", "place it on the surface at this pixel of --scene")
+    ] = None
+    up: Annotated[
+        tuple[float, float, float] | None,
+        option("X Y Z", "vertical of the scene (default: the guess of `fidsplat info`)"),
+    ] = None
+    lift: Annotated[
+        float | None, option("M", "metres in front (default: 1 mm and twice the roughness of the surface)")
+    ] = None
+    radius: Annotated[
+        float | None, option("M", "radius of the fitted patch (default: that of the marker)")
+    ] = None
+    append: Annotated[bool, switch("append the table to SCENE.toml")] = False
+
+    def __post_init__(self) -> None:
+        if (self.scene is None) != (self.at_pixel is None):
+            raise InputError("--scene SCENE and --at-pixel X Y must be given together")
+        others = (self.up, self.lift, self.radius)
+        if self.scene is None and (self.append or any(value is not None for value in others)):
+            raise InputError("--up, --lift, --radius and --append need --scene SCENE and --at-pixel X Y")
+        if self.append and not str(self.scene).lower().endswith(".toml"):
+            raise InputError(f"--append must have a scene file (.toml), got {self.scene}")
+
+    def placed(self, marker: fs.Marker, device: str | None) -> tuple[dict[str, Any], str]:
+        """Facts of the surface, and the [[markers]] table."""
+        import fidsplat as fs
+        from fidsplat.scenes.sources import load_source
+        from fidsplat.scenes.write import marker_block
+        from fidsplat.splats.rotations import matrix_to_quaternion
+        from fidsplat.viewer.scene_file import SceneFile
+
+        assert self.scene is not None
+        file = SceneFile(Path(self.scene)) if self.append else None
+        with delayed_progress() as progress:
+            scene = load_source(self.scene, None, progress)
+        renderer = fs.Renderer(device or scene.device)
+        options: dict[str, Any] = {"renderer": renderer, "resident": renderer.upload(scene)}
+        options["radius"] = marker.radius if self.radius is None else self.radius
+        surface = scene.surface_at(pixel=self.at_pixel, **options)
+        scene = scene.place(marker, pixel=self.at_pixel, up=self.up, lift=self.lift, **options)
+        pose = scene.markers[-1].pose
+        block = marker_block(scene.markers[-1], Path(self.scene).parent, scene.quality)
+        if file is not None:
+            file.add_marker(block)
+        facts = {
+            "position": pose[:3, 3],
+            "quaternion": matrix_to_quaternion(pose[:3, :3]),
+            "normal": surface.normal,
+            "inlier_share": surface.inlier_share,
+            "roughness_m": surface.roughness,
+            "radius_m": surface.radius,
+            "appended": self.append,
+        }
+        return facts, block
+
+
+@dataclass
 class Marker:
-    """Make a marker of splats; -o writes it as a PLY file.
+    """Make a marker of splats; -o writes it as a PLY file, --at-pixel places it on a surface of a scene.
 
     SPEC is one of
       apriltag:FAMILY:ID   16h5, 25h9, 36h10, 36h11         apriltag:36h11:5
@@ -48,6 +113,7 @@ class Marker:
       fidsplat marker qr:hello --quality marker.template=9
       fidsplat marker "qr:hello" --mixture paper --json
       fidsplat marker apriltag:36h11:5 --mixture refined -o tag.ply
+      fidsplat marker apriltag:36h11:5 --size 0.16 --scene scene.toml --at-pixel 640 360 --append
     """
 
     spec: Annotated[tyro.conf.Positional[str], option("SPEC", "marker, e.g. apriltag:36h11:5")]
@@ -57,10 +123,13 @@ class Marker:
     mixture: str | None = None
     """NAME: mixture: exact, fitted, facets, paper or refined (default: exact)"""
     iterations: Annotated[int | None, option("N", "iterations of refined (default: 1000)")] = None
-    device: Annotated[str | None, option("D", "device of refined (default: FIDSPLAT_DEVICE, or auto)")] = None
+    device: Annotated[
+        str | None, option("D", "device of refined and --scene (default: FIDSPLAT_DEVICE, or auto)")
+    ] = None
     quality: Annotated[str | None, option("Q", "quality with settings of the mixtures, as above")] = None
     native_2dgs: Annotated[bool, switch("leave the third scale out of the file, as 2DGS does")] = False
     max_splats: Annotated[int | None, option("N", "maximum number of splats (default: 1000000)")] = None
+    placing: Placing = field(default_factory=Placing)
     overwrite: Overwrite = False
     json: Json = False
 
@@ -75,7 +144,8 @@ class Marker:
             raise InputError(f"-o must be a .ply file, got {file}")
         limit = {} if self.max_splats is None else {"max_splats": self.max_splats}
         refined = self.mixture == "refined"
-        if not refined and (self.iterations is not None or self.device is not None):
+        placing = self.placing.scene is not None
+        if not refined and (self.iterations is not None or (self.device is not None and not placing)):
             raise InputError("--iterations and --device need --mixture refined")
         mixture = "fitted" if refined else self.mixture
         quality = fs.Quality.of(self.quality).marker
@@ -89,7 +159,7 @@ class Marker:
             fs.save_ply(made.gaussians, file, native_2dgs=self.native_2dgs)
         written = "fitted" if made.mixture == "exact" else made.mixture
         dark = int(made.is_dark.sum())
-        facts = {
+        facts: dict[str, Any] = {
             "spec": made.spec,
             "kind": made.kind,
             "family": made.family,
@@ -121,7 +191,14 @@ class Marker:
             rows.append(("", f"as {len(made.gaussians)} Gaussians (fitted), as a PLY file has no boxes"))
         if file is not None and made.mixture == "facets":
             rows.append(("", "for --quality order=pixel; sorted by their centres they occlude each other"))
-        return report(self.json, facts, table=(made.spec, ("", ""), rows))
+        lines = []
+        if placing:
+            facts["placed"], block = self.placing.placed(made, self.device)
+            share, roughness = 100 * facts["placed"]["inlier_share"], 1e3 * facts["placed"]["roughness_m"]
+            rows.append(("surface", f"{share:.0f} % of the patch in one plane, {roughness:.2g} mm RMS"))
+            appended = f"appended to {self.placing.scene}"
+            lines = [appended if self.placing.append else f"\n{block.rstrip()}"]
+        return report(self.json, facts, *lines, table=(made.spec, ("", ""), rows))
 
     def _refine(self, made: fs.Marker, progress: Callable[[str, float], None]) -> fs.Marker:
         """The marker with Gaussians optimised on a device."""

@@ -151,6 +151,11 @@ class Marker(PickledByFields):
         """Metres per module."""
         return self.size / (self.bits.shape[1] - 2 * self.outside)
 
+    @property
+    def radius(self) -> float:
+        """Metres from the centre to the corners of the quiet zone."""
+        return self.module * math.hypot(*self.grid.shape) / 2
+
     @cached_property
     def gaussians(self) -> SplatCloud:
         """The marker as Gaussians, for renderers and files without boxes.

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from fidsplat.cameras import Camera
 from fidsplat.capture.quality import Quality
 from fidsplat.formats import Progress
-from fidsplat.scenes.parts import SceneParts
+from fidsplat.scenes.parts import PlacedMarker, SceneParts
 from fidsplat.scenes.read import read_scene
+from fidsplat.scenes.surface import Surface
+from fidsplat.scenes.up import scene_up
 from fidsplat.scenes.write import write_scene
 from fidsplat.util.markup import Summarised, point
+
+if TYPE_CHECKING:
+    from fidsplat.markers import Marker
 
 
 class Scene(SceneParts, Summarised):
@@ -55,3 +65,49 @@ class Scene(SceneParts, Summarised):
         Raises InputError if a file cannot be written, or a marker cannot be expressed in a scene file.
         """
         write_scene(self, path)
+
+    def surface_at(self, camera: Camera | None = None, pixel: Any = None, **options: Any) -> Surface:
+        """Position and normal of the surface at a pixel, from rendered depth: `fs.surface_at`, whose further
+        arguments are options: ray, radius, renderer, resident.
+
+        Raises:
+            InputError: no plane in at least half of the patch; a pixel outside the image.
+        """
+        import fidsplat  # the facade loads the renderer; scenes import nothing that renders
+
+        return fidsplat.surface_at(self, camera, pixel, **options)
+
+    def place(
+        self,
+        marker: Marker,
+        *,
+        camera: Camera | None = None,
+        pixel: Any = None,
+        up: Any = None,
+        lift: float | None = None,
+        bundle: str | None = None,
+        **options: Any,
+    ) -> Scene:
+        """The scene with one more marker, upright on the surface at a pixel or along a ray.
+
+        On floors and ceilings the top of the marker is the top of the image.
+
+        Args:
+            marker: its quiet zone defines the patch of the surface, unless `radius` is given.
+            camera, pixel: by default the scene's camera; (x, y).
+            up: (3,) vertical of the scene; by default `fidsplat info` guesses it.
+            lift: metres in front of the surface; by default 1 mm and twice the roughness.
+            bundle: see `PlacedMarker`.
+            options: ray, radius, renderer, resident of `fs.surface_at`.
+
+        Raises:
+            InputError: no plane in at least half of the patch; a pixel outside the image.
+        """
+        found = self.surface_at(camera, pixel, **{"radius": marker.radius} | options)
+        view = camera or self.camera
+        if "ray" in options or view is None:
+            directions = [options["ray"][1], *np.eye(3)]
+        else:
+            directions = [-view.world_to_camera[1, :3], view.world_to_camera[2, :3]]
+        pose = found.pose([scene_up(self) if up is None else up, *directions], lift)
+        return replace(self, markers=(*self.markers, PlacedMarker(marker, pose, bundle=bundle)))

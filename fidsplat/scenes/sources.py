@@ -13,10 +13,10 @@ from fidsplat.capture.quality import Quality
 from fidsplat.formats.collect import Progress
 from fidsplat.formats.files import FORMATS, NAMED, load_splats
 from fidsplat.scenes.scene import Scene
+from fidsplat.scenes.up import sampled
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.statistics import guess_up, level_rotation
 from fidsplat.store.layout import SUFFIX
-from fidsplat.store.partial_cloud import PartialCloud, concatenated
 from fidsplat.store.store import Store
 from fidsplat.util.errors import InputError
 
@@ -25,8 +25,6 @@ ELEVATION = math.radians(15.0)
 MARGIN = 1.1
 REACH = 1.5
 """standard deviations of a splat that must be visible; with 3, faint tails would set the camera's distance"""
-CHUNKS = 32
-"""largest number of chunks of a store that its up axis is guessed from"""
 MANY = 10_000
 """captured scenes have strays far away: a cloud of this many is framed without the outermost 1 % of its
 splats"""
@@ -117,7 +115,7 @@ def framing_camera(
     the pose names the up axis, or level areas show it, and else horizontally: from -z for y down.
     """
     width, height = (WIDTH, HEIGHT) if size is None else size
-    guess = guess_up(_sampled(cloud))
+    guess = guess_up(sampled(cloud))
     up = guess.direction if pose.up is None else np.array(pose.up)
     low, high = _extent(cloud)
     middle, half = (low + high) / 2, np.maximum((high - low) / 2, 1e-6)
@@ -132,22 +130,6 @@ def framing_camera(
     position = middle - away * start.world_to_camera[2, :3]
     camera = Camera.look_at(width, height, FOV_X, position, middle, up, near=min(0.01, away / 100))
     return pose.applied(camera, middle)
-
-
-def scene_up(scene: Scene) -> np.ndarray:
-    """Direction (3,) that points up in a scene, as `fidsplat info` guesses it."""
-    return guess_up(_sampled(scene.stores[0] if scene.stores else scene.cloud())).direction
-
-
-def _sampled(cloud: SplatCloud | Store) -> SplatCloud:
-    """The cloud, or some chunks of a store."""
-    if not isinstance(cloud, Store):
-        return cloud
-    chunks = np.flatnonzero(np.tile(cloud.nodes["level"] == 0, cloud.instances))
-    if not len(chunks):
-        return SplatCloud.empty()
-    some = chunks[np.linspace(0, len(chunks) - 1, min(len(chunks), CHUNKS)).astype(int)]
-    return PartialCloud.of(concatenated([cloud.load(int(number)) for number in some]), cloud)
 
 
 def _extent(cloud: SplatCloud | Store) -> tuple[np.ndarray, np.ndarray]:

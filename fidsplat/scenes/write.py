@@ -60,6 +60,14 @@ def write_scene(scene: SceneParts, path: str | os.PathLike[str]) -> None:
         stream.write(content)
 
 
+def marker_block(placed: PlacedMarker, folder: Path, quality: Quality | str | None = None) -> str:
+    """The [[markers]] table of a marker for a scene file in a folder. quality: the scene's.
+
+    Raises InputError if the marker cannot be expressed in a scene file.
+    """
+    return _table("[[markers]]", _marker(placed, folder, quality))
+
+
 def _camera(scene: SceneParts) -> dict:
     camera = scene.camera
     assert camera is not None

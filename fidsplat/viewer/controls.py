@@ -65,6 +65,10 @@ class Controls:
             shown.on_update(lambda _: actions.overlay(shown.value))
             self._button("Detect markers", actions.detect_markers)
             self._button("Save image", actions.save_image)
+        with gui.add_folder("New marker"):
+            self._places = gui.add_checkbox("place by a click", False)
+            self._spec = gui.add_text("spec", "apriltag:36h11:0")
+            self._size = gui.add_number("size [m]", 0.16, min=1e-4, step=1e-4)
         with gui.add_folder("Trajectory"):
             self._button("Add keyframe", actions.add_keyframe)
             self._button("Save keyframes", actions.save_keyframes)
@@ -76,6 +80,15 @@ class Controls:
         state = self._session.state
         lines = [f"{len(state.resident):,} splats, {escaped(state.renderer.device.title)}"]
         self.status.content = "\n\n".join(lines + ([f"**{escaped(problem)}**"] if problem else []))
+
+    @property
+    def new_marker(self) -> tuple[str, float] | None:
+        """Spec and size of the marker that a click places; None: a click reads the pixel."""
+        return (self._spec.value, float(self._size.value)) if self._places.value else None
+
+    def end_placing(self) -> None:
+        """Let the next click read the pixel."""
+        self._places.value = False
 
     def offer_targets(self, names: list[str]) -> None:
         """Replace the names of the gizmo's selector; none is selected."""

@@ -1,5 +1,4 @@
-"""Write the pose of a moved marker or splat file back to its scene file: two lines change, everything else
-stays."""
+"""Write the pose of a moved marker or splat file, or a new marker, to a scene file; all other lines stay."""
 
 from __future__ import annotations
 
@@ -69,11 +68,21 @@ class SceneFile:
         Raises:
             InputError: the file has changed, cannot be written, or has no plain table of that index.
         """
+        self._write(with_pose(self.text, number, pose, str(self.path), kind))
+
+    def add_marker(self, block: str) -> None:
+        """Append a [[markers]] table.
+
+        Raises:
+            InputError: the file has changed, cannot be written, or declares its markers in another way.
+        """
+        self._write(with_marker(self.text, block, str(self.path)))
+
+    def _write(self, text: str) -> None:
         if self._read() != self.text:
             raise InputError(
                 f"{self.path} was edited by another program; it is loaded again, and nothing was written"
             )
-        text = with_pose(self.text, number, pose, str(self.path), kind)
         with atomic_write(self.path.resolve()) as stream:  # preserves symbolic links
             stream.write(text.encode("utf-8"))
         self.text = self._last_read = text
@@ -105,6 +114,20 @@ def with_pose(text: str, number: int, pose: np.ndarray, name: str, kind: str = "
             f"{name}: {_NAMES[kind]} {number} must be a plain [[{kind}]] table, got another form; write "
             f"position = {position}, quaternion = {quaternion} there yourself"
         )
+    return new
+
+
+def with_marker(text: str, block: str, name: str) -> str:
+    """Text of a scene file with one more [[markers]] table at its end.
+
+    Raises:
+        InputError: the file declares its markers in another way; the message names it.
+    """
+    new = f"{text.rstrip()}\n\n{block}" if text.strip() else block
+    before, table, after = (_parsed(one) for one in (text, block, new))
+    if before is None or after != before | {"markers": [*before.get("markers", ()), *table["markers"]]}:
+        lines = ", ".join(line for line in block.splitlines()[1:] if line)
+        raise InputError(f"{name}: markers must be [[markers]] tables; write there yourself: {lines}")
     return new
 
 

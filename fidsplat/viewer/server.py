@@ -9,6 +9,7 @@ import logging
 import socket
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -20,7 +21,9 @@ from fidsplat.backends import devices
 from fidsplat.cameras import Trajectory
 from fidsplat.formats import save_trajectory
 from fidsplat.images.files import encode_png
+from fidsplat.markers import marker
 from fidsplat.scenes import Scene
+from fidsplat.scenes.write import marker_block
 from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.util.arguments import settings_with
 from fidsplat.util.errors import FidsplatError, InputError
@@ -222,11 +225,35 @@ class Viewer:
         if view is None:
             message.content = "Wait for the exact image, then click again."
             return
+        if self._controls.new_marker is not None:
+            message.content = self._place(view, *event.screen_pos)
+            return
         found = view.pick(*event.screen_pos)
         depth = "nothing" if found["depth"] is None else f"{found['depth']:.4f} m"
         rows = [f"pixel {found['pixel']}", f"depth {depth}", f"label {found['label']}"]
         rows += [f"splat {found['splat_id']}", f"marker {escaped(found['marker'] or '-')}"]
         message.content = "  \n".join(rows)
+
+    def _place(self, view: StillImage, x: float, y: float) -> str:
+        """Place a new marker on the surface at a position in the image, 0 to 1, and append it to the scene
+        file. Returns the message for the page."""
+        assert self._controls.new_marker is not None
+        try:
+            placed = view.place(marker(*self._controls.new_marker), x, y)
+            with self._lock:
+                scene, _ = self.session.requested()
+                scene = replace(scene, markers=(*scene.markers, placed))
+                folder = Path() if self._file is None else self._file.path.parent
+                block = marker_block(placed, folder, scene.quality)
+                if self._file is not None:
+                    self._file.add_marker(block)
+        except FidsplatError as error:
+            return escaped(error)
+        self._controls.end_placing()
+        self._controls.offer_targets(self.target_names(scene))
+        self.session.request(scene=scene, done=lambda why: self._controls.show_status(why or ""))
+        where = "Add to a scene file" if self._file is None else f"Appended to {self._file.path.name}"
+        return f"{escaped(where)}:\n```toml\n{block}```"
 
     def detect_markers(self, client: Any) -> None:
         """Detect the markers in the exact image and show their errors."""

@@ -9,11 +9,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from fidsplat.cameras import Shutter
 from fidsplat.effects import FeatureSet, select
+from fidsplat.markers import Marker
 from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer, default_device
 from fidsplat.render.resident import ResidentCloud
-from fidsplat.scenes import Scene
+from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.util.errors import FidsplatError
 from fidsplat.viewer.settings import Settings, Viewpoint
 
@@ -64,6 +66,19 @@ class StillImage:
         markers = {placed.label: placed.marker.spec for placed in self.state.scene.markers}
         found: dict[str, object] = {"label": label, "splat_id": splat, "depth": depth if depth > 0 else None}
         return found | {"marker": markers.get(label), "pixel": (column, row)}
+
+    def place(self, marker: Marker, x: float, y: float) -> PlacedMarker:
+        """The marker on the surface at a position in the image, 0 to 1 from the left and from the top.
+
+        Raises:
+            InputError: no plane in at least half of the marker's area.
+        """
+        state, camera = self.state, self.frame.capture.camera
+        assert camera is not None
+        scene = replace(state.scene, shutter=Shutter(time=state.settings.time))
+        pixel = (min(max(x, 0.0), 1.0) * camera.width, min(max(y, 0.0), 1.0) * camera.height)
+        options = {"renderer": state.renderer, "resident": state.resident}
+        return scene.place(marker, camera=camera, pixel=pixel, **options).markers[-1]
 
 
 @dataclass

@@ -27,6 +27,7 @@ PAGES = [README, TREE / "CONTRIBUTING.md", *sorted((TREE / "docs").glob("*.md"))
 DEVLOG = sorted((TREE / "devlog").glob("*.md"))
 GIVEN = {
     "large-scenes.md",
+    "markers.md",
     "README.md",
     "rendering.md",
     "scene-files.md",

@@ -33,7 +33,8 @@ MAY_IMPORT = {
     "selftest": DATA | {"scenes", "effects", "backends", "render", "images", "vision"},
     "accuracy": DATA | {"store", "scenes", "streaming", "effects", "backends", "render"},
     "viewer": DATA
-    | {"store", "scenes", "effects", "backends", "render", "streaming", "images", "vision", "formats"},
+    | {"store", "scenes", "markers", "effects", "backends", "render", "streaming", "images", "vision"}
+    | {"formats"},
     "remote": {"render", "images", "experiments", "store"},
     "sim": DATA | {"scenes", "effects", "images", "render"},
     "worlds": DATA | {"scenes", "markers", "formats", "store", "sim"},

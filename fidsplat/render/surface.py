@@ -1,0 +1,184 @@
+"""Surface at a pixel of a scene, from the rendered median depth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fidsplat.cameras import Camera, Motion, Shutter
+from fidsplat.capture.sensor import Sensor
+from fidsplat.scenes.surface import Surface, fit_surface
+from fidsplat.util.arguments import real_array
+from fidsplat.util.errors import InputError
+
+if TYPE_CHECKING:
+    from fidsplat.render.renderer import Renderer
+    from fidsplat.render.resident import ResidentCloud
+    from fidsplat.scenes import Scene
+
+SAMPLES = 32
+"""samples per side of the rendered patch"""
+SHARE, LEAST = 0.02, 8.0
+"""default radius of the patch: a share of the width of the image, and at least some pixels"""
+MEDIAN = 0.5
+"""opacity in front of the median depth; more transparent pixels are empty"""
+_RAY = 0.1
+"""field of view of a ray's camera in radians"""
+
+
+def surface_at(
+    scene: Scene,
+    camera: Camera | None = None,
+    pixel=None,
+    *,
+    ray=None,
+    radius: float | None = None,
+    renderer: Renderer | None = None,
+    resident: ResidentCloud | None = None,
+) -> Surface:
+    """The surface of a scene at a pixel or along a ray.
+
+    A plane is fitted to the median depth of a round patch. Outliers, such as leaves in front of a wall, may
+    be up to half of it.
+
+    Args:
+        scene: splats and markers, at the time of the scene's shutter.
+        camera: at its own pose; by default the scene's, at the time of its shutter.
+        pixel: (x, y), 0 to width and 0 to height.
+        ray: (origin (3,), direction (3,)) in the world, instead of camera and pixel.
+        radius: metres, radius of the patch; by default 2 % of the width of the image, at least 8 pixels.
+        renderer: by default one on the scene's device.
+        resident: the uploaded scene, for many calls.
+
+    Raises:
+        InputError: no plane in at least half of the patch; a pixel outside the image; unusable arguments.
+    """
+    capture = scene.capture
+    if camera is None and scene.camera is not None:
+        camera = capture.motion.moved(scene.camera, capture.shutter.time)
+    camera, pixel = _viewpoint(camera, pixel, ray)
+    if radius is not None and not (np.isfinite(radius) and radius > 0):
+        raise InputError(f"radius must be a positive length in metres, got {radius!r}")
+    if renderer is None:
+        from fidsplat.render.renderer import Renderer  # here, as most callers have one
+
+        renderer = Renderer(scene.device)
+    uploaded = renderer.upload(scene) if resident is None else resident
+    still = capture.with_(
+        outputs=("depth_first",),
+        quality=replace(capture.quality, samples=1, first_hit=MEDIAN),
+        motion=Motion(None, capture.motion.groups),
+        shutter=Shutter(time=capture.shutter.time),
+        sensor=Sensor(),
+        background=(0.0, 0.0, 0.0),
+    )
+    still = replace(still, fog=None, external_depth=None)
+
+    def depth_of(patch: Camera) -> np.ndarray:
+        return renderer.render(uploaded, still.with_(camera=patch))["depth_first"]
+
+    pixels = default_radius(camera)
+    if radius is not None:
+        metres = _radius(camera, pixel, pixels, _middle_depth(depth_of(_patch(camera, pixel, pixels))))
+        pixels = min(pixels * radius / metres, 2.0 * camera.width)
+    patch = _patch(camera, pixel, pixels)
+    depth = depth_of(patch)
+    metres = _radius(camera, pixel, pixels, _middle_depth(depth))
+    return _fitted(depth, patch, (SAMPLES / 2, SAMPLES / 2), SAMPLES / 2, metres)
+
+
+def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = None) -> Surface:
+    """The surface at a pixel of an image of the median depth.
+
+    Args:
+        depth: (h, w) metres, the output `depth_first` at `first_hit=0.5`; 0 where the opacity is below 0.5.
+        camera: camera of the image.
+        pixel: (x, y), 0 to width and 0 to height.
+        radius: radius of the patch in pixels; by default 2 % of the width, at least 8.
+
+    Raises:
+        InputError: no plane in at least half of the patch; a pixel outside the image.
+    """
+    camera, pixel = _viewpoint(camera, pixel, None)
+    pixels = default_radius(camera) if radius is None else radius
+    x, y = (int(v) for v in pixel)
+    reach = int(np.ceil(pixels))
+    left, top = max(x - reach, 0), max(y - reach, 0)
+    patch = depth[top : y + reach + 1, left : x + reach + 1]
+    metres = _radius(camera, pixel, pixels, _middle_depth(patch))
+    window = replace(
+        camera, width=patch.shape[1], height=patch.shape[0], cx=camera.cx - left, cy=camera.cy - top
+    )
+    return _fitted(patch, window, (pixel[0] - left, pixel[1] - top), pixels, metres)
+
+
+def default_radius(camera: Camera) -> float:
+    """Radius of the patch in pixels."""
+    return max(SHARE * camera.width, LEAST)
+
+
+def _viewpoint(camera: Camera | None, pixel, ray) -> tuple[Camera, tuple[float, float]]:
+    """Camera and pixel of a call. Raises InputError."""
+    if (pixel is None) == (ray is None):
+        given = "neither" if pixel is None else "both"
+        raise InputError(f"the place of a surface must be a pixel or a ray, got {given}; give one of them")
+    if ray is not None:
+        return _ray_camera(ray), (SAMPLES / 2, SAMPLES / 2)
+    if camera is None:
+        raise InputError("the camera of a pixel must be given for a scene without one, got None")
+    at = real_array("pixel", pixel, "two numbers")
+    if at.shape != (2,) or not (0 <= at[0] <= camera.width and 0 <= at[1] <= camera.height):
+        raise InputError(
+            f"pixel must be (x, y) in the image, 0 to {camera.width} and 0 to {camera.height}, got {pixel!r}"
+        )
+    return camera, (float(at[0]), float(at[1]))
+
+
+def _ray_camera(ray) -> Camera:
+    try:
+        origin, direction = (real_array("ray", part, "three numbers") for part in ray)
+    except (TypeError, ValueError):
+        raise InputError(f"ray must be an origin (3,) and a direction (3,), got {ray!r}") from None
+    if origin.shape != (3,) or direction.shape != (3,) or not direction.any():
+        raise InputError(f"ray must be an origin (3,) and a direction (3,), not 0, got {ray!r}")
+    up = np.eye(3)[np.argmin(np.abs(direction))]
+    along = direction / np.linalg.norm(direction)
+    return Camera.look_at(SAMPLES, SAMPLES, _RAY, origin, origin + along, up, near=1e-3)
+
+
+def _patch(camera: Camera, pixel: tuple[float, float], radius: float) -> Camera:
+    """The camera of the square of this half side around a pixel, in `SAMPLES` samples per side."""
+    zoom = SAMPLES / (2 * radius)
+    cx = (camera.cx - pixel[0] + radius) * zoom
+    cy = (camera.cy - pixel[1] + radius) * zoom
+    return replace(
+        camera, width=SAMPLES, height=SAMPLES, fx=camera.fx * zoom, fy=camera.fy * zoom, cx=cx, cy=cy
+    )
+
+
+def _middle_depth(depth: np.ndarray) -> float:
+    filled = depth[depth > 0]
+    if not len(filled):
+        raise InputError("the surface must have splats at this pixel, got none; give another pixel")
+    return float(np.median(filled))
+
+
+def _radius(camera: Camera, pixel: tuple[float, float], pixels: float, depth: float) -> float:
+    """Metres of a radius in pixels at a depth."""
+    sides = np.array([pixel, (pixel[0] + pixels, pixel[1]), (pixel[0] - pixels, pixel[1])])
+    middle, *others = camera.unproject(sides, np.full(3, depth))
+    return float(np.nanmax(np.linalg.norm(others - middle, axis=1)))
+
+
+def _fitted(
+    depth: np.ndarray, camera: Camera, pixel: tuple[float, float], pixels: float, metres: float
+) -> Surface:
+    h, w = depth.shape
+    x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
+    within = (x - pixel[0]) ** 2 + (y - pixel[1]) ** 2 <= max(pixels, 1.0) ** 2
+    depths = depth[within].astype(np.float64)
+    points = camera.unproject(np.stack([x[within], y[within]], 1), np.where(depths > 0, depths, np.nan))
+    origin, ahead = camera.unproject(np.array([pixel, pixel]), np.array([0.0, 1.0]))
+    return fit_surface(points, origin, ahead - origin, metres)

@@ -1,0 +1,127 @@
+"""Surface of a scene at a point: a plane fitted to points of rendered depth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from fidsplat.util.arguments import number, real_array
+from fidsplat.util.errors import InputError
+
+TOLERANCE = 0.1
+"""largest distance of an inlier from the plane, as a share of the radius of the patch"""
+LEAST_SHARE = 0.5
+"""smallest share of inliers of a surface"""
+GRAZING = 0.02
+"""smallest cosine between the ray and the normal"""
+LIFT = 1e-3
+"""metres in front of a surface that is smooth"""
+LEVEL = 0.17
+"""smallest sine of the angle between the normal and the direction of a marker's upper edge"""
+_TRIPLES = 256
+_TUKEY = 4.685
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A plane fitted to a patch of a scene's surface."""
+
+    position: np.ndarray
+    """(3,) float64 world metres, on the ray"""
+    normal: np.ndarray
+    """(3,) float64 unit vector in the world, towards the camera"""
+    inlier_share: float
+    """share of the patch in the plane, 0.5 to 1"""
+    roughness: float
+    """metres: RMS distance of the inliers from the plane"""
+    radius: float
+    """metres: radius of the patch"""
+
+    def pose(self, ups: Iterable, lift: float | None = None) -> np.ndarray:
+        """world_from_marker (4, 4) float64 of a marker on the surface.
+
+        Args:
+            ups: (k, 3) world directions of its upper edge; the first that is not within 10 degrees of the
+                normal is used.
+            lift: metres in front of the surface; None: 1 mm and twice the roughness.
+        """
+        lift = LIFT + 2 * self.roughness if lift is None else number("lift", lift)
+        for up in ups:
+            given = real_array("up", up, "three numbers")
+            if given.shape != (3,) or not np.isfinite(given).all() or not given.any():
+                raise InputError(f"up must be three finite numbers, not all 0, got {up!r}")
+            top = given / np.linalg.norm(given)
+            top = top - (top @ self.normal) * self.normal
+            if np.linalg.norm(top) >= LEVEL:
+                break
+        top = top / np.linalg.norm(top)
+        matrix = np.eye(4)
+        matrix[:3, :3] = np.stack([np.cross(top, self.normal), -top, -self.normal], 1) + 0.0
+        matrix[:3, 3] = self.position + lift * self.normal
+        return matrix
+
+
+def fit_surface(points: np.ndarray, origin: np.ndarray, ray: np.ndarray, radius: float) -> Surface:
+    """The dominant plane of points, where a ray intersects it.
+
+    Consensus of planes through three points (MSAC), then least squares with Tukey's weights.
+
+    Args:
+        points: (n, 3) world points of a patch, one for each pixel; NaN for empty pixels.
+        origin, ray: (3,) a point of the ray and its direction.
+        radius: metres, radius of the patch.
+
+    Raises:
+        InputError: less than half of the pixels are in one plane, or the ray is parallel to it.
+    """
+    filled = points[np.isfinite(points).all(1)]
+    share = len(filled) / max(len(points), 1)
+    if share < LEAST_SHARE or len(filled) < 3:
+        raise InputError(_refusal(f"{100 - 100 * share:.0f} % of the patch without splats"))
+    centre = filled.mean(0)
+    local, tolerance = filled - centre, TOLERANCE * radius
+    triples = np.random.default_rng(0).integers(0, len(local), (_TRIPLES, 3))
+    a, b, c = (local[triples[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    usable = lengths > 1e-12 * radius**2
+    if not usable.any():
+        raise InputError(_refusal("points of one line"))
+    normals, a = normals[usable] / lengths[usable, None], a[usable]
+    distances = np.abs(local @ normals.T - (a * normals).sum(1))
+    best = int(np.argmin((np.minimum(distances, tolerance) ** 2).sum(0)))
+    normal, middle = normals[best], a[best]
+    for _ in range(10):
+        residuals = (local - middle) @ normal
+        inside = np.abs(residuals) <= tolerance
+        if inside.sum() < 3:
+            break
+        scale = max(1.4826 * float(np.median(np.abs(residuals[inside]))), 1e-7 * radius)
+        weights = np.clip(1 - (residuals / min(_TUKEY * scale, tolerance)) ** 2, 0, None) ** 2
+        middle = weights @ local / weights.sum()
+        moment = (local - middle).T @ ((local - middle) * weights[:, None])
+        normal = np.linalg.eigh(moment)[1][:, 0]
+    residuals = (local - middle) @ normal
+    inside = np.abs(residuals) <= tolerance
+    share = float(inside.sum() / len(points))
+    if share < LEAST_SHARE:
+        raise InputError(_refusal(f"{100 * share:.0f} %"))
+    ray = ray / np.linalg.norm(ray)
+    slope = float(ray @ normal)
+    if abs(slope) < GRAZING:
+        raise InputError(
+            "the surface must face the camera, got one that is parallel to the ray; give another pixel"
+        )
+    normal = -np.sign(slope) * normal
+    away = float((centre + middle - origin) @ normal) / -abs(slope)
+    rms = float(np.sqrt(np.mean(residuals[inside] ** 2)))
+    return Surface(origin + away * ray, normal, share, rms, float(radius))
+
+
+def _refusal(got: str) -> str:
+    return (
+        f"the surface must be one plane in at least {100 * LEAST_SHARE:.0f} % of the patch, got {got}; "
+        "give another pixel or radius"
+    )
