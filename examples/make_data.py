@@ -1,4 +1,4 @@
-"""Generate examples/data for the examples: a sky, and a globe with view-dependent colours.
+"""Generate examples/data: a sky, a globe with view-dependent colours, and a corner of a room.
 
 python examples/make_data.py [FOLDER]        default: examples/data
 """
@@ -12,6 +12,7 @@ import numpy as np
 
 import fidsplat as fs
 from fidsplat.images.files import write_png
+from fidsplat.splats.rotations import matrix_to_quaternion
 
 
 def sky() -> np.ndarray:
@@ -40,12 +41,44 @@ def globe(degree: int = 3, n: int = 1500) -> fs.SplatCloud:
     return fs.SplatCloud(0.5 * normals, quats, np.full((n, 2), 0.97 / np.sqrt(n)), np.full(n, 0.95), sh=sh)
 
 
+def panel(middle, along, across, color, step: float = 0.08) -> fs.SplatCloud:
+    """Rectangle of overlapping disks. along, across: half sides, perpendicular vectors in metres."""
+    u, v = np.array(along, float), np.array(across, float)
+    counts = [max(2, round(2 * np.linalg.norm(side) / step)) for side in (u, v)]
+    shares = [(np.arange(n) + 0.5) / n * 2 - 1 for n in counts]
+    a, b = (grid.ravel() for grid in np.meshgrid(*shares))
+    axes = np.stack([u / np.linalg.norm(u), v / np.linalg.norm(v)])
+    frame = np.column_stack([*axes, np.cross(*axes)])
+    quat = np.tile(matrix_to_quaternion(frame), (len(a), 1))
+    sizes = [0.6 * 2 * np.linalg.norm(side) / n for side, n in zip((u, v), counts, strict=True)]
+    return fs.SplatCloud(
+        np.array(middle) + np.outer(a, u) + np.outer(b, v),
+        quat,
+        np.tile(sizes, (len(a), 1)),
+        np.full(len(a), 0.98),
+        colors=np.tile(np.asarray(color, float), (len(a), 1)),
+    )
+
+
+def corner() -> fs.SplatCloud:
+    """Corner of a room, 1.6 m wide: wall, shelf, floor, and a red side wall; y down, open towards -z."""
+    return fs.SplatCloud.concatenate(
+        [
+            panel((0, 0, 0.5), (0.8, 0, 0), (0, 0.6, 0), (0.62, 0.6, 0.56)),
+            panel((-0.8, 0, 0), (0, 0, 0.5), (0, 0.6, 0), (0.75, 0.2, 0.15)),
+            panel((0, 0.6, 0), (0.8, 0, 0), (0, 0, 0.5), (0.45, 0.36, 0.28)),
+            panel((0.2, -0.12, 0.36), (0.34, 0, 0), (0, 0, 0.13), (0.5, 0.35, 0.2), step=0.04),
+        ]
+    )
+
+
 def main() -> None:
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).resolve().parent / "data"
     folder.mkdir(parents=True, exist_ok=True)
     print(write_png(folder / "sky.png", sky()))
-    fs.save_ply(globe(n=400), folder / "globe.ply")
-    print(folder / "globe.ply")
+    for name, cloud in (("globe", globe(n=400)), ("corner", corner())):
+        fs.save_ply(cloud, folder / f"{name}.ply")
+        print(folder / f"{name}.ply")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Unpack
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from fidsplat.render.batch import FrameBatch
 from fidsplat.render.certified_error import ErrorImage, ideal_of
 from fidsplat.render.differentiable_frame import DifferentiableFrame
 from fidsplat.render.frame import Frame, check_process, stack_bands
+from fidsplat.render.lighting import lit_scene
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.scenes import Scene
 from fidsplat.splats.cloud import SplatCloud
@@ -69,6 +71,7 @@ class Renderer:
     def __init__(self, device: str | None = None, memory_budget: int | None = None) -> None:
         self.backend = open_backend(default_device() if device is None else device)
         self._process, self._lock = os.getpid(), threading.Lock()
+        self._lit: WeakKeyDictionary[Scene, Scene] = WeakKeyDictionary()
         if memory_budget is not None:
             if isinstance(memory_budget, bool) or not isinstance(memory_budget, int) or memory_budget <= 0:
                 raise InputError(
@@ -98,6 +101,7 @@ class Renderer:
         """
         check_process(self._process, "Renderer")
         capture = scene.capture if isinstance(scene, Scene) else _DEFAULT_CAPTURE
+        scene = self.lit(scene) if isinstance(scene, Scene) else scene
         stored = Scene(stores=(scene,)) if isinstance(scene, Store) else scene
         cloud = stored.splats if isinstance(stored, Scene) else stored
         if isinstance(cloud, ChunkedSplats):
@@ -106,6 +110,20 @@ class Renderer:
             raise InputError(f"cannot render a {type(scene).__name__}; give a Scene, a SplatCloud or a Store")
         with self._lock:
             return ResidentCloud(self.backend, self.backend.upload(cloud), capture, cloud.labels)
+
+    def lit(self, scene: Scene) -> Scene:
+        """The scene with the colours of markers with `light` computed; `upload` and `render` call it.
+
+        A scene that is rendered again is not computed again.
+
+        Raises:
+            InputError: the light of a marker cannot be computed, e.g. its surroundings are black.
+        """
+        if not any(placed.light for placed in scene.markers):
+            return scene
+        if scene not in self._lit:
+            self._lit[scene] = lit_scene(scene, self)
+        return self._lit[scene]
 
     def adopt(
         self,

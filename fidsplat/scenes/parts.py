@@ -15,6 +15,7 @@ from fidsplat.capture.capture import Capture, output_names
 from fidsplat.capture.environment import Background, Fog, background_of
 from fidsplat.capture.quality import Quality
 from fidsplat.capture.sensor import Sensor
+from fidsplat.scenes.lights import Light, Lighting
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import check_similarity, pose_matrix
 from fidsplat.store.chunked_splats import ChunkedSplats
@@ -43,6 +44,9 @@ class PlacedMarker(PickledByFields):
     """its pose at a time in seconds; None: constant"""
     bundle: str | None = None
     """name of the rigid object that it is attached to; markers of a bundle are detected as one pose"""
+    light: Lighting | str | None = None
+    """colours from light when the scene is rendered: "scene", "lights" or a Lighting; None: the marker's own.
+    A moving marker keeps the light of its initial pose."""
 
     def __post_init__(self) -> None:
         given = pose_matrix(self.pose, "a marker's pose")
@@ -58,6 +62,7 @@ class PlacedMarker(PickledByFields):
             raise InputError(
                 f"marker must be an fs.Marker, got {self.marker!r}; e.g. fs.marker('apriltag:36h11:5')"
             )
+        object.__setattr__(self, "light", Lighting.of(self.light))
         pose = np.array(given, dtype=np.float64)
         pose.flags.writeable = False
         object.__setattr__(self, "pose", pose)
@@ -103,11 +108,14 @@ class SceneParts(PickledByFields):
     cloud_motions: Mapping[int, Pose] = field(default_factory=dict)
     """number of a moving cloud -> its rigid world motion at a time in seconds; the cloud gets a unique label,
     above those of markers"""
+    lights: tuple[Light, ...] = ()
+    """lights that illuminate the markers with `light`"""
 
     def __post_init__(self) -> None:
         put = object.__setattr__
         put(self, "clouds", _all_of(self.clouds, SplatCloud, "clouds"))
         put(self, "stores", _all_of(self.stores, Store, "stores"))
+        put(self, "lights", _all_of(self.lights, Light, "lights"))
         Motion(self.camera_motion)  # reports an invalid motion here rather than when rendering
         moving = self.cloud_motions
         if not isinstance(moving, Mapping) or not all(map(callable, moving.values())):

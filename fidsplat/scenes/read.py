@@ -18,6 +18,7 @@ from fidsplat.capture.sensor import Sensor
 from fidsplat.formats import Progress, load_splats
 from fidsplat.scenes.camera import POSE, TABLES, read_focal_lengths, read_keyframes, read_lens, read_shutter
 from fidsplat.scenes.environment import read_background, read_part
+from fidsplat.scenes.lights import read_lighting, read_lights
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.scenes.quality_settings import read_quality
 from fidsplat.scenes.table import Table
@@ -33,7 +34,7 @@ MAX_BYTES = 16 * 2**20
 MAX_PARTS = 8
 """limit on the parts of a dotted key (scene files have at most three): the parser takes quadratic time and
 memory"""
-TOP = ("camera", "splats", "markers", "render", "quality", "sensor", "fog", "background")
+TOP = ("camera", "splats", "markers", "render", "quality", "sensor", "fog", "background", "lights")
 CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
 CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLES, "shutter", "motion")
 CAMERA_POSE = ("position", "look_at", "up", "world_to_camera")
@@ -49,6 +50,7 @@ MARKER = (
     "white",
     "motion",
     "bundle",
+    "light",
 )
 MARKERS = (*MARKER, *setting_types(MarkerQuality))
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
@@ -115,6 +117,7 @@ def read_scene(
         camera_motion=keyframes,
         sensor=read_part(top, "sensor", Sensor),
         fog=read_part(top, "fog", Fog),
+        lights=read_lights(top),
         cloud_motions={i: motion for i, (_, motion) in enumerate(splats) if motion is not None},
     )
 
@@ -218,7 +221,7 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progre
         raise table.error("size", f"must be above 0 metres, got {size!r}")
     pose, motion = _pose(table), read_keyframes(table, POSE, _pose)
     quiet_zone, max_splats = table.whole("quiet_zone", None), table.whole("max_splats", None)
-    own = table.values(MarkerQuality)
+    own, light = table.values(MarkerQuality), read_lighting(table)
     if quiet_zone is not None and quiet_zone < 0:
         raise table.error("quiet_zone", f"must be 0 or more modules, got {quiet_zone}")
     from fidsplat.markers import marker, with_file  # late: it imports heavy packages
@@ -229,4 +232,5 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progre
     with table.at():
         spec = with_file(spec, lambda name: str(folder / name))
         built = marker(spec, size, **known, **own)
-        return PlacedMarker(built, pose, motion=motion, bundle=table.text("bundle", None))
+        bundle = table.text("bundle", None)
+        return PlacedMarker(built, pose, motion=motion, bundle=bundle, light=light)

@@ -66,6 +66,14 @@ class Table:
             raise self.error(key, f"must be text, got {_kind(value)}")
         return value
 
+    def is_text(self, key: str) -> bool:
+        """Whether a key has a string."""
+        return isinstance(self._values.get(key), str)
+
+    def narrowed(self, known: tuple[str, ...]) -> "Table":
+        """The table with fewer known keys. Raises InputError if it has another key."""
+        return Table(self._values, self._file, self._path, known)
+
     def texts(self, key: str, default: Any = _MISSING) -> Any:
         """A tuple of one or more strings, or the default."""
         value = self._get(key, default)

@@ -11,6 +11,7 @@ from fidsplat.markers import with_file
 from fidsplat.markers.printing import MAX_SPLATS
 from fidsplat.scenes.camera import keyframe_tables, lens_table, shutter_table
 from fidsplat.scenes.environment import environment_tables
+from fidsplat.scenes.lights import Lighting, light_tables, lighting_value
 from fidsplat.scenes.parts import PlacedMarker, SceneParts
 from fidsplat.scenes.quality_settings import marker_settings, quality_tables
 from fidsplat.splats.rotations import matrix_to_quaternion
@@ -47,6 +48,7 @@ def write_scene(scene: SceneParts, path: str | os.PathLike[str]) -> None:
         parts += [_table("[[camera.motion]]", frame) for frame in frames]
     parts += [_table("[[splats]]", table) for table in splats]
     parts += [_table("[[markers]]", table) for table in markers]
+    parts += [_table("[[lights]]", table) for table in light_tables(scene.lights)]
     parts += [_table(f"[{name}]", table) for name, table in environment.items()]
     parts.append(_table("[render]", render))
     parts += [_table(f"[{name}]", table) for name, table in qualities.items()]
@@ -94,6 +96,7 @@ def _marker(placed: PlacedMarker, folder: Path, quality: Quality | str | None) -
         **limit,
         **inks,
         **bundle,
+        **lighting_value(Lighting.of(placed.light)),
         **motion,
     }
 

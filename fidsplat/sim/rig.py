@@ -82,24 +82,24 @@ class Rig:
         self.scene = scene if isinstance(scene, Scene) else Scene((scene,))
         if not self.scene.motion.is_still:
             raise InputError("the scene of a rig must be still, got motion; the simulator moves the bodies")
+        if renderer is not None:
+            instance("renderer", renderer, Renderer, "an fs.Renderer or None")
+        self.renderer = Renderer() if renderer is None else renderer
         self.cameras = _cameras_of(cameras)
         """RigCamera by name, in the order of the images' axis `camera`"""
-        cloud = self.scene.cloud()
+        cloud = self.renderer.lit(self.scene).cloud()
         self.labels = _bodies_of({} if bodies is None else bodies, cloud)
         """name of the body by label"""
         mounts = (camera.body for camera in self.cameras.values() if camera.body is not None)
         self.bodies = tuple(dict.fromkeys((*self.labels.values(), *mounts)))
         """names of the bodies whose poses are required, in the order of the axis `body`"""
         self._rest = {}
-        if renderer is not None:
-            instance("renderer", renderer, Renderer, "an fs.Renderer or None")
         if not isinstance(rest, Mapping | None):
             raise invalid("rest", "{name of a body: pose (7,)}", rest)
         for name, pose in ({} if rest is None else rest).items():
             if name not in self.bodies:
                 raise InputError(unknown("body", name, self.bodies))
             self._rest[name] = inverse(check_poses(f"rest of {name}", pose, ()))
-        self.renderer = Renderer() if renderer is None else renderer
         self._cloud = self.renderer.upload(cloud)
         self._capture = self.scene.capture.with_(outputs=outputs)
         self._rendered = 0

@@ -263,6 +263,7 @@ def test_the_files_of_the_examples_are_made_by_their_script(tmp_path, monkeypatc
         np.abs(read_image(tmp_path / "sky.png").astype(int) - read_image(EXAMPLES / "data/sky.png")).max()
         <= 1
     )
-    made, stored = (fs.load_ply(folder / "globe.ply") for folder in (tmp_path, EXAMPLES / "data"))
-    assert np.allclose(made.sh, stored.sh, atol=1e-6)
-    assert np.allclose(made.means, stored.means, atol=1e-6)
+    for name in ("globe", "corner"):
+        made, stored = (fs.load_ply(folder / f"{name}.ply") for folder in (tmp_path, EXAMPLES / "data"))
+        assert np.allclose(made.sh, stored.sh, atol=1e-6)
+        assert np.allclose(made.means, stored.means, atol=1e-6)

@@ -1,0 +1,141 @@
+"""Irradiance from panoramas that are rendered at points of a marker."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+LEVELS = (3, 5, 9)
+"""numbers of panoramas along a side of the marker, until interpolation between them is accurate enough"""
+
+
+def panorama_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """World directions (d, 3) of the pixels of an equirectangular panorama of 2 rows x rows pixels, and their
+    solid angles (d,)."""
+    columns = 2 * rows
+    longitude = (np.arange(columns) + 0.5) / columns * 2 * np.pi - np.pi
+    edges = np.arange(rows + 1) / rows * np.pi - np.pi / 2
+    latitude = (edges[1:] + edges[:-1]) / 2
+    around, down = np.meshgrid(longitude, latitude)
+    flat = np.cos(down)
+    directions = np.stack([flat * np.sin(around), np.sin(down), flat * np.cos(around)], -1)
+    angles = np.repeat(np.diff(np.sin(edges)) * 2 * np.pi / columns, columns)
+    return directions.reshape(-1, 3), angles
+
+
+def cosine_weights(normal: np.ndarray, directions: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Weights (d,) of radiance in the irradiance of a surface; their sum is pi."""
+    weights = np.maximum(directions @ normal, 0) * angles
+    return weights * (np.pi / weights.sum())
+
+
+class LightField:
+    """Radiance from all directions, measured on a grid over a marker and interpolated between."""
+
+    def __init__(self, directions: np.ndarray, angles: np.ndarray) -> None:
+        self.directions, self.angles = directions, angles
+        self.low, self.high = np.zeros(2), np.ones(2)
+        self.radiance = np.zeros((1, 1, len(angles), 3))
+        """(rows, columns, d, 3)"""
+
+    @staticmethod
+    def uniform(radiance: tuple[float, float, float]) -> LightField:
+        """Equal radiance from all directions."""
+        field = LightField(*panorama_directions(8))
+        field.radiance[:] = radiance
+        return field
+
+    @staticmethod
+    def measured(
+        rows: int,
+        places: np.ndarray,
+        radiance_at: Callable[[np.ndarray], np.ndarray],
+        normal: np.ndarray,
+        step: float,
+    ) -> LightField:
+        """Measure until interpolated irradiance differs by at most `step` of its maximum.
+
+        places: (m, 2) on the marker. radiance_at: called with (k, 2) places, returns (k, d, 3). normal: (3,)
+        for the irradiance that is compared.
+        """
+        field = LightField(*panorama_directions(rows))
+        field.low, field.high = places.min(axis=0), places.max(axis=0)
+        weights = cosine_weights(normal, field.directions, field.angles)
+        known: dict[tuple[float, float], np.ndarray] = {}
+        for level in LEVELS:
+            shares = [(x, y) for y in np.linspace(0, 1, level) for x in np.linspace(0, 1, level)]
+            new = [share for share in shares if share not in known]
+            new_places = field.low + np.array(new) * (field.high - field.low)
+            known |= dict(zip(new, radiance_at(new_places), strict=True))
+            field.radiance = np.stack([known[share] for share in shares]).reshape(level, level, -1, 3)
+            found = np.einsum("d,yxdc->yxc", weights, field.radiance)
+            halved = found[::2, ::2]
+            error = max(
+                _difference(found[::2, 1::2], (halved[:, 1:] + halved[:, :-1]) / 2),
+                _difference(found[1::2, ::2], (halved[1:] + halved[:-1]) / 2),
+            )
+            if error <= step * found.max():
+                break
+        return field
+
+    def _between(self, places: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], np.ndarray]]:
+        """Grid indices (y, x) and weights of the four measurements around each place (m, 2)."""
+        size = np.array(self.radiance.shape[1::-1]) - 1
+        span = np.where(self.high > self.low, self.high - self.low, 1)
+        at = np.clip((places - self.low) / span, 0, 1) * size
+        cell = np.minimum(at.astype(int), np.maximum(size - 1, 0))
+        part = at - cell
+        for dy in (0, 1):
+            for dx in (0, 1):
+                x, y = np.minimum(cell + np.array([dx, dy]), size).T
+                share = np.where(dx, part[:, 0], 1 - part[:, 0]) * np.where(dy, part[:, 1], 1 - part[:, 1])
+                yield (y, x), share
+
+    def interpolated(self, values: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Values (rows, columns, ...) of the grid at places (m, 2)."""
+        return sum(  # type: ignore[return-value]
+            values[index] * share.reshape(-1, *[1] * (values.ndim - 2))
+            for index, share in self._between(places)
+        )
+
+    def arriving(self, directions: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Radiance (m, k, 3) from directions (m, k, 3) at places (m, 2), interpolated in both."""
+        rows = round(np.sqrt(len(self.angles) / 2))
+        images = self.radiance.reshape(*self.radiance.shape[:2], rows, 2 * rows, 3)
+        x, y, z = np.moveaxis(directions, -1, 0)
+        u = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * 2 * rows - 0.5
+        v = (np.arcsin(np.clip(y, -1, 1)) / np.pi + 0.5) * rows - 0.5
+        left, top = np.floor(u).astype(int), np.floor(v).astype(int)
+        found = np.zeros(directions.shape)
+        for dy in (0, 1):
+            for dx in (0, 1):
+                share = np.where(dx, u - left, left + 1 - u) * np.where(dy, v - top, top + 1 - v)
+                pixel = np.clip(top + dy, 0, rows - 1), (left + dx) % (2 * rows)
+                for (row, column), near in self._between(places):
+                    here = images[row[:, None], column[:, None], *pixel]
+                    found += here * (share * near[:, None])[..., None]
+        return found
+
+    def reflected(self, directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Weighted sums (rows, columns, v, 3) of the radiance from directions (v, k, 3) at all
+        measurements."""
+        height, width = self.radiance.shape[:2]
+        sides = (np.linspace(0, 1, count) for count in (width, height))
+        shares = np.stack(np.meshgrid(*sides), -1).reshape(-1, 2)
+        places = self.low + shares * (self.high - self.low)
+        flat = directions.reshape(1, -1, 3)
+        found = [
+            np.einsum("vk,vkc->vc", weights, self.arriving(flat, place[None]).reshape(*directions.shape))
+            for place in places
+        ]
+        return np.stack(found).reshape(height, width, -1, 3)
+
+    def irradiance(self, normal: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Irradiance (m, 3) of surfaces with a normal (3,) at places (m, 2)."""
+        weights = cosine_weights(normal, self.directions, self.angles)
+        return self.interpolated(np.einsum("d,yxdc->yxc", weights, self.radiance), places)
+
+
+def _difference(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.abs(one - other).max(initial=0.0))

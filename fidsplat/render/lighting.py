@@ -1,0 +1,445 @@
+"""Lighting of markers: colours of their splats from the light of the scene.
+
+The light of the splats around a marker is measured in panoramas, that of explicit lights by shadow maps.
+Boxes are split where the light changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.cameras.lenses import Orthographic
+from fidsplat.capture.capture import Capture
+from fidsplat.render.irradiance import LightField
+from fidsplat.render.reflection import (
+    Gloss,
+    fit_harmonics,
+    fresnel,
+    gloss,
+    lobe,
+    to_colors,
+    to_light,
+    view_directions,
+)
+from fidsplat.render.shadows import LightPoint, Surface, light_points, unit, visibility
+from fidsplat.scenes import PlacedMarker, Scene
+from fidsplat.scenes.lights import Lighting, PointLight
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.harmonics import rotation_of_coefficients
+from fidsplat.splats.rotations import quaternion_to_matrix
+from fidsplat.util.errors import InputError
+
+FINEST = 8
+"""parts per module along a side of a box, the smallest that light is measured on"""
+MOST = 256
+"""measured points along a side of a square marker, at most"""
+SMOOTHEST = 0.5
+"""smallest roughness whose reflections harmonics of degree 3 represent (docs/effects.md)"""
+_DARK = 1e-6
+"""radiance below which a panorama is black"""
+_CHUNK = 256
+_WALL = 0.1
+"""metres around a light in which splats on all sides mean that it is inside of something"""
+
+
+def lit_scene(scene: Scene, renderer: Any) -> Scene:
+    """The scene with the colours of markers with `light` computed, and without further requests of light.
+
+    Raises InputError if the light of a marker cannot be computed.
+    """
+    if not any(placed.light for placed in scene.markers):
+        return scene
+    around = _Surroundings(scene, renderer)
+    markers = tuple(_lit(placed, around) if placed.light else placed for placed in scene.markers)
+    for number, light in enumerate(scene.lights):
+        if isinstance(light, PointLight) and number not in around.arrived and light.power.any():
+            around.refuse_inside(number, light)
+    return replace(scene, markers=markers, lights=())
+
+
+class _Surroundings:
+    """What is around the lit markers: splats, background and lights, and panoramas of them."""
+
+    def __init__(self, scene: Scene, renderer: Any) -> None:
+        self.renderer, self.lights, self.camera = renderer, scene.lights, scene.camera
+        unlit = tuple(placed for placed in scene.markers if not placed.light)
+        self.scene = Scene(
+            scene.clouds,
+            markers=unlit,
+            background=scene.background,
+            fog=scene.fog,
+            stores=scene.stores,
+            cloud_motions=scene.cloud_motions,
+        )
+        self.arrived: set[int] = set()
+        """numbers of the lights that reach a marker"""
+
+    @cached_property
+    def resident(self) -> Any:
+        """The splats on the device."""
+        return self.renderer.upload(self.scene)
+
+    @cached_property
+    def black(self) -> tuple[Any, np.ndarray, np.ndarray]:
+        """The splats on the device without colour, and their bounding box."""
+        cloud = self.scene.cloud()
+        black = _rebuilt(cloud, colors=np.zeros((len(cloud), 3), np.float32))
+        low, high = cloud.bounds() if len(cloud) else (np.zeros(3), np.zeros(3))
+        return self.renderer.upload(black), low, high
+
+    def extent(self, point: np.ndarray) -> float:
+        """Largest distance of a splat from a point, at most 1 km."""
+        _, low, high = self.black
+        return float(min(np.linalg.norm(np.maximum(high - point, point - low)) + 1e-3, 1e3))
+
+    def panoramas(self, points: np.ndarray, rows: int, near: float, **parts: Any) -> list[Any]:
+        """Frames of panoramas at points (k, 3) in the axes of the world, with `alpha`."""
+        cameras = []
+        for point in points:
+            pose = np.eye(4)
+            pose[:3, 3] = -point
+            cameras.append(Camera.equirectangular(2 * rows, rows, pose, near=near))
+        base = Capture(background=self.scene.background, motion=self.scene.motion, fog=self.scene.fog)
+        captures = [base.with_(camera=camera, **parts) for camera in cameras]
+        return list(self.renderer.render_views(self.resident, captures))
+
+    def refuse_inside(self, number: int, light: PointLight) -> None:
+        """Raise InputError for a light that reaches no marker and has splats near it on all sides."""
+        place = np.array(light.position)
+        (frame,) = self.panoramas(place[None], 16, 1e-4, outputs=("alpha", "depth_median"))
+        near = max(light.radius, _WALL)
+        blocked = (np.asarray(frame["alpha"]) > 0.5) & (np.asarray(frame["depth_median"]) < near)
+        if blocked.mean() > 0.7:
+            raise InputError(
+                f"lights[{number}] must be outside of surfaces, got the position {tuple(light.position)}, "
+                f"which has splats within {near:g} m on all sides; move it"
+            )
+
+
+class _Points(NamedTuple):
+    """Points on the splats of a marker at which light is measured: a grid on each box, row by row."""
+
+    local: np.ndarray
+    """(m, 3) in the marker's frame"""
+    owner: np.ndarray
+    """(m,) index of the splat"""
+    counts: np.ndarray
+    """(n, 2) points along the tangents of each splat"""
+    surface: Surface
+    """the points in the world"""
+
+    @property
+    def starts(self) -> np.ndarray:
+        """Index of each splat's first point, (n,)."""
+        return np.cumsum(self.counts.prod(axis=1)) - self.counts.prod(axis=1)
+
+
+class _Light(NamedTuple):
+    """Light at points of a marker."""
+
+    irradiance: np.ndarray
+    """(m, 3)"""
+    field: LightField
+    points: list[tuple[LightPoint, np.ndarray]]
+    """points of lights, and the visibility (m,) of each"""
+
+
+def _lit(placed: PlacedMarker, around: _Surroundings) -> PlacedMarker:
+    """A marker with its colours from light."""
+    light = Lighting.of(placed.light)
+    assert light is not None
+    _check_gloss(light, around)
+    cloud = placed.marker.cloud
+    points = _points(placed, light)
+    arriving = _measured(placed, light, points, around)
+    shiny = None if light.roughness is None else Gloss(light.roughness, light.reflectance)
+    seen = arriving.irradiance / np.pi
+    if shiny is not None and light.view == "camera":
+        mirrored, factor = _from_camera(points, arriving, shiny, around)
+        seen = np.concatenate([seen * factor[:, None], mirrored], 1)
+    largest = None if shiny is None or light.view == "camera" else FINEST
+    owner, corners, part = _split(points, seen, light.step, largest)
+    means, scales = _placed_parts(cloud, points, owner, corners)
+    albedo = light.ink + (light.paper - light.ink) * to_light(_rgb(cloud), "srgb")[owner]
+    count = np.bincount(part)
+    mean = np.stack([np.bincount(part, values) / count for values in seen.T], 1)
+    diffuse = albedo * mean[:, :3]
+    colors: dict[str, np.ndarray] = {}
+    if shiny is None or light.view == "camera":
+        total = diffuse if shiny is None else diffuse + mean[:, 3:]
+        colors["colors"] = to_colors(light.exposure * total, light.response)
+    else:
+        shown = [(point, np.bincount(part, one) / count) for point, one in arriving.points]
+        sh = _from_anywhere(placed, light, cloud, owner, means, diffuse, arriving._replace(points=shown))
+        # the scene rotates harmonics from the marker's frame to the world
+        colors["sh"] = rotation_of_coefficients(3, placed.pose[:3, :3].T) @ sh
+    lit = _rebuilt(cloud, owner, means, scales, **colors)
+    return replace(placed, marker=replace(placed.marker, cloud=lit), light=None)
+
+
+def _check_gloss(light: Lighting, around: _Surroundings) -> None:
+    """Raise InputError for gloss that cannot be represented."""
+    if light.roughness is None:
+        return
+    if light.view == "any" and light.roughness < SMOOTHEST:
+        raise InputError(
+            f"light: roughness must be at least {SMOOTHEST:g} with view='any', as harmonics of degree 3 "
+            f"cannot represent sharper reflections, got {light.roughness:g}; use view='camera'"
+        )
+    if light.view == "camera" and around.camera is None:
+        raise InputError("light: view='camera' must have a scene with a camera, got none; add a camera")
+
+
+def _points(placed: PlacedMarker, light: Lighting) -> _Points:
+    """Points on all splats: one on each Gaussian."""
+    cloud, pose = placed.marker.cloud, placed.pose
+    area = 4 * float((cloud.scales[:, 0] * cloud.scales[:, 1]).sum(dtype=np.float64))
+    pitch = max(placed.marker.module / FINEST, np.sqrt(area) / MOST)
+    sides = 2 * cloud.scales.astype(np.float64)
+    boxes = np.ones(len(cloud), bool) if cloud.boxes is None else cloud.boxes
+    boxes = boxes & (cloud.footprint != "gaussian")
+    counts = np.where(boxes[:, None], np.maximum(np.rint(sides / pitch), 1), 1).astype(int)
+    each = counts.prod(axis=1)
+    owner = np.repeat(np.arange(len(cloud)), each)
+    index = np.arange(len(owner)) - np.repeat(np.cumsum(each) - each, each)
+    row, column = np.divmod(index, counts[owner, 0])
+    share = (np.stack([column, row], 1) + 0.5) / counts[owner] * 2 - 1
+    offset = (share * cloud.scales[owner])[:, :, None]
+    turns = quaternion_to_matrix(cloud.quats)
+    local = cloud.world_means()[owner]
+    for axis in (0, 1):
+        local = local + offset[:, axis] * turns[owner, :, axis]
+    # a marker is visible from its -z
+    normals = -turns[owner, :, 2] @ pose[:3, :3].T
+    clearance = placed.marker.size / 20 if light.clearance is None else light.clearance
+    surface = Surface(local @ pose[:3, :3].T + pose[:3, 3], normals, pitch, clearance)
+    return _Points(local, owner, counts, surface)
+
+
+def _measured(placed: PlacedMarker, light: Lighting, points: _Points, around: _Surroundings) -> _Light:
+    """Light at the points, from the panoramas and the lights."""
+    surface, places = points.surface, points.local[:, :2]
+    field = _field(placed, light, points, around)
+    irradiance = np.empty((len(places), 3))
+    for rows in _by_normal(surface.normals):
+        irradiance[rows] = field.irradiance(surface.normals[rows[0]], places[rows])
+    shown = []
+    for number, one in enumerate(around.lights):
+        extent = around.extent(placed.pose[:3, 3])
+        for point in light_points(one, surface.points.mean(axis=0)):
+            seen = visibility(point, surface, around.black[0], extent, around.renderer)
+            if seen.any():
+                around.arrived.add(number)
+                towards, power = point.arriving(surface.points)
+                cosine = np.einsum("mc,mc->m", towards, surface.normals)
+                irradiance += power * (np.maximum(cosine, 0) * seen)[:, None]
+                shown.append((point, seen))
+    return _Light(irradiance, field, shown)
+
+
+def _field(placed: PlacedMarker, light: Lighting, points: _Points, around: _Surroundings) -> LightField:
+    """Radiance around the marker from splats and background. Raises InputError if it is black."""
+    surface, places = points.surface, points.local[:, :2]
+
+    def radiance_at(wanted: np.ndarray) -> np.ndarray:
+        nearest = np.array([np.argmin(((places - place) ** 2).sum(axis=1)) for place in wanted])
+        local = points.local[nearest].copy()
+        local[:, :2] = wanted  # on the sheet between its splats, too
+        at = local @ placed.pose[:3, :3].T + placed.pose[:3, 3]
+        at = at + max(surface.clearance, 1e-6) * surface.normals[nearest]
+        parts: dict[str, Any] = {"outputs": ("rgb", "alpha")}
+        if light.ambient is not None:
+            parts["background"] = (0.0, 0.0, 0.0)
+        frames = around.panoramas(at, light.rows, 1e-4, **parts)
+        found = []
+        for frame in frames:
+            radiance = to_light(frame["rgb"], light.response).reshape(-1, 3)
+            if light.ambient is not None:
+                radiance = radiance + (1 - np.asarray(frame["alpha"]).reshape(-1, 1)) * light.ambient
+            found.append(radiance)
+        return np.stack(found)
+
+    if light.source == "lights":
+        ambient = (0.0, 0.0, 0.0) if light.ambient is None else light.ambient
+        return LightField.uniform(ambient)
+    normal = unit(surface.normals.mean(axis=0))
+    field = LightField.measured(light.rows, places, radiance_at, normal, light.step)
+    if light.ambient is None and field.radiance.max() < _DARK:
+        raise InputError(
+            f"the panorama at marker {placed.label}, {placed.marker.spec}, must show something, got black; "
+            "add splats or a background, name ambient light (ambient = [0.5, 0.5, 0.5]), or use light = "
+            "'lights'"
+        )
+    return field
+
+
+def _by_normal(normals: np.ndarray) -> Iterator[np.ndarray]:
+    """Indices of the rows with each normal."""
+    _, group = np.unique(np.rint(normals * 1e4), axis=0, return_inverse=True)
+    order = np.argsort(group.ravel(), kind="stable")
+    yield from np.split(order, np.flatnonzero(np.diff(group.ravel()[order])) + 1)
+
+
+def _split(
+    points: _Points, seen: np.ndarray, step: float, largest: int | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Parts of the splats in which values (m, c) at the points differ by at most `step` of the largest.
+
+    largest: largest number of points along a side of a part.
+
+    Returns the splat (p,) of each part, its first and last columns and rows (p, 4) x0, y0, x1, y1 on the grid
+    of the splat, half-open, and the part (m,) of each point.
+    """
+    limit = step * max(float(seen.max(initial=0.0)), 1e-12)
+    owner, corners, part = [], [], np.empty(len(seen), np.int64)
+    for splat, (start, (width, height)) in enumerate(zip(points.starts, points.counts, strict=True)):
+        grid = seen[start : start + width * height].reshape(height, width, -1)
+        index = np.arange(start, start + width * height).reshape(height, width)
+        remaining = [(0, 0, int(width), int(height))]
+        while remaining:
+            x0, y0, x1, y1 = remaining.pop()
+            across, down = x1 - x0, y1 - y0
+            here = grid[y0:y1, x0:x1]
+            same = (here.max(axis=(0, 1)) - here.min(axis=(0, 1))).max() <= limit
+            small = largest is None or max(across, down) <= largest
+            if (same and small) or across == down == 1:
+                part[index[y0:y1, x0:x1]] = len(owner)
+                owner.append(splat)
+                corners.append((x0, y0, x1, y1))
+            elif across >= down:
+                middle = x0 + across // 2
+                remaining += [(middle, y0, x1, y1), (x0, y0, middle, y1)]
+            else:
+                middle = y0 + down // 2
+                remaining += [(x0, middle, x1, y1), (x0, y0, x1, middle)]
+    return np.array(owner), np.array(corners), part
+
+
+def _placed_parts(
+    cloud: SplatCloud, points: _Points, owner: np.ndarray, corners: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (p, 3) in the marker's frame, and scales (p, 2), of parts."""
+    shares = corners.reshape(-1, 2, 2) / points.counts[owner][:, None]
+    offset = (shares.sum(axis=1) - 1) * cloud.scales[owner]
+    scales = (shares[:, 1] - shares[:, 0]) * cloud.scales[owner]
+    turns = quaternion_to_matrix(cloud.quats)[owner]
+    means = cloud.means[owner] + offset[:, :1] * turns[:, :, 0] + offset[:, 1:] * turns[:, :, 1]
+    return means, scales
+
+
+def _from_camera(
+    points: _Points, arriving: _Light, shiny: Gloss, around: _Surroundings
+) -> tuple[np.ndarray, np.ndarray]:
+    """Radiance (m, 3) that the points reflect to the scene's camera, and the factor (m,) of their matte
+    colour."""
+    surface = points.surface
+    camera = around.camera
+    assert camera is not None
+    if isinstance(camera.lens, Orthographic):
+        viewers = np.broadcast_to(-camera.world_to_camera[2, :3], surface.points.shape)
+    else:
+        viewers = unit(camera.position - surface.points)
+    found = np.empty((len(viewers), 3))
+    for start in range(0, len(viewers), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        shown = [(point, one[rows]) for point, one in arriving.points]
+        normals = surface.normals[rows]
+        directions, weights = lobe(viewers[rows, None], normals, shiny)
+        radiance = arriving.field.arriving(directions[:, 0], points.local[rows, :2])
+        found[rows] = np.einsum("nk,nkc->nc", weights[:, 0], radiance)
+        found[rows] += _highlights(surface.points[rows], normals, viewers[rows, None], shiny, shown)[:, 0]
+    cosine = np.einsum("mc,mc->m", viewers, surface.normals)
+    return found, 1 - fresnel(cosine, shiny.reflectance)
+
+
+def _highlights(
+    places: np.ndarray,
+    normals: np.ndarray,
+    viewers: np.ndarray,
+    shiny: Gloss,
+    shown: list[tuple[LightPoint, np.ndarray]],
+) -> np.ndarray:
+    """Reflections (n, v, 3) of lights at places (n, 3) towards viewers (n, v, 3)."""
+    found = np.zeros(viewers.shape)
+    cosine = np.einsum("nvc,nc->nv", viewers, normals)
+    for point, seen in shown:
+        towards, power = point.arriving(places)
+        reflected = gloss(cosine, viewers, towards, normals, shiny)
+        found += reflected[..., None] * (power * seen[:, None])[:, None]
+    return found
+
+
+def _from_anywhere(
+    placed: PlacedMarker,
+    light: Lighting,
+    cloud: SplatCloud,
+    owner: np.ndarray,
+    means: np.ndarray,
+    diffuse: np.ndarray,
+    arriving: _Light,
+) -> np.ndarray:
+    """Harmonics (p, 16, 3) in the world of the colours of parts."""
+    assert light.roughness is not None
+    shiny, rotation = Gloss(light.roughness, light.reflectance), placed.pose[:3, :3]
+    places = (means + cloud.origin) @ rotation.T + placed.pose[:3, 3]
+    normals = -quaternion_to_matrix(cloud.quats)[owner, :, 2] @ rotation.T
+    sh = np.empty((len(owner), 16, 3))
+    for same in _by_normal(normals):
+        normal = normals[same[0]]
+        views = view_directions(normal)
+        directions, weights = lobe(views[None], normal[None], shiny)
+        factor = 1 - fresnel(views @ normal, shiny.reflectance)
+        mirrored = arriving.field.reflected(directions[0], weights[0])
+        for start in range(0, len(same), _CHUNK):
+            rows = same[start : start + _CHUNK]
+            shown = [(point, one[rows]) for point, one in arriving.points]
+            viewers = np.broadcast_to(views, (len(rows), *views.shape))
+            total = _highlights(places[rows], normals[rows], viewers, shiny, shown)
+            total += factor[:, None] * diffuse[rows, None]
+            total += arriving.field.interpolated(mirrored, means[rows, :2])
+            sh[rows] = fit_harmonics(views, to_colors(light.exposure * total, light.response))
+    return sh
+
+
+def _rgb(cloud: SplatCloud) -> np.ndarray:
+    """Colours (n, 3) of a marker's splats."""
+    colors = cloud.plain_colors
+    if colors is None:
+        raise InputError(
+            f"a marker with light must have plain colours, got harmonics of degree {cloud.sh_degree}; leave "
+            "out its light"
+        )
+    return colors
+
+
+def _rebuilt(
+    cloud: SplatCloud,
+    owner: np.ndarray | None = None,
+    means: np.ndarray | None = None,
+    scales: np.ndarray | None = None,
+    **colors: np.ndarray,
+) -> SplatCloud:
+    """A cloud of parts of splats, or of all splats, in other colours. owner: (p,) splat of each part."""
+    rows = np.arange(len(cloud)) if owner is None else owner
+    scales = cloud.scales[rows] if scales is None else scales
+    if cloud.thickness is not None:
+        scales = np.column_stack([scales, cloud.thickness[rows]])
+    built = SplatCloud(
+        cloud.means[rows] if means is None else means.astype(np.float32),
+        cloud.quats[rows],
+        scales,
+        cloud.opacities[rows],
+        labels=cloud.labels[rows],
+        origin=cloud.origin,
+        **colors,
+    )
+    if cloud.boxes is not None:
+        built = built.with_boxes(cloud.boxes[rows])
+    groups = cloud.coplanar_groups
+    return built if groups is None else built.with_coplanar_groups(groups[rows])

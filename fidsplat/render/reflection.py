@@ -1,0 +1,151 @@
+"""Reflection of light by a surface: Lambert's law, and gloss by the microfacet model GGX.
+
+GGX with Smith's height-correlated masking (Walter et al. 2007, Heitz 2014) and Schlick's Fresnel factor.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fidsplat.splats.harmonics import C0, MAX_DEGREE, sh_basis
+
+_DIRECTIONS = 256
+_GRAZING = 0.05
+"""smallest cosine of a fitted direction from the normal: markers are not legible beyond 87 degrees"""
+_LOBE = 64
+_BELOW = 1e-6
+
+
+class Gloss(NamedTuple):
+    """A glossy surface."""
+
+    roughness: float
+    reflectance: float
+    """at normal incidence"""
+
+    @property
+    def alpha(self) -> float:
+        """Width of the distribution of microfacet normals."""
+        return self.roughness**2
+
+
+def to_light(colors: np.ndarray, response: str | float) -> np.ndarray:
+    """Linear light of colours; the curve of sRGB continues above 1."""
+    colors = np.maximum(np.asarray(colors, np.float64), 0)
+    if response == "linear":
+        return colors
+    if response == "srgb":
+        return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    return colors ** float(response)
+
+
+def to_colors(light: np.ndarray, response: str | float) -> np.ndarray:
+    """Colours of linear light, the inverse of `to_light`."""
+    light = np.maximum(np.asarray(light, np.float64), 0)
+    if response == "linear":
+        return light
+    if response == "srgb":
+        return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return light ** (1 / float(response))
+
+
+def fresnel(cosine: np.ndarray, reflectance: float) -> np.ndarray:
+    """Schlick's approximation of the Fresnel factor."""
+    return reflectance + (1 - reflectance) * (1 - np.clip(cosine, 0, 1)) ** 5
+
+
+def gloss(
+    cosine: np.ndarray, to_viewer: np.ndarray, to_light: np.ndarray, normal: np.ndarray, surface: Gloss
+) -> np.ndarray:
+    """Radiance towards viewers (n, v, 3) per irradiance that a surface facing the light would receive, (n,
+    v): the BRDF times the cosine of the light.
+
+    cosine: (n, v) of viewer and normal (n, 3); to_light: (n, 3).
+    """
+    square = surface.alpha**2
+    light = np.einsum("nc,nc->n", to_light, normal)[:, None]
+    above = (cosine > _BELOW) & (light > _BELOW)
+    view, light = np.maximum(cosine, _BELOW), np.maximum(light, _BELOW)
+    along = np.einsum("nvc,nc->nv", to_viewer, to_light)
+    length = np.sqrt(np.maximum(2 + 2 * along, 1e-12))
+    half = (view + light) / length
+    distribution = square / (np.pi * (half**2 * (square - 1) + 1) ** 2)
+    masking = 0.5 / (light * _slope(view, square) + view * _slope(light, square))
+    factor = fresnel((1 + along) / length, surface.reflectance)  # by viewer and half vector
+    return np.where(above, distribution * masking * factor * light, 0.0)
+
+
+def lobe(to_viewer: np.ndarray, normal: np.ndarray, surface: Gloss) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (n, v, k, 3) from which reflected light comes, and their weights (n, v, k): the sum of
+    weights times radiance is the radiance towards viewers (n, v, 3).
+
+    Visible normals are sampled (Heitz 2018) at the points of a Hammersley set.
+    """
+    square, i = surface.alpha**2, np.arange(_LOBE)
+    radius, angle = np.sqrt((i + 0.5) / _LOBE), 2 * np.pi * _van_der_corput(_LOBE)
+    axes = np.concatenate([_frames(normal), normal[:, None]], 1)
+    local = np.einsum("nvd,ncd->nvc", to_viewer, axes)
+    stretched = local * (surface.alpha, surface.alpha, 1.0)
+    stretched = (stretched / np.linalg.norm(stretched, axis=-1, keepdims=True))[..., None, :]
+    first = np.cross((0.0, 0.0, 1.0), stretched)
+    across = np.linalg.norm(first, axis=-1, keepdims=True)
+    first = np.where(across > 1e-9, first / np.maximum(across, 1e-9), (1.0, 0.0, 0.0))
+    second = np.cross(stretched, first)
+    one, share = radius * np.cos(angle), (1 + stretched[..., 2]) / 2
+    two = (1 - share) * np.sqrt(1 - one**2) + share * (radius * np.sin(angle))
+    three = np.sqrt(np.maximum(1 - one**2 - two**2, 0))
+    half = one[:, None] * first + two[..., None] * second + three[..., None] * stretched
+    half *= (surface.alpha, surface.alpha, 1.0)
+    half[..., 2] = np.maximum(half[..., 2], 1e-9)
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    local = local[..., None, :]
+    cosine = np.sum(local * half, axis=-1, keepdims=True)
+    found = 2 * cosine * half - local
+    light, view = found[..., 2], np.maximum(local[..., 2], _BELOW)
+    above = light > _BELOW
+    masking = light * (view + _slope(view, square))
+    masking = masking / (light * _slope(view, square) + view * _slope(light, square))
+    weights = np.where(above, fresnel(cosine[..., 0], surface.reflectance) * masking / _LOBE, 0.0)
+    return np.einsum("nvkc,ncd->nvkd", found, axes), weights
+
+
+def _slope(cosine: np.ndarray, square: float) -> np.ndarray:
+    return np.sqrt(cosine**2 * (1 - square) + square)
+
+
+def _van_der_corput(count: int) -> np.ndarray:
+    """The first numbers of the sequence in base 2, (count,)."""
+    bits = np.arange(count)[:, None] >> np.arange(16) & 1
+    return bits @ 0.5 ** np.arange(1, 17)
+
+
+def _frames(normals: np.ndarray) -> np.ndarray:
+    """Two unit vectors (n, 2, 3) perpendicular to normals (n, 3) and to each other."""
+    helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    x = np.cross(normals, helper)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.stack([x, np.cross(normals, x)], 1)
+
+
+def view_directions(normal: np.ndarray) -> np.ndarray:
+    """Unit directions (v, 3) from a surface to viewers, evenly over the hemisphere of its normal (3,)."""
+    i = np.arange(_DIRECTIONS)
+    height = _GRAZING + (1 - _GRAZING) * (i + 0.5) / _DIRECTIONS
+    angle, radius = i * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - height**2)
+    x, y = _frames(normal[None])[0]
+    local = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
+    return local @ np.stack([x, y, normal])
+
+
+def fit_harmonics(to_viewer: np.ndarray, colors: np.ndarray) -> np.ndarray:
+    """Harmonics (n, 16, 3) of degree 3 for colours (n, v, 3) in directions (v, 3), by least squares.
+
+    Directions on the hemisphere alone leave the other one free; the smallest coefficients are chosen.
+    """
+    basis = sh_basis(MAX_DEGREE, -to_viewer)  # of the direction from the camera to the splat
+    base = colors.mean(axis=1, keepdims=True)
+    fitted = np.einsum("kv,nvc->nkc", np.linalg.pinv(basis, rcond=1e-3), colors - base)
+    fitted[:, 0] += (base[:, 0] - 0.5) / C0
+    return fitted

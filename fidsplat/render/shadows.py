@@ -1,0 +1,178 @@
+"""Shadow maps: transmittance of the splats between points of a light and a marker."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from fidsplat.cameras import Camera, look_at_matrix
+from fidsplat.cameras.lenses import Orthographic
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.environment import ExternalDepth
+from fidsplat.scenes.lights import Light, PointLight, SpotLight, Sun
+
+if TYPE_CHECKING:
+    from fidsplat.render.resident import ResidentCloud
+
+MAX_PIXELS = 512
+"""pixels of a shadow map along a side"""
+_MARGIN = 4
+"""pixels around the marker"""
+_WIDEST = np.tan(np.radians(80))
+"""tangent of the largest half field of view of a shadow map; beyond it there are no shadows"""
+
+
+class Surface(NamedTuple):
+    """Measured points of a marker."""
+
+    points: np.ndarray
+    """(m, 3) in the world"""
+    normals: np.ndarray
+    """(m, 3) unit, towards the viewer"""
+    pitch: float
+    """metres between neighbours"""
+    clearance: float
+    """metres in front of the marker in which splats do not occlude"""
+
+
+class LightPoint(NamedTuple):
+    """One of the points of a light from which its shadows are rendered."""
+
+    light: Light
+    place: np.ndarray
+    """(3,) its position; of a sun the direction of its light"""
+    share: float
+    """of the light's intensity"""
+
+    def arriving(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Unit directions (m, 3) towards the light, and irradiance (m, 3) of facing surfaces without
+        shadows."""
+        power = self.share * self.light.power
+        if isinstance(self.light, Sun):
+            return np.broadcast_to(-self.place, points.shape), np.broadcast_to(power, points.shape)
+        towards = self.place - points
+        distance = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
+        towards, irradiance = towards / distance, power / distance**2
+        if isinstance(self.light, SpotLight):
+            low, high = np.cos(self.light.outer), np.cos(self.light.inner)
+            cosine = -towards @ unit(np.array(self.light.direction))
+            irradiance = irradiance * np.clip((cosine - low) / (high - low), 0, 1)[:, None] ** 2
+        return towards, irradiance
+
+
+def light_points(light: Light, middle: np.ndarray) -> list[LightPoint]:
+    """Points of the disk that a light shows at a place (3,)."""
+    size = light.angle if isinstance(light, Sun) else getattr(light, "radius", 0.0)
+    count = light.samples if size > 0 else 1
+    i = np.arange(count)
+    radius, angle = np.sqrt((i + 0.5) / count) * (count > 1), i * np.pi * (3 - np.sqrt(5))
+    disk = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    if isinstance(light, Sun):
+        axis = unit(np.array(light.direction))
+        places = unit(axis + np.tan(size / 2) * (disk @ _across(axis)))
+    else:
+        assert isinstance(light, PointLight)
+        center = np.array(light.position)
+        places = center + size * (disk @ _across(unit(center - middle)))
+    return [LightPoint(light, place, 1 / count) for place in places]
+
+
+def visibility(
+    point: LightPoint, surface: Surface, black: ResidentCloud, extent: float, renderer: Any
+) -> np.ndarray:
+    """Transmittance (m,) float32 between the surface's points and a point of a light; 0 where the surface
+    faces away.
+
+    The marker is an opaque white surface in an external depth image, and the other splats are black, so that
+    the image from the light is the transmittance.
+
+    black: the other splats with the colour 0. extent: largest distance of a splat from the marker.
+    """
+    towards, irradiance = point.arriving(surface.points)
+    found = np.zeros(len(towards), np.float32)
+    lit = (np.einsum("mc,mc->m", towards, surface.normals) > 0) & (irradiance > 0).any(axis=1)
+    if lit.any():
+        points = surface.points[lit]
+        camera = _camera(point, points, surface.pitch, extent + surface.clearance)
+        depth = _depth_image(camera, points + surface.clearance * surface.normals[lit])
+        image = ExternalDepth(np.ones((*depth.shape, 3), np.float32), depth)
+        seen = renderer.render(black, Capture(camera, external_depth=image))["rgb"][..., 0]
+        found[lit] = _bilinear(np.asarray(seen), camera.project(points))
+    return found
+
+
+def _camera(point: LightPoint, points: np.ndarray, pitch: float, extent: float) -> Camera:
+    """Camera of a shadow map: at the point of the light; of a sun beyond all splats."""
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    reach = max(float(np.linalg.norm(points - middle, axis=1).max()), pitch)
+    inner = int(np.clip(np.ceil(2 * reach / pitch), 8, MAX_PIXELS))
+    side = inner + 2 * _MARGIN
+    if isinstance(point.light, Sun):
+        pose = look_at_matrix(middle - (extent + 2 * reach) * point.place, middle, _across(point.place)[0])
+        return Camera.orthographic(side, side, 2 * reach * side / inner, pose, near=1e-6)
+    away = float(np.linalg.norm(middle - point.place))
+    tangent = min(reach / np.sqrt(max(away**2 - reach**2, 1e-12)), _WIDEST)
+    focal = inner / (2 * tangent)
+    pose = look_at_matrix(point.place, middle, _across(unit(middle - point.place))[0])
+    return Camera.pinhole(side, side, focal, focal, side / 2, side / 2, pose, near=min(1e-3, away / 10))
+
+
+def _depth_image(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Depth (h, w) of the surface through points (m, 3): their plane, and their distances from it.
+
+    The depth of a plane is linear in the pixels for parallel rays, and its inverse in a pinhole image.
+    """
+    pixels = camera.project(points)
+    z = (points - camera.position) @ camera.world_to_camera[2, :3]
+    inverse = not isinstance(camera.lens, Orthographic)
+    value = 1 / np.maximum(z, 1e-9) if inverse else z
+    inside = np.isfinite(pixels).all(axis=1)
+    pixels, value = pixels[inside], value[inside]
+    plane = np.linalg.lstsq(_affine(pixels), value, rcond=None)[0]
+    height, width = camera.height, camera.width
+    grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
+    image = (_affine(grid) @ plane).reshape(height, width)
+    off = value - _affine(pixels) @ plane
+    if len(off) and np.abs(off).max() > 1e-6 * np.abs(value).max():  # a curved surface
+        column, row = np.clip(pixels.astype(int), 0, (width - 1, height - 1)).T
+        total, count = np.zeros((height, width)), np.zeros((height, width))
+        np.add.at(total, (row, column), off)
+        np.add.at(count, (row, column), 1)
+        for dy in (-1, 0, 1):  # also next to the pixels of points
+            for dx in (-1, 0, 1):
+                if dx or dy:
+                    total += 1e-6 * np.roll(total, (dy, dx), (0, 1))
+                    count += 1e-6 * np.roll(count, (dy, dx), (0, 1))
+        image += np.where(count > 0, total / np.maximum(count, 1e-30), 0)
+    with np.errstate(divide="ignore"):
+        depth = np.where(image > 0, 1 / image, np.inf) if inverse else image
+    return np.where(depth > 0, depth, np.inf).astype(np.float32)
+
+
+def _affine(pixels: np.ndarray) -> np.ndarray:
+    return np.column_stack([pixels, np.ones(len(pixels))])
+
+
+def _bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Values of an image (h, w) at pixel coordinates (m, 2); 1 outside."""
+    height, width = image.shape
+    inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)  # False for NaN
+    x, y = np.clip(np.where(inside.reshape(-1, 1), pixels, 0) - 0.5, 0, (width - 1, height - 1)).T
+    left, top = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
+    right, below = x - left, y - top
+    upper = image[top, left] * (1 - right) + image[top, left + 1] * right
+    lower = image[top + 1, left] * (1 - right) + image[top + 1, left + 1] * right
+    return np.where(inside, upper * (1 - below) + lower * below, 1.0)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) of length 1; (0, 0, 1) for those of length 0."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > 0, vectors / np.where(length > 0, length, 1), (0.0, 0.0, 1.0))
+
+
+def _across(axis: np.ndarray) -> np.ndarray:
+    """Two unit vectors (2, 3) perpendicular to an axis (3,) and to each other."""
+    first = unit(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]))
+    return np.stack([first, np.cross(axis, first)])

@@ -1,0 +1,258 @@
+"""Light of markers: lights in the scene, and how a marker's colours follow from light."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import MISSING, dataclass, fields
+from typing import Any, ClassVar
+
+import numpy as np
+
+from fidsplat.capture.environment import three_numbers
+from fidsplat.capture.sensor import GAMMAS
+from fidsplat.scenes.table import Table, names_of
+from fidsplat.util.arguments import LARGEST, as_float, invalid, number, own_scalars, whole_number
+from fidsplat.util.errors import InputError, unknown
+
+SOURCES = ("scene", "lights")
+VIEWS = ("any", "camera")
+MAX_SAMPLES = 1024
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """How the colours of a marker follow from the light that it receives.
+
+    The reflectance of a splat of colour c is `ink` + (`paper` - `ink`) c, with c in linear light. Matte
+    paper of reflectance 1 under radiance L from all sides has the radiance L. Raises InputError for a value
+    out of range.
+    """
+
+    source: str = "scene"
+    """"scene": the splats and background around the marker, and the scene's lights; "lights": these only"""
+    paper: float = 0.85
+    """reflectance of white, 0 to 1"""
+    ink: float = 0.05
+    """reflectance of black, 0 to 1, at most that of paper"""
+    roughness: float | None = None
+    """0.1 to 1: a glossy surface (GGX, alpha = roughness squared); None: matte"""
+    reflectance: float = 0.04
+    """Fresnel reflectance of the glossy surface at normal incidence, 0 to 1"""
+    view: str = "any"
+    """gloss "any": spherical harmonics of degree 3, from every direction; "camera": exact at the scene's
+    camera"""
+    exposure: float = 1.0
+    """factor of the light, at least 0"""
+    response: str | float = "srgb"
+    """response of the scene's colours to light: "srgb", "linear", or a gamma as in `Sensor.response`; values
+    above 1 are kept"""
+    ambient: tuple[float, float, float] | None = None
+    """linear RGB radiance where the panorama contains no splats; None: the scene's background"""
+    rows: int = 32
+    """rows of the panorama that is rendered at each measured point, 8 to 1024"""
+    step: float = 0.02
+    """largest difference of light within a rectangle, relative to the marker's largest; above it the
+    rectangle is split"""
+    clearance: float | None = None
+    """splats within this many metres in front of the marker do not occlude light; None: size / 20"""
+
+    def __post_init__(self) -> None:
+        own_scalars(self)
+        for name, known in (("source", SOURCES), ("view", VIEWS)):
+            value = getattr(self, name)
+            if value not in known:
+                raise InputError(unknown(f"{name} of a marker's light", str(value), known))
+        for name, low, high in (
+            ("paper", 0, 1),
+            ("ink", 0, self.paper),
+            ("reflectance", 0, 1),
+            ("exposure", 0, LARGEST),
+            ("step", 1e-4, 1),
+            *([("roughness", 0.1, 1)] if self.roughness is not None else []),
+            *([("clearance", 0, LARGEST)] if self.clearance is not None else []),
+        ):
+            number(f"light: {name}", getattr(self, name), f"a number from {low:g} to {high:g}", low, high)
+        whole_number("light: rows", self.rows, 8, 1024)
+        if self.ambient is not None:
+            object.__setattr__(self, "ambient", _radiance("light: ambient", self.ambient))
+        if self.response not in ("srgb", "linear") or isinstance(self.response, bool):
+            requirement = '"srgb", "linear" or a gamma from {:g} to {:g}'.format(*GAMMAS)
+            number("light: response", self.response, requirement, *GAMMAS)
+
+    @staticmethod
+    def of(value: Any) -> Lighting | None:
+        """A Lighting from itself, the name of a source, or None. Raises InputError for anything else."""
+        if value is None or isinstance(value, Lighting):
+            return value
+        if isinstance(value, str):
+            return Lighting(value)
+        raise invalid("a marker's light", "'scene', 'lights', an fs.Lighting or None", value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Light:
+    """A light in the scene: the common part of `Sun`, `PointLight` and `SpotLight`.
+
+    Lights illuminate markers with `light`; captured splats keep their colours. Raises InputError for a value
+    out of range.
+    """
+
+    kind: ClassVar[str]
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """linear RGB, factors of the intensity, at least 0"""
+    intensity: float = 1.0
+    """irradiance of a surface that faces the sun; of other lights that at a distance of 1 m on the axis"""
+    samples: int = 32
+    """points of the light from which shadows are rendered, 1 to 1024; more make softer edges smoother"""
+
+    def __post_init__(self) -> None:
+        own_scalars(self)
+        self._number("intensity", 0, LARGEST)
+        whole_number(f"{self.kind}: samples", self.samples, 1, MAX_SAMPLES)
+        object.__setattr__(self, "color", _radiance(f"{self.kind}: color", self.color))
+        for name in ("position", "direction"):
+            if name in self.__dataclass_fields__:
+                vector = three_numbers(f"{self.kind}: {name}", getattr(self, name))
+                if name == "direction" and not 0 < np.linalg.norm(vector) < math.inf:
+                    raise invalid(f"{self.kind}: direction", "three numbers, not all 0", vector)
+                object.__setattr__(self, name, vector)
+
+    def _number(self, name: str, low: float, high: float) -> None:
+        requirement = f"a number from {low:g} to {high:g}"
+        number(f"{self.kind}: {name}", getattr(self, name), requirement, low, high)
+
+    @property
+    def power(self) -> np.ndarray:
+        """Intensity in each channel, (3,)."""
+        return self.intensity * np.array(self.color)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sun(Light):
+    """A light at infinity."""
+
+    kind: ClassVar[str] = "sun"
+    direction: tuple[float, float, float]
+    """world direction in which its light travels, of any length"""
+    angle: float = math.radians(0.53)
+    """angular diameter in radians, 0 to 3"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._number("angle", 0, 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointLight(Light):
+    """A sphere that radiates equally in all directions."""
+
+    kind: ClassVar[str] = "point"
+    position: tuple[float, float, float]
+    """metres in the world"""
+    radius: float = 0.0
+    """metres"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._number("radius", 0, LARGEST)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpotLight(PointLight):
+    """A sphere whose light is limited to a cone."""
+
+    kind: ClassVar[str] = "spot"
+    direction: tuple[float, float, float]
+    """axis of the cone in the world, of any length"""
+    inner: float = 0.0
+    """angle from the axis in radians up to which the intensity is constant"""
+    outer: float = math.radians(45)
+    """angle from the axis in radians from which it is 0, above `inner`, at most pi / 2"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._number("inner", 0, math.pi / 2)
+        self._number("outer", 0, math.pi / 2)
+        if not self.inner < self.outer:
+            raise InputError(f"spot: outer must be above inner, got {self.outer:g} and {self.inner:g}")
+
+
+LIGHTS: dict[str, type[Light]] = {kind.kind: kind for kind in (Sun, PointLight, SpotLight)}
+_ANGLES = ("angle", "inner", "outer")
+"""fields in radians, whose keys in scene files are NAME_deg"""
+
+
+def read_lights(top: Table) -> tuple[Light, ...]:
+    """The lights of the tables [[lights]]. Raises InputError, naming the key."""
+    found = []
+    every = {_key(name) for kind in LIGHTS.values() for name in names_of(kind)}
+    for any_kind in top.tables("lights", ("kind", *sorted(every))):
+        name = any_kind.text("kind")
+        if name not in LIGHTS:
+            raise any_kind.error("kind", f"must be {', '.join(LIGHTS)}, got {name!r}")
+        kind = LIGHTS[name]
+        table = any_kind.narrowed(("kind", *map(_key, names_of(kind))))
+        values = {}
+        for field in fields(kind):
+            key = _key(field.name)
+            if key not in table and field.default is not MISSING:
+                continue
+            if str(field.type).startswith("tuple"):
+                value = table.numbers(key, 3)
+            else:
+                value = table.whole(key) if field.type == "int" else table.number(key)
+            values[field.name] = math.radians(value) if key != field.name else value
+        with table.at():
+            found.append(kind(**values))
+    return tuple(found)
+
+
+def light_tables(lights: tuple[Light, ...]) -> Iterator[dict[str, Any]]:
+    """Content of the tables [[lights]]."""
+    for light in lights:
+        table: dict[str, Any] = {"kind": light.kind}
+        for field in fields(light):
+            value = getattr(light, field.name)
+            if value != field.default:
+                key = _key(field.name)
+                value = math.degrees(value) if key != field.name else value
+                table[key] = list(value) if isinstance(value, tuple) else value
+        yield table
+
+
+def read_lighting(marker: Table) -> Lighting | None:
+    """The light of a [[markers]] table: the name of a source, or a table. Raises InputError."""
+    if "light" not in marker:
+        return None
+    if marker.is_text("light"):
+        with marker.at("light"):
+            return Lighting.of(marker.text("light"))
+    table = marker.table("light", names_of(Lighting))
+    with table.at():
+        return Lighting(**table.values(Lighting))
+
+
+def lighting_value(light: Lighting | None) -> dict[str, Any]:
+    """The key `light` of a [[markers]] table; empty without light."""
+    if light is None:
+        return {}
+    plain = Lighting()
+    changes = {name: getattr(light, name) for name in names_of(Lighting)}
+    changes = {name: value for name, value in changes.items() if value != getattr(plain, name)}
+    if set(changes) <= {"source"}:
+        return {"light": light.source}
+    lists = {name: list(value) if isinstance(value, tuple) else value for name, value in changes.items()}
+    return {"light": lists}
+
+
+def _key(name: str) -> str:
+    return f"{name}_deg" if name in _ANGLES else name
+
+
+def _radiance(name: str, value: Any) -> tuple[float, float, float]:
+    """Validated RGB of at least 0."""
+    color = three_numbers(name, value)
+    if min(map(as_float, color)) < 0:
+        raise invalid(name, "three numbers of at least 0", value)
+    return color
