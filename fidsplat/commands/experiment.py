@@ -19,6 +19,7 @@ from fidsplat.commands.localise import Localise
 from fidsplat.commands.options import Json, RayAddress, repeatable, require_packages
 from fidsplat.commands.output import console, print_lines, report, show_progress
 from fidsplat.commands.sweeps import measure_on_cluster, run_sweeps
+from fidsplat.commands.tags import Tags
 from fidsplat.experiments.settings import (
     AngleSettings,
     ExperimentSettings,
@@ -217,6 +218,7 @@ class Experiment:
         "localisation": Localisation,
         "localise": Localise,
         "calibrate": Calibrate,
+        "tags": Tags,
         "pictures": Pictures,
         "dataset": Dataset,
         "baseline": Baseline,

@@ -175,12 +175,12 @@ class Merge:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.experiments import trained
+        from fidsplat.experiments import tags, trained
         from fidsplat.experiments.run import NAMES
         from fidsplat.experiments.sweep import merge, missing_shards, result_files
 
         result, lines = {}, []
-        for name in (*NAMES, trained.NAME):
+        for name in (*NAMES, trained.NAME, tags.NAME):
             if not (files := result_files([Path(folder) for folder in self.folders], name)):
                 continue
             target = Path(self.out) / f"{name}.jsonl"

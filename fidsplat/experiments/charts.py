@@ -1,12 +1,13 @@
-"""Charts by matplotlib as SVG: grouped bars, and points with labels that do not overlap."""
+"""Charts by matplotlib as SVG or PNG: grouped bars, and points with labels that do not overlap."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import matplotlib
 import numpy as np
@@ -39,18 +40,32 @@ COLOURS = (
 
 
 @contextmanager
-def chart(file: Path, panels: int = 1, size: tuple[float, float] = (9.0, 4.2), one_scale: bool = True):
+def chart(
+    file: Path, panels: int = 1, size: tuple[float, float] = (9.0, 4.2), one_scale: bool = True, rows: int = 1
+):
     """Figure and its axes side by side; the file is written at the end unless an error is raised.
 
-    size: inches. one_scale: whether all axes share the vertical scale.
+    size: inches. one_scale: whether all axes share the vertical scale. rows: of `panels` axes each.
     """
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)  # to measure texts
-        axes = figure.subplots(1, panels, squeeze=False, sharey=one_scale)[0]
+        axes = figure.subplots(rows, panels, squeeze=False, sharey=one_scale).ravel()
         yield figure, axes
         with atomic_write(file) as stream:
-            figure.savefig(stream, format=file.suffix[1:], metadata={"Date": None})
+            if file.suffix == ".png":
+                _write_png(figure, stream)
+            else:
+                figure.savefig(stream, format=file.suffix[1:], metadata={"Date": None})
+
+
+def _write_png(figure: Figure, stream: IO[bytes]) -> None:
+    """Write a PNG file with a palette, a quarter of the size of one without."""
+    from PIL import Image  # matplotlib requires it
+
+    with io.BytesIO() as content:
+        figure.savefig(content, format="png", dpi=110)
+        Image.open(content).convert("RGB").quantize(128).save(stream, format="png", optimize=True)
 
 
 def bars(axes: Axes, groups: Sequence[str], series: Mapping[str, Values], logarithmic: bool = False) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from fidsplat.experiments import angles, counts, localisation, views
 from fidsplat.experiments.methods import IDEAL, MarkerRenderer
-from fidsplat.experiments.settings import ImageSettings, MeasureSettings, SweepSettings
+from fidsplat.experiments.settings import ImageSettings, MeasureSettings, ShardSettings
 from fidsplat.experiments.setup import MARKERS, PROTOCOLS, TEST_VIEWS, chosen_categories
 from fidsplat.experiments.sweep import Key, Results, Sweep, shard, thread_pool
 from fidsplat.render.renderer import Renderer
@@ -60,7 +60,7 @@ def device_name(renderer: Renderer) -> str:
     return f"{renderer.device.title}, {renderer.device.version}"
 
 
-def results_of(name: str, options: SweepSettings, device: str | None) -> Results:
+def results_of(name: str, options: ShardSettings, device: str | None) -> Results:
     """Results file of an experiment; device: `device_name` of the renderer, or None."""
     versions = reader_versions() | (metric_versions() if name == views.NAME else {})
     return Results(options.file(name), run_facts(device, options.seed, versions), options.overwrite)

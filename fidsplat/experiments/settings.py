@@ -15,13 +15,11 @@ from fidsplat.util.errors import InputError, unknown
 
 
 @dataclass(frozen=True)
-class MarkerSettings:
-    """Markers of an experiment and the folder of its results."""
+class FolderSettings:
+    """Folder of the results of an experiment, and seed."""
 
     out: Path | None = None
     """Folder for results. By default fidsplat-experiments, with --quick fidsplat-experiments-quick."""
-    category: tuple[str, ...] = ()
-    """Category of markers: apriltag, small, medium, large or huge. By default all; repeat for several."""
     seed: int = SEED
     """Seed of texts and views."""
 
@@ -29,6 +27,29 @@ class MarkerSettings:
     def folder(self) -> Path:
         """Folder for results."""
         return self.out or Path("fidsplat-experiments")
+
+
+@dataclass(frozen=True)
+class ShardSettings(FolderSettings):
+    """Part of a sweep that one machine measures."""
+
+    shard: str | None = None
+    """Share of the work to measure, as i/n; `fidsplat experiment merge` joins the shares."""
+    overwrite: bool = False
+    """Replace existing results."""
+
+    def file(self, name: str) -> Path:
+        """File for the results of an experiment."""
+        ending = "" if self.shard is None else "-" + self.shard.replace("/", "-of-")
+        return self.folder / f"{name}{ending}.jsonl"
+
+
+@dataclass(frozen=True)
+class MarkerSettings(FolderSettings):
+    """Markers of an experiment."""
+
+    category: tuple[str, ...] = ()
+    """Category of markers: apriltag, small, medium, large or huge. By default all; repeat for several."""
 
     @property
     def marker_count(self) -> int:
@@ -111,18 +132,8 @@ class BlenderSettings(CountedSettings):
 
 
 @dataclass(frozen=True)
-class SweepSettings(CountedSettings):
-    """Part of a sweep that one machine measures."""
-
-    shard: str | None = None
-    """Share of the work to measure, as i/n; `fidsplat experiment merge` joins the shares."""
-    overwrite: bool = False
-    """Replace existing results."""
-
-    def file(self, name: str) -> Path:
-        """File for the results of an experiment."""
-        ending = "" if self.shard is None else "-" + self.shard.replace("/", "-of-")
-        return self.folder / f"{name}{ending}.jsonl"
+class SweepSettings(ShardSettings, CountedSettings):
+    """Part of a sweep over markers that one machine measures."""
 
 
 @dataclass(frozen=True)

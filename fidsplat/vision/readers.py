@@ -6,15 +6,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from itertools import product
+from threading import local
+from typing import Any
 
 import cv2
 import numpy as np
 import zxingcpp
 
+from fidsplat.images.apriltag3 import LAYOUTS
 from fidsplat.images.tag_dictionaries import predefined
 from fidsplat.util.errors import InputError
 from fidsplat.vision.apriltag_library import read_tags
@@ -27,6 +30,7 @@ ENLARGE = (1.0, 2.0)
 # minimum intersection over union with the code
 MIN_OVERLAP = 0.5
 _MARGIN = 16  # margin in pixels around the foreground
+_of_thread = local()
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +38,7 @@ class Target:
     """The code to detect in an image."""
 
     kind: str
-    """"apriltag" or "qr\""""
+    """"apriltag", "aruco" or "qr\""""
     family: str
     """tag family, e.g. "36h11"; ignored for QR codes"""
     id: int | None
@@ -51,28 +55,50 @@ class Attempt:
     """whether a quadrilateral overlaps the code (`MIN_OVERLAP`), decoded or not"""
     read: bool
     """whether exactly this id or text was decoded"""
+    corners: np.ndarray | None = field(default=None, compare=False)
+    """(4, 2) pixels of the decoded code, TL, TR, BR, BL as printed; None if it was not read"""
 
 
 def _aruco(grey: np.ndarray, target: Target) -> Attempt:
     """OpenCV's aruco module with its defaults."""
     detector = cv2.aruco.ArucoDetector(predefined(target.kind, target.family))
     quads, ids, rejected = detector.detectMarkers(grey)
-    read = ids is not None and target.id in ids.ravel()
     # OpenCV counts from the centre of the first pixel
-    return Attempt(read or _any_over((q.reshape(4, 2) + 0.5 for q in (*quads, *rejected)), target), read)
+    every = [quad.reshape(4, 2) + 0.5 for quad in (*quads, *rejected)]
+    numbers = [] if ids is None else ids.ravel()
+    return attempt_of(zip(map(int, numbers), every, strict=False), target, every)
 
 
 def _pupil(grey: np.ndarray, target: Target) -> Attempt:
     """The AprilTag library at full resolution. It reports only decoded tags."""
-    read = any(number == target.id for number, _ in read_tags(grey, target.family))
-    return Attempt(read, read)
+    tags = read_tags(grey, target.family)
+    if target.family not in LAYOUTS:  # OpenCV prints the families of AprilTag 2 upside down
+        tags = [(number, np.roll(corners, 2, axis=0)) for number, corners in tags]
+    return attempt_of(tags, target)
+
+
+def _locus(grey: np.ndarray, target: Target) -> Attempt:
+    """locus-tag with its defaults. It reports only decoded tags."""
+    found = _locus_detector(target.family).detect(grey)
+    return attempt_of(zip(found.ids.tolist(), found.corners.astype(np.float64), strict=True), target)
+
+
+def _locus_detector(family: str) -> Any:
+    """The detector of this thread: two threads that share one abort the process."""
+    import locus  # type: ignore[import-not-found]
+
+    own = _of_thread.__dict__
+    if family not in own:
+        tags = [getattr(locus.TagFamily, _LOCUS_FAMILIES[family])]
+        own[family] = locus.Detector(families=tags, threads=1)
+    return own[family]
 
 
 def _cv2_qr(grey: np.ndarray, target: Target) -> Attempt:
     """OpenCV's QRCodeDetector."""
     text, quad, _ = cv2.QRCodeDetector().detectAndDecode(grey)
-    read = text == target.payload
-    return Attempt(read or (quad is not None and _any_over([quad.reshape(4, 2) + 0.5], target)), read)
+    every = [] if quad is None else [quad.reshape(4, 2) + 0.5]
+    return attempt_of([(text, quad) for quad in every], target, every)
 
 
 def _zxing(grey: np.ndarray, target: Target, enlarged: tuple[float, float] = (1.0, 1.0)) -> Attempt:
@@ -80,9 +106,9 @@ def _zxing(grey: np.ndarray, target: Target, enlarged: tuple[float, float] = (1.
     codes = zxingcpp.read_barcodes(
         grey, formats=QR_ONLY, text_mode=zxingcpp.TextMode.Plain, return_errors=True
     )
-    quads = (corners_of(code) / enlarged for code in codes)
-    read = any(code.valid and code.text == target.payload for code in codes)
-    return Attempt(read or _any_over(quads, target), read)
+    every = [corners_of(code) / enlarged for code in codes]
+    texts = (code.text if code.valid else None for code in codes)
+    return attempt_of(zip(texts, every, strict=True), target, every)
 
 
 def _zxing_tall(grey: np.ndarray, target: Target) -> Attempt:
@@ -97,18 +123,26 @@ def _zxing_tall(grey: np.ndarray, target: Target) -> Attempt:
         attempt = _zxing(tall, moved, (across, tall.shape[0] / part.shape[0]))
         found = found or attempt.found
         if attempt.read:
-            return attempt
+            assert attempt.corners is not None
+            return Attempt(True, True, attempt.corners + np.array([0.0, top]))
     return Attempt(found, False)
 
 
 _READERS: dict[str, dict[str, Callable[[np.ndarray, Target], Attempt]]] = {
-    "apriltag": {"aruco": _aruco, "pupil": _pupil},
+    "apriltag": {"aruco": _aruco, "pupil": _pupil, "locus": _locus},
+    "aruco": {"aruco": _aruco, "locus": _locus},
     "qr": {"cv2": _cv2_qr, "zxing": _zxing, "zxing-tall": _zxing_tall},
 }
-_PACKAGES = {"aruco": "cv2", "cv2": "cv2", "pupil": "pupil_apriltags"}
+_LOCUS_FAMILIES = {
+    **{"36h11": "AprilTag36h11", "16h5": "AprilTag16h5", "mip_36h12": "ArUcoMip36h12"},
+    **{name: f"ArUco{name}" for name in ("4x4_50", "4x4_100", "6x6_250")},
+}
+_OPTIONAL = {"pupil": ("pupil_apriltags", "pupil-apriltags"), "locus": ("locus", "locus-tag")}
+"""module and package of detectors that may be missing"""
 TITLES = {
     "aruco": "OpenCV aruco",
     "pupil": "AprilTag library (pupil-apriltags)",
+    "locus": "locus-tag",
     "cv2": "OpenCV QRCodeDetector",
     "zxing": "zxing-cpp",
     "zxing-tall": "zxing-cpp, un-foreshortened",
@@ -116,9 +150,31 @@ TITLES = {
 """titles of the detectors"""
 
 
-def readers(kind: str) -> tuple[str, ...]:
-    """Names of the installed detectors for "apriltag" or "qr"."""
-    return tuple(name for name in _READERS[kind] if find_spec(_PACKAGES.get(name, "zxingcpp")) is not None)
+def readers(kind: str, family: str | None = None) -> tuple[str, ...]:
+    """Names of the installed detectors for "apriltag", "aruco" or "qr", of a family if it is given."""
+    missing = missing_readers()
+    return tuple(
+        name
+        for name in _READERS[kind]
+        if name not in missing and (name != "locus" or family is None or family in _LOCUS_FAMILIES)
+    )
+
+
+def missing_readers() -> dict[str, str]:
+    """Packages that must be installed for the detectors that are missing, by the detector's name."""
+    return {name: package for name, (module, package) in _OPTIONAL.items() if find_spec(module) is None}
+
+
+def attempt_of(
+    decoded: Iterable[tuple[int | str | None, np.ndarray]], target: Target, every: Iterable[np.ndarray] = ()
+) -> Attempt:
+    """The result for a target among ids or texts with corners. every: quadrilaterals, decoded or not."""
+    own = target.payload if target.id is None else target.id
+    corners = [quad for name, quad in decoded if name is not None and name == own]
+    if not corners:
+        return Attempt(_any_over(every, target), False)
+    nearest = min(corners, key=lambda quad: float(np.linalg.norm(quad - target.corners)))
+    return Attempt(True, True, nearest)
 
 
 def attempt(name: str, grey: np.ndarray, target: Target) -> Attempt:
@@ -139,7 +195,7 @@ def attempt(name: str, grey: np.ndarray, target: Target) -> Attempt:
 def reader_versions() -> dict[str, str]:
     """Versions of the detectors' packages."""
     found = {"opencv": cv2.__version__}
-    for package in ("zxing-cpp", "pupil-apriltags"):
+    for package in ("zxing-cpp", *(package for _, package in _OPTIONAL.values())):
         try:
             found[package] = version(package)
         except PackageNotFoundError:

@@ -27,9 +27,10 @@ def ideal(category: str, tilt: float, protocol: str = "fixed-module") -> tuple[n
 
 
 def test_the_extra_detector_is_among_those_tested():
-    assert readers("apriltag") == ("aruco", "pupil")
+    assert readers("apriltag") == ("aruco", "pupil", "locus")
+    assert readers("apriltag", "25h9") == ("aruco", "pupil")
     assert readers("qr") == ("cv2", "zxing", "zxing-tall")
-    assert set(reader_versions()) == {"opencv", "zxing-cpp", "pupil-apriltags"}
+    assert set(reader_versions()) == {"opencv", "zxing-cpp", "pupil-apriltags", "locus-tag"}
 
 
 @pytest.mark.parametrize(("kind", "name"), ALL)
@@ -45,8 +46,8 @@ def test_another_code_in_its_place_is_found_at_most_and_not_read(kind, name):
     other = replace(target, id=99) if kind == "apriltag" else replace(target, payload="another")
     result = attempt(name, image, other)
     assert not result.read
-    # the AprilTag library tells nothing of what it does not read as this tag
-    assert result.found == (name != "pupil")
+    # these report only decoded tags
+    assert result.found == (name not in ("pupil", "locus"))
 
 
 @pytest.mark.parametrize("name", ["aruco", "cv2", "zxing"])

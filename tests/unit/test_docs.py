@@ -67,7 +67,7 @@ SMALLER = {
 }
 """options that make a command fast"""
 EXTRAS = {
-    "experiments": ("pandas", "matplotlib", "pupil_apriltags", "flip_evaluator", "jinja2"),
+    "experiments": ("pandas", "matplotlib", "pupil_apriltags", "locus", "flip_evaluator", "jinja2"),
     "logs": ("mcap", "rosbags"),
     "sim": ("mujoco", "gymnasium"),
     "usd": ("pxr",),

@@ -48,6 +48,7 @@ HOME_OF = {
     "cv2": ("images", "vision"),
     "zxingcpp": ("vision",),
     "pupil_apriltags": ("vision",),
+    "locus": ("vision",),
     "flip_evaluator": ("vision",),
     "viser": ("viewer.server", "viewer.guard"),
     "zstandard": ("viewer.guard", "logs.bags", "util.zstd"),

@@ -1,0 +1,285 @@
+"""Causes of failed tag detections, each with a severity from 0 to 1, applied to views of a marker in a
+scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fidsplat.cameras import BrownConrady, Camera, Motion, Shutter
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.environment import Fog
+from fidsplat.capture.sensor import Sensor
+from fidsplat.formats.files import load_splats
+from fidsplat.markers import Marker, marker
+from fidsplat.scenes import PlacedMarker, Scene
+from fidsplat.scenes.captured import fetch_scene
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import rigid_matrix
+from fidsplat.util.arguments import number
+from fidsplat.worlds.greenhouse import AISLE, Greenhouse, facing
+
+WIDTH, HEIGHT, FOV = 640, 480, math.radians(60.0)
+EDGES = 6.0
+"""distance of the camera without a cause, in edges of the code: about 90 pixels per edge"""
+INK, PAPER = 0.05, 0.85
+"""grey of ink and paper"""
+_COVER = 0.16, 0.3, 0.09
+"""colour of an object in front of the marker"""
+
+
+class Place(NamedTuple):
+    """A captured scene, and where its marker is: in front of the figure, facing -z; y points down."""
+
+    position: tuple[float, float, float]
+    size: float
+    """edge of the code in metres"""
+    background: tuple[float, float, float]
+
+
+GREENHOUSE = "greenhouse"
+CAPTURED = {
+    "biker": Place((-0.1, -1.6, -0.75), 0.3, (0.72, 0.74, 0.76)),
+    "playbot": Place((0.0, -0.45, -0.75), 0.15, (0.16, 0.17, 0.2)),
+}
+"""captured scenes by name"""
+SCENES = (GREENHOUSE, *CAPTURED)
+
+
+@cache
+def scene_of(name: str) -> tuple[Scene, np.ndarray, float]:
+    """A scene without markers, and the pose and size of its marker.
+
+    Raises InputError as `fetch_scene`.
+    """
+    if name == GREENHOUSE:
+        house = Greenhouse(rows=2, plants=6).scene
+        pose = facing((-0.3, AISLE / 2, 0.8), (-1, 0))
+        return Scene((SplatCloud.concatenate(house.clouds),), background=house.background), pose, 0.16
+    place = CAPTURED[name]
+    scene = Scene((load_splats(fetch_scene(name)),), background=place.background)
+    return scene, rigid_matrix(place.position), place.size
+
+
+@cache
+def marker_of(spec: str, size: float) -> Marker:
+    """A marker with the grey of ink and paper."""
+    return marker(spec, size=size, black=(INK,) * 3, white=(PAPER,) * 3)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A marker in a scene, and how a camera captures it."""
+
+    scene: Scene
+    """without the marker"""
+    placed: PlacedMarker
+    seed: int
+    """seed of noise, wear and the position of objects in front"""
+    edges: float
+    """distance in edges of the code"""
+    tilt: float
+    """radians between the marker's normal and the direction to the camera"""
+    azimuth: float
+    """radians of the tilt's axis: 0 tilts about the vertical"""
+    roll: float
+    aim: tuple[float, float]
+    """point of the marker's plane in the middle of the image, in units of the distance"""
+    capture: Capture
+    """without the camera's pose"""
+    cover: SplatCloud | None = None
+    """object in front of the marker, in its frame"""
+    defocus: float = 0.0
+    """radius in pixels of the disk that blurs the image"""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera at its pose."""
+        distance = self.edges * self.placed.marker.size
+        sine = math.sin(self.tilt)
+        towards = np.array(
+            [sine * math.cos(self.azimuth), sine * math.sin(self.azimuth), -math.cos(self.tilt)]
+        )
+        up = (math.sin(self.roll), -math.cos(self.roll), 0.0)
+        target = distance * np.array([*self.aim, 0.0])
+        camera = Camera.look_at(WIDTH, HEIGHT, FOV, distance * towards + target, target, up)
+        lens = None if self.capture.camera is None else self.capture.camera.lens
+        pose = camera.world_to_camera @ np.linalg.inv(self.placed.pose)
+        return replace(camera.with_pose(pose), lens=lens)
+
+    @property
+    def complete_scene(self) -> Scene:
+        """The scene with the marker and what covers it."""
+        clouds = self.scene.clouds
+        if self.cover is not None:
+            clouds = (*clouds, self.cover.transformed(self.placed.pose))
+        return replace(self.scene, clouds=clouds, markers=(self.placed,))
+
+    @property
+    def complete_capture(self) -> Capture:
+        return self.capture.with_(camera=self.camera)
+
+    def changed(self, **parts: Any) -> View:
+        """The view with parts of its capture replaced."""
+        return replace(self, capture=self.capture.with_(**parts))
+
+    def moving(self, pixels: float, shutter: Shutter) -> View:
+        """The view with a camera that moves sideways, so that the marker moves by this number of pixels per
+        second at the time 0."""
+        camera = self.camera
+        speed = pixels * self.edges * self.placed.marker.size / camera.fx
+        angle = 2 * math.pi * self.rng.random()
+        step = speed * np.array([math.cos(angle), math.sin(angle), 0.0])
+
+        def world_to_camera(time: float) -> np.ndarray:
+            return rigid_matrix(step * time) @ camera.world_to_camera
+
+        return self.changed(motion=Motion(world_to_camera), shutter=shutter)
+
+    @property
+    def rng(self) -> np.random.Generator:
+        return np.random.default_rng(self.seed)
+
+
+def view_of(scene: str, spec: str, seed: str) -> View:
+    """A view without a cause; distance, tilt, roll and aim are random.
+
+    Views of equal seeds have equal poses for all specs, causes and severities.
+    """
+    base, pose, size = scene_of(scene)
+    rng = np.random.default_rng([*seed.encode()])
+    edges = EDGES * math.exp(rng.uniform(-0.15, 0.15))
+    tilt, azimuth = math.radians(rng.uniform(0, 40)), math.radians(rng.uniform(-25, 25))
+    roll, aim = math.radians(rng.uniform(-20, 20)), rng.uniform(-0.05, 0.05, 2)
+    return View(
+        base,
+        PlacedMarker(marker_of(spec, size), pose),
+        int(rng.integers(2**31)),
+        edges,
+        tilt * rng.choice((-1, 1)),
+        azimuth,
+        roll,
+        (float(aim[0]), float(aim[1])),
+        Capture(background=base.background),
+    )
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A cause of failed detections: severity -> amount -> changed view."""
+
+    title: str
+    group: str
+    """figure that has the cause"""
+    amount: Callable[[float], float]
+    """physical amount of a severity from 0 to 1"""
+    form: str
+    """format of the amount, e.g. "{:.0f}" """
+    unit: str
+    change: Callable[[View, float], View]
+    """the view with an amount"""
+
+    def apply(self, view: View, severity: float) -> View:
+        """The view with a severity. Raises InputError for a severity outside 0 to 1."""
+        number("severity", severity, "a number from 0 to 1", 0, 1)
+        return self.change(view, self.amount(severity))
+
+    def text(self, severity: float) -> str:
+        """The amount of a severity, without its unit."""
+        return self.form.format(self.amount(severity))
+
+
+def _linear(most: float, least: float = 0.0) -> Callable[[float], float]:
+    return lambda severity: least + severity * (most - least)
+
+
+def _geometric(first: float, last: float) -> Callable[[float], float]:
+    return lambda severity: first * (last / first) ** severity
+
+
+def _distance(view: View, edges: float) -> View:
+    return replace(view, edges=view.edges * edges / EDGES)
+
+
+def _angle(view: View, degrees: float) -> View:
+    return replace(view, tilt=math.copysign(math.radians(degrees), view.tilt))
+
+
+def _lens(view: View, k1: float) -> View:
+    """Strong distortion is far from the axis: the marker is near a corner of the image."""
+    signs = view.rng.choice((-1.0, 1.0), 2)
+    view = replace(view, aim=(float(0.36 * signs[0]), float(0.24 * signs[1])), tilt=view.tilt / 4)
+    return view.changed(camera=replace(view.camera, lens=BrownConrady(k1=-k1)))
+
+
+def _blur(view: View, pixels: float) -> View:
+    return view.moving(pixels, Shutter(exposure_time=1.0, sub_poses=max(2, math.ceil(pixels / 2))))
+
+
+def _rolling(view: View, pixels: float) -> View:
+    return view.moving(pixels, Shutter(readout=1.0, rows_per_band=6))
+
+
+def _noise(view: View, electrons: float) -> View:
+    return view.changed(sensor=Sensor(full_well=electrons, seed=view.seed))
+
+
+def _underexposed(view: View, factor: float) -> View:
+    sensor = Sensor(1 / factor, full_well=10_000.0, read_noise=5.0, seed=view.seed)
+    return view.changed(sensor=sensor)
+
+
+def _overexposed(view: View, factor: float) -> View:
+    return view.changed(sensor=Sensor(factor))
+
+
+def _fog(view: View, transmittance: float) -> View:
+    distance = view.edges * view.placed.marker.size
+    return view.changed(fog=Fog(-math.log(transmittance) / distance))
+
+
+def _covered(view: View, share: float) -> View:
+    """A dark leaf across one side of the code, at random."""
+    size, rng = view.placed.marker.size, view.rng
+    angle = math.pi / 2 * int(rng.integers(4)) + rng.uniform(-0.2, 0.2)
+    middle = size * (0.5 - share + 1.0)  # the leaf is two edges wide and ends at the share
+    position = (middle * math.cos(angle), middle * math.sin(angle), -0.02 * size)
+    quaternion = [math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)]
+    leaf = SplatCloud([position], [quaternion], [(size, 0.8 * size)], [1.0], colors=[_COVER])
+    return replace(view, cover=leaf.with_boxes())
+
+
+def _transparent(view: View, opacity: float) -> View:
+    made, cloud = view.placed.marker, view.placed.marker.cloud
+    thin = SplatCloud(
+        cloud.world_means(), cloud.quats, cloud.scales, opacity * cloud.opacities, colors=cloud.colors
+    ).with_coplanar_groups(cloud.coplanar_groups)
+    thin = thin.with_boxes(cloud.boxes)
+    return replace(view, placed=replace(view.placed, marker=replace(made, cloud=thin)))
+
+
+def _defocused(view: View, radius: float) -> View:
+    return replace(view, defocus=radius)
+
+
+GEOMETRY, CAMERA = "geometry", "camera"
+CAUSES = {
+    "distance": Cause("distance", GEOMETRY, _geometric(EDGES, 60), "{:.0f}", "edges", _distance),
+    "angle": Cause("angle to the normal", GEOMETRY, _linear(85), "{:.0f}", "degrees", _angle),
+    "covered": Cause("covered side", GEOMETRY, _linear(0.15), "{:.2f}", "of the code", _covered),
+    "fog": Cause("fog", GEOMETRY, _geometric(1, 0.01), "{:.2f}", "of the contrast", _fog),
+    "opacity": Cause("translucent marker", GEOMETRY, _linear(0.02, 1.0), "{:.2f}", "opacity", _transparent),
+    "blur": Cause("motion blur", CAMERA, _linear(24), "{:.0f}", "px", _blur),
+    "rolling": Cause("rolling shutter", CAMERA, _linear(80), "{:.0f}", "px per frame", _rolling),
+    "defocus": Cause("defocus", CAMERA, _linear(8), "{:.1f}", "px radius", _defocused),
+    "noise": Cause("shot noise", CAMERA, _geometric(10_000, 3), "{:.0f}", "electrons", _noise),
+    "dark": Cause("under-exposure", CAMERA, _geometric(1, 300), "1/{:.0f}", "light", _underexposed),
+    "bright": Cause("over-exposure", CAMERA, _geometric(1, 25), "{:.1f}", "x light", _overexposed),
+    "lens": Cause("distortion near a corner", CAMERA, _linear(0.35), "-{:.2f}", "k1", _lens),
+}
+"""causes by name"""

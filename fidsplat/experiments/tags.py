@@ -1,0 +1,252 @@
+"""Test bench of tag detectors: which cause breaks which detector, at which severity."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from fidsplat.experiments.run import device_name, results_of
+from fidsplat.experiments.sweep import Key, Record, Sweep, Work, shard, thread_pool
+from fidsplat.experiments.tag_causes import CAPTURED, CAUSES, GREENHOUSE, SCENES, View, scene_of, view_of
+from fidsplat.experiments.tag_settings import TagSettings
+from fidsplat.images.files import write_png
+from fidsplat.images.filters import defocused, grey_of
+from fidsplat.markers.spec import Detector
+from fidsplat.render.renderer import Renderer
+from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.files import writable_folder
+from fidsplat.vision.bop import BopScene
+from fidsplat.vision.coco import CocoAnnotations
+from fidsplat.vision.detect import detect
+from fidsplat.vision.pose import marker_pose, pose_error
+from fidsplat.vision.readers import TITLES, Attempt, Target, attempt, attempt_of, missing_readers, readers
+from fidsplat.vision.truth import truth_of
+
+NAME = "tags"
+NONE = "none"
+"""name of the point without a cause, severity 0 of all causes"""
+FAMILIES = {"apriltag:36h11": "apriltag:36h11:5", "aruco:4x4_50": "aruco:4x4_50:7", "qr": "qr:fidsplat"}
+"""families with the marker that is rendered"""
+OWN = "fidsplat"
+"""name of our `detect` among the detectors"""
+SLOW = "zxing-tall"
+"""detector that is measured only on request: it takes a second for an image that it cannot read"""
+Errors = list[float] | None
+"""corner error [pixels, RMS], rotation [degrees], translation [% of the distance]; None: not read"""
+
+
+def check(options: TagSettings) -> None:
+    """Raise InputError for settings that cannot be used."""
+    for name, known in (("scene", SCENES), ("cause", CAUSES), ("family", FAMILIES)):
+        for text in getattr(options, name):
+            if text not in known:
+                raise InputError(unknown(name, text, known))
+    options.check()
+    points_of(options)
+
+
+def points_of(options: TagSettings) -> list[Key]:
+    """Points of the shard of a run: first those without a cause, then cause by cause.
+
+    Raises InputError for detectors that cannot be used.
+    """
+    chosen = [(NONE, 0.0)]
+    chosen += [(cause, severity) for cause in options.cause or CAUSES for severity in options.steps]
+    families = options.family or tuple(FAMILIES)
+    names = {family: list(detectors_of(family, options.detector)) for family in families}
+    every = [
+        {
+            "scene": scene,
+            "family": family,
+            "cause": cause,
+            "severity": severity,
+            "views": options.view_count,
+            "detectors": names[family],
+        }
+        for cause, severity in chosen
+        for scene in options.scene or (GREENHOUSE, next(iter(CAPTURED)))
+        for family in families
+        if names[family]
+    ]
+    if not every:
+        raise InputError(
+            f"--detector must read one of {', '.join(families)}, got {', '.join(options.detector)}"
+        )
+    return shard(every, options.shard)
+
+
+def detectors_of(
+    family: str, names: Sequence[str] = ()
+) -> dict[str, Callable[[np.ndarray, Target], Attempt]]:
+    """Detectors of a family by name, for a grey image and its target.
+
+    names: those to use, in which module:function is the user's own; by default all installed ones except
+    `SLOW`.
+
+    Raises InputError for an unknown name, a missing package, or a function that cannot be imported.
+    """
+    kind, _, dictionary = family.partition(":")
+    found: dict[str, Callable[[np.ndarray, Target], Attempt]] = {
+        name: partial(attempt, name) for name in readers(kind, dictionary or None)
+    }
+    found[OWN] = partial(
+        attempt_by,
+        lambda grey: [
+            (one.name, one.corners) for one in detect(grey, (family,) if dictionary else (), not dictionary)
+        ],
+    )
+    if not names:
+        return {name: function for name, function in found.items() if name != SLOW}
+    every = {OWN, *TITLES}
+    for name in names:
+        if ":" in name:
+            found[name] = partial(attempt_by, own_detector(name))
+        elif name in missing_readers():
+            package = missing_readers()[name]
+            raise InputError(f"the detector {name} requires {package}; pip install {package}")
+        elif name not in every:
+            raise InputError(unknown("detector", name, every) + "; or module:function for your own")
+    return {name: found[name] for name in names if name in found}
+
+
+def own_detector(text: str) -> Detector:
+    """The function module:function, of a module on the path or in the working folder: (h, w) uint8 -> pairs
+    of the spec and the corners (4, 2) of each detected code. Raises InputError if it cannot be imported."""
+    module, _, name = text.partition(":")
+    if "" not in sys.path:
+        sys.path.insert(0, "")
+    try:
+        function = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(
+            f"--detector must be module:function that can be imported, got {text!r}: {error}"
+        ) from error
+    if not callable(function):
+        raise InputError(f"--detector must name a function, got {text!r}, a {type(function).__name__}")
+    return cast(Detector, function)
+
+
+def attempt_by(function: Detector, grey: np.ndarray, target: Target) -> Attempt:
+    """The result of a detector that returns specs and corners."""
+    own = target.payload if target.id is None else target.id
+    spec = f"{target.kind}:{own if target.id is None else f'{target.family}:{own}'}"
+    pairs = ((own if name == spec else None, np.asarray(quad, np.float64)) for name, quad in function(grey))
+    return attempt_of(pairs, target)
+
+
+@contextmanager
+def tag_sweep(options: TagSettings) -> Iterator[Sweep]:
+    """The sweep of the test bench.
+
+    Raises InputError for options that cannot be used, DeviceError when the device cannot be opened.
+    """
+    check(options)
+    points = points_of(options)
+    for scene in {point["scene"] for point in points}:
+        scene_of(scene)  # errors of a download appear before a device is opened
+    renderer = Renderer(options.device)
+    results = results_of(NAME, options, device_name(renderer))
+    begin = partial(begin_point, renderer=renderer, seed=options.seed, own=options.detector)
+    with thread_pool(options.workers) as pool:
+        yield Sweep(NAME, results, points, begin, batch=2 * options.workers, pool=pool)
+
+
+def views_of(key: Key, seed: int) -> list[View]:
+    """Views of a point, with its cause."""
+    spec, cause = FAMILIES[key["family"]], key["cause"]
+    views = [view_of(key["scene"], spec, f"{seed} {key['scene']} {k}") for k in range(key["views"])]
+    return views if cause == NONE else [CAUSES[cause].apply(view, key["severity"]) for view in views]
+
+
+def begin_point(key: Key, renderer: Renderer, seed: int, own: Sequence[str] = ()) -> Work:
+    """Render the views of a point; returns their detection."""
+    shots = []
+    for view in views_of(key, seed):
+        frame = renderer.render(view.complete_scene, view.complete_capture)
+        shots.append((view, grey_of(defocused(frame.to_uint8(), view.defocus))))
+    return partial(_detect, key, shots, detectors_of(key["family"], own))
+
+
+def _detect(
+    key: Key,
+    shots: Iterable[tuple[View, np.ndarray]],
+    detectors: dict[str, Callable[[np.ndarray, Target], Attempt]],
+) -> dict[str, Any]:
+    """Errors of each view by detector, see `Errors`."""
+    found: dict[str, list[Errors]] = {name: [] for name in key["detectors"]}
+    for view, grey in shots:
+        made, camera = view.placed.marker, view.camera
+        corners = camera.project(view.placed.corners)
+        target = Target(made.kind, made.family or "", made.id, made.payload, corners)
+        for name in found:
+            found[name].append(errors_of(detectors[name](grey, target).corners, view))
+    return {"errors": found}
+
+
+def errors_of(corners: np.ndarray | None, view: View) -> Errors:
+    """Errors of detected corners (4, 2); None for corners of None, or without a pose."""
+    if corners is None:
+        return None
+    camera, placed = view.camera, view.placed
+    truth = camera.world_to_camera @ placed.pose
+    pixels = float(np.sqrt(((corners - camera.project(placed.corners)) ** 2).sum(1).mean()))
+    pose = marker_pose(corners, placed.marker.size, camera)
+    if not np.isfinite(pose).all():
+        return None
+    metres, radians = pose_error(pose, truth)
+    return [pixels, math.degrees(radians), 100 * metres / float(np.linalg.norm(truth[:3, 3]))]
+
+
+def write_labels(options: TagSettings, folder: Path) -> Iterator[Path]:
+    """Write images and ground truth of all points; yields the folder of each point.
+
+    FOLDER/train/000000 and so on are scenes of a BOP data set with a `coco.json` each; a lens, which BOP
+    lacks, leaves only COCO. Existing ones are kept.
+    """
+    renderer = Renderer(options.device)
+    for number, key in enumerate(points_of(options)):
+        yield _write_point(key, writable_folder(folder / "train" / f"{number:06d}"), renderer, options.seed)
+
+
+def _write_point(key: Key, folder: Path, renderer: Renderer, seed: int) -> Path:
+    done = folder / "coco.json"
+    if done.is_file():
+        return folder
+    (folder / "scene_gt.json").unlink(missing_ok=True)  # of an interrupted run
+    coco, bop = CocoAnnotations(), BopScene(folder)
+    flat = True
+    for k, view in enumerate(views_of(key, seed)):
+        scene, capture = view.complete_scene, view.complete_capture.with_(outputs=("rgb", "depth", "label"))
+        frame = renderer.render(scene, capture)
+        images = {name: frame[name] for name in ("depth", "label")}
+        images["rgb"] = defocused(frame.to_uint8(), view.defocus)
+        truth = truth_of(images, scene, view.camera)
+        coco.add(f"rgb/{k:06d}.png", truth)
+        flat = flat and truth.camera.lens is None
+        if flat:
+            bop.add(images, truth)
+        else:
+            write_png(folder / "rgb" / f"{k:06d}.png", images["rgb"])
+    if flat:
+        bop.save()
+    coco.save(done)
+    return folder
+
+
+def rows_of(record: Record) -> Iterator[dict[str, Any]]:
+    """A row for each view and detector of a record."""
+    key = record.key
+    for name, views in record.result["errors"].items():
+        for errors in views:
+            row = {name: key[name] for name in ("scene", "family", "cause", "severity")}
+            row |= {"detector": name, "read": errors is not None}
+            pixels, degrees, percent = errors or (math.nan,) * 3
+            yield row | {"corner_px": pixels, "rotation_deg": degrees, "translation_percent": percent}

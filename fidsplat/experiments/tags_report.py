@@ -1,0 +1,199 @@
+"""Report of the test bench of tag detectors: failure curves, tables, and a CSV table of all measurements."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from fidsplat.experiments.charts import COLOURS, chart, legend_above
+from fidsplat.experiments.intervals import bootstrap, percentile, root_mean_square, wilson
+from fidsplat.experiments.pages import NOTHING, page_and_folder, write_page
+from fidsplat.experiments.summary import Frame, Summary, provenance, summarise
+from fidsplat.experiments.sweep import Record
+from fidsplat.experiments.tag_causes import CAUSES
+from fidsplat.experiments.tags import FAMILIES, NAME, NONE, OWN, rows_of
+from fidsplat.vision.readers import TITLES
+
+_ERRORS = ("corner_px", "rotation_deg", "translation_percent")
+_GROUP = ("scene", "family", "detector", "cause", "severity")
+PRECISE = 1.0
+"""pixels: largest RMS error of the corners of a precise reading"""
+NEVER = "never"
+"""cell of a detector that reads at least half of the views at every severity"""
+_COLUMNS = 6
+"""panels next to each other"""
+
+
+def view_table(records: Sequence[Record]) -> Summary:
+    """Table with a row for each view and detector."""
+    return summarise(records, rows_of, (*_GROUP, "read", *_ERRORS))
+
+
+def statistics_of(rows: Frame, seed: int, by: Sequence[str] = _GROUP) -> Frame:
+    """Detection rates and errors of groups of views, with intervals of 95 %."""
+    return pd.DataFrame(
+        dict(zip(by, names, strict=True)) | _statistics(group, seed)
+        for names, group in rows.groupby(list(by), sort=False)
+    )
+
+
+def _statistics(group: Frame, seed: int) -> dict[str, Any]:
+    read = group[group["read"]]
+    found: dict[str, Any] = {"amount": len(group)}
+    for name, hits in (("rate", len(read)), ("precise", int((read["corner_px"] <= PRECISE).sum()))):
+        found[name] = hits / len(group)
+        found[f"{name}_low"], found[f"{name}_high"] = wilson(hits, len(group))
+    for name, statistics in (
+        ("corner_px", {"rms": root_mean_square}),
+        *((name, {"p50": percentile(50), "p99": percentile(99)}) for name in _ERRORS[1:]),
+    ):
+        values = read[name].to_numpy(float)
+        for ending, statistic in statistics.items():
+            found[f"{name}_{ending}"] = float(statistic(values)) if len(values) else math.nan
+            found[f"{name}_{ending}_low"], found[f"{name}_{ending}_high"] = bootstrap(values, statistic, seed)
+    return found
+
+
+def breaking_severity(severities: Sequence[float], rates: Sequence[float]) -> float | None:
+    """Severity at which a rate falls below one half, interpolated; None if it does not."""
+    points = sorted(zip(severities, rates, strict=True))
+    if not points or points[0][1] < 0.5:
+        return points[0][0] if points else None
+    for (s0, r0), (s1, r1) in pairwise(points):
+        if r1 < 0.5:
+            return s0 + (s1 - s0) * (r0 - 0.5) / (r0 - r1)
+    return None
+
+
+def breaks_of(rates: Frame, name: str = "rate") -> Frame:
+    """Table of causes and families: the amount at which each detector reads half of the views.
+
+    Args:
+        rates: `statistics_of` by family, detector, cause and severity.
+        name: "rate", or "precise" for readings with corner errors of at most `PRECISE`.
+    """
+    detectors = _detectors(rates)
+    table = []
+    for cause in (name for name in CAUSES if name in set(rates["cause"])):
+        for family in (name for name in FAMILIES if name in set(rates["family"])):
+            row = {"cause": f"{CAUSES[cause].title} [{CAUSES[cause].unit}]"}
+            row |= {"to": CAUSES[cause].text(1.0), "family": family.rpartition(":")[2]}
+            for detector in detectors:
+                own = rates[(rates["family"] == family) & (rates["detector"] == detector)]
+                own = own[own["cause"].isin((cause, NONE))]
+                row[detector] = NOTHING
+                if len(own):
+                    severity = breaking_severity(own["severity"].tolist(), own[name].tolist())
+                    row[detector] = NEVER if severity is None else CAUSES[cause].text(severity)
+            table.append(row)
+    return pd.DataFrame(table)
+
+
+def _detectors(rates: Frame) -> list[str]:
+    known = [*TITLES, OWN]
+    names = dict.fromkeys(rates["detector"])
+    return sorted(names, key=lambda name: known.index(name) if name in known else len(known))
+
+
+def _errors(statistics: Frame) -> Frame:
+    """Errors of each detector, with intervals."""
+
+    def cell(row: Any, name: str) -> str:
+        if math.isnan(row[name]):
+            return NOTHING
+        low, high = (row[f"{name}_{end}"] for end in ("low", "high"))
+        return f"{row[name]:.2g} ({low:.2g} to {high:.2g})"
+
+    return pd.DataFrame(
+        {
+            "detector": f"{row['detector']}, {row['family'].rpartition(':')[2]}",
+            "read [%]": f"{100 * row['rate']:.0f} ({100 * row['rate_low']:.0f} to "
+            f"{100 * row['rate_high']:.0f})",
+            "corners, RMS [px]": cell(row, "corner_px_rms"),
+            "rotation, p50 [deg]": cell(row, "rotation_deg_p50"),
+            "p99": cell(row, "rotation_deg_p99"),
+            "translation, p50 [%]": cell(row, "translation_percent_p50"),
+            "p99 [%]": cell(row, "translation_percent_p99"),
+        }
+        for _, row in statistics.iterrows()
+    )
+
+
+def write_report(records: Sequence[Record], folder: Path, out: Path, seed: int) -> tuple[list[Path], Frame]:
+    """Write tags.csv into the folder of results, and the page with its charts.
+
+    out: folder for report.md and its charts, or FILE.md, whose charts are written into a folder of that name.
+
+    Returns the files, the page first, and the table of `breaks_of`.
+    """
+    summary, (page, charts) = view_table(records), page_and_folder(out)
+    views = summary.rows
+    views["read"] = views["read"].astype(bool)
+    table = Summary(statistics_of(views, seed).assign(run=0), summary.runs)
+    table.write(folder / f"{NAME}.csv")
+    pooled = statistics_of(views, seed, _GROUP[1:])
+    files = []
+    groups = dict.fromkeys(CAUSES[name].group for name in pooled["cause"] if name != NONE)
+    for group in groups:
+        causes = [name for name in CAUSES if CAUSES[name].group == group and name in set(pooled["cause"])]
+        for first in range(0, len(causes), _COLUMNS):
+            ending = f"-{first // _COLUMNS + 1}" if len(causes) > _COLUMNS else ""
+            file = charts / f"{group}{ending}.png"
+            _curves(pooled, causes[first : first + _COLUMNS], file)
+            files.append((group, file))
+    breaks = breaks_of(pooled)
+    detectors = _detectors(pooled)
+    context = {
+        "figures": [{"title": group, "file": file.name} for group, file in files],
+        "breaks": breaks,
+        "imprecise": breaks_of(pooled, "precise"),
+        "precise": PRECISE,
+        "errors": _errors(pooled[pooled["cause"] == NONE]),
+        "detectors": [f"`{name}`: {TITLES[name]}" for name in detectors if name in TITLES],
+        "scenes": " and ".join(dict.fromkeys(views["scene"])),
+        "views": len(views.drop_duplicates(["scene", "family", "cause", "severity"])),
+        "images": int(views.groupby(["scene", "family", "cause", "severity", "detector"]).size().groupby(
+            level=[0, 1, 2, 3]).max().sum()),
+        "runs": provenance({"`experiment tags`": summary}),
+    }  # fmt: skip
+    write_page(page, charts, "tags.md.j2", context)
+    return [page, folder / f"{NAME}.csv", *(file for _, file in files)], breaks
+
+
+def _curves(rates: Frame, causes: Sequence[str], file: Path) -> None:
+    """Rates of detection by severity with Wilson's intervals: a row for each family, a column for each
+    cause."""
+    families = [name for name in FAMILIES if name in set(rates["family"])]
+    detectors = _detectors(rates)
+    size = (2.2 * len(causes) + 0.8, 1.7 * len(families) + 0.9)
+    with chart(file, len(causes), size, rows=len(families)) as (figure, axes):
+        for place, (family, cause) in zip(axes, [(f, c) for f in families for c in causes], strict=True):
+            for number, detector in enumerate(detectors):
+                own = rates[(rates["family"] == family) & (rates["detector"] == detector)]
+                own = own[own["cause"].isin((cause, NONE))].sort_values("severity")
+                colour = COLOURS[number % len(COLOURS)]
+                x = own["severity"].to_numpy()
+                label = detector if place is axes[0] else None
+                if not len(own):
+                    place.plot([], [], color=colour, label=label)
+                    continue
+                place.plot(x, 100 * own["rate"].to_numpy(), color=colour, label=label, linewidth=1.3)
+                low, high = (100 * own[f"rate_{end}"].to_numpy() for end in ("low", "high"))
+                place.fill_between(x, low, high, color=colour, alpha=0.12, linewidth=0)
+            place.set_xticks([0.0, 0.5, 1.0], ["", "", ""])
+            place.set_ylim(-4, 104)
+            if family == families[0]:
+                place.set_title(CAUSES[cause].title, fontsize=9)
+            if family == families[-1]:
+                texts = [CAUSES[cause].text(severity) for severity in (0, 0.5, 1)]
+                place.set_xticks([0.0, 0.5, 1.0], texts, fontsize=7)
+                place.set_xlabel(CAUSES[cause].unit, fontsize=7)
+            if cause == causes[0]:
+                place.set_ylabel(f"{family.rpartition(':')[2]}\nread [%]", fontsize=8)
+            place.tick_params(axis="y", labelsize=7)
+        legend_above(figure, axes[0])
