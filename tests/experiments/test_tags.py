@@ -60,10 +60,9 @@ def test_amounts_are_physical(view):
     cosine = -tilted.placed.pose[:3, 2] @ towards / np.linalg.norm(towards)
     assert math.degrees(math.acos(cosine)) == pytest.approx(85, abs=4)  # the aim is up to 4 degrees beside it
     # the marker moves by 24 pixels in a second, the exposure
-    blurred = CAUSES["blur"].apply(view, 1.0).complete_capture
+    camera, blurred = view.camera, CAUSES["blur"].apply(view, 1.0).complete_capture
     before, after = (
-        blurred.motion.moved(blurred.camera, time).project(view.placed.corners).mean(0)
-        for time in (-0.5, 0.5)
+        blurred.motion.moved(camera, time).project(view.placed.corners).mean(0) for time in (-0.5, 0.5)
     )
     assert np.linalg.norm(after - before) == pytest.approx(24, rel=0.2)  # edges of the image are further away
     assert blurred.shutter.exposure_time == 1.0
