@@ -53,6 +53,7 @@ COMMANDS = CommandTable(
     gallery="render.Gallery",
     fetch="fetch.Fetch",
     greenhouse="greenhouse.Greenhouse",
+    capture="capture.Capture",
     train="train.Train",
     store="store.Store",
     source="source.Source",

@@ -43,6 +43,7 @@ def load_scene(example: Example) -> None:
 
 
 PARSED_ONLY = {
+    "capture": "needs photographs; tests/unit/test_photographs_command.py",
     "bench": "times the machine",
     "check": "minutes; tests/selftest",
     "demo": "tests/unit/test_demo.py runs it",
@@ -59,6 +60,7 @@ PARSED_WORDS = {
     "--plants-from": "made by an experiment",
     "--ray": "a cluster",
     "scene.html": "needs npm; tests/unit/test_scene_page.py",
+    "bench/scene.toml": "made from photographs",
     "city/city.toml": "a hundred frames of 1280 x 720; tests/unit/test_flights.py",
 }
 SMALLER = {

@@ -39,6 +39,7 @@ MAY_IMPORT = {
     "sim": DATA | {"scenes", "effects", "images", "render"},
     "worlds": DATA | {"scenes", "markers", "formats", "store", "sim"},
     "logs": {"splats", "cameras", "effects", "images", "vision"},
+    "photographs": DATA | {"images", "markers", "formats", "vision", "scenes"},
     "train": DATA | {"formats", "markers", "images", "vision", "render", "backends", "effects"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}
@@ -57,6 +58,7 @@ HOME_OF = {
     "ray": ("remote.ray_engine",),
     "pxr": ("formats.usd",),
     "imageio_ffmpeg": ("images.video",),
+    "pycolmap": ("photographs.mapping",),
     "bpy": ("experiments.blender_worker", "experiments.blender_plants"),
     "shapely": ("markers", "vision.visible"),
     "networkx": ("markers",),

@@ -1,0 +1,107 @@
+"""`fidsplat capture`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import Json, repeatable
+from fidsplat.commands.output import delayed_progress, report
+from fidsplat.photographs.settings import CaptureSettings
+
+if TYPE_CHECKING:
+    from fidsplat.photographs.steps import Captured
+
+
+@repeatable
+@dataclass
+class Capture:
+    """Make a metric scene from photographs or a video (extra: capture).
+
+    DIR becomes a data set for `fidsplat train`: undistorted images, masks, COLMAP's model in sparse/0, and
+    scene.toml. Tags of known size determine the scale. In the scene exact markers replace them, and training
+    ignores their pixels. z is up; the first tag, or the tag of --up, is at the origin. The same command
+    resumes, and repeats only the last steps if tags, --up or --scale change.
+
+    Examples:
+      fidsplat capture photos -o bench --tag apriltag:36h11:5=0.16
+      fidsplat capture walk.mp4 -o hall --tag qr:door=0.2 --tag apriltag:36h11:6=0.16 --up qr:door
+      fidsplat capture photos -o yard --scale a.jpg:812:430,b.jpg:120:655=1.25
+      fidsplat train bench -o bench/splats.ply && fidsplat view bench/scene.toml
+    """
+
+    photos: Annotated[tyro.conf.Positional[str], option("PHOTOS|VIDEO", "folder of photographs, or a video")]
+    out: Annotated[str, option("DIR", "folder for the data set and its scene file", "-o")]
+    settings: CaptureSettings = field(default_factory=CaptureSettings)
+    overwrite: bool = False
+    """restart, also for other photographs"""
+    json: Json = False
+
+    def run(self) -> int:
+        from fidsplat.photographs.steps import photographs_to_scene
+
+        with delayed_progress() as progress:
+            made = photographs_to_scene(self.photos, self.out, self.settings, progress, self.overwrite)
+        facts = _facts(made)
+        return report(self.json, facts, *_words(made, facts, self.out))
+
+
+def _facts(made: Captured) -> dict[str, Any]:
+    adjusted = made.adjustment
+    facts: dict[str, Any] = {
+        "scene": str(made.scene),
+        "photographs": made.photographs,
+        "registered": len(made.model.names),
+        "missing": dict(made.missing),
+        "points": len(made.model.points),
+        "reprojection_px": made.model.reprojection,
+        "metric": made.metric,
+    }
+    if adjusted is None:
+        return facts
+    tags = {}
+    for spec, pose in zip(adjusted.poses, made.tags, strict=True):
+        views = sum(view.tag == spec for view in adjusted.used)
+        own = adjusted.scales.get(spec)
+        tags[spec] = {
+            "views": views,
+            "rejected": sum(view.tag == spec for view in adjusted.rejected),
+            "scale_alone": None if own is None else own[0] / adjusted.scale,
+            "pose": pose.pose,
+        }
+    return facts | {
+        "metres_per_unit": adjusted.scale,
+        "scale_standard_error": adjusted.scale_error,
+        "corner_rms_px": adjusted.rms,
+        "tags": tags,
+    }
+
+
+def _words(made: Captured, facts: dict[str, Any], out: str) -> list[str]:
+    lines = [
+        f"{facts['registered']} of {facts['photographs']} photographs, {facts['points']:,} points, "
+        f"reprojection error {facts['reprojection_px']:.2f} px"
+    ]
+    lines += [f"no camera for {name}: {reason}" for name, reason in made.missing]
+    if made.adjustment is not None:
+        lines.append(
+            f"scale {facts['metres_per_unit']:.6g} m per unit with a standard error of "
+            f"{100 * facts['scale_standard_error']:.2g} %; corners of tags {facts['corner_rms_px']:.2f} px"
+        )
+        for spec, tag in facts["tags"].items():
+            alone = (
+                ""
+                if tag["scale_alone"] is None
+                else f", scale of this tag alone {100 * (tag['scale_alone'] - 1):+.2f} %"
+            )
+            others = f", {tag['rejected']} rejected" if tag["rejected"] else ""
+            lines.append(f"{spec}: {tag['views']} photographs{others}{alone}")
+    elif not made.metric:
+        lines.append("lengths are not in metres; give --tag SPEC=METRES, or --scale A,B=METRES")
+    splats = Path(out) / "splats.ply"
+    lines.append(f"train it: fidsplat train {out} -o {splats}; then view it: fidsplat view {made.scene}")
+    return lines

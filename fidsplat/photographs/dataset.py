@@ -1,0 +1,115 @@
+"""A data set for training from photographs with cameras: undistorted images, masks, model and scene file."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.formats.colmap import save_colmap
+from fidsplat.images.files import encode_image, read_image, write_png
+from fidsplat.images.visualize import resize_to_width
+from fidsplat.markers import marker
+from fidsplat.photographs.mapping import Progress
+from fidsplat.photographs.tags import beside_tags, module_colors, tag_region
+from fidsplat.scenes.parts import PlacedMarker
+from fidsplat.scenes.scene import Scene
+from fidsplat.util.files import atomic_write
+from fidsplat.vision.undistort import undistort_masked
+
+SPLATS = "splats.ply"
+"""file of the trained splats, which the scene file names"""
+_QUALITY = 95
+
+
+def write_images(
+    folder: Path,
+    photos: Path,
+    names: Sequence[str],
+    cameras: Sequence[Camera],
+    tags: Sequence[PlacedMarker],
+    max_side: int,
+    progress: Progress,
+) -> tuple[list[Camera], list[PlacedMarker]]:
+    """Write undistorted images of at most `max_side` pixels a side, and masks that exclude tags and pixels
+    outside of the photograph.
+
+    Returns the images' cameras, and the tags with the inks of their print.
+    """
+    found: list[Camera] = []
+    inks: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in tags]
+    for name in ("images", "masks"):
+        shutil.rmtree(folder / name, ignore_errors=True)
+        (folder / name).mkdir()
+    for number, (name, camera) in enumerate(zip(names, cameras, strict=True)):
+        progress("images", number / len(names))
+        image, inside = read_image(photos / name), np.ones((camera.height, camera.width), bool)
+        if camera.lens is not None:
+            image, inside = undistort_masked(image, camera, inside)
+        shrink = max_side / max(camera.width, camera.height)
+        if shrink < 1:
+            image = resize_to_width(image, round(shrink * camera.width))
+            inside = resize_to_width(inside[..., None].astype(np.uint8) * 255, image.shape[1]) == 255
+        small = scaled(camera, image.shape[1], image.shape[0])
+        for tag, colors in zip(tags, inks, strict=True):
+            if (measured := module_colors(tag, image, small)) is not None:
+                colors.append(measured)
+            inside &= ~tag_region(tag, small)
+        kind = "jpeg" if name.endswith((".jpg", ".jpeg")) else "png"
+        target = folder / "images" / (name if kind == "jpeg" else f"{Path(name).stem}.png")
+        with atomic_write(target) as stream:
+            stream.write(encode_image(image, kind, _QUALITY))
+        if not inside.all():
+            write_png(folder / "masks" / f"{target.name}.png", inside)
+        found.append(small)
+    return found, [_printed(tag, colors) for tag, colors in zip(tags, inks, strict=True)]
+
+
+def scaled(camera: Camera, width: int, height: int) -> Camera:
+    """The camera without its lens, of an image that was resized."""
+    x, y = width / camera.width, height / camera.height
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * x,
+        fy=camera.fy * y,
+        cx=camera.cx * x,
+        cy=camera.cy * y,
+        lens=None,
+    )
+
+
+def _printed(tag: PlacedMarker, colors: Sequence[tuple[np.ndarray, np.ndarray]]) -> PlacedMarker:
+    """The tag with the median inks of its photographs."""
+    if not colors:
+        return tag
+    black, white = np.round(np.median(np.array(colors), axis=0), 3)
+    made = tag.marker
+    return replace(
+        tag, marker=marker(made.spec, made.size, black=tuple(black.tolist()), white=tuple(white.tolist()))
+    )
+
+
+def write_model(
+    folder: Path,
+    names: Sequence[str],
+    cameras: Sequence[Camera],
+    points: np.ndarray,
+    colors: np.ndarray,
+    tags: Sequence[PlacedMarker],
+) -> Path:
+    """Write COLMAP's model of the undistorted images, without points on tags, and scene.toml with the tags;
+    returns the scene file."""
+    free = beside_tags(points, tags)
+    names = [name if name.endswith((".jpg", ".jpeg")) else f"{Path(name).stem}.png" for name in names]
+    save_colmap(folder / "sparse" / "0", names, cameras, points[free], colors[free])
+    file = folder / "scene.toml"
+    Scene(camera=cameras[0], markers=tuple(tags)).save(file)
+    with atomic_write(file) as stream:
+        stream.write(file.read_bytes() + f'\n[[splats]]\nfile = "{SPLATS}"\n'.encode())
+    return file

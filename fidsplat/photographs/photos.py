@@ -1,0 +1,98 @@
+"""Photographs for structure from motion: upright copies of image files, or frames of a video."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.images.exif import read_exif, with_exif
+from fidsplat.images.files import (
+    IMAGE_SUFFIXES,
+    declared_pixels,
+    encode_image,
+    is_video,
+    read_image,
+    read_images,
+)
+from fidsplat.photographs.mapping import Progress
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import read_input
+from fidsplat.vision.video_frames import choose_frames, measure_frames
+
+MIN_PHOTOS = 3
+_QUALITY = 97
+
+
+def source_files(source: Path) -> list[Path]:
+    """Image files of a folder, or a video. Raises InputError for anything else, or too few images."""
+    if is_video(source):
+        return [source]
+    if not source.is_dir():
+        raise InputError(f"PHOTOS must be a folder of images or a video, got {source}")
+    files = sorted(file for file in source.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+    if len(files) < MIN_PHOTOS:
+        raise InputError(
+            f"a capture must have at least {MIN_PHOTOS} photographs, got {len(files)} in {source}; take 20 "
+            "to 200 of the scene, each overlapping the one before by two thirds"
+        )
+    return files
+
+
+def copy_photos(files: Sequence[Path], folder: Path, progress: Progress) -> None:
+    """Copy photographs into a folder, rotated upright by their EXIF orientation, under names without blanks.
+
+    Raises InputError for an image that cannot be read.
+    """
+    for number, file in enumerate(files):
+        progress("photographs", number / len(files))
+        data = read_input(file)
+        if not declared_pixels(data):
+            raise InputError(f"cannot read {file} as an image; give a PNG, JPEG, BMP, TIFF or WebP file")
+        name = "_".join(file.stem.split())
+        exif = read_exif(data)
+        if file.suffix.lower() in (".jpg", ".jpeg") and exif.orientation != 1:
+            data = with_exif(encode_image(read_image(file), "jpeg", _QUALITY), exif)
+        target = folder / f"{name}{file.suffix.lower()}"
+        if target.exists():
+            raise InputError(f"photographs must have different names, got {file.name} twice; rename one")
+        target.write_bytes(data)
+
+
+def copy_frames(video: Path, folder: Path, count: int, progress: Progress) -> tuple[int, int]:
+    """Write the chosen frames of a video; returns the numbers of frames and of chosen ones.
+
+    Raises InputError if too few frames differ.
+    """
+    measured = []
+    for values in measure_frames(frame for _, frame in read_images(video)):
+        measured.append(values)
+        progress(f"choosing frames, {len(measured)} measured", 0.0)
+    sharpness, motion = np.array(measured).T
+    chosen = choose_frames(sharpness, motion, count)
+    if len(chosen) < MIN_PHOTOS:
+        raise InputError(
+            f"a video must show the scene from different positions, got {len(chosen)} different of "
+            f"{len(measured)} frames; move the camera sideways around the scene"
+        )
+    wanted = set(chosen)
+    for number, (_, frame) in enumerate(read_images(video)):
+        progress("frames", number / len(measured))
+        if number in wanted:
+            (folder / f"frame-{number:06d}.jpg").write_bytes(encode_image(frame, "jpeg", _QUALITY))
+    return len(measured), len(chosen)
+
+
+def camera_groups(folder: Path) -> list[list[str]]:
+    """Names of photographs by camera: those of one size and focal length have the same."""
+    groups: dict[tuple, list[str]] = {}
+    for file in sorted(folder.iterdir()):
+        data = read_input(file)
+        groups.setdefault((_size(file, data), read_exif(data).focal_length), []).append(file.name)
+    return list(groups.values())
+
+
+def _size(file: Path, data: bytes) -> tuple[int, int]:
+    height, width = read_image(file).shape[:2]
+    return width, height

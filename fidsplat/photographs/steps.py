@@ -1,0 +1,200 @@
+"""The steps from photographs to a metric data set. Finished steps are kept in the folder `work`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.photographs.adjustment import Adjustment, adjust
+from fidsplat.photographs.dataset import scaled, write_images, write_model
+from fidsplat.photographs.frame import WorldFrame, world_frame
+from fidsplat.photographs.mapping import (
+    Model,
+    Progress,
+    extract,
+    map_incrementally,
+    match,
+    read_model,
+    require_pycolmap,
+    unregistered,
+)
+from fidsplat.photographs.photos import camera_groups, copy_frames, copy_photos, source_files
+from fidsplat.photographs.settings import CaptureSettings
+from fidsplat.photographs.tags import detect_tags, parse_tags
+from fidsplat.scenes.parts import PlacedMarker
+from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.files import atomic_write, from_json, path_of, read_text, writable_folder
+
+INPUTS = "inputs.json"
+SNAP = 0.02
+"""largest distance of a picked pixel from a feature, as a share of the image's width"""
+
+
+@dataclass(frozen=True, eq=False)
+class Captured:
+    """A data set made from photographs."""
+
+    scene: Path
+    """scene file with the tags"""
+    photographs: int
+    model: Model
+    frame: WorldFrame
+    adjustment: Adjustment | None
+    tags: tuple[PlacedMarker, ...]
+    missing: tuple[tuple[str, str], ...]
+    """photographs without a camera, and why"""
+    metric: bool
+    """whether lengths are in metres"""
+
+
+def photographs_to_scene(
+    source: str | Path,
+    out: str | Path,
+    settings: CaptureSettings | None = None,
+    progress: Progress | None = None,
+    overwrite: bool = False,
+) -> Captured:
+    """Make a metric data set for training, and a scene file with the tags, from photographs.
+
+    Args:
+        source: a folder of photographs, or a video.
+        out: folder. Finished steps in its folder `work` are not repeated for the same photographs.
+        progress: called with the current step and its share done.
+        overwrite: restart, also for other photographs.
+
+    Raises InputError if a photograph cannot be read, if too few can be registered, or if tags contradict.
+    """
+    settings, report = settings or CaptureSettings(), progress or (lambda words, share: None)
+    tags = parse_tags(settings.tag)
+    if settings.up is not None and settings.up not in tags:
+        raise InputError(f"--up must be a tag of --tag, got {settings.up}; give its size by --tag too")
+    picks = None if settings.scale is None else parse_scale(settings.scale)
+    require_pycolmap()
+    files = source_files(path_of(source))
+    folder = writable_folder(out)
+    work = _work_folder(folder, files, settings, overwrite)
+    video = len(files) == 1
+
+    def prepare(part: Path) -> None:
+        if video:
+            copy_frames(files[0], part, settings.frames, report)
+        else:
+            copy_photos(files, part, report)
+
+    photos, database = _step(work / "photos", prepare), work / "database.db"
+    groups = camera_groups(photos)
+    if not (work / "model").exists():
+        extract(database, photos, groups, settings.lens, report)
+        match(database, video, report)
+        model = map_incrementally(database, photos, work / "model", report)
+    else:
+        model = read_model(work / "model")
+    adjustment, frame = None, None
+    pinholes = [scaled(camera, camera.width, camera.height) for camera in model.cameras]
+    if tags:
+        views = detect_tags(photos, model.names, model.cameras, tags, report)
+        adjustment = adjust(pinholes, views, {spec: made.size for spec, made in tags.items()})
+        first = settings.up or next(iter(adjustment.poses))
+        if first not in adjustment.poses:
+            raise InputError(f"--up must be a tag in the photographs, got {first}, which was not detected")
+        frame = world_frame(pinholes, adjustment.scale, adjustment.poses[first], settings.up is not None)
+        placed = [
+            PlacedMarker(tags[spec], frame.pose(pose), label=i + 1)
+            for i, (spec, pose) in enumerate(adjustment.poses.items())
+        ]
+    else:
+        placed = []
+        scale = 1.0 if picks is None else scale_of(model, *picks)
+        frame = world_frame(pinholes, scale, middle=np.median(model.points, axis=0))
+    cameras = [frame.camera(camera) for camera in model.cameras]
+    small, placed = write_images(folder, photos, model.names, cameras, placed, settings.max_side, report)
+    scene = write_model(folder, model.names, small, frame.points(model.points), model.colors, placed)
+    missing = unregistered(database, model.names)
+    count = sum(map(len, groups))
+    metric = adjustment is not None or picks is not None
+    return Captured(scene, count, model, frame, adjustment, tuple(placed), tuple(missing), metric)
+
+
+def _step(folder: Path, make: Callable[[Path], None]) -> Path:
+    """A folder that is complete when it exists."""
+    if not folder.exists():
+        part = folder.with_name(f".{folder.name}.part")
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        make(part)
+        part.rename(folder)
+    return folder
+
+
+def _work_folder(folder: Path, files: list[Path], settings: CaptureSettings, overwrite: bool) -> Path:
+    """The folder of finished steps. Raises InputError if it is of other photographs."""
+    work = folder / "work"
+    stats = [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in files]
+    inputs = {"files": stats, "lens": settings.lens, "frames": settings.frames if len(files) == 1 else None}
+    if overwrite:
+        shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(exist_ok=True)
+    known = work / INPUTS
+    if not known.exists():
+        with atomic_write(known) as stream:
+            stream.write(json.dumps(inputs).encode())
+    elif from_json(read_text(known)) != inputs:
+        raise InputError(
+            f"{folder} must be a new folder or of the same photographs and lens, got others; give another "
+            "folder, or --overwrite"
+        )
+    return work
+
+
+Pick = tuple[str, float, float]
+"""a photograph, and x and y in pixels"""
+
+
+def parse_scale(text: str) -> tuple[Pick, Pick, float]:
+    """Two picks and their distance in metres, from `NAME:X:Y,NAME:X:Y=METRES`. Raises InputError."""
+    points, _, metres = text.rpartition("=")
+    try:
+        first, second = (
+            (name, float(x), float(y)) for name, x, y in (point.rsplit(":", 2) for point in points.split(","))
+        )
+        length = float(metres)
+        if not 0 < length < np.inf:
+            raise ValueError
+    except ValueError:
+        raise InputError(
+            f"--scale must be two pixels of photographs and their distance in metres, got {text!r}; write "
+            "for example a.jpg:812:430,b.jpg:120:655=1.25"
+        ) from None
+    return first, second, length
+
+
+def scale_of(model: Model, first: Pick, second: Pick, metres: float) -> float:
+    """Metres for each unit of the model, by the features nearest to two picks.
+
+    Raises InputError for an unknown photograph, or a pick without a feature nearby.
+    """
+    apart = float(np.linalg.norm(_picked(model, first) - _picked(model, second)))
+    if not apart > 0:
+        raise InputError("--scale must be two different points, got one; pick corners far from each other")
+    return metres / apart
+
+
+def _picked(model: Model, pick: Pick) -> np.ndarray:
+    """The point of the feature nearest to a pixel."""
+    name, x, y = pick
+    if name not in model.names:
+        raise InputError(unknown("photograph of --scale", name, model.names))
+    number = model.names.index(name)
+    apart = np.hypot(*(model.pixels[number] - (x, y)).T)
+    nearest = int(np.argmin(apart))
+    if apart[nearest] > SNAP * model.cameras[number].width:
+        raise InputError(
+            f"--scale must have pixels at features, got {name}:{x:g}:{y:g}; the nearest feature is at "
+            "{:.0f}:{:.0f}".format(*model.pixels[number][nearest])
+        )
+    return model.points[model.tracks[number][nearest]]

@@ -1,0 +1,135 @@
+"""Tags in photographs: detection, the region that a tag covers, and the inks of its print."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.images.files import read_image
+from fidsplat.markers import Marker, marker
+from fidsplat.photographs.adjustment import TagView
+from fidsplat.photographs.mapping import Progress
+from fidsplat.scenes.parts import PlacedMarker
+from fidsplat.util.errors import InputError
+from fidsplat.vision.detect import detect
+from fidsplat.vision.readback import families_of, same_code
+
+THICK = 0.15
+"""initial points within this distance of a tag's plane are of its print, as a share of its size"""
+_EDGE = 1.0
+"""pixels by which the masked region is larger than the tag"""
+_MIN_MODULE = 3.0
+"""pixels: smallest module whose colour is measured"""
+_MIN_CONTRAST = 0.1
+
+
+def parse_tags(texts: Sequence[str]) -> dict[str, Marker]:
+    """Markers of `SPEC=METRES`, by their specs. Raises InputError."""
+    found: dict[str, Marker] = {}
+    for text in texts:
+        spec, equals, size = text.rpartition("=")
+        try:
+            metres = float(size)
+        except ValueError:
+            equals = ""
+        if not equals:
+            raise InputError(
+                f"--tag must be a marker spec and the edge of its black square in metres, got {text!r}; "
+                "write for example apriltag:36h11:5=0.16"
+            )
+        made = marker(spec, metres)
+        other = next((each for each in found.values() if _identity(each) == _identity(made)), None)
+        if other is not None:
+            raise InputError(
+                f"each tag must have one size, got {other.size:g} and {made.size:g} m for {made.spec}; "
+                "measure the edge of the black square and give it once"
+            )
+        found[made.spec] = made
+    return found
+
+
+def _identity(made: Marker) -> tuple:
+    return (made.kind, made.payload if made.id is None else (made.family, made.id))
+
+
+def detect_tags(
+    folder: Path,
+    names: Sequence[str],
+    cameras: Sequence[Camera],
+    tags: Mapping[str, Marker],
+    progress: Progress,
+) -> list[TagView]:
+    """Detect tags in photographs; corners in pixels of the camera without its lens.
+
+    Raises InputError for a tag that occurs twice in a photograph.
+    """
+    families, qr = families_of(tags.values()), any(made.kind == "qr" for made in tags.values())
+    found: list[TagView] = []
+    for number, (name, camera) in enumerate(zip(names, cameras, strict=True)):
+        progress("tags", number / len(names))
+        detections = detect(read_image(folder / name), families, qr)
+        for spec, made in tags.items():
+            own = [code for code in detections if same_code(code, made)]
+            if len(own) > 1:
+                raise InputError(
+                    f"{spec} must occur once in the scene, got {len(own)} of it in {name}; remove copies, or "
+                    "print tags with other ids"
+                )
+            for code in own:
+                rays = camera.rays(code.corners)
+                corners = rays[:, :2] / rays[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+                if np.isfinite(corners).all() and (rays[:, 2] > 0).all():
+                    found.append(TagView(spec, number, corners))
+    return found
+
+
+def tag_region(placed: PlacedMarker, camera: Camera) -> np.ndarray:
+    """Pixels (h, w) bool that a tag covers with its quiet zone, if it faces the camera."""
+    size = (camera.height, camera.width)
+    if not placed.pose[:3, 2] @ (placed.pose[:3, 3] - camera.position) > 0:
+        return np.zeros(size, bool)
+    h, w = np.array(placed.marker.grid.shape) * placed.marker.module / 2
+    outline = np.array([[-w, -h, 0], [w, -h, 0], [w, h, 0], [-w, h, 0]])
+    corners = camera.project(outline @ placed.pose[:3, :3].T + placed.pose[:3, 3])
+    if not np.isfinite(corners).all():
+        return np.zeros(size, bool)
+    y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
+    inside = np.ones(size, bool)
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, 0), strict=True):
+        length = max(float(np.hypot(x1 - x0, y1 - y0)), 1e-9)
+        # clockwise in the image, since y points down
+        inside &= (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) > -_EDGE * length
+    return inside
+
+
+def beside_tags(points: np.ndarray, placed: Sequence[PlacedMarker]) -> np.ndarray:
+    """Points (n,) bool that are not of the print of a tag."""
+    free = np.ones(len(points), bool)
+    for tag in placed:
+        local = np.abs((points - tag.pose[:3, 3]) @ tag.pose[:3, :3])
+        h, w = np.array(tag.marker.grid.shape) * tag.marker.module / 2
+        free &= (local > (w, h, THICK * tag.marker.size)).any(1)
+    return free
+
+
+def module_colors(
+    placed: PlacedMarker, image: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Median colours (3,) of the dark and the light modules in a photograph (h, w, 3) uint8, display values;
+    None where the modules are too small or too few are in the image."""
+    made = placed.marker
+    rows, columns = np.indices(made.bits.shape) + 0.5
+    middle = np.array(made.bits.shape) / 2
+    flat = np.stack([columns - middle[1], rows - middle[0], 0 * rows], -1).reshape(-1, 3) * made.module
+    at = camera.project(flat @ placed.pose[:3, :3].T + placed.pose[:3, 3])
+    with np.errstate(invalid="ignore"):
+        inside = ((at >= 0) & (at < (camera.width, camera.height))).all(1)
+    edges = np.linalg.norm(np.diff(at.reshape(*made.bits.shape, 2), axis=1), axis=-1)
+    if not inside.all() or edges.min() < _MIN_MODULE:
+        return None
+    values = image[at[:, 1].astype(int), at[:, 0].astype(int)] / 255.0
+    dark, light = (np.median(values[made.bits.ravel() == bit], axis=0) for bit in (1, 0))
+    return (dark, light) if (light - dark).min() > _MIN_CONTRAST else None

@@ -1,0 +1,241 @@
+"""Photographs to a metric data set: adjustment of tags, world frame, EXIF, frames of a video."""
+
+import math
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat import InputError
+from fidsplat.images.exif import read_exif, with_exif
+from fidsplat.images.files import read_image
+from fidsplat.photographs.adjustment import TagView, adjust
+from fidsplat.photographs.frame import camera_up, world_frame
+from fidsplat.photographs.mapping import Model
+from fidsplat.photographs.photos import camera_groups, copy_photos
+from fidsplat.photographs.settings import CaptureSettings
+from fidsplat.photographs.steps import parse_scale, scale_of
+from fidsplat.photographs.tags import beside_tags, module_colors, parse_tags, tag_region
+from fidsplat.scenes import PlacedMarker
+from fidsplat.splats.rotations import quaternion_to_matrix, rigid_matrix
+from fidsplat.vision.video_frames import choose_frames, measure_frames
+
+SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
+
+
+def photographed(seed, scale, noise=0.1, count=8, tags=3, shaken=0.0):
+    """Cameras in a model of `scale` metres per unit, corners of tags in them, sizes and poses in metres."""
+    rng, true, cameras = np.random.default_rng(seed), [], []
+    for _ in range(count):
+        position = rng.uniform((-1, -0.6, -1.8), (1, 0.6, -1.2))
+        pose = fs.Camera.look_at(641, 481, 1.0, position, rng.normal(0, 0.1, 3)).world_to_camera
+        true.append(fs.Camera.pinhole(641, 481, 600, 660, 310, 250, pose))
+        pose = true[-1].world_to_camera.copy()
+        pose[:3, 3] /= scale
+        pose[:3, :3] = quaternion_to_matrix(np.array([1, *rng.normal(0, shaken / 2, 3)])) @ pose[:3, :3]
+        cameras.append(true[-1].with_pose(pose))
+    sizes = {f"tag {k}": 0.1 + 0.05 * k for k in range(tags)}
+    poses = {tag: rigid_matrix(rng.uniform(-0.4, 0.4, 3), [1, *rng.uniform(-0.3, 0.3, 3)]) for tag in sizes}
+    views = [
+        TagView(tag, i, camera.project(SQUARE * size @ poses[tag][:3, :3].T + poses[tag][:3, 3]))
+        for i, camera in enumerate(true)
+        for tag, size in sizes.items()
+    ]
+    noisy = [TagView(v.tag, v.image, v.corners + rng.normal(0, noise, (4, 2))) for v in views]
+    return cameras, noisy, sizes, poses
+
+
+def test_exact_corners_give_scale_and_poses():
+    cameras, views, sizes, poses = photographed(0, scale=0.37, noise=0.0)
+    found = adjust(cameras, views, sizes)
+    assert found.scale == pytest.approx(0.37, rel=1e-9)
+    assert found.rms < 1e-6
+    for tag, pose in poses.items():
+        np.testing.assert_allclose(found.poses[tag][:3, :3], pose[:3, :3], atol=1e-8)
+        np.testing.assert_allclose(found.poses[tag][:3, 3], pose[:3, 3] / 0.37, atol=1e-8)
+
+
+@pytest.mark.parametrize("shaken", [0.0, 3e-4])
+def test_the_standard_error_is_that_of_repeated_captures(shaken):
+    """Also with errors of the cameras' directions, which all corners of a photograph share."""
+    normalised = []
+    for seed in range(12):
+        found = adjust(*photographed(seed, scale=2.5, tags=2, shaken=shaken)[:3])
+        normalised.append(math.log(found.scale / 2.5) / found.scale_error)
+    assert 0.3 < np.mean(np.square(normalised)) < 2.2  # chi squared with 12 degrees of freedom: 98 %
+
+
+def test_a_tag_of_one_photograph_is_placed_by_the_scale_of_the_others():
+    cameras, views, sizes, poses = photographed(1, scale=2.0, noise=0.02)
+    views = [view for view in views if view.tag != "tag 2" or view.image == 3]
+    found = adjust(cameras, views, sizes)
+    assert "tag 2" not in found.scales
+    assert np.linalg.norm(2.0 * found.poses["tag 2"][:3, 3] - poses["tag 2"][:3, 3]) < 0.005
+
+
+def test_a_wrong_detection_is_rejected():
+    cameras, views, sizes, _ = photographed(2, scale=2.0)
+    views[4] = TagView(views[4].tag, views[4].image, views[4].corners + 60)
+    found = adjust(cameras, views, sizes)
+    assert found.rejected == (views[4],)
+    assert found.scale == pytest.approx(2.0, rel=0.005)
+
+
+def test_tags_that_contradict_are_errors():
+    cameras, views, sizes, _ = photographed(3, scale=2.0, tags=2)
+    with pytest.raises(InputError, match=r"sizes of tags must agree.*has 0\.1(5|499|501) m"):
+        adjust(cameras, views, sizes | {"tag 1": 0.25})
+    moved = [view if view.image % 2 else TagView(view.tag, view.image, view.corners + 50) for view in views]
+    with pytest.raises(InputError, match="at one place"):
+        adjust(cameras, moved, sizes)
+    with pytest.raises(InputError, match="from at least 2 positions, got tag 0 in 1, tag 1 in 1"):
+        adjust(cameras, views[:2], sizes)
+
+
+def level(azimuth, roll=0.0, pitch=0.0):
+    """A camera of a world with z up, around the origin."""
+    position = np.array([math.sin(azimuth), -math.cos(azimuth), math.tan(pitch)])
+    side = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+    return fs.Camera.look_at(64, 48, 1.0, position, (0, 0, 0), np.array([0, 0, 1.0]) + roll * side)
+
+
+def test_cameras_held_level_give_the_vertical():
+    cameras = [level(azimuth, pitch=0.6) for azimuth in np.linspace(0, 3, 9)]
+    np.testing.assert_allclose(camera_up(cameras), (0, 0, 1), atol=0.002)
+    alike = [level(0.3, roll, pitch=-0.2) for roll in (-0.1, 0.1)]  # one azimuth does not determine the pitch
+    assert camera_up(alike)[2] > 0.95
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_the_tag_of_up_is_exactly_vertical_and_at_the_origin(axis):
+    """On a wall upright (its y axis), sideways (x) or flat (z); the model is turned and scaled."""
+    model = rigid_matrix((0.3, -2, 1), (0.5, 0.4, -0.2, 0.7))
+    tag = np.eye(4)
+    tag[:3, :3] = np.roll(np.eye(3), axis + 1, axis=1)  # its `axis` is z of the world
+    tag[:3, :3] = quaternion_to_matrix(np.array([1, 0, 0, 0.1])) @ tag[:3, :3]
+    cameras = [level(azimuth, roll=0.1, pitch=0.3) for azimuth in (0.0, 0.4, 1.0)]
+    turned = [each.with_pose(each.world_to_camera @ np.linalg.inv(model)) for each in cameras]
+    frame = world_frame(turned, 3.0, model @ tag, vertical=True)
+    placed = frame.pose(model @ tag)
+    np.testing.assert_allclose(placed[:3, axis], (0, 0, 1), atol=1e-12)
+    np.testing.assert_allclose(placed[:3, 3], 0, atol=1e-12)
+    before = [np.linalg.norm(a.position - b.position) for a, b in pairwise(cameras)]
+    world = [frame.camera(each) for each in turned]
+    after = [np.linalg.norm(a.position - b.position) for a, b in pairwise(world)]
+    np.testing.assert_allclose(after, 3 * np.array(before), rtol=1e-9)
+    np.testing.assert_allclose(frame.points(model[None, :3, 3] + 0)[0], placed[:3, 3], atol=1e-12)
+
+
+def test_the_region_of_a_tag_is_masked_and_its_inks_are_measured():
+    tag = PlacedMarker(fs.marker("apriltag:36h11:5", 0.16, black=(0.2, 0.1, 0.1), white=(0.8, 0.9, 0.7)))
+    camera = fs.Camera.look_at(121, 91, 0.4, (0.1, 0.05, -0.6), (0, 0, 0))
+    frame = fs.Renderer("reference").render(tag.cloud(), fs.Capture(camera, outputs=("rgb", "alpha")))
+    region = tag_region(tag, camera)
+    assert region[frame["alpha"] > 0.01].all()
+    rim = cv2.dilate((frame["alpha"] > 0.5).astype(np.uint8), np.ones((7, 7))) == 0
+    assert not region[rim].any()
+    behind = camera.with_pose(position=(0, 0, 0.6), target=(0, 0, 0))
+    assert not tag_region(tag, behind).any()
+    dark, light = module_colors(tag, (255 * frame["rgb"]).round().astype(np.uint8), camera)
+    np.testing.assert_allclose(dark, (0.2, 0.1, 0.1), atol=0.02)
+    np.testing.assert_allclose(light, (0.8, 0.9, 0.7), atol=0.02)
+    points = np.array([[0.07, 0.0, 0.01], [0.12, 0.0, 0.0], [0.0, 0.0, -0.1]])
+    assert beside_tags(points, [tag]).tolist() == [False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tag": ("apriltag:36h11:5",)}, "--tag must be a marker spec and the edge"),
+        ({"tag": ("apriltag:36h11:5=0.1", "tag36h11:5=0.2")}, "one size, got 0.1 and 0.2 m"),
+        ({"tag": ("apriltag:36h11:5=0",)}, "size must be"),
+        ({"lens": "wide"}, "unknown lens 'wide'"),
+        ({"frames": 2}, "--frames must be"),
+        ({"tag": ("qr:a=1",), "scale": "a:1:1,b:2:2=1"}, "--scale must be given without --tag"),
+    ],
+)
+def test_wrong_settings_are_one_clear_line(options, message):
+    with pytest.raises(fs.InputError, match=message):
+        parse_tags(CaptureSettings(**options).tag)
+
+
+def test_two_picked_features_give_the_scale():
+    points = np.array([[0.0, 0, 2], [1, 0, 2], [0, 1.5, 4]])
+    camera = fs.Camera.pinhole(640, 480, 500, 500, 320, 240)
+    pixels = camera.project(points)
+    tracks = (np.array([0, 1]), np.array([2]))
+    pixels = tuple(camera.project(points[track]) for track in tracks)
+    model = Model(("a.jpg", "b.jpg"), (camera, camera), points, np.zeros((3, 3), np.uint8), pixels, tracks)
+    (x, y), (u, v) = pixels[0][1] + 4, pixels[1][0] - 3  # picks are near features, not at them
+    assert scale_of(model, *parse_scale(f"a.jpg:{x}:{y},b.jpg:{u}:{v}=5")) == pytest.approx(5 / 2.6925824)
+    with pytest.raises(InputError, match=r"a\.jpg:330:300; the nearest feature is at 320:240"):
+        scale_of(model, *parse_scale(f"a.jpg:330:300,b.jpg:{u}:{v}=5"))
+    with pytest.raises(InputError, match=r"unknown photograph of --scale 'c\.jpg'"):
+        scale_of(model, *parse_scale(f"a.jpg:{x}:{y},c.jpg:1:1=5"))
+    for text in ("a.jpg:1:1,b.jpg:2:2", "a.jpg:1:1=2", "a.jpg:1:1,b.jpg:2:2=0", "a:b:c,d:1:2=3"):
+        with pytest.raises(InputError, match="--scale must be two pixels"):
+            parse_scale(text)
+
+
+def exif(order, orientation):
+    """A segment with orientation and focal length."""
+    word = {"<": "little", ">": "big"}[order]
+
+    def number(value, size):
+        return value.to_bytes(size, word)
+
+    def entry(tag, kind, value):
+        return number(tag, 2) + number(kind, 2) + number(1, 4) + value
+
+    first = (
+        number(2, 2) + entry(0x0112, 3, number(orientation, 2) + b"\0\0") + entry(0x8769, 4, number(38, 4))
+    )
+    second = number(1, 2) + entry(0x920A, 5, number(56, 4))
+    tiff = {"<": b"II", ">": b"MM"}[order] + number(42, 2) + number(8, 4) + first + b"\0" * 4
+    tiff += second + b"\0" * 4 + number(43, 4) + number(10, 4)
+    return b"\xff\xe1" + (len(tiff) + 8).to_bytes(2, "big") + b"Exif\0\0" + tiff
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_exif_is_kept_with_upright_pixels(order, tmp_path):
+    image = np.zeros((16, 32, 3), np.uint8)
+    image[:8] = 255
+    jpeg = cv2.imencode(".jpg", image)[1].tobytes()
+    rotated = jpeg[:2] + exif(order, 6) + jpeg[2:]
+    found = read_exif(rotated)
+    assert (found.orientation, found.focal_length) == (6, (4.3,))
+    (tmp_path / "a.jpg").write_bytes(rotated)
+    assert read_image(tmp_path / "a.jpg").shape == (32, 16, 3)  # OpenCV reads the orientation too
+    upright = with_exif(jpeg, found)
+    again = read_exif(upright)
+    assert (again.orientation, again.focal_length) == (1, (4.3,))
+    (tmp_path / "b.jpg").write_bytes(upright)
+    np.testing.assert_array_equal(read_image(tmp_path / "b.jpg").shape, image.shape)
+    (tmp_path / "upright copies").mkdir()
+    files = [tmp_path / name for name in ("a.jpg", "b.jpg")]
+    copy_photos(files, tmp_path / "upright copies", lambda words, share: None)
+    copied = read_image(tmp_path / "upright copies" / "a.jpg")
+    np.testing.assert_allclose(copied, read_image(tmp_path / "a.jpg"), atol=3)
+    assert read_exif((tmp_path / "upright copies" / "a.jpg").read_bytes()).orientation == 1
+    # portrait and landscape have different cameras
+    assert camera_groups(tmp_path / "upright copies") == [["a.jpg"], ["b.jpg"]]
+    for damaged in (rotated[:40], jpeg, b"", rotated.replace(b"II", b"XX").replace(b"MM", b"XX")):
+        assert read_exif(damaged).orientation in (1, 6)
+
+
+def test_sharp_frames_at_equal_steps_are_chosen():
+    rng = np.random.default_rng(0)
+    wall = cv2.GaussianBlur(rng.integers(0, 255, (120, 1000, 3), np.uint8), (0, 0), 1.5)
+    shifts = [0] * 10 + [4 * i for i in range(1, 61)]  # still, then sideways by 2.5 % of the width
+    frames = [wall[:, shift : shift + 160] for shift in shifts]
+    blurred = set(range(0, 70, 3))
+    frames = [cv2.GaussianBlur(f, (0, 0), 2) if i in blurred else f for i, f in enumerate(frames)]
+    sharpness, motion = np.array(list(measure_frames(frames))).T
+    np.testing.assert_allclose(motion[12:], 4 / 160, atol=0.002)
+    chosen = choose_frames(sharpness, motion, 100)
+    assert not blurred & set(chosen)
+    assert 20 <= len(chosen) <= 26  # 60 x 0.025 / 0.06
+    assert np.diff(chosen).max() <= 10 + 4
+    assert len(choose_frames(sharpness, motion, 5)) == 5

@@ -1,0 +1,160 @@
+"""`fidsplat capture` on small photographs of two textured walls with two tags, whose cameras are known."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from command_line import fails, prints_json
+
+import fidsplat as fs
+from fidsplat.train import load_dataset
+
+pytest.importorskip("pycolmap", reason="pycolmap finds the cameras of photographs; pip install pycolmap")
+
+PER_METRE = 300
+TAGS = {"apriltag:36h11:5": (0.5, 0.5), "apriltag:36h11:9": (1.2, 0.7)}
+"""centres on the wall, metres from its upper left corner"""
+SIZE = 0.2
+ARGUMENTS = [word for tag in TAGS for word in ("--tag", f"{tag}={SIZE}")]
+
+
+def walls():
+    """Textures (h, w, 3) of two walls of 1.6 x 1.2 m at a right angle, and their world from metres (4, 4)."""
+    rng = np.random.default_rng(3)
+    textures = []
+    for _ in range(2):
+        fine, coarse = (
+            cv2.resize(
+                rng.integers(0, 255, (n * 3, n * 4, 3), np.uint8), (480, 360), interpolation=cv2.INTER_CUBIC
+            )
+            for n in (24, 8)
+        )
+        textures.append(cv2.addWeighted(fine, 0.5, coarse, 0.5, 0))
+    for tag, (x, y) in TAGS.items():
+        bits = np.pad(fs.marker(tag).bits, 1)
+        edge = round(SIZE * PER_METRE / 8 * 10)
+        modules = cv2.resize(
+            np.where(bits, 0, 255).astype(np.uint8), (edge, edge), interpolation=cv2.INTER_NEAREST
+        )
+        top, left = (round(v * PER_METRE - edge / 2) for v in (y, x))
+        textures[0][top : top + edge, left : left + edge] = modules[..., None]
+    # x right, y down; the second wall continues the first one towards the cameras
+    second = np.array([[0, 0, 1, 1.6], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
+    return list(zip(textures, (np.eye(4), second), strict=True))
+
+
+def cameras(count=5):
+    rng = np.random.default_rng(1)
+    for share in np.linspace(0, 1, count):
+        position = np.array([0.3 + 1.0 * share, 0.5, -1.4]) + rng.normal(0, 0.1, 3)
+        pose = fs.Camera.look_at(320, 240, 1.0, position, (1.0, 0.6, -0.1)).world_to_camera
+        yield fs.Camera.pinhole(320, 240, 290, 291, 160, 120, pose)
+
+
+def photograph(camera):
+    image = np.zeros((240, 320, 3), np.uint8)
+    for texture, wall in walls():
+        plane = (camera.world_to_camera @ wall)[:3][:, [0, 1, 3]] @ np.diag([1 / PER_METRE, 1 / PER_METRE, 1])
+        to_pixels = camera.matrix @ plane
+        # OpenCV counts from the centre of the first pixel
+        shift = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+        matrix = shift @ to_pixels @ np.linalg.inv(shift)
+        part = cv2.warpPerspective(texture, matrix, (320, 240), flags=cv2.INTER_AREA)
+        inside = cv2.warpPerspective(np.full(texture.shape[:2], 255, np.uint8), matrix, (320, 240)) > 127
+        image[inside] = part[inside]
+    return image
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photos")
+    for i, camera in enumerate(cameras()):
+        cv2.imwrite(str(folder / f"view {i}.png"), photograph(camera))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def captured(photos, tmp_path_factory):
+    out = tmp_path_factory.mktemp("scene")
+    return out, [photos, "-o", out, *ARGUMENTS, "--up", "apriltag:36h11:9"]
+
+
+def test_photographs_become_a_metric_data_set(captured, capsys):
+    out, words = captured
+    facts = prints_json(capsys, "capture", *words)
+    assert (facts["registered"], facts["missing"]) == (5, {})
+    assert facts["corner_rms_px"] < 0.4
+    known = {f"view_{i}.png": camera for i, camera in enumerate(cameras())}
+    found = fs.load_cameras(out / "sparse" / "0")
+    assert found.keys() == known.keys()
+    # distances between cameras, in metres
+    lengths = [
+        [np.linalg.norm(each["view_0.png"].position - each[f"view_{i}.png"].position) for i in (2, 3, 4)]
+        for each in (found, known)
+    ]
+    np.testing.assert_allclose(*lengths, rtol=0.01)
+    markers = fs.Scene.load(without_splats(out)).markers
+    assert [tag.marker.spec for tag in markers] == list(TAGS)
+    # the tag of --up is upright at the origin; x points right along the wall and y into it
+    np.testing.assert_allclose(markers[1].pose[:3, :3], [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
+    np.testing.assert_allclose(markers[1].pose[:3, 3], 0, atol=1e-12)
+    np.testing.assert_allclose(markers[0].pose[:3, 3], (-0.7, 0, 0.2), atol=0.01)
+    black, white = markers[0].marker.inks
+    assert max(black) < 0.1 < 0.9 < min(white)
+
+
+def without_splats(folder):
+    """The scene before training, in a file that names no splats."""
+    file = folder / "tags.toml"
+    file.write_text((folder / "scene.toml").read_text().partition("[[splats]]")[0])
+    return file
+
+
+def test_training_reads_the_data_set_without_the_tags(captured):
+    out, _ = captured
+    dataset = load_dataset(out)
+    assert len(dataset.views) == 5
+    tags = fs.Scene.load(without_splats(out)).markers
+    for view in dataset.views:
+        for tag in tags:
+            x, y = view.camera.project(tag.pose[None, :3, 3])[0].astype(int)
+            assert not view.mask[y, x]
+        assert view.mask.mean() > 0.8
+
+
+def test_the_same_command_resumes_with_other_tags(captured, capsys):
+    out, words = captured
+    before = (out / "work" / "model" / "images.bin").stat().st_mtime_ns
+    half = [word.replace("=0.2", "=0.1") if isinstance(word, str) else word for word in words]
+    facts = prints_json(capsys, "capture", *half)
+    assert (out / "work" / "model" / "images.bin").stat().st_mtime_ns == before
+    markers = fs.Scene.load(without_splats(out)).markers
+    np.testing.assert_allclose(markers[0].pose[:3, 3], (-0.35, 0, 0.1), atol=0.005)
+    assert facts["tags"].keys() == TAGS.keys()
+    wrong = [word.replace("5=0.1", "5=0.2") if isinstance(word, str) else word for word in half]
+    status, message = fails(capsys, "capture", *wrong)
+    assert status == 2
+    assert "sizes of tags must agree" in message
+
+
+def test_too_few_or_unrelated_photographs_are_one_clear_line(photos, captured, tmp_path, capsys):
+    two, unrelated = tmp_path / "two", tmp_path / "unrelated"
+    rng = np.random.default_rng(0)
+    for folder in (two, unrelated):
+        folder.mkdir()
+    for i in range(3):
+        noise = cv2.resize(rng.integers(0, 255, (12, 16, 3), np.uint8), (160, 120))
+        cv2.imwrite(str(unrelated / f"{i}.png"), noise)
+        if i < 2:
+            cv2.imwrite(str(two / f"{i}.png"), noise)
+    status, message = fails(capsys, "capture", two, "-o", tmp_path / "a")
+    assert (status, "at least 3 photographs, got 2" in message) == (2, True)
+    status, message = fails(capsys, "capture", unrelated, "-o", tmp_path / "b")
+    assert status == 2
+    assert "photographs must overlap" in message
+    assert "0.png: " in message
+    status, message = fails(capsys, "capture", unrelated, "-o", captured[0])
+    assert (status, "of the same photographs" in message) == (2, True)
+    status, message = fails(capsys, "capture", photos, "-o", tmp_path / "c", "--up", "qr:a")
+    assert (status, "--up must be a tag of --tag" in message) == (2, True)
