@@ -1,7 +1,5 @@
 """`fidsplat capture` on small photographs of two textured walls with two tags, whose cameras are known."""
 
-import json
-
 import cv2
 import numpy as np
 import pytest
