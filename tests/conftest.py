@@ -1,6 +1,7 @@
 """Every device that can be opened here, the reference excepted: contract tests run on each."""
 
 import math
+import random
 
 import pytest
 from rich.progress import Progress
@@ -22,9 +23,23 @@ def pytest_generate_tests(metafunc):
         metafunc.parametrize("renderer", names, indirect=True, scope="session")
 
 
+def pytest_addoption(parser):
+    words = "device that begins with the cases of `in_turn` (tests/sampling.py): 0 or 1; each run draws one"
+    parser.addoption("--turn", type=int, help=words)
+
+
+def pytest_configure(config):
+    if config.option.turn is None:  # drawn before xdist starts its workers, which receive the options
+        config.option.turn = random.randrange(2)
+
+
+def pytest_report_header(config):
+    return f"cases in turn: this sample by --turn={config.option.turn}"
+
+
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
-    take_turns(items, [info.name for info in USABLE if info.kind == "cpu"])
+def pytest_collection_modifyitems(config, items):
+    take_turns(items, [info.name for info in USABLE if info.kind == "cpu"], config.option.turn)
 
 
 @pytest.fixture(scope="session")

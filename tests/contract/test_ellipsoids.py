@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, against_reference, assert_agrees, random_splats
-from sampling import in_turn
+from sampling import by, in_turn
 
 import fidsplat as fs
 from fidsplat.capture.quality import ELLIPSOID
@@ -40,12 +40,14 @@ def mixed(seed):
     return fs.SplatCloud.concatenate([disks, thick(seed), boxes, marker.transformed(pose)])
 
 
+@in_turn()
 @pytest.mark.parametrize("way", ["exact", "ewa"])
 def test_all_kinds_of_splats_in_one_frame(renderer, way):
     """Around the camera and across its plane, with every output."""
     assert_agrees(renderer, mixed(5), CAMERA, quality=fs.Quality(ellipsoid=way))
 
 
+@in_turn(1)
 @pytest.mark.parametrize("way", ["exact", "ewa"])
 def test_each_fragment_by_its_own_depth(renderer, way):
     disks = random_splats(20, 3, depth=(0.5, 4.0), scale=(0.05, 0.5), across=1.2)
@@ -61,6 +63,7 @@ ALONE = {
 }
 
 
+@in_turn(0, by("order"))
 @pytest.mark.parametrize("order", ["centre", "pixel"])
 @pytest.mark.parametrize("place", ALONE)
 def test_ellipsoids_are_bit_identical_in_any_cloud(renderer, place, order):
@@ -88,6 +91,7 @@ def test_exact_behind_a_fisheye(renderer):
     assert_agrees(renderer, mixed(7), camera, quality=fs.Quality())
 
 
+@in_turn(1)
 @pytest.mark.parametrize("anisotropy", [1e3, 1e6])
 def test_needles_and_pancakes(renderer, anisotropy):
     """Also straight along a needle and edge-on to a pancake."""

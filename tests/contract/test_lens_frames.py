@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, against_reference, assert_agrees, random_splats, reference_pixels
-from sampling import SAMPLES, alternate, in_turn
+from sampling import SAMPLES, alternate, by_lens, in_turn
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
@@ -37,7 +37,19 @@ CAMERAS = {
     "panorama": fs.Camera.equirectangular(110, 55, POSE),
     "parallel": fs.Camera.pinhole(75, 62, 19.0, 24.0, 36.0, 32.5, POSE, lens=fs.Orthographic()),
 }
-each_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+
+
+def lens_of(call):
+    """Number of a case for `in_turn`: a kind of lens is on one device."""
+    return by_lens(call, CAMERAS)
+
+
+each_lens = in_turn(0, lens_of)
+
+
+def each_camera(test):
+    """A case for each camera, each lens on one device."""
+    return each_lens(pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)(test))
 
 
 @each_camera
@@ -46,6 +58,7 @@ def test_splats_all_around_the_camera(renderer, camera, seed):
     assert_agrees(renderer, random_splats(200, seed, depth=(-5.0, 6.0)), camera)
 
 
+@each_lens
 @pytest.mark.parametrize("name", ["distortion", "fisheye 200", "panorama", "parallel"])
 def test_near_and_far_planes_amid_the_splats(renderer, name):
     """Whole disks end at the far plane, fragments at the near one."""
@@ -56,6 +69,7 @@ def test_near_and_far_planes_amid_the_splats(renderer, name):
     assert np.abs(frame["rgb"] - whole["rgb"]).max() > 0.1
 
 
+@each_lens
 @pytest.mark.parametrize("name", ["pinhole", "distortion", "fisheye 200", "panorama", "parallel"])
 def test_depths_of_a_tilted_wall_are_right_to_a_hundred_thousandth(renderer, name):
     """Without a certificate: nothing is hard here."""
@@ -135,20 +149,21 @@ def test_rims_in_a_panorama(renderer, seed, depth, scale):
     assert_agrees(renderer, opaque, camera, quality=TO_THE_RIM)
 
 
-@in_turn()
+@each_lens
 @pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, SAMPLES))
 def test_layers(renderer, camera, samples):
     assert_agrees(renderer, coplanar_cloud(1), camera, quality=fs.Quality(samples=samples))
 
 
 # test_all_effects of both matrices has them behind every lens
-@in_turn()
+@each_lens
 @pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama", "parallel"])
 def test_colours_that_depend_on_the_view(renderer, name):
     cloud = random_splats(100, 11, depth=(1, 6), scale=(0.02, 0.4), sh_degree=3)
     assert_agrees(renderer, cloud, CAMERAS[name])
 
 
+@each_lens
 @pytest.mark.parametrize("name", ["fisheye 200", "panorama"])
 def test_splats_that_cross_the_rim_seam_and_poles(renderer, name):
     """Splats centred within a few degrees of where the image ends, or of its poles and seam."""
@@ -197,6 +212,7 @@ def test_outside_the_lens_is_background(renderer):
     assert frame["alpha"][~outside].max() > 0.5
 
 
+@each_lens
 @pytest.mark.parametrize("name", ["fold", "fisheye 200"])
 def test_outside_of_a_lens_there_is_no_distance_and_no_gradient(renderer, name):
     image = FrameSpec(
@@ -248,6 +264,7 @@ def test_depths_of_a_fisheye_are_distances(renderer):
     np.testing.assert_allclose(renderer.render(wall, parallel, ALL_OUTPUTS)["depth"], 2, rtol=1e-5)
 
 
+@each_lens
 @pytest.mark.parametrize("name", ["fisheye", "parallel"])
 def test_bands_are_bit_identical(renderer, name):
     cloud, camera = random_splats(300, 2, depth=(-4.0, 5.0)), CAMERAS[name]
@@ -262,7 +279,7 @@ def test_bands_are_bit_identical(renderer, name):
         backend.pair_budget = held
 
 
-@in_turn()
+@each_lens
 @pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama", "parallel"])
 def test_lenses_in_single_precision(renderer, name):
     """The set-up of devices without float64, held as the pinhole's is: to a tenth of an 8-bit step."""

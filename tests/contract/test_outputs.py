@@ -15,6 +15,7 @@ ALL = tuple(OUTPUTS)
 KINDS = ("", "_median", "_first")
 
 
+@in_turn()
 @pytest.mark.parametrize(("seed", "quality"), [(0, "standard"), (1, "reference"), (2, "gsplat")])
 def test_outputs_of_splats_around_the_camera(renderer, seed, quality):
     assert_agrees(renderer, random_splats(150, seed), CAMERA, ALL, quality)
@@ -27,6 +28,7 @@ def test_outputs_of_several_samples(renderer, samples):
     assert_agrees(renderer, cloud, CAMERA, ALL, fs.Quality(samples=samples, first_hit=0.6))
 
 
+@in_turn(1)
 @pytest.mark.parametrize("mixture", ["fitted", "exact"])
 def test_outputs_of_layers(renderer, mixture):
     tag = fs.marker("aruco:4x4_50:7", size=1.0, mixture=mixture).cloud

@@ -47,11 +47,13 @@ def test_steps_of_the_sensor(renderer, name):
     agree(renderer, FrameSpec(CLOUD, CAMERA, outputs=("rgb",), sensor=SENSORS[name]))
 
 
+@in_turn()
 @pytest.mark.parametrize("name", ["all", "vignetting"])
 def test_the_sensor_sees_pixels_not_samples(renderer, name):
     agree(renderer, FrameSpec(CLOUD, CAMERA, fs.Quality(samples=2), sensor=SENSORS[name]))
 
 
+@in_turn(1)
 @pytest.mark.parametrize(
     ("density", "samples"), alternate({"thin": 0.05, "fog": 1.0, "thick": 30.0}, SAMPLES)
 )
@@ -67,6 +69,7 @@ def test_fog(renderer, density, samples):
 SKIES = {"gradient": fs.Gradient((0.2, 0.4, 0.9), (0.3, 0.2, 0.1), (0.1, -2, 0.3)), "panorama": panorama()}
 
 
+@in_turn()
 @pytest.mark.parametrize(("background", "samples"), alternate(SKIES, {"1 sample": 1, "3 x 3 samples": 3}))
 def test_backgrounds(renderer, background, samples):
     for target in ((0.0, 0.1, 3.0), (0.0, 0.1, -3.0), (0.3, -9.0, 0.0)):
@@ -185,6 +188,7 @@ def test_nothing_is_read_beyond_the_end_of_a_table(renderer, monkeypatch):
     assert (frame["rgb"] == 1).all()
 
 
+@in_turn(1)
 @pytest.mark.parametrize("samples", [1, 2])
 def test_light_falls_off_from_the_principal_point(renderer, samples):
     """By the formula, at the centres of pixels; black, not negative, in the corners."""

@@ -160,6 +160,7 @@ def test_many_views_share_a_motion_and_a_shutter(renderer):
         assert all(np.array_equal(moved[name], single[name]) for name in outputs)
 
 
+@in_turn()
 @pytest.mark.parametrize(("lowpass", "samples"), alternate({"screen": "screen", "none": "none"}, SAMPLES))
 def test_what_bands_leave_out_by_its_sphere_renders_nothing_there(renderer, lowpass, samples):
     """The same bits with and without `shutter_rows`: near, behind, large and far below a pixel."""

@@ -3,19 +3,29 @@
 import json
 from dataclasses import replace
 
+import pytest
+from sampling import in_turn
+
 from fidsplat.backends.opencl import pipeline
 from fidsplat.cli import main
 from fidsplat.selftest import digests
 
 
-def test_devices_render_the_digests_of_the_table(renderer, monkeypatch):
+def test_the_table_has_all_scenes():
+    assert list(digests.read_table()) == list(range(digests.COUNT))
+
+
+@in_turn()
+@pytest.mark.parametrize("kind", digests.KINDS, ids=lambda kind: kind.name)
+def test_devices_render_the_digests_of_the_table(renderer, monkeypatch, kind):
+    """Each kind of scene is on one device in a run, which compiles a feature set for it."""
     monkeypatch.setattr(pipeline, "MIN_BATCHED", 0)  # set-up is vectorised where it can be
-    expected = digests.read_table()
-    assert list(expected) == list(range(digests.COUNT))
+    expected = {seed: row for seed, row in digests.read_table().items() if digests.kind_of(seed) == kind}
+    assert len(expected) == digests.COUNT // len(digests.KINDS)
     differing = {
-        seed: (digests.kind_of(seed).name, found.differing(expected[seed]))
-        for seed in expected
-        if (found := digests.digest_of(renderer, seed)) != expected[seed]
+        seed: found.differing(row)
+        for seed, row in expected.items()
+        if (found := digests.digest_of(renderer, seed)) != row
     }
     assert not differing
 

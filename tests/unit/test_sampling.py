@@ -1,11 +1,22 @@
 """What plain pytest leaves to `pytest -m exhaustive`."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-from sampling import alternate, in_turn, sampled, take_turns
+from sampling import alternate, by, by_lens, in_turn, sampled, take_turns
+
+import fidsplat as fs
 
 DEVICES = ("one", "two", "gpu")
+PINHOLE = fs.Camera.pinhole(8, 8, 8.0, 8.0, 4.0, 4.0)
+CAMERAS = (
+    PINHOLE,
+    fs.Camera.fisheye(8, 8, 2.0),
+    fs.Camera.equirectangular(8, 8),
+    replace(PINHOLE, lens=fs.Fisheye(0.1)),
+    replace(PINHOLE, lens=fs.BrownConrady(-0.1)),
+)
 
 
 class Item:
@@ -14,7 +25,9 @@ class Item:
     def __init__(self, device, case, *marks):
         self.name = f"{device}-{case}"
         self.nodeid = f"file::test[{self.name}]"
-        self.callspec = SimpleNamespace(id=self.name, params={"renderer": device})
+        self.callspec = SimpleNamespace(
+            id=self.name, params={"renderer": device, "camera": CAMERAS[case]}, indices={"pair": case // 2}
+        )
         self.marks = {mark.name: mark for mark in marks}
 
     def get_closest_marker(self, name):
@@ -24,10 +37,10 @@ class Item:
         self.marks[mark.name] = mark.mark
 
 
-def kept(marks_of):
+def kept(marks_of, turn=0):
     """Of five cases on three devices, those that plain pytest runs."""
     items = [Item(device, case, *marks_of(case)) for device in DEVICES for case in range(5)]
-    take_turns(items, DEVICES[:2])
+    take_turns(items, DEVICES[:2], turn)
     return [item.name for item in items if "exhaustive" not in item.marks and item.name[:3] != "gpu"], items
 
 
@@ -36,6 +49,24 @@ def test_each_case_runs_on_one_device_round_robin_and_on_every_gpu():
     assert names == ["one-0", "one-2", "one-4", "two-1", "two-3"]
     assert not any("exhaustive" in item.marks for item in items[10:])
     assert kept(lambda case: [in_turn(1).mark])[0] == ["one-1", "one-3", "two-0", "two-2", "two-4"]
+
+
+@pytest.mark.parametrize("number", [None, by("pair"), by_lens])
+def test_two_runs_have_every_case_on_both_devices(number):
+    runs = [kept(lambda case: [in_turn(0, number).mark], turn)[0] for turn in (0, 1)]
+    assert all(len(run) == 5 and {name[:3] for name in run} == {"one", "two"} for run in runs)
+    assert len({*runs[0], *runs[1]}) == 10
+
+
+def test_cases_of_one_number_run_on_one_device():
+    assert kept(lambda case: [in_turn(0, by("pair")).mark])[0] == [
+        "one-0",
+        "one-1",
+        "one-4",
+        "two-2",
+        "two-3",
+    ]
+    assert kept(lambda case: [in_turn(0, by_lens).mark])[0] == ["one-0", "one-1", "one-3", "two-2", "two-4"]
 
 
 def test_what_is_left_out_anyway_is_not_scheduled():
