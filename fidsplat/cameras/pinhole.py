@@ -3,6 +3,7 @@
 import math
 import operator
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -77,15 +78,21 @@ class Camera(PickledByFields, Summarised):
                 raise InputError(f"camera {name} must be finite, got {getattr(self, name)!r}")
         if not self.far > self.near:
             raise InputError(f"camera far must be above near ({self.near!r}), got {self.far!r}")
-        given = pose_matrix(self.world_to_camera, "camera world_to_camera")
+        self._set_pose(self.world_to_camera, self.position)
+        if self.lens is not None:
+            self._check_lens()
+
+    def _set_pose(self, world_to_camera: Any, position: Any) -> None:
+        """Set the pose of a new camera. Raises InputError if it is not rigid."""
+        given = pose_matrix(world_to_camera, "camera world_to_camera")
         check_similarity(given, "camera world_to_camera", rigid=True)
         matrix = np.array(given, dtype=np.float64)
         rotation, moved = matrix[:3, :3], matrix[:3, 3]
-        if self.position is None:
+        if position is None:
             # by the inverse, not the transpose: a rotation from a float32 file is orthonormal to 1e-7 only
             position = np.linalg.solve(rotation, -moved) + 0.0
         else:
-            position = _vector("position", self.position)
+            position = _vector("position", position)
             if np.abs(rotation @ position + moved).max() > 1e-6 * (1 + np.abs(position).max()):
                 raise InputError(
                     f"camera position must be that of world_to_camera, got {tuple(position.tolist())}; leave "
@@ -93,9 +100,14 @@ class Camera(PickledByFields, Summarised):
                 )
         for name, array in (("world_to_camera", matrix), ("position", position)):
             array.flags.writeable = False
-            put(self, name, array)
-        if self.lens is not None:
-            self._check_lens()
+            object.__setattr__(self, name, array)
+
+    def _posed(self, world_to_camera: Any, position: Any = None) -> "Camera":
+        """A copy at another pose; the other fields were checked when this camera was made."""
+        camera = object.__new__(Camera)
+        camera.__dict__.update(self.__dict__)
+        camera._set_pose(world_to_camera, position)
+        return camera
 
     def _check_lens(self) -> None:
         lens = self.lens
@@ -263,15 +275,15 @@ class Camera(PickledByFields, Summarised):
             rotation, _, position = check_similarity(pose, "camera_to_world", rigid=True)
             world_to_camera = np.eye(4)
             world_to_camera[:3, :3], world_to_camera[:3, 3] = rotation.T, -rotation.T @ position
-            return replace(self, world_to_camera=world_to_camera, position=position)
+            return self._posed(world_to_camera, position)
         if world_to_camera is not None:
-            return replace(self, world_to_camera=world_to_camera, position=None)
+            return self._posed(world_to_camera)
         position = self.position if position is None else _vector("position", position)
         if target is not None:
-            return replace(self, world_to_camera=look_at_matrix(position, target, up), position=position)
+            return self._posed(look_at_matrix(position, target, up), position)
         pose = self.world_to_camera.copy()
         pose[:3, 3] = -pose[:3, :3] @ position
-        return replace(self, world_to_camera=pose, position=position)
+        return self._posed(pose, position)
 
     def with_size(self, width: int, height: int) -> "Camera":
         """The same camera with another number of pixels.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypedDict
 
@@ -18,6 +18,9 @@ _KINDS = {
     **{"motion": Motion, "shutter": Shutter, "sensor": Sensor, "fog": Fog},
     **{"external_depth": ExternalDepth},
 }
+# shared by captures: making them takes longer than the rest of a capture
+_QUALITY, _MOTION, _SHUTTER, _SENSOR = Quality(), Motion(), Shutter(), Sensor()
+_DEFAULTS = {"motion": _MOTION, "shutter": _SHUTTER, "sensor": _SENSOR}
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,15 +35,15 @@ class Capture(PickledByFields):
     """None: must be set before rendering"""
     outputs: tuple[str, ...] = ("rgb",)
     """names of the output images; a single name may be a str"""
-    quality: Quality = field(default_factory=Quality)
+    quality: Quality = _QUALITY
     """a Quality, or text such as "fast" or "fast,samples=2" (`Quality.of`); None: standard"""
     background: Background = (0.0, 0.0, 0.0)
     """behind the splats: RGB in display space, a Gradient or a Panorama"""
-    motion: Motion = field(default_factory=Motion)
+    motion: Motion = _MOTION
     """motion of the camera and of groups of splats; None: nothing moves"""
-    shutter: Shutter = field(default_factory=Shutter)
+    shutter: Shutter = _SHUTTER
     """time, exposure and readout; None: at time 0, without duration"""
-    sensor: Sensor = field(default_factory=Sensor)
+    sensor: Sensor = _SENSOR
     """sensor applied to rgb; None: no sensor"""
     fog: Fog | None = None
     """fog between the camera and the splats"""
@@ -58,8 +61,8 @@ class Capture(PickledByFields):
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
                 raise InputError(f"{name} must be a {kind.__name__}, got {value!r}")
-            if value is None and name in ("motion", "shutter", "sensor"):
-                put(self, name, kind())
+            if value is None and name in _DEFAULTS:
+                put(self, name, _DEFAULTS[name])
 
     @cached_property
     def foggy(self) -> bool:

@@ -97,7 +97,8 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
             f"{name} must be a rotation with one uniform scale, got columns that are skew or of unequal "
             f"length, by {off:.1g} where 1e-06 is allowed{rounded}"
         )
-    if np.linalg.det(rotation) < 0:
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:  # the determinant
         raise InputError(
             f"{name} holds a reflection (its determinant is negative); only rotations are possible"
         )

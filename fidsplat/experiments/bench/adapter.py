@@ -20,6 +20,9 @@ from typing import Any
 
 import numpy as np
 
+WARM_UP = 0.01
+"""seconds of untimed submissions before a timed one"""
+
 
 class Server:
     """Answers requests by an adapter. A request is a dict with the name of a method as `do`."""
@@ -37,8 +40,11 @@ class Server:
         self.adapter.load(scene)
         return {"load_ms": 1e3 * (time.perf_counter() - begun)}
 
-    def frame(self, setting: str, views: list[int]) -> dict:
-        """Render views as one submission; milliseconds until they are complete, and processor time."""
+    def frame(self, setting: str, views: list[int], before: list[list[int]] | None = None) -> dict:
+        """Render views as one submission, after untimed submissions `before`, repeated for WARM_UP seconds;
+        milliseconds until they are complete, and processor time."""
+        if before:
+            self._repeat(setting, before, WARM_UP)
         begun, busy = time.perf_counter(), time.process_time()
         self.rendered = self.adapter.render(setting, views)
         taken = {"ms": 1e3 * (time.perf_counter() - begun), "cpu_ms": 1e3 * (time.process_time() - busy)}
@@ -56,11 +62,17 @@ class Server:
 
     def burst(self, setting: str, views: list[int], seconds: float) -> dict:
         """Render the same views again and again; number of submissions and seconds."""
-        begun, count = time.perf_counter(), 0
-        while (taken := time.perf_counter() - begun) < seconds:
-            self.adapter.render(setting, views)
+        begun = time.perf_counter()
+        count = self._repeat(setting, [views], seconds)
+        return {"submissions": count, "seconds": time.perf_counter() - begun}
+
+    def _repeat(self, setting: str, submissions: list[list[int]], seconds: float) -> int:
+        """Render submissions in turn until the time has passed; their number."""
+        end, count = time.perf_counter() + seconds, 0
+        while time.perf_counter() < end:
+            self.adapter.render(setting, submissions[count % len(submissions)])
             count += 1
-        return {"submissions": count, "seconds": taken}
+        return count
 
 
 def main() -> None:

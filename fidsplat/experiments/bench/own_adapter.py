@@ -56,7 +56,7 @@ class Adapter:
         self.resident = self.renderer.upload(cloud)
         inverse = np.linalg.inv(self.poses)
         self.vectors = np.hstack([inverse[:, :3, 3], matrices_to_quaternions(inverse[:, :3, :3])])
-        self.capture = lru_cache(None)(self._capture)
+        self.capture = lru_cache(1)(self._capture)  # a flight makes one for each frame
 
     def _capture(self, setting: str, view: int) -> fs.Capture:
         return fs.Capture(self.camera.with_pose(self.poses[view]), quality=self.qualities[setting])

@@ -42,7 +42,7 @@ SLOW, TOO_SLOW = 1000.0, 10_000.0
 """Milliseconds of a frame. Above SLOW, a renderer is measured at its first setting, and interleaved
 separately, so that faster renderers have more rounds. Above TOO_SLOW it is left out."""
 SHORT = 50.0
-"""milliseconds: shorter frames follow an untimed one, since another process used the device before"""
+"""milliseconds: shorter frames follow untimed ones, since another process used device and caches before"""
 Progress = Callable[[str, float], None]
 
 
@@ -112,10 +112,12 @@ class RendererProcess:
             self._process.stdin.flush()
         return self._answer()
 
-    def frame(self, setting: str, views: list[int]) -> dict[str, float]:
-        """Render one submission; the clock advances by its time. Returns `ms`, `cpu_ms`, and `device_ms` if
-        known."""
-        taken = self.ask("frame", setting=setting, views=views)
+    def frame(
+        self, setting: str, views: list[int], before: list[list[int]] | None = None
+    ) -> dict[str, float]:
+        """Render one submission, after untimed submissions `before`; the clock advances by its time.
+        Returns `ms`, `cpu_ms`, and `device_ms` if known."""
+        taken = self.ask("frame", setting=setting, views=views, before=before)
         self.clock.seconds += taken["ms"] / 1e3
         return taken
 
@@ -178,13 +180,16 @@ class Measurement:
         self.second_ms = 0.0
         """milliseconds of the second frame of the first view"""
         self.timer = Timer(self._render, process.clock, catch_errors=True)
-        self._next = cycle(submissions)
+        self._next = cycle(range(len(submissions)))
 
     def _render(self) -> dict[str, float]:
-        views = next(self._next)
-        if self.second_ms < SHORT:
-            self.process.ask("frame", setting=self.setting, views=views)
-        taken = self.process.frame(self.setting, views)
+        number = next(self._next)
+        # those of a flight before this one, so that its camera is new to the renderer, as in a flight
+        before = [self.submissions[number - k] for k in range(min(8, len(self.submissions) - 1), 0, -1)]
+        views = self.submissions[number]
+        taken = self.process.frame(
+            self.setting, views, (before or [views]) if self.second_ms < SHORT else None
+        )
         return {name: ms for name, ms in taken.items() if name != "ms"}
 
     def first(self, references: References, file: Path) -> np.ndarray:
