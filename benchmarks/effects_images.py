@@ -31,6 +31,7 @@ from fidsplat.images.visualize import (
     depth_span,
     normal_key,
 )
+from fidsplat.markers import BentSheet, BoxEdge, Cone, Crumpled, Cylinder, Wear
 from fidsplat.scenes import PlacedMarker
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -177,6 +178,47 @@ def drawing_sheet(renderer: fs.Renderer) -> np.ndarray:
     return contact_sheet([panels], width=WIDTH)
 
 
+def turned_marker(renderer: fs.Renderer, size: tuple[int, int], **settings) -> np.ndarray:
+    """A tilted AprilTag with a shape or wear."""
+    camera = fs.Camera.look_at(*size, math.radians(46), (0.12, -0.13, -0.27), (0, 0, 0.01))
+    scene = fs.Scene(markers=[PlacedMarker(fs.marker("apriltag:36h11:5", 0.16, **settings))])
+    return to_uint8(renderer.render(scene, camera, background=(0.45, 0.5, 0.55))["rgb"])
+
+
+def shapes_sheet(renderer: fs.Renderer) -> np.ndarray:
+    """A tag on each shape, and a part of two at four times the size."""
+    shapes = {
+        "cylinder, radius 0.06": Cylinder(0.06),
+        "cone, radius 0.09, taper 0.4": Cone(0.09, 0.4),
+        "bent, radius 0.05, length 0.15": BentSheet(0.05, 0.15),
+        "edge, radius 0.006": BoxEdge(0.006),
+        "crumpled, height 0.009, length 0.09": Crumpled(0.009, 0.09, 2),
+    }
+    panels = [(name, turned_marker(renderer, (WIDTH, HEIGHT), shape=shape)) for name, shape in shapes.items()]
+    return contact_sheet([panels[:3], [*panels[3:], ("crumpled, 4 x", enlarged(panels[4][1]))]], width=WIDTH)
+
+
+def wear_sheet(renderer: fs.Renderer) -> np.ndarray:
+    """A tag with each kind of wear."""
+    severities = {"bleed": 0.3, "coarseness": 0.4, "fading": 0.6, "dirt": 0.3, "drops": 0.3}
+    severities |= {"scratches": 0.2, "tear": 0.2, "fold": 0.4, "cover": 0.2}
+    panels = [
+        (
+            f"{name} {severity:g}",
+            turned_marker(renderer, (WIDTH, HEIGHT), wear=Wear(**{name: severity}, seed=2)),
+        )
+        for name, severity in severities.items()
+    ]
+    return contact_sheet([panels[k : k + 3] for k in (0, 3, 6)], width=WIDTH)
+
+
+def enlarged(image: np.ndarray) -> np.ndarray:
+    """The middle quarter of an image, each pixel as 4 x 4."""
+    h, w = image.shape[0] // 4, image.shape[1] // 4
+    top, left = (image.shape[0] - h) // 2, (image.shape[1] - w) // 2
+    return image[top : top + h, left : left + w].repeat(4, 0).repeat(4, 1)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -200,6 +242,8 @@ def main() -> None:
     ]
     save(options.out / "effect-boxes.jpg", contact_sheet(boxes, width=WIDTH))
     save(options.out / "drawing.jpg", drawing_sheet(renderer))
+    save(options.out / "effect-shapes.jpg", shapes_sheet(renderer))
+    save(options.out / "effect-wear.jpg", wear_sheet(renderer))
     save(options.out / "effect-outputs.jpg", outputs_sheet(renderer, exact))
 
     panels = [

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.util.arguments import as_float, instance, invalid, whole_number
+from fidsplat.util.arguments import as_float, instance, invalid, parse_setting, whole_number
 from fidsplat.util.errors import InputError, unknown
 
 LOWPASS = ("screen", "pixel", "none")
@@ -274,15 +274,7 @@ def _read(kind: type[Quality] | type[MarkerQuality], name: str, text: str) -> An
             f"quality: marker must be given by its settings, e.g. marker.template=9, got marker={text}"
         )
     _check_known(kind, name)
-    wanted = setting_types(kind)[name]
-    if wanted.endswith("| None") and text.lower() == "none":
-        return None
-    convert = {"float": float, "int": int, "str": str}[wanted.split()[0]]
-    try:
-        return convert(text)
-    except ValueError:
-        what = "a whole number" if convert is int else "a number"
-        raise InputError(f"quality: {name} must be {what}, got {text!r}") from None
+    return parse_setting("quality", kind, name, text)
 
 
 # gsplat: gsplat 1.5/1.6 `rasterization_2dgs`; surfel: the 2DGS authors' diff-surfel-rasterization.

@@ -12,6 +12,7 @@ import tyro
 from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Json, Overwrite, new_file
 from fidsplat.commands.output import delayed_progress, report
+from fidsplat.util.arguments import changes_of
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
@@ -108,8 +109,14 @@ class Marker:
 
     An image of noise can become tens of millions of splats; --max-splats raises the limit of one million.
 
+    --shape bends the sheet: cylinder (radius, axis x or y), cone (radius, taper), bent (radius, length,
+    axis), edge (radius, offset, axis) or crumpled (height, length, seed), lengths in metres; deviation is the
+    largest distance of the splats from the surface. --wear has severities from 0 to 1: bleed, coarseness,
+    fading, dirt, drops, scratches, tear, fold, cover; and a seed.
+
     Examples:
       fidsplat marker apriltag:36h11:5 --size 0.16 -o tag.ply
+      fidsplat marker apriltag:36h11:5 --size 0.16 --shape cylinder,radius=0.05 --wear fading=0.3,dirt=0.1
       fidsplat marker qr:hello --quality marker.template=9
       fidsplat marker "qr:hello" --mixture paper --json
       fidsplat marker apriltag:36h11:5 --mixture refined -o tag.ply
@@ -127,6 +134,12 @@ class Marker:
         str | None, option("D", "device of refined and --scene (default: FIDSPLAT_DEVICE, or auto)")
     ] = None
     quality: Annotated[str | None, option("Q", "quality with settings of the mixtures, as above")] = None
+    shape: Annotated[
+        str | None, option("KIND,KEY=VALUE", "surface that the sheet is bent to, e.g. cylinder,radius=0.05")
+    ] = None
+    wear: Annotated[
+        str | None, option("KEY=VALUE", "print defects and wear, e.g. fading=0.4,dirt=0.2,seed=3")
+    ] = None
     native_2dgs: Annotated[bool, switch("leave the third scale out of the file, as 2DGS does")] = False
     max_splats: Annotated[int | None, option("N", "maximum number of splats (default: 1000000)")] = None
     placing: Placing = field(default_factory=Placing)
@@ -143,6 +156,7 @@ class Marker:
         if file is not None and file.suffix.lower() != ".ply":
             raise InputError(f"-o must be a .ply file, got {file}")
         limit = {} if self.max_splats is None else {"max_splats": self.max_splats}
+        changed = {"shape": self.shape, "wear": self.wear}
         refined = self.mixture == "refined"
         placing = self.placing.scene is not None
         if not refined and (self.iterations is not None or (self.device is not None and not placing)):
@@ -152,7 +166,9 @@ class Marker:
         if refined and self.quality is None:
             quality = fs.MarkerQuality(template=LADDER)
         with delayed_progress() as progress:
-            made = fs.marker(self.spec, self.size, mixture, quality=quality, progress=progress, **limit)
+            made = fs.marker(
+                self.spec, self.size, mixture, quality=quality, progress=progress, **limit, **changed
+            )
             if refined:
                 made = self._refine(made, progress)
         if file is not None:
@@ -173,6 +189,8 @@ class Marker:
             "seconds": made.seconds,
             "mixture": made.mixture,
             "written": None if file is None else {"mixture": written, "splats": len(made.gaussians)},
+            "surface": None if made.shape is None else {"kind": made.shape.kind} | changes_of(made.shape),
+            "wear": None if made.wear is None else changes_of(made.wear),
             "size_m": made.size,
             "module_m": made.module,
             "file": str(file) if file else None,
@@ -183,6 +201,7 @@ class Marker:
             ("components", made.components),
             ("rectangles", f"{dark} dark, {len(made.boxes) - dark} light"),
             ("splats", f"{len(made.cloud)} ({made.mixture})"),
+            *((name, text) for name, text in changed.items() if text is not None),
             ("seconds", f"{made.seconds:.3f}"),
         ]
         if file is not None:

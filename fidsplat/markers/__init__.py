@@ -7,10 +7,16 @@ marker needs them.
 from importlib import import_module
 
 _HOME = {
+    "BentSheet": "fidsplat.markers.surfaces",
+    "BoxEdge": "fidsplat.markers.surfaces",
+    "Cone": "fidsplat.markers.surfaces",
+    "Crumpled": "fidsplat.markers.surfaces",
+    "Cylinder": "fidsplat.markers.surfaces",
     "Kind": "fidsplat.markers.spec",
     "Marker": "fidsplat.markers.build",
     "Rectangle": "fidsplat.markers.build",
     "Spec": "fidsplat.markers.spec",
+    "Wear": "fidsplat.markers.wear",
     "marker": "fidsplat.markers.build",
     "parse_spec": "fidsplat.markers.kinds",
     "register": "fidsplat.markers.kinds",

@@ -12,6 +12,7 @@ import numpy as np
 
 from fidsplat.capture.quality import MarkerQuality
 from fidsplat.images.apriltag3 import HOLE
+from fidsplat.markers.bending import FINE, GAP, bend, fine, subdivide, surface_frames
 from fidsplat.markers.facets import count_facets, facet_cloud
 from fidsplat.markers.kinds import bits_of, kind_of, parse_spec
 from fidsplat.markers.mixture import (
@@ -34,6 +35,8 @@ from fidsplat.markers.printing import (
 )
 from fidsplat.markers.regions import label_components, polygons
 from fidsplat.markers.spec import Spec
+from fidsplat.markers.surfaces import Surface, surface_of
+from fidsplat.markers.wear import Wear, wear_of, worn
 from fidsplat.util.arguments import (
     PickledByFields,
     flag,
@@ -131,6 +134,10 @@ class Marker(PickledByFields):
     """modules of the code on each side of the square that `size` and `corners` measure"""
     inks: tuple[Ink, Ink] | None = None
     """RGB of the dark and of the light modules, as given; None: black and white, or a drawing's colours"""
+    shape: Surface | None = None
+    """surface that the sheet is bent to; None: flat"""
+    wear: Wear | None = None
+    """print defects and wear of the splats; grid and rectangles are those of the new marker; None: none"""
 
     def __repr__(self) -> str:
         return (
@@ -168,13 +175,13 @@ class Marker(PickledByFields):
         """
         if self.mixture != "exact":
             return self.cloud
-        templates = fitted_templates(self.quality.template)
-        printed = without_slivers(
-            Printed(self.grid, self.boxes, self.values, self.angles, self.regions, self.module, self.palette)
+        printed = Printed(
+            self.grid, self.boxes, self.values, self.angles, self.regions, self.module, self.palette
         )
-        count = int(count_gaussians(aspect_of(printed.boxes), templates).sum())
-        refuse_more(f"as Gaussians {self.spec}", count, self.max_splats)
-        return gaussian_cloud(printed, templates, fitted_growth(), lambda task, share: None)
+        printed = printed if self.wear is None else worn(self.spec, printed, self.wear)
+        mixture = fitted_templates(self.quality.template), fitted_growth()
+        sheet = _Sheet(f"as Gaussians {self.spec}", self.size, self.module, self.max_splats, self.shape)
+        return sheet.gaussians(printed, *mixture, lambda task, share: None)
 
     @cached_property
     def rectangles(self) -> list[Rectangle]:
@@ -199,11 +206,28 @@ class Marker(PickledByFields):
     @property
     def corners(self) -> np.ndarray:
         """(4, 3) float64 metres, the code's outer corners as printed, of AprilTag 3 its border's: top left,
-        top right, bottom right, bottom left.
+        top right, bottom right, bottom left; on the surface of a bent marker.
         """
+        return self.points(self.flat_corners)
+
+    @property
+    def flat_corners(self) -> np.ndarray:
+        """(4, 2) float64 metres, positions of `corners` on the flat sheet."""
         h, w = np.array(self.bits.shape) - 2 * self.outside
         x, y = w * self.module / 2, h * self.module / 2
-        return np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
+        return np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
+
+    def points(self, xy: np.ndarray) -> np.ndarray:
+        """Points (n, 3) float64 metres in the marker's frame of positions (n, 2) on its sheet, x right and y
+        down from the centre.
+
+        Raises:
+            InputError: an array of another shape.
+        """
+        at = real_array("xy", xy, "(n, 2) metres on the sheet")
+        if at.ndim != 2 or at.shape[1] != 2:
+            raise InputError(f"xy must be (n, 2) metres on the sheet, got the shape {at.shape}")
+        return surface_frames(self.shape, np.asarray(at, np.float64)).points
 
 
 def marker(
@@ -220,6 +244,8 @@ def marker(
     black: Ink | None = None,
     white: Ink | None = None,
     quality: MarkerQuality | None = None,
+    shape: Surface | str | None = None,
+    wear: Wear | str | None = None,
     max_splats: int = MAX_SPLATS,
     progress: Progress | None = None,
 ) -> Marker:
@@ -244,6 +270,10 @@ def marker(
             and (1, 1, 1). Printed ink and paper are nearer to (0.05, 0.05, 0.05) and (0.85, 0.85, 0.85).
         quality: defaults of mixture, levels, density, growth and template (`Quality.marker`); settings of
             other mixtures are ignored.
+        shape: surface that the sheet is bent to, such as `fidsplat.markers.Cylinder(radius=0.05)`, or its
+            text "cylinder,radius=0.05"; not for facets.
+        wear: print defects and wear, such as `fidsplat.markers.Wear(fading=0.4)`, or its text
+            "fading=0.4,dirt=0.2,seed=3"; not for facets or drawings with slanted edges.
         max_splats: maximum number of splats; an image of noise can need tens of millions.
         progress: callback of the current task and its completed share, 0 to 1.
 
@@ -266,6 +296,11 @@ def marker(
     each = 1 if chosen.mixture == "exact" else min(len(template.gaussians) for template in templates)
     inks = None if black is None and white is None else _inks(parsed, black, white)
     palette = np.array(parsed.colors or (inks or _INKS)[::-1], np.float32)
+    surface, old = surface_of(shape), wear_of(wear)
+    if chosen.mixture == "facets" and not (surface is None and old is None):
+        raise InputError("shape and wear must be left out with mixture facets; use exact or fitted")
+    if surface is not None:
+        surface.fit(_half(grid, size / (bits.shape[1] - 2 * parsed.outside)))
     if chosen.mixture == "facets":
         refuse_more(spec, count_facets(grid.shape), max_splats)
     elif len(palette) == 2 and grid.max() <= 1:
@@ -277,15 +312,14 @@ def marker(
     boxes, values, angles, regions = printed.boxes, printed.values, printed.angles, printed.regions
     if regions is not None:
         components = sum(len(region.geoms) for region in regions)
+    sheet = _Sheet(spec, size, printed.module, max_splats, surface)
+    printed = printed if old is None else worn(spec, printed, old)
     if chosen.mixture == "facets":
         cloud = facet_cloud(spec, printed, progress)
     elif chosen.mixture == "exact":
-        refuse_more(spec, len(boxes), max_splats)
-        cloud = box_cloud(printed, progress)
+        cloud = sheet.boxes(printed, progress)
     else:
-        filled = without_slivers(printed)
-        refuse_more(spec, int(count_gaussians(aspect_of(filled.boxes), templates).sum()), max_splats)
-        cloud = gaussian_cloud(filled, templates, growth, progress)
+        cloud = sheet.gaussians(printed, templates, growth, progress)
     for array in (bits, grid, boxes, values, angles, labels, palette):
         if array is not None:
             array.flags.writeable = False
@@ -313,7 +347,59 @@ def marker(
         max_splats=max_splats,
         outside=parsed.outside,
         inks=inks,
+        shape=surface,
+        wear=old,
     )
+
+
+def _half(grid: np.ndarray, module: float) -> tuple[float, float]:
+    """Half edges of the sheet in metres."""
+    return grid.shape[1] * module / 2, grid.shape[0] * module / 2
+
+
+class _Sheet(NamedTuple):
+    """Conversion of printed rectangles to splats, on the plane or on a surface."""
+
+    spec: str
+    size: float
+    module: float
+    max_splats: int
+    surface: Surface | None
+
+    def boxes(self, printed: Printed, progress: Progress) -> SplatCloud:
+        """One box for each rectangle, or for each piece of it."""
+        refuse_more(self.spec, len(printed.boxes), self.max_splats)
+        if self.surface is None:
+            return box_cloud(printed, progress)
+        pieces = subdivide(self.spec, printed, self.surface, self._deviation, self.max_splats)
+        return self._bent(box_cloud(pieces, progress), printed)
+
+    def gaussians(
+        self, printed: Printed, templates: tuple[Template, ...], growth: float, progress: Progress
+    ) -> SplatCloud:
+        """Gaussians of each rectangle, or of each piece of it."""
+        filled = without_slivers(printed)
+        if self.surface is not None:
+            whole = printed.regions is None
+            filled = fine(filled) if whole and printed.module == self.module else filled
+            filled = subdivide(self.spec, filled, self.surface, self._deviation, self.max_splats, whole)
+        refuse_more(
+            self.spec, int(count_gaussians(aspect_of(filled.boxes), templates).sum()), self.max_splats
+        )
+        cloud = gaussian_cloud(filled, templates, growth, progress)
+        return cloud if self.surface is None else self._bent(cloud, printed)
+
+    @property
+    def _deviation(self) -> float:
+        """Deviation of the pieces; copies of pieces at the borders of coplanar groups are farther by `GAP`
+        times it."""
+        own = None if self.surface is None else self.surface.deviation
+        return (self.size / FINE if own is None else own) / (1 + GAP)
+
+    def _bent(self, flat: SplatCloud, printed: Printed) -> SplatCloud:
+        assert self.surface is not None
+        half = _half(printed.grid, printed.module)
+        return bend(flat, self.surface, half, self.module, self._deviation)
 
 
 def _inks(parsed: Spec, black: Ink | None, white: Ink | None) -> tuple[Ink, Ink]:

@@ -16,12 +16,14 @@ from fidsplat.capture.environment import Fog
 from fidsplat.capture.quality import MarkerQuality, Quality, setting_types
 from fidsplat.capture.sensor import Sensor
 from fidsplat.formats import Progress, load_splats
+from fidsplat.markers.surfaces import SURFACES, Surface
+from fidsplat.markers.wear import Wear
 from fidsplat.scenes.camera import POSE, TABLES, read_focal_lengths, read_keyframes, read_lens, read_shutter
 from fidsplat.scenes.environment import read_background, read_part
 from fidsplat.scenes.lights import read_lighting, read_lights
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.scenes.quality_settings import read_quality
-from fidsplat.scenes.table import Table
+from fidsplat.scenes.table import Table, names_of
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.store.layout import SUFFIX
@@ -51,6 +53,8 @@ MARKER = (
     "motion",
     "bundle",
     "light",
+    "shape",
+    "wear",
 )
 MARKERS = (*MARKER, *setting_types(MarkerQuality))
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
@@ -215,6 +219,18 @@ def _splats(table: Table, load: Callable[[str], SplatCloud]) -> tuple[SplatCloud
         return (cloud.transformed(pose) if moved else cloud), motion
 
 
+def _surface(table: Table) -> Surface:
+    """Shape of a marker: the inline table `shape`."""
+    names = dict.fromkeys(name for kind in SURFACES.values() for name in names_of(kind))
+    name = table.table("shape", ("kind", *names)).text("kind")
+    if name not in SURFACES:
+        raise table.error("shape.kind", f"must be {', '.join(SURFACES)}, got {name!r}")
+    kind = SURFACES[name]
+    own = table.table("shape", ("kind", *names_of(kind)))
+    with own.at():
+        return kind(**own.values(kind))
+
+
 def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progress | None) -> PlacedMarker:
     spec, size = table.text("spec"), table.number("size")
     if not size > 0:
@@ -228,6 +244,11 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progre
 
     limit = {} if max_splats is None else {"max_splats": max_splats}
     limit |= {name: table.numbers(name, 3) for name in ("black", "white") if name in table}
+    limit |= {"shape": _surface(table)} if "shape" in table else {}
+    if "wear" in table:
+        own_wear = table.table("wear", names_of(Wear))
+        with own_wear.at():
+            limit["wear"] = Wear(**own_wear.values(Wear))
     known = {"quiet_zone": quiet_zone, "quality": quality, "progress": progress, **limit}
     with table.at():
         spec = with_file(spec, lambda name: str(folder / name))

@@ -15,6 +15,7 @@ from fidsplat.scenes.lights import Lighting, light_tables, lighting_value
 from fidsplat.scenes.parts import PlacedMarker, SceneParts
 from fidsplat.scenes.quality_settings import marker_settings, quality_tables
 from fidsplat.splats.rotations import matrix_to_quaternion
+from fidsplat.util.arguments import changes_of
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, path_of
 
@@ -95,6 +96,8 @@ def _marker(placed: PlacedMarker, folder: Path, quality: Quality | str | None) -
         "quiet_zone": int(marker.quiet_zone),
         **limit,
         **inks,
+        **({} if marker.shape is None else {"shape": {"kind": marker.shape.kind} | changes_of(marker.shape)}),
+        **({} if marker.wear is None else {"wear": changes_of(marker.wear)}),
         **bundle,
         **lighting_value(Lighting.of(placed.light)),
         **motion,

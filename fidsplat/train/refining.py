@@ -74,7 +74,7 @@ def refine(
     The number of splats stays the same; start with `template=121`. Bit-identical on every run of a device.
 
     Args:
-        made: a marker of `fs.marker`, without slanted edges.
+        made: a marker of `fs.marker`, flat, without wear and slanted edges.
         renderer: device to optimise on; None: the default device.
         iterations: number of frames, 1 to 100,000.
         leak: weight of transmitted light, 0 to 1: squared missing optical depth relative to squared colour
@@ -85,8 +85,8 @@ def refine(
 
     Raises:
         DeviceError: the device has no gradients.
-        InputError: a marker with slanted edges, a number outside its range, or more Gaussians than the
-            marker's ``max_splats``.
+        InputError: a marker with slanted edges, a shape or wear, a number outside its range, or more
+            Gaussians than the marker's ``max_splats``.
     """
     start = time.perf_counter()
     instance("made", made, Marker, "what fs.marker returns")
@@ -99,6 +99,8 @@ def refine(
     seed = whole_number("the seed", seed, 0, 2**63 - 1)
     if made.regions is not None:
         raise InputError(f"made must be a marker of modules, got {made.spec} with edges across its modules")
+    if made.shape is not None or made.wear is not None:
+        raise InputError(f"made must be flat and not worn, got {made.spec}; leave out shape and wear")
     renderer = Renderer() if renderer is None else renderer
     sheet = _Sheet(made, float(leak))
     splats = _Parameters.of(made)

@@ -6,7 +6,7 @@ Every check raises InputError with a message `<what> must be <requirement>, got 
 import math
 import operator
 from collections.abc import Iterable
-from dataclasses import fields, replace
+from dataclasses import MISSING, fields, replace
 from numbers import Real
 from typing import Annotated, Any, TypeVar
 
@@ -121,6 +121,50 @@ def settings_with(kind: type[T], settings: T | None, changes: dict[str, Any]) ->
         if name not in known:
             raise InputError(unknown("setting", name, known))
     return replace(kind() if settings is None else settings, **changes)  # type: ignore[type-var]
+
+
+def parse_settings(what: str, kind: type, parts: Iterable[str]) -> dict[str, Any]:
+    """Values of fields of a dataclass from texts `name=value`, in the types of the fields."""
+    found = {}
+    for part in parts:
+        name, equals, value = (piece.strip() for piece in part.partition("="))
+        if not equals:
+            raise InputError(f"{what}: {part!r} must be a setting as key=value")
+        found[name] = parse_setting(what, kind, name, value)
+    return found
+
+
+def parse_setting(what: str, kind: type, name: str, text: str) -> Any:
+    """Value of a field of a dataclass from a text, by the first type of its annotation."""
+    types = {field.name: str(field.type) for field in fields(kind)}
+    if name not in types:
+        raise InputError(unknown(f"setting of {what}", name, types))
+    if types[name].endswith("| None") and text.lower() == "none":
+        return None
+    convert = {"float": float, "int": int, "str": str}[types[name].split()[0]]
+    try:
+        return convert(text)
+    except ValueError:
+        wanted = "a whole number" if convert is int else "a number"
+        raise InputError(f"{what}: {name} must be {wanted}, got {text!r}") from None
+
+
+def changes_of(settings: Any) -> dict[str, Any]:
+    """Fields of a dataclass that differ from their defaults, with tuples as lists."""
+    values = {field.name: (getattr(settings, field.name), field.default) for field in fields(settings)}
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, (value, default) in values.items()
+        if default is MISSING or value != default
+    }
+
+
+def made_of(what: str, kind: type[T], values: dict[str, Any]) -> T:
+    """An instance of a dataclass; a missing field is an error."""
+    for field in fields(kind):  # type: ignore[arg-type]
+        if field.default is MISSING and field.default_factory is MISSING and field.name not in values:
+            raise InputError(f"{what}: {field.name} must be given, got none")
+    return kind(**values)
 
 
 class PickledByFields:

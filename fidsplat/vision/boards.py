@@ -35,16 +35,14 @@ def board_pose(
     assert isinstance(spec, BoardSpec)
     kind, family = parse_family(spec.family or "")
     side = families(kind)[family].size
-    origin = marker.corners[0]
+    origin = marker.flat_corners[0]
     points, observed = [], []
     for number, (y, x) in enumerate(tag_places(spec, side)):
         own = [tag for tag in left if (tag.kind, tag.family, tag.id) == (kind, family, number)]
         corners = np.array([(x, y), (x + side, y), (x + side, y + side), (x, y + side)], float)
-        where = origin[:2] + corners * marker.module
+        where = origin + corners * marker.module
         if own:
-            true = camera.project(
-                np.pad(where, ((0, 0), (0, 1))) @ placed.pose[:3, :3].T + placed.pose[:3, 3]
-            )
+            true = camera.project(marker.points(where) @ placed.pose[:3, :3].T + placed.pose[:3, 3])
             tag = min(own, key=lambda tag: np.nan_to_num(np.linalg.norm(tag.corners - true), nan=np.inf))
             left.remove(tag)
             points.append(where)
@@ -55,12 +53,12 @@ def board_pose(
     if spec.kind == "charuco":
         squares, corners = chess_corners(image, spec, side)
         if len(corners) >= ENOUGH:
-            at, on = origin[:2] + squares * marker.module, corners
+            at, on = origin + squares * marker.module, corners
     pose = plane_pose(at, on, camera)
     if not np.isfinite(pose).all():
         return None, left
     standing = camera.with_pose(np.eye(4))
-    corners = standing.project(marker.corners @ pose[:3, :3].T + pose[:3, 3])
+    corners = standing.project(np.pad(marker.flat_corners, ((0, 0), (0, 1))) @ pose[:3, :3].T + pose[:3, 3])
     text = f"{spec.columns}x{spec.rows}:{family}"
     return (Detection(spec.kind, family, None, text, corners), pose), left
 

@@ -16,7 +16,7 @@ from fidsplat.images.files import write_png
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, read_text, writable_folder
 from fidsplat.vision.truth import Box, MarkerTruth, Truth
-from fidsplat.vision.visible import outline
+from fidsplat.vision.visible import POINTS, outline
 
 PIXEL = 0.5
 """offset to the pixel coordinates of BOP, whose first pixel centre is at 0"""
@@ -145,10 +145,13 @@ def _box(box: Box | None) -> list[float]:
 
 
 def _model(marker: MarkerTruth) -> dict[str, Any]:
-    low, high = (1000 * marker.placed.marker.corners[k] for k in (0, 2))
+    made = marker.placed.marker
+    across = np.linspace(-1, 1, POINTS) * np.abs(made.flat_corners[:1].T)
+    at = 1000 * made.points(np.stack(np.meshgrid(*across), -1).reshape(-1, 2))
+    low, high = at.min(0), at.max(0)
     names = "xyz"
     return {
-        "spec": marker.placed.marker.spec,
+        "spec": made.spec,
         "diameter": float(np.linalg.norm(high - low)),
         **{f"min_{n}": float(v) for n, v in zip(names, low, strict=True)},
         **{f"size_{n}": float(v) for n, v in zip(names, high - low, strict=True)},

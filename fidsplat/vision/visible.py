@@ -12,7 +12,10 @@ MARGIN = 1
 """Modules of the quiet zone that belong to a marker's outline, since detectors require them."""
 
 POINTS = 16
-"""Samples along a side, which is curved by lenses."""
+"""Samples along a side, which is curved by lenses, and cells of a bent sheet along an edge."""
+
+GRID = 1e-6
+"""Pixels to which the corners of the cells of a bent sheet are rounded."""
 
 
 class Visible(NamedTuple):
@@ -28,12 +31,18 @@ def visible_part(placed: PlacedMarker, camera: Camera) -> tuple[shapely.Geometry
     """Outline of a marker in an unbounded image, and its part in the camera's image, in pixels.
 
     The outline has one module of the quiet zone, if there is one. Both are empty for a marker that faces
-    away.
+    away. That of a bent marker is the union of its parts that face the camera.
     """
     marker = placed.marker
     margin = min(MARGIN, marker.quiet_zone) * marker.module
-    corners = marker.corners + margin * np.sign(marker.corners)
-    points = corners @ placed.pose[:3, :3].T + placed.pose[:3, 3]
+    corners = marker.flat_corners + margin * np.sign(marker.flat_corners)
+    whole = (_flat if marker.shape is None else _bent)(placed, camera, corners)
+    return whole, shapely.intersection(whole, shapely.box(0, 0, camera.width, camera.height))
+
+
+def _flat(placed: PlacedMarker, camera: Camera, corners: np.ndarray) -> shapely.Geometry:
+    """Image of a rectangle (4, 2) of a flat sheet."""
+    points = placed.marker.points(corners) @ placed.pose[:3, :3].T + placed.pose[:3, 3]
     if camera.lens is None or isinstance(camera.lens, Orthographic):
         depth = points @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
         points = _clipped(points, depth - camera.near)
@@ -41,10 +50,26 @@ def visible_part(placed: PlacedMarker, camera: Camera) -> tuple[shapely.Geometry
     sides = [a + share * (b - a) for a, b in zip(points, np.roll(points, -1, 0), strict=True)]
     at = camera.project(np.concatenate(sides)) if sides else np.zeros((0, 2))
     at = at[np.isfinite(at).all(1)]
-    after = np.roll(at, -1, 0)
-    area = (at[:, 0] * after[:, 1] - at[:, 1] * after[:, 0]).sum()
-    whole = shapely.Polygon(at).buffer(0) if area > 0 else shapely.Polygon()  # as printed, clockwise
-    return whole, whole & shapely.box(0, 0, camera.width, camera.height)
+    return shapely.Polygon(at).buffer(0) if _area(at) > 0 else shapely.Polygon()  # as printed, clockwise
+
+
+def _bent(placed: PlacedMarker, camera: Camera, corners: np.ndarray) -> shapely.Geometry:
+    """Image of a rectangle (4, 2) of a bent sheet: the union of its cells that face the camera."""
+    lines = [np.linspace(low, high, POINTS + 1) for low, high in zip(corners[0], corners[2], strict=True)]
+    points = placed.marker.points(np.stack(np.meshgrid(*lines), -1).reshape(-1, 2))
+    at = camera.project(points @ placed.pose[:3, :3].T + placed.pose[:3, 3]).reshape(
+        POINTS + 1, POINTS + 1, 2
+    )
+    cells = np.stack([at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]], 2).reshape(-1, 4, 2)
+    cells = cells[np.isfinite(cells).all((1, 2))]
+    facing = cells[_area(cells) > 0]
+    return shapely.union_all(shapely.make_valid(shapely.polygons(facing)), grid_size=GRID)
+
+
+def _area(polygons: np.ndarray) -> np.ndarray:
+    """Twice the areas (...) of polygons (..., n, 2), above 0 for clockwise ones."""
+    after = np.roll(polygons, -1, -2)
+    return (polygons[..., 0] * after[..., 1] - polygons[..., 1] * after[..., 0]).sum(-1)
 
 
 def visible(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = None) -> Visible:

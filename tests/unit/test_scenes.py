@@ -52,6 +52,8 @@ def fake_marker(
         quiet_zone=quiet_zone,
         max_splats=max_splats,
         inks=None,
+        shape=None,
+        wear=None,
         cloud=cloud,
         corners=corners,
     )

@@ -1,0 +1,186 @@
+"""Bending of a marker's sheet: subdivision of its rectangles by curvature, and their poses on a surface.
+
+A flat rectangle is tangential to the surface at its centre. It is halved until its distance from the surface,
+at equal positions on the sheet, is at most a bound.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from fidsplat.markers.printing import Printed, refuse_more
+from fidsplat.markers.surfaces import Frames, Surface
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import matrices_to_quaternions, quaternion_multiply
+
+FINE = 1500
+"""The default bound of the deviation is the size of the marker divided by this number."""
+
+GAP = 2
+"""Maximum distance between the planes of two neighbouring pieces, relative to the deviation of each"""
+
+SAMPLES = 5
+"""samples of the distance along each edge of a rectangle"""
+
+MARGIN = 0.9
+"""share of the bound that the samples may have"""
+
+TURN = np.radians(30)
+"""Maximum rotation of the normal within a coplanar group. A layer has no order, so that the two sides of a
+sheet that occludes itself must be in different groups."""
+
+CELLS = 8
+"""Gaussians have pieces of at least 1 / 8 module"""
+
+
+def fine(printed: Printed) -> Printed:
+    """The same rectangles on a grid of `CELLS` times as many cells."""
+    return printed._replace(
+        grid=printed.grid.repeat(CELLS, 0).repeat(CELLS, 1),
+        boxes=printed.boxes * CELLS,
+        module=printed.module / CELLS,
+    )
+
+
+def subdivide(
+    spec: str, printed: Printed, surface: Surface, deviation: float, max_splats: int, whole: bool = False
+) -> Printed:
+    """Halve rectangles until they deviate from a surface by at most a bound.
+
+    deviation: metres. whole: cut between whole cells, so that pieces of one cell may deviate more.
+
+    Raises InputError for more than `max_splats` pieces.
+    """
+    boxes, owner = printed.boxes.astype(np.float64), np.arange(len(printed.boxes))
+    done_boxes, done_owner, done = [], [], 0
+    while len(boxes):
+        length = boxes[:, 2:] - boxes[:, :2]
+        apart, by_axis = _deviations(printed, surface, boxes, owner)
+        halved = (apart > MARGIN * deviation) & ~(whole & (length.max(1) <= 1))
+        done_boxes.append(boxes[~halved])
+        done_owner.append(owner[~halved])
+        done += len(boxes) - int(halved.sum())
+        boxes, owner, length, by_axis = boxes[halved], owner[halved], length[halved], by_axis[halved]
+        refuse_more(f"on its surface {spec}", done + 2 * len(boxes), max_splats, "at least ")
+        # a twisted rectangle has straight lines along its axes
+        straight = by_axis.max(1) < MARGIN * deviation / 2
+        axis = np.where(straight, length[:, 1] > length[:, 0], by_axis[:, 1] > by_axis[:, 0]).astype(int)
+        each = np.arange(len(boxes))
+        if whole:
+            axis = np.where(length[each, axis] > 1, axis, 1 - axis)
+        middle = (boxes[each, axis] + boxes[each, axis + 2]) / 2
+        middle = np.floor(middle) if whole else middle
+        first, second = boxes.copy(), boxes.copy()
+        first[each, axis + 2] = second[each, axis] = middle
+        if printed.angles is not None:  # pieces rotate about their own centres
+            first, second = (_rotated(piece, boxes, printed.angles[owner]) for piece in (first, second))
+        boxes, owner = np.concatenate([first, second]), np.concatenate([owner, owner])
+    found, owner = np.concatenate(done_boxes), np.concatenate(done_owner)
+    order = np.argsort(owner, kind="stable")
+    found, owner = found[order], owner[order]
+    return printed._replace(
+        boxes=np.rint(found).astype(np.int64) if whole else found,
+        values=printed.values[owner],
+        angles=None if printed.angles is None else printed.angles[owner],
+    )
+
+
+def _rotated(pieces: np.ndarray, boxes: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Pieces of boxes that are rotated about the centres of the boxes, moved for a rotation about their
+    own."""
+    before, about = ((each[:, :2] + each[:, 2:]) / 2 for each in (pieces, boxes))
+    (x, y), c, s = (before - about).T, np.cos(angles), np.sin(angles)
+    step = about + np.column_stack([c * x - s * y, s * x + c * y]) - before
+    return pieces + np.tile(step, 2)
+
+
+def _deviations(
+    printed: Printed, surface: Surface, boxes: np.ndarray, owner: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Maximum distances (n,) of rectangles from a surface, and (n, 2) those along their two axes."""
+    module, middle = printed.module, np.array(printed.grid.shape[::-1]) / 2
+    centre = ((boxes[:, :2] + boxes[:, 2:]) / 2 - middle) * module
+    half = (boxes[:, 2:] - boxes[:, :2]) * (module / 2)
+    share = np.linspace(-1, 1, SAMPLES)
+    steps = np.stack(np.meshgrid(share, share), -1).reshape(-1, 2)
+    offset = half[:, None] * steps
+    if printed.angles is not None:
+        c, s = np.cos(printed.angles[owner])[:, None], np.sin(printed.angles[owner])[:, None]
+        x, y = offset[..., 0], offset[..., 1]
+        offset = np.stack([c * x - s * y, s * x + c * y], -1)
+    at = surface.frames(centre)
+    true = surface.frames((centre[:, None] + offset).reshape(-1, 2)).points.reshape(*offset.shape[:2], 3)
+    flat = at.points[:, None] + offset[..., :1] * at.along_x[:, None] + offset[..., 1:] * at.along_y[:, None]
+    apart = np.linalg.norm(true - flat, axis=2)
+    on_axis = [apart[:, steps[:, 1 - axis] == 0].max(1) for axis in (0, 1)]
+    return apart.max(1), np.column_stack(on_axis)
+
+
+def bend(
+    cloud: SplatCloud, surface: Surface, half: tuple[float, float], overlap: float, deviation: float
+) -> SplatCloud:
+    """Move the splats of a flat sheet to the tangent planes of a surface.
+
+    half: half edges of the sheet in metres. deviation: that of the pieces, in metres. Boxes are extended by
+    the largest distance between neighbouring planes. Splats up to `overlap` metres from the border of a
+    coplanar group are in both groups, so that no light passes between these; the copy is farther from the
+    viewer by the same distance, and so occluded elsewhere.
+    """
+    gap = GAP * deviation
+    at = surface.frames(cloud.means[:, :2].astype(np.float64))
+    turn = np.stack([at.along_x, at.along_y, at.normals], -1)
+    quats = quaternion_multiply(matrices_to_quaternions(turn), cloud.quats).astype(np.float32)
+    scales = cloud.scales if cloud.boxes is None else (cloud.scales + gap).astype(np.float32)
+    rows, groups, copies = _groups(cloud, surface, half, overlap)
+    means = at.points[rows] + np.where(copies, gap, 0.0)[:, None] * at.normals[rows]
+    bent = SplatCloud.of_checked(
+        means.astype(np.float32),
+        quats[rows],
+        scales[rows],
+        cloud.opacities[rows],
+        colors=None if cloud.colors is None else cloud.colors[rows],
+        origin=np.zeros(3),
+        dropped={},
+    )
+    return (bent if cloud.boxes is None else bent.with_boxes()).with_coplanar_groups(groups)
+
+
+def _groups(
+    cloud: SplatCloud, surface: Surface, half: tuple[float, float], overlap: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of the splats of all coplanar groups, their groups, and whether they are copies from a
+    neighbour."""
+    way, every = surface.across, np.arange(len(cloud))
+    extent = 0.0 if way is None else float(np.abs(way) @ half)
+    borders = [] if way is None else _borders(surface, way, -extent, extent)
+    if way is None or len(borders) == 2:
+        return every, np.zeros(len(cloud), np.int32), np.zeros(len(cloud), bool)
+    middle, reach = cloud.means[:, :2] @ way, cloud.reach(2.0)[:, :2] @ np.abs(way)
+    own = np.searchsorted(borders[1:-1], middle)
+    rows = [
+        np.flatnonzero((middle + reach > low - overlap) & (middle - reach < high + overlap) | (own == number))
+        for number, (low, high) in enumerate(pairwise(borders))
+    ]
+    groups = np.repeat(np.arange(len(rows), dtype=np.int32), [len(each) for each in rows])
+    found = np.concatenate(rows)
+    return found, groups, own[found] != groups
+
+
+def _borders(surface: Surface, way: np.ndarray, low: float, high: float) -> list[float]:
+    """Positions across a surface between which its normal rotates by at most `TURN`."""
+    normals = surface.frames(np.linspace(low, high, 65)[:, None] * way).normals
+    if np.arccos(np.clip(normals @ normals.T, -1, 1)).max() <= TURN:
+        return [low, high]
+    middle = (low + high) / 2
+    return [*_borders(surface, way, low, middle), *_borders(surface, way, middle, high)[1:]]
+
+
+def surface_frames(surface: Surface | None, xy: np.ndarray) -> Frames:
+    """Points and tangents of positions (n, 2) of a sheet; None: a flat one."""
+    if surface is not None:
+        return surface.frames(xy)
+    along = np.zeros((2, len(xy), 3))
+    along[0, :, 0] = along[1, :, 1] = 1
+    return Frames(np.column_stack([xy, np.zeros(len(xy))]), *along)

@@ -1,0 +1,388 @@
+"""Shapes of a marker's sheet: parametric surfaces over the flat sheet, with unit tangents.
+
+A surface maps positions (x, y) of the flat sheet, in metres from its centre, to positions in the marker's
+frame. The centre stays at the origin. All surfaces but `Crumpled` are developable: the map preserves lengths,
+and the tangent plane of the centre is the plane of the flat marker.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from fidsplat.util.arguments import (
+    instance,
+    made_of,
+    number,
+    parse_settings,
+    real_array,
+    whole_number,
+)
+from fidsplat.util.errors import InputError, unknown
+
+SHARPEST = 1e-4
+"""minimum radius of curvature relative to the size of the sheet"""
+
+WAVES = 7
+"""number of plane waves of a crumpled sheet"""
+
+CREASE = 0.2
+"""width of the creases of a crumpled sheet, relative to their distance: 0 is a sharp edge"""
+
+
+class Frames(NamedTuple):
+    """Points of a surface with orthonormal tangents, in the marker's frame."""
+
+    points: np.ndarray
+    """(n, 3) metres"""
+    along_x: np.ndarray
+    """(n, 3) unit tangent in the direction of the sheet's x"""
+    along_y: np.ndarray
+    """(n, 3) unit tangent in the direction of the sheet's y, perpendicular to `along_x`"""
+
+    @property
+    def normals(self) -> np.ndarray:
+        """(n, 3) unit normals away from the viewer, as those of splats."""
+        return np.cross(self.along_x, self.along_y)
+
+
+class Surface:
+    """Base of the shapes, which are dataclasses; `kind` is their name in scene files."""
+
+    kind: ClassVar[str]
+    deviation: float | None
+
+    def fit(self, half: tuple[float, float]) -> None:
+        """Raise InputError if a sheet with these half edges in metres does not fit on the surface."""
+
+    def frames(self, xy: np.ndarray) -> Frames:
+        """Points and tangents at positions (n, 2) of the sheet."""
+        raise NotImplementedError
+
+    @property
+    def across(self) -> np.ndarray | None:
+        """Direction (2,) of the largest curvature on the sheet; None for a surface of moderate slopes, which
+        occludes itself only from the side."""
+        return None
+
+
+class _Along(Surface):
+    """Surface with an axis: straight lines of the sheet along `axis` stay straight."""
+
+    axis: str | tuple[float, ...]
+
+    @property
+    def across(self) -> np.ndarray:
+        along = axis_of(self.axis)
+        return np.array([along[1], -along[0]])
+
+    def _extent(self, half: tuple[float, float]) -> float:
+        """Half of the sheet's width across the axis."""
+        return float(np.abs(self.across) @ half)
+
+
+class _Profile(_Along):
+    """Curve across the axis, extruded along it."""
+
+    def _profile(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Positions across and away from the viewer, and tangent angles, at lengths s along the curve."""
+        raise NotImplementedError
+
+    def frames(self, xy: np.ndarray) -> Frames:
+        xy = np.asarray(xy, np.float64)
+        side, axis = np.array([*self.across, 0.0]), np.array([*axis_of(self.axis), 0.0])
+        p, q, angle = self._profile(xy @ side[:2])
+        away = np.array([0.0, 0.0, 1.0])
+        points = p[:, None] * side + (xy @ axis[:2])[:, None] * axis + q[:, None] * away
+        tangent = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * away
+        return Frames(points, side[0] * tangent + axis[0] * axis, side[1] * tangent + axis[1] * axis)
+
+
+@dataclass(frozen=True)
+class Cylinder(_Profile):
+    """Cylinder: a tag around a pipe or a bottle."""
+
+    radius: float
+    """metres; negative: on the inside of a pipe"""
+    axis: str | tuple[float, ...] = "y"
+    """direction of the axis on the sheet: "x", "y" or two numbers x, y"""
+    deviation: float | None = None
+    """metres: maximum distance of the splats from the surface; None: size / 1500"""
+    kind: ClassVar[str] = "cylinder"
+
+    def __post_init__(self) -> None:
+        _check(self, "radius")
+
+    def fit(self, half: tuple[float, float]) -> None:
+        width = 2 * self._extent(half)
+        _require_radius(self.radius, width / (2 * math.pi), width)
+
+    def _profile(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        angle = s / self.radius
+        return self.radius * np.sin(angle), 2 * self.radius * np.sin(angle / 2) ** 2, angle
+
+
+@dataclass(frozen=True)
+class BentSheet(_Profile):
+    """Wavy sheet: its curvature is cos(2 pi s / length) / radius at the length s across the axis."""
+
+    radius: float
+    """metres: minimum radius of curvature; negative: the centre is the nearest to the wall, not the
+    farthest"""
+    length: float
+    """metres along the sheet from one wave to the next"""
+    axis: str | tuple[float, ...] = "y"
+    """direction of the axis on the sheet: "x", "y" or two numbers x, y"""
+    deviation: float | None = None
+    """metres: maximum distance of the splats from the surface; None: size / 1500"""
+    kind: ClassVar[str] = "bent"
+
+    def __post_init__(self) -> None:
+        _check(self, "radius", "length")
+        number("shape: length", self.length, "a positive length in metres", 1e-9)
+
+    def fit(self, half: tuple[float, float]) -> None:
+        width = 2 * self._extent(half)
+        # beyond, the tangent rotates by more than 90 degrees, and waves touch each other
+        _require_radius(self.radius, max(self.length / math.pi**2, SHARPEST * width), width)
+
+    def _profile(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        wave, most = 2 * math.pi / self.length, self.length / (2 * math.pi * self.radius)
+
+        def angle(at: np.ndarray) -> np.ndarray:
+            return most * np.sin(wave * at)
+
+        # Gauss-Legendre quadrature, exact to rounding for pieces shorter than half a wave
+        pieces = max(int(np.ceil(2 * np.abs(s).max(initial=0.0) / self.length)), 1)
+        at, weight = np.polynomial.legendre.leggauss(24)
+        at = ((at + 1) / 2 + np.arange(pieces)[:, None]).ravel() / pieces
+        weight = np.tile(weight / 2 / pieces, pieces)
+        angles = angle(s[:, None] * at)
+        return s * (np.cos(angles) @ weight), s * (np.sin(angles) @ weight), angle(s)
+
+
+@dataclass(frozen=True)
+class BoxEdge(_Profile):
+    """Foil over the edge of a box: two planes at a right angle, joined by an arc."""
+
+    radius: float
+    """metres: radius of the arc; negative: foil in an inner corner"""
+    offset: float = 0.0
+    """metres from the centre of the marker to the edge, across the axis"""
+    axis: str | tuple[float, ...] = "y"
+    """direction of the edge on the sheet: "x", "y" or two numbers x, y"""
+    deviation: float | None = None
+    """metres: maximum distance of the splats from the surface; None: size / 1500"""
+    kind: ClassVar[str] = "edge"
+
+    def __post_init__(self) -> None:
+        _check(self, "radius", "offset")
+
+    def fit(self, half: tuple[float, float]) -> None:
+        width = 2 * self._extent(half)
+        _require_radius(self.radius, SHARPEST * width, width)
+
+    def _profile(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        radius, right = abs(self.radius), math.pi / 2
+        start = self.offset - radius * right / 2
+
+        def curve(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            angle = np.clip((at - start) / radius, 0, right)
+            before, after = np.minimum(at - start, 0), np.maximum(at - start - radius * right, 0)
+            return radius * np.sin(angle) + before, 2 * radius * np.sin(angle / 2) ** 2 + after, angle
+
+        (p, q, angle), (p0, q0, angle0) = curve(s), curve(np.zeros(1))
+        cosine, sine = np.cos(angle0), np.sin(angle0)
+        p, q = p - p0, q - q0
+        way = math.copysign(1.0, self.radius)
+        return cosine * p + sine * q, way * (cosine * q - sine * p), way * (angle - angle0)
+
+
+@dataclass(frozen=True)
+class Cone(_Along):
+    """Cone: a tag around a cup or a traffic cone, whose apex is above the tag."""
+
+    radius: float
+    """metres: radius of the cone at the centre of the marker"""
+    taper: float
+    """decrease of the radius per metre of height towards the apex, 0.001 to 100"""
+    axis: str | tuple[float, ...] = "y"
+    """direction on the sheet away from the apex: "x", "y" or two numbers x, y"""
+    deviation: float | None = None
+    """metres: maximum distance of the splats from the surface; None: size / 1500"""
+    kind: ClassVar[str] = "cone"
+
+    def __post_init__(self) -> None:
+        _check(self, "radius", "taper")
+        number("shape: radius", self.radius, "a positive length in metres", 1e-9)
+        number("shape: taper", self.taper, "a number from 0.001 to 100; a cylinder has none", 1e-3, 100)
+
+    def fit(self, half: tuple[float, float]) -> None:
+        corners = np.array([[x, y] for x in (-1, 1) for y in (-1, 1)]) * half
+        size = 2 * max(half)
+
+        def fits(radius: float) -> bool:
+            far, angle = self._unrolled(corners, radius)
+            return bool(
+                (far * np.cos(angle) > SHARPEST * size).all() and np.abs(angle).max() <= math.pi * self._sine
+            )
+
+        if not fits(self.radius):
+            low, high = self.radius, 2 * max(self.radius, size * (1 + self.taper))
+            for _ in range(60):
+                middle = (low + high) / 2
+                low, high = (low, middle) if fits(middle) else (middle, high)
+            _require_radius(self.radius, high, size)
+
+    @property
+    def _sine(self) -> float:
+        """Sine of the angle between the axis and the lines of the cone."""
+        return self.taper / math.hypot(1, self.taper)
+
+    def _unrolled(self, xy: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """Polar coordinates about the apex on the flat sheet: distances, and angles from the axis."""
+        down = np.asarray(xy, np.float64) @ axis_of(self.axis) + radius / self._sine
+        side = xy @ self.across
+        return np.hypot(side, down), np.arctan2(side, down)
+
+    def frames(self, xy: np.ndarray) -> Frames:
+        far, angle = self._unrolled(xy, self.radius)
+        sine, cosine = self._sine, 1 / math.hypot(1, self.taper)
+        x, y = axis_of(self.axis)
+        side, down, away = np.array([y, -x, 0.0]), np.array([x, y, 0.0]), np.array([0.0, 0.0, 1.0])
+        outwards, axis = sine * down - cosine * away, cosine * down + sine * away
+        turn = (angle / sine)[:, None]
+        line = sine * (np.cos(turn) * outwards + np.sin(turn) * side) + cosine * axis
+        around = np.cos(turn) * side - np.sin(turn) * outwards
+        points = far[:, None] * line - self.radius / sine * down
+        c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+        by_side, by_down = s * line + c * around, c * line - s * around
+        return Frames(points, y * by_side + x * by_down, -x * by_side + y * by_down)
+
+
+@dataclass(frozen=True)
+class Crumpled(Surface):
+    """Crumpled sheet: a height field of creases in random directions.
+
+    Each plane wave of creases is shortened in its direction so that lengths are preserved; where waves cross,
+    the sheet is stretched by the product of their slopes, about 1 % at the largest height.
+    """
+
+    height: float
+    """metres: maximum difference of height, at most a tenth of `length`"""
+    length: float
+    """metres: mean distance of creases"""
+    seed: int = 0
+    deviation: float | None = None
+    """metres: maximum distance of the splats from the surface; None: size / 1500"""
+    kind: ClassVar[str] = "crumpled"
+
+    def __post_init__(self) -> None:
+        _check(self, "height", "length")
+        number("shape: length", self.length, "a positive length in metres", 1e-9)
+        limit = f"0 to a tenth of the length, {self.length / 10:g} m"
+        number("shape: height", self.height, limit, 0, self.length / 10)
+        whole_number("shape: seed", self.seed, 0, 2**63 - 1)
+
+    def fit(self, half: tuple[float, float]) -> None:
+        smallest = SHARPEST * max(half)
+        if self.length < smallest:
+            raise InputError(
+                f"shape: length must be at least {smallest:g} m for this marker, got {self.length:g}; use "
+                "longer creases"
+            )
+
+    def frames(self, xy: np.ndarray) -> Frames:
+        xy = np.asarray(xy, np.float64)
+        rng = np.random.default_rng(self.seed)
+        turn = np.pi * (np.arange(WAVES) + rng.random(WAVES)) / WAVES
+        ways = np.column_stack([np.cos(turn), np.sin(turn)])
+        wave = 2 * np.pi / self.length * rng.uniform(0.6, 1.4, WAVES)
+        share = rng.uniform(0.5, 1.5, WAVES)
+        tall = self.height * share / share.sum()
+        start = rng.uniform(0, 2 * np.pi, WAVES)
+
+        phase = wave * (xy @ ways.T) + start
+        z = (_crease(phase) - _crease(np.linspace(0, 2 * np.pi, 256, endpoint=False)).mean()) @ tall
+        slope = tall * wave * np.sin(phase) / (4 * _crease(phase))
+        shorter = -wave * tall**2 / 2 * (_squared_slopes(phase) - _squared_slopes(start))
+        points = np.column_stack([xy + shorter @ ways, z])
+        along = [
+            np.column_stack([np.eye(2)[i] - (slope**2 / 2 * ways[:, i]) @ ways, slope @ ways[:, i]])
+            for i in (0, 1)
+        ]
+        x, y = (tangent / np.linalg.norm(tangent, axis=1, keepdims=True) for tangent in along)
+        middle, apart = x + y, x - y  # perpendicular, as x and y have the same length
+        middle, apart = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (middle, apart))
+        return Frames(points, (middle + apart) / math.sqrt(2), (middle - apart) / math.sqrt(2))
+
+
+def _crease(phase: np.ndarray) -> np.ndarray:
+    """Height of creases at phases of period 2 pi."""
+    return np.sqrt(np.sin(phase / 2) ** 2 + CREASE**2)
+
+
+def _squared_slopes(phase: np.ndarray) -> np.ndarray:
+    """Integral of the squared derivative of `_crease` from 0, in closed form."""
+    grown = math.hypot(1, CREASE)
+    period = np.round(phase / (2 * np.pi))
+    angle = np.arctan(grown / CREASE * np.tan(phase / 2 - np.pi * period)) + np.pi * period
+    return (phase / 2 + np.sin(phase) / 2 + CREASE**2 * phase - 2 * CREASE * grown * angle) / 4
+
+
+SURFACES: dict[str, type[Surface]] = {
+    kind.kind: kind for kind in (Cylinder, Cone, BentSheet, BoxEdge, Crumpled)
+}
+"""classes of shapes by their names in scene files"""
+
+
+def surface_of(shape: Surface | str | None) -> Surface | None:
+    """Convert a shape, its text or None (flat) to a shape: "cylinder,radius=0.05,axis=x".
+
+    Raises:
+        InputError: an unknown shape or field, a missing field, or a value out of range.
+    """
+    if not isinstance(shape, str):
+        return (
+            None if shape is None else instance("shape", shape, Surface, "a shape, its text or None", _REMEDY)
+        )
+    name, *settings = (part.strip() for part in shape.split(","))
+    if name not in SURFACES:
+        raise InputError(unknown("shape", name, SURFACES))
+    return made_of("shape", SURFACES[name], parse_settings("shape", SURFACES[name], settings))
+
+
+def axis_of(axis: str | tuple[float, ...]) -> np.ndarray:
+    """Unit vector (2,) of an axis on the sheet."""
+    if isinstance(axis, str):
+        if axis not in ("x", "y"):
+            raise InputError(f"shape: axis must be x, y or two numbers, got {axis!r}")
+        return np.array([1.0, 0.0] if axis == "x" else [0.0, 1.0])
+    found = real_array("shape: axis", axis, "x, y or two numbers")
+    if found.shape != (2,) or not np.isfinite(found).all() or not found.any():
+        raise InputError(f"shape: axis must be x, y or two numbers, not both 0, got {axis!r}")
+    return found / np.linalg.norm(found)
+
+
+_REMEDY = "e.g. fidsplat.markers.Cylinder(radius=0.05)"
+
+
+def _check(shape: Any, *lengths: str) -> None:
+    """Validate the numbers, the axis and the deviation of a shape."""
+    for name in lengths:
+        number(f"shape: {name}", getattr(shape, name))
+    if hasattr(shape, "axis"):
+        axis_of(shape.axis)
+    if shape.deviation is not None:
+        number("shape: deviation", shape.deviation, "a positive length in metres, or None", 1e-9)
+
+
+def _require_radius(radius: float, smallest: float, width: float) -> None:
+    if abs(radius) < smallest:
+        raise InputError(
+            f"shape: radius must be at least {smallest:.4g} m for a sheet of {width:.4g} m with its quiet "
+            f"zone, got {radius:g}; use a larger radius or a smaller size"
+        )
