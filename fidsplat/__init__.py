@@ -55,6 +55,7 @@ _HOME = {
     "FrameBatch": "fidsplat.render.batch",
     "Surface": "fidsplat.scenes.surface",
     "surface_at": "fidsplat.render.surface",
+    "scene_mesh": "fidsplat.render.mesh",
     "devices": "fidsplat.backends",
     "FidsplatError": "fidsplat.util.errors",
     "InputError": "fidsplat.util.errors",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,8 +16,30 @@ from fidsplat.util.errors import InputError
 
 
 @dataclass
+class MeshOptions:
+    """Options of a triangle mesh."""
+
+    mesh: Annotated[bool, switch("write a triangle mesh: .glb, .ply, .obj, .stl, or .xml for MuJoCo")] = False
+    voxel: Annotated[
+        float | None, option("M", "voxel of the mesh in metres (default: a 200th of the longest side)")
+    ] = None
+    cameras: Annotated[
+        str | None,
+        option("FILE", "views of the mesh: COLMAP, transforms.json, a trajectory (default: from outside)"),
+    ] = None
+    faces: Annotated[int | None, option("N", "largest number of triangles (extra: mesh)")] = None
+    parts: Annotated[int, option("N", "largest number of convex parts in .xml (extra: mesh)")] = 32
+
+    def __post_init__(self) -> None:
+        if not self.mesh and (self.voxel, self.cameras, self.faces, self.parts) != (None, None, None, 32):
+            raise InputError("--voxel, --cameras, --faces and --parts need --mesh")
+        if self.parts < 1:
+            raise InputError(f"--parts must be at least 1, got {self.parts}")
+
+
+@dataclass
 class Convert:
-    """Convert splats to another format, and measure the loss.
+    """Convert splats to another format, and measure the loss; or to a triangle mesh.
 
     Formats by ending: .ply, .splat, .spz, .glb and .gltf (KHR_gaussian_splatting), .usda, .usdc and .usd
     (OpenUSD's ParticleField; extra usd), .sog and meta.json (SOG). The command lists what the format of OUT
@@ -29,6 +51,8 @@ class Convert:
       fidsplat convert tag.ply tag.usda --json
       fidsplat convert scene.toml scene.html         one page that renders it offline, in a browser
       fidsplat convert city.fss city/lod-meta.json   a store as streamed SOG
+      fidsplat convert room.ply room.glb --mesh --cameras room/sparse/0      a triangle mesh
+      fidsplat convert pot.ply pot.xml --mesh --voxel 0.01                   convex parts for MuJoCo
     """
 
     source: Annotated[tyro.conf.Positional[str], option("IN", "splat file to read")]
@@ -36,6 +60,7 @@ class Convert:
     spz_version: int = 4
     """3|4: version of SPZ; 3 is for older readers and has no labels and coplanar groups"""
     no_images: Annotated[bool, switch("do not render and compare both files", "--no-pictures")] = False
+    mesh: MeshOptions = field(default_factory=MeshOptions)
     device: Device = None
     overwrite: Overwrite = False
     json: Json = False
@@ -48,6 +73,8 @@ class Convert:
         from fidsplat.formats.spz import save_spz
         from fidsplat.store.layout import SUFFIX
 
+        if self.mesh.mesh:
+            return self._mesh()
         if Path(self.source).suffix == SUFFIX and Path(self.target).name == META:
             return self._export()
         if Path(self.target).suffix.lower() == ".html":
@@ -77,6 +104,27 @@ class Convert:
             apart = f"image error: largest {error['largest']:.2g}, mean {error['mean']:.2g}"
             lines.append(f"{apart}; {psnr}")
         return report(self.json, facts, *lines)
+
+    def _mesh(self) -> int:
+        import fidsplat as fs
+        from fidsplat.formats.meshes import check_mesh_file, save_mesh
+        from fidsplat.render.mesh import cameras_of
+        from fidsplat.scenes.sources import load_source
+
+        target = check_mesh_file(new_file(self.target, self.overwrite))
+        with delayed_progress() as progress:
+            scene = load_source(self.source, progress=progress)
+            views = None if self.mesh.cameras is None else cameras_of(self.mesh.cameras, scene)
+            renderer = fs.Renderer(self.device or scene.device)
+            made = fs.scene_mesh(scene, views, self.mesh.voxel, renderer, progress)
+        if self.mesh.faces is not None:
+            made = made.simplified(self.mesh.faces)
+        files = save_mesh(made, target, self.mesh.parts)
+        facts: dict[str, Any] = {"source": self.source, "target": self.target, "format": "mesh"}
+        facts |= {"vertices": len(made.vertices), "faces": len(made.faces), "area_m2": made.area}
+        facts["files"] = [str(file) for file in files]
+        more = f" and {len(files) - 1} convex parts" if len(files) > 1 else ""
+        return report(self.json, facts, f"{len(made.faces):,} triangles: {self.target}{more}")
 
     def _page(self) -> int:
         from fidsplat.scenes.sources import load_source

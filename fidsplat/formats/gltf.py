@@ -122,7 +122,7 @@ def save_gltf(cloud: SplatCloud, path: Path) -> None:
         document["buffers"][0]["uri"] = uri
         out = json.dumps(document).encode()
     else:
-        out = _glb(document, binary)
+        out = pack_glb(document, binary)
     with atomic_write(path) as stream:
         stream.write(out)
 
@@ -136,7 +136,8 @@ def _primitive(names: list[str]) -> dict[str, Any]:
     }
 
 
-def _glb(document: dict[str, Any], binary: bytes) -> bytes:
+def pack_glb(document: dict[str, Any], binary: bytes) -> bytes:
+    """Content of a .glb file."""
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     binary += b"\0" * (-len(binary) % 4)

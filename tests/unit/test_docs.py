@@ -71,6 +71,7 @@ SMALLER = {
 EXTRAS = {
     "experiments": ("pandas", "matplotlib", "pupil_apriltags", "locus", "flip_evaluator", "jinja2"),
     "logs": ("mcap", "rosbags"),
+    "mesh": ("coacd", "fast_simplification"),
     "sim": ("mujoco", "gymnasium"),
     "usd": ("pxr",),
     "video": ("imageio_ffmpeg",),

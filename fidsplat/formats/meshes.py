@@ -1,0 +1,217 @@
+"""Writing of triangle meshes: glTF, PLY, OBJ, STL, and a MuJoCo model of convex parts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fidsplat.formats.gltf import pack_glb
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write
+
+MESH_FORMATS = (".glb", ".ply", ".obj", ".stl", ".xml")
+_STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """Triangles with colours at their vertices."""
+
+    vertices: np.ndarray
+    """(n, 3) float64 world metres"""
+    faces: np.ndarray
+    """(m, 3) int32 indices of vertices, counter-clockwise from outside"""
+    colors: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+    """(n, 3) RGB in display space, 0 to 1; or empty"""
+
+    @property
+    def area(self) -> float:
+        """Square metres."""
+        return float(np.linalg.norm(self._crosses, axis=1).sum() / 2)
+
+    @property
+    def volume(self) -> float:
+        """Cubic metres inside a closed mesh."""
+        return float((self.vertices[self.faces[:, 0]] * self._crosses).sum() / 6)
+
+    @property
+    def closed(self) -> bool:
+        """Whether each edge is in exactly two triangles, once in each direction."""
+        edges = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)
+        keys = np.sort(edges[:, 0] * len(self.vertices) + edges[:, 1])
+        opposite = np.sort(edges[:, 1] * len(self.vertices) + edges[:, 0])
+        return bool((keys[1:] > keys[:-1]).all() and np.array_equal(keys, opposite))
+
+    @property
+    def _crosses(self) -> np.ndarray:
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        return np.cross(b - a, c - a)
+
+    def simplified(self, faces: int) -> TriangleMesh:
+        """The mesh with at most this many faces, by quadric error metrics. Colours are those of the nearest
+        original vertices of the collapsed edges.
+
+        Raises:
+            InputError: the package fast-simplification is missing; a number below 4.
+        """
+        if faces < 4:
+            raise InputError(f"--faces must be at least 4, got {faces}")
+        if len(self.faces) <= faces:
+            return self
+        simplification = _package("fast_simplification")
+        centre = self.vertices.mean(0)
+        local = (self.vertices - centre).astype(np.float32)
+        points, triangles, collapses = simplification.simplify(
+            local, self.faces.astype(np.int32), target_count=faces, return_collapses=True
+        )
+        colors = self.colors
+        if len(colors):
+            _, _, where = simplification.replay_simplification(local, self.faces.astype(np.int32), collapses)
+            kept = where >= 0
+            where, colors = where[kept], colors[kept]
+            counts = np.bincount(where, minlength=len(points))[:, None]
+            sums = np.stack([np.bincount(where, colors[:, k], len(points)) for k in range(3)], 1)
+            colors = sums / np.maximum(counts, 1)
+        return TriangleMesh(points + centre, triangles.astype(np.int32), colors)
+
+    def convex_parts(self, most: int) -> list[TriangleMesh]:
+        """Approximate convex decomposition (CoACD) into at most this many parts.
+
+        Raises:
+            InputError: the package coacd is missing.
+        """
+        coacd = _package("coacd")
+        coacd.set_log_level("error")
+        centre = self.vertices.mean(0)
+        mesh = coacd.Mesh(self.vertices - centre, self.faces)
+        preprocess = "off" if self.closed else "auto"  # remeshing takes most of the time
+        parts = coacd.run_coacd(mesh, max_convex_hull=most, preprocess_mode=preprocess, seed=0)
+        return [TriangleMesh(np.asarray(v) + centre, np.asarray(f, np.int32)) for v, f in parts]
+
+
+def save_mesh(mesh: TriangleMesh, path: Path, parts: int = 32) -> list[Path]:
+    """Write a mesh in the format of the file's ending; returns the written files.
+
+    .glb has colours and y up, .ply has colours; .xml is a MuJoCo model of convex parts in OBJ files next
+    to it.
+
+    Raises InputError for another ending, an empty mesh, or a file that cannot be written.
+    """
+    suffix = check_mesh_file(path).suffix.lower()
+    if not len(mesh.faces):
+        raise InputError(
+            "a mesh must have at least one triangle, got none; give other cameras or a voxel size"
+        )
+    if suffix == ".xml":
+        return _save_mujoco(mesh.convex_parts(parts), path)
+    writer = {".glb": _glb, ".ply": _ply, ".obj": _obj, ".stl": _stl}[suffix]
+    with atomic_write(path) as stream:
+        stream.write(writer(mesh))
+    return [path]
+
+
+def check_mesh_file(path: Path) -> Path:
+    """The path of a mesh, before anything is computed. Raises InputError for another ending, or a missing
+    package."""
+    suffix = path.suffix.lower()
+    if suffix not in MESH_FORMATS:
+        raise InputError(f"a mesh must end in {', '.join(MESH_FORMATS)}, got {path}")
+    if suffix == ".xml":
+        _package("coacd")
+    return path
+
+
+def _save_mujoco(parts: list[TriangleMesh], path: Path) -> list[Path]:
+    files = [path.with_name(f"{path.stem}-{k}.obj") for k in range(len(parts))]
+    for part, file in zip(parts, files, strict=True):
+        with atomic_write(file) as stream:
+            stream.write(_obj(part))
+    names = [file.stem for file in files]
+    assets = [f'    <mesh name="{n}" file="{n}.obj" inertia="convex"/>' for n in names]
+    geoms = [f'      <geom type="mesh" mesh="{name}"/>' for name in names]
+    lines = [f'<mujoco model="{path.stem}">', "  <asset>", *assets, "  </asset>", "  <worldbody>"]
+    lines += [f'    <body name="{path.stem}">', *geoms, "    </body>", "  </worldbody>", "</mujoco>", ""]
+    with atomic_write(path) as stream:
+        stream.write("\n".join(lines).encode())
+    return [path, *files]
+
+
+def _glb(mesh: TriangleMesh) -> bytes:
+    points, faces = mesh.vertices.astype("<f4"), mesh.faces.astype("<u4")
+    arrays = [(faces.reshape(-1, 1), 5125, "SCALAR"), (points, 5126, "VEC3")]
+    if len(mesh.colors):
+        display = np.clip(mesh.colors, 0, 1)  # colours of vertices are linear in glTF
+        linear = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+        arrays.append((linear.astype("<f4"), 5126, "VEC3"))
+    views, accessors, place = [], [], 0
+    for array, component, kind in arrays:
+        views.append({"buffer": 0, "byteOffset": place, "byteLength": array.nbytes})
+        accessors.append(
+            {
+                "bufferView": len(views) - 1,
+                "componentType": component,
+                "count": len(array),
+                "type": kind,
+            }
+        )
+        place += array.nbytes
+    accessors[1] |= {"min": points.min(0).tolist(), "max": points.max(0).tolist()}
+    attributes = {"POSITION": 1} | ({"COLOR_0": 2} if len(mesh.colors) else {})
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "fidsplat"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": [0.0, 0.0, 1.0, 0.0]}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0}]}],
+        "materials": [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": place}],
+    }
+    return pack_glb(document, b"".join(array.tobytes() for array, _, _ in arrays))
+
+
+def _ply(mesh: TriangleMesh) -> bytes:
+    columns: list[Any] = [(name, "<f4") for name in "xyz"]
+    colored = len(mesh.colors) > 0
+    columns += [(name, "u1") for name in ("red", "green", "blue")] if colored else []
+    rows = np.empty(len(mesh.vertices), columns)
+    for k, name in enumerate("xyz"):
+        rows[name] = mesh.vertices[:, k]
+    if colored:
+        rounded = np.clip(np.rint(255 * mesh.colors), 0, 255)
+        for k, name in enumerate(("red", "green", "blue")):
+            rows[name] = rounded[:, k]
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, mesh.faces
+    types = {"<f4": "float", "|u1": "uchar"}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    lines += [f"property {types[rows.dtype[name].str]} {name}" for name in rows.dtype.names or ()]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    return "\n".join(lines).encode() + rows.tobytes() + faces.tobytes()
+
+
+def _obj(mesh: TriangleMesh) -> bytes:
+    lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in mesh.vertices.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _stl(mesh: TriangleMesh) -> bytes:
+    rows = np.zeros(len(mesh.faces), _STL)
+    rows["corners"] = mesh.vertices[mesh.faces]
+    crosses = mesh._crosses
+    rows["normal"] = crosses / np.maximum(np.linalg.norm(crosses, axis=1, keepdims=True), 1e-30)
+    return bytes(80) + np.array([len(rows)], "<u4").tobytes() + rows.tobytes()
+
+
+def _package(module: str) -> Any:
+    from importlib import import_module
+
+    try:
+        return import_module(module)
+    except ImportError:
+        raise InputError(f"this mesh needs {module}; pip install 'fidsplat[mesh]'") from None

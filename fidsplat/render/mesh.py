@@ -1,0 +1,146 @@
+"""Mesh of a scene: depth images of many views, fused into a distance field."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from fidsplat.cameras import Camera, Motion
+from fidsplat.capture.sensor import Sensor
+from fidsplat.formats.cameras import load_cameras
+from fidsplat.formats.collect import Progress
+from fidsplat.formats.meshes import TriangleMesh
+from fidsplat.formats.trajectories import load_trajectory
+from fidsplat.render.renderer import Renderer
+from fidsplat.render.surface import MEDIAN
+from fidsplat.render.tsdf import DistanceField
+from fidsplat.scenes import Scene
+from fidsplat.splats.statistics import guess_up
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import path_of
+
+VIEWS, SIDE, FOV = 64, 512, math.radians(50.0)
+"""number, pixels per side and field of view of the views around a scene"""
+RESOLUTION = 200
+"""voxels along the longest side of a scene"""
+MOST_VOXELS = 1 << 20
+"""largest number of voxels per side"""
+
+
+def scene_mesh(
+    scene: Scene,
+    cameras: Iterable[Camera] | None = None,
+    voxel: float | None = None,
+    renderer: Renderer | None = None,
+    progress: Progress | None = None,
+) -> TriangleMesh:
+    """Triangle mesh of a scene's surfaces, with colours at the vertices.
+
+    The median depth of each view is fused into a truncated signed distance field; pixels with an opacity
+    below one half are empty. Surfaces that are thinner than two voxels and visible from both sides are lost.
+
+    Args:
+        cameras: views; by default 64 on a sphere around the scene, which looks from outside.
+        voxel: metres; by default a 200th of the longest side of the scene.
+        renderer: by default one on the scene's device.
+        progress: called with the current step and its share done.
+
+    Raises:
+        InputError: no splats; a voxel size that is not positive or too small.
+    """
+    low, high = _bounds(scene)
+    size = float((high - low).max())
+    voxel = size / RESOLUTION if voxel is None else voxel
+    if not (math.isfinite(voxel) and voxel > 0):
+        raise InputError(f"voxel must be a positive length in metres, got {voxel!r}")
+    if size / voxel > MOST_VOXELS / 2:
+        raise InputError(
+            f"voxel must be at least {2 * size / MOST_VOXELS:.2g} m for this scene, got {voxel:g}"
+        )
+    views = list(views_around(scene, low, high) if cameras is None else cameras)
+    if not views:
+        raise InputError("a mesh must have at least one camera, got none")
+    renderer = Renderer(scene.device) if renderer is None else renderer
+    report: Callable[[str, float], object] = progress or (lambda step, share: None)
+    capture = scene.capture
+    quality = replace(capture.quality, samples=1, first_hit=MEDIAN)
+    motion = Motion(None, capture.motion.groups)
+    still = replace(
+        capture,
+        outputs=("rgb", "depth_first", "normal"),
+        quality=quality,
+        motion=motion,
+        sensor=Sensor(),
+        fog=None,
+        background=(0.0, 0.0, 0.0),
+    )
+    field = DistanceField(voxel, (low + high) / 2)
+    images = []
+    frames = renderer.render_views(renderer.upload(scene), [replace(still, camera=one) for one in views])
+    for k, frame in enumerate(frames):
+        depth = frame["depth_first"]
+        field.allocate(depth, views[k])
+        images.append((depth, _cosine(frame["normal"], views[k]), frame.to_uint8()))
+        report("rendering views", 0.5 * (k + 1) / len(views))
+    for k, (depth, cosine, rgb) in enumerate(images):
+        field.integrate(depth, cosine, rgb.astype(np.float32) / 255, views[k])
+        report("fusing views", 0.5 + 0.5 * (k + 1) / len(views))
+    return field.mesh()
+
+
+def cameras_of(path: str | os.PathLike[str], scene: Scene) -> list[Camera]:
+    """Cameras of a COLMAP model or transforms.json, or the scene's camera at the poses of a trajectory.
+
+    Raises:
+        InputError: an unreadable file; a trajectory for a scene without a camera.
+    """
+    file = path_of(path)
+    if file.is_dir() or file.suffix.lower() == ".json":
+        return list(load_cameras(file).values())
+    if scene.camera is None:
+        raise InputError(f"the scene of the trajectory {file} must have a camera, got none")
+    camera = scene.camera
+    return [camera.with_pose(camera_to_world=pose) for pose in load_trajectory(file).poses]
+
+
+def _cosine(normal: np.ndarray, camera: Camera) -> np.ndarray:
+    """Cosine (h, w) float32 of the angle between the rays and the normals (h, w, 3), at least 0.1."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    pixels = np.stack([x.ravel(), y.ravel()], 1)
+    ends = camera.unproject(pixels, np.ones(len(pixels))) - camera.unproject(pixels, np.zeros(len(pixels)))
+    rays = (ends @ camera.world_to_camera[:3, :3].T).reshape(normal.shape)
+    cosine = -(normal * rays).sum(2) / np.linalg.norm(rays, axis=2)
+    return np.nan_to_num(np.maximum(cosine, 0.1), nan=0.1).astype(np.float32)
+
+
+def views_around(scene: Scene, low: np.ndarray, high: np.ndarray) -> list[Camera]:
+    """Cameras on a sphere around a box, evenly by the golden angle. Those below level ground are left out."""
+    guess = guess_up(scene.cloud())
+    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    away = radius / math.sin(FOV / 2)
+    k = np.arange(VIEWS)
+    z = 1 - (2 * k + 1) / VIEWS
+    angle, across = math.pi * (1 + 5**0.5) * k, np.sqrt(1 - z * z)
+    directions = np.stack([across * np.cos(angle), across * np.sin(angle), z], 1)
+    found = []
+    for direction in directions:
+        if guess.ground and direction @ guess.direction < 0.1:
+            continue
+        up = guess.direction if abs(direction @ guess.direction) < 0.99 else np.roll(guess.direction, 1)
+        near = max(away - 1.5 * radius, 1e-3 * radius)
+        found.append(Camera.look_at(SIDE, SIDE, FOV, middle + away * direction, middle, up, near=near))
+    return found
+
+
+def _bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Box of the middle 99 % of the centres along each axis."""
+    cloud = scene.cloud()
+    if not len(cloud):
+        raise InputError("a mesh must have a scene with splats, got none")
+    low, high = np.percentile(cloud.means.astype(np.float64), (0.5, 99.5), axis=0) + cloud.origin
+    reach = np.percentile(cloud.scales, 90)
+    return low - reach, high + reach
