@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,9 +16,10 @@ from fidsplat.images.files import encode_image, read_image, write_png
 from fidsplat.images.visualize import resize_to_width
 from fidsplat.markers import marker
 from fidsplat.photographs.mapping import Progress
-from fidsplat.photographs.tags import beside_tags, module_colors, tag_region
+from fidsplat.photographs.tags import box_of, module_colors, tag_region
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.scenes.scene import Scene
+from fidsplat.train.dataset import outside_boxes
 from fidsplat.util.files import atomic_write
 from fidsplat.vision.undistort import undistort_masked
 
@@ -103,9 +105,12 @@ def write_model(
     colors: np.ndarray,
     tags: Sequence[PlacedMarker],
 ) -> Path:
-    """Write COLMAP's model of the undistorted images, without points on tags, and scene.toml with the tags;
-    returns the scene file."""
-    free = beside_tags(points, tags)
+    """Write COLMAP's model of the undistorted images, without points in the boxes of tags, dataset.json with
+    these boxes, and scene.toml with the tags; returns the scene file."""
+    boxes = [box_of(tag) for tag in tags]
+    free = outside_boxes(points, boxes)
+    with atomic_write(folder / "dataset.json") as stream:
+        stream.write(json.dumps({"boxes": [box.tolist() for box in boxes]}).encode())
     names = [name if name.endswith((".jpg", ".jpeg")) else f"{Path(name).stem}.png" for name in names]
     save_colmap(folder / "sparse" / "0", names, cameras, points[free], colors[free])
     file = folder / "scene.toml"

@@ -6,6 +6,7 @@ interrupted run continues.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,8 +25,8 @@ EXHAUSTIVE = 80
 """up to this number of images all pairs are matched; beyond, a video's frames with their neighbours"""
 NEIGHBOURS, STRIDE = 12, 10
 """frames of a long video are matched with the next ones; every STRIDE-th with each other to close loops"""
-PAIRS = 16
-"""pairs that are matched between two reports of progress"""
+AT_ONCE, PAIRS = min(8, os.cpu_count() or 1), 16
+"""photographs and pairs between two reports of progress"""
 FEW_FEATURES = 200
 MIN_MATCHES = 15
 """matches that COLMAP's mapper needs of a pair"""
@@ -86,12 +87,11 @@ def extract(
     for group in groups:
         if group[0] not in present:
             pycolmap.import_images(database, photos, pycolmap.CameraMode.SINGLE, list(group), options)
-    for number, name in enumerate(names):
-        progress("features", number / len(names))
-        if not present.get(name):
-            pycolmap.extract_features(
-                database, photos, [name], reader_options=options, device=pycolmap.Device.cpu
-            )
+    left = [name for name in names if not present.get(name)]
+    for first in range(0, len(left), AT_ONCE):
+        progress("features", 1 - (len(left) - first) / len(names))
+        some = left[first : first + AT_ONCE]
+        pycolmap.extract_features(database, photos, some, reader_options=options, device=pycolmap.Device.cpu)
 
 
 def match(database: Path, ordered: bool, progress: Progress) -> None:

@@ -18,7 +18,7 @@ from fidsplat.vision.detect import detect
 from fidsplat.vision.readback import families_of, same_code
 
 THICK = 0.15
-"""initial points within this distance of a tag's plane are of its print, as a share of its size"""
+"""half the thickness of a tag's box, as a share of its size"""
 _EDGE = 1.0
 """pixels by which the masked region is larger than the tag"""
 _MIN_MODULE = 3.0
@@ -105,14 +105,10 @@ def tag_region(placed: PlacedMarker, camera: Camera) -> np.ndarray:
     return inside
 
 
-def beside_tags(points: np.ndarray, placed: Sequence[PlacedMarker]) -> np.ndarray:
-    """Points (n,) bool that are not of the print of a tag."""
-    free = np.ones(len(points), bool)
-    for tag in placed:
-        local = np.abs((points - tag.pose[:3, 3]) @ tag.pose[:3, :3])
-        h, w = np.array(tag.marker.grid.shape) * tag.marker.module / 2
-        free &= (local > (w, h, THICK * tag.marker.size)).any(1)
-    return free
+def box_of(tag: PlacedMarker) -> np.ndarray:
+    """Matrix (4, 4) from the cube [-1, 1]^3 to a box around a tag: splats in it are of its print."""
+    h, w = np.array(tag.marker.grid.shape) * tag.marker.module / 2
+    return tag.pose @ np.diag([w, h, THICK * tag.marker.size, 1.0])
 
 
 def module_colors(

@@ -83,6 +83,9 @@ class Dataset:
     """(m, 3) uint8"""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """background colour, display values"""
+    boxes: tuple[np.ndarray, ...] = ()
+    """(4, 4) matrices from the cube [-1, 1]^3 to boxes of markers: trained splats with centres in them are
+    removed"""
 
     def __post_init__(self) -> None:
         text("the name of a data set", self.name)
@@ -97,6 +100,10 @@ class Dataset:
             raise invalid(f"the colours of {self.name}", f"an array {points.shape} of uint8", colors)
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "background", three_numbers("background", self.background))
+        boxes = [real_array(f"a box of {self.name}", box) for box in self.boxes]
+        if not all(box.shape == (4, 4) and np.linalg.matrix_rank(box) == 4 for box in boxes):
+            raise invalid(f"a box of {self.name}", "an invertible matrix (4, 4)", self.boxes)
+        object.__setattr__(self, "boxes", tuple(boxes))
         if len(self.views) < 2:
             raise InputError(
                 f"{self.name} must have at least two training views, from different positions, got "
@@ -165,6 +172,15 @@ class Dataset:
         else:
             points = _points_in_frustums(cameras, draws[:, :3], _RANDOM_DEPTH * self.extent)
         return replace(self, points=points, colors=(shades[:, :3] * 256).astype(np.uint8))
+
+
+def outside_boxes(points: np.ndarray, boxes: Sequence[np.ndarray]) -> np.ndarray:
+    """Which points (n, 3) are outside all boxes, (n,) bool; boxes as in `Dataset`."""
+    outside = np.ones(len(points), bool)
+    for box in boxes:
+        local = np.linalg.solve(box[:3, :3], (points - box[:3, 3]).T)
+        outside &= (np.abs(local) > 1).any(0)
+    return outside
 
 
 def viewed_cube(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, bool]:

@@ -18,7 +18,7 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, path_of, read_text
 
 NOTES = ("dataset.json", "marker.json")
-"""files of fidsplat's data sets with the field `background`: one display value, or three"""
+"""files of fidsplat's data sets with the fields `background`, one display value or three, and `boxes`"""
 _MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 """folders of COLMAP's model in a data set"""
 HOLD_OUT, MIN_VIEWS_TO_HOLD_OUT = 8, 16
@@ -63,7 +63,7 @@ def load_dataset(
         raise InputError(
             f"{folder} must have initial points, got none; give --random-points 5000, or a model with points"
         )
-    dataset = Dataset(str(folder), views, held_out, points, colors, found.background)
+    dataset = Dataset(str(folder), views, held_out, points, colors, found.background, found.boxes)
     return dataset.with_random_points(random_points, seed) if random_points else dataset
 
 
@@ -87,13 +87,13 @@ def _load_colmap(folder: Path, progress: Progress) -> DatasetContents:
             f"{folder} must be a data set of COLMAP (sparse/0/cameras.bin and images/) or nerfstudio "
             "(transforms.json), got neither"
         )
-    background = _background(folder)
+    background, boxes = _notes(folder)
     views, points, colors = _model(folder, model, background, progress, "images")
     held_out: list[TrainingView] = []
     if has_colmap(folder / "test" / "sparse" / "0"):
         test = folder / "test"
         held_out, _, _ = _model(test, test / "sparse" / "0", background, progress, "test images")
-    return DatasetContents(views, held_out, points, colors, background)
+    return DatasetContents(views, held_out, points, colors, background, boxes)
 
 
 def _model(
@@ -117,17 +117,24 @@ def _mask(mask: Path) -> np.ndarray | None:
     return None if file is None else read_image(file).max(axis=2) > 0
 
 
-def _background(folder: Path) -> Background:
+def _notes(folder: Path) -> tuple[Background, tuple[np.ndarray, ...]]:
+    """Background and boxes of the folder's notes."""
     for name in NOTES:
         file = folder / name
         if file.exists():
             text = read_text(file, "replace")
             try:
-                value = from_json(text).get("background", 0.0)
-                red, green, blue = np.broadcast_to(np.asarray(value, float), 3).tolist()
+                notes = from_json(text)
+                red, green, blue = np.broadcast_to(
+                    np.asarray(notes.get("background", 0.0), float), 3
+                ).tolist()
             except (ValueError, AttributeError, TypeError, OverflowError):
                 raise InputError(
                     f"background of {file} must be one number or three, got another value"
                 ) from None
-            return red, green, blue
-    return (0.0, 0.0, 0.0)
+            try:
+                boxes = tuple(np.array(notes.get("boxes", ()), float).reshape(-1, 4, 4))
+            except (ValueError, TypeError):
+                raise InputError(f"boxes of {file} must be matrices of 4 x 4 numbers, got others") from None
+            return (red, green, blue), boxes
+    return (0.0, 0.0, 0.0), ()

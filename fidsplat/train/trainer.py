@@ -26,7 +26,7 @@ from fidsplat.render.renderer import Renderer
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.train import densify, mcmc
 from fidsplat.train.checkpoint import TrainingState, load_checkpoint, save_checkpoint
-from fidsplat.train.dataset import Dataset, TrainingView
+from fidsplat.train.dataset import Dataset, TrainingView, outside_boxes
 from fidsplat.train.device_model import DeviceModel
 from fidsplat.train.host_model import HostModel
 from fidsplat.train.losses import Loss
@@ -184,8 +184,12 @@ class Trainer:
         return self.cloud()
 
     def cloud(self) -> SplatCloud:
-        """The current splats. Raises TrainingError if a value is not finite."""
-        return self._checked_splats().cloud(self.settings.sh_degree, self.dataset.origin)
+        """The current splats, without those in the data set's boxes. Raises TrainingError if a value is not
+        finite."""
+        splats, origin = self._checked_splats(), self.dataset.origin
+        if self.dataset.boxes:
+            splats = splats.select(outside_boxes(splats.values["means"] + origin, self.dataset.boxes))
+        return splats.cloud(self.settings.sh_degree, origin)
 
     def save(self, path: str | Path) -> None:
         """Write the current splats to a PLY file. Raises InputError if it cannot be written, TrainingError

@@ -32,6 +32,7 @@ class DatasetContents(NamedTuple):
     points: np.ndarray
     colors: np.ndarray
     background: tuple[float, float, float]
+    boxes: tuple[np.ndarray, ...] = ()
 
 
 def has_transforms(path: Path) -> bool:

@@ -39,7 +39,7 @@ MAY_IMPORT = {
     "sim": DATA | {"scenes", "effects", "images", "render"},
     "worlds": DATA | {"scenes", "markers", "formats", "store", "sim"},
     "logs": {"splats", "cameras", "effects", "images", "vision"},
-    "photographs": DATA | {"images", "markers", "formats", "vision", "scenes"},
+    "photographs": DATA | {"images", "markers", "formats", "vision", "scenes", "train"},
     "train": DATA | {"formats", "markers", "images", "vision", "render", "backends", "effects"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}

@@ -17,7 +17,7 @@ from fidsplat.photographs.mapping import Model
 from fidsplat.photographs.photos import camera_groups, copy_photos
 from fidsplat.photographs.settings import CaptureSettings
 from fidsplat.photographs.steps import parse_scale, scale_of
-from fidsplat.photographs.tags import beside_tags, module_colors, parse_tags, tag_region
+from fidsplat.photographs.tags import box_of, module_colors, parse_tags, tag_region
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import quaternion_to_matrix, rigid_matrix
 from fidsplat.vision.video_frames import choose_frames, measure_frames
@@ -141,8 +141,8 @@ def test_the_region_of_a_tag_is_masked_and_its_inks_are_measured():
     dark, light = module_colors(tag, (255 * frame["rgb"]).round().astype(np.uint8), camera)
     np.testing.assert_allclose(dark, (0.2, 0.1, 0.1), atol=0.02)
     np.testing.assert_allclose(light, (0.8, 0.9, 0.7), atol=0.02)
-    points = np.array([[0.07, 0.0, 0.01], [0.12, 0.0, 0.0], [0.0, 0.0, -0.1]])
-    assert beside_tags(points, [tag]).tolist() == [False, True, True]
+    corner = (box_of(tag) @ (1, -1, 0, 1))[:3]
+    np.testing.assert_allclose(corner, (0.1, -0.1, 0), atol=1e-12)  # with the quiet zone
 
 
 @pytest.mark.parametrize(

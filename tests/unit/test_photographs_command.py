@@ -119,6 +119,17 @@ def test_training_reads_the_data_set_without_the_tags(captured):
             x, y = view.camera.project(tag.pose[None, :3, 3])[0].astype(int)
             assert not view.mask[y, x]
         assert view.mask.mean() > 0.8
+    # neither initial points nor trained splats are in the tags
+    assert len(dataset.boxes) == 2
+    for tag, box in zip(tags, dataset.boxes, strict=True):
+        np.testing.assert_allclose(box[:3, 3], tag.pose[:3, 3], atol=1e-12)
+        assert not (np.linalg.norm(dataset.points - tag.pose[:3, 3], axis=1) < 0.02).any()
+    file = out / "dataset.json"
+    notes = file.read_text()
+    file.write_text('{"boxes": [[1, 2]]}')
+    with pytest.raises(fs.InputError, match=r"boxes of .* must be matrices of 4 x 4"):
+        load_dataset(out)
+    file.write_text(notes)
 
 
 def test_the_same_command_resumes_with_other_tags(captured, capsys):

@@ -47,6 +47,24 @@ def mean_psnr(scores):
     return np.mean([score.psnr for score in scores])
 
 
+def test_splats_in_the_boxes_of_markers_are_not_saved(dataset, tmp_path):
+    """Training itself is the same: the other splats have the same values."""
+    renderer = fs.Renderer("reference")
+    box = np.array([[0.3, 0.1, 0, 0.2], [-0.1, 0.3, 0, 0], [0, 0, 0.4, 0.1], [0, 0, 0, 1]])
+    complete = Trainer(dataset, renderer, iterations=2, **QUICK).run()
+    trainer = Trainer(replace(dataset, boxes=(box,)), renderer, iterations=2, **QUICK)
+    trainer.run()
+    trainer.save(tmp_path / "scene.ply")
+    saved = fs.load_ply(tmp_path / "scene.ply")
+    local = (complete.world_means() - box[:3, 3]) @ np.linalg.inv(box[:3, :3]).T
+    outside = (np.abs(local) > 1).any(1)
+    assert 0 < outside.sum() < len(outside)
+    np.testing.assert_array_equal(saved.means, complete.means[outside])
+    np.testing.assert_allclose(saved.opacities, complete.opacities[outside], rtol=1e-6)  # files have logits
+    with pytest.raises(fs.InputError, match="a box of tiny must be an invertible matrix"):
+        replace(dataset, boxes=(np.zeros((4, 4)),))
+
+
 def test_training_raises_the_psnr_and_lowers_the_loss(whole, dataset):
     """By 3 dB on the views that are trained on, and 1 dB on one that is not."""
     trainer, steps, at_first, _ = whole
