@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,8 +19,9 @@ from fidsplat.formats.files import load_splats
 from fidsplat.markers import Marker, marker
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.captured import fetch_scene
+from fidsplat.scenes.lights import Light, Lighting, PointLight, Sun
 from fidsplat.splats.cloud import SplatCloud
-from fidsplat.splats.rotations import rigid_matrix
+from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.util.arguments import number
 from fidsplat.worlds.greenhouse import AISLE, Greenhouse, facing
 
@@ -29,6 +30,8 @@ EDGES = 6.0
 """distance of the camera without a cause, in edges of the code: about 90 pixels per edge"""
 INK, PAPER = 0.05, 0.85
 """grey of ink and paper"""
+_PLANKS = 4
+"""number of arrangements of planks"""
 _COVER = 0.16, 0.3, 0.09
 """colour of an object in front of the marker"""
 
@@ -67,9 +70,35 @@ def scene_of(name: str) -> tuple[Scene, np.ndarray, float]:
 
 
 @cache
-def marker_of(spec: str, size: float) -> Marker:
-    """A marker with the grey of ink and paper."""
-    return marker(spec, size=size, black=(INK,) * 3, white=(PAPER,) * 3)
+def marker_of(spec: str, size: float, lit: bool = False) -> Marker:
+    """A marker with the grey of ink and paper; lit: black and white, for `Lighting`."""
+    return marker(spec, size=size) if lit else marker(spec, size=size, black=(INK,) * 3, white=(PAPER,) * 3)
+
+
+@cache
+def placed_in(scene: str, spec: str) -> PlacedMarker:
+    """The marker of a scene."""
+    _, pose, size = scene_of(scene)
+    return PlacedMarker(marker_of(spec, size), pose)
+
+
+@lru_cache(32)
+def _lit(placed: PlacedMarker, light: Lighting) -> PlacedMarker:
+    made = placed.marker
+    return replace(placed, marker=marker_of(made.spec, made.size, True), light=light)
+
+
+@lru_cache(8)
+def _assembled(
+    base: Scene,
+    placed: PlacedMarker,
+    cover: SplatCloud | None,
+    lights: tuple[Light, ...],
+    camera: Camera | None,
+) -> Scene:
+    """The same object for the same parts, so that its light is computed once."""
+    clouds = base.clouds if cover is None else (*base.clouds, cover.transformed(placed.pose))
+    return replace(base, clouds=clouds, markers=(placed,), lights=lights, camera=camera)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +123,7 @@ class View:
     """without the camera's pose"""
     cover: SplatCloud | None = None
     """object in front of the marker, in its frame"""
+    lights: tuple[Light, ...] = ()
     defocus: float = 0.0
     """radius in pixels of the disk that blurs the image"""
 
@@ -114,11 +144,10 @@ class View:
 
     @property
     def complete_scene(self) -> Scene:
-        """The scene with the marker and what covers it."""
-        clouds = self.scene.clouds
-        if self.cover is not None:
-            clouds = (*clouds, self.cover.transformed(self.placed.pose))
-        return replace(self.scene, clouds=clouds, markers=(self.placed,))
+        """The scene with the marker, its lights and what covers it."""
+        light = self.placed.light
+        camera = self.camera if isinstance(light, Lighting) and light.view == "camera" else None
+        return _assembled(self.scene, self.placed, self.cover, self.lights, camera)
 
     @property
     def complete_capture(self) -> Capture:
@@ -151,14 +180,14 @@ def view_of(scene: str, spec: str, seed: str) -> View:
 
     Views of equal seeds have equal poses for all specs, causes and severities.
     """
-    base, pose, size = scene_of(scene)
+    base, _, _ = scene_of(scene)
     rng = np.random.default_rng([*seed.encode()])
     edges = EDGES * math.exp(rng.uniform(-0.15, 0.15))
     tilt, azimuth = math.radians(rng.uniform(0, 40)), math.radians(rng.uniform(-25, 25))
     roll, aim = math.radians(rng.uniform(-20, 20)), rng.uniform(-0.05, 0.05, 2)
     return View(
         base,
-        PlacedMarker(marker_of(spec, size), pose),
+        placed_in(scene, spec),
         int(rng.integers(2**31)),
         edges,
         tilt * rng.choice((-1, 1)),
@@ -267,7 +296,74 @@ def _defocused(view: View, radius: float) -> View:
     return replace(view, defocus=radius)
 
 
-GEOMETRY, CAMERA = "geometry", "camera"
+def _direction(placed: PlacedMarker, vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    """World direction of a vector in the marker's frame."""
+    x, y, z = (placed.pose[:3, :3] @ np.array(vector)).tolist()
+    return x, y, z
+
+
+def _backlight(view: View, factor: float) -> View:
+    """The marker is darker than its surroundings, to which the camera is exposed."""
+    return replace(view, placed=_lit(view.placed, Lighting(exposure=1 / factor)))
+
+
+def _shadow(view: View, ratio: float) -> View:
+    """Shadows of planks in the sun; the camera is exposed to the sunlit parts."""
+    cover, sun = _planks(view.placed.marker.size, view.seed % _PLANKS)
+    # paper in the sun has the linear light of PAPER
+    light = Lighting(source="lights", exposure=_white(1 + ratio))
+    facing = sun[2] / math.hypot(*sun)
+    lights = (
+        Sun(direction=_direction(view.placed, sun), intensity=ratio * math.pi / facing),
+        Sun(direction=_direction(view.placed, (0, 0, 1)), intensity=1.1 * math.pi, angle=2.0, samples=6),
+    )
+    return replace(view, placed=_lit(view.placed, light), cover=cover, lights=lights)
+
+
+@cache
+def _planks(size: float, number: int) -> tuple[SplatCloud, tuple[float, float, float]]:
+    """Planks above and in front of a marker, out of the camera's way, and the direction of the sunlight
+    through them, in the marker's frame."""
+    sun = np.array([0.35, 0.75, 0.56])
+    rng = np.random.default_rng(number)
+    angle = rng.uniform(-0.5, 0.5)
+    across = np.cross(sun, [math.sin(angle), -math.cos(angle), 0.0])
+    u = across / np.linalg.norm(across)
+    v = np.cross(sun / np.linalg.norm(sun), u)
+    frame = matrix_to_quaternion(np.stack([u, v, np.cross(u, v)], 1))
+    start = rng.uniform()
+    middles = [size * (-4 * sun + 0.6 * (k + start) * v) for k in range(-5, 5)]
+    planks = SplatCloud(
+        middles, [frame] * 10, [(2 * size, 0.15 * size)] * 10, np.ones(10), colors=[_COVER] * 10
+    )
+    return planks.with_boxes(), tuple(sun.tolist())
+
+
+def _white(light: float) -> float:
+    """Exposure with which paper under this light, relative to that of white, has the colour PAPER."""
+    return ((PAPER + 0.055) / 1.055) ** 2.4 / (Lighting.paper * light)
+
+
+def _glare(view: View, ratio: float) -> View:
+    """A lamp that a laminated marker mirrors into the camera."""
+    placed = _lit(view.placed, Lighting("lights", roughness=0.25, view="camera", exposure=_white(1.0)))
+    distance = view.edges * placed.marker.size
+    towards = placed.pose[:3, :3].T @ (view.camera.position - placed.pose[:3, 3])
+    offset = 0.25 * placed.marker.size * view.rng.uniform(-1, 1, 2)  # middle of the highlight
+    lamp = np.array([2 * offset[0] - towards[0], 2 * offset[1] - towards[1], towards[2]])
+    position = tuple((placed.pose[:3, :3] @ lamp + placed.pose[:3, 3]).tolist())
+    sky = Sun(direction=_direction(placed, (0, 0.87, 0.5)), intensity=2 * math.pi)
+    light = PointLight(position=position, intensity=ratio * math.pi * distance**2)
+    return replace(view, placed=placed, lights=(sky, light))
+
+
+def _dusk(view: View, factor: float) -> View:
+    """Less light, and a gain that makes up for it."""
+    sensor = Sensor(1 / factor, full_well=10_000.0, read_noise=5.0, seed=view.seed, gain=factor)
+    return view.changed(sensor=sensor)
+
+
+GEOMETRY, CAMERA, LIGHT = "geometry", "camera", "light"
 CAUSES = {
     "distance": Cause("distance", GEOMETRY, _geometric(EDGES, 60), "{:.0f}", "edges", _distance),
     "angle": Cause("angle to the normal", GEOMETRY, _linear(85), "{:.0f}", "degrees", _angle),
@@ -281,5 +377,9 @@ CAUSES = {
     "dark": Cause("under-exposure", CAMERA, _geometric(1, 300), "1/{:.0f}", "light", _underexposed),
     "bright": Cause("over-exposure", CAMERA, _geometric(1, 25), "{:.1f}", "x light", _overexposed),
     "lens": Cause("distortion near a corner", CAMERA, _linear(0.35), "-{:.2f}", "k1", _lens),
+    "backlight": Cause("backlight", LIGHT, _geometric(1, 300), "1/{:.0f}", "light", _backlight),
+    "shadow": Cause("shadows of planks", LIGHT, _geometric(0.1, 30), "{:.1f}", "sun / shade", _shadow),
+    "glare": Cause("glare of a lamp", LIGHT, _geometric(0.01, 3), "{:.2f}", "lamp / light", _glare),
+    "dusk": Cause("dusk", LIGHT, _geometric(1, 3000), "1/{:.0f}", "light", _dusk),
 }
 """causes by name"""

@@ -82,6 +82,34 @@ def test_a_cover_hides_its_share_of_the_code(view):
     assert (leaf & code).area / code.area == pytest.approx(0.15, abs=0.02)
 
 
+def test_planks_are_beside_the_marker_in_every_view():
+    for number in range(12):
+        shaded = CAUSES["shadow"].apply(view_of("greenhouse", "qr:a", f"{number}"), 1.0)
+        assert shaded.cover is not None
+        cloud, camera = shaded.cover.transformed(shaded.placed.pose), shaded.camera
+        code = shapely.Polygon(camera.project(shaded.placed.corners)).buffer(20)
+        square = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
+        for middle, quat, scale in zip(cloud.world_means(), cloud.quats, cloud.scales, strict=True):
+            corners = middle + square * [*scale, 0] @ quaternion_to_matrix(quat[None].astype(float))[0].T
+            at = camera.project(corners)
+            assert np.isnan(at).any() or not shapely.Polygon(at).intersects(code)  # NaN: behind the camera
+
+
+def test_a_glaring_lamp_is_mirrored_within_the_code():
+    for seed in "abc":
+        view = CAUSES["glare"].apply(view_of("greenhouse", "apriltag:36h11:5", seed), 0.5)
+        inverse, light = np.linalg.inv(view.placed.pose), view.lights[1]
+        assert isinstance(light, fs.PointLight)
+        lamp, camera = (
+            inverse[:3, :3] @ np.array(place) + inverse[:3, 3]
+            for place in (light.position, view.camera.position)
+        )
+        # the mirror image of the lamp is behind the sheet; its ray crosses the sheet within the code
+        image = lamp * (1, 1, -1)
+        cross = camera + (image - camera) * camera[2] / (camera[2] - image[2])
+        assert np.abs(cross[:2]).max() <= 0.26 * view.placed.marker.size
+
+
 def test_detectors_agree_with_the_truth_without_a_cause(view):
     key = {"scene": "greenhouse", "family": "apriltag:36h11", "cause": "none", "severity": 0.0, "views": 2}
     key["detectors"] = list(detectors_of("apriltag:36h11"))
