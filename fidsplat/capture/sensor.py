@@ -1,14 +1,15 @@
-"""Sensor model: exposure, vignetting, noise, gain, response and quantisation."""
+"""Sensor model: veiling glare, exposure, vignetting, noise, saturation, white balance, response, bits."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from fidsplat.capture.response import to_light
 from fidsplat.util.arguments import as_float, invalid, items, number, own_scalars, whole_number
 from fidsplat.util.errors import InputError
 
@@ -16,14 +17,20 @@ RESPONSES = ("linear", "srgb")
 BITS = (8, 16)
 GAMMAS = 0.01, 100.0
 """range of gammas"""
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""weights of linear RGB in luminance (Rec. 709)"""
+MOST_BALANCE = 8.0
+"""largest factor of a measured white balance"""
 LARGEST = 1e15
 """largest factor and curve value: results stay within float32"""
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """Sensor model of a camera. The values of a frame are linear light; the steps are applied in the order of
-    the fields. A step with its default value costs nothing.
+    """Sensor model of a camera. Values are linear light. A step with its default value costs nothing.
+
+    Order of the steps: decode, veiling_glare, exposure, vignetting, noise, saturation, gain, white_balance,
+    response, extra_steps, bits.
 
     Raises:
         InputError: a value is out of range.
@@ -49,6 +56,20 @@ class Sensor:
     """bits of quantisation and of the rgb file, 8 or 16; None: no quantisation"""
     extra_steps: tuple[str, ...] = ()
     """steps of other packages before quantisation, NAME or NAME:NUMBER,NUMBER (docs/effects.md)"""
+    decode: str = "linear"
+    """what the frame's colours are: "linear" light, or display colours ("srgb"), which are decoded"""
+    veiling_glare: float = 0.0
+    """share of the light, 0 to below 1, that the lens scatters evenly over the image"""
+    glare_light: tuple[float, ...] = ()
+    """RGB of the scattered light; empty: the mean of the image, measured in a small frame"""
+    auto_exposure: float = 0.0
+    """luminance that the mean of the image is exposed to, e.g. 0.18, measured in a small frame; `exposure` is
+    its correction. 0: off"""
+    saturation: float = math.inf
+    """largest value that the sensor registers, above 0; before gain"""
+    white_balance: str | tuple[float, ...] = (1.0, 1.0, 1.0)
+    """factors of R, G and B, or "grey": those that make the mean of the image grey, measured in a small
+    frame"""
 
     def __post_init__(self) -> None:
         own_scalars(self)
@@ -59,6 +80,22 @@ class Sensor:
         if self.read_noise > 0 and math.isinf(self.full_well):
             raise InputError(f"sensor: full_well must be given with read_noise, got {self.read_noise!r} only")
         whole_number("sensor: seed", self.seed, 0, 2**32 - 1)
+        if self.decode not in RESPONSES:
+            raise invalid("sensor: decode", " or ".join(RESPONSES), self.decode)
+        number("sensor: veiling_glare", self.veiling_glare, "a number from 0 to 0.99", 0, 0.99)
+        number("sensor: auto_exposure", self.auto_exposure, "a number from 0 to 1", 0, 1)
+        if not as_float(self.saturation) > 0:
+            raise invalid("sensor: saturation", "a number above 0", self.saturation)
+        for name, counts in (("glare_light", (0, 3)), ("white_balance", (3,))):
+            value = getattr(self, name)
+            if isinstance(value, str) and name == "white_balance":
+                if value != "grey":
+                    raise invalid("sensor: white_balance", 'three numbers or "grey"', value)
+                continue
+            numbers = _numbers(name, value, counts[0], 3)
+            if len(numbers) not in counts or min(numbers, default=0) < 0:
+                raise invalid(f"sensor: {name}", "three numbers of at least 0", value)
+            object.__setattr__(self, name, numbers)
         if self.bits is not None and (not isinstance(self.bits, int) or self.bits not in BITS):
             raise invalid("sensor: bits", "8, 16 or None", self.bits)
         steps = items("sensor: extra_steps", self.extra_steps, str, "several texts, as ('negative:1',)")
@@ -88,10 +125,14 @@ class Sensor:
     def steps(self) -> tuple[str, ...]:
         """Names of the active steps, in order of application."""
         found = [
-            ("exposure", self.exposure != 1),
+            ("decode_srgb", self.decode == "srgb"),
+            ("veiling_glare", self.veiling_glare > 0),
+            ("exposure", self.exposure != 1 or self.auto_exposure > 0),
             ("vignetting", any(self.vignetting)),
             ("noise", math.isfinite(self.full_well)),
+            ("saturation", math.isfinite(self.saturation)),
             ("gain", self.gain != 1),
+            ("white_balance", self.white_balance != (1.0, 1.0, 1.0)),
         ]
         if not isinstance(self.response, (str, tuple)):
             found.append(("response_gamma", self.response != 1))
@@ -105,6 +146,28 @@ class Sensor:
         found.append(("quantise", self.bits is not None))
         return tuple(name for name, active in found if active)
 
+    @property
+    def meters(self) -> bool:
+        """Whether a small frame must be measured first."""
+        glare = self.veiling_glare > 0 and not self.glare_light
+        return glare or self.auto_exposure > 0 or self.white_balance == "grey"
+
+    def metered(self, colors: np.ndarray) -> Sensor:
+        """The sensor with numbers instead of what is measured, by an image (h, w, 3) without a sensor."""
+        if not self.meters:
+            return self
+        mean = to_light(colors, self.decode).reshape(-1, 3).mean(axis=0)
+        glare = self.glare_light or tuple(mean.tolist())
+        # scattering changes the mean if glare_light is not the image's
+        mean = (1 - self.veiling_glare) * mean + self.veiling_glare * np.array(glare)
+        luminance = max(float(mean @ LUMINANCE), 1 / LARGEST)
+        exposure = self.exposure * (self.auto_exposure / luminance if self.auto_exposure > 0 else 1.0)
+        balance = self.white_balance
+        if balance == "grey":
+            balance = tuple((luminance / np.maximum(mean, luminance / MOST_BALANCE)).tolist())
+        changes = {"exposure": exposure, "auto_exposure": 0.0, "white_balance": balance}
+        return replace(self, glare_light=glare if self.veiling_glare > 0 else (), **changes)
+
     def uniform(self, name: str) -> tuple[Any, ...]:
         """Kernel arguments of a step, in order."""
         match name:
@@ -113,6 +176,10 @@ class Sensor:
                 return variance, (self.read_noise * variance) ** 2, np.uint32(self.seed)
             case "vignetting":
                 return (*self.vignetting, 0.0, 0.0, 0.0)[:3]
+            case "veiling_glare":
+                return 1 - self.veiling_glare, *(self.veiling_glare * light for light in self.glare_light)
+            case "white_balance":
+                return tuple(self.white_balance)
             case "inverse_gamma":
                 return (1 / self.response,)  # type: ignore[operator]
             case "response_count":

@@ -78,7 +78,8 @@ _PLAIN = (
     "blend_half",
     "termination_depths",
     # steps after blending
-    *("fog", "exposure", "vignetting", "noise", "gain"),
+    *("fog", "decode_srgb", "veiling_glare", "exposure", "vignetting", "noise", "saturation", "gain"),
+    "white_balance",
     *("response_gamma", "response_srgb", "response_table", "quantise"),
 )
 _IMAGES = (

@@ -16,6 +16,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.cameras.lenses import Orthographic
 from fidsplat.capture.capture import Capture
+from fidsplat.capture.response import to_colors, to_light
 from fidsplat.render.irradiance import LightField
 from fidsplat.render.reflection import (
     Gloss,
@@ -23,8 +24,6 @@ from fidsplat.render.reflection import (
     fresnel,
     gloss,
     lobe,
-    to_colors,
-    to_light,
     view_directions,
 )
 from fidsplat.render.shadows import LightPoint, Surface, light_points, unit, visibility

@@ -31,26 +31,6 @@ class Gloss(NamedTuple):
         return self.roughness**2
 
 
-def to_light(colors: np.ndarray, response: str | float) -> np.ndarray:
-    """Linear light of colours; the curve of sRGB continues above 1."""
-    colors = np.maximum(np.asarray(colors, np.float64), 0)
-    if response == "linear":
-        return colors
-    if response == "srgb":
-        return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
-    return colors ** float(response)
-
-
-def to_colors(light: np.ndarray, response: str | float) -> np.ndarray:
-    """Colours of linear light, the inverse of `to_light`."""
-    light = np.maximum(np.asarray(light, np.float64), 0)
-    if response == "linear":
-        return light
-    if response == "srgb":
-        return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return light ** (1 / float(response))
-
-
 def fresnel(cosine: np.ndarray, reflectance: float) -> np.ndarray:
     """Schlick's approximation of the Fresnel factor."""
     return reflectance + (1 - reflectance) * (1 - np.clip(cosine, 0, 1)) ** 5

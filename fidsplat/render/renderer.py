@@ -19,6 +19,7 @@ from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture, CaptureParts, output_names
 from fidsplat.capture.environment import background_of
 from fidsplat.capture.quality import Quality
+from fidsplat.capture.sensor import Sensor
 from fidsplat.capture.views import Views, views_of
 from fidsplat.effects.differentiable import check_gradients, with_distortion
 from fidsplat.render.batch import FrameBatch
@@ -38,6 +39,8 @@ from fidsplat.util.arguments import invalid, whole_number
 from fidsplat.util.errors import InputError, unknown
 
 _DEFAULT_CAPTURE = Capture()
+METERED = 96
+"""width in pixels of the small frame in which light is measured for a sensor"""
 
 
 def _render_view(pipeline: Pipeline, data: Any, view: View) -> Images:
@@ -380,6 +383,9 @@ class Renderer:
 
     def _render_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
         interrupts.check()
+        if any(capture.sensor.meters for capture in views.captures):
+            metered = (self._metered(resident, views.capture(number)) for number in range(len(views)))
+            views = Views(tuple(metered), mask=views.mask)
         features, batch = prepare_batch(resident.complete, views)
         with self._lock:
             rendered = (batch.one(number) for number in range(len(batch)))
@@ -396,6 +402,18 @@ class Renderer:
             )
         return resident
 
+    def _metered(self, resident: ResidentCloud, capture: Capture) -> Capture:
+        """The capture with a sensor of numbers only: what it measures is measured in a small frame."""
+        camera = capture.camera
+        if not capture.sensor.meters or camera is None:
+            return capture
+        if capture.external_depth is None and camera.width > METERED:
+            height = max(1, round(camera.height * METERED / camera.width))
+            camera = camera.with_size(METERED, height)
+        plain = capture.with_(camera=camera, outputs=("rgb",), sensor=Sensor())
+        colors = self._render(resident, plain)["rgb"]
+        return capture.with_(sensor=capture.sensor.metered(np.asarray(colors)))
+
     def _render(
         self,
         resident: ResidentCloud,
@@ -404,6 +422,7 @@ class Renderer:
         band: tuple[int, int] | None = None,
     ) -> Frame:
         interrupts.check()
+        capture = self._metered(resident, capture)
         features, view = prepare(resident.complete, capture)
         if band is not None:
             view = _banded(view, band)

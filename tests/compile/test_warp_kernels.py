@@ -24,7 +24,8 @@ LENSES = [
     ("camera_orthographic", "lowpass_screen"),
     *((f"camera_{name}", "rays", *RECORD) for name in ("brown_conrady", "fisheye", "equirectangular")),
 ]
-STEPS = ("exposure", "vignetting", "noise", "gain", "response_srgb", "response_table", "quantise")
+STEPS = ("decode_srgb", "veiling_glare", "exposure", "vignetting", "noise", "saturation", "gain")
+STEPS += ("white_balance", "response_srgb", "response_table", "quantise")
 
 
 def made(name, *arguments):

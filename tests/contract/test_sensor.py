@@ -37,7 +37,22 @@ SENSORS = {
     "srgb": fs.Sensor(response="srgb"),
     "table": fs.Sensor(response=(0.0, 0.7, 0.9, 0.95)),
     "bits": fs.Sensor(bits=8),
-    "all": replace(NOISY, exposure=1.3, vignetting=(-0.4,), gain=1.5, response="srgb", bits=16),
+    "decode": fs.Sensor(decode="srgb", exposure=3.0),
+    "glare": fs.Sensor(veiling_glare=0.3, glare_light=(0.2, 0.5, 0.9)),
+    "saturation": fs.Sensor(exposure=2.0, saturation=0.7, white_balance=(0.8, 1.0, 1.4)),
+    "all": replace(
+        NOISY,
+        exposure=1.3,
+        vignetting=(-0.4,),
+        gain=1.5,
+        response="srgb",
+        bits=16,
+        decode="srgb",
+        veiling_glare=0.1,
+        saturation=0.9,
+        white_balance=(0.8, 1.0, 1.4),
+        glare_light=(0.2, 0.5, 0.9),
+    ),
 }
 
 
@@ -177,6 +192,24 @@ def test_curves_at_their_own_points(renderer):
     # a device's division may round otherwise
     assert value(0.301, bits=8) == pytest.approx(77 / 255, abs=6e-8)
     assert value(-3.0, bits=16) == 0
+
+
+def test_values_of_a_camera():
+    """Of the reference, with which devices agree."""
+    reference, camera = fs.Renderer("reference"), fs.Camera.pinhole(1, 1, 1.0, 1.0, 0.5, 0.5)
+
+    def value(light, **settings):
+        frame = reference.render(EMPTY, camera, background=(light, 0, 0), sensor=fs.Sensor(**settings))
+        return frame["rgb"][0, 0, 0]
+
+    assert value(0.735357, decode="srgb") == pytest.approx(0.5, abs=2e-6)
+    assert value(0.01292, decode="srgb") == pytest.approx(0.001, abs=1e-8)
+    assert value(1.353256, decode="srgb") == pytest.approx(2.0, rel=2e-6)  # above 1 too
+    assert value(-0.1, decode="srgb") == 0
+    assert value(0.6, decode="srgb", response="srgb") == pytest.approx(0.6, abs=1e-6)
+    assert value(0.4, exposure=3, saturation=0.8, gain=0.5) == pytest.approx(0.4, abs=1e-6)
+    assert value(0.4, white_balance=(1.5, 1, 2)) == pytest.approx(0.6, abs=1e-6)
+    assert value(0.4, veiling_glare=0.25, glare_light=(0.8, 0, 0)) == pytest.approx(0.5, abs=1e-6)
 
 
 def test_nothing_is_read_beyond_the_end_of_a_table(renderer, monkeypatch):

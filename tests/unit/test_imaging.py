@@ -1,6 +1,7 @@
 """Sensors, fog and backgrounds: values, scene files, and what is wrong with them."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ import pytest
 from sampling import in_turn
 
 import fidsplat as fs
+from fidsplat.capture.response import to_light
 from fidsplat.cli import main
 from fidsplat.images.files import write_png
 
@@ -46,6 +48,13 @@ size = 0.3
         ({"response": 1e-300}, "a gamma must be from 0.01 to 100"),
         ({"response": (1,)}, "2 to 65536 finite numbers"),
         ({"response": (0, math.inf)}, "finite numbers"),
+        ({"decode": 2.2}, "decode must be linear or srgb, got 2.2"),
+        ({"veiling_glare": 1}, "veiling_glare must be a number from 0 to 0.99, got 1"),
+        ({"glare_light": (1, 2)}, "glare_light must be three numbers"),
+        ({"auto_exposure": -1}, "auto_exposure must be a number from 0 to 1"),
+        ({"saturation": 0}, "saturation must be a number above 0, got 0"),
+        ({"white_balance": "gray"}, 'white_balance must be three numbers or "grey"'),
+        ({"white_balance": (1, -1, 1)}, "white_balance must be three numbers of at least 0"),
     ],
 )
 def test_sensors_that_cannot_be(values, words):
@@ -90,6 +99,43 @@ def test_steps_come_in_the_order_of_the_light():
     assert fs.Sensor().steps == ()
 
 
+def test_an_image_is_exposed_by_its_light():
+    """A uniform image has the requested luminance; grey after white balance, in linear light."""
+    color, empty, renderer = (0.5, 0.7, 0.9), fs.SplatCloud.empty(), fs.Renderer("reference")
+    camera = fs.Camera.look_at(200, 100, 1.0, (0, 0, 0), (0, 0, 1))
+    light = to_light(np.array(color), "srgb")
+
+    def seen(**sensor):
+        frame = renderer.render(empty, camera, background=color, sensor=fs.Sensor(decode="srgb", **sensor))
+        assert not frame.capture.sensor.meters
+        return frame["rgb"][50, 100]
+
+    luminance = [0.2126, 0.7152, 0.0722]
+    assert seen(auto_exposure=0.18) @ luminance == pytest.approx(0.18, rel=1e-5)
+    assert seen(auto_exposure=0.18, exposure=2.0) @ luminance == pytest.approx(0.36, rel=1e-5)
+    assert np.allclose(seen(auto_exposure=0.18) / light, 0.18 / (light @ luminance), rtol=1e-5)
+    assert np.allclose(seen(auto_exposure=0.18, white_balance="grey"), 0.18, rtol=1e-5)
+    assert np.allclose(seen(veiling_glare=0.3), light, rtol=1e-5)  # of a uniform image
+
+
+def test_glare_lightens_the_dark_half_of_an_image():
+    """The image's mean times the share, at every size and in batches."""
+    sky = fs.Panorama(np.repeat([[[0.8, 0.4, 0.2]], [[0.0, 0.0, 0.0]]], [64, 64], 0).repeat(256, 1))
+    sensor, mean = fs.Sensor(veiling_glare=0.2), np.array([0.4, 0.2, 0.1])
+    renderer = fs.Renderer(BACKEND)
+    camera = fs.Camera.look_at(64, 64, 1.0, (0, 0, 0), (0, 0, 1))
+    captures = [fs.Capture(camera, background=sky, sensor=sensor), fs.Capture(camera, background=sky)]
+    captures[1] = captures[1].with_(sensor=replace(sensor, veiling_glare=0.1))
+    scene = fs.SplatCloud.empty()
+    batch = renderer.render_batch(scene, captures)["rgb"]
+    for image, share in zip(batch, (0.2, 0.1), strict=True):
+        assert np.allclose(image[60, 30], share * mean, atol=2e-3)
+        assert np.allclose(image[4, 30], (1 - share) * 2 * mean + share * mean, atol=2e-3)
+    assert np.array_equal(renderer.render(scene, captures[0])["rgb"], batch[0])
+    rows = renderer.render_band((32, 64), scene, captures[0])["rgb"]
+    assert np.array_equal(rows[32:], batch[0][32:])
+
+
 def test_a_scene_file_keeps_them(tmp_path):
     write_png(tmp_path / "sky.png", np.random.default_rng(0).uniform(0, 1, (8, 16, 3)))
     sensor = fs.Sensor(1.5, (-0.2, 0.1), 9000, 4.5, 11, 2.0, (0.0, 0.6, 1.0), 16)
@@ -108,6 +154,12 @@ def test_a_scene_file_keeps_them(tmp_path):
             assert 'image = "sky.png"' in (tmp_path / "a.toml").read_text()  # a folder can be moved
         else:
             assert read.background == background
+    camera = fs.Sensor(
+        decode="srgb", veiling_glare=0.1, auto_exposure=0.2, white_balance="grey", saturation=2
+    )
+    for one in (camera, fs.Sensor(white_balance=(1, 1, 2), veiling_glare=0.1, glare_light=(0.1, 0.2, 0.3))):
+        fs.Scene(sensor=one).save(tmp_path / "a.toml")
+        assert fs.Scene.load(tmp_path / "a.toml").sensor == one
     for response in ("srgb", 1.8):
         fs.Scene(sensor=fs.Sensor(response=response)).save(tmp_path / "a.toml")
         assert fs.Scene.load(tmp_path / "a.toml").sensor == fs.Sensor(response=response)

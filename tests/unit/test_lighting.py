@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.capture.response import to_colors, to_light
 from fidsplat.render.irradiance import LightField, cosine_weights, panorama_directions
 from fidsplat.render.reflection import (
     Gloss,
@@ -15,8 +16,6 @@ from fidsplat.render.reflection import (
     fresnel,
     gloss,
     lobe,
-    to_colors,
-    to_light,
     view_directions,
 )
 from fidsplat.scenes import PlacedMarker

@@ -323,6 +323,11 @@ LAYOUTS: dict[str, Layout] = {
         blend=takes(uniforms("fog_density", "float fog_density"), RAY_UNIFORMS),
         samples=(Samples("float", "fog_raw", averaged=True),),
     ),
+    "decode_srgb": Layout("post/decode_srgb.cl"),
+    "veiling_glare": Layout(
+        "post/veiling_glare.cl",
+        resolve=uniforms("veiling_glare", "float glare_rest glare_r glare_g glare_b"),
+    ),
     "exposure": Layout("post/exposure.cl", resolve=uniforms("exposure", "float exposure")),
     "vignetting": Layout(
         "post/vignetting.cl",
@@ -343,6 +348,10 @@ LAYOUTS: dict[str, Layout] = {
             "uint noise_seed",
             note="at value 1, and at every value",
         ),
+    ),
+    "saturation": Layout("post/saturation.cl", resolve=uniforms("saturation", "float saturation")),
+    "white_balance": Layout(
+        "post/white_balance.cl", resolve=uniforms("white_balance", "float balance_r balance_g balance_b")
     ),
     "gain": Layout("post/gain.cl", resolve=uniforms("gain", "float gain")),
     "response_gamma": Layout(

@@ -7,6 +7,7 @@ import numpy as np
 from fidsplat.backends.reference.optics import rays_of
 from fidsplat.backends.view import View
 from fidsplat.capture.environment import Gradient, Panorama
+from fidsplat.capture.response import to_light
 
 _ROUND = 2e-6
 """relative rounding error of float32 before each step"""
@@ -78,6 +79,15 @@ def _step(name: str, value: np.ndarray, view: View, x: np.ndarray, y: np.ndarray
     sensor = view.sensor
     inside = np.clip(value, 0, 1)
     match name:
+        case "decode_srgb":
+            return to_light(value, "srgb")
+        case "veiling_glare":
+            rest, *light = sensor.uniform("veiling_glare")
+            return value * rest + np.array(light)
+        case "saturation":
+            return np.minimum(value, sensor.saturation)
+        case "white_balance":
+            return value * np.array(sensor.uniform("white_balance"))
         case "exposure" | "gain":
             return value * getattr(sensor, name)
         case "vignetting":
