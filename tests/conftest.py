@@ -29,8 +29,16 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    if config.option.turn is None:  # drawn before xdist starts its workers, which receive the options
+    if hasattr(config, "workerinput"):
+        config.option.turn = config.workerinput["turn"]
+    elif config.option.turn is None:
         config.option.turn = random.randrange(2)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node):
+    """Workers of xdist run the sample of the process that starts them."""
+    node.workerinput["turn"] = node.config.option.turn
 
 
 def pytest_report_header(config):

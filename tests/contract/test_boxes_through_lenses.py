@@ -139,10 +139,10 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, camera, tilt, distance):
 
 
 @each_camera
-@pytest.mark.parametrize("size", [0.004, 0.2])
-def test_light_is_that_of_the_image(renderer, camera, size):
+@pytest.mark.parametrize(("size", "shifts"), [(0.004, 8), (0.2, 3)])
+def test_light_is_that_of_the_image(renderer, camera, size, shifts):
     """The opacities that a tilted box adds to an image sum up to the area of its image, below a pixel and
-    above it."""
+    above it, on average over shifts x shifts positions in a pixel."""
     turn = [math.cos(0.35), math.sin(0.35), 0.2, 0.1]
     box = fs.SplatCloud(
         [(0.1, 0.1, 0.1)], [turn], [(size, 1.5 * size)], [1.0], colors=[(1, 1, 1)]
@@ -154,8 +154,8 @@ def test_light_is_that_of_the_image(renderer, camera, size):
     x, y = looking.project(box.means[0] + outline @ quaternion_to_matrix(box.quats)[0, :, :2].T).T
     area = abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2
     areas = []
-    grid = np.stack(np.meshgrid(np.arange(8), np.arange(8)), 2).reshape(-1, 2)
-    for shift in (grid + np.random.default_rng(0).uniform(0, 1, (64, 2))) / 8:
+    grid = np.stack(np.meshgrid(np.arange(shifts), np.arange(shifts)), 2).reshape(-1, 2)
+    for shift in (grid + np.random.default_rng(0).uniform(0, 1, (shifts**2, 2))) / shifts:
         moved = replace(looking, cx=looking.cx + shift[0], cy=looking.cy + shift[1])
         areas.append(float(renderer.render(box, moved, ALL_OUTPUTS, EXACT)["alpha"].sum()))
     assert np.mean(areas) == pytest.approx(area, rel=0.03)
