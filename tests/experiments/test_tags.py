@@ -15,6 +15,7 @@ from fidsplat.experiments.intervals import bootstrap, percentile, root_mean_squa
 from fidsplat.experiments.tag_causes import CAUSES, EDGES, view_of
 from fidsplat.experiments.tags import begin_point, detectors_of, errors_of
 from fidsplat.experiments.tags_report import breaking_severity
+from fidsplat.scenes.lights import PointLight
 from fidsplat.splats.rotations import quaternion_to_matrix
 
 SMALL = ("--scene", "greenhouse", "--family", "apriltag:36h11", "--views", "2", "--severities", "1")
@@ -99,7 +100,7 @@ def test_a_glaring_lamp_is_mirrored_within_the_code():
     for seed in "abc":
         view = CAUSES["glare"].apply(view_of("greenhouse", "apriltag:36h11:5", seed), 0.5)
         inverse, light = np.linalg.inv(view.placed.pose), view.lights[1]
-        assert isinstance(light, fs.PointLight)
+        assert isinstance(light, PointLight)
         lamp, camera = (
             inverse[:3, :3] @ np.array(place) + inverse[:3, 3]
             for place in (light.position, view.camera.position)
