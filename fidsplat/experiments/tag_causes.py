@@ -14,9 +14,11 @@ import numpy as np
 from fidsplat.cameras import BrownConrady, Camera, Motion, Shutter
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.environment import Fog
+from fidsplat.capture.response import to_colors
 from fidsplat.capture.sensor import Sensor
 from fidsplat.formats.files import load_splats
-from fidsplat.markers import Marker, marker
+from fidsplat.markers import BoxEdge, Crumpled, Cylinder, Marker, Wear, marker
+from fidsplat.markers.surfaces import Surface
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.captured import fetch_scene
 from fidsplat.scenes.lights import Light, Lighting, PointLight, Sun
@@ -28,10 +30,12 @@ from fidsplat.worlds.greenhouse import AISLE, Greenhouse, facing
 WIDTH, HEIGHT, FOV = 640, 480, math.radians(60.0)
 EDGES = 6.0
 """distance of the camera without a cause, in edges of the code: about 90 pixels per edge"""
-INK, PAPER = 0.05, 0.85
-"""grey of ink and paper"""
-_PLANKS = 4
-"""number of arrangements of planks"""
+INK, PAPER = Lighting.ink, Lighting.paper
+"""reflectance of ink and paper"""
+VARIANTS = 4
+"""number of seeds of planks, wear and crumpled sheets; views share them, since each is computed"""
+_PRINT = tuple((float(to_colors(np.array(light), "srgb")),) * 3 for light in (INK, PAPER))
+"""display colours of ink and paper"""
 _COVER = 0.16, 0.3, 0.09
 """colour of an object in front of the marker"""
 
@@ -70,9 +74,12 @@ def scene_of(name: str) -> tuple[Scene, np.ndarray, float]:
 
 
 @cache
-def marker_of(spec: str, size: float, lit: bool = False) -> Marker:
-    """A marker with the grey of ink and paper; lit: black and white, for `Lighting`."""
-    return marker(spec, size=size) if lit else marker(spec, size=size, black=(INK,) * 3, white=(PAPER,) * 3)
+def marker_of(
+    spec: str, size: float, lit: bool = False, shape: Surface | None = None, wear: Wear | None = None
+) -> Marker:
+    """A marker with the colours of ink and paper; lit: black and white, for `Lighting`."""
+    black, white = ((0.0,) * 3, (1.0,) * 3) if lit else _PRINT
+    return marker(spec, size=size, black=black, white=white, shape=shape, wear=wear)
 
 
 @cache
@@ -86,6 +93,12 @@ def placed_in(scene: str, spec: str) -> PlacedMarker:
 def _lit(placed: PlacedMarker, light: Lighting) -> PlacedMarker:
     made = placed.marker
     return replace(placed, marker=marker_of(made.spec, made.size, True), light=light)
+
+
+@lru_cache(32)
+def _changed(placed: PlacedMarker, shape: Surface | None = None, wear: Wear | None = None) -> PlacedMarker:
+    made = placed.marker
+    return replace(placed, marker=marker_of(made.spec, made.size, False, shape, wear))
 
 
 @lru_cache(8)
@@ -156,6 +169,10 @@ class View:
     def changed(self, **parts: Any) -> View:
         """The view with parts of its capture replaced."""
         return replace(self, capture=self.capture.with_(**parts))
+
+    def exposed(self, **parts: Any) -> View:
+        """The view with a sensor that gathers linear light, and whose response is sRGB."""
+        return self.changed(sensor=Sensor(decode="srgb", response="srgb", seed=self.seed, **parts))
 
     def moving(self, pixels: float, shutter: Shutter) -> View:
         """The view with a camera that moves sideways, so that the marker moves by this number of pixels per
@@ -255,16 +272,15 @@ def _rolling(view: View, pixels: float) -> View:
 
 
 def _noise(view: View, electrons: float) -> View:
-    return view.changed(sensor=Sensor(full_well=electrons, seed=view.seed))
+    return view.exposed(full_well=electrons)
 
 
 def _underexposed(view: View, factor: float) -> View:
-    sensor = Sensor(1 / factor, full_well=10_000.0, read_noise=5.0, seed=view.seed)
-    return view.changed(sensor=sensor)
+    return view.exposed(exposure=1 / factor, full_well=10_000.0, read_noise=5.0)
 
 
 def _overexposed(view: View, factor: float) -> View:
-    return view.changed(sensor=Sensor(factor))
+    return view.exposed(exposure=factor)
 
 
 def _fog(view: View, transmittance: float) -> View:
@@ -309,9 +325,9 @@ def _backlight(view: View, factor: float) -> View:
 
 def _shadow(view: View, ratio: float) -> View:
     """Shadows of planks in the sun; the camera is exposed to the sunlit parts."""
-    cover, sun = _planks(view.placed.marker.size, view.seed % _PLANKS)
-    # paper in the sun has the linear light of PAPER
-    light = Lighting(source="lights", exposure=_white(1 + ratio))
+    cover, sun = _planks(view.placed.marker.size, view.seed % VARIANTS)
+    # paper in the sun is as bright as without a cause
+    light = Lighting(source="lights", exposure=1 / (1 + ratio))
     facing = sun[2] / math.hypot(*sun)
     lights = (
         Sun(direction=_direction(view.placed, sun), intensity=ratio * math.pi / facing),
@@ -339,14 +355,9 @@ def _planks(size: float, number: int) -> tuple[SplatCloud, tuple[float, float, f
     return planks.with_boxes(), tuple(sun.tolist())
 
 
-def _white(light: float) -> float:
-    """Exposure with which paper under this light, relative to that of white, has the colour PAPER."""
-    return ((PAPER + 0.055) / 1.055) ** 2.4 / (Lighting.paper * light)
-
-
 def _glare(view: View, ratio: float) -> View:
     """A lamp that a laminated marker mirrors into the camera."""
-    placed = _lit(view.placed, Lighting("lights", roughness=0.25, view="camera", exposure=_white(1.0)))
+    placed = _lit(view.placed, Lighting("lights", roughness=0.25, view="camera"))
     distance = view.edges * placed.marker.size
     towards = placed.pose[:3, :3].T @ (view.camera.position - placed.pose[:3, 3])
     offset = 0.25 * placed.marker.size * view.rng.uniform(-1, 1, 2)  # middle of the highlight
@@ -359,11 +370,44 @@ def _glare(view: View, ratio: float) -> View:
 
 def _dusk(view: View, factor: float) -> View:
     """Less light, and a gain that makes up for it."""
-    sensor = Sensor(1 / factor, full_well=10_000.0, read_noise=5.0, seed=view.seed, gain=factor)
-    return view.changed(sensor=sensor)
+    return view.exposed(exposure=1 / factor, full_well=10_000.0, read_noise=5.0, gain=factor)
+
+
+def _flare(view: View, share: float) -> View:
+    """Light that the lens scatters over the image, from a window outside of it."""
+    return view.exposed(veiling_glare=share, glare_light=(0.6,) * 3)
+
+
+def _cylinder(view: View, degrees: float) -> View:
+    radius = view.placed.marker.size / math.radians(max(degrees, 1e-3))
+    axis = "xy"[view.seed % 2]
+    return replace(view, placed=_changed(view.placed, Cylinder(radius, axis=axis)))
+
+
+def _crumpled(view: View, height: float) -> View:
+    size = view.placed.marker.size
+    sheet = Crumpled(height * size, size, seed=view.seed % VARIANTS)
+    return replace(view, placed=_changed(view.placed, sheet))
+
+
+def _box_edge(view: View, share: float) -> View:
+    size, axis = view.placed.marker.size, "xy"[view.seed % 2]
+    return replace(view, placed=_changed(view.placed, BoxEdge(0.03 * size, (0.5 - share) * size, axis=axis)))
+
+
+def _faded(view: View, contrast: float) -> View:
+    return _worn("fading")(view, 1 - contrast)
+
+
+def _worn(name: str) -> Callable[[View, float], View]:
+    """The change by a field of `Wear`."""
+    return lambda view, severity: replace(
+        view, placed=_changed(view.placed, wear=Wear(**{name: severity}, seed=view.seed % VARIANTS))
+    )
 
 
 GEOMETRY, CAMERA, LIGHT = "geometry", "camera", "light"
+SHAPE, WEAR = "shape", "print and wear"
 CAUSES = {
     "distance": Cause("distance", GEOMETRY, _geometric(EDGES, 60), "{:.0f}", "edges", _distance),
     "angle": Cause("angle to the normal", GEOMETRY, _linear(85), "{:.0f}", "degrees", _angle),
@@ -375,11 +419,23 @@ CAUSES = {
     "defocus": Cause("defocus", CAMERA, _linear(12), "{:.1f}", "px radius", _defocused),
     "noise": Cause("shot noise", CAMERA, _geometric(10_000, 1), "{:.0f}", "electrons", _noise),
     "dark": Cause("under-exposure", CAMERA, _geometric(1, 300), "1/{:.0f}", "light", _underexposed),
-    "bright": Cause("over-exposure", CAMERA, _geometric(1, 25), "{:.1f}", "x light", _overexposed),
+    "bright": Cause("over-exposure", CAMERA, _geometric(1, 40), "{:.1f}", "x light", _overexposed),
     "lens": Cause("distortion near a corner", CAMERA, _linear(0.35), "-{:.2f}", "k1", _lens),
     "backlight": Cause("backlight", LIGHT, _geometric(1, 300), "1/{:.0f}", "light", _backlight),
     "shadow": Cause("shadows of planks", LIGHT, _geometric(0.1, 30), "{:.1f}", "sun / shade", _shadow),
     "glare": Cause("glare of a lamp", LIGHT, _geometric(0.01, 3), "{:.2f}", "lamp / light", _glare),
     "dusk": Cause("dusk", LIGHT, _geometric(1, 3000), "1/{:.0f}", "light", _dusk),
+    "flare": Cause("veiling glare", LIGHT, _linear(0.98), "{:.2f}", "of the light", _flare),
+    "cylinder": Cause("cylinder", SHAPE, _linear(140), "{:.0f}", "degrees of arc", _cylinder),
+    "crumpled": Cause("crumpled", SHAPE, _linear(0.1), "{:.2f}", "edges high", _crumpled),
+    "box edge": Cause("around a box", SHAPE, _linear(0.2), "{:.2f}", "of the code", _box_edge),
+    "bleed": Cause("ink bleed", WEAR, _linear(1), "{:.2f}", "half modules", _worn("bleed")),
+    "coarse": Cause("coarse print", WEAR, _linear(1), "{:.2f}", "severity", _worn("coarseness")),
+    "fading": Cause("fading", WEAR, _geometric(1, 0.01), "{:.2f}", "contrast left", _faded),
+    "dirt": Cause("dirt", WEAR, _linear(0.2), "{:.2f}", "of the sheet", _worn("dirt")),
+    "drops": Cause("water drops", WEAR, _linear(1), "{:.2f}", "of the sheet", _worn("drops")),
+    "scratches": Cause("scratches", WEAR, _linear(0.3), "{:.2f}", "severity", _worn("scratches")),
+    "tear": Cause("torn corner", WEAR, _linear(0.25), "{:.2f}", "severity", _worn("tear")),
+    "fold": Cause("folded corner", WEAR, _linear(0.6), "{:.2f}", "severity", _worn("fold")),
 }
 """causes by name"""

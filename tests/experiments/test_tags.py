@@ -44,7 +44,7 @@ def test_a_severity_outside_of_0_to_1_is_refused(view, severity):
 
 
 def test_severity_0_is_the_view_without_a_cause(view):
-    for name in ("distance", "opacity", "blur", "fog", "bright", "rolling", "defocus"):
+    for name in ("distance", "opacity", "blur", "fog", "bright", "rolling", "defocus", "cylinder", "fading"):
         none = CAUSES[name].apply(view, 0.0)
         assert np.allclose(none.camera.world_to_camera, view.camera.world_to_camera), name
         assert none.camera.project(none.placed.corners) == pytest.approx(
