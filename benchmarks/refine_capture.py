@@ -15,10 +15,10 @@ import numpy as np
 from real_scene import extent
 
 import fidsplat as fs
+from fidsplat.cameras.pose_offset import offset_camera
 from fidsplat.images.files import to_uint8
 from fidsplat.splats.harmonics import C0
 from fidsplat.train import Dataset, Trainer, TrainingView
-from fidsplat.train.pose_offset import offset_camera
 
 BACKGROUND = (0.72, 0.74, 0.76)
 VIEWS, WIDTH, HEIGHT, FOV_X = 24, 400, 400, math.radians(40)

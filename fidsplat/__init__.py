@@ -56,6 +56,8 @@ _HOME = {
     "Surface": "fidsplat.scenes.surface",
     "surface_at": "fidsplat.render.surface",
     "scene_mesh": "fidsplat.render.mesh",
+    "localise": "fidsplat.localisation.localise",
+    "Localisation": "fidsplat.localisation.localise",
     "devices": "fidsplat.backends",
     "FidsplatError": "fidsplat.util.errors",
     "InputError": "fidsplat.util.errors",

@@ -302,6 +302,17 @@ class Camera(PickledByFields, Summarised):
             self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=cy
         )
 
+    def resampled(self, width: int, height: int) -> "Camera":
+        """The camera of the same image resampled to another number of pixels, in both directions.
+
+        Raises:
+            InputError: a size out of range.
+        """
+        width, height = _size("width", width), _size("height", height)
+        x, y = width / self.width, height / self.height
+        intrinsics = {"fx": self.fx * x, "fy": self.fy * y, "cx": self.cx * x, "cy": self.cy * y}
+        return replace(self, width=width, height=height, **intrinsics)
+
     def summary(self) -> dict[str, str]:
         """Size, intrinsics, lens and pose in words, for notebooks."""
         lens = self.lens

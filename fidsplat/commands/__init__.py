@@ -55,6 +55,7 @@ COMMANDS = CommandTable(
     greenhouse="greenhouse.Greenhouse",
     capture="capture.Capture",
     train="train.Train",
+    localise="localise.Localise",
     store="store.Store",
     source="source.Source",
 )

@@ -15,7 +15,7 @@ from fidsplat.commands.experiment_data import (
     Report,
     write_report,
 )
-from fidsplat.commands.localise import Localise
+from fidsplat.commands.experiment_localise import Localise
 from fidsplat.commands.options import Json, RayAddress, repeatable, require_packages
 from fidsplat.commands.output import console, print_lines, report, show_progress
 from fidsplat.commands.sweeps import measure_on_cluster, run_sweeps

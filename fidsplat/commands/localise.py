@@ -1,107 +1,142 @@
-"""`fidsplat experiment localise`."""
+"""`fidsplat localise`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from fidsplat.commands.declarations import option, switch
-from fidsplat.commands.options import Device, Json, require_packages
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import Device, Json
 from fidsplat.commands.output import console, delayed_progress, report
-from fidsplat.experiments.localise import Drive
+from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
-    from fidsplat.render.renderer import Renderer
+    from fidsplat.cameras import Camera
+    from fidsplat.localisation import Localisation
 
 
 @dataclass
 class Localise:
-    """Localisation of a robot by tags in a greenhouse, with ideal and simulated cameras.
+    """Find the poses of photographs in a scene, with covariance.
 
-    MuJoCo drives the robot up one aisle and down the next; an error-state filter fuses wheels, gyroscope and
-    tags. Variants: odometry only, ideal corners, an ideal texture, mixtures of the markers, lens, blur,
-    rolling shutter, noise, speeds, and the largest distance of tags. Results: absolute and relative
-    trajectory errors, corner errors by distance, trajectories as TUM for evo, a page. An interrupted run
-    resumes. Needs the extra `sim`.
+    The scene's camera has the size, intrinsics and lens of the photographs. Each search starts at --start, at
+    the pose by the scene's markers in the photograph, at the pose of the photograph before, or at the most
+    similar of --candidates, in this order. It continues by direct image alignment, which exposure and white
+    balance do not change. Deviations are standard deviations. A pose is found if most of the textured pixels
+    agree with the scene.
 
     Examples:
-      fidsplat experiment localise --quick
-      fidsplat experiment localise --variant odometry --variant exact -o drive
+      fidsplat localise photo.jpg --scene scene.toml
+      fidsplat localise photo.jpg --scene scene.toml --start 0.1,0,-1.5,1,0,0,0 --json
+      fidsplat localise stills/ --scene scene.toml --candidates sparse/0 -o poses.tum
     """
 
-    out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-localise"
-    quick: Annotated[bool, switch("measure one row of four plants and the first three variants")] = False
-    drive: Drive = field(default_factory=Drive)
-    variant: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]],
-        option("NAME", "variant to measure, repeat for several (default: all)"),
-    ] = ()
-    log: str | None = None
-    """FILE.mcap|BAG: also write the drive of `exact` as a ROS 2 log (extra: logs)"""
-    video: str | None = None
-    """FILE.mp4: also write the images of `exact` as a video (extra: video)"""
+    images: Annotated[
+        tyro.conf.Positional[tuple[str, ...]],
+        option("IMAGE", "photograph, folder of photographs, or video"),
+    ]
+    scene: Annotated[str, option("SCENE", "scene file, with the camera of the photographs")]
+    start: str | None = None
+    """X,Y,Z,QW,QX,QY,QZ: initial pose of the camera in the world, metres and a unit quaternion"""
+    candidates: str | None = None
+    """FILE: poses where a search may start: COLMAP, transforms.json or a trajectory, e.g. of training"""
+    out: Annotated[
+        str | None,
+        option(
+            "FILE",
+            "also write the found poses: .tum, .kitti, .json (transforms.json) or a folder (COLMAP)",
+            "-o",
+        ),
+    ] = None
     device: Device = None
-    overwrite: Annotated[bool, switch("replace existing results")] = False
     json: Json = False
 
     def run(self) -> int:
         import fidsplat as fs
-        from fidsplat.experiments.localise import VARIANTS
-        from fidsplat.images.video import check_video
-        from fidsplat.util.provenance import digest_of
+        from fidsplat.images.files import read_images
 
-        require_packages()
-        from fidsplat.experiments.localise_sweep import drive_sweep, found_of, table_of, write_report
-
-        drive = replace(self.drive, rows=1, plants=4) if self.quick else self.drive
-        names = list(self.variant) or (list(VARIANTS)[:3] if self.quick else list(VARIANTS))
-        if self.video is not None:
-            check_video(self.video)
-        _ = drive.house  # check it before a device is opened
-        renderer = fs.Renderer(self.device)
-        log_is_complete, source = False, digest_of((drive, renderer.device.title, fs.__version__))
-        if self.log is not None:
-            from fidsplat.logs import check_log
-
-            log_is_complete = check_log(self.log, self.overwrite, source)
-        done = 0
-
-        def step(name: str, share: float) -> None:
-            progress(name, (done + share) / len(names))
-
-        folder = Path(self.out)
-        sweep = drive_sweep(folder, drive, names, renderer, step, self.overwrite)
+        if not self.images:
+            raise InputError("localisation needs at least one IMAGE: a photograph, a folder or a video")
+        start = None if self.start is None else _pose(self.start)
         with delayed_progress() as progress:
-            done = len(names) - len(sweep.left)
-            for record in sweep.run():
-                done += 1
-                step(record.key["variant"], 0.0)
-        found, device = found_of(sweep.results), renderer.device.title
-        page = write_report(folder, drive, device, found)
-        self._record(drive, renderer, None if log_is_complete else source)
-        rows, length = table_of(found), found[names[0]]["length_m"]
-        rows = rows.iloc[:, :6]  # the width of a terminal; the page has all columns
-        return report(
-            self.json,
-            {"run": sweep.results.run, "variants": found},
-            *(name for name in (str(page), self.log, self.video) if name is not None),
-            table=(f"{length:.1f} m", rows.columns, rows.itertuples(index=False)),
-        )
+            scene = fs.Scene.load(self.scene, progress=progress)
+        camera = scene.camera
+        if camera is None:
+            raise InputError(f"{self.scene} must have a [camera] table, the camera of the photographs")
+        candidates = [] if self.candidates is None else _candidates(self.candidates, camera)
+        with console(self.json).status("opening the device"):
+            renderer = fs.Renderer(self.device)
+            resident = renderer.upload(scene)
+        results: dict[str, Localisation] = {}
+        previous: list[Camera] = []
+        for path in self.images:
+            for name, image in read_images(path):
+                try:
+                    found = fs.localise(
+                        image,
+                        scene,
+                        None if start is None else camera.with_pose(camera_to_world=start),
+                        candidates=previous or candidates,
+                        renderer=renderer,
+                        resident=resident,
+                    )
+                except InputError as error:
+                    raise InputError(f"{name} and {self.scene}: {error}") from None
+                results[name] = found
+                previous = [found.camera] if found.found else []
+        files = [] if self.out is None else [_write(self.out, results, camera)]
+        facts = [{"image": name, **found.as_dict()} for name, found in results.items()]
+        heads = ("image", "found", "position [m]", "deviation [mm]", "[deg]", "inliers", "start")
+        table = (f"Poses in {self.scene}", heads, [_row(one) for one in facts])
+        device = renderer.device.title
+        return report(self.json, {"device": device, "images": facts, "files": files}, *files, table=table)
 
-    def _record(self, drive: Drive, renderer: Renderer, source: str | None) -> None:
-        """Write the video and the log; a source of None means that the log is complete."""
-        from fidsplat.experiments.localise import RATE, VARIANTS, write_log
-        from fidsplat.images.video import write_video
 
-        if (self.log is None or source is None) and self.video is None:
-            return
-        images = drive.images(VARIANTS["exact"], drive.run(), renderer)
-        if self.log is not None and source is not None:
-            images = write_log(drive, "exact", renderer, self.log, self.overwrite, source)
-        steps = images if self.video is None else write_video(self.video, images, RATE)
-        with console(True).status("recording"):
-            for _ in steps:
-                pass
+def _row(facts: dict[str, Any]) -> tuple[str, ...]:
+    return (
+        facts["image"],
+        "yes" if facts["found"] else "no",
+        " ".join(f"{value:.4f}" for value in facts["position"]),
+        f"{facts['position_deviation_mm']:.2f}",
+        f"{facts['angle_deviation_deg']:.4f}",
+        f"{100 * facts['inliers']:.0f} %",
+        facts["start"],
+    )
+
+
+def _pose(text: str) -> tuple[list[float], list[float]]:
+    """Position and quaternion of the option --start."""
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 7:
+        raise InputError(f"--start must be 7 numbers X,Y,Z,QW,QX,QY,QZ separated by commas, got {text!r}")
+    return numbers[:3], numbers[3:]
+
+
+def _candidates(path: str, camera: Camera) -> list[Camera]:
+    """Cameras at the poses of a file."""
+    from fidsplat.formats import load_cameras, load_trajectory
+
+    try:
+        return list(load_cameras(path).values())
+    except InputError:
+        return [camera.with_pose(camera_to_world=pose) for pose in load_trajectory(path).poses]
+
+
+def _write(out: str, results: dict[str, Localisation], camera: Camera) -> str:
+    """Write the found poses as a trajectory, one a second; returns the name of the file."""
+    import numpy as np
+
+    from fidsplat.cameras import Trajectory
+    from fidsplat.formats import save_trajectory
+
+    found = {name: one.camera.camera_to_world for name, one in results.items() if one.found}
+    if not found:
+        raise InputError(f"a pose must be found to write {out}, got none of {len(results)} images")
+    trajectory = Trajectory(np.arange(len(found)), np.array(list(found.values())))
+    save_trajectory(trajectory, out, camera, list(found))
+    return out

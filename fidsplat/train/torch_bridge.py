@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.cameras.pose_offset import offset_camera, offset_gradient
 from fidsplat.capture.capture import Capture
 from fidsplat.render.renderer import Renderer
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import C0
-from fidsplat.train.pose_offset import offset_camera, offset_gradient
 from fidsplat.util.errors import InputError
 
 try:

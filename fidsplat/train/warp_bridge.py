@@ -14,9 +14,9 @@ from fidsplat.backends.gradients import on_host
 from fidsplat.backends.warp.device import WarpBackend
 from fidsplat.backends.warp.gradients import add_to, flat_of
 from fidsplat.backends.warp.runtime import load
+from fidsplat.cameras.pose_offset import offset_camera, offset_gradient
 from fidsplat.capture.capture import Capture
 from fidsplat.render.renderer import Renderer
-from fidsplat.train.pose_offset import offset_camera, offset_gradient
 from fidsplat.util.errors import DeviceError, InputError
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.train.pose_offset import offset_camera, offset_gradient
+from fidsplat.cameras.pose_offset import offset_camera, offset_gradient
 
 CAMERA = fs.Camera.look_at(24, 18, 0.9, (0.2, 0.1, -2.0), (0.0, 0.0, 0.0))
 OUTPUTS = ("rgb", "alpha", "depth")

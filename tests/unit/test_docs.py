@@ -50,6 +50,7 @@ PARSED_ONLY = {
     "experiment": "minutes; tests/experiments",
     "tradeoff": "minutes; tests/experiments",
     "train": "minutes; tests/unit/test_train_command.py",
+    "localise": "needs photographs; tests/unit/test_localisation.py",
     "fetch": "needs the network; tests/unit/test_captured_scenes.py",
     "view": "ends when it is stopped; tests/unit/test_viewer_*.py",
 }

@@ -7,8 +7,8 @@ from training_scene import QUICK, run_and_resumed, scene
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
+from fidsplat.cameras.pose_offset import offset_camera, offset_gradient
 from fidsplat.train import Trainer
-from fidsplat.train.pose_offset import offset_camera, offset_gradient
 
 wp = pytest.importorskip("warp")
 POSE = np.array([0.02, -0.05, 0.1, 0.03, -0.02, 0.04])

@@ -1,0 +1,107 @@
+"""`fidsplat experiment localise`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from fidsplat.commands.declarations import option, switch
+from fidsplat.commands.options import Device, Json, require_packages
+from fidsplat.commands.output import console, delayed_progress, report
+from fidsplat.experiments.localise import Drive
+
+if TYPE_CHECKING:
+    from fidsplat.render.renderer import Renderer
+
+
+@dataclass
+class Localise:
+    """Localisation of a robot by tags in a greenhouse, with ideal and simulated cameras.
+
+    MuJoCo drives the robot up one aisle and down the next; an error-state filter fuses wheels, gyroscope and
+    tags. Variants: odometry only, ideal corners, an ideal texture, mixtures of the markers, lens, blur,
+    rolling shutter, noise, speeds, and the largest distance of tags. Results: absolute and relative
+    trajectory errors, corner errors by distance, trajectories as TUM for evo, a page. An interrupted run
+    resumes. Needs the extra `sim`.
+
+    Examples:
+      fidsplat experiment localise --quick
+      fidsplat experiment localise --variant odometry --variant exact -o drive
+    """
+
+    out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-localise"
+    quick: Annotated[bool, switch("measure one row of four plants and the first three variants")] = False
+    drive: Drive = field(default_factory=Drive)
+    variant: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        option("NAME", "variant to measure, repeat for several (default: all)"),
+    ] = ()
+    log: str | None = None
+    """FILE.mcap|BAG: also write the drive of `exact` as a ROS 2 log (extra: logs)"""
+    video: str | None = None
+    """FILE.mp4: also write the images of `exact` as a video (extra: video)"""
+    device: Device = None
+    overwrite: Annotated[bool, switch("replace existing results")] = False
+    json: Json = False
+
+    def run(self) -> int:
+        import fidsplat as fs
+        from fidsplat.experiments.localise import VARIANTS
+        from fidsplat.images.video import check_video
+        from fidsplat.util.provenance import digest_of
+
+        require_packages()
+        from fidsplat.experiments.localise_sweep import drive_sweep, found_of, table_of, write_report
+
+        drive = replace(self.drive, rows=1, plants=4) if self.quick else self.drive
+        names = list(self.variant) or (list(VARIANTS)[:3] if self.quick else list(VARIANTS))
+        if self.video is not None:
+            check_video(self.video)
+        _ = drive.house  # check it before a device is opened
+        renderer = fs.Renderer(self.device)
+        log_is_complete, source = False, digest_of((drive, renderer.device.title, fs.__version__))
+        if self.log is not None:
+            from fidsplat.logs import check_log
+
+            log_is_complete = check_log(self.log, self.overwrite, source)
+        done = 0
+
+        def step(name: str, share: float) -> None:
+            progress(name, (done + share) / len(names))
+
+        folder = Path(self.out)
+        sweep = drive_sweep(folder, drive, names, renderer, step, self.overwrite)
+        with delayed_progress() as progress:
+            done = len(names) - len(sweep.left)
+            for record in sweep.run():
+                done += 1
+                step(record.key["variant"], 0.0)
+        found, device = found_of(sweep.results), renderer.device.title
+        page = write_report(folder, drive, device, found)
+        self._record(drive, renderer, None if log_is_complete else source)
+        rows, length = table_of(found), found[names[0]]["length_m"]
+        rows = rows.iloc[:, :6]  # the width of a terminal; the page has all columns
+        return report(
+            self.json,
+            {"run": sweep.results.run, "variants": found},
+            *(name for name in (str(page), self.log, self.video) if name is not None),
+            table=(f"{length:.1f} m", rows.columns, rows.itertuples(index=False)),
+        )
+
+    def _record(self, drive: Drive, renderer: Renderer, source: str | None) -> None:
+        """Write the video and the log; a source of None means that the log is complete."""
+        from fidsplat.experiments.localise import RATE, VARIANTS, write_log
+        from fidsplat.images.video import write_video
+
+        if (self.log is None or source is None) and self.video is None:
+            return
+        images = drive.images(VARIANTS["exact"], drive.run(), renderer)
+        if self.log is not None and source is not None:
+            images = write_log(drive, "exact", renderer, self.log, self.overwrite, source)
+        steps = images if self.video is None else write_video(self.video, images, RATE)
+        with console(True).status("recording"):
+            for _ in steps:
+                pass

@@ -1,0 +1,91 @@
+"""Initial poses for localisation: from detected markers, and from the most similar of rendered views."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.images.files import to_uint8
+from fidsplat.scenes import PlacedMarker, Scene
+from fidsplat.vision.boards import BOARDS
+from fidsplat.vision.detect import detect
+from fidsplat.vision.pose import marker_pose, points_pose
+from fidsplat.vision.pyramid import resized, smoothed
+from fidsplat.vision.readback import families_of
+
+DESCRIPTOR_WIDTH = 32
+"""width in pixels of the descriptor of a view"""
+DESCRIPTOR_BLUR = 1.0
+
+
+def pose_of_markers(image: np.ndarray, scene: Scene, camera: Camera) -> tuple[Camera, list[str]] | None:
+    """The camera at its pose by the detected markers of a scene, and their names; None without any.
+
+    Tags and QR codes whose content occurs once in the scene are used.
+    """
+    markers = [placed for placed in scene.markers if placed.marker.kind not in BOARDS]
+    if not markers:
+        return None
+    counts = Counter(_content(placed) for placed in markers)
+    known = {_content(placed): placed for placed in markers if counts[_content(placed)] == 1}
+    qr = any(placed.marker.kind == "qr" for placed in markers)
+    found = detect(to_uint8(image), families_of(placed.marker for placed in markers), qr=qr)
+    pairs = []
+    for code in found:
+        content = (code.kind, code.payload) if code.id is None else (code.kind, code.family, code.id)
+        if content in known:
+            pairs.append((code, known[content]))
+    if not pairs:
+        return None
+    if len(pairs) == 1:
+        code, placed = pairs[0]
+        pose = marker_pose(code.corners, placed.marker.size, camera) @ np.linalg.inv(placed.pose)
+    else:
+        points = np.concatenate([placed.corners for _, placed in pairs])
+        pose = points_pose(points, np.concatenate([code.corners for code, _ in pairs]), camera)
+    if not np.isfinite(pose).all():
+        return None
+    return camera.with_pose(pose), [code.name for code, _ in pairs]
+
+
+def most_similar(
+    image: np.ndarray,
+    camera: Camera,
+    candidates: Sequence[Camera],
+    render: Callable[[list[Camera]], np.ndarray],
+    count: int,
+) -> list[Camera]:
+    """The candidates whose rendered views are most similar to an image, best first.
+
+    Similarity is the correlation of small blurred images, channel by channel, so that exposure and white
+    balance do not matter.
+
+    Args:
+        image: (h, w, c) display values.
+        camera: pinhole camera of the image.
+        render: renders cameras, (n, h, w, 3).
+    """
+    width = min(DESCRIPTOR_WIDTH, camera.width)
+    height = max(2, round(camera.height * width / camera.width))
+    double = camera.resampled(2 * width, 2 * height)
+    views = render([double.with_pose(each.world_to_camera) for each in candidates])
+    if image.shape[2] == 1:
+        views = views.mean(axis=3, keepdims=True)
+    rendered = np.array([_descriptor(view, width, height) for view in views])
+    order = np.argsort(-(rendered @ _descriptor(image, width, height)), kind="stable")
+    return [camera.with_pose(candidates[k].world_to_camera) for k in order[:count]]
+
+
+def _descriptor(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Small blurred image with mean 0 and norm 1 of each channel, as a vector."""
+    small = smoothed(resized(image, width, height), DESCRIPTOR_BLUR)
+    small = small - small.mean(axis=(0, 1))
+    return (small / (np.linalg.norm(small, axis=(0, 1)) + 1e-6)).ravel()
+
+
+def _content(placed: PlacedMarker) -> tuple:
+    made = placed.marker
+    return (made.kind, made.payload) if made.id is None else (made.kind, made.family, made.id)

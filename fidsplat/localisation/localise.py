@@ -1,0 +1,199 @@
+"""`localise`: the pose of a camera in a scene from one image."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fidsplat.cameras import Camera, Motion, Shutter
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.sensor import Sensor
+from fidsplat.images.files import pixels_of
+from fidsplat.localisation.direct_alignment import align
+from fidsplat.localisation.initial_pose import most_similar, pose_of_markers
+from fidsplat.render.renderer import Renderer
+from fidsplat.render.resident import ResidentCloud
+from fidsplat.scenes import Scene
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import matrix_to_quaternion
+from fidsplat.util.arguments import instance, invalid
+from fidsplat.util.errors import InputError
+from fidsplat.vision.undistort import undistort_masked
+
+TRIED = 3
+"""number of candidates that are aligned coarsely"""
+MIN_INLIERS = 0.6
+"""share of inliers from which a pose counts as found"""
+
+
+@dataclass(frozen=True, eq=False)
+class Localisation:
+    """Pose of a camera in a scene."""
+
+    camera: Camera
+    """camera of the image at its pose"""
+    covariance: np.ndarray
+    """(6, 6) covariance of a rotation vector [rad] and a translation [m] applied after `world_to_camera`, in
+    camera axes, as the gradient `pose`"""
+    inliers: float
+    """share of the textured pixels that agree with the scene, 0 to 1"""
+    noise: float
+    """standard deviation of the residuals of a pixel, display values"""
+    start: str
+    """source of the initial pose: `start`, `candidates`, or names of the detected markers"""
+
+    @property
+    def pose(self) -> np.ndarray:
+        """(4, 4) world_to_camera."""
+        return self.camera.world_to_camera
+
+    @property
+    def found(self) -> bool:
+        """Whether the image agrees with the scene: at least 0.6 of the textured pixels are inliers."""
+        return self.inliers >= MIN_INLIERS
+
+    @property
+    def position_deviation(self) -> float:
+        """Standard deviation of the position [m], root of the sum over the axes."""
+        return math.sqrt(float(np.trace(self.covariance[3:, 3:])))
+
+    @property
+    def angle_deviation(self) -> float:
+        """Standard deviation of the rotation [rad], root of the sum over the axes."""
+        return math.sqrt(float(np.trace(self.covariance[:3, :3])))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Values for JSON, in metres, millimetres and degrees."""
+        return {
+            "found": self.found,
+            "start": self.start,
+            "position": self.camera.position.tolist(),
+            "quaternion": matrix_to_quaternion(self.camera.camera_to_world[:3, :3]).tolist(),
+            "world_to_camera": self.pose.tolist(),
+            "covariance": self.covariance.tolist(),
+            "position_deviation_mm": 1e3 * self.position_deviation,
+            "angle_deviation_deg": math.degrees(self.angle_deviation),
+            "inliers": self.inliers,
+            "noise": self.noise,
+        }
+
+
+def localise(
+    image: np.ndarray,
+    scene: Scene | SplatCloud | ResidentCloud,
+    start: Camera | np.ndarray | Sequence[Any] | None = None,
+    *,
+    camera: Camera | None = None,
+    candidates: Sequence[Camera] = (),
+    mask: np.ndarray | None = None,
+    renderer: Renderer | None = None,
+    resident: ResidentCloud | None = None,
+) -> Localisation:
+    """Find the pose at which a camera took an image of a scene.
+
+    Renders of the scene are aligned with the image from coarse to fine, with robust weights and a gain and
+    an offset for each channel, so that exposure and white balance do not matter.
+
+    ```python
+    found = fs.localise(image, scene, start=pose)
+    found.pose, found.covariance, found.inliers
+    ```
+
+    Args:
+        image: (h, w, 3) or (h, w), uint8 or float display values.
+        scene: the scene.
+        start: initial pose, world_to_camera (4, 4) or (position, quaternion w, x, y, z), or a Camera there.
+            None: from the scene's markers in the image, else the best of `candidates`.
+        camera: size, intrinsics and lens of the image; None: those of `start` if it is a Camera, else the
+            scene's camera.
+        candidates: cameras at possible poses, e.g. of the photographs of the scene.
+        mask: (h, w) bool, False for ignored pixels, e.g. people.
+        renderer: device; None: the default device.
+        resident: the scene uploaded by `renderer`, to localise many images.
+
+    Raises:
+        InputError: no camera, an image of another size than the camera's, or no initial pose: no start, no
+            known marker in the image and no candidate.
+        DeviceError: the device fails or lacks memory.
+    """
+    pixels = _pixels(image)
+    instance("scene", scene, Scene | SplatCloud | ResidentCloud, "a Scene, a SplatCloud or a ResidentCloud")  # type: ignore[arg-type]
+    renderer = Renderer() if renderer is None else instance("renderer", renderer, Renderer)
+    capture = scene.capture if isinstance(scene, (Scene, ResidentCloud)) else Capture()
+    if camera is None:
+        camera = start if isinstance(start, Camera) else capture.camera
+    if camera is None:
+        raise InputError("the image must have a camera, got none; give camera= with its size and intrinsics")
+    instance("camera", camera, Camera)
+    if pixels.shape[:2] != (camera.height, camera.width):
+        raise InputError(
+            f"the image must have the camera's size, {camera.width} x {camera.height} pixels, got "
+            f"{pixels.shape[1]} x {pixels.shape[0]}; give the camera that took the image"
+        )
+    if mask is not None and (np.shape(mask) != pixels.shape[:2] or np.asarray(mask).dtype != bool):
+        raise invalid("mask", f"an array {pixels.shape[:2]} of bool, False for ignored pixels", mask)
+    capture = capture.with_(outputs=("rgb", "depth"), motion=Motion(), shutter=Shutter(), sensor=Sensor())
+    uploaded = (
+        resident
+        if resident is not None
+        else renderer.upload(scene)
+        if not isinstance(scene, ResidentCloud)
+        else scene
+    )
+
+    def render(at: Camera) -> tuple[np.ndarray, np.ndarray]:
+        frame = renderer.render(uploaded, capture.with_(camera=at))
+        return frame["rgb"], frame["depth"]
+
+    source, starts = "start", []
+    if start is not None:
+        pose = start.world_to_camera if isinstance(start, Camera) else start
+        starts = [camera.with_pose(pose)]
+    elif isinstance(scene, Scene) and (detected := pose_of_markers(pixels, scene, camera)) is not None:
+        starts, source = [detected[0]], ", ".join(detected[1])
+    pinhole, values = replace(camera, lens=None), pixels
+    if camera.lens is not None:
+        inside = np.ones(pixels.shape[:2], bool) if mask is None else np.asarray(mask)
+        values, mask = undistort_masked(pixels, camera, inside)
+        values = values.reshape(*pixels.shape)
+    if not starts:
+        if not len(candidates):
+            raise InputError(
+                "localisation must have an initial pose, got no start, no marker of the scene in the image "
+                "and no candidates; give start= or candidates="
+            )
+        source = "candidates"
+
+        def render_all(at: list[Camera]) -> np.ndarray:
+            return renderer.render_batch(uploaded, [capture.with_(camera=one, outputs="rgb") for one in at])[
+                "rgb"
+            ]
+
+        best = most_similar(values, pinhole, candidates, render_all, TRIED)
+        tried = [align(values, mask, one, render, coarse=True) for one in best]
+        starts = [min(tried, key=lambda one: one.noise).camera]
+    found = align(values, mask, pinhole.with_pose(starts[0].world_to_camera), render)
+    return Localisation(
+        camera.with_pose(found.camera.world_to_camera), found.covariance, found.inliers, found.noise, source
+    )
+
+
+def _pixels(image: Any) -> np.ndarray:
+    """An image (h, w, 3) or (h, w, 1) float32 of display values."""
+    pixels = pixels_of(image)
+    if pixels.ndim == 2:
+        pixels = pixels[:, :, None]
+    if pixels.ndim != 3 or pixels.shape[2] not in (1, 3) or pixels.dtype.kind not in "fu" or not pixels.size:
+        raise InputError(
+            f"the image must be (h, w) or (h, w, 3) of uint8 or floats, got {pixels.dtype} {pixels.shape}"
+        )
+    if pixels.dtype.kind == "u" and pixels.dtype != np.uint8:
+        raise InputError(f"the image must be uint8 or floats, got {pixels.dtype}; convert it first")
+    values = pixels.astype(np.float32) / (255 if pixels.dtype == np.uint8 else 1)
+    if not np.isfinite(values).all():
+        raise InputError("the image must be finite, got NaN or infinity")
+    return values

@@ -1,0 +1,167 @@
+"""Localisation: recovered poses, their covariance, initial poses and errors."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.cameras.pose_offset import offset_camera
+from fidsplat.cli import main
+from fidsplat.images.files import write_png
+from fidsplat.vision.pose import pose_error
+
+START = np.array([0.03, -0.04, 0.03, 0.02, -0.015, 0.03])
+"""motion of a start from the truth [rad, m]: 3.3 degrees, 39 mm"""
+
+
+def scene_with(count=60, marker=None):
+    """Disks in a room of 1.2 m, far from the world origin, and a camera with fx other than fy."""
+    random = np.random.default_rng(3)
+    means = random.uniform((-0.7, -0.5, 0.6), (0.7, 0.5, 1.6), (count, 3)) + np.array([3.0, -2.0, 5.0])
+    cloud = fs.SplatCloud(
+        means,
+        random.normal(size=(count, 4)),
+        random.uniform(0.04, 0.15, (count, 2)),
+        random.uniform(0.7, 0.99, count),
+        colors=random.uniform(0.1, 0.9, (count, 3)),
+    )
+    pose = fs.Camera.look_at(64, 48, 0.9, (3.1, -2.05, 4.7), (3.0, -2.0, 6.0)).world_to_camera
+    camera = fs.Camera.pinhole(64, 48, 62.0, 66.0, 33.0, 23.0, pose)
+    markers = () if marker is None else (marker,)
+    return fs.Scene([cloud], camera, markers, background=(0.3, 0.35, 0.4))
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return fs.Renderer("opencl")
+
+
+@pytest.fixture(scope="module")
+def room(renderer):
+    scene = scene_with()
+    return scene, renderer.upload(scene), renderer.render(scene)["rgb"]
+
+
+def off(found, camera):
+    """Millimetres and degrees between two cameras."""
+    position, angle = pose_error(found.camera_to_world, camera.camera_to_world)
+    return 1e3 * position, math.degrees(angle)
+
+
+def test_the_pose_of_a_noisy_image_is_recovered(renderer, room):
+    scene, resident, image = room
+    noisy = image + np.random.default_rng(0).normal(0, 0.01, image.shape)
+    start = offset_camera(scene.camera, START)
+    found = fs.localise(noisy, scene, start, renderer=renderer, resident=resident)
+    assert found.found
+    assert found.start == "start"
+    millimetres, degrees = off(found.camera, scene.camera)
+    assert millimetres < 2
+    assert degrees < 0.15
+    assert off(start, scene.camera)[0] > 30
+    assert found.inliers > 0.95
+    assert found.noise == pytest.approx(0.01, rel=0.2)
+    assert found.camera.fx == 62.0
+
+
+def test_exposure_and_white_balance_do_not_matter(renderer, room):
+    scene, resident, image = room
+    start = offset_camera(scene.camera, START)
+    changed = image * np.float32([0.6, 0.8, 1.1]) + np.float32([0.05, -0.02, 0.01])
+    found = [fs.localise(one, scene, start, renderer=renderer, resident=resident) for one in (image, changed)]
+    assert off(found[1].camera, found[0].camera)[0] < 0.05
+    assert off(found[1].camera, scene.camera)[0] < 0.3
+
+
+def test_an_occluder_is_an_outlier_and_a_mask_ignores_it(renderer, room):
+    scene, resident, image = room
+    occluded, mask = image.copy(), np.ones((48, 64), bool)
+    occluded[10:38, 20:34] = (0.9, 0.1, 0.8)
+    mask[10:38, 20:34] = False
+    start = offset_camera(scene.camera, START / 3)
+    free = fs.localise(occluded, scene, start, renderer=renderer, resident=resident)
+    masked = fs.localise(occluded, scene, start, mask=mask, renderer=renderer, resident=resident)
+    assert off(free.camera, scene.camera)[0] < 3
+    assert off(masked.camera, scene.camera)[0] < 0.3
+    assert free.inliers < 0.9 < masked.inliers
+
+
+def test_the_covariance_has_the_scale_of_the_errors(renderer, room):
+    """The squared error, normalised by the covariance, has a mean of six numbers."""
+    scene, resident, image = room
+    random, squares = np.random.default_rng(5), []
+    for _ in range(40):
+        noisy = image + random.normal(0, 0.02, image.shape)
+        found = fs.localise(noisy, scene, scene.camera, renderer=renderer, resident=resident)
+        moved = scene.camera.world_to_camera @ found.camera.camera_to_world
+        turn = (moved[:3, :3] - moved[:3, :3].T) / 2
+        error = np.array([turn[2, 1], turn[0, 2], turn[1, 0], *moved[:3, 3]])
+        squares.append(error @ np.linalg.solve(found.covariance, error))
+    assert 4 < np.mean(squares) < 8.5
+
+
+def test_a_lens_and_a_grey_image(renderer):
+    scene = scene_with()
+    camera = fs.Camera.pinhole(
+        64, 48, 62.0, 66.0, 33.0, 23.0, scene.camera.world_to_camera, lens=fs.BrownConrady(k1=-0.1)
+    )
+    image = renderer.render(scene, camera)["rgb"].mean(axis=2)
+    found = fs.localise(image, scene, offset_camera(camera, START / 2), renderer=renderer)
+    assert off(found.camera, camera)[0] < 6
+    assert found.camera.lens == camera.lens
+
+
+def test_a_tag_gives_the_initial_pose(renderer, tmp_path, capsys):
+    made = fs.marker("apriltag:36h11:5", size=0.5)
+    pose = np.eye(4)
+    pose[:3, 3] = 3.0, -2.0, 5.75
+    placed = fs.scenes.PlacedMarker(made, pose)
+    scene = scene_with(count=40, marker=placed)
+    image = renderer.render(scene)["rgb"]
+    found = fs.localise(image, scene, renderer=renderer)
+    assert found.found
+    assert found.start == made.spec
+    assert off(found.camera, scene.camera)[0] < 3
+    scene.save(tmp_path / "scene.toml")
+    write_png(tmp_path / "photo.png", image)
+    files = ["--scene", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "poses.tum")]
+    assert main(["localise", str(tmp_path / "photo.png"), *files, "--device", "opencl", "--json"]) == 0
+    (facts,) = json.loads(capsys.readouterr().out)["images"]
+    assert facts["found"]
+    assert np.shape(facts["covariance"]) == (6, 6)
+    assert facts["position"] == pytest.approx(scene.camera.position, abs=2e-3)
+    written = fs.load_trajectory(tmp_path / "poses.tum").poses[0]
+    assert written == pytest.approx(scene.camera.camera_to_world, abs=5e-3)
+
+
+def test_the_most_similar_candidate_is_the_start(renderer, room):
+    scene, resident, image = room
+    others = [
+        scene.camera.with_pose(position=(3.0 + math.sin(k), -2.0, 6.0 + 2 * math.cos(k)), target=(3, -2, 6))
+        for k in (0.5, 1.5, 2.5, 4.0, 5.0)
+    ]
+    candidates = [*others[:3], offset_camera(scene.camera, START), *others[3:]]
+    found = fs.localise(image, scene, candidates=candidates, renderer=renderer, resident=resident)
+    assert found.start == "candidates"
+    assert off(found.camera, scene.camera)[0] < 3
+
+
+def test_errors_of_localisation(renderer, room, tmp_path, capsys):
+    scene, resident, image = room
+    with pytest.raises(fs.InputError, match="initial pose, got no start, no marker of the scene"):
+        fs.localise(image, scene, renderer=renderer, resident=resident)
+    with pytest.raises(fs.InputError, match="camera's size, 64 x 48 pixels, got 60 x 48; give the camera"):
+        fs.localise(image[:, :60], scene, scene.camera, renderer=renderer, resident=resident)
+    with pytest.raises(fs.InputError, match="the image must have a camera, got none"):
+        fs.localise(image, scene.clouds[0], np.eye(4), renderer=renderer)
+    with pytest.raises(fs.InputError, match="must be finite, got NaN"):
+        fs.localise(image * np.nan, scene, scene.camera, renderer=renderer, resident=resident)
+    scene.save(tmp_path / "scene.toml")
+    write_png(tmp_path / "photo.png", image)
+    words = ["localise", str(tmp_path / "photo.png"), "--scene", str(tmp_path / "scene.toml")]
+    assert main([*words, "--start", "1,2,3"]) == 2
+    assert "--start must be 7 numbers X,Y,Z,QW,QX,QY,QZ" in capsys.readouterr().err
+    assert main(words) == 2
+    assert capsys.readouterr().err.count("\n") == 1
