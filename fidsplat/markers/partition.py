@@ -164,6 +164,31 @@ def partition_colors(grid: np.ndarray) -> np.ndarray:
     return found[np.lexsort((found[:, 0], found[:, 1]))]
 
 
+def merge_runs(grid: np.ndarray) -> np.ndarray:
+    """Partition of an (h, w) grid of any colours into merged runs, in one pass: equal runs of successive
+    rows, or of columns if these are fewer. It has a few per cent more rectangles than the minimum partition.
+    """
+    across, down = _merged(grid), _merged(grid.T)[:, [1, 0, 3, 2]]
+    return across if len(across) <= len(down) else down
+
+
+def _merged(grid: np.ndarray) -> np.ndarray:
+    """Runs of equal cells of the rows, merged with equal runs of the row above."""
+    h, w = grid.shape
+    edge = np.ones((h, w + 1), bool)
+    edge[:, 1:-1] = grid[:, 1:] != grid[:, :-1]
+    y, x0 = np.nonzero(edge[:, :-1])
+    x1 = np.nonzero(edge[:, 1:])[1] + 1
+    stop = np.zeros((h, w), np.int64)
+    stop[y, x0] = x1
+    continues = (y > 0) & (stop[y - 1, x0] == x1) & (grid[y - 1, x0] == grid[y, x0])
+    order = np.argsort(x0 * h + y)
+    first = np.flatnonzero(~continues[order])
+    last = np.append(first[1:], len(order)) - 1
+    top, bottom = order[first], order[last]
+    return np.stack([x0[top], y[top], x1[top], y[bottom] + 1], 1)
+
+
 def _unit_edges(line: np.ndarray, start: np.ndarray, stop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit edges of segments on grid lines: lines and positions along them."""
     length = stop - start

@@ -1,9 +1,8 @@
-"""Print and wear of a marker: its sheet as a fine grid of colours, changed by seeded effects of severity 0 to
-1.
+"""Print and wear of a marker: a fine grid of colours, changed by seeded effects of severity 0 to 1.
 
-The modules are divided into cells. Each effect maps the colours of the cells to new ones; the cells of each
-colour are then partitioned into rectangles like modules. Every effect has random numbers of its own, so that
-the severity of one does not change the others.
+The modules are divided into cells. Each effect maps the colours of the cells to new ones; cells of one colour
+are then joined to rectangles. Every effect has random numbers of its own, so that the severity of one does
+not change the others.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fidsplat.images.apriltag3 import HOLE
-from fidsplat.markers.partition import partition_colors
+from fidsplat.markers.partition import merge_runs, partition
 from fidsplat.markers.printing import Printed
 from fidsplat.util.arguments import instance, number, parse_settings, whole_number
 from fidsplat.util.errors import InputError
@@ -152,7 +151,7 @@ def worn(spec: str, printed: Printed, wear: Wear) -> Printed:
         if severity > 0:
             sheet = effect(sheet, float(severity), np.random.default_rng([wear.seed, place]))
     values, palette = _indexed(sheet)
-    boxes = partition_colors(values)
+    boxes = partition(values) if values.max() <= 1 else merge_runs(values)
     value = values[boxes[:, 1], boxes[:, 0]]
     left = value != HOLE
     return Printed(values, boxes[left], value[left], None, None, printed.module / cells, palette)
@@ -223,42 +222,41 @@ def _faded(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
 
 def _scratched(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
     """Straight scratches without ink."""
-    (y, x), (h, w) = sheet.at, sheet.size
+    h, w = sheet.size
     color, left = sheet.color.copy(), SCRATCHED * severity * h * w
     while left > 0:
         middle, turn = rng.random(2) * (h, w), rng.uniform(0, math.pi)
         length, width = rng.uniform(0.05, 0.5) * max(h, w), SCRATCH * rng.uniform(0.7, 1.3)
         length = min(length, left / width)
         left -= length * width
-        dy, dx = y - middle[0], x - middle[1]
+        near, dy, dx = _around(sheet, middle, length / 2 + width)
         along = np.abs(math.cos(turn) * dx + math.sin(turn) * dy)
         across = np.abs(math.cos(turn) * dy - math.sin(turn) * dx)
-        color[(along < length / 2) & (across < width / 2)] = sheet.paper
+        color[near][(along < length / 2) & (across < width / 2)] = sheet.paper
     return sheet._replace(color=color)
 
 
 def _wet(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
     """Water drops: lenses that magnify the code, with a dark rim and a highlight."""
-    (y, x), (h, w) = sheet.at, sheet.size
+    h, w = sheet.size
     color, left = sheet.color.copy(), severity * h * w
     while left > 0:
         middle = rng.random(2) * (h, w)
         radius = min(rng.uniform(0.3, 1.3), math.sqrt(left / math.pi))
         left -= math.pi * radius**2
-        dy, dx = y - middle[0], x - middle[1]
-        inside = (np.hypot(dy, dx) < radius) & sheet.present
-        rows, columns = np.nonzero(inside)
+        near, dy, dx = _around(sheet, middle, radius)
+        rows, columns = np.nonzero((np.hypot(dy, dx) < radius) & sheet.present[near])
         dy, dx = dy[rows, 0], dx[0, columns]
         far = np.hypot(dy, dx) / radius
         shrunk = 0.4 + 0.5 * far**2
         source = [
             np.clip(((at + shrunk * step) * sheet.cells).astype(int), 0, n - 1)
-            for at, step, n in zip(middle, (dy, dx), inside.shape, strict=True)
+            for at, step, n in zip(middle, (dy, dx), sheet.present.shape, strict=True)
         ]
         rim = np.floor(LEVELS * np.clip((far - 0.75) / 0.25, 0, 1)) / LEVELS
-        color[rows, columns] = sheet.color[tuple(source)] * (0.9 - 0.35 * rim)[:, None]
+        color[near][rows, columns] = sheet.color[tuple(source)] * (0.9 - 0.35 * rim)[:, None]
         shine = np.hypot(dy + 0.4 * radius, dx + 0.4 * radius) < 0.18 * radius
-        color[rows[shine], columns[shine]] = 1.0
+        color[near][rows[shine], columns[shine]] = 1.0
     return sheet._replace(color=color)
 
 
@@ -323,6 +321,17 @@ EFFECTS: dict[str, Callable[[Sheet, float, np.random.Generator], Sheet]] = {
     "cover": _covered,
 }
 """effects in the order in which they are applied; positions are part of their seeds"""
+
+
+def _around(
+    sheet: Sheet, middle: np.ndarray, reach: float
+) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray]:
+    """Cells of a square around a position, and their distances (h, 1) down and (1, w) right of it, in
+    modules."""
+    low = np.maximum(np.floor((middle - reach) * sheet.cells), 0).astype(int)
+    high = np.maximum(np.ceil((middle + reach) * sheet.cells), 0).astype(int)
+    near, (y, x) = (slice(low[0], high[0]), slice(low[1], high[1])), sheet.at
+    return near, y[near[0]] - middle[0], x[:, near[1]] - middle[1]
 
 
 def _noise(sheet: Sheet, wide: float, rng: np.random.Generator) -> np.ndarray:

@@ -18,6 +18,7 @@ from fidsplat.markers.partition import (
     chords,
     concave_vertices,
     independent_chords,
+    merge_runs,
     minimum_rectangles,
     partition,
 )
@@ -230,3 +231,15 @@ def test_large_grids_take_no_quadratic_time():
 def test_the_same_on_every_run():
     grid = (np.random.default_rng(3).random((60, 60)) < 0.5).astype(np.uint8)
     assert np.array_equal(partition(grid), partition(grid.copy()))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (6, 1), (9, 12)])
+def test_merged_runs_cover_each_cell_once_in_its_colour(shape):
+    grid = np.random.default_rng(5).integers(0, 3, shape).astype(np.uint8)
+    painted = np.full(shape, -1)
+    for x0, y0, x1, y1 in merge_runs(grid):
+        assert (painted[y0:y1, x0:x1] == -1).all()
+        painted[y0:y1, x0:x1] = grid[y0, x0]
+    assert np.array_equal(painted, grid)
+    striped = np.repeat(np.arange(4, dtype=np.uint8)[None], 5, 0)
+    assert len(merge_runs(striped)) == len(merge_runs(striped.T)) == 4
