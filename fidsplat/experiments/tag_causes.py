@@ -379,7 +379,7 @@ def _flare(view: View, share: float) -> View:
 
 
 def _cylinder(view: View, degrees: float) -> View:
-    radius = view.placed.marker.size / math.radians(max(degrees, 1e-3))
+    radius = view.placed.marker.size / math.radians(max(degrees, 1e-5))
     axis = "xy"[view.seed % 2]
     return replace(view, placed=_changed(view.placed, Cylinder(radius, axis=axis)))
 
