@@ -12,10 +12,10 @@ from pathlib import Path
 
 
 class CommandTable(Mapping[str, type]):
-    """Command classes by name, imported on access."""
+    """Command classes by name, imported on access. Names have hyphens for underscores."""
 
     def __init__(self, **places: str) -> None:
-        self._places = places
+        self._places = {name.replace("_", "-"): place for name, place in places.items()}
 
     def __getitem__(self, name: str) -> type:
         module, _, kind = self._places[name].partition(".")
@@ -53,6 +53,7 @@ COMMANDS = CommandTable(
     gallery="render.Gallery",
     fetch="fetch.Fetch",
     greenhouse="greenhouse.Greenhouse",
+    plan_tags="plan_tags.PlanTags",
     capture="capture.Capture",
     train="train.Train",
     localise="localise.Localise",

@@ -18,7 +18,7 @@ from fidsplat.capture.capture import Capture
 from fidsplat.capture.sensor import Sensor
 from fidsplat.experiments.ideal_tags import tag_depth_image
 from fidsplat.render.renderer import Renderer
-from fidsplat.scenes import PlacedMarker
+from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.sim.localiser import Localiser
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
@@ -117,6 +117,10 @@ class Drive:
         """Placed tags by id."""
         return {placed.marker.id: placed for placed in self.house.markers if placed.marker.id is not None}
 
+    def scene(self, mixture: str | None) -> Scene:
+        """The greenhouse with markers of a mixture."""
+        return replace(self.house, mixture=mixture).scene
+
     def run(self, speed: float | None = None) -> Run:
         """Drive up one aisle and down the next, at a given or the default speed."""
         ends, path = (-0.8, self.house.length + 0.8), []
@@ -131,7 +135,7 @@ class Drive:
 
     def images(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[np.ndarray]:
         """Images (480, 640, 3) uint8 of the drive."""
-        scene = replace(self.house, mixture=variant.mixture).scene
+        scene = self.scene(variant.mixture)
         if variant.texture:
             scene = replace(scene, markers=tuple(each for each in scene.markers if each.marker.id is None))
         camera, motion = replace(self.camera, lens=variant.lens), Motion(run.camera.inverse())

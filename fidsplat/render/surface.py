@@ -104,14 +104,21 @@ def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = 
     camera, pixel = _viewpoint(camera, pixel, None)
     pixels = default_radius(camera) if radius is None else radius
     x, y = (int(v) for v in pixel)
-    reach = int(np.ceil(pixels))
+    reach, step = int(np.ceil(pixels)), max(1, int(pixels) // (SAMPLES // 4))
     left, top = max(x - reach, 0), max(y - reach, 0)
-    patch = depth[top : y + reach + 1, left : x + reach + 1]
+    patch = depth[top : y + reach + 1 : step, left : x + reach + 1 : step]
     metres = _radius(camera, pixel, pixels, _middle_depth(patch))
-    window = replace(
-        camera, width=patch.shape[1], height=patch.shape[0], cx=camera.cx - left, cy=camera.cy - top
+    window = replace(  # pixel centres of every step-th row and column
+        camera,
+        width=patch.shape[1],
+        height=patch.shape[0],
+        fx=camera.fx / step,
+        fy=camera.fy / step,
+        cx=(camera.cx - left - 0.5) / step + 0.5,
+        cy=(camera.cy - top - 0.5) / step + 0.5,
     )
-    return _fitted(patch, window, (pixel[0] - left, pixel[1] - top), pixels, metres)
+    at = ((pixel[0] - left - 0.5) / step + 0.5, (pixel[1] - top - 0.5) / step + 0.5)
+    return _fitted(patch, window, at, pixels / step, metres)
 
 
 def default_radius(camera: Camera) -> float:

@@ -48,6 +48,7 @@ PARSED_ONLY = {
     "check": "minutes; tests/selftest",
     "demo": "tests/unit/test_demo.py runs it",
     "experiment": "minutes; tests/experiments",
+    "plan-tags": "needs walls; tests/unit/test_tag_placement.py",
     "tradeoff": "minutes; tests/experiments",
     "train": "minutes; tests/unit/test_train_command.py",
     "localise": "needs photographs; tests/unit/test_localisation.py",

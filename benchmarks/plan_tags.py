@@ -1,0 +1,77 @@
+"""Planned tags in the greenhouse: errors of the robot's drive with its own tags and with planned ones.
+
+python benchmarks/plan_tags.py --rows 5 --plants 12 --counts 25 12
+"""
+
+import argparse
+import json
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+import fidsplat as fs
+from fidsplat.experiments.localise import VARIANTS, Drive
+from fidsplat.experiments.plan_tags import PlanSettings, plan_tags
+from fidsplat.scenes import PlacedMarker
+
+
+@dataclass(frozen=True)
+class PlannedDrive(Drive):
+    """A drive with other tags."""
+
+    placed: tuple[PlacedMarker, ...] = ()
+
+    @property
+    def tags(self) -> dict[int, PlacedMarker]:
+        return {one.marker.id: one for one in self.placed}
+
+    def scene(self, mixture):
+        house = super().scene(mixture)
+        others = tuple(one for one in house.markers if one.marker.id is None)
+        return replace(house, markers=(*others, *self.placed))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rows", type=int, default=5)
+    parser.add_argument("--plants", type=int, default=12)
+    parser.add_argument("--counts", type=int, nargs="*", default=[25])
+    parser.add_argument("--walls", action="store_true")
+    parser.add_argument(
+        "--seeds", type=int, default=1, help="drives with other errors of wheels and gyroscope"
+    )
+    parser.add_argument(
+        "--corner-noise", type=float, default=0.5, help="pixels, of the filter and of the plan"
+    )
+    parser.add_argument("--device")
+    given = parser.parse_args()
+    base = Drive(given.rows, given.plants)
+    renderer, run = fs.Renderer(given.device), base.run()
+    own = tuple(base.tags.values())
+    bare = replace(PlannedDrive(given.rows, given.plants).scene("exact"), camera=base.camera)
+    layouts = {f"greenhouse's {len(own)}": own}
+    for count in given.counts:
+        settings = PlanSettings(
+            count, poses=min(200, int(3 * run.length)), views=60, walls=given.walls,
+            corner_noise=given.corner_noise,
+        )  # fmt: skip
+        plan = plan_tags(bare, run.camera, settings, renderer)
+        share = plan.selection.value / plan.selection.bound
+        print(
+            f"{plan.candidates} candidates, predicted {100 * plan.errors[-1]:.3f} cm, {share:.2f}", flush=True
+        )
+        layouts[f"planned {len(plan.tags)}"] = plan.tags
+        some = np.linspace(0, len(own) - 1, count).round().astype(int)
+        layouts[f"every {len(own) / count:.2g}th"] = tuple(own[k] for k in some)
+    runs = [replace(base, seed=seed).run() for seed in range(given.seeds)]
+    for name, tags in layouts.items():
+        drive = PlannedDrive(given.rows, given.plants, placed=tags)
+        codes = list(drive.detections(VARIANTS["exact"], runs[0], renderer))
+        found = [drive.localise(one, codes, drive.camera, given.corner_noise)[1] for one in runs]
+        keys = ("ate_m", "worst_m", "heading_deg", "tags")
+        facts = {key: float(np.mean([one[key] for one in found])) for key in keys}
+        print(json.dumps({"layout": name} | facts), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""`fidsplat plan-tags`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
+
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import Device, Json, Overwrite, require_packages
+from fidsplat.commands.output import delayed_progress, report
+from fidsplat.experiments.plan_tags import PlanSettings
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import path_of, writable_folder
+
+
+@dataclass
+class PlanTags:
+    """Plan where to hang tags, for a camera that moves along a trajectory.
+
+    Candidates are flat surfaces that the camera sees. Each has the Fisher information of its four corners at
+    every pose that can read it: not occluded, modules of at least 2.5 pixels, incidence below 70 degrees,
+    with the motion blur and the noise of the scene's shutter and sensor. Greedy selection and local search
+    maximise the information about the trajectory. Tags that the scene has count as well.
+
+    Written are DIR/scene.toml, the scene with the tags; plan.json; map.svg. Needs the extra `experiments`.
+
+    Examples:
+      fidsplat plan-tags scene.toml --trajectory flight.tum --count 10
+      fidsplat plan-tags scene.toml --trajectory flight.tum --count 50 --target 0.01 --size 0.2 -o hall
+    """
+
+    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss", "scene")]
+    trajectory: Annotated[
+        str, option("FILE", "camera-to-world poses of the camera (docs/formats.md#trajectories)")
+    ]
+    out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-plan"
+    settings: PlanSettings = field(default_factory=PlanSettings)
+    device: Device = None
+    overwrite: Overwrite = False
+    json: Json = False
+
+    def run(self) -> int:
+        import fidsplat as fs
+        from fidsplat.experiments.plan_tags import plan_tags, write_plan
+        from fidsplat.scenes.sources import load_source
+
+        require_packages("the map", ("matplotlib",))
+        folder = path_of(self.out)
+        if (folder / "scene.toml").exists() and not self.overwrite:
+            raise InputError(f"{folder / 'scene.toml'} already exists; give another folder, or --overwrite")
+        path = fs.load_trajectory(self.trajectory)
+        with delayed_progress() as progress:
+            scene = load_source(self.source)
+            renderer = fs.Renderer(self.device or scene.device)
+            plan = plan_tags(scene, path, self.settings, renderer, progress)
+        writable_folder(folder)
+        files = write_plan(plan, folder, self.settings.size)
+        facts = plan.facts()
+        rows = [
+            (
+                tag["spec"],
+                " ".join(f"{v:.3f}" for v in tag["position"]),
+                tag["poses"],
+                f"{100 * tag['error_m']:.3g}",
+            )
+            for tag in facts["tags"]
+        ]
+        share = facts["information_nats"] / max(facts["bound_nats"], 1e-9)
+        without, with_tags = 100 * facts["error_without_m"], 100 * facts["error_m"]
+        lines = [
+            f"{len(rows)} of {facts['candidates']} candidates; predicted RMS error of positions "
+            f"{without:.3g} cm without them, {with_tags:.3g} cm with them",
+            f"information {facts['information_nats']:.1f} nats, at least {100 * share:.0f} % of the optimum",
+            *map(str, files),
+        ]
+        head = ("tag", "position [m]", "poses", "predicted error [cm]")
+        return report(
+            self.json, facts | {"files": [str(one) for one in files]}, *lines, table=("", head, rows)
+        )

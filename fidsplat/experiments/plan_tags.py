@@ -1,0 +1,415 @@
+"""Places for tags on the surfaces of a scene that help most to localise a camera along a trajectory."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fidsplat.cameras import Camera, Motion, Shutter, Trajectory
+from fidsplat.capture.sensor import Sensor
+from fidsplat.formats import Progress
+from fidsplat.markers import Marker, marker
+from fidsplat.render.renderer import Renderer
+from fidsplat.render.surface import MEDIAN, surface_of
+from fidsplat.scenes import PlacedMarker, Scene
+from fidsplat.scenes.surface import Surface
+from fidsplat.scenes.up import scene_up
+from fidsplat.util.errors import InputError
+from fidsplat.vision.fisher_information import CornerNoise, tag_information
+from fidsplat.vision.tag_placement import (
+    Selection,
+    Sightings,
+    greedy,
+    local_search,
+    odometry_covariance,
+    position_error,
+    updated,
+)
+
+if TYPE_CHECKING:
+    pass
+
+WIDEST = 640
+"""pixels: largest width of the depth images"""
+STEPS, ROWS = 16, 12
+"""candidates per image, in x and y"""
+MODULE = 2.5
+"""pixels: smallest module of a readable tag"""
+INCIDENCE = math.cos(math.radians(70))
+"""smallest cosine between the normal of a readable tag and the ray"""
+TAGS = ("apriltag", "aruco")
+"""kinds of markers of a scene that a camera localises by"""
+STEEP = math.sqrt(0.5)
+"""largest cosine between the normal of a wall and the vertical"""
+FLAT = 0.1
+"""largest roughness of a candidate, as a share of the size of the tag"""
+SHARE = 0.9
+"""smallest share of the tag's area that is in the plane"""
+_DEPTH = 0.02, 0.01
+"""metres and share of the distance: a tag is occluded where the depth image is nearer than this"""
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """Settings of a plan.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    count: int = 10
+    """N: number of tags"""
+    size: float = 0.16
+    """M: edge of a tag in metres"""
+    family: str = "36h11"
+    """TEXT: AprilTag family; ids that the scene has are left out"""
+    target: float | None = None
+    """M: place tags, at most N, until the predicted RMS error of positions is below this"""
+    walls: bool = False
+    """use walls only, no floors and ceilings"""
+    poses: int = 150
+    """N: poses of the trajectory, evenly in time, that are evaluated"""
+    views: int = 30
+    """N: poses whose images are searched for surfaces"""
+    drift: tuple[float, float] = (0.01, 0.5)
+    """M DEG: standard deviation of the odometry after one metre"""
+    corner_noise: float = 0.05
+    """PX: error of a detected corner that blur and noise of the sensor do not explain"""
+
+    def __post_init__(self) -> None:
+        for name in ("count", "poses", "views"):
+            if getattr(self, name) < 1:
+                raise InputError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("size", "corner_noise"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"--{name.replace('_', '-')} must be above 0, got {getattr(self, name)}")
+        if not (self.target is None or 0 < self.target < math.inf):
+            raise InputError(f"--target must be a positive length in metres, got {self.target}")
+        if len(self.drift) != 2 or not all(0 < value < math.inf for value in self.drift):
+            raise InputError(f"--drift must be metres and degrees, both above 0, got {self.drift}")
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A scene with planned tags."""
+
+    scene: Scene
+    """the scene with the tags after its own markers"""
+    tags: tuple[PlacedMarker, ...]
+    """planned tags, in the order of the greedy selection"""
+    sightings: tuple[int, ...]
+    """number of evaluated poses that see each tag"""
+    errors: tuple[float, ...]
+    """predicted RMS error of the positions in metres without planned tags, with the first, ..."""
+    selection: Selection
+    candidates: int
+    """number of candidates that a pose sees"""
+    path: np.ndarray
+    """(p, 4, 4) evaluated camera-to-world poses"""
+
+    def facts(self) -> dict[str, Any]:
+        """Plain data of the plan."""
+        rows = [
+            {"spec": tag.marker.spec, "position": tag.pose[:3, 3].tolist(), "poses": seen, "error_m": error}
+            for tag, seen, error in zip(self.tags, self.sightings, self.errors[1:], strict=True)
+        ]
+        facts: dict[str, Any] = {"tags": rows, "error_without_m": self.errors[0]}
+        facts |= {"error_m": self.errors[-1], "candidates": self.candidates, "poses": len(self.path)}
+        return facts | {"information_nats": self.selection.value, "bound_nats": self.selection.bound}
+
+
+def plan_tags(
+    scene: Scene,
+    path: Trajectory,
+    settings: PlanSettings,
+    renderer: Renderer,
+    progress: Progress | None = None,
+) -> Plan:
+    """Places of tags on surfaces of a scene for a camera on a trajectory.
+
+    Candidates are flat surfaces that the trajectory sees. A pose sees a tag if its depth image shows no
+    occlusion, its modules are large enough and its incidence is below 70 degrees. The information of the
+    corners depends on incidence, distance, motion blur and noise. Tags that the scene has count as well.
+
+    Args:
+        path: camera-to-world poses.
+        progress: called with the current step and its share done.
+
+    Raises:
+        InputError: a scene without a camera, no flat surface in view of the trajectory, or too many tags
+            for the family.
+    """
+    report = progress or (lambda step, share: None)
+    camera = _camera(scene)
+    count = settings.poses if len(path) > 1 else 1
+    times = np.linspace(float(path.times[0]), float(path.times[-1]), count)
+    cameras = [camera.with_pose(camera_to_world=path(float(time))) for time in times]
+    depths = []
+    for k, frame in enumerate(_depth_frames(scene, cameras, renderer)):
+        depths.append(frame["depth_first"])
+        report("rendering depth", 0.3 * (k + 1) / len(cameras))
+    tag = marker(f"apriltag:{settings.family}:0", settings.size)
+    every = range(0, len(cameras), max(1, -(-len(cameras) // settings.views)))
+    up, found = scene_up(scene), []
+    for n, k in enumerate(every):
+        seen = surface_candidates(depths[k], _smaller(cameras[k]), tag, up)
+        found += [one for one in seen if not settings.walls or abs(one[0].normal @ up) < STEEP]
+        report("searching surfaces", 0.3 + 0.4 * (n + 1) / len(every))
+    poses = spread_out(found, tag)
+    for one in scene.markers:  # markers are flat, too
+        poses = poses[
+            np.linalg.norm(poses[:, :3, 3] - one.pose[:3, 3], axis=1) > tag.radius + one.marker.radius
+        ]
+    existing = [one for one in scene.markers if one.motion is None and one.marker.kind in TAGS]
+    places = [PlacedMarker(tag, pose) for pose in poses]
+    noise = corner_noise(scene.sensor or Sensor(), settings.corner_noise)
+    all_seen = sightings_of(
+        [*places, *existing], cameras, depths, noise, _exposed(scene, camera, path, times)
+    )
+    report("selecting", 0.8)
+    here = np.array([one.camera_to_world for one in cameras])
+    before = odometry_covariance(here, settings.drift[0], math.radians(settings.drift[1]))
+    for one in all_seen[len(places) :]:
+        before = updated(before, one)
+    visible = [k for k, one in enumerate(all_seen[: len(places)]) if len(one.poses)]
+    if not visible:
+        raise InputError(
+            "the trajectory must see a flat surface of the size of a tag at less than 70 degrees, got none; "
+            "give smaller tags or another trajectory"
+        )
+    seen, poses = [all_seen[k] for k in visible], poses[visible]
+    apart = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2)
+    conflicts = apart < 2.2 * tag.radius
+    np.fill_diagonal(conflicts, False)
+    target = settings.target or 0.0
+    selection = greedy(before, seen, settings.count, conflicts, lambda now: position_error(now) <= target)
+    if settings.target is None:
+        selection = local_search(before, seen, selection, conflicts)
+    errors = [position_error(before)]
+    for k in selection.chosen:
+        before = updated(before, seen[k])
+        errors.append(position_error(before))
+    made = _tags(scene, settings, poses[list(selection.chosen)])
+    report("selecting", 1.0)
+    return Plan(
+        replace(scene, markers=(*scene.markers, *made)),
+        made,
+        tuple(len(seen[k].poses) for k in selection.chosen),
+        tuple(errors),
+        selection,
+        len(seen),
+        here,
+    )
+
+
+def corner_noise(sensor: Sensor, floor: float) -> CornerNoise:
+    """The noise of corners for a sensor, at half of its full well."""
+    steps = 2.0 ** (sensor.bits or 8) - 1
+    noise = (1 / steps) ** 2 / 12
+    if math.isfinite(sensor.full_well):
+        noise += (0.5 * sensor.full_well + sensor.read_noise**2) / sensor.full_well**2
+    return CornerNoise(floor, math.sqrt(noise))
+
+
+def surface_candidates(
+    depth: np.ndarray, camera: Camera, tag: Marker, up: np.ndarray
+) -> list[tuple[Surface, np.ndarray]]:
+    """Flat surfaces of the size of a tag in a depth image, with the pose (4, 4) of a tag on each."""
+    found = []
+    view = camera.world_to_camera
+    for y in (np.arange(ROWS) + 0.5) * camera.height / ROWS:
+        for x in (np.arange(STEPS) + 0.5) * camera.width / STEPS:
+            distance = float(depth[int(y), int(x)])
+            if distance <= 0:
+                continue
+            radius = tag.radius * max(camera.fx, camera.fy) / distance
+            if radius < 4 or radius > camera.width / 4:
+                continue
+            try:
+                surface = surface_of(depth, camera, (x, y), radius)
+            except InputError:
+                continue
+            if surface.inlier_share >= SHARE and surface.roughness <= FLAT * tag.size:
+                found.append((surface, surface.pose([up, -view[1, :3], view[2, :3]])))
+    return found
+
+
+def spread_out(found: Sequence[tuple[Surface, np.ndarray]], tag: Marker) -> np.ndarray:
+    """Poses (n, 4, 4) of the candidates, of near ones only the one with the largest share of inliers."""
+    order = sorted(range(len(found)), key=lambda k: (-found[k][0].inlier_share, found[k][0].roughness))
+    kept: list[np.ndarray] = []
+    for k in order:
+        pose = found[k][1]
+        near = [one for one in kept if np.linalg.norm(one[:3, 3] - pose[:3, 3]) < tag.size]
+        if not any(one[:3, 2] @ pose[:3, 2] > 0.8 for one in near):
+            kept.append(pose)
+    return np.array(kept).reshape(-1, 4, 4)
+
+
+def sightings_of(
+    tags: Sequence[PlacedMarker],
+    cameras: Sequence[Camera],
+    depths: Sequence[np.ndarray],
+    noise: CornerNoise,
+    exposed: Sequence[tuple[Camera, Camera]] | None = None,
+) -> list[Sightings]:
+    """The images of each tag in which it is readable.
+
+    Args:
+        depths: (h, w) median depth of each camera, at most 640 pixels wide.
+        exposed: each camera at the begin and the end of the exposure; None: an instantaneous shutter.
+    """
+    if not tags:
+        return []
+    corners = np.array([tag.corners for tag in tags])
+    middles, normals = corners.mean(1), np.array([-tag.pose[:3, 2] for tag in tags])
+    sides = np.array([tag.marker.bits.shape[1] for tag in tags])
+    margin = np.array([tag.marker.radius * math.sqrt(2) / tag.marker.size for tag in tags])
+    u = np.linspace(-1, 1, 5)
+    grid = np.stack(np.meshgrid(u, u), -1).reshape(-1, 2) / 2
+    across, down = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
+    samples = margin[:, None, None] * (
+        grid[None, :, :1] * across[:, None] + grid[None, :, 1:] * down[:, None]
+    )
+    samples = samples + middles[:, None]
+    poses: list[list[int]] = [[] for _ in tags]
+    known: list[list[np.ndarray]] = [[] for _ in tags]
+    for k, (camera, depth) in enumerate(zip(cameras, depths, strict=True)):
+        rays = camera.position - middles
+        away = np.linalg.norm(rays, axis=1)
+        facing = (rays * normals).sum(1) / np.maximum(away, 1e-9) >= INCIDENCE
+        some = np.flatnonzero(facing)
+        if not len(some):
+            continue
+        pixels = camera.project(samples[some].reshape(-1, 3)).reshape(len(some), -1, 2)
+        code = camera.project(corners[some].reshape(-1, 3)).reshape(-1, 4, 2)
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all((1, 2))
+            edge = np.linalg.norm(np.roll(code, -1, axis=1) - code, axis=2).min(1)
+        kept = np.flatnonzero(inside & (edge >= MODULE * sides[some]))
+        kept = kept[_unoccluded(camera, depth, samples[some[kept]])]
+        some = some[kept]
+        if not len(some):
+            continue
+        moved = None
+        if exposed is not None:
+            begin, end = (one.project(corners[some].reshape(-1, 3)) for one in exposed[k])
+            moved = np.nan_to_num(end - begin).reshape(-1, 4, 2)
+        for tag, information in zip(some, tag_information(camera, corners[some], noise, moved), strict=True):
+            poses[tag].append(k)
+            known[tag].append(information)
+    return [
+        Sightings(np.array(own, int), np.array(matrices).reshape(-1, 6, 6))
+        for own, matrices in zip(poses, known, strict=True)
+    ]
+
+
+def _unoccluded(camera: Camera, depth: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """Whether no sample (n, m, 3) of a tag is behind the depth image."""
+    image = _smaller(camera)
+    flat = samples.reshape(-1, 3)
+    x, y = np.clip(image.project(flat).astype(int), 0, (image.width - 1, image.height - 1)).T
+    measured = depth[y, x]
+    local = flat - image.position
+    along_ray = image.lens is not None and image.lens.along_ray
+    away = np.linalg.norm(local, axis=1) if along_ray else local @ image.world_to_camera[2, :3]
+    free = (measured <= 0) | (measured >= away - _DEPTH[0] - _DEPTH[1] * away)
+    return np.asarray(free).reshape(samples.shape[:2]).all(1)
+
+
+def _camera(scene: Scene) -> Camera:
+    if scene.camera is None:
+        raise InputError("the scene of a plan must have a camera, got none; add a [camera] table")
+    return scene.camera
+
+
+def _smaller(camera: Camera) -> Camera:
+    """The camera of the depth images."""
+    if camera.width <= WIDEST:
+        return camera
+    return camera.with_size(WIDEST, max(1, round(camera.height * WIDEST / camera.width)))
+
+
+def _depth_frames(scene: Scene, cameras: Sequence[Camera], renderer: Renderer):
+    capture = scene.capture
+    still = replace(
+        capture,
+        outputs=("depth_first",),
+        quality=replace(capture.quality, samples=1, first_hit=MEDIAN),
+        motion=Motion(None, capture.motion.groups),
+        shutter=Shutter(time=capture.shutter.time),
+        sensor=Sensor(),
+        fog=None,
+    )
+    captures = [replace(still, camera=_smaller(camera)) for camera in cameras]
+    return renderer.render_views(renderer.upload(scene), captures)
+
+
+def _exposed(
+    scene: Scene, camera: Camera, path: Trajectory, times: np.ndarray
+) -> list[tuple[Camera, Camera]] | None:
+    half = 0.0 if scene.shutter is None else scene.shutter.exposure_time / 2
+    if not half:
+        return None
+    return [
+        (
+            camera.with_pose(camera_to_world=path(float(time) - half)),
+            camera.with_pose(camera_to_world=path(float(time) + half)),
+        )
+        for time in times
+    ]
+
+
+def _tags(scene: Scene, settings: PlanSettings, poses: np.ndarray) -> tuple[PlacedMarker, ...]:
+    used = {
+        placed.marker.id
+        for placed in scene.markers
+        if (placed.marker.kind, placed.marker.family) == ("apriltag", settings.family)
+    }
+    ids = (number for number in range(100_000) if number not in used)
+    made = []
+    for pose, number in zip(poses, ids, strict=False):
+        made.append(PlacedMarker(marker(f"apriltag:{settings.family}:{number}", settings.size), pose))
+    return tuple(made)
+
+
+def write_plan(plan: Plan, folder: Path, size: float) -> list[Path]:
+    """Write scene.toml, plan.json and map.svg into a folder; returns the files."""
+    from fidsplat.util.files import atomic_write
+
+    plan.scene.save(folder / "scene.toml")
+    with atomic_write(folder / "plan.json") as stream:
+        stream.write(json.dumps(plan.facts(), indent=2).encode())
+    _write_map(plan, folder / "map.svg", size)
+    return [folder / name for name in ("scene.toml", "plan.json", "map.svg")]
+
+
+def _write_map(plan: Plan, file: Path, size: float) -> None:
+    """Map from above: trajectory and tags with their ids; and the predicted error by the number of tags."""
+    from fidsplat.experiments.charts import COLOURS, chart
+    from fidsplat.splats.statistics import level_rotation
+
+    level = level_rotation(scene_up(plan.scene))
+    flat = level[:, [0, 2]]  # right and ahead
+    with chart(file, panels=2, size=(11.0, 4.6), one_scale=False) as (_, axes):
+        path = plan.path[:, :3, 3] @ flat
+        axes[0].plot(path[:, 0], path[:, 1], color="#bbbbbb", linewidth=2.0)
+        for tag in plan.tags:
+            (x, y), normal = tag.pose[:3, 3] @ flat, -tag.pose[:3, 2] @ flat
+            axes[0].plot([x, x + 2 * size * normal[0]], [y, y + 2 * size * normal[1]], color=COLOURS[0])
+            axes[0].plot([x], [y], "s", color=COLOURS[0], markersize=4)
+            axes[0].annotate(
+                str(tag.marker.id), (x, y), fontsize=7, xytext=(3, 3), textcoords="offset points"
+            )
+        axes[0].set_aspect("equal", adjustable="datalim")
+        axes[0].set_xlabel("[m], from above")
+        axes[1].plot(range(len(plan.errors)), 100 * np.array(plan.errors), marker="o", color=COLOURS[0])
+        axes[1].set_yscale("log")
+        axes[1].set_xlabel("tags")
+        axes[1].set_ylabel("predicted RMS error [cm]")
