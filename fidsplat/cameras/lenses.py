@@ -22,6 +22,7 @@ MAX_COEFFICIENT = 1e12
 """largest size of a lens coefficient: far beyond invertible ones, and products of several stay finite"""
 _STEPS = 4096  # of the tables from which Newton's iteration starts
 _ITERATIONS = 12
+_LOWEST = math.cos(math.radians(1))  # -z is infinitely far in the chart of directions
 _NOTHING = 1e-200  # a leading coefficient that would overflow when roots are found
 
 
@@ -314,9 +315,77 @@ class Orthographic:
         return np.tile(np.eye(2, 3), (len(points), 1, 1))
 
 
-RayLens: TypeAlias = BrownConrady | Fisheye | Equirectangular
+@dataclass(frozen=True, eq=False)
+class RayTable:
+    """Arbitrary rays from one point, one for each pixel: for scanners. The camera has fx = fy = 1 and
+    cx = cy = 0, and the size of the table.
+
+    Points have no image coordinates, so low-pass filters have no effect. Neighbours in the table should be
+    neighbours in space: the larger the angles between them, the slower is rendering. Raises InputError for
+    another shape, no ray at all, or a ray within 1 degree of -z.
+    """
+
+    directions: np.ndarray
+    """(h, w, 3) float64 in the camera's frame, of any length but 0; NaN for a pixel without a ray"""
+    divergence: float = 1e-3
+    """radians between the edges of a ray's beam: it blurs the edges of box splats"""
+
+    kind: ClassVar[str] = "ray_table"
+    along_ray: ClassVar[bool] = True
+    does_nothing: ClassVar[bool] = False
+    uniforms: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0, 0.0, -1.0)
+    """of a fisheye whose field of view is empty, so that no centre has an image"""
+
+    def __post_init__(self) -> None:
+        given = real_array("directions", self.directions)
+        if given.ndim != 3 or given.shape[2] != 3:
+            raise InputError(f"directions must have the shape (h, w, 3), got {given.shape}")
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rays = given / np.linalg.norm(given, axis=2, keepdims=True)
+        if not np.isfinite(rays).any():
+            raise InputError("directions must have a ray, got none with finite numbers and a length above 0")
+        if (rays[..., 2] < -_LOWEST).any():
+            raise InputError(
+                "directions must be at least 1 degree from -z, got a ray that is closer; turn the camera's "
+                "axes"
+            )
+        rays.flags.writeable = False
+        object.__setattr__(self, "directions", rays)
+        number("divergence", self.divergence, "an angle above 0, at most 1 rad", 1e-9, 1.0)
+
+    def image(self, points: np.ndarray) -> np.ndarray:
+        """NaN (n, 2): points have no image coordinates."""
+        return np.full((len(_rows("points", points, 3)), 2), np.nan)
+
+    def derivative(self, points: np.ndarray) -> np.ndarray:
+        """Jacobian (n, 2, 3) of coordinates across the beam, in beam widths, at points (n, 3)."""
+        points = _rows("points", points, 3)
+        far = np.linalg.norm(points, axis=1, keepdims=True)
+        unit = points / far
+        aside = np.eye(3)[np.argmin(np.abs(unit), axis=1)]
+        first = np.cross(unit, aside)
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        return np.stack([first, np.cross(unit, first)], 1) / (self.divergence * far[:, :, None])
+
+    def rays(self, image: np.ndarray) -> np.ndarray:
+        """Unit directions (n, 3) of the pixels of image coordinates (n, 2); NaN outside the table."""
+        column, row = np.floor(_rows("image", image, 2)).astype(np.int64).T
+        height, width = self.directions.shape[:2]
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        rays = self.directions[np.where(inside, row, 0), np.where(inside, column, 0)]
+        return np.where(inside[:, None], rays, np.nan)
+
+
+RayLens: TypeAlias = BrownConrady | Fisheye | Equirectangular | RayTable
 """lenses whose rays start at one point"""
 Lens: TypeAlias = RayLens | Orthographic
+
+
+def camera_effect(lens: Lens | None) -> str:
+    """Name of the effect that projects splats. A table of rays has the chart of directions of a fisheye."""
+    if lens is None:
+        return "camera_pinhole"
+    return "camera_fisheye" if isinstance(lens, RayTable) else f"camera_{lens.kind}"
 
 
 def _rows(name: str, value: np.ndarray, width: int) -> np.ndarray:

@@ -317,7 +317,7 @@ class Camera(PickledByFields, Summarised):
         """Size, intrinsics, lens and pose in words, for notebooks."""
         lens = self.lens
         changes = [] if lens is None else [(f.name, getattr(lens, f.name)) for f in fields(lens)]
-        values = ", ".join(f"{name} = {value:g}" for name, value in changes if value)
+        values = ", ".join(f"{name} = {value:g}" for name, value in changes if np.ndim(value) == 0 and value)
         return {
             "size": f"{self.width} x {self.height} pixels",
             "focal length": f"{self.fx:.6g}, {self.fy:.6g} pixels",

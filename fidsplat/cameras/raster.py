@@ -7,7 +7,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from fidsplat.cameras.lenses import Fisheye, RayLens
+from fidsplat.cameras.lenses import Fisheye, RayLens, RayTable
 
 CELLS = 512
 """maximum number of cells of the finest map along an axis"""
@@ -84,10 +84,10 @@ class RayRaster:
         return float(np.sqrt(np.nanmax(squared))) * 1.00001
 
     def chart(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates in which kernels bound a splat: the ideal pinhole image in samples, or, for a fisheye,
-        the stereographic projection (X, Y) / (|ray| + Z)."""
+        """Coordinates in which kernels bound a splat: the ideal pinhole image in samples, or, for a fisheye
+        or a table of rays, the stereographic projection (X, Y) / (|ray| + Z)."""
         x, y, z = np.moveaxis(rays.astype(np.float64), -1, 0)
-        if isinstance(self.lens, Fisheye):
+        if isinstance(self.lens, Fisheye | RayTable):
             below = z + np.sqrt(x * x + y * y + z * z)
             return x / below, y / below
         return self.focal_x * x / z + self.center_x, self.focal_y * y / z + self.center_y
@@ -134,7 +134,7 @@ class RayRaster:
         if self.lens.kind == "equirectangular":
             return self.lens.uniforms
         low_x, low_y, *rest = map(float, self.map[1])
-        if not isinstance(self.lens, Fisheye):
+        if not isinstance(self.lens, Fisheye | RayTable):
             low_y -= self.top  # the chart counts rows as the image does
         return (*self.lens.uniforms, low_x, low_y, *rest, float(self.top))
 

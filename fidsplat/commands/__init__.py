@@ -44,6 +44,7 @@ COMMANDS = CommandTable(
     view="view.View",
     fly="fly.Fly",
     detect="detect.Detect",
+    scan="scan.Scan",
     convert="convert.Convert",
     check="check.Check",
     bench="bench.Bench",

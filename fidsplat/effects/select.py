@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Protocol
 
 from fidsplat.cameras import Orthographic
-from fidsplat.cameras.lenses import Lens
+from fidsplat.cameras.lenses import Lens, camera_effect
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.environment import Gradient, Panorama
 from fidsplat.capture.quality import Quality
@@ -119,7 +119,7 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
     sh_degree = max(cloud.sh_degree, 0)
     return FeatureSet(
         slots=(
-            f"camera_{lens.kind if lens else 'pinhole'}",
+            camera_effect(lens),
             "color_sh" if sh_degree else "color_rgb",
             *((f"ellipsoid_{ellipsoid}",) if ellipsoid else ()),
             *(("ellipsoids_only",) if ewa_only else ()),

@@ -22,6 +22,8 @@ from fidsplat.vision.detect import Detection
 
 OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 """link_from_optical: REP-103's body axes (x forward, y left, z up) from OpenCV's"""
+_POINT_FIELDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+"""datatypes of sensor_msgs/PointField"""
 
 
 class RobotLog:
@@ -194,6 +196,30 @@ class RobotLog:
             unknown if acceleration is None else none,
         )  # fmt: skip
         self._write(topic, time, message)
+
+    def points(self, time: float, lidar: str, cloud: np.ndarray, topic: str | None = None) -> None:
+        """Points of a scan (`Scan.cloud`) as `/LIDAR/points`: PointCloud2 in the frame LIDAR. `time` is the
+        start of the scan; the field `time` of a point is in seconds after it.
+
+        Raises:
+            InputError: not a structured array of numbers.
+        """
+        names = getattr(getattr(cloud, "dtype", None), "names", None)
+        if names is None or cloud.ndim != 1:
+            raise invalid("the points of a scan", "a structured array (n,), as of Scan.cloud()", cloud)
+        made = self._of("sensor_msgs/msg/PointField")
+        little = np.dtype([(name, cloud.dtype[name].newbyteorder("<")) for name in names])
+        fields = []
+        for name in names:
+            code = little[name].str[1:]
+            if code not in _POINT_FIELDS:
+                raise invalid(f"the field {name} of points", f"one of {', '.join(_POINT_FIELDS)}", code)
+            fields.append(made(name, little.fields[name][1], _POINT_FIELDS[code], 1))  # type: ignore[index]
+        data = np.frombuffer(cloud.astype(little).tobytes(), np.uint8)
+        message = self._of("sensor_msgs/msg/PointCloud2")(
+            self._header(time, lidar), 1, len(cloud), fields, False, little.itemsize, data.size, data, True
+        )
+        self._write(f"/{lidar}/points" if topic is None else topic, time, message)
 
     def detections(self, time: float, camera: str, found: Iterable[Detection]) -> None:
         """Detections in an image as `/CAMERA/detections` (apriltag_msgs); the family of a QR code is its

@@ -13,6 +13,7 @@ from fidsplat.cameras import (
     Fisheye,
     Lens,
     Orthographic,
+    RayTable,
     Shutter,
     Trajectory,
     fisheye_focal_length,
@@ -89,6 +90,8 @@ def lens_table(camera: Camera) -> tuple[str, dict[str, float]] | None:
     if isinstance(lens, BrownConrady | Fisheye):
         values = {name: getattr(lens, name) for name in names_of(type(lens))}
         return _NAME[type(lens)], {name: value for name, value in values.items() if value}
+    if isinstance(lens, RayTable):
+        raise InputError("the camera of a file must have a lens with coefficients, got a table of rays")
     return lens.kind, {}
 
 

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from fidsplat.backends.view import View
-from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye
+from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye, RayTable
 from fidsplat.cameras.raster import RayRaster
 from fidsplat.effects import FeatureSet
 from fidsplat.store.merge import MAX_OPACITY
@@ -145,7 +145,7 @@ def _in_pose_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.n
             visible &= inside
         return visible
     lens = view.raster.lens
-    if isinstance(lens, Equirectangular):
+    if isinstance(lens, Equirectangular | RayTable):
         return visible
     step = view.raster.step * margin
     if isinstance(lens, Fisheye):
@@ -274,6 +274,8 @@ def projected_sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
     largest = np.zeros(len(edges))
     for one in (view, *(own for _, own in view.groups)):
         focal = max(one.focal_x, one.focal_y)
+        if isinstance(one.lens, RayTable):
+            focal = 1 / one.lens.divergence  # samples per radian
         if one.parallel:
             largest = np.maximum(largest, edges * focal)
             continue

@@ -16,6 +16,7 @@ from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load
 from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.backends.warp.workspace import ArrayPool, Workspace, nbytes
+from fidsplat.cameras.lenses import camera_effect
 from fidsplat.cameras.raster import RayRaster
 from fidsplat.capture.environment import Gradient, Panorama
 from fidsplat.util.errors import DeviceError, bytes_words
@@ -109,7 +110,7 @@ def lens_of(view: View, workspace: Workspace) -> Any:
     wp, declared, raster = load(), kernels("lens"), view.raster
     if raster is None:
         return _empty(declared.make_lens(None))
-    camera, arrays = f"camera_{raster.lens.kind}", _arrays(raster, workspace)
+    camera, arrays = camera_effect(raster.lens), _arrays(raster, workspace)
     lens = declared.make_lens(camera)()
     lens.rays = arrays["rays"][raster.top * raster.width :]
     if camera in declared.COEFFICIENTS:

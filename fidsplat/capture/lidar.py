@@ -1,0 +1,329 @@
+"""LiDAR model: directions and times of its beams, returns, noise and detection."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field, replace
+from functools import cache, lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from fidsplat.cameras import Camera, RayTable
+from fidsplat.cameras.pinhole import MAX_SIZE
+from fidsplat.util.arguments import array_of, instance, invalid, items, number, own_scalars, whole_number
+from fidsplat.util.errors import InputError, unknown
+
+RETURNS = ("first", "strongest", "last")
+MAX_BEAMS = 2**22
+_GOLDEN = math.pi * (3 - math.sqrt(5))
+
+
+@dataclass(frozen=True)
+class Spinning:
+    """Lasers on a rotor: one turn about the z axis, from azimuth pi (behind) clockwise as seen from above.
+
+    Raises InputError for an angle out of range or numbers of lasers that differ.
+    """
+
+    elevations: tuple[float, ...]
+    """radians above the xy plane, one for each laser (ring)"""
+    columns: int = 1024
+    """firings in a turn"""
+    azimuths: tuple[float, ...] = ()
+    """radians, counterclockwise offset of each laser; empty: 0"""
+
+    def __post_init__(self) -> None:
+        limit = math.radians(88)
+        for name, most in (("elevations", limit), ("azimuths", math.pi)):
+            given = array_of(name, getattr(self, name), "numbers in radians", "fiu").astype(np.float64)
+            if given.ndim != 1 or not (np.abs(given) <= most).all():
+                raise invalid(name, f"numbers up to {most:.4g} rad", getattr(self, name))
+            object.__setattr__(self, name, tuple(given.tolist()))
+        whole_number("columns", self.columns, 1, MAX_SIZE)
+        if not 1 <= len(self.elevations) <= MAX_SIZE:
+            raise invalid("elevations", f"1 to {MAX_SIZE} numbers", self.elevations)
+        if len(self.azimuths) not in (0, len(self.elevations)):
+            raise InputError(
+                f"azimuths must have one number for each of {len(self.elevations)} elevations, got "
+                f"{len(self.azimuths)}"
+            )
+
+    @property
+    def rings(self) -> int:
+        """Number of lasers."""
+        return len(self.elevations)
+
+    @property
+    def beams(self) -> int:
+        """Number of beams in a scan."""
+        return self.columns * self.rings
+
+    def directions(self, start: float, duration: float) -> np.ndarray:
+        """(columns x rings, 3) unit directions in the order of firing; the same for every scan."""
+        turn = math.pi - 2 * math.pi * (np.arange(self.columns) + 0.5) / self.columns
+        azimuth = turn[:, None] + (np.array(self.azimuths) if self.azimuths else 0.0)
+        elevation = np.broadcast_to(self.elevations, (self.columns, self.rings))
+        flat = np.cos(elevation)
+        rays = (flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation))
+        return np.stack(rays, 2).reshape(-1, 3)
+
+    def fractions(self) -> np.ndarray:
+        """(beams,) times of the beams as shares of the scan; lasers of a column fire together."""
+        return np.repeat((np.arange(self.columns) + 0.5) / self.columns, self.rings)
+
+    def ring_of(self) -> np.ndarray:
+        """(beams,) index of the laser of each beam."""
+        return np.tile(np.arange(self.rings), self.columns)
+
+
+@dataclass(frozen=True)
+class Rosette:
+    """One laser behind two thin rotating prisms, about the x axis: the pattern differs from scan to scan.
+
+    Raises InputError for an angle or a rate out of range.
+    """
+
+    half_angle: float
+    """radians between the x axis and the outermost beams"""
+    rates: tuple[float, float]
+    """radians per second of the two prisms"""
+    points: int = 10_000
+    """beams in a scan"""
+
+    def __post_init__(self) -> None:
+        number("half_angle", self.half_angle, "an angle above 0, at most 1.4 rad", 1e-6, 1.4)
+        rates = tuple(number("a rate", rate, "a finite number of rad/s") for rate in self.rates)
+        if len(rates) != 2:
+            raise invalid("rates", "two numbers in rad/s", self.rates)
+        object.__setattr__(self, "rates", rates)
+        whole_number("points", self.points, 1, MAX_BEAMS)
+
+    rings = 1
+
+    @property
+    def beams(self) -> int:
+        """Number of beams in a scan."""
+        return self.points
+
+    def directions(self, start: float, duration: float) -> np.ndarray:
+        """(points, 3) unit directions in the order of firing, of a scan from a time in seconds."""
+        time = start + duration * self.fractions()
+        first, second = (rate * time for rate in self.rates)
+        left = self.half_angle / 2 * (np.cos(first) + np.cos(second))
+        up = self.half_angle / 2 * (np.sin(first) + np.sin(second))
+        away = np.hypot(left, up)
+        aside = np.sinc(away / np.pi)
+        return np.stack([np.cos(away), aside * left, aside * up], 1)
+
+    def fractions(self) -> np.ndarray:
+        """(points,) times of the beams as shares of the scan."""
+        return (np.arange(self.points) + 0.5) / self.points
+
+    def ring_of(self) -> np.ndarray:
+        """(points,) zeros: there is one laser."""
+        return np.zeros(self.points, np.int64)
+
+
+Pattern: TypeAlias = Spinning | Rosette
+
+
+@dataclass(frozen=True, eq=False)
+class Lidar:
+    """LiDAR sensor. Its frame has x forward, y left and z up, as in ROS.
+
+    Raises InputError for a value out of range.
+    """
+
+    pattern: Pattern
+    """directions of the beams"""
+    rate: float = 10.0
+    """scans per second"""
+    near: float = 0.5
+    """metres, minimum range; nearer returns are empty"""
+    far: float = 100.0
+    """metres, maximum range"""
+    divergence: float = 2e-3
+    """radians between the edges of a beam"""
+    rays: int = 1
+    """rays per beam, spread over its cross-section; several returns need several rays"""
+    returns: tuple[str, ...] = ("strongest",)
+    """which returns a beam has: some of first, strongest, last. A return that an earlier one of them has
+    already is empty"""
+    separation: float = 1.0
+    """metres in range below which surfaces in a beam are one return"""
+    opacity: float = 0.5
+    """opacity in front of and including a surface at which a ray ends: 0.5 is the median, less is a first
+    surface"""
+    noise: float = 0.0
+    """metres, standard deviation of ranges"""
+    noise_growth: float = 0.0
+    """standard deviation per metre of range, added to `noise`"""
+    detection_range: float = math.inf
+    """metres at which a surface of 10 % reflectivity, facing the sensor, is detected with a probability of
+    90 %; the signal falls with the square of the range, the cosine of incidence and the reflectivity"""
+    dropouts: float = 0.0
+    """share of returns that are lost at random, 0 to 1"""
+    reflectivity: dict[int, float] = field(default_factory=dict)
+    """label of splats: reflectivity, 0 or more; that of other splats is the luminance of their colour as
+    linear light"""
+    bands: int = 32
+    """poses of a scan while something moves; a beam is up to duration / (2 bands) away from the time of its
+    pose. At most the number of columns"""
+    seed: int = 0
+    """of noise and detection, 0 to 2^32 - 1"""
+    source: str = ""
+    """where the values of a preset come from"""
+
+    def __post_init__(self) -> None:
+        own_scalars(self)
+        instance("pattern", self.pattern, Pattern, "a Spinning or a Rosette")  # type: ignore[arg-type]
+        for name, low, high, requirement in (
+            ("rate", 1e-3, 1e6, "scans per second, above 0"),
+            ("near", 1e-3, 1e9, "metres, above 0"),
+            ("far", self.near, 1e9, "metres, above near"),
+            ("divergence", 1e-9, 0.5, "radians, above 0"),
+            ("separation", 0.0, 1e9, "metres, at least 0"),
+            ("opacity", 1e-3, 0.999, "a share from 0.001 to 0.999"),
+            ("noise", 0.0, 1e9, "metres, at least 0"),
+            ("noise_growth", 0.0, 1.0, "a number from 0 to 1"),
+            ("dropouts", 0.0, 1.0, "a share from 0 to 1"),
+        ):
+            number(f"lidar {name}", getattr(self, name), requirement, low, high)
+        if not self.detection_range > 0:
+            raise invalid("lidar detection_range", "metres, above 0", self.detection_range)
+        whole_number("lidar rays", self.rays, 1, 256)
+        whole_number("lidar bands", self.bands, 1, MAX_SIZE)
+        whole_number("lidar seed", self.seed, 0, 2**32 - 1)
+        if isinstance(self.returns, str):
+            object.__setattr__(self, "returns", (self.returns,))
+        kinds = items("lidar returns", self.returns, str, "some of first, strongest, last")
+        for kind in kinds:
+            if kind not in RETURNS:
+                raise InputError(unknown("return of a lidar", kind, RETURNS))
+        if not kinds or len(set(kinds)) < len(kinds):
+            raise invalid("lidar returns", "one or more different ones", self.returns)
+        object.__setattr__(self, "returns", kinds)
+        for label, value in self.reflectivity.items():
+            number(f"lidar reflectivity of label {label}", value, "a number of at least 0", 0.0, 1e9)
+        if self.pattern.beams * self.rays > MAX_BEAMS or (
+            isinstance(self.pattern, Spinning) and self.pattern.rings * self.rays > MAX_SIZE
+        ):
+            raise InputError(
+                f"lidar rays must be at most {MAX_BEAMS:,} in a scan, got {self.pattern.beams:,} beams of "
+                f"{self.rays}"
+            )
+
+    @staticmethod
+    def preset(name: str, **changes: Any) -> Lidar:
+        """A sensor by its name: vlp-16, os1-64 or livox-mid-40. changes: fields with other values.
+
+        Raises:
+            InputError: an unknown name or field.
+        """
+        known = presets()
+        if not isinstance(name, str) or name.lower() not in known:
+            raise InputError(unknown("lidar", name, known))
+        for change in changes:
+            if change not in Lidar.__dataclass_fields__:
+                raise InputError(unknown("field of a lidar", change, Lidar.__dataclass_fields__))
+        return replace(known[name.lower()], **changes)
+
+    @property
+    def duration(self) -> float:
+        """Seconds of a scan."""
+        return 1 / self.rate
+
+    def rows_per_band(self, moving: bool) -> int:
+        """Rows of the rendered image that share a pose."""
+        height = self.layout(moving).shape[0]
+        return height if not moving else -(-height // self.bands)
+
+    def layout(self, moving: bool, start: float = 0.0) -> np.ndarray:
+        """(h, w) int: index of the ray of each pixel of the rendered image, -1 for none; rows are in the
+        order of firing. Ray k of beam i has the index i x rays + k."""
+        return _layout(self, moving, start if isinstance(self.pattern, Rosette) else 0.0)[0]
+
+    def camera(self, start: float = 0.0, moving: bool = False) -> Camera:
+        """The camera whose pixels are the rays of a scan from a time in seconds, in the lidar's frame."""
+        start = start if isinstance(self.pattern, Rosette) else 0.0
+        _, lens = _layout(self, moving, start)
+        height, width = lens.directions.shape[:2]
+        return Camera(width, height, 1.0, 1.0, 0.0, 0.0, near=min(self.near, 0.05), far=self.far, lens=lens)
+
+    def directions(self, start: float = 0.0) -> np.ndarray:
+        """(beams, 3) unit directions of the beams of a scan from a time in seconds, in the order of firing,
+        as float32 rays round them."""
+        return self.pattern.directions(start, self.duration).astype(np.float32).astype(np.float64)
+
+
+@lru_cache(maxsize=8)
+def _layout(lidar: Lidar, moving: bool, start: float) -> tuple[np.ndarray, RayTable]:
+    """Pixels and rays of a scan: see `Lidar.layout`."""
+    pattern, n = lidar.pattern, lidar.rays
+    beams = pattern.directions(start, lidar.duration)
+    rays = _spread(beams, lidar.divergence, n)
+    if isinstance(pattern, Spinning):
+        order = np.arange(len(rays)).reshape(pattern.columns, pattern.rings * n)
+    else:
+        bands = min(lidar.bands, len(beams)) if moving else 1
+        edges = np.linspace(0, len(beams), bands + 1).astype(int)
+        width = math.ceil(math.sqrt(np.diff(edges).max() * n))
+        rows = -(-np.diff(edges).max() * n // width)
+        order = np.concatenate(
+            [_grid(rays, begin * n, end * n, rows, width) for begin, end in pairwise(edges)]
+        )
+    table = np.where(order[..., None] >= 0, rays[order], np.nan)
+    order.flags.writeable = False
+    return order, RayTable(table, lidar.divergence / math.sqrt(n))
+
+
+def _grid(rays: np.ndarray, begin: int, end: int, rows: int, width: int) -> np.ndarray:
+    """Indices of rays [begin, end) in a grid in which neighbours are neighbours in space: columns by the
+    horizontal direction, rows by the vertical; -1 in the rest of the grid."""
+    grid = np.full((width, rows), -1)
+    across = begin + np.argsort(rays[begin:end, 1], kind="stable")
+    for column in range(width):
+        part = across[column * rows : (column + 1) * rows]
+        grid[column, : len(part)] = part[np.argsort(rays[part, 2], kind="stable")]
+    return grid.T
+
+
+def _spread(beams: np.ndarray, divergence: float, count: int) -> np.ndarray:
+    """(n x count, 3) directions of the rays of beams (n, 3): evenly over a disk (Vogel's spiral), the first
+    in its middle."""
+    if count == 1:
+        return beams
+    k = np.arange(count)
+    away, turn = divergence / 2 * np.sqrt(k / (count - 0.5)), _GOLDEN * k
+    aside = np.eye(3)[np.argmin(np.abs(beams), axis=1)]
+    first = np.cross(beams, aside)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(beams, first)
+    tilt = away * np.cos(turn), away * np.sin(turn)
+    rays = beams[:, None] + tilt[0][:, None] * first[:, None] + tilt[1][:, None] * second[:, None]
+    return (rays / np.linalg.norm(rays, axis=2, keepdims=True)).reshape(-1, 3)
+
+
+@cache
+def presets() -> dict[str, Lidar]:
+    """Sensors of lidars.json by name."""
+    found = json.loads(Path(__file__).with_name("lidars.json").read_text("utf-8"))
+    return {name: _of_preset(values) for name, values in found.items()}
+
+
+def _of_preset(values: dict[str, Any]) -> Lidar:
+    values = dict(values)
+    if "half_angle_deg" in values:
+        rates = [rate * 2 * math.pi / 60 for rate in values.pop("rates_rpm")]
+        half, points = math.radians(values.pop("half_angle_deg")), values.pop("points")
+        pattern: Pattern = Rosette(half, (rates[0], rates[1]), points)
+    else:
+        degrees = values.pop("elevations_deg")
+        if isinstance(degrees, dict):
+            degrees = np.linspace(degrees["from"], degrees["to"], degrees["count"])
+        pattern = Spinning(tuple(np.radians(degrees)), values.pop("columns"))
+    return Lidar(pattern, divergence=values.pop("divergence_mrad") / 1e3, **values)

@@ -1,0 +1,358 @@
+"""Scans of a scene by a LiDAR: ranges, intensities, labels and times of its beams."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fidsplat.cameras import Camera, Motion, Shutter
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.lidar import Lidar, Spinning
+from fidsplat.capture.sensor import Sensor
+from fidsplat.capture.views import pose_matrices
+from fidsplat.formats.points import save_points
+from fidsplat.render.reflection import to_light
+from fidsplat.splats.rotations import check_similarity, pose_matrix
+from fidsplat.util.arguments import instance, invalid, number
+from fidsplat.util.errors import InputError
+
+if TYPE_CHECKING:
+    from fidsplat.render.renderer import Renderer
+    from fidsplat.render.resident import ResidentCloud
+    from fidsplat.scenes import Scene
+    from fidsplat.splats.cloud import SplatCloud
+
+LINK_FROM_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+"""the lidar's axes (x forward, y left, z up) from those of a camera (z forward, y down)"""
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+_REFERENCE = 0.1  # reflectivity of `Lidar.detection_range`
+_DETECTED = math.log(9)  # logit of a probability of 90 %
+_SHARPNESS = 4.0  # logits per factor e of the signal: from 90 % to 10 % by a factor of 3
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A scan: arrays of its beams in the order of firing. r: number of `Lidar.returns`."""
+
+    lidar: Lidar
+    start: float
+    """seconds: start of the scan"""
+    range: np.ndarray
+    """(r, beams) float32 metres; 0 where there is no return"""
+    intensity: np.ndarray
+    """(r, beams) float32: reflectivity times cosine of incidence, times the share of the beam; 0 where there
+    is no return"""
+    label: np.ndarray | None
+    """(r, beams) int32, -1 where there is no return; None if not requested"""
+    time: np.ndarray
+    """(beams,) float64 seconds after the start"""
+    ring: np.ndarray
+    """(beams,) index of the laser"""
+    directions: np.ndarray
+    """(beams, 3) float64 unit directions in the lidar's frame"""
+    poses: np.ndarray
+    """(bands, 4, 4) world_from_lidar of each pose of the scan"""
+    band: np.ndarray
+    """(beams,) index of the pose of each beam"""
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """(r, beams, 3) float64 metres in the lidar's frame at the time of the beam; NaN without a return."""
+        return np.where(self.range > 0, self.range.astype(np.float64), np.nan)[..., None] * self.directions
+
+    @cached_property
+    def world_points(self) -> np.ndarray:
+        """(r, beams, 3) float64 metres in the world; NaN without a return."""
+        poses = self.poses[self.band]
+        return np.einsum("bij,rbj->rbi", poses[:, :3, :3], self.points) + poses[:, :3, 3]
+
+    def image(self, name: str = "range") -> np.ndarray:
+        """range, intensity or label as (r, rings, columns), from left (azimuth pi) to right, for a spinning
+        lidar."""
+        pattern = self.lidar.pattern
+        if not isinstance(pattern, Spinning):
+            raise InputError("the lidar of a range image must be a Spinning, got a Rosette")
+        if name not in ("range", "intensity", "label") or getattr(self, name) is None:
+            raise InputError(
+                f"an image of a scan must be range, intensity or a requested label, got {name!r}"
+            )
+        values = getattr(self, name)
+        return values.reshape(len(values), pattern.columns, pattern.rings).swapaxes(1, 2)
+
+    def cloud(self, frame: str = "lidar") -> np.ndarray:
+        """Points with a return, as a structured array: x, y, z, intensity float32, ring uint16, time float32
+        (seconds after the start), echo uint8 (index of the return), and label int32 if requested.
+
+        frame: "lidar" or "world"; a world far from the origin is rounded to float32.
+        """
+        check_frame(frame)
+        echo, beam = np.nonzero(self.range.T > 0)[::-1]
+        points = (self.points if frame == "lidar" else self.world_points)[echo, beam]
+        columns = {name: points[:, k].astype(np.float32) for k, name in enumerate("xyz")}
+        columns["intensity"] = self.intensity[echo, beam]
+        columns["ring"] = self.ring[beam].astype(np.uint16)
+        columns["time"] = self.time[beam].astype(np.float32)
+        columns["echo"] = echo.astype(np.uint8)
+        if self.label is not None:
+            columns["label"] = self.label[echo, beam]
+        made = np.empty(len(beam), [(name, values.dtype) for name, values in columns.items()])
+        for name, values in columns.items():
+            made[name] = values
+        return made
+
+    def save(self, path: str | os.PathLike[str], frame: str = "lidar") -> None:
+        """Write `cloud` as .pcd, .ply or .npy. Raises InputError for another ending."""
+        save_points(self.cloud(frame), path)
+
+
+def check_frame(frame: str) -> None:
+    """Raise InputError for anything but lidar and world."""
+    if frame not in ("lidar", "world"):
+        raise invalid("frame", "lidar or world", frame)
+
+
+def scan(
+    scene: Scene | SplatCloud | ResidentCloud,
+    lidar: Lidar | str,
+    pose: Any = None,
+    *,
+    renderer: Renderer | None = None,
+    motion: Motion | None = None,
+    start: float | None = None,
+    label: bool = False,
+) -> Scan:
+    """Scan a scene.
+
+    Args:
+        scene: splats and markers, or a cloud uploaded by `renderer`.
+        lidar: a Lidar, or the name of a preset.
+        pose: world_from_lidar, (4, 4) or (position, quaternion w, x, y, z), of a sensor with x forward, y
+            left and z up; None: at the scene's camera.
+        renderer: None: one for the scene's device.
+        motion: `Motion(camera=...)` has the pose lidar_from_world at a time, instead of `pose`; `groups`
+            moves splats. None: the scene's groups move as its motion states.
+        start: seconds, start of the scan; None: the time of the scene's shutter.
+        label: whether the labels of the splats are requested.
+
+    Raises:
+        InputError: no pose, or a pose that is not rigid; as `Renderer.render`.
+    """
+    renderer, resident = _resident(scene, renderer)
+    request = _Request.of(lidar, scene, label, motion, start)
+    capture = request.capture(pose)
+    frame = renderer.render(resident, capture)
+    return request.decoded({name: frame[name] for name in frame.outputs}, capture, 0)
+
+
+def scan_batch(
+    scene: Scene | SplatCloud | ResidentCloud,
+    lidar: Lidar | str,
+    poses: Any,
+    *,
+    renderer: Renderer | None = None,
+    start: float | None = None,
+    label: bool = False,
+) -> list[Scan]:
+    """Scan a scene from many poses in one submission; scan i has the noise of `seed` + i.
+
+    Args:
+        poses: (v, 7) world from lidar: x y z and a quaternion w x y z.
+        scene, lidar, renderer, start, label: as in `scan`; nothing moves during a scan.
+
+    Raises:
+        InputError: as `scan`.
+    """
+    renderer, resident = _resident(scene, renderer)
+    matrices = pose_matrices("poses", poses)
+    request = _Request.of(lidar, scene, label, Motion(), start)
+    batch = renderer.render_batch(resident, request.capture(np.eye(4)), poses=poses)
+    images = {name: batch[name] for name in batch.outputs}
+    return [
+        request.decoded({name: each[view] for name, each in images.items()}, request.capture(pose), view)
+        for view, pose in enumerate(matrices)
+    ]
+
+
+def _resident(scene: Any, renderer: Renderer | None) -> tuple[Renderer, Any]:
+    from fidsplat.render.renderer import Renderer
+    from fidsplat.render.resident import ResidentCloud
+
+    if isinstance(scene, ResidentCloud):
+        if renderer is None:
+            raise InputError("renderer must be the one that uploaded the cloud, got None")
+        return renderer, scene
+    if renderer is None:
+        renderer = Renderer(getattr(scene, "device", None))
+    return renderer, renderer.upload(scene)
+
+
+@dataclass(frozen=True)
+class _Request:
+    """A scan that is requested, except the pose."""
+
+    lidar: Lidar
+    base: Capture
+    """the scene's"""
+    motion: Motion
+    start: float
+    label: bool
+
+    @classmethod
+    def of(cls, lidar: Lidar | str, scene: Any, label: bool, motion: Motion | None, start: Any) -> _Request:
+        lidar = Lidar.preset(lidar) if isinstance(lidar, str) else instance("lidar", lidar, Lidar)
+        base = getattr(scene, "capture", None) or Capture()
+        if motion is None:
+            motion = Motion(None, base.motion.groups)
+        instance("motion", motion, Motion)
+        start = base.shutter.time if start is None else number("start", start, "a finite number of seconds")
+        return cls(lidar, base, motion, start, label or bool(lidar.reflectivity))
+
+    @property
+    def moving(self) -> bool:
+        """Whether something moves during the scan."""
+        return not self.motion.is_still
+
+    def capture(self, pose: Any) -> Capture:
+        """The capture that renders the rays."""
+        lidar = self.lidar
+        camera = lidar.camera(self.start, self.moving)
+        if self.motion.camera is None:
+            camera = camera.with_pose(camera_to_world=_pose_of(pose, self.base.camera))
+        elif pose is not None:
+            raise InputError("pose and motion.camera both move the lidar; leave one out")
+        outputs = ["rgb", "normal", "distance_first"] + ["label"] * self.label
+        return replace(
+            self.base,
+            camera=camera,
+            outputs=tuple(outputs),
+            quality=replace(self.base.quality, samples=1, lowpass="none", first_hit=lidar.opacity),
+            background=(0.0, 0.0, 0.0),
+            motion=self.motion,
+            shutter=Shutter(
+                time=self.start + lidar.duration / 2,
+                readout=lidar.duration if self.moving else 0.0,
+                rows_per_band=lidar.rows_per_band(self.moving),
+            ),
+            sensor=Sensor(),
+            fog=None,
+            external_depth=None,
+        )
+
+    def decoded(self, images: dict[str, np.ndarray], capture: Capture, number_of_scan: int) -> Scan:
+        """The scan of rendered images."""
+        lidar, pattern, camera = self.lidar, self.lidar.pattern, capture.camera
+        assert camera is not None
+        order = lidar.layout(self.moving, self.start)
+        used, shape = order >= 0, (pattern.beams, lidar.rays)
+        table = camera.lens.directions[used]  # type: ignore[union-attr]
+        rays = {"range": images["distance_first"][used].astype(np.float64)}
+        rgb = np.clip(images["rgb"][used], 0, 1)
+        reflectivity = to_light(rgb, "srgb") @ _LUMINANCE
+        if "label" in images:
+            rays["label"] = images["label"][used]
+            for label, value in lidar.reflectivity.items():
+                reflectivity = np.where(rays["label"] == label, value, reflectivity)
+        incidence = np.abs(np.einsum("ni,ni->n", table, images["normal"][used].astype(np.float64)))
+        rays["intensity"] = reflectivity * incidence
+        index = order[used]
+        by_beam = {}
+        for name, values in rays.items():
+            by_beam[name] = np.empty(shape, values.dtype)
+            by_beam[name].reshape(-1)[index] = values
+        found = _returns(by_beam, lidar)
+        _measure(found, lidar, np.random.default_rng((lidar.seed, number_of_scan)))
+        top = np.empty(shape, np.int64)  # row of each ray
+        top.reshape(-1)[index] = np.nonzero(used)[0]
+        bands = capture.shutter.bands(camera.height)
+        return Scan(
+            lidar=lidar,
+            start=self.start,
+            range=found["range"].astype(np.float32),
+            intensity=found["intensity"].astype(np.float32),
+            label=found["label"].astype(np.int32) if self.label else None,
+            time=pattern.fractions() * lidar.duration,
+            ring=pattern.ring_of(),
+            directions=lidar.directions(self.start),
+            poses=np.stack([capture.motion.moved(camera, middle).camera_to_world for _, _, middle in bands]),
+            band=np.searchsorted([end for _, end, _ in bands], top[:, 0], side="right"),
+        )
+
+
+def _pose_of(pose: Any, camera: Camera | None) -> np.ndarray:
+    """world_from_lidar (4, 4); by default at the camera."""
+    if pose is None:
+        if camera is None:
+            raise InputError("pose must be given for a scene without a camera, got None")
+        return camera.camera_to_world @ np.linalg.inv(LINK_FROM_OPTICAL)
+    matrix = pose_matrix(pose, "the pose of a lidar")
+    check_similarity(matrix, "the pose of a lidar", rigid=True)
+    return matrix
+
+
+def _returns(rays: dict[str, np.ndarray], lidar: Lidar) -> dict[str, np.ndarray]:
+    """Returns (r, beams) of the rays of beams, (beams, n): neighbours in range are one return. A return has
+    the mean range of its rays by signal, their sum of intensities over n, and the label of the first."""
+    count = lidar.rays
+    if count == 1:
+        empty = np.zeros((len(lidar.returns) - 1, len(rays["range"])))
+        found = {name: np.concatenate([values.T, empty]) for name, values in rays.items()}
+        if "label" in found:
+            found["label"][1:] = -1
+        return found
+    order = np.argsort(np.where(rays["range"] > 0, rays["range"], np.inf), axis=1, kind="stable")
+    sorted_ = {name: np.take_along_axis(values, order, 1) for name, values in rays.items()}
+    ranges, hit = sorted_["range"], sorted_["range"] > 0
+    starts = np.diff(np.where(hit, ranges, 0.0), axis=1, prepend=-np.inf) > lidar.separation
+    group = np.clip(np.cumsum(starts & hit, axis=1) - 1, 0, count - 1)
+    # dark surfaces return something too, so that a group without signal has a range
+    signal = np.where(hit, (sorted_["intensity"] + 1e-9) / np.where(hit, ranges, 1.0) ** 2, 0.0)
+    beams = np.arange(len(ranges))[:, None]
+
+    def gathered(values: np.ndarray) -> np.ndarray:
+        total = np.zeros(ranges.shape)
+        np.add.at(total, (beams, group), np.where(hit, values, 0.0))
+        return total
+
+    power = gathered(signal)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = np.where(power > 0, gathered(signal * ranges) / power, 0.0)
+    light = gathered(sorted_["intensity"]) / count
+    groups = (power > 0).sum(1)
+    picks = []
+    for kind in lidar.returns:
+        pick = {"first": 0 * groups, "last": groups - 1, "strongest": power.argmax(1)}[kind]
+        repeated = np.logical_or.reduce([pick == earlier for earlier in picks]) if picks else groups < 0
+        picks.append(np.where((groups > 0) & ~repeated, pick, -1))
+    picked = np.stack(picks)
+    known, at = picked >= 0, np.clip(picked, 0, count - 1)
+    rows = np.arange(len(ranges))
+    found = {
+        name: np.where(known, each[rows, at], 0.0) for name, each in (("range", mean), ("intensity", light))
+    }
+    if "label" in sorted_:
+        first = np.argmax(group[None] == at[..., None], axis=2)
+        found["label"] = np.where(known, sorted_["label"][rows, first], -1)
+    return found
+
+
+def _measure(found: dict[str, np.ndarray], lidar: Lidar, random: np.random.Generator) -> None:
+    """Apply detection, drop-outs, noise and the limits of range, in place."""
+    ranges = found["range"]
+    kept = (ranges >= lidar.near) & (ranges <= lidar.far)
+    if math.isfinite(lidar.detection_range):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            signal = found["intensity"] / _REFERENCE * (lidar.detection_range / ranges) ** 2
+            chance = 1 / (1 + np.exp(-_DETECTED - _SHARPNESS * np.log(signal)))
+        kept &= random.random(ranges.shape) < chance
+    if lidar.dropouts:
+        kept &= random.random(ranges.shape) >= lidar.dropouts
+    if lidar.noise or lidar.noise_growth:
+        ranges += random.standard_normal(ranges.shape) * (lidar.noise + lidar.noise_growth * ranges)
+        kept &= ranges > 0
+    for name, values in found.items():
+        values[~kept] = -1 if name == "label" else 0
