@@ -13,10 +13,10 @@ import numpy as np
 from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.lidar import Lidar, Spinning
+from fidsplat.capture.response import to_light
 from fidsplat.capture.sensor import Sensor
 from fidsplat.capture.views import pose_matrices
 from fidsplat.formats.points import save_points
-from fidsplat.render.reflection import to_light
 from fidsplat.splats.rotations import check_similarity, pose_matrix
 from fidsplat.util.arguments import instance, invalid, number
 from fidsplat.util.errors import InputError
