@@ -21,6 +21,7 @@ import fidsplat as fs
 from fidsplat.cameras import BrownConrady
 from fidsplat.capture.sensor import Sensor
 from fidsplat.images.files import encode_image
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.worlds.greenhouse import Greenhouse
 from fidsplat.worlds.plants import disks
 
@@ -64,8 +65,9 @@ def texture(rng: np.random.Generator, count: int) -> fs.SplatCloud:
     return fs.SplatCloud.concatenate(clouds)
 
 
-def take(folder: Path, count: int, size: tuple[int, int], seed: int) -> dict:
-    """Render the photographs; returns and writes the truth."""
+def take(folder: Path, count: int, size: tuple[int, int], seed: int, readout: float = 0.0) -> dict:
+    """Render the photographs; returns and writes the truth. readout: seconds, of a camera that is moved by hand
+    at 0.5 m/s and 0.2 rad/s."""
     house, rng = Greenhouse(rows=1, plants=6, seed=seed), np.random.default_rng(seed)
     # without the roof, whose posts are between the bench and the cameras
     clouds = (*house.scene.clouds[:3], texture(rng, 4000))
@@ -75,12 +77,27 @@ def take(folder: Path, count: int, size: tuple[int, int], seed: int) -> dict:
     for i, camera in enumerate(cameras(count, *size, seed)):
         exposure = float(2 ** rng.normal(0, 0.2))
         sensor = Sensor(exposure=exposure, full_well=8000, read_noise=8, seed=i)
-        frame = renderer.render(scene, fs.Capture(camera, sensor=sensor))
+        capture = fs.Capture(camera, sensor=sensor)
+        if readout:
+            motion = fs.Motion(camera=_by_hand(camera, rng))
+            capture = fs.Capture(camera, sensor=sensor, motion=motion, shutter=fs.Shutter(readout=readout))
+        frame = renderer.render(scene, capture)
         (folder / "photos" / f"{i:03d}.jpg").write_bytes(encode_image(frame["rgb"], "jpeg", 95))
         found[f"{i:03d}.jpg"] = camera.world_to_camera.tolist()
     truth = {"cameras": found, "tags": {tag.marker.spec: tag.pose.tolist() for tag in house.markers}}
     (folder / "truth.json").write_text(json.dumps(truth))
     return truth
+
+
+def _by_hand(camera: fs.Camera, rng: np.random.Generator):
+    """world_to_camera at a time, of a camera that moves to the side and turns."""
+    speed, turn = rng.normal(0, 0.3, 3), rng.normal(0, 0.12, 3)
+
+    def pose(time: float) -> np.ndarray:
+        moved = rigid_matrix(speed * time, (1, *(turn * time / 2)))
+        return moved @ camera.world_to_camera
+
+    return pose
 
 
 def errors(scene: Path, truth: dict) -> dict[str, float]:
@@ -131,8 +148,9 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--up", action="store_true", help="gravity by the first tag")
+    parser.add_argument("--readout", type=float, default=0.0, help="seconds of a rolling shutter")
     options = parser.parse_args()
-    truth = take(options.o, options.count, tuple(options.size), options.seed)
+    truth = take(options.o, options.count, tuple(options.size), options.seed, options.readout)
     scene, begun = options.o / "scene", time.perf_counter()
     command = ["capture", str(options.o / "photos"), "-o", str(scene), "--overwrite", "--json"]
     command += [word for tag in TAGS for word in ("--tag", f"{tag}=0.16")]

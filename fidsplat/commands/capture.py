@@ -47,7 +47,7 @@ class Capture:
         with delayed_progress() as progress:
             made = photographs_to_scene(self.photos, self.out, self.settings, progress, self.overwrite)
         facts = _facts(made)
-        return report(self.json, facts, *_words(made, facts, self.out))
+        return report(self.json, facts, *_words(made, facts, self.out, self.settings.lens))
 
 
 def _facts(made: Captured) -> dict[str, Any]:
@@ -60,6 +60,7 @@ def _facts(made: Captured) -> dict[str, Any]:
         "points": len(made.model.points),
         "reprojection_px": made.model.reprojection,
         "metric": made.metric,
+        "readout_px": made.readout,
     }
     if adjusted is None:
         return facts
@@ -81,7 +82,7 @@ def _facts(made: Captured) -> dict[str, Any]:
     }
 
 
-def _words(made: Captured, facts: dict[str, Any], out: str) -> list[str]:
+def _words(made: Captured, facts: dict[str, Any], out: str, lens: str) -> list[str]:
     lines = [
         f"{facts['registered']} of {facts['photographs']} photographs, {facts['points']:,} points, "
         f"reprojection error {facts['reprojection_px']:.2f} px"
@@ -102,6 +103,13 @@ def _words(made: Captured, facts: dict[str, Any], out: str) -> list[str]:
             lines.append(f"{spec}: {tag['views']} photographs{others}{alone}")
     elif not made.metric:
         lines.append("lengths are not in metres; give --tag SPEC=METRES, or --scale A,B=METRES")
+    if made.readout:
+        lines.append(
+            f"rows are displaced by motion during the readout (rolling shutter), or the lens is not {lens}: "
+            f"{made.readout:.2f} px remain in the errors, and lengths may be wrong by some percent; take "
+            "photographs with the camera held still, or give --lens"
+        )
+    lines += [f"{spec} was not detected" for spec in made.undetected]
     splats = Path(out) / "splats.ply"
     lines.append(f"train it: fidsplat train {out} -o {splats}; then view it: fidsplat view {made.scene}")
     return lines

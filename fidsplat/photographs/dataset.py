@@ -16,10 +16,10 @@ from fidsplat.images.files import encode_image, read_image, write_png
 from fidsplat.images.visualize import resize_to_width
 from fidsplat.markers import marker
 from fidsplat.photographs.mapping import Progress
-from fidsplat.photographs.tags import box_of, module_colors, tag_region
+from fidsplat.photographs.tags import box_of, module_colors
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.scenes.scene import Scene
-from fidsplat.train.dataset import outside_boxes
+from fidsplat.train.boxes import EDGE, front_of, outside_boxes
 from fidsplat.util.files import atomic_write
 from fidsplat.vision.undistort import undistort_masked
 
@@ -60,15 +60,20 @@ def write_images(
         for tag, colors in zip(tags, inks, strict=True):
             if (measured := module_colors(tag, image, small)) is not None:
                 colors.append(measured)
-            inside &= ~tag_region(tag, small)
-        kind = "jpeg" if name.endswith((".jpg", ".jpeg")) else "png"
-        target = folder / "images" / (name if kind == "jpeg" else f"{Path(name).stem}.png")
+            inside &= ~front_of(box_of(tag), small, EDGE)
+        target = folder / "images" / _image_name(name)
+        kind = "png" if target.suffix == ".png" else "jpeg"
         with atomic_write(target) as stream:
             stream.write(encode_image(image, kind, _QUALITY))
         if not inside.all():
             write_png(folder / "masks" / f"{target.name}.png", inside)
         found.append(small)
     return found, [_printed(tag, colors) for tag, colors in zip(tags, inks, strict=True)]
+
+
+def _image_name(name: str) -> str:
+    """Name of the undistorted image of a photograph: JPEG or PNG."""
+    return name if name.endswith((".jpg", ".jpeg")) else f"{Path(name).stem}.png"
 
 
 def scaled(camera: Camera, width: int, height: int) -> Camera:
@@ -104,15 +109,24 @@ def write_model(
     points: np.ndarray,
     colors: np.ndarray,
     tags: Sequence[PlacedMarker],
+    visible: Sequence[Sequence[str]],
 ) -> Path:
     """Write COLMAP's model of the undistorted images, without points in the boxes of tags, dataset.json with
-    these boxes, and scene.toml with the tags; returns the scene file."""
+    these boxes, and scene.toml with the tags; returns the scene file.
+
+    visible: for each tag the names of the photographs in which it was detected.
+    """
     boxes = [box_of(tag) for tag in tags]
     free = outside_boxes(points, boxes)
     with atomic_write(folder / "dataset.json") as stream:
-        stream.write(json.dumps({"boxes": [box.tolist() for box in boxes]}).encode())
-    names = [name if name.endswith((".jpg", ".jpeg")) else f"{Path(name).stem}.png" for name in names]
-    save_colmap(folder / "sparse" / "0", names, cameras, points[free], colors[free])
+        table = [
+            {"matrix": box.tolist(), "visible": [_image_name(name) for name in seen]}
+            for box, seen in zip(boxes, visible, strict=True)
+        ]
+        stream.write(json.dumps({"boxes": table}).encode())
+    save_colmap(
+        folder / "sparse" / "0", [_image_name(name) for name in names], cameras, points[free], colors[free]
+    )
     file = folder / "scene.toml"
     Scene(camera=cameras[0], markers=tuple(tags)).save(file)
     with atomic_write(file) as stream:

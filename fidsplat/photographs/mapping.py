@@ -27,6 +27,8 @@ NEIGHBOURS, STRIDE = 12, 10
 """frames of a long video are matched with the next ones; every STRIDE-th with each other to close loops"""
 AT_ONCE, PAIRS = min(8, os.cpu_count() or 1), 16
 """photographs and pairs between two reports of progress"""
+FEATURE_SIDE, FEATURES = 2000, 4096
+"""pixels: side to which photographs are reduced for features; and largest number of features of each"""
 FEW_FEATURES = 200
 MIN_MATCHES = 15
 """matches that COLMAP's mapper needs of a pair"""
@@ -87,11 +89,20 @@ def extract(
     for group in groups:
         if group[0] not in present:
             pycolmap.import_images(database, photos, pycolmap.CameraMode.SINGLE, list(group), options)
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size, extraction.sift.max_num_features = FEATURE_SIDE, FEATURES
     left = [name for name in names if not present.get(name)]
     for first in range(0, len(left), AT_ONCE):
         progress("features", 1 - (len(left) - first) / len(names))
         some = left[first : first + AT_ONCE]
-        pycolmap.extract_features(database, photos, some, reader_options=options, device=pycolmap.Device.cpu)
+        pycolmap.extract_features(
+            database,
+            photos,
+            some,
+            reader_options=options,
+            extraction_options=extraction,
+            device=pycolmap.Device.cpu,
+        )
 
 
 def match(database: Path, ordered: bool, progress: Progress) -> None:

@@ -24,6 +24,7 @@ from fidsplat.photographs.mapping import (
     unregistered,
 )
 from fidsplat.photographs.photos import camera_groups, copy_frames, copy_photos, source_files
+from fidsplat.photographs.rolling_shutter import MIN_DISPLACEMENT, MIN_SHARE, readout_motion
 from fidsplat.photographs.settings import CaptureSettings
 from fidsplat.photographs.tags import detect_tags, parse_tags
 from fidsplat.scenes.parts import PlacedMarker
@@ -46,10 +47,14 @@ class Captured:
     frame: WorldFrame
     adjustment: Adjustment | None
     tags: tuple[PlacedMarker, ...]
+    undetected: tuple[str, ...]
+    """tags that no photograph has"""
     missing: tuple[tuple[str, str], ...]
     """photographs without a camera, and why"""
     metric: bool
     """whether lengths are in metres"""
+    readout: float
+    """pixels that rows are displaced by motion during the readout; 0 unless a rolling shutter is likely"""
 
 
 def photographs_to_scene(
@@ -113,11 +118,28 @@ def photographs_to_scene(
         frame = world_frame(pinholes, scale, middle=np.median(model.points, axis=0))
     cameras = [frame.camera(camera) for camera in model.cameras]
     small, placed = write_images(folder, photos, model.names, cameras, placed, settings.max_side, report)
-    scene = write_model(folder, model.names, small, frame.points(model.points), model.colors, placed)
+    used = () if adjustment is None else adjustment.used
+    visible = [[model.names[view.image] for view in used if view.tag == tag.marker.spec] for tag in placed]
+    points = frame.points(model.points)
+    scene = write_model(folder, model.names, small, points, model.colors, placed, visible)
     missing = unregistered(database, model.names)
     count = sum(map(len, groups))
     metric = adjustment is not None or picks is not None
-    return Captured(scene, count, model, frame, adjustment, tuple(placed), tuple(missing), metric)
+    share, displaced = readout_motion(model)
+    readout = displaced if share > MIN_SHARE and displaced > MIN_DISPLACEMENT else 0.0
+    undetected = tuple(spec for spec in tags if adjustment is None or spec not in adjustment.poses)
+    return Captured(
+        scene,
+        count,
+        model,
+        frame,
+        adjustment,
+        tuple(placed),
+        undetected,
+        tuple(missing),
+        metric,
+        readout,
+    )
 
 
 def _step(folder: Path, make: Callable[[Path], None]) -> Path:

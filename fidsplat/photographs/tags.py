@@ -19,8 +19,6 @@ from fidsplat.vision.readback import families_of, same_code
 
 THICK = 0.15
 """half the thickness of a tag's box, as a share of its size"""
-_EDGE = 1.0
-"""pixels by which the masked region is larger than the tag"""
 _MIN_MODULE = 3.0
 """pixels: smallest module whose colour is measured"""
 _MIN_CONTRAST = 0.1
@@ -84,25 +82,6 @@ def detect_tags(
                 if np.isfinite(corners).all() and (rays[:, 2] > 0).all():
                     found.append(TagView(spec, number, corners))
     return found
-
-
-def tag_region(placed: PlacedMarker, camera: Camera) -> np.ndarray:
-    """Pixels (h, w) bool that a tag covers with its quiet zone, if it faces the camera."""
-    size = (camera.height, camera.width)
-    if not placed.pose[:3, 2] @ (placed.pose[:3, 3] - camera.position) > 0:
-        return np.zeros(size, bool)
-    h, w = np.array(placed.marker.grid.shape) * placed.marker.module / 2
-    outline = np.array([[-w, -h, 0], [w, -h, 0], [w, h, 0], [-w, h, 0]])
-    corners = camera.project(outline @ placed.pose[:3, :3].T + placed.pose[:3, 3])
-    if not np.isfinite(corners).all():
-        return np.zeros(size, bool)
-    y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
-    inside = np.ones(size, bool)
-    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, 0), strict=True):
-        length = max(float(np.hypot(x1 - x0, y1 - y0)), 1e-9)
-        # clockwise in the image, since y points down
-        inside &= (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) > -_EDGE * length
-    return inside
 
 
 def box_of(tag: PlacedMarker) -> np.ndarray:

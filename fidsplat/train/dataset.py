@@ -37,6 +37,8 @@ class TrainingView:
     """(h, w, 3) uint8 display values"""
     mask: np.ndarray | None = None
     """(h, w) bool, False for ignored pixels"""
+    background: tuple[float, float, float] | None = None
+    """background colour of this view, display values; None: that of the data set"""
 
     def __post_init__(self) -> None:
         text("the name of a training view", self.name)
@@ -156,6 +158,8 @@ class Dataset:
             lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
             found.update(json.dumps([view.name, *lens, camera.near, camera.far]).encode())
             update(camera.world_to_camera, view.image, view.mask)
+            if view.background is not None:
+                found.update(json.dumps(view.background).encode())
         update(self.points, self.colors)
         return found.hexdigest()
 
@@ -172,15 +176,6 @@ class Dataset:
         else:
             points = _points_in_frustums(cameras, draws[:, :3], _RANDOM_DEPTH * self.extent)
         return replace(self, points=points, colors=(shades[:, :3] * 256).astype(np.uint8))
-
-
-def outside_boxes(points: np.ndarray, boxes: Sequence[np.ndarray]) -> np.ndarray:
-    """Which points (n, 3) are outside all boxes, (n,) bool; boxes as in `Dataset`."""
-    outside = np.ones(len(points), bool)
-    for box in boxes:
-        local = np.linalg.solve(box[:3, :3], (points - box[:3, 3]).T)
-        outside &= (np.abs(local) > 1).any(0)
-    return outside
 
 
 def viewed_cube(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, bool]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from fidsplat.formats.colmap_read import has_colmap, load_colmap
 from fidsplat.images.files import read_image, read_on_background
+from fidsplat.train.boxes import MarkerBox, read_boxes, without_markers
 from fidsplat.train.dataset import MAX_POINTS, Dataset, TrainingView
 from fidsplat.train.transforms import DatasetContents, check_other_image, has_transforms, load_transforms
 from fidsplat.train.undistorted_view import undistorted_view
@@ -93,7 +94,9 @@ def _load_colmap(folder: Path, progress: Progress) -> DatasetContents:
     if has_colmap(folder / "test" / "sparse" / "0"):
         test = folder / "test"
         held_out, _, _ = _model(test, test / "sparse" / "0", background, progress, "test images")
-    return DatasetContents(views, held_out, points, colors, background, boxes)
+    views, held_out = without_markers(views, boxes), without_markers(held_out, boxes)
+    matrices = tuple(box.matrix for box in boxes)
+    return DatasetContents(views, held_out, points, colors, background, matrices)
 
 
 def _model(
@@ -117,7 +120,7 @@ def _mask(mask: Path) -> np.ndarray | None:
     return None if file is None else read_image(file).max(axis=2) > 0
 
 
-def _notes(folder: Path) -> tuple[Background, tuple[np.ndarray, ...]]:
+def _notes(folder: Path) -> tuple[Background, tuple[MarkerBox, ...]]:
     """Background and boxes of the folder's notes."""
     for name in NOTES:
         file = folder / name
@@ -132,9 +135,5 @@ def _notes(folder: Path) -> tuple[Background, tuple[np.ndarray, ...]]:
                 raise InputError(
                     f"background of {file} must be one number or three, got another value"
                 ) from None
-            try:
-                boxes = tuple(np.array(notes.get("boxes", ()), float).reshape(-1, 4, 4))
-            except (ValueError, TypeError):
-                raise InputError(f"boxes of {file} must be matrices of 4 x 4 numbers, got others") from None
-            return (red, green, blue), boxes
+            return (red, green, blue), read_boxes(file, notes.get("boxes", ()))
     return (0.0, 0.0, 0.0), ()

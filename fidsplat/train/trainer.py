@@ -25,8 +25,9 @@ from fidsplat.formats.collect import Progress
 from fidsplat.render.renderer import Renderer
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.train import densify, mcmc
+from fidsplat.train.boxes import outside_boxes
 from fidsplat.train.checkpoint import TrainingState, load_checkpoint, save_checkpoint
-from fidsplat.train.dataset import Dataset, TrainingView, outside_boxes
+from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.device_model import DeviceModel
 from fidsplat.train.host_model import HostModel
 from fidsplat.train.losses import Loss
@@ -327,7 +328,8 @@ class Trainer:
         return splats
 
     def _capture(self, view: TrainingView) -> Capture:
-        return Capture(view.camera, quality=self._quality, background=self.dataset.background)
+        background = self.dataset.background if view.background is None else view.background
+        return Capture(view.camera, quality=self._quality, background=background)
 
     def _begin(self, start: SplatCloud | None, restart: bool) -> TrainingState:
         settings = self.settings

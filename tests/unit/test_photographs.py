@@ -15,11 +15,13 @@ from fidsplat.photographs.adjustment import TagView, adjust
 from fidsplat.photographs.frame import camera_up, world_frame
 from fidsplat.photographs.mapping import Model
 from fidsplat.photographs.photos import camera_groups, copy_photos
+from fidsplat.photographs.rolling_shutter import MIN_DISPLACEMENT, MIN_SHARE, readout_motion
 from fidsplat.photographs.settings import CaptureSettings
 from fidsplat.photographs.steps import parse_scale, scale_of
-from fidsplat.photographs.tags import box_of, module_colors, parse_tags, tag_region
+from fidsplat.photographs.tags import box_of, module_colors, parse_tags
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import quaternion_to_matrix, rigid_matrix
+from fidsplat.train.boxes import front_of
 from fidsplat.vision.video_frames import choose_frames, measure_frames
 
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
@@ -132,12 +134,12 @@ def test_the_region_of_a_tag_is_masked_and_its_inks_are_measured():
     tag = PlacedMarker(fs.marker("apriltag:36h11:5", 0.16, black=(0.2, 0.1, 0.1), white=(0.8, 0.9, 0.7)))
     camera = fs.Camera.look_at(121, 91, 0.4, (0.1, 0.05, -0.6), (0, 0, 0))
     frame = fs.Renderer("reference").render(tag.cloud(), fs.Capture(camera, outputs=("rgb", "alpha")))
-    region = tag_region(tag, camera)
+    region = front_of(box_of(tag), camera, 1.0)
     assert region[frame["alpha"] > 0.01].all()
     rim = cv2.dilate((frame["alpha"] > 0.5).astype(np.uint8), np.ones((7, 7))) == 0
     assert not region[rim].any()
     behind = camera.with_pose(position=(0, 0, 0.6), target=(0, 0, 0))
-    assert not tag_region(tag, behind).any()
+    assert not front_of(box_of(tag), behind, 1.0).any()
     dark, light = module_colors(tag, (255 * frame["rgb"]).round().astype(np.uint8), camera)
     np.testing.assert_allclose(dark, (0.2, 0.1, 0.1), atol=0.02)
     np.testing.assert_allclose(light, (0.8, 0.9, 0.7), atol=0.02)
@@ -177,6 +179,28 @@ def test_two_picked_features_give_the_scale():
     for text in ("a.jpg:1:1,b.jpg:2:2", "a.jpg:1:1=2", "a.jpg:1:1,b.jpg:2:2=0", "a:b:c,d:1:2=3"):
         with pytest.raises(InputError, match="--scale must be two pixels"):
             parse_scale(text)
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.01])
+def test_a_rolling_shutter_of_moving_cameras_is_found(speed):
+    """Cameras at the middle of the readout, each with a motion of its own; 0.3 pixels of noise."""
+    rng = np.random.default_rng(0)
+    points, cameras, seen = rng.uniform((-1, -1, -0.5), (1, 1, 0.5), (300, 3)), [], []
+    for _ in range(6):
+        position = rng.uniform((-1, -0.6, -3.2), (1, 0.6, -2.8))
+        cameras.append(fs.Camera.look_at(640, 480, 1.0, position, (0, 0, 0)))
+        pixels, motion = cameras[-1].project(points), rng.normal(0, speed, 3)
+        for _ in range(3):  # a row's time depends on where the point is in the image
+            times = pixels[:, 1] / 480 - 0.5
+            late = (points[:, None] - motion * times[:, None, None]).reshape(-1, 3)
+            pixels = cameras[-1].project(late)
+        seen.append(pixels + rng.normal(0, 0.3, pixels.shape))
+    tracks = tuple(np.arange(300) for _ in cameras)
+    model = Model(tuple("abcdef"), tuple(cameras), points, np.zeros((300, 3), np.uint8), tuple(seen), tracks)
+    share, displaced = readout_motion(model)
+    assert (share > MIN_SHARE and displaced > MIN_DISPLACEMENT) == (speed > 0)
+    if speed:
+        assert displaced == pytest.approx(585 / 3 * 1.3 * speed, rel=0.5)
 
 
 def exif(order, orientation):

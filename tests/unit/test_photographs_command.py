@@ -6,6 +6,7 @@ import pytest
 from command_line import fails, prints_json
 
 import fidsplat as fs
+from fidsplat.images.files import read_image
 from fidsplat.train import load_dataset
 
 pytest.importorskip("pycolmap", reason="pycolmap finds the cameras of photographs; pip install pycolmap")
@@ -114,11 +115,16 @@ def test_training_reads_the_data_set_without_the_tags(captured):
     dataset = load_dataset(out)
     assert len(dataset.views) == 5
     tags = fs.Scene.load(without_splats(out)).markers
+    assert {view.background for view in dataset.views} == {(0, 0, 0), (1, 1, 1)}
     for view in dataset.views:
         for tag in tags:
             x, y = view.camera.project(tag.pose[None, :3, 3])[0].astype(int)
-            assert not view.mask[y, x]
-        assert view.mask.mean() > 0.8
+            # in place of the tag the image has the background's colour
+            np.testing.assert_array_equal(view.image[y, x], np.multiply(view.background, 255))
+            assert view.mask[y, x]
+            # the masks for other trainers exclude it
+            assert not read_image(out / "masks" / f"{view.name}.png")[y, x].any()
+        assert view.mask.mean() > 0.9
     # neither initial points nor trained splats are in the tags
     assert len(dataset.boxes) == 2
     for tag, box in zip(tags, dataset.boxes, strict=True):
@@ -127,7 +133,7 @@ def test_training_reads_the_data_set_without_the_tags(captured):
     file = out / "dataset.json"
     notes = file.read_text()
     file.write_text('{"boxes": [[1, 2]]}')
-    with pytest.raises(fs.InputError, match=r"boxes of .* must be matrices of 4 x 4"):
+    with pytest.raises(fs.InputError, match=r"boxes of .* must be a list of an invertible matrix"):
         load_dataset(out)
     file.write_text(notes)
 

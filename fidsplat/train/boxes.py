@@ -1,0 +1,102 @@
+"""Boxes of markers in a data set: training leaves no splats in them and none in front of them.
+
+Where a marker is visible in a view, its image has the background's colour instead, and views have backgrounds
+of different colours, so that splats there must be transparent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.train.dataset import TrainingView
+from fidsplat.util.errors import InputError
+
+GREYS = (0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0)
+"""backgrounds of views in turn: black and white, without a period of two views"""
+EDGE = 1.5
+"""pixels on both sides of a marker's edge that are ignored"""
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerBox:
+    """A box around a marker."""
+
+    matrix: np.ndarray
+    """(4, 4) from the cube [-1, 1]^3 to the box; the marker is in its plane z = 0 and faces -z"""
+    visible: frozenset[str]
+    """names of the views in which nothing occludes the marker"""
+
+
+def read_boxes(file: Path, given: Any) -> tuple[MarkerBox, ...]:
+    """Boxes of the field `boxes` of a data set's notes: a list of {"matrix": 4 x 4, "visible": names}.
+
+    Raises InputError.
+    """
+    try:
+        boxes = tuple(
+            MarkerBox(np.array(each["matrix"], float).reshape(4, 4), frozenset(map(str, each["visible"])))
+            for each in given
+        )
+        if not all(np.isfinite(box.matrix).all() and abs(np.linalg.det(box.matrix)) > 0 for box in boxes):
+            raise ValueError
+    except (ValueError, TypeError, KeyError):
+        raise InputError(
+            f"boxes of {file} must be a list of an invertible matrix (4 x 4 numbers) and the names of views, "
+            "got others; run the capture again"
+        ) from None
+    return boxes
+
+
+def outside_boxes(points: np.ndarray, matrices: Sequence[np.ndarray]) -> np.ndarray:
+    """Which points (n, 3) are outside all boxes, (n,) bool."""
+    outside = np.ones(len(points), bool)
+    for box in matrices:
+        local = np.linalg.solve(box[:3, :3], (points - box[:3, 3]).T)
+        outside &= (np.abs(local) > 1).any(0)
+    return outside
+
+
+def front_of(box: np.ndarray, camera: Camera, margin: float) -> np.ndarray:
+    """Pixels (h, w) bool of a box's marker, if it faces the camera, and `margin` pixels around it."""
+    size = (camera.height, camera.width)
+    if not box[:3, 2] @ (box[:3, 3] - camera.position) > 0:
+        return np.zeros(size, bool)
+    corners = camera.project(np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ box[:3, :2].T + box[:3, 3])
+    if not np.isfinite(corners).all():
+        return np.zeros(size, bool)
+    y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
+    inside = np.ones(size, bool)
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, 0), strict=True):
+        length = max(float(np.hypot(x1 - x0, y1 - y0)), 1e-9)
+        # clockwise in the image, since y points down
+        inside &= (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) > -margin * length
+    return inside
+
+
+def without_markers(views: Sequence[TrainingView], boxes: Sequence[MarkerBox]) -> list[TrainingView]:
+    """Views whose images have the background's colour in place of visible markers; their edges, and markers
+    that may be occluded, are ignored."""
+    if not boxes:
+        return list(views)
+    found = []
+    for number, view in enumerate(views):
+        grey = GREYS[number % len(GREYS)]
+        image, mask = (
+            view.image.copy(),
+            np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask.copy(),
+        )
+        for box in boxes:
+            mask &= ~front_of(box.matrix, view.camera, EDGE)
+        for box in boxes:
+            if view.name in box.visible:
+                middle = front_of(box.matrix, view.camera, -EDGE)
+                image[middle] = round(255 * grey)
+                mask |= middle
+        found.append(replace(view, image=image, mask=mask, background=(grey,) * 3))
+    return found
