@@ -134,7 +134,8 @@ def marker_truth(placed: PlacedMarker, camera: Camera, label: np.ndarray | None 
 def groups_of(label: np.ndarray) -> dict[int, GroupTruth]:
     """Masks and boxes of the labels of an image, (h, w) int32; -1 is the background."""
     found = {}
-    for value in np.unique(label).tolist():
+    starts = label[:, 1:] != label[:, :-1]  # values of runs are much fewer than those of pixels
+    for value in np.unique(np.concatenate([label[:, 0], label[:, 1:][starts]])).tolist():
         if value < 0:
             continue
         mask = label == value

@@ -45,10 +45,13 @@ def _flat(placed: PlacedMarker, camera: Camera, corners: np.ndarray) -> shapely.
     points = placed.marker.points(corners) @ placed.pose[:3, :3].T + placed.pose[:3, 3]
     if camera.lens is None or isinstance(camera.lens, Orthographic):
         depth = points @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
-        points = _clipped(points, depth - camera.near)
-    share = np.arange(POINTS)[:, None] / POINTS
-    sides = [a + share * (b - a) for a, b in zip(points, np.roll(points, -1, 0), strict=True)]
-    at = camera.project(np.concatenate(sides)) if sides else np.zeros((0, 2))
+        points = points if (depth > camera.near).all() else _clipped(points, depth - camera.near)
+    else:  # sides are curved
+        share = np.arange(POINTS)[:, None] / POINTS
+        points = np.concatenate(
+            [a + share * (b - a) for a, b in zip(points, np.roll(points, -1, 0), strict=True)]
+        )
+    at = camera.project(points)
     at = at[np.isfinite(at).all(1)]
     return shapely.Polygon(at).buffer(0) if _area(at) > 0 else shapely.Polygon()  # as printed, clockwise
 

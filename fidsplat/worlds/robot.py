@@ -13,13 +13,6 @@ from fidsplat.cameras import Camera, Trajectory
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util.errors import InputError
 
-try:
-    import mujoco as _mujoco  # type: ignore[import-not-found]
-except ImportError as error:
-    raise InputError(f"the robot needs MuJoCo ({error}); pip install 'fidsplat[sim]'") from None
-
-mujoco: Any = _mujoco  # without type information
-
 WHEEL, TRACK = 0.08, 0.3
 """metres: radius of a wheel, distance between the wheels"""
 CAMERA_AT = (0.1, 0.0, 0.32)
@@ -102,6 +95,15 @@ def camera_at(camera: Camera, robot: np.ndarray) -> Camera:
     return camera.with_pose(np.linalg.inv(robot @ mount()))
 
 
+def _mujoco() -> Any:
+    """The package, without type information. Raises InputError if it is missing."""
+    try:
+        import mujoco  # here, since only a drive needs it  # type: ignore[import-not-found]
+    except ImportError as error:
+        raise InputError(f"the robot needs MuJoCo ({error}); pip install 'fidsplat[sim]'") from None
+    return mujoco
+
+
 def drive(mjcf: str, path: np.ndarray, speed: float = 0.5, errors: Errors | None = None) -> Run:
     """Drive along a path in a model with `BODY`: straight segments, turns at the corners.
 
@@ -111,8 +113,9 @@ def drive(mjcf: str, path: np.ndarray, speed: float = 0.5, errors: Errors | None
         speed: metres per second.
 
     Raises:
-        InputError: fewer than two corners, or the robot is stuck.
+        InputError: MuJoCo is missing, fewer than two corners, or the robot is stuck.
     """
+    mujoco = _mujoco()
     corners = np.asarray(path, np.float64)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 2:
         raise InputError(f"path must be two or more corners (k, 2), got {corners.shape}")

@@ -4,8 +4,10 @@
 #define JOINED(name, count) name##count
 #define OF(name, count) JOINED(name, count)
 
-// Index space: one work-item per VALUES values. Reads: values (count). Writes: made (count).
-kernel void to_uint8(ulong count, global const float *values, global uchar *made) {
+// Index space: one work-item per VALUES values. Reads: values (first + count), from `first` on. Writes:
+// made (count).
+kernel void to_uint8(ulong count, ulong first, global const float *values, global uchar *made) {
+    values += first;
     ulong at = get_global_id(0) * (ulong)VALUES;
     if (at + VALUES <= count) {
         OF(float, VALUES) v = OF(vload, VALUES)(0, values + at);

@@ -81,6 +81,17 @@ def test_frames_are_read_concurrently(renderer):
         assert np.array_equal(first, to_uint8(frame["rgb"]))
 
 
+def test_frames_of_a_batch_are_converted_on_the_device(renderer):
+    """Their images begin at bytes that no vector of the device is aligned to."""
+    cameras = [fs.Camera.look_at(37, 23, 1.0, (x, 0.0, -0.1), (0.0, 0.0, 3.0)) for x in (-0.4, 0.0, 0.3)]
+    batch = renderer.render_batch(CLOUD, [fs.Capture(camera) for camera in cameras])
+    images = [batch.frame(k).to_uint8() for k in range(3)]
+    assert all(batch._images.read_uint8("rgb", k) is not None for k in range(3))
+    for image, expected in zip(images, batch["rgb"], strict=True):
+        assert np.array_equal(image, to_uint8(expected))
+    assert len({image.tobytes() for image in images}) == 3
+
+
 def test_the_reference_and_cached_frames_convert_on_the_host(reference):
     frame = rendered(reference, 9, 7)
     expected = to_uint8(frame["rgb"])

@@ -3,6 +3,7 @@ the contract."""
 
 import io
 import os
+import runpy
 import subprocess
 import sys
 import time
@@ -24,6 +25,7 @@ from fidsplat.commands.output import delayed_progress
 from fidsplat.images.files import read_image, write_png
 from fidsplat.images.tag_dictionaries import dictionary_bits
 from fidsplat.splats.statistics import describe
+from fidsplat.util.errors import InputError
 
 CAMERA = fs.Camera.pinhole(320, 240, 400, 400, 160, 120)
 
@@ -378,3 +380,10 @@ def test_figures_of_a_cloud_move_with_its_origin():
             np.testing.assert_allclose(moved, np.asarray(value) + away, atol=1e-6, err_msg=name)
         elif isinstance(value, float):
             assert far[name] == pytest.approx(value, rel=1e-6), name
+
+
+def test_experiments_need_mujoco_only_to_drive(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    robot = runpy.run_module("fidsplat.worlds.robot")  # as imported by all experiments
+    with pytest.raises(InputError, match=r"the robot needs MuJoCo .*fidsplat\[sim\]"):
+        robot["drive"]("", [(0.0, 0.0), (1.0, 0.0)])

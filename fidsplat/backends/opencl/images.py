@@ -134,13 +134,10 @@ class OpenCLImages(Images):
             self._workspace.queue.finish()
         return [event for one in self.complete() for event in one.done()]
 
-    def read_uint8(self, name: str, index: int = 0) -> np.ndarray | None:
-        """Copy an image converted to 8 bits; None for a batch. Raises DeviceError if the device has
-        failed."""
-        if self._batch is not None:
-            return None
+    def read_uint8(self, name: str, index: int = 0) -> np.ndarray:
+        """Copy an image converted to 8 bits. Raises DeviceError if the device has failed."""
         with self._workspace.failing(f"rendering {name}"):
-            return read_uint8(self._workspace, self._buffer(name), self._shape(name), self._done())
+            return read_uint8(self._workspace, self._buffer(name), index, self._shape(name), self._done())
 
     def device_array(self, name: str, index: int | None = None) -> Any:
         """The images as a pyopencl.array.Array (views, h, w) or (views, h, w, channels); no copy."""

@@ -18,9 +18,11 @@ _KERNELS: WeakKeyDictionary[Workspace, tuple[cl.Kernel, int]] = WeakKeyDictionar
 
 
 def read_uint8(
-    workspace: Workspace, image: cl.Buffer, shape: tuple[int, ...], after: list[cl.Event]
+    workspace: Workspace, image: cl.Buffer, index: int, shape: tuple[int, ...], after: list[cl.Event]
 ) -> np.ndarray:
-    """An image of floats as an array of uint8 on the host; waits for the device. after: events to wait for.
+    """An image of floats as an array of uint8 on the host; waits for the device.
+
+    index: number of the image in the buffer. after: events to wait for.
 
     Raises:
         DeviceError: no memory, or the compiler refuses.
@@ -31,7 +33,8 @@ def read_uint8(
         kernel, values = _kernel(workspace)
         made = workspace.pool.lease(name, count)
         items = -(-count // (values * _GROUP)) * _GROUP
-        converted = kernel(queue, (items,), (_GROUP,), np.uint64(count), image, made, wait_for=after)
+        numbers = np.uint64(count), np.uint64(index * count)
+        converted = kernel(queue, (items,), (_GROUP,), *numbers, image, made, wait_for=after)
     try:
         cl.enqueue_copy(queue, into, made, wait_for=[converted])
     finally:
