@@ -3,18 +3,18 @@
 import json
 import re
 import time
+from dataclasses import replace
 
 import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.experiments.sweep import TimeLimit, read_records
-from fidsplat.experiments.tradeoff import compare, run
+from fidsplat.experiments.tradeoff import compare, run, scenes
 from fidsplat.experiments.tradeoff.scenes import NAMES, scene_names
 from fidsplat.experiments.tradeoff.summary import load
 from fidsplat.scenes.random_clouds import random_cloud
 
-pytestmark = pytest.mark.usefixtures("optimised")
 WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--settings", "opacity_ceiling")
 
 
@@ -31,6 +31,8 @@ def test_an_interrupted_run_continues(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(run, "_begin", stopped)
     monkeypatch.setattr(run.TradeoffSettings, "workers", 1)
     monkeypatch.setattr(compare, "QUICK_TILTS", "0:40:20")
+    for module in (scenes, compare):  # images of 200 x 200 pixels instead of 800 x 800
+        monkeypatch.setattr(module, "PROTOCOL", replace(scenes.PROTOCOL, pixels=200))
     assert main(words) == 130
     out, err = capsys.readouterr()
     assert out == ""
