@@ -217,7 +217,7 @@ def test_a_batch_of_exposures_counts_all_its_images(renderer, cloud):
         ({"captures": [CAMERA, fs.Capture(CAMERA, "alpha")]}, "same outputs"),
         (
             {"captures": [CAMERA, fs.Capture(CAMERA, sensor=fs.Sensor(gain=2.0))]},
-            "views 0 and 1 differ in gain",
+            "views 0 and 1 that differ in gain",
         ),
         ({"captures": CAMERAS, "poses": POSES[:2]}, "captures has 3, poses has 2"),
         ({"poses": POSES[:, :6]}, r"poses must have the shape \(views, 7\).* \(3, 6\)"),
