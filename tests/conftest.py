@@ -4,8 +4,8 @@ import math
 import random
 
 import pytest
+import sampling
 from rich.progress import Progress
-from sampling import take_turns
 
 import fidsplat as fs
 
@@ -33,6 +33,8 @@ def pytest_configure(config):
         config.option.turn = config.workerinput["turn"]
     elif config.option.turn is None:
         config.option.turn = random.randrange(2)
+    if config.option.markexpr == "not exhaustive":
+        sampling.TURN = config.option.turn
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -47,7 +49,7 @@ def pytest_report_header(config):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    take_turns(items, [info.name for info in USABLE if info.kind == "cpu"], config.option.turn)
+    sampling.take_turns(items, [info.name for info in USABLE if info.kind == "cpu"], config.option.turn)
 
 
 @pytest.fixture(scope="session")

@@ -10,10 +10,12 @@ import pytest
 
 from fidsplat.cameras import Camera
 
-_LENSES = (None, "brown_conrady", "fisheye", "equirectangular", "orthographic")
+LENSES = (None, "brown_conrady", "fisheye", "equirectangular", "orthographic")
 """kinds of lenses, numbered for `in_turn`: neighbours run on different devices"""
 SAMPLES = {"1 sample": 1, "2 x 2 samples": 2}
 """samples along a pixel's side, for `alternate`"""
+TURN: int | None = None
+"""the option `--turn`; None: sweeps are complete"""
 
 
 def sampled(cases: Sequence, count: int, seed: int) -> list:
@@ -55,7 +57,16 @@ def by_lens(call: Any, cameras: Mapping[str, Camera] = MappingProxyType({})) -> 
     """Number of a case by the kind of the lens of its parameter `camera`, or `name`, a key of `cameras`."""
     camera = call.params["camera"] if "camera" in call.params else cameras.get(call.params["name"])
     lens = None if camera is None else camera.lens
-    return _LENSES.index(None if lens is None else lens.kind)
+    return LENSES.index(None if lens is None else lens.kind)
+
+
+def chessboard(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rows and columns of every other pixel of an image (h, w), as the fields of a chessboard of one colour,
+    the other one with the other `TURN`. None, for all pixels, in complete sweeps."""
+    if TURN is None:
+        return None
+    rows, columns = np.indices(size)
+    return np.nonzero((rows + columns + TURN) % 2 == 0)
 
 
 def take_turns(items: Sequence[pytest.Item], devices: Sequence[str], turn: int = 0) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, against_reference, assert_agrees, random_splats, reference_pixels
-from sampling import SAMPLES, alternate, by_lens, in_turn
+from sampling import LENSES, SAMPLES, alternate, by_lens, in_turn
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
@@ -45,6 +45,11 @@ def lens_of(call):
 
 
 each_lens = in_turn(0, lens_of)
+
+
+def through(kind):
+    """Marks a test of one kind of lens, which is on the same device as in the other tests here."""
+    return in_turn(LENSES.index(kind), lambda _: 0)
 
 
 def each_camera(test):
@@ -106,6 +111,7 @@ TO_THE_RIM = fs.Quality(alpha_cutoff=math.exp(-0.5), lowpass="none")
 """opaque disks of one standard deviation, whose rims are visible"""
 
 
+@through("fisheye")
 @pytest.mark.parametrize("name", RIMS)
 def test_rims_that_bulge_behind_a_fisheye(renderer, name):
     mean, *axes = np.array(RIMS[name])
@@ -119,6 +125,7 @@ def test_rims_that_bulge_behind_a_fisheye(renderer, name):
     assert (alpha > 0.6).any()
 
 
+@through("fisheye")
 def test_a_disk_whose_middle_a_fisheye_nearly_touches(renderer):
     """All of it is within its radius of the camera, so that it reaches around it: almost half of all rays
     meet it, and the arcs of its bounding polygon are short nevertheless. Found at random."""
@@ -141,6 +148,7 @@ def test_a_rim_ahead_of_a_disk_that_reaches_behind_the_camera(renderer):
     assert (alpha == 0).any()
 
 
+@through("equirectangular")
 @pytest.mark.parametrize(("seed", "depth", "scale"), [(6, 4.0, (0.1, 3.0)), (18, 1.0, (0.05, 0.5))])
 def test_rims_in_a_panorama(renderer, seed, depth, scale):
     cloud = random_splats(60, seed, depth=(-depth, depth), scale=scale)
@@ -195,6 +203,7 @@ def fs_move(position):
     return matrix
 
 
+@through("fisheye")
 def test_outside_the_lens_is_background(renderer):
     camera = CAMERAS["fisheye 200"]
     frame = renderer.render(
@@ -235,6 +244,7 @@ def test_outside_of_a_lens_there_is_no_distance_and_no_gradient(renderer, name):
     assert all(difference.agrees for difference in against_reference(renderer, image))
 
 
+@through("fisheye")
 def test_a_splat_next_to_the_camera_that_is_viewed_edge_on_leaves_its_dot(renderer):
     """All of its plane lies at z = 0: only the forms' z is not 0."""
     cloud = fs.SplatCloud([[1, 0.1, 0]], [[1, 0, 0, 0]], [[0.1, 0.2]], [0.9], colors=[[1, 0.5, 0.2]])
@@ -243,6 +253,7 @@ def test_a_splat_next_to_the_camera_that_is_viewed_edge_on_leaves_its_dot(render
     assert frame["alpha"].max() > 0.3
 
 
+@through("brown_conrady")
 def test_a_slight_distortion_is_nearly_a_pinhole(renderer):
     cloud = random_splats(200, 1, depth=(0.5, 6.0), scale=(0.02, 0.3))
     plain, bent = seen_through(None), seen_through(BrownConrady(k1=1e-7))
@@ -253,6 +264,7 @@ def test_a_slight_distortion_is_nearly_a_pinhole(renderer):
     assert np.quantile(np.abs(a["depth"] - b["depth"]), 0.999) < 1e-2
 
 
+@through("fisheye")
 def test_depths_of_a_fisheye_are_distances(renderer):
     """A wall at z = 2: the distance grows as 1 / cos; along z with parallel rays it is 2."""
     wall = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[50, 50]], [1.0], colors=[[1, 1, 1]])

@@ -1,6 +1,7 @@
 """`fidsplat experiment` as a user meets it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,10 +13,10 @@ from fidsplat.experiments import angles, localisation, views
 from fidsplat.experiments import run as run_module
 from fidsplat.experiments.blender import check_images, record_images
 from fidsplat.experiments.settings import ExperimentSettings
+from fidsplat.experiments.setup import PROTOCOLS
 from fidsplat.experiments.sweep import read_records
 from fidsplat.images.files import write_png
 
-pytestmark = pytest.mark.usefixtures("optimised")
 SMALL = ["--category", "apriltag", "--markers", "1"]
 
 
@@ -110,6 +111,11 @@ def test_everything_quick_and_its_report(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(localisation, "QUICK_DISTANCES", (1.0,))
     monkeypatch.setattr(localisation, "QUICK_TILTS", (0.0, 40.0))
     monkeypatch.setattr(views, "flip", lambda ours, theirs: abs(ours - theirs).mean())
+    for name, plane in PROTOCOLS.items():  # images of a quarter of the pixels
+        module = plane.module_px and plane.module_px / 2
+        monkeypatch.setitem(PROTOCOLS, name, replace(plane, pixels=plane.pixels // 2, module_px=module))
+    monkeypatch.setattr(localisation, "WIDTH", localisation.WIDTH // 2)
+    monkeypatch.setattr(localisation, "HEIGHT", localisation.HEIGHT // 2)
     words = ("all", "--quick", *SMALL, "--mixture", "fitted", "-o", tmp_path)
     status, out, err = run(capsys, *words, "--device", "opencl")
     assert status == 0, err

@@ -3,10 +3,14 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import sampling
+from agreement import FEW_PIXELS, differences_of, random_splats, reference_images
 from sampling import alternate, by, by_lens, in_turn, sampled, take_turns
 
 import fidsplat as fs
+from fidsplat.selftest.agreement import FrameSpec
 
 DEVICES = ("one", "two", "gpu")
 PINHOLE = fs.Camera.pinhole(8, 8, 8.0, 8.0, 4.0, 4.0)
@@ -84,3 +88,18 @@ def test_a_chessboard_and_a_sample():
     cases = sampled("abcdef", 2, seed=1)
     assert sum(not case.marks for case in cases) == 2
     assert [case.values[0] for case in cases] == list("abcdef")
+
+
+def test_a_wrong_pixel_is_found_in_one_of_two_runs(monkeypatch):
+    """And by complete sweeps."""
+    image = FrameSpec(random_splats(3, 1), fs.Camera.pinhole(50, 40, 40.0, 40.0, 25.0, 20.0))
+    assert FEW_PIXELS < 50 * 40
+    images = {name: np.array(reference_images(image)[name]) for name in image.outputs}
+    agree = []
+    for pixel in (None, (7, 8), (8, 8)):
+        if pixel is not None:
+            images["rgb"][pixel] += 0.5
+        for turn in (0, 1, None):
+            monkeypatch.setattr(sampling, "TURN", turn)
+            agree.append(all(difference.agrees for difference in differences_of(images, image)))
+    assert agree == [True, True, True, True, False, False, False, False, False]
