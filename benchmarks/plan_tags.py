@@ -11,8 +11,9 @@ import numpy as np
 
 import fidsplat as fs
 from fidsplat.experiments.localise import VARIANTS, Drive
-from fidsplat.experiments.plan_tags import PlanSettings, plan_tags
+from fidsplat.experiments.plan_tags import PlanSettings, Survey, plan_tags
 from fidsplat.scenes import PlacedMarker
+from fidsplat.vision.tag_placement import position_error
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=5)
     parser.add_argument("--plants", type=int, default=12)
     parser.add_argument("--counts", type=int, nargs="*", default=[25])
+    parser.add_argument("--objectives", nargs="*", default=["information"])
     parser.add_argument("--walls", action="store_true")
     parser.add_argument(
         "--seeds", type=int, default=1, help="drives with other errors of wheels and gyroscope"
@@ -49,18 +51,17 @@ def main() -> None:
     renderer, run = fs.Renderer(given.device), base.run()
     own = tuple(base.tags.values())
     bare = replace(PlannedDrive(given.rows, given.plants).scene("exact"), camera=base.camera)
+    settings = PlanSettings(
+        poses=min(200, int(3 * run.length)), views=80, walls=given.walls, planar=True, drift=(0.003, 0.1),
+        corner_noise=given.corner_noise,
+    )  # fmt: skip
+    survey = Survey(bare, run.camera, settings, renderer)
     layouts = {f"greenhouse's {len(own)}": own}
     for count in given.counts:
-        settings = PlanSettings(
-            count, poses=min(200, int(3 * run.length)), views=60, walls=given.walls,
-            corner_noise=given.corner_noise,
-        )  # fmt: skip
-        plan = plan_tags(bare, run.camera, settings, renderer)
-        share = plan.selection.value / plan.selection.bound
-        print(
-            f"{plan.candidates} candidates, predicted {100 * plan.errors[-1]:.3f} cm, {share:.2f}", flush=True
-        )
-        layouts[f"planned {len(plan.tags)}"] = plan.tags
+        for objective in given.objectives:
+            wanted = replace(settings, count=count, objective=objective)
+            plan = plan_tags(bare, run.camera, wanted, renderer)
+            layouts[f"{count}, {objective}"] = plan.tags
         some = np.linspace(0, len(own) - 1, count).round().astype(int)
         layouts[f"every {len(own) / count:.2g}th"] = tuple(own[k] for k in some)
     runs = [replace(base, seed=seed).run() for seed in range(given.seeds)]
@@ -70,7 +71,8 @@ def main() -> None:
         found = [drive.localise(one, codes, drive.camera, given.corner_noise)[1] for one in runs]
         keys = ("ate_m", "worst_m", "heading_deg", "tags")
         facts = {key: float(np.mean([one[key] for one in found])) for key in keys}
-        print(json.dumps({"layout": name} | facts), flush=True)
+        predicted = position_error(survey.with_tags(tags))
+        print(json.dumps({"layout": name, "predicted_m": predicted} | facts), flush=True)
 
 
 if __name__ == "__main__":

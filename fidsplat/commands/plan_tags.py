@@ -67,14 +67,15 @@ class PlanTags:
             )
             for tag in facts["tags"]
         ]
-        share = facts["information_nats"] / max(facts["bound_nats"], 1e-9)
         without, with_tags = 100 * facts["error_without_m"], 100 * facts["error_m"]
         lines = [
             f"{len(rows)} of {facts['candidates']} candidates; predicted RMS error of positions "
             f"{without:.3g} cm without them, {with_tags:.3g} cm with them",
-            f"information {facts['information_nats']:.1f} nats, at least {100 * share:.0f} % of the optimum",
-            *map(str, files),
         ]
+        if facts["bound"] is not None:
+            share = 100 * facts["objective"] / max(facts["bound"], 1e-9)
+            lines.append(f"information {facts['objective']:.1f} nats, at least {share:.0f} % of the optimum")
+        lines += map(str, files)
         head = ("tag", "position [m]", "poses", "predicted error [cm]")
         return report(
             self.json, facts | {"files": [str(one) for one in files]}, *lines, table=("", head, rows)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -23,11 +23,15 @@ from fidsplat.scenes.up import scene_up
 from fidsplat.util.errors import InputError
 from fidsplat.vision.fisher_information import CornerNoise, tag_information
 from fidsplat.vision.tag_placement import (
+    Objective,
     Selection,
     Sightings,
+    error_gain,
+    gain,
     greedy,
     local_search,
     odometry_covariance,
+    planar_information,
     position_error,
     updated,
 )
@@ -55,6 +59,9 @@ _DEPTH = 0.02, 0.01
 """metres and share of the distance: a tag is occluded where the depth image is nearer than this"""
 
 
+OBJECTIVES: dict[str, Objective] = {"information": gain, "error": error_gain}
+
+
 @dataclass(frozen=True)
 class PlanSettings:
     """Settings of a plan.
@@ -73,6 +80,11 @@ class PlanSettings:
     """M: place tags, at most N, until the predicted RMS error of positions is below this"""
     walls: bool = False
     """use walls only, no floors and ceilings"""
+    objective: Literal["information", "error"] = "information"
+    """information|error: maximise the information, with a bound, or minimise the predicted error of the
+    positions"""
+    planar: bool = False
+    """the camera moves on a floor: height, roll and pitch do not drift, and err by 3 mm and 0.3 degrees"""
     poses: int = 150
     """N: poses of the trajectory, evenly in time, that are evaluated"""
     views: int = 30
@@ -121,7 +133,8 @@ class Plan:
         ]
         facts: dict[str, Any] = {"tags": rows, "error_without_m": self.errors[0]}
         facts |= {"error_m": self.errors[-1], "candidates": self.candidates, "poses": len(self.path)}
-        return facts | {"information_nats": self.selection.value, "bound_nats": self.selection.bound}
+        value, bound = self.selection.value, self.selection.bound
+        return facts | {"objective": value, "bound": bound if math.isfinite(bound) else None}
 
 
 def plan_tags(
@@ -145,58 +158,33 @@ def plan_tags(
         InputError: a scene without a camera, no flat surface in view of the trajectory, or too many tags
             for the family.
     """
-    report = progress or (lambda step, share: None)
-    camera = _camera(scene)
-    count = settings.poses if len(path) > 1 else 1
-    times = np.linspace(float(path.times[0]), float(path.times[-1]), count)
-    cameras = [camera.with_pose(camera_to_world=path(float(time))) for time in times]
-    depths = []
-    for k, frame in enumerate(_depth_frames(scene, cameras, renderer)):
-        depths.append(frame["depth_first"])
-        report("rendering depth", 0.3 * (k + 1) / len(cameras))
-    tag = marker(f"apriltag:{settings.family}:0", settings.size)
-    every = range(0, len(cameras), max(1, -(-len(cameras) // settings.views)))
-    up, found = scene_up(scene), []
-    for n, k in enumerate(every):
-        seen = surface_candidates(depths[k], _smaller(cameras[k]), tag, up)
-        found += [one for one in seen if not settings.walls or abs(one[0].normal @ up) < STEEP]
-        report("searching surfaces", 0.3 + 0.4 * (n + 1) / len(every))
-    poses = spread_out(found, tag)
-    for one in scene.markers:  # markers are flat, too
-        poses = poses[
-            np.linalg.norm(poses[:, :3, 3] - one.pose[:3, 3], axis=1) > tag.radius + one.marker.radius
-        ]
-    existing = [one for one in scene.markers if one.motion is None and one.marker.kind in TAGS]
-    places = [PlacedMarker(tag, pose) for pose in poses]
-    noise = corner_noise(scene.sensor or Sensor(), settings.corner_noise)
-    all_seen = sightings_of(
-        [*places, *existing], cameras, depths, noise, _exposed(scene, camera, path, times)
-    )
-    report("selecting", 0.8)
-    here = np.array([one.camera_to_world for one in cameras])
-    before = odometry_covariance(here, settings.drift[0], math.radians(settings.drift[1]))
-    for one in all_seen[len(places) :]:
-        before = updated(before, one)
-    visible = [k for k, one in enumerate(all_seen[: len(places)]) if len(one.poses)]
+    survey = Survey(scene, path, settings, renderer, progress)
+    poses = survey.candidate_poses()
+    tag = survey.tag
+    seen = survey.sightings([PlacedMarker(tag, pose) for pose in poses])
+    visible = [k for k, one in enumerate(seen) if len(one.poses)]
     if not visible:
         raise InputError(
             "the trajectory must see a flat surface of the size of a tag at less than 70 degrees, got none; "
             "give smaller tags or another trajectory"
         )
-    seen, poses = [all_seen[k] for k in visible], poses[visible]
-    apart = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2)
-    conflicts = apart < 2.2 * tag.radius
+    seen, poses = [seen[k] for k in visible], poses[visible]
+    conflicts = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2) < 2.2 * tag.radius
     np.fill_diagonal(conflicts, False)
-    target = settings.target or 0.0
-    selection = greedy(before, seen, settings.count, conflicts, lambda now: position_error(now) <= target)
+    covariance, target = survey.covariance, settings.target or 0.0
+    objective = OBJECTIVES[settings.objective]
+    survey.report("selecting", 0.8)
+    selection = greedy(
+        covariance, seen, settings.count, conflicts, lambda now: position_error(now) <= target, objective
+    )
     if settings.target is None:
-        selection = local_search(before, seen, selection, conflicts)
-    errors = [position_error(before)]
+        selection = local_search(covariance, seen, selection, conflicts, objective)
+    errors = [position_error(covariance)]
     for k in selection.chosen:
-        before = updated(before, seen[k])
-        errors.append(position_error(before))
+        covariance = updated(covariance, seen[k])
+        errors.append(position_error(covariance))
     made = _tags(scene, settings, poses[list(selection.chosen)])
-    report("selecting", 1.0)
+    survey.report("selecting", 1.0)
     return Plan(
         replace(scene, markers=(*scene.markers, *made)),
         made,
@@ -204,8 +192,70 @@ def plan_tags(
         tuple(errors),
         selection,
         len(seen),
-        here,
+        survey.path,
     )
+
+
+class Survey:
+    """Depth images along a trajectory, and the covariance of the trajectory with the scene's own tags."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        path: Trajectory,
+        settings: PlanSettings,
+        renderer: Renderer,
+        progress: Progress | None = None,
+    ) -> None:
+        self.report = progress or (lambda step, share: None)
+        self._scene, self._settings, camera = scene, settings, _camera(scene)
+        count = settings.poses if len(path) > 1 else 1
+        times = np.linspace(float(path.times[0]), float(path.times[-1]), count)
+        self.cameras = [camera.with_pose(camera_to_world=path(float(time))) for time in times]
+        self._exposed = _exposed(scene, camera, path, times)
+        self._depths = []
+        for k, frame in enumerate(_depth_frames(scene, self.cameras, renderer)):
+            self._depths.append(frame["depth_first"])
+            self.report("rendering depth", 0.3 * (k + 1) / count)
+        self.tag = marker(f"apriltag:{settings.family}:0", settings.size)
+        self.up = scene_up(scene)
+        self.path = np.array([one.camera_to_world for one in self.cameras])
+        drift = settings.drift[0], math.radians(settings.drift[1])
+        self.covariance = odometry_covariance(self.path, *drift, up=self.up if settings.planar else None)
+        existing = [one for one in scene.markers if one.motion is None and one.marker.kind in TAGS]
+        self.covariance = self.with_tags(existing)
+
+    def candidate_poses(self) -> np.ndarray:
+        """Poses (n, 4, 4) of tags on flat surfaces, apart from the scene's markers."""
+        settings, found = self._settings, []
+        every = range(0, len(self.cameras), max(1, -(-len(self.cameras) // settings.views)))
+        for n, k in enumerate(every):
+            seen = surface_candidates(self._depths[k], _smaller(self.cameras[k]), self.tag, self.up)
+            found += [one for one in seen if not settings.walls or abs(one[0].normal @ self.up) < STEEP]
+            self.report("searching surfaces", 0.3 + 0.4 * (n + 1) / len(every))
+        poses = spread_out(found, self.tag)
+        for one in self._scene.markers:  # markers are flat, too
+            apart = np.linalg.norm(poses[:, :3, 3] - one.pose[:3, 3], axis=1)
+            poses = poses[apart > self.tag.radius + one.marker.radius]
+        return poses
+
+    def sightings(self, tags: Sequence[PlacedMarker]) -> list[Sightings]:
+        """The images of each tag in which it is readable."""
+        noise = corner_noise(self._scene.sensor or Sensor(), self._settings.corner_noise)
+        seen = sightings_of(tags, self.cameras, self._depths, noise, self._exposed)
+        if not self._settings.planar:
+            return seen
+        return [
+            Sightings(poses, planar_information(information, self.path[poses], self.up))
+            for poses, information in seen
+        ]
+
+    def with_tags(self, tags: Sequence[PlacedMarker]) -> np.ndarray:
+        """The covariance (6 p, 6 p) of the trajectory with tags."""
+        covariance = self.covariance
+        for one in self.sightings(tags):
+            covariance = updated(covariance, one)
+        return covariance
 
 
 def corner_noise(sensor: Sensor, floor: float) -> CornerNoise:
@@ -319,8 +369,8 @@ def _unoccluded(camera: Camera, depth: np.ndarray, samples: np.ndarray) -> np.nd
     local = flat - image.position
     along_ray = image.lens is not None and image.lens.along_ray
     away = np.linalg.norm(local, axis=1) if along_ray else local @ image.world_to_camera[2, :3]
-    free = (measured <= 0) | (measured >= away - _DEPTH[0] - _DEPTH[1] * away)
-    return np.asarray(free).reshape(samples.shape[:2]).all(1)
+    hidden = (measured > 0) & (measured < away - _DEPTH[0] - _DEPTH[1] * away)
+    return ~np.any(np.reshape(hidden, samples.shape[:2]), axis=1)
 
 
 def _camera(scene: Scene) -> Camera:

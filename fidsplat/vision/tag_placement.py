@@ -7,9 +7,10 @@ the optimum (Nemhauser et al. 1978).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -17,8 +18,10 @@ from fidsplat.util import interrupts
 
 PASSES = 5
 """largest number of passes of the local search"""
+TILT = 0.005, 0.003
+"""standard deviations of roll and pitch [rad] and of the height [m] of a camera on a floor"""
 _MORE = 1e-9
-"""smallest improvement of the objective"""
+"""smallest relative improvement of the objective"""
 
 
 class Sightings(NamedTuple):
@@ -41,6 +44,10 @@ class Sightings(NamedTuple):
         return vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
 
 
+Objective: TypeAlias = Callable[[np.ndarray, Sightings], float]
+"""increase of an objective by a tag, for the covariance of a trajectory"""
+
+
 @dataclass(frozen=True)
 class Selection:
     """Selected candidates."""
@@ -48,23 +55,28 @@ class Selection:
     chosen: tuple[int, ...]
     """indices, in the order of the selection"""
     value: float
-    """objective in nats"""
+    """objective: nats, or square metres"""
     bound: float
     """upper bound of the objective of any selection of the same number, for candidates without conflicts"""
 
 
 def odometry_covariance(
-    poses: np.ndarray, metres: float, radians: float, start: tuple[float, float] = (0.01, 0.01)
+    poses: np.ndarray,
+    metres: float,
+    radians: float,
+    start: tuple[float, float] = (0.01, 0.01),
+    up: np.ndarray | None = None,
 ) -> np.ndarray:
     """Covariance (6 p, 6 p) of camera-to-world poses (p, 4, 4) from odometry, in the cameras' own axes.
 
     Args:
         metres, radians: standard deviations of each axis after one metre, or one radian of rotation.
         start: those of the first pose.
+        up: (3,) vertical of a floor that the camera moves on, without errors of height, roll and pitch.
     """
     count = len(poses)
     out = np.zeros((6 * count, 6 * count))
-    out[:6, :6] = np.diag(np.repeat(np.square(start), 3))
+    out[:6, :6] = _drift(poses[0], start, up)
     for k in range(1, count):
         step = np.linalg.solve(poses[k - 1], poses[k])
         rotation, shift = step[:3, :3].T, step[:3, 3]
@@ -76,8 +88,37 @@ def odometry_covariance(
         row, before = slice(6 * k, 6 * k + 6), slice(0, 6 * k)
         out[row, before] = moved @ out[6 * k - 6 : 6 * k, before]
         out[before, row] = out[row, before].T
-        added = share * np.repeat(np.square((metres, radians)), 3)
-        out[row, row] = moved @ out[6 * k - 6 : 6 * k, 6 * k - 6 : 6 * k] @ moved.T + np.diag(added)
+        added = share * _drift(poses[k], (metres, radians), up)
+        out[row, row] = moved @ out[6 * k - 6 : 6 * k, 6 * k - 6 : 6 * k] @ moved.T + added
+    return out
+
+
+def planar_information(information: np.ndarray, poses: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Information (k, 6, 6) about cameras on a floor, whose height, roll and pitch have errors of `TILT` that
+    are independent in each image.
+
+    Args:
+        poses: (k, 4, 4) camera-to-world.
+        up: (3,) vertical of the floor.
+    """
+    own = poses[:, :3, :3].transpose(0, 2, 1) @ (up / np.linalg.norm(up))
+    others = np.zeros((len(poses), 6, 4))
+    others[:, :3, 0] = TILT[1] * own
+    others[:, 3:, 1:] = TILT[0] * (np.eye(3) - own[:, :, None] * own[:, None, :])
+    seen = information @ others
+    inner = np.eye(4) + others.transpose(0, 2, 1) @ seen
+    return information - seen @ np.linalg.solve(inner, seen.transpose(0, 2, 1))
+
+
+def _drift(pose: np.ndarray, deviations: Sequence[float], up: np.ndarray | None) -> np.ndarray:
+    """Covariance (6, 6) of an error of translation and rotation in the camera's axes."""
+    out = np.zeros((6, 6))
+    level = turn = np.eye(3)
+    if up is not None:
+        own = pose[:3, :3].T @ (up / np.linalg.norm(up))
+        turn = np.outer(own, own)
+        level = np.eye(3) - turn
+    out[:3, :3], out[3:, 3:] = deviations[0] ** 2 * level, deviations[1] ** 2 * turn
     return out
 
 
@@ -89,6 +130,17 @@ def position_error(covariance: np.ndarray) -> float:
 def gain(covariance: np.ndarray, sightings: Sightings) -> float:
     """Increase of the log determinant of the information by a tag, in nats."""
     return float(np.linalg.slogdet(_spread(covariance, sightings))[1])
+
+
+def error_gain(covariance: np.ndarray, sightings: Sightings) -> float:
+    """Decrease of the mean variance of the positions by a tag, in square metres. It is not submodular."""
+    k = len(sightings.poses)
+    if not k:
+        return 0.0
+    positions = covariance.reshape(-1, 6, covariance.shape[1])[:, :3].reshape(-1, covariance.shape[1])
+    seen = np.einsum("nka,kai->nki", positions[:, sightings.rows].reshape(-1, k, 6), sightings.roots)
+    seen = seen.reshape(-1, 6 * k)
+    return float((seen * np.linalg.solve(_spread(covariance, sightings), seen.T).T).sum() / (len(seen) / 3))
 
 
 def updated(covariance: np.ndarray, sightings: Sightings) -> np.ndarray:
@@ -108,6 +160,7 @@ def greedy(
     count: int,
     conflicts: np.ndarray | None = None,
     enough: Callable[[np.ndarray], bool] = lambda covariance: False,
+    objective: Objective = gain,
 ) -> Selection:
     """Select candidates one by one, each with the largest gain (lazy evaluation, Minoux 1978).
 
@@ -117,18 +170,19 @@ def greedy(
         count: largest number of selected candidates.
         conflicts: (n, n) bool, pairs that exclude each other, such as tags that overlap.
         enough: called with the covariance; the selection ends when it returns True.
+        objective: `gain`, or `error_gain`, which has no bound.
     """
-    limits = np.array([gain(covariance, one) for one in candidates])
-    free = limits > _MORE
+    limits = np.array([objective(covariance, one) for one in candidates])
+    free = limits > 0
     chosen: list[int] = []
     value = 0.0
     while len(chosen) < count and free.any() and not enough(covariance):
         interrupts.check()
-        best, most = -1, _MORE
+        best, most = -1, 0.0
         for k in np.argsort(-np.where(free, limits, -np.inf), kind="stable"):
-            if not free[k] or limits[k] <= most:
+            if not free[k] or (objective is gain and limits[k] <= most):
                 break
-            limits[k] = gain(covariance, candidates[k])
+            limits[k] = objective(covariance, candidates[k])
             if limits[k] > most:
                 best, most = int(k), float(limits[k])
         if best < 0:
@@ -139,8 +193,7 @@ def greedy(
         free[best] = False
         if conflicts is not None:
             free &= ~conflicts[best]
-    more = sorted((gain(covariance, one) for one in candidates), reverse=True)[: len(chosen)]
-    return Selection(tuple(chosen), value, value + sum(more))
+    return Selection(tuple(chosen), value, _bound(covariance, candidates, chosen, value, objective))
 
 
 def local_search(
@@ -148,11 +201,12 @@ def local_search(
     candidates: Sequence[Sightings],
     selection: Selection,
     conflicts: np.ndarray | None = None,
+    objective: Objective = gain,
 ) -> Selection:
     """Exchange one selected candidate at a time for a better one, until no exchange improves the
     objective."""
     chosen, value = list(selection.chosen), selection.value
-    limits = np.array([gain(covariance, one) for one in candidates])
+    limits = np.array([objective(covariance, one) for one in candidates])
     order = np.argsort(-limits, kind="stable")
     for _ in range(PASSES):
         before = value
@@ -162,30 +216,40 @@ def local_search(
             without = covariance
             for k in others:
                 without = updated(without, candidates[k])
-            own = gain(without, candidates[chosen[place]])
-            best, most = chosen[place], own + _MORE
+            own = objective(without, candidates[chosen[place]])
+            best, most = chosen[place], own * (1 + _MORE)
             for k in order:
-                if limits[k] <= most:
+                if objective is gain and limits[k] <= most:
                     break
                 if k in chosen or (conflicts is not None and conflicts[k, others].any()):
                     continue
-                found = gain(without, candidates[k])
+                found = objective(without, candidates[k])
                 if found > most:
                     best, most = int(k), found
             if best != chosen[place]:
                 chosen[place] = best
                 value += most - own
-        if value <= before + _MORE:
+        if value <= before * (1 + _MORE):
             break
-    bound = min(selection.bound, _bound(covariance, candidates, chosen, value))
+    after = covariance
+    for k in chosen:
+        after = updated(after, candidates[k])
+    bound = min(selection.bound, _bound(after, candidates, chosen, value, objective))
     return Selection(tuple(chosen), value, bound)
 
 
-def _bound(covariance: np.ndarray, candidates: Sequence[Sightings], chosen: list[int], value: float) -> float:
-    for k in chosen:
-        covariance = updated(covariance, candidates[k])
-    more = sorted((gain(covariance, one) for one in candidates), reverse=True)[: len(chosen)]
-    return value + sum(more)
+def _bound(
+    covariance: np.ndarray,
+    candidates: Sequence[Sightings],
+    chosen: list[int],
+    value: float,
+    objective: Objective,
+) -> float:
+    """Upper bound of any selection of the same number, from the gains after the selection; infinite for an
+    objective that is not submodular."""
+    if objective is not gain:
+        return math.inf
+    return value + sum(sorted((gain(covariance, one) for one in candidates), reverse=True)[: len(chosen)])
 
 
 def _spread(covariance: np.ndarray, sightings: Sightings) -> np.ndarray:
