@@ -1,9 +1,9 @@
 """The command line: exit statuses, one line for an error, --json alone on stdout, the commands of
 the contract."""
 
+import importlib
 import io
 import os
-import runpy
 import subprocess
 import sys
 import time
@@ -384,6 +384,7 @@ def test_figures_of_a_cloud_move_with_its_origin():
 
 def test_experiments_need_mujoco_only_to_drive(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    robot = runpy.run_module("fidsplat.worlds.robot")  # as imported by all experiments
+    monkeypatch.delitem(sys.modules, "fidsplat.worlds.robot", raising=False)
+    robot = importlib.import_module("fidsplat.worlds.robot")  # as all experiments do
     with pytest.raises(InputError, match=r"the robot needs MuJoCo .*fidsplat\[sim\]"):
-        robot["drive"]("", [(0.0, 0.0), (1.0, 0.0)])
+        robot.drive("", np.array([(0.0, 0.0), (1.0, 0.0)]))

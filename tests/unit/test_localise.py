@@ -105,7 +105,7 @@ def test_the_filter_doubts_its_wheels_by_the_metre():
 
 
 def test_a_robot_that_meets_a_bench_says_so(house):
-    with pytest.raises(fs.InputError, match="is stuck at"):
+    with pytest.raises(fs.InputError, match="got stuck at"):
         drive(house.mjcf(BODY), np.array([[0.9, -0.9], [0.9, 0.9]]), speed=3.0)
     with pytest.raises(fs.InputError, match="two or more corners"):
         drive(house.mjcf(BODY), np.zeros((1, 2)))
