@@ -55,7 +55,7 @@ class Tags(TagSettings):
             records, file = run_sweeps([sweep]), str(sweep.results.file)
         if self.shard is not None:
             return report(self.json, {"files": {"tags": file}}, file)
-        from fidsplat.experiments.tags_report import write_report
+        from fidsplat.experiments.tags_report import compact, write_report
 
         # earlier points of the file are included, e.g. of other detectors
         files, breaks = write_report(
@@ -63,9 +63,6 @@ class Tags(TagSettings):
         )
         facts = {"files": {"tags": file, "report": list(map(str, files))}, "points": len(records)}
         facts["breaks"] = breaks.to_dict("records")
-        return report(
-            self.json,
-            facts,
-            str(files[0]),
-            table=("Half of the views are read at", breaks.columns, breaks.itertuples(index=False)),
-        )
+        rows = compact(breaks)
+        table = ("Half of the views are read at", rows.columns, rows.itertuples(index=False))
+        return report(self.json, facts, str(files[0]), table=table)

@@ -25,7 +25,7 @@ PRECISE = 1.0
 """pixels: largest RMS error of the corners of a precise reading"""
 NEVER = "never"
 """cell of a detector that reads at least half of the views at every severity"""
-_COLUMNS = 6
+_COLUMNS = 4
 """panels next to each other"""
 
 
@@ -94,6 +94,23 @@ def breaks_of(rates: Frame, name: str = "rate") -> Frame:
     return pd.DataFrame(table)
 
 
+def compact(breaks: Frame) -> Frame:
+    """The table of `breaks_of` with a row for each cause and a column for each family."""
+    detectors = list(breaks.columns[3:])
+    names = {
+        family: [name for name in detectors if (rows[name] != NOTHING).any()]
+        for family, rows in breaks.groupby("family", sort=False)
+    }
+    return pd.DataFrame(
+        {"cause": cause, "to": rows["to"].iloc[0]}
+        | {
+            f"{row['family']}: {' / '.join(names[row['family']])}": " / ".join(row[names[row["family"]]])
+            for _, row in rows.iterrows()
+        }
+        for cause, rows in breaks.groupby("cause", sort=False)
+    )
+
+
 def _detectors(rates: Frame) -> list[str]:
     known = [*TITLES, OWN]
     names = dict.fromkeys(rates["detector"])
@@ -141,17 +158,18 @@ def write_report(records: Sequence[Record], folder: Path, out: Path, seed: int) 
     groups = dict.fromkeys(CAUSES[name].group for name in pooled["cause"] if name != NONE)
     for group in groups:
         causes = [name for name in CAUSES if CAUSES[name].group == group and name in set(pooled["cause"])]
-        for first in range(0, len(causes), _COLUMNS):
-            ending = f"-{first // _COLUMNS + 1}" if len(causes) > _COLUMNS else ""
-            file = charts / f"{group}{ending}.png"
-            _curves(pooled, causes[first : first + _COLUMNS], file)
+        count = math.ceil(len(causes) / _COLUMNS)
+        for k in range(count):
+            ending = f"-{k + 1}" if count > 1 else ""
+            file = charts / f"{group.replace(' ', '-')}{ending}.png"
+            _curves(pooled, causes[k * len(causes) // count : (k + 1) * len(causes) // count], file)
             files.append((group, file))
     breaks = breaks_of(pooled)
     detectors = _detectors(pooled)
     context = {
         "figures": [{"title": group, "file": file.name} for group, file in files],
-        "breaks": breaks,
-        "imprecise": breaks_of(pooled, "precise"),
+        "breaks": compact(breaks),
+        "imprecise": compact(breaks_of(pooled, "precise")),
         "precise": PRECISE,
         "errors": _errors(pooled[pooled["cause"] == NONE]),
         "detectors": [f"`{name}`: {TITLES[name]}" for name in detectors if name in TITLES],
