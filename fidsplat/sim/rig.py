@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from fidsplat.capture.environment import ExternalDepth
 from fidsplat.capture.sensor import Sensor
 from fidsplat.render.batch import FrameBatch
 from fidsplat.render.renderer import Renderer
+from fidsplat.render.resident import ResidentCloud
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.sim.poses import IDENTITY, check_poses, compose, inverse, matrix_of, pose_of
 from fidsplat.splats.cloud import SplatCloud
@@ -61,7 +63,8 @@ class Rig:
         scene: splats and markers, with quality, background, fog and sensor. Marker i has the label i + 1.
         bodies: {label: name of the body}.
         cameras: {name: Camera or RigCamera}, or pairs of these.
-        renderer: renders the images; None: one for the default device.
+        renderer: renders the images; None: one for the default device, opened when the first image is
+            rendered, so that a process may make a rig and its forks render it.
         rest: {name of a body: pose (7,)} for bodies whose splats are given in the world, at this pose.
         outputs: names of the output images; default the scene's.
 
@@ -84,11 +87,10 @@ class Rig:
             raise InputError("the scene of a rig must be still, got motion; the simulator moves the bodies")
         if renderer is not None:
             instance("renderer", renderer, Renderer, "an fs.Renderer or None")
-        self.renderer = Renderer() if renderer is None else renderer
+        self._renderer = renderer
         self.cameras = _cameras_of(cameras)
         """RigCamera by name, in the order of the images' axis `camera`"""
-        cloud = self.renderer.lit(self.scene).cloud()
-        self.labels = _bodies_of({} if bodies is None else bodies, cloud)
+        self.labels = _bodies_of({} if bodies is None else bodies, self.scene.cloud())
         """name of the body by label"""
         mounts = (camera.body for camera in self.cameras.values() if camera.body is not None)
         self.bodies = tuple(dict.fromkeys((*self.labels.values(), *mounts)))
@@ -100,9 +102,18 @@ class Rig:
             if name not in self.bodies:
                 raise InputError(unknown("body", name, self.bodies))
             self._rest[name] = inverse(check_poses(f"rest of {name}", pose, ()))
-        self._cloud = self.renderer.upload(cloud)
         self._capture = self.scene.capture.with_(outputs=outputs)
         self._rendered = 0
+
+    @cached_property
+    def renderer(self) -> Renderer:
+        """The renderer of the images."""
+        return Renderer() if self._renderer is None else self._renderer
+
+    @cached_property
+    def _cloud(self) -> ResidentCloud:
+        """The splats on the device."""
+        return self.renderer.upload(self.renderer.lit(self.scene).cloud())
 
     def render(
         self,

@@ -2,6 +2,8 @@
 
 import math
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -264,3 +266,36 @@ def test_gymnasium_needs_to_know_where_bodies_are(rig):
 
     with pytest.raises(fs.InputError, match="must have MuJoCo data"):
         SplatObservation(Blind(), rig)
+
+
+VECTOR = """
+import gymnasium, numpy as np, fidsplat as fs
+from fidsplat.sim import Rig
+from fidsplat.sim.gymnasium import SplatObservation
+
+class Still(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,))
+    action_space = gymnasium.spaces.Box(-1, 1, (1,))
+    def reset(self, seed=None, options=None):
+        return np.zeros(1, np.float32), {}
+
+def make():
+    splat = fs.SplatCloud([[0, 0, 2.0]], [[1, 0, 0, 0]], [[0.4, 0.2]], [0.9], colors=[[1, 0.5, 0]])
+    rig = Rig(splat, cameras={"front": fs.Camera.pinhole(32, 24, 25, 25, 16, 12)})
+    return SplatObservation(Still(), rig, lambda env: ({}, {}))
+
+if __name__ == "__main__":
+    envs = gymnasium.vector.AsyncVectorEnv([make, make])
+    images = envs.reset()[0]["front_rgb"]
+    envs.close()
+    alone = make().reset()[0]["front_rgb"]      # the first renderer of this process
+    assert images.shape == (2, 24, 32, 3) and images.any()
+    assert (images == alone).all()
+"""
+
+
+def test_gymnasium_starts_its_workers_by_fork(tmp_path):
+    script = tmp_path / "vector.py"
+    script.write_text(VECTOR)
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
