@@ -249,16 +249,19 @@ class _Request:
         assert camera is not None
         order = lidar.layout(self.moving, self.start)
         used, shape = order >= 0, (pattern.beams, lidar.rays)
-        table = camera.lens.directions[used]  # type: ignore[union-attr]
         rays = {"range": images["distance_first"][used].astype(np.float64)}
-        rgb = np.clip(images["rgb"][used], 0, 1)
-        reflectivity = to_light(rgb, "srgb") @ _LUMINANCE
         if "label" in images:
             rays["label"] = images["label"][used]
-            for label, value in lidar.reflectivity.items():
-                reflectivity = np.where(rays["label"] == label, value, reflectivity)
-        incidence = np.abs(np.einsum("ni,ni->n", table, images["normal"][used].astype(np.float64)))
-        rays["intensity"] = reflectivity * incidence
+        hit = rays["range"] > 0
+        rows, columns = np.nonzero(used)
+        at = rows[hit], columns[hit]
+        reflectivity = to_light(np.clip(images["rgb"][at], 0, 1), "srgb") @ _LUMINANCE
+        for label, value in lidar.reflectivity.items():
+            reflectivity[rays["label"][hit] == label] = value
+        directions = camera.lens.directions[at]  # type: ignore[union-attr]
+        incidence = np.abs((directions * images["normal"][at]).sum(1))
+        rays["intensity"] = np.zeros(len(hit))
+        rays["intensity"][hit] = reflectivity * incidence
         index = order[used]
         by_beam = {}
         for name, values in rays.items():
@@ -267,7 +270,7 @@ class _Request:
         found = _returns(by_beam, lidar)
         _measure(found, lidar, np.random.default_rng((lidar.seed, number_of_scan)))
         top = np.empty(shape, np.int64)  # row of each ray
-        top.reshape(-1)[index] = np.nonzero(used)[0]
+        top.reshape(-1)[index] = rows
         bands = capture.shutter.bands(camera.height)
         return Scan(
             lidar=lidar,
