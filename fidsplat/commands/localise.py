@@ -64,7 +64,9 @@ class Localise:
             scene = fs.Scene.load(self.scene, progress=progress)
         camera = scene.camera
         if camera is None:
-            raise InputError(f"{self.scene} must have a [camera] table, the camera of the photographs")
+            raise InputError(
+                f"{self.scene} must have a [camera] table, the camera of the photographs, got none; add one"
+            )
         candidates = [] if self.candidates is None else _candidates(self.candidates, camera)
         with console(self.json).status("opening the device"):
             renderer = fs.Renderer(self.device)

@@ -43,7 +43,7 @@ class Placing:
 
     def __post_init__(self) -> None:
         if (self.scene is None) != (self.at_pixel is None):
-            raise InputError("--scene SCENE and --at-pixel X Y must be given together")
+            raise InputError("--scene SCENE and --at-pixel X Y must be given together, got one of them")
         others = (self.up, self.lift, self.radius)
         if self.scene is None and (self.append or any(value is not None for value in others)):
             raise InputError("--up, --lift, --radius and --append need --scene SCENE and --at-pixel X Y")

@@ -92,7 +92,7 @@ def read_description(
         for world in root.findall("world"):
             reader.group(world, "", IDENTITY, place.within("world"), ())
     else:
-        raise place.wrong(f"the root is <{root.tag}>; it must be <sdf> or <robot>")
+        raise place.wrong(f"the root must be <sdf> or <robot>, got <{root.tag}>")
     return found
 
 

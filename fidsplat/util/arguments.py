@@ -129,7 +129,7 @@ def parse_settings(what: str, kind: type, parts: Iterable[str]) -> dict[str, Any
     for part in parts:
         name, equals, value = (piece.strip() for piece in part.partition("="))
         if not equals:
-            raise InputError(f"{what}: {part!r} must be a setting as key=value")
+            raise InputError(f"{what} must be settings as key=value, got {part!r}")
         found[name] = parse_setting(what, kind, name, value)
     return found
 

@@ -131,7 +131,7 @@ def test_a_robot(tmp_path):
         ("0 0 0.25 0 90 0", "0 0 0.25", "must be 6 finite numbers, got '0 0 0.25'"),
         ('<sensor name="depth"', "<sensor", "a <sensor> must have a name"),
         ("<world", "<wrld", "as XML"),
-        ("sdf", "sdff", "the root is <sdff>; it must be <sdf> or <robot>"),
+        ("sdf", "sdff", "the root must be <sdf> or <robot>, got <sdff>"),
     ],
 )
 def test_files_that_cannot_be_used(world, old, new, words):
