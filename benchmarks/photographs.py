@@ -68,7 +68,7 @@ def texture(rng: np.random.Generator, count: int) -> fs.SplatCloud:
 def take(folder: Path, count: int, size: tuple[int, int], seed: int, readout: float = 0.0) -> dict:
     """Render the photographs; returns and writes the truth.
 
-    readout: seconds, of a camera that is moved by hand
+    readout: seconds, of a camera that is moved by hand.
     """
     house, rng = Greenhouse(rows=1, plants=6, seed=seed), np.random.default_rng(seed)
     # without the roof, whose posts are between the bench and the cameras

@@ -20,7 +20,7 @@ from fidsplat.util.errors import InputError
 GREYS = (0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0)
 """backgrounds of views in turn: black and white, without a period of two views"""
 EDGE = 1.5
-"""pixels on both sides of a marker's edge that are ignored"""
+"""pixels: width of the marker's rim that stays in the image, so that no gap remains around the marker"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +80,8 @@ def front_of(box: np.ndarray, camera: Camera, margin: float) -> np.ndarray:
 
 
 def without_markers(views: Sequence[TrainingView], boxes: Sequence[MarkerBox]) -> list[TrainingView]:
-    """Views whose images have the background's colour in place of visible markers; their edges, and markers
-    that may be occluded, are ignored."""
+    """Views whose images have the background's colour in place of visible markers; markers that may be
+    occluded are ignored."""
     if not boxes:
         return list(views)
     found = []
@@ -92,11 +92,11 @@ def without_markers(views: Sequence[TrainingView], boxes: Sequence[MarkerBox]) -
             np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask.copy(),
         )
         for box in boxes:
-            mask &= ~front_of(box.matrix, view.camera, EDGE)
-        for box in boxes:
+            region = front_of(box.matrix, view.camera, EDGE)
             if view.name in box.visible:
-                middle = front_of(box.matrix, view.camera, -EDGE)
-                image[middle] = round(255 * grey)
-                mask |= middle
+                image[front_of(box.matrix, view.camera, -EDGE)] = round(255 * grey)
+                mask |= region
+            else:
+                mask &= ~region
         found.append(replace(view, image=image, mask=mask, background=(grey,) * 3))
     return found
