@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from textwrap import indent
 from typing import TYPE_CHECKING, Annotated
@@ -23,6 +24,8 @@ from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.files import path_of, writable_folder
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from fidsplat.accuracy.choice import Choice
     from fidsplat.capture.quality import Quality
     from fidsplat.render.frame import Frame
@@ -54,6 +57,9 @@ class Render(RenderInput):
     Lenses, shutters and motion, fog, backgrounds and sensors are tables of a scene file
     (docs/scene-files.md) and can be combined.
 
+    --depth-camera writes the depth that a device measures at the camera's position, with its own field of
+    view, errors and holes, as NAME.npy, NAME.png and NAME-turbo.png.
+
     Examples:
       fidsplat render scene.toml
       fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,samples=2
@@ -73,6 +79,10 @@ class Render(RenderInput):
     """T: use the most accurate quality that takes at most T milliseconds per frame"""
     every: int | None = None
     """N: render every Nth pixel in both directions as a smaller image (device reference only)"""
+    depth_camera: Annotated[
+        str | None,
+        option("NAME", "also write what a depth camera measures there: d435, azure-kinect or kinect-v1"),
+    ] = None
     pose: StartPose = field(default_factory=StartPose)
     size: Size = None
     json: Json = False
@@ -99,8 +109,12 @@ class Render(RenderInput):
         frame = self._render(renderer, scene, self.quality if choice is None else choice.quality)
         images = {name: frame[name] for name in frame.outputs}
         seconds = time.perf_counter() - begun
+        measured = {} if self.depth_camera is None else {self.depth_camera: self._measured(renderer, scene)}
         bits = None if scene.sensor is None else scene.sensor.bits
         files = [str(file) for name in images for file in save_output(name, images[name], name_of, bits)]
+        for name, depth in measured.items():
+            own = partial(_named, name_of, name)
+            files += [str(file) for file in save_output("depth", depth, own)]
         height, width = images[frame.outputs[0]].shape[:2]
         facts = {
             "source": self.source,
@@ -120,6 +134,16 @@ class Render(RenderInput):
         lines = [*(() if choice is None else (f"chosen: {choice.summary}",)), *files]
         title = f"{self.source} on {renderer.device.title}"
         return report(self.json, facts, *lines, table=(title, ("", ""), rows))
+
+    def _measured(self, renderer: Renderer, scene: Scene) -> np.ndarray:
+        """Depth image of the depth camera at the scene's camera."""
+        from fidsplat.sim.depth_cameras import depth_camera
+
+        assert scene.camera is not None
+        assert self.depth_camera is not None
+        camera = scene.capture.motion.moved(scene.camera, scene.capture.shutter.time)
+        device, pinhole = depth_camera(self.depth_camera, world_to_camera=camera.world_to_camera)
+        return device.measure(renderer, scene, pinhole)
 
     def _choose_quality(self, scene: Scene, renderer: Renderer) -> Choice:
         """The quality within --max-error and --max-ms."""
@@ -169,6 +193,10 @@ def _option_names() -> Iterator[None]:
     except InputError as error:
         text = re.sub(r"^(error|ms) must", r"--max-\1 must", str(error))
         raise InputError(re.sub(r"try (error|ms)=", r"try --max-\1 ", text)) from error
+
+
+def _named(name_of: Callable[[str, str], Path], name: str, _: str, suffix: str) -> Path:
+    return name_of(name, suffix)
 
 
 def _file_names(out: str | None, source: Path) -> Callable[[str, str], Path]:

@@ -1,0 +1,100 @@
+"""Measure the errors of the depth cameras on a wall, by distance, incidence and reflectance.
+
+python benchmarks/depth_cameras.py [NAME ...] [--device opencl] [--json FILE]
+
+The error is the root mean square distance along z to the plane that fits best, over the middle 120 x 120
+pixels; the bias is that of the mean. `published` has the curve that the parameters follow.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from measuring import facts, keep, options, show
+
+import fidsplat as fs
+from fidsplat.capture.response import to_colors
+from fidsplat.sim.depth_cameras import PRESETS, depth_camera
+
+DISTANCES = (0.5, 0.8, 1.0, 1.5, 2.0, 3.0, 3.8)
+TILTS = (30, 50, 60, 70, 80)
+GREYS = (0.3, 0.1, 0.03)
+MIDDLE = 60
+"""half edge of the measured square in pixels"""
+PUBLISHED: dict[str, Callable[[float], float]] = {
+    # 0.08 pixels of disparity (Grunnet-Jepsen, Sweetser, Woodfill)
+    "d435": lambda z: z * z * 0.08 / (424 * 0.05),
+    # Toelgyessy et al. 2021: 0.61 mm at 0.8 m, 0.89 mm at 1.5 m, 1.78 mm at 3 m
+    "azure-kinect": lambda z: float(
+        np.interp(z, (0.8, 1.5, 3.0), (0.61e-3, 0.89e-3, 1.78e-3), np.nan, np.nan)
+    ),
+    # Khoshelham and Elberink 2012
+    "kinect-v1": lambda z: 1.425e-3 * z * z,
+}
+
+
+def wall(z: float, grey: float = 0.9, tilt: float = 0.0) -> fs.Scene:
+    """A wall at a distance, rotated about the vertical by degrees."""
+    turn = [math.cos(math.radians(tilt) / 2), 0, math.sin(math.radians(tilt) / 2), 0]
+    color = to_colors(np.full((1, 3), grey), "srgb")
+    return fs.Scene([fs.SplatCloud([[0, 0, z]], [turn], [[8.0, 8.0]], [1.0], colors=color).with_boxes()])
+
+
+def errors(depth: np.ndarray, z: float) -> tuple[float, float, float]:
+    """Share of measured pixels, root mean square distance from the best plane, and bias, in metres."""
+    h, w = depth.shape
+    y, x = np.mgrid[h // 2 - MIDDLE : h // 2 + MIDDLE, w // 2 - MIDDLE : w // 2 + MIDDLE]
+    found = depth[y, x].astype(np.float64)
+    valid = found > 0
+    if valid.sum() < 100:
+        return float(valid.mean()), math.nan, math.nan
+    known = np.column_stack([x[valid], y[valid], np.ones(valid.sum())])
+    inverse = known @ np.linalg.lstsq(known, 1 / found[valid], rcond=None)[0]
+    rms = np.sqrt(np.mean((found[valid] - 1 / inverse) ** 2))
+    return float(valid.mean()), float(rms), float(found[valid].mean() - z)
+
+
+def main() -> None:
+    parser = options(__doc__, repeats=1)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"default all of {', '.join(PRESETS)}")
+    arguments = parser.parse_args()
+    renderer = fs.Renderer(arguments.device)
+    cases = [{"z": z} for z in DISTANCES]
+    cases += [{"z": 1.5, "tilt": tilt} for tilt in TILTS] + [{"z": 1.5, "grey": grey} for grey in GREYS]
+    rows = []
+    for name in arguments.names or PRESETS:
+        device, camera = depth_camera(name)
+        for case in cases:
+            share, rms, bias = errors(device.measure(renderer, wall(**case), camera), case["z"])
+            plain = set(case) == {"z"}
+            row = {"camera": name, "case": " ".join(f"{key} {value:g}" for key, value in case.items())}
+            row |= {"measured": share, "rms_mm": rms * 1e3, "bias_mm": bias * 1e3 if plain else math.nan}
+            row["published_mm"] = PUBLISHED[name](case["z"]) * 1e3 if plain else math.nan
+            rows.append(facts(renderer) | row)
+    if keep(rows, arguments.json):
+        return
+
+    def text(value: float, digits: int) -> str:
+        return "" if math.isnan(value) else f"{value:.{digits}f}"
+
+    show(
+        "{device}, {date}: a wall of reflectance 0.9 unless stated".format(**rows[0]),
+        ("camera", "case", "measured", "rms [mm]", "published [mm]", "bias [mm]"),
+        (
+            (
+                row["camera"],
+                row["case"],
+                f"{row['measured']:.2f}",
+                text(row["rms_mm"], 2),
+                text(row["published_mm"], 2),
+                text(row["bias_mm"], 2),
+            )
+            for row in rows
+        ),
+    )
+
+
+if __name__ == "__main__":
+    main()
