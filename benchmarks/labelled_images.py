@@ -3,9 +3,9 @@
 python benchmarks/labelled_images.py                                     two cores, a minute
 python benchmarks/labelled_images.py --device opencl:nvidia --batch 64 --batches 8 --json figures.json
 
-The rows add up: rendering (rgb and label stay on the device), transfer (rgb as 8 bits, label as 32 bits),
-true corners and poses of the markers in the image, and COCO annotations with run-length masks. The last two
-run in threads next to the renderer. Writing PNG files is measured alone.
+The rows add up: rendering (rgb and label stay on the device), true corners and poses of all markers in
+NumPy, transfer (rgb as 8 bits, label as 32 bits), and COCO annotations with run-length masks in threads.
+Writing PNG files is measured alone.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from fidsplat.images.files import write_png
 from fidsplat.util.files import atomic_write
 from fidsplat.util.provenance import run_facts
 from fidsplat.vision.coco import CocoAnnotations
-from fidsplat.vision.truth import marker_truth, truth_of
+from fidsplat.vision.truth import truth_of
 from fidsplat.worlds.greenhouse import Greenhouse
 
 FOV = math.radians(70)
@@ -77,16 +77,17 @@ def measure(renderer: fs.Renderer, name: str, batch: int, repeats: int, width: i
     def render() -> fs.FrameBatch:
         return renderer.render_batch(resident, captures).wait()
 
-    def transfer() -> list[tuple[np.ndarray, np.ndarray]]:
+    poses = np.stack([placed.pose for placed in scene.markers])
+    points = np.concatenate([placed.corners for placed in scene.markers])
+
+    def labelled() -> tuple[fs.FrameBatch, list[tuple[np.ndarray, np.ndarray]]]:
         frames = render()
+        return frames, [(camera.world_to_camera @ poses, camera.project(points)) for camera in cameras]
+
+    def transfer() -> list[tuple[np.ndarray, np.ndarray]]:
+        frames, _ = labelled()
         label = frames["label"]
         return [(frames.frame(k).to_uint8(), label[k]) for k in range(batch)]
-
-    def corners() -> None:
-        work = [pool.submit(lambda c: [marker_truth(m, c) for m in scene.markers], c) for c in cameras]
-        transfer()
-        for one in work:
-            one.result()
 
     def annotate() -> CocoAnnotations:
         images = transfer()
@@ -99,7 +100,7 @@ def measure(renderer: fs.Renderer, name: str, batch: int, repeats: int, width: i
             coco.add(f"{k:06d}.png", truth)
         return coco
 
-    steps = {"rendering": render, "and transfer": transfer, "and corners": corners, "and COCO": annotate}
+    steps = {"rendering": render, "and corners": labelled, "and transfer": transfer, "and COCO": annotate}
     found = {step: seconds_of(work, repeats) / batch for step, work in steps.items()}
     image = transfer()[0][0]
     with tempfile.TemporaryDirectory() as folder:

@@ -120,8 +120,10 @@ def _of_group(group: GroupTruth) -> dict[str, Any]:
 
 def run_lengths(mask: np.ndarray) -> list[int]:
     """Encode a mask (h, w) bool as COCO's uncompressed run lengths: column by column, False first."""
-    flat = np.concatenate([[False], mask.ravel(order="F"), [False]])
-    edges = np.flatnonzero(flat[1:] != flat[:-1])
+    columns = np.flatnonzero(mask.any(0))
+    first, end = (columns[0], columns[-1] + 1) if len(columns) else (0, 0)
+    flat = np.concatenate([[False], mask[:, first:end].ravel(order="F"), [False]])
+    edges = np.flatnonzero(flat[1:] != flat[:-1]) + first * mask.shape[0]
     lengths = np.diff(np.concatenate([[0], edges])).tolist()
     rest = mask.size - int(edges[-1]) if len(edges) else mask.size
     return [*lengths, rest] if rest else lengths
