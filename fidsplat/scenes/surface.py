@@ -20,7 +20,7 @@ LIFT = 1e-3
 """metres in front of a surface that is smooth"""
 LEVEL = 0.17
 """smallest sine of the angle between the normal and the direction of a marker's upper edge"""
-_TRIPLES = 256
+_TRIPLES = 128
 _TUKEY = 4.685
 
 
@@ -102,7 +102,9 @@ def fit_surface(points: np.ndarray, origin: np.ndarray, ray: np.ndarray, radius:
         weights = np.clip(1 - (residuals / min(_TUKEY * scale, tolerance)) ** 2, 0, None) ** 2
         middle = weights @ local / weights.sum()
         moment = (local - middle).T @ ((local - middle) * weights[:, None])
-        normal = np.linalg.eigh(moment)[1][:, 0]
+        before, normal = normal, np.linalg.eigh(moment)[1][:, 0]
+        if 1 - abs(before @ normal) < 1e-15:
+            break
     residuals = (local - middle) @ normal
     inside = np.abs(residuals) <= tolerance
     share = float(inside.sum() / len(points))

@@ -30,7 +30,7 @@ def foreign(made: TriangleMesh) -> trimesh.Trimesh:
 
 @pytest.fixture(scope="module")
 def ball():
-    """A sphere with a red half, of 24 views of 128 x 128 pixels."""
+    """A sphere with a red half, of 24 views of 112 x 112 pixels."""
     cloud = sphere(AT, RADIUS, 1500)
     red = np.where((cloud.means + cloud.origin)[:, :1] > AT[0], [0.9, 0.1, 0.1], [0.2, 0.2, 0.2])
     cloud = fs.SplatCloud(
@@ -38,7 +38,7 @@ def ball():
     )
     with pytest.MonkeyPatch.context() as small:
         small.setattr(mesh, "VIEWS", 24)
-        small.setattr(mesh, "SIDE", 128)
+        small.setattr(mesh, "SIDE", 112)
         return scene_mesh(fs.Scene([cloud]), voxel=VOXEL, renderer=fs.Renderer("opencl"))
 
 
@@ -149,9 +149,10 @@ def test_convex_parts_collide_in_mujoco(tmp_path):
 
 
 def test_the_command_writes_a_mesh(tmp_path, capsys):
-    fs.save_ply(plane((0.0, 0.0, 2.0), (0.0, 0.0, -1.0), 0.5), tmp_path / "wall.ply")
+    view = fs.Camera.look_at(96, 72, 1.0, (0, 0, 0), (0, 0, 1))
+    fs.Scene([plane((0.0, 0.0, 2.0), (0.0, 0.0, -1.0), 0.5)], camera=view).save(tmp_path / "wall.toml")
     (tmp_path / "path.tum").write_text("0 0 0 0 0 0 0 1\n1 0.2 0 0 0 0 0 1\n")
-    words = ["convert", tmp_path / "wall.ply", tmp_path / "wall.stl", "--mesh", "--voxel", "0.05"]
+    words = ["convert", tmp_path / "wall.toml", tmp_path / "wall.stl", "--mesh", "--voxel", "0.05"]
     facts = prints_json(capsys, *words, "--cameras", tmp_path / "path.tum")
     assert facts["files"] == [str(tmp_path / "wall.stl")]
     again = trimesh.load(tmp_path / "wall.stl")

@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 
 import fidsplat as fs
 from fidsplat.cameras.lenses import BrownConrady, Fisheye
+from fidsplat.experiments import plan_tags as plans
 from fidsplat.experiments.plan_tags import PlanSettings, plan_tags, sightings_of
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import rigid_matrix
@@ -257,6 +258,12 @@ def test_tags_are_seen_where_they_are_readable():
     np.testing.assert_allclose(found[0].information, tag_information(view, placed.corners[None], NOISE))
 
 
+@pytest.fixture
+def few_candidates(monkeypatch):
+    monkeypatch.setattr(plans, "STEPS", 6)
+    monkeypatch.setattr(plans, "ROWS", 4)
+
+
 @pytest.fixture(scope="module")
 def hall(tmp_path_factory):
     """A wall along a path of 4 m; the camera looks at it obliquely."""
@@ -271,7 +278,7 @@ def hall(tmp_path_factory):
     return folder
 
 
-def test_planned_tags_are_detected_where_the_plan_says(hall):
+def test_planned_tags_are_detected_where_the_plan_says(hall, few_candidates):
     renderer, path = fs.Renderer("opencl"), fs.load_trajectory(hall / "path.tum")
     scene = fs.Scene.load(hall / "scene.toml")
     settings = PlanSettings(count=3, size=0.4, poses=5, views=5)
@@ -296,7 +303,7 @@ def test_planned_tags_are_detected_where_the_plan_says(hall):
     assert again.errors[0] == pytest.approx(plan.errors[-1], rel=0.05)
 
 
-def test_the_command_writes_a_scene_and_a_map(hall, tmp_path, capsys):
+def test_the_command_writes_a_scene_and_a_map(hall, few_candidates, tmp_path, capsys):
     pytest.importorskip("matplotlib", reason="the extra experiments is not installed")
     words = ["plan-tags", hall / "scene.toml", "--trajectory", hall / "path.tum", "--size", "0.4"]
     words += ["--poses", "5", "--views", "3", "--count", "2", "-o", tmp_path / "plan"]
@@ -317,6 +324,6 @@ def test_the_command_writes_a_scene_and_a_map(hall, tmp_path, capsys):
         (["--size", "9"], "the trajectory must see a flat surface of the size of a tag"),
     ],
 )
-def test_impossible_plans_are_reported(hall, tmp_path, capsys, words, said):
+def test_impossible_plans_are_reported(hall, few_candidates, tmp_path, capsys, words, said):
     given = ["plan-tags", hall / "scene.toml", "--trajectory", hall / "path.tum", "-o", tmp_path / "p"]
     assert said in fails(capsys, *given, "--poses", "5", *words)[1]
