@@ -164,6 +164,23 @@ def outputs_sheet(renderer: fs.Renderer, scene: fs.Scene) -> np.ndarray:
     return contact_sheet(rows, width=WIDTH, key=lambda row, height: keys[row](height))
 
 
+def light_sheet(renderer: fs.Renderer) -> np.ndarray:
+    """The examples of light on markers, and their first marker at four times the scale."""
+    rows = []
+    for name in ("lit-tag", "shadow-tag", "glossy-tag"):
+        scene = renderer.lit(fs.Scene.load(ROOT / "examples" / f"{name}.toml"))
+        small = scene.camera
+        assert small is not None
+        times = WIDTH / small.width
+        fx, cx, cy = small.fx * times, WIDTH / 2, HEIGHT / 2
+        camera = replace(small, width=WIDTH, height=HEIGHT, fx=fx, fy=fx, cx=cx, cy=cy)
+        x, y = camera.project(scene.markers[0].pose[None, :3, 3])[0]
+        near = replace(camera, fx=4 * fx, fy=4 * fx, cx=4 * (cx - x) + cx, cy=4 * (cy - y) + cy)
+        views = ((name, camera), ("4 times larger", near))
+        rows.append([(title, to_uint8(renderer.render(scene, view)["rgb"])) for title, view in views])
+    return contact_sheet(rows, width=WIDTH)
+
+
 def drawing_sheet(renderer: fs.Renderer) -> np.ndarray:
     """A tilted drawing, and a corner of it from a twelfth of the distance."""
     sign = fs.Scene(markers=[PlacedMarker(fs.marker(f"svg:{ROOT / 'examples/data/sign.svg'}"))])
@@ -242,6 +259,7 @@ def main() -> None:
     ]
     save(options.out / "effect-boxes.jpg", contact_sheet(boxes, width=WIDTH))
     save(options.out / "drawing.jpg", drawing_sheet(renderer))
+    save(options.out / "effect-light.jpg", light_sheet(renderer))
     save(options.out / "effect-shapes.jpg", shapes_sheet(renderer))
     save(options.out / "effect-wear.jpg", wear_sheet(renderer))
     save(options.out / "effect-outputs.jpg", outputs_sheet(renderer, exact))

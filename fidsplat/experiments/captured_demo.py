@@ -17,6 +17,7 @@ from fidsplat.markers import marker
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.captured import captured_scenes, fetch_scene
+from fidsplat.scenes.lights import Lighting
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.vision.readback import Reading, read_back
 
@@ -35,12 +36,28 @@ class _Layout:
     target: tuple[float, float, float]
     distance: float
     background: tuple[float, float, float]
+    ambient: tuple[float, float, float]
+    """light of the studio, which the background does not show"""
 
 
 _LAYOUTS = {
-    "biker": _Layout((0.75, -1.3, -0.2), (-1.15, -1.3, -0.2), 0.6, (-0.15, -1.6, 0), 7.0, (0.72, 0.74, 0.76)),
+    "biker": _Layout(
+        (0.75, -1.3, -0.2),
+        (-1.15, -1.3, -0.2),
+        0.6,
+        (-0.15, -1.6, 0),
+        7.0,
+        (0.72, 0.74, 0.76),
+        (0.6, 0.61, 0.63),
+    ),
     "playbot": _Layout(
-        (0.6, -0.2, -0.55), (-0.6, -0.2, -0.55), 0.24, (0, -0.45, -0.1), 3.0, (0.16, 0.17, 0.2)
+        (0.6, -0.2, -0.55),
+        (-0.6, -0.2, -0.55),
+        0.24,
+        (0, -0.45, -0.1),
+        3.0,
+        (0.16, 0.17, 0.2),
+        (0.45, 0.45, 0.5),
     ),
 }
 
@@ -49,7 +66,14 @@ def captured_scene(name: str, progress: Callable[[str, float], None] = lambda *_
     """A captured scene with an AprilTag and a QR code. Raises InputError as `fetch_scene`."""
     path, layout = fetch_scene(name, progress), _LAYOUTS[name]
     specs = (("apriltag:36h11:5", layout.tag), ("qr:fidsplat", layout.code))
-    placed = tuple(PlacedMarker(marker(spec, size=layout.size), rigid_matrix(place)) for spec, place in specs)
+    placed = tuple(
+        PlacedMarker(
+            marker(spec, size=layout.size),
+            rigid_matrix(place),
+            light=Lighting(ambient=layout.ambient, rows=16, panoramas=2),
+        )
+        for spec, place in specs
+    )
     return Scene((load_splats(path),), markers=placed, background=layout.background)
 
 

@@ -27,7 +27,7 @@ from fidsplat.scenes import Scene
 from fidsplat.scenes.captured import fetch_scene
 from fidsplat.util.files import atomic_write, writable_folder
 from fidsplat.vision.readback import Reading, read_back
-from fidsplat.worlds.yard import OUTPUTS, demo_scene, demo_views
+from fidsplat.worlds.yard import OUTPUTS, demo_scene, demo_views, sunlit
 
 COMPLETE = 0.98
 """minimum visible share of a completely visible marker; the rest is the soft edge of its quiet zone"""
@@ -111,13 +111,14 @@ def run_demo(
         progress(f"fetching the captured scene {captured}")
         fetch_scene(captured)  # first, since it may fail
     progress("making three markers and their scene")
-    scene = demo_scene(mixture=mixture)
+    scene = sunlit(demo_scene(mixture=mixture))
     progress("opening the device")
     renderer = Renderer(device)
     files = [folder / "scene.toml", folder / "scene.ply"]
     scene.save(files[0])
     files += sorted(folder.glob("scene-splats-*.ply"))
-    save_ply((scene if mixture != "exact" else demo_scene(mixture="fitted")).cloud(), files[1])
+    gaussians = scene if mixture != "exact" else sunlit(demo_scene(mixture="fitted"))
+    save_ply(renderer.lit(gaussians).cloud(), files[1])
     # files round logarithms and logits to float32: render the splats of the file
     scene = Scene.load(files[0])
     resident = renderer.upload(scene)

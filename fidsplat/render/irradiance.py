@@ -6,9 +6,6 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-LEVELS = (3, 5, 9)
-"""numbers of panoramas along a side of the marker, until interpolation between them is accurate enough"""
-
 
 def panorama_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
     """World directions (d, 3) of the pixels of an equirectangular panorama of 2 rows x rows pixels, and their
@@ -49,6 +46,7 @@ class LightField:
     @staticmethod
     def measured(
         rows: int,
+        levels: tuple[int, ...],
         places: np.ndarray,
         radiance_at: Callable[[np.ndarray], np.ndarray],
         normal: np.ndarray,
@@ -56,26 +54,30 @@ class LightField:
     ) -> LightField:
         """Measure until interpolated irradiance differs by at most `step` of its maximum.
 
-        places: (m, 2) on the marker. radiance_at: called with (k, 2) places, returns (k, d, 3). normal: (3,)
+        levels: numbers of panoramas along a side, the last of which is not checked. places: (m, 2) on the
+        marker. radiance_at: called with (k, 2) places, returns (k, d, 3). normal: (3,)
         for the irradiance that is compared.
         """
         field = LightField(*panorama_directions(rows))
         field.low, field.high = places.min(axis=0), places.max(axis=0)
         weights = cosine_weights(normal, field.directions, field.angles)
         known: dict[tuple[float, float], np.ndarray] = {}
-        for level in LEVELS:
-            shares = [(x, y) for y in np.linspace(0, 1, level) for x in np.linspace(0, 1, level)]
+        for level in levels:
+            sides = np.linspace(0, 1, level) if level > 1 else [0.5]
+            shares = [(x, y) for y in sides for x in sides]
             new = [share for share in shares if share not in known]
             new_places = field.low + np.array(new) * (field.high - field.low)
             known |= dict(zip(new, radiance_at(new_places), strict=True))
             field.radiance = np.stack([known[share] for share in shares]).reshape(level, level, -1, 3)
+            if level == levels[-1]:
+                break
             found = np.einsum("d,yxdc->yxc", weights, field.radiance)
             halved = found[::2, ::2]
             error = max(
                 _difference(found[::2, 1::2], (halved[:, 1:] + halved[:, :-1]) / 2),
                 _difference(found[1::2, ::2], (halved[1:] + halved[:-1]) / 2),
             )
-            if error <= step * found.max():
+            if error <= 2 * step * found.max():  # that of a coarser grid: halved spacing halves it at least
                 break
         return field
 

@@ -16,6 +16,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.cameras.lenses import Orthographic
 from fidsplat.capture.capture import Capture
+from fidsplat.capture.quality import Quality
 from fidsplat.capture.response import to_colors, to_light
 from fidsplat.render.irradiance import LightField
 from fidsplat.render.reflection import (
@@ -28,7 +29,7 @@ from fidsplat.render.reflection import (
 )
 from fidsplat.render.shadows import LightPoint, Surface, light_points, unit, visibility
 from fidsplat.scenes import PlacedMarker, Scene
-from fidsplat.scenes.lights import Lighting, PointLight
+from fidsplat.scenes.lights import GRIDS, Lighting, PointLight
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import rotation_of_coefficients
 from fidsplat.splats.rotations import quaternion_to_matrix
@@ -40,6 +41,8 @@ MOST = 256
 """measured points along a side of a square marker, at most"""
 SMOOTHEST = 0.5
 """smallest roughness whose reflections harmonics of degree 3 represent (docs/effects.md)"""
+MEASURING = "fast,lowpass=none,samples=2"
+"""quality of panoramas: a low-pass filter would enlarge splats that are smaller than the coarse pixels"""
 _DARK = 1e-6
 """radiance below which a panorama is black"""
 _CHUNK = 256
@@ -104,7 +107,12 @@ class _Surroundings:
             pose = np.eye(4)
             pose[:3, 3] = -point
             cameras.append(Camera.equirectangular(2 * rows, rows, pose, near=near))
-        base = Capture(background=self.scene.background, motion=self.scene.motion, fog=self.scene.fog)
+        base = Capture(
+            quality=Quality.of(MEASURING),
+            background=self.scene.background,
+            motion=self.scene.motion,
+            fog=self.scene.fog,
+        )
         captures = [base.with_(camera=camera, **parts) for camera in cameras]
         return list(self.renderer.render_views(self.resident, captures))
 
@@ -162,20 +170,22 @@ def _lit(placed: PlacedMarker, around: _Surroundings) -> PlacedMarker:
     if shiny is not None and light.view == "camera":
         mirrored, factor = _from_camera(points, arriving, shiny, around)
         seen = np.concatenate([seen * factor[:, None], mirrored], 1)
+    albedo = light.ink + (light.paper - light.ink) * to_light(_rgb(cloud), "srgb")
+    fragments = albedo[points.owner] * seen[:, :3]
+    if seen.shape[1] > 3:
+        fragments = fragments + seen[:, 3:]
     largest = None if shiny is None or light.view == "camera" else FINEST
-    owner, corners, part = _split(points, seen, light.step, largest)
+    displayed = to_colors(light.exposure * fragments, light.response)
+    owner, corners, part = _split(points, displayed, light.step, largest)
     means, scales = _placed_parts(cloud, points, owner, corners)
-    albedo = light.ink + (light.paper - light.ink) * to_light(_rgb(cloud), "srgb")[owner]
     count = np.bincount(part)
-    mean = np.stack([np.bincount(part, values) / count for values in seen.T], 1)
-    diffuse = albedo * mean[:, :3]
+    mean = np.stack([np.bincount(part, values) / count for values in fragments.T], 1)
     colors: dict[str, np.ndarray] = {}
     if shiny is None or light.view == "camera":
-        total = diffuse if shiny is None else diffuse + mean[:, 3:]
-        colors["colors"] = to_colors(light.exposure * total, light.response)
+        colors["colors"] = to_colors(light.exposure * mean, light.response)
     else:
         shown = [(point, np.bincount(part, one) / count) for point, one in arriving.points]
-        sh = _from_anywhere(placed, light, cloud, owner, means, diffuse, arriving._replace(points=shown))
+        sh = _from_anywhere(placed, light, cloud, owner, means, mean, arriving._replace(points=shown))
         # the scene rotates harmonics from the marker's frame to the world
         colors["sh"] = rotation_of_coefficients(3, placed.pose[:3, :3].T) @ sh
     lit = _rebuilt(cloud, owner, means, scales, **colors)
@@ -268,7 +278,8 @@ def _field(placed: PlacedMarker, light: Lighting, points: _Points, around: _Surr
         ambient = (0.0, 0.0, 0.0) if light.ambient is None else light.ambient
         return LightField.uniform(ambient)
     normal = unit(surface.normals.mean(axis=0))
-    field = LightField.measured(light.rows, places, radiance_at, normal, light.step)
+    levels = tuple(count for count in GRIDS if 3 <= count <= light.panoramas) or (light.panoramas,)
+    field = LightField.measured(light.rows, levels, places, radiance_at, normal, light.step)
     if light.ambient is None and field.radiance.max() < _DARK:
         raise InputError(
             f"the panorama at marker {placed.label}, {placed.marker.spec}, must show something, got black; "
@@ -286,26 +297,25 @@ def _by_normal(normals: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _split(
-    points: _Points, seen: np.ndarray, step: float, largest: int | None
+    points: _Points, colors: np.ndarray, step: float, largest: int | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Parts of the splats in which values (m, c) at the points differ by at most `step` of the largest.
+    """Parts of the splats in which colours (m, 3) at the points differ by at most `step`.
 
     largest: largest number of points along a side of a part.
 
     Returns the splat (p,) of each part, its first and last columns and rows (p, 4) x0, y0, x1, y1 on the grid
     of the splat, half-open, and the part (m,) of each point.
     """
-    limit = step * max(float(seen.max(initial=0.0)), 1e-12)
-    owner, corners, part = [], [], np.empty(len(seen), np.int64)
+    owner, corners, part = [], [], np.empty(len(colors), np.int64)
     for splat, (start, (width, height)) in enumerate(zip(points.starts, points.counts, strict=True)):
-        grid = seen[start : start + width * height].reshape(height, width, -1)
+        grid = colors[start : start + width * height].reshape(height, width, -1)
         index = np.arange(start, start + width * height).reshape(height, width)
         remaining = [(0, 0, int(width), int(height))]
         while remaining:
             x0, y0, x1, y1 = remaining.pop()
             across, down = x1 - x0, y1 - y0
             here = grid[y0:y1, x0:x1]
-            same = (here.max(axis=(0, 1)) - here.min(axis=(0, 1))).max() <= limit
+            same = (here.max(axis=(0, 1)) - here.min(axis=(0, 1))).max() <= step
             small = largest is None or max(across, down) <= largest
             if (same and small) or across == down == 1:
                 part[index[y0:y1, x0:x1]] = len(owner)

@@ -18,6 +18,8 @@ from fidsplat.util.errors import InputError, unknown
 SOURCES = ("scene", "lights")
 VIEWS = ("any", "camera")
 MAX_SAMPLES = 1024
+GRIDS = (1, 2, 3, 5, 9, 17)
+"""numbers of panoramas along a side; a finer grid contains the points of the coarser ones"""
 
 
 @dataclass(frozen=True)
@@ -51,9 +53,11 @@ class Lighting:
     """linear RGB radiance where the panorama contains no splats; None: the scene's background"""
     rows: int = 32
     """rows of the panorama that is rendered at each measured point, 8 to 1024"""
+    panoramas: int = 5
+    """largest number of panoramas along a side: 1, 2, 3, 5, 9 or 17; fewer where `step` holds"""
     step: float = 0.02
-    """largest difference of light within a rectangle, relative to the marker's largest; above it the
-    rectangle is split"""
+    """largest difference of colour within a rectangle, above which it is split; and of interpolated light,
+    relative to the marker's largest, above which more panoramas are rendered"""
     clearance: float | None = None
     """splats within this many metres in front of the marker do not occlude light; None: size / 20"""
 
@@ -74,6 +78,8 @@ class Lighting:
         ):
             number(f"light: {name}", getattr(self, name), f"a number from {low:g} to {high:g}", low, high)
         whole_number("light: rows", self.rows, 8, 1024)
+        if self.panoramas not in GRIDS:
+            raise invalid("light: panoramas", ", ".join(map(str, GRIDS)), self.panoramas)
         if self.ambient is not None:
             object.__setattr__(self, "ambient", _radiance("light: ambient", self.ambient))
         if self.response not in ("srgb", "linear") or isinstance(self.response, bool):

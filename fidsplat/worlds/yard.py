@@ -6,12 +6,14 @@ shrubs 3D Gaussians.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.markers import marker
 from fidsplat.scenes import PlacedMarker, Scene
+from fidsplat.scenes.lights import Sun
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
 
@@ -26,6 +28,7 @@ SIGNS = (
     ("qr:fidsplat demo", 0.42, (0.74, 0.0, 0.0)),
 )
 OUTPUTS = ("rgb", "depth", "normal", "label")
+SUN = Sun(direction=(-0.45, 0.9, 0.8), color=(1.0, 0.93, 0.8), intensity=2.6, angle=0.02, samples=4)
 
 
 def demo_scene(seed: int = 0, mixture: str = "exact") -> Scene:
@@ -48,6 +51,12 @@ def demo_scene(seed: int = 0, mixture: str = "exact") -> Scene:
         background=SKY,
         outputs=OUTPUTS,
     )
+
+
+def sunlit(scene: Scene) -> Scene:
+    """The scene with signs that are lit by it and by a sun over the viewer's right shoulder."""
+    signs = tuple(replace(placed, light="scene") for placed in scene.markers)
+    return replace(scene, markers=signs, lights=(SUN,))
 
 
 def demo_views() -> dict[str, Camera]:

@@ -170,6 +170,8 @@ def test_an_obstacle_next_to_a_marker_darkens_its_half():
     paper = light[:, 0] > 0.2
     assert np.abs(light[paper, 0] / 0.85 - free[paper]).max() < 0.015
     assert np.ptp(light[paper, 0]) > 0.05
+    one = replace(scene, markers=[PlacedMarker(TAG, light=fs.Lighting(panoramas=1))])
+    assert np.ptp(lit(one)[0][TAG.is_dark == 0, 0]) < 1e-6
     assert len(cloud) > len(TAG.cloud)
 
 
@@ -341,6 +343,7 @@ def test_errors_of_scene_files(tmp_path, text, words):
         (lambda: fs.Lighting(roughness=0.01), "roughness must be a number from 0.1 to 1"),
         (lambda: fs.Lighting(response="log"), "response must be"),
         (lambda: fs.Lighting(ambient=(1, 1, -1)), "at least 0"),
+        (lambda: fs.Lighting(panoramas=4), "panoramas must be 1, 2, 3, 5, 9, 17, got 4"),
         (lambda: fs.Sun(direction=(0, 0, math.nan)), "three finite numbers"),
         (lambda: fs.SpotLight(position=(0, 0, 0), direction=(0, 0, 1), inner=0.8), "outer must be above"),
         (lambda: PlacedMarker(TAG, light=1), "a marker's light must be"),
