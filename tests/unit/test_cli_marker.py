@@ -88,3 +88,19 @@ def test_marker_writes_two_scales_on_request(capsys, tmp_path):
 
 def test_marker_with_the_mixture_of_the_paper(capsys):
     assert prints_json(capsys, "marker", "qr:hello", "--mixture", "paper")["mixture"] == "paper"
+
+
+def test_marker_with_shape_and_wear(capsys, tmp_path):
+    words = ("--shape", "cylinder,radius=0.05,axis=x", "--wear", "fading=0.3,seed=2")
+    facts = prints_json(capsys, "marker", "apriltag:16h5:5", "--size", "0.16", *words)
+    made = fs.marker("apriltag:16h5:5", 0.16, shape=words[1], wear=words[3])
+    assert facts["splats"] == len(made.cloud) > len(made.boxes)
+    assert facts["surface"] == {"kind": "cylinder", "radius": 0.05, "axis": "x"}
+    assert facts["wear"] == {"fading": 0.3, "seed": 2}
+    for option, value, message in (
+        ("--shape", "cylinder,radius=0.01", "radius must be at least 0.2122 m for a sheet of 1.333 m"),
+        ("--wear", "dirt=2", "dirt must be a severity from 0 to 1, got 2.0"),
+    ):
+        status, error = fails(capsys, "marker", "apriltag:16h5:5", option, value)
+        assert status == 2
+        assert message in error

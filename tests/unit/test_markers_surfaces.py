@@ -8,6 +8,7 @@ from scipy.integrate import quad
 from scipy.spatial import cKDTree
 
 import fidsplat as fs
+from fidsplat.capture.response import to_light
 from fidsplat.images.files import to_uint8
 from fidsplat.markers import BentSheet, BoxEdge, Cone, Crumpled, Cylinder
 from fidsplat.scenes import PlacedMarker
@@ -206,3 +207,19 @@ def test_gaussians_of_a_bent_marker(renderer):
     assert [code.name for code in detect(to_uint8(image), ["apriltag:16h5"])] == ["apriltag:16h5:3"]
     with pytest.raises(fs.InputError, match="mixture facets"):
         fs.marker(SPEC, SIZE, "facets", shape=Cylinder(0.1))
+
+
+def test_light_of_a_worn_tag_on_a_cylinder_follows_its_normals(renderer):
+    """Paper under a sun: 0.85 / pi times the irradiance times the cosine to the normal of the cylinder."""
+    radius = 0.06
+    made = fs.marker(SPEC, SIZE, shape=Cylinder(radius), wear="dirt=0.1,seed=1")
+    sun = fs.Sun(direction=(0.8, 0.0, 0.6), intensity=3.0)
+    scene = fs.Scene(markers=[PlacedMarker(made, light="lights")], lights=[sun])
+    cloud = renderer.lit(scene).cloud()
+    paper = (made.cloud.colors == 1).all(1)
+    assert len(cloud) == len(made.cloud)
+    turn = np.arctan2(cloud.means[paper, 0], radius - cloud.means[paper, 2])
+    cosine = np.maximum(-(0.8 * np.sin(turn) - 0.6 * np.cos(turn)), 0)
+    light = to_light(cloud.plain_colors[paper, 0], "srgb")
+    assert np.abs(light - 0.85 / math.pi * 3.0 * cosine).max() < 0.02
+    assert (light == 0).any()
