@@ -13,8 +13,8 @@ WIDTH = 480
 """pixels: largest width of the image in which sharpness and motion are measured"""
 _CORNERS, _QUALITY, _APART = 200, 0.01, 8
 """number of tracked corners, their minimum quality relative to the best, and distance in pixels"""
-STEP = 0.06
-"""motion between chosen frames, as a share of the image's width"""
+STEP, FEW = 0.02, 20
+"""motion between chosen frames as a share of the image's width; number of frames below which it is less"""
 LOST = 0.3
 """motion of a pair of frames of which too few corners can be tracked"""
 _MIN_TRACKED = 8
@@ -50,10 +50,14 @@ def _motion(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def choose_frames(sharpness: np.ndarray, motion: np.ndarray, count: int) -> list[int]:
-    """Numbers of the frames to keep: the path of the motion is divided into parts of equal length, of `STEP`
-    or as many as `count`, and the sharpest frame of each part is taken."""
-    path = np.cumsum(motion)
-    parts = min(whole_number("the number of frames", count, 3, 100_000), 1 + int(path[-1] / STEP))
+    """Numbers of the frames to keep: the path of the motion is divided into at most `count` parts of equal
+    length, of `STEP` or less, and the sharpest frame of each part is taken.
+
+    Less than three for a camera that does not move.
+    """
+    path, count = np.cumsum(motion), whole_number("the number of frames", count, 3, 100_000)
+    parts = 1 + int(path[-1] / STEP)
+    parts = min(count, max(FEW, parts)) if parts >= 3 else 1
     part = np.minimum((path / max(path[-1], 1e-9) * parts).astype(int), parts - 1)
     return sorted(
         int(max(np.flatnonzero(part == each), key=lambda i: sharpness[i])) for each in np.unique(part)
