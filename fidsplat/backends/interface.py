@@ -383,14 +383,16 @@ class TrainingKernels(ABC):
 
     @abstractmethod
     def loss(
-        self, images: Any, view: int, dssim_weight: float
-    ) -> tuple[Callable[[], tuple[float, float]], Any]:
+        self, images: Any, view: int, dssim_weight: float, exposure: np.ndarray | None = None
+    ) -> tuple[Callable[[], tuple[Any, ...]], Any]:
         """Compare a frame with the ground truth of view number `view`.
 
+        exposure: (2, 3) logarithms of gains, and offsets, applied to the frame first; None: as rendered.
+
         Returns:
-            A function that waits for the loss and the mean squared difference and returns them, to be called
-            before `max_pending_losses` more frames; and the gradient of the loss (h, w, 3), a device array
-            that is valid until the next call.
+            A function that waits for the loss, the mean squared difference and, with an exposure, the
+            gradient (2, 3) by it, and returns them, to be called before `max_pending_losses` more frames; and
+            the gradient of the loss (h, w, 3), a device array that is valid until the next call.
         """
 
     @abstractmethod
@@ -411,7 +413,8 @@ class TrainingKernels(ABC):
         numbers: Mapping[str, float],
         camera: Camera | None,
         origin: np.ndarray,
-    ) -> None:
+        pose: bool = False,
+    ) -> Callable[[], np.ndarray] | None:
         """Apply a step of Adam.
 
         Args:
@@ -422,6 +425,8 @@ class TrainingKernels(ABC):
                 `opacity_penalty`, added to the gradients; `sparse`: 1 where splats on which the frame does
                 not depend are left unchanged.
             camera: if given, statistics are accumulated first, as by `accumulate_statistics`.
+            pose: whether to return a function that waits for the gradient (6,) of the loss with respect to
+                the camera pose.
         """
 
     @abstractmethod

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -51,6 +51,10 @@ class Train:
     hold_out: int | None = None
     """N: hold out every Nth view, 0 for none (default: see above)"""
     random_points: Annotated[int, option("N", "start from N random points instead of the data set's")] = 0
+    masks: str | None = None
+    """DIR: masks NAME.png of the images, 0 for ignored pixels (default: those of the data set)"""
+    alpha_masks: bool = False
+    """ignore transparent pixels, instead of showing the background there"""
     start: Annotated[str | None, option("FILE", "splats to refine, instead of one at each point")] = None
     report: str | None = None
     """DIR|FILE.md: write a page with curves and images of the held-out views"""
@@ -74,7 +78,8 @@ class Train:
             new_file(file, self.overwrite)
         where = console(self.json)
         with delayed_progress() as progress:
-            dataset = load_dataset(self.dataset, self.hold_out, self.random_points, settings.seed, progress)
+            words = self.dataset, self.hold_out, self.random_points, settings.seed
+            dataset = load_dataset(*words, progress, self.masks, self.alpha_masks)
         if self.within_memory is not None:
             settings = splats_within(settings, _bytes(self.within_memory), dataset)
         with where.status("opening the device"):
@@ -99,7 +104,10 @@ class Train:
         with delayed_progress() as progress:
             scores = trainer.evaluate(progress=progress)
         done = trainer.iteration - before
-        facts = _facts(trainer, scores, seconds, done) | {"file": str(file), "checkpoint": str(checkpoint)}
+        facts: dict[str, Any] = _facts(trainer, scores, seconds, done) | {
+            "file": str(file),
+            "checkpoint": str(checkpoint),
+        }
         if self.report is not None:
             from fidsplat.experiments.training_page import write_training_page
 
@@ -114,6 +122,12 @@ class Train:
         words = f"{facts['splats']:,} splats after {trainer.iteration:,} iterations ({speed})"
         if not scores:
             words += "; no view was held out; --hold-out 8 holds out every eighth"
+        if settings.refine_poses:
+            moved = facts["pose_changes"]
+            words += (
+                f"; poses moved by {moved['mean_m']:.4g} m and {moved['mean_deg']:.3g} degrees on average, "
+                f"{moved['largest_m']:.4g} m and {moved['largest_deg']:.3g} degrees at most"
+            )
         table = (title, ("view", "PSNR, dB", "SSIM"), rows) if scores else None
         return report(self.json, facts, words, facts["file"], *facts.get("report", []), table=table)
 
@@ -151,7 +165,26 @@ def _bar(trainer: Trainer) -> Iterator:
 
 
 def _facts(trainer: Trainer, scores: list[ViewScore], seconds: float, done: int) -> dict:
-    count = max(1, len(scores))
+    count, settings = max(1, len(scores)), trainer.settings
+    refined: dict[str, Any] = {}
+    if settings.refine_poses:
+        moved = trainer.pose_changes()
+        (mean_m, mean_deg), (largest_m, largest_deg) = moved.mean(axis=0), moved.max(axis=0)
+        refined["pose_changes"] = {
+            **{"mean_m": float(mean_m), "mean_deg": float(mean_deg)},
+            **{"largest_m": float(largest_m), "largest_deg": float(largest_deg)},
+        }
+    if settings.refine_poses or settings.fit_exposures:
+        gains = trainer.exposures
+        refined["training_views"] = [
+            {
+                "name": view.name,
+                "world_to_camera": view.camera.world_to_camera.tolist(),
+                "gain": gain.tolist(),
+                "offset": offset.tolist(),
+            }
+            for view, (gain, offset) in zip(trainer.views, gains, strict=True)
+        ]
     return {
         "dataset": trainer.dataset.name,
         "device": trainer.renderer.device.title,
@@ -162,4 +195,5 @@ def _facts(trainer: Trainer, scores: list[ViewScore], seconds: float, done: int)
         "psnr": sum(score.psnr for score in scores) / count if scores else None,
         "ssim": sum(score.ssim for score in scores) / count if scores else None,
         "views": [{"name": score.name, "psnr": score.psnr, "ssim": score.ssim} for score in scores],
+        **refined,
     }

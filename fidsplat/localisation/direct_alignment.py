@@ -36,6 +36,8 @@ MIN_BLOCK, BLOCKS = 4, 30
 """independent blocks of the covariance: minimum side in pixels, and number along the shorter side"""
 _MEDIAN = {1: 0.4549, 3: 2.3660}
 """median of the sum of squares of so many normal numbers"""
+MIN_INLIERS = 0.6
+"""share of inliers from which a pose counts as found"""
 HUBER, TUKEY = 1.5, 4.685
 """robust thresholds in standard deviations of the noise: coarse levels, finest level"""
 MIN_NOISE, MAX_NOISE = 1e-3, 0.03

@@ -13,7 +13,7 @@ from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.sensor import Sensor
 from fidsplat.images.files import pixels_of
-from fidsplat.localisation.direct_alignment import align
+from fidsplat.localisation.direct_alignment import MIN_INLIERS, align
 from fidsplat.localisation.initial_pose import most_similar, pose_of_markers
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
@@ -26,8 +26,6 @@ from fidsplat.vision.undistort import undistort_masked
 
 TRIED = 3
 """number of candidates that are aligned coarsely"""
-MIN_INLIERS = 0.6
-"""share of inliers from which a pose counts as found"""
 
 
 @dataclass(frozen=True, eq=False)

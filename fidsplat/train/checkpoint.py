@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ _FORMAT = 4
 _GROUPS = ("values", "first", "second")
 _VALUES = tuple(f"values.{name}" for name in NAMES)
 _HISTORY = {"losses": np.float32, "psnrs": np.float32, "counts": np.int32}
+_VIEWS = "views."
+"""prefix of the arrays of `ViewRefinement`"""
 _MAY_DIFFER = ("iterations",)
 """settings that may differ when a run resumes, so that it can be extended"""
 
@@ -38,6 +40,8 @@ class TrainingState:
     splats: Splats
     history: Arrays
     """`losses` and `psnrs` (iteration,) float32, and numbers of splats `counts` (iteration,) int32"""
+    views: Arrays = field(default_factory=dict)
+    """state of `ViewRefinement`; empty without refinement"""
 
     @staticmethod
     def initial(splats: Splats) -> TrainingState:
@@ -67,6 +71,7 @@ def save_checkpoint(
     }
     arrays = {f"{group}.{name}": getattr(made.splats, group)[name] for group in _GROUPS for name in NAMES}
     arrays |= {"gradients": made.splats.gradient_sums, "seen": made.splats.visible_counts, **made.history}
+    arrays |= {_VIEWS + name: array for name, array in made.views.items()}
     with atomic_write(file, durable=True) as stream:
         np.savez(stream, facts=np.frombuffer(json.dumps(facts).encode(), np.uint8), **arrays)
 
@@ -118,7 +123,8 @@ def load_checkpoint(
         iteration = whole_number("iteration", facts["iteration"], 0, MAX_ITERATIONS)
         before = [str(facts["by"][name]) for name in _made_by(device)]
         differ = _differences(facts, settings, digest)
-        made = None if differ else TrainingState(iteration, *_state(arrays, settings, iteration))
+        views = {name.removeprefix(_VIEWS): arrays.pop(name) for name in [*arrays] if name.startswith(_VIEWS)}
+        made = None if differ else TrainingState(iteration, *_state(arrays, settings, iteration), views)
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise InputError(
             f"cannot read {file} as a checkpoint: {error}; remove it, or give --overwrite to start again"

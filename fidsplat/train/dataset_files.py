@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.formats.colmap_read import has_colmap, load_colmap
-from fidsplat.images.files import read_image, read_on_background
+from fidsplat.images.files import read_on_background
 from fidsplat.train.boxes import MarkerBox, read_boxes, without_markers
 from fidsplat.train.dataset import MAX_POINTS, Dataset, TrainingView
+from fidsplat.train.masks import Masks, mask_file
 from fidsplat.train.transforms import DatasetContents, check_other_image, has_transforms, load_transforms
 from fidsplat.train.undistorted_view import undistorted_view
-from fidsplat.util.arguments import callback, whole_number
+from fidsplat.util.arguments import callback, flag, whole_number
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, path_of, read_text
 
@@ -35,6 +36,8 @@ def load_dataset(
     random_points: int = 0,
     seed: int = 0,
     progress: Progress | None = None,
+    masks: str | Path | None = None,
+    alpha_masks: bool = False,
 ) -> Dataset:
     """Read a data set.
 
@@ -46,9 +49,12 @@ def load_dataset(
         random_points: number of random initial points that replace those of the data set.
         seed: seed of the random points.
         progress: called with the item that is read and the share done.
+        masks: folder of masks `NAME.png`, 0 for ignored pixels, instead of those of the data set.
+        alpha_masks: whether transparent pixels are ignored, instead of showing the background.
 
     Raises:
-        InputError: no data set, an image that is missing or of another size than its camera, no points.
+        InputError: no data set, no mask in the folder, an image that is missing or of another size than its
+            camera, no points.
     """
     folder = path_of(path)
     if not folder.exists():
@@ -57,7 +63,13 @@ def load_dataset(
         raise InputError(f"--hold-out must be 0 (none), or 2 or more (every n-th view), got {hold_out}")
     random_points = whole_number("--random-points", random_points, 0, MAX_POINTS)
     report = callback("progress", progress) or (lambda words, share: None)
-    found = (load_transforms if has_transforms(folder) else _load_colmap)(folder, report)
+    chosen = Masks(None if masks is None else path_of(masks), flag("alpha_masks", alpha_masks))
+    if chosen.folder is not None and not chosen.folder.is_dir():
+        raise InputError(f"--masks must be a folder of masks NAME.png, got {chosen.folder}")
+    found = (load_transforms if has_transforms(folder) else _load_colmap)(folder, report, chosen)
+    if chosen.folder is not None and all(view.mask is None for view in found.views):
+        example = found.views[0].name if found.views else "NAME"
+        raise InputError(f"{chosen.folder} must have masks of the images, e.g. {example}.png, got none")
     views, held_out = _divided(found.views, found.held_out, hold_out)
     points, colors = found.points, found.colors
     if not len(points) and not random_points:
@@ -81,7 +93,7 @@ def _divided(
     )
 
 
-def _load_colmap(folder: Path, progress: Progress) -> DatasetContents:
+def _load_colmap(folder: Path, progress: Progress, masks: Masks) -> DatasetContents:
     model = next((folder / name for name in _MODELS if has_colmap(folder / name)), None)
     if model is None:
         raise InputError(
@@ -89,35 +101,29 @@ def _load_colmap(folder: Path, progress: Progress) -> DatasetContents:
             "(transforms.json), got neither"
         )
     background, boxes = _notes(folder)
-    views, points, colors = _model(folder, model, background, progress, "images")
+    views, points, colors = _model(folder, model, background, progress, "images", masks)
     held_out: list[TrainingView] = []
     if has_colmap(folder / "test" / "sparse" / "0"):
         test = folder / "test"
-        held_out, _, _ = _model(test, test / "sparse" / "0", background, progress, "test images")
+        held_out, _, _ = _model(test, test / "sparse" / "0", background, progress, "test images", masks)
     views, held_out = without_markers(views, boxes), without_markers(held_out, boxes)
     matrices = tuple(box.matrix for box in boxes)
     return DatasetContents(views, held_out, points, colors, background, matrices)
 
 
 def _model(
-    folder: Path, place: Path, background: Background, progress: Progress, words: str
+    folder: Path, place: Path, background: Background, progress: Progress, words: str, masks: Masks
 ) -> tuple[list[TrainingView], np.ndarray, np.ndarray]:
     model = load_colmap(place)
     views: list[TrainingView] = []
     others: set[tuple[int, int]] = set()
     for i, (name, camera) in enumerate(zip(model.names, model.cameras, strict=True)):
         progress(words, i / len(model.names))
-        check_other_image(folder / "images" / name, others)
-        image = read_on_background(folder / "images" / name, background)
-        views.append(undistorted_view(name, camera, image, _mask(folder / "masks" / name)))
+        file = folder / "images" / name
+        check_other_image(file, others)
+        mask = masks.of(file, name, mask_file(folder / "masks", name))
+        views.append(undistorted_view(name, camera, read_on_background(file, background), mask))
     return views, model.points, model.colors
-
-
-def _mask(mask: Path) -> np.ndarray | None:
-    # COLMAP appends .png to the name of the image, others replace its suffix
-    candidates = (mask.with_name(f"{mask.name}.png"), mask.with_suffix(".png"))
-    file = next((one for one in candidates if one.is_file()), None)
-    return None if file is None else read_image(file).max(axis=2) > 0
 
 
 def _notes(folder: Path) -> tuple[Background, tuple[MarkerBox, ...]]:

@@ -32,7 +32,7 @@ class DeviceModel:
         self._kernels, self._settings = kernels, settings
         self.max_pending_losses = kernels.max_pending_losses
         kernels.load_views([(view.image, view.mask) for view in views])
-        self._cameras = [view.camera for view in views]
+        self._intrinsics = [view.camera for view in views]
         self._number = 0
 
     def load(self, splats: Splats) -> None:
@@ -79,14 +79,16 @@ class DeviceModel:
         """The splats as a cloud to render, with SH of this degree."""
         return self._kernels.resident(degree, origin)
 
-    def loss(self, images: Images, view: int) -> tuple[Callable[[], Loss], Any]:
+    def loss(
+        self, images: Images, view: int, exposure: np.ndarray | None = None
+    ) -> tuple[Callable[[], Loss], Any]:
         """A function that waits for the loss of a rendered view, and the gradient (h, w, 3) on the device."""
-        value, gradient = self._kernels.loss(images, view, self._settings.dssim_weight)
+        value, gradient = self._kernels.loss(images, view, self._settings.dssim_weight, exposure)
         return lambda: Loss(*value()), gradient
 
     def normal_loss_gradients(self, images: Images, view: int, weight: float) -> dict[str, Any]:
         """Gradients of the weighted normal loss with respect to `depth` and `normal`."""
-        return self._kernels.normal_loss_gradients(images, view, self._cameras[view], weight)
+        return self._kernels.normal_loss_gradients(images, view, self._intrinsics[view], weight)
 
     def backward_to_tiles(self, pipeline: Any, images: Images, gradients: Mapping[str, Any]) -> Any:
         """The backward pass up to the sums over tiles, for `accumulate_statistics` and `step`."""
@@ -103,8 +105,9 @@ class DeviceModel:
         step: int,
         camera: Camera | None,
         origin: np.ndarray,
-    ) -> None:
-        """Apply one step of Adam. camera: if given, statistics are accumulated first."""
+    ) -> Callable[[], np.ndarray] | None:
+        """Apply one step of Adam. camera: if given, statistics are accumulated first. Returns a function that
+        waits for the gradient (6,) of the pose, if poses are refined."""
         settings, count = self._settings, max(1, self._number)
         by_names = {
             "means": "means",
@@ -124,7 +127,7 @@ class DeviceModel:
             "scale_penalty": settings.scale_penalty / (settings.axes * count) if mcmc else 0.0,
             "opacity_penalty": settings.opacity_penalty / count if mcmc else 0.0,
         }
-        self._kernels.step(taken, sizes, numbers, camera, origin)
+        return self._kernels.step(taken, sizes, numbers, camera, origin, settings.refine_poses)
 
     def add_noise(self, iteration: int, rate: float) -> None:
         """Add MCMC noise to the means. rate: learning rate of the means [m]."""

@@ -13,7 +13,7 @@ from fidsplat.cameras import Camera
 from fidsplat.train import mcmc
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.densify import Densification, limited_logits
-from fidsplat.train.losses import Loss, image_loss, normal_loss
+from fidsplat.train.losses import Loss, exposed_loss, normal_loss
 from fidsplat.train.optimiser import adam_step, contributing, parameter_gradients, sparse_adam_step
 from fidsplat.train.parameters import Splats
 from fidsplat.train.settings import TrainSettings
@@ -62,11 +62,14 @@ class HostModel:
         """The splats as a cloud to render, with SH of this degree."""
         return self._backend.upload(self._splats.cloud(degree, origin, shared=True))
 
-    def loss(self, images: Images, view: int) -> tuple[Callable[[], Loss], np.ndarray]:
+    def loss(
+        self, images: Images, view: int, exposure: np.ndarray | None = None
+    ) -> tuple[Callable[[], Loss], np.ndarray]:
         """A function that returns the loss of a rendered view, and the gradient (h, w, 3)."""
         of = self._views[view]
         target = of.image * np.float32(1 / 255)
-        loss, gradient = image_loss(images.read("rgb", 0), target, of.mask, self._settings.dssim_weight)
+        weight = self._settings.dssim_weight
+        loss, gradient = exposed_loss(images.read("rgb", 0), target, of.mask, weight, exposure)
         return lambda: loss, gradient
 
     def normal_loss_gradients(self, images: Images, view: int, weight: float) -> dict[str, np.ndarray]:
@@ -99,8 +102,9 @@ class HostModel:
         step: int,
         camera: Camera | None,
         origin: np.ndarray,
-    ) -> None:
-        """Apply one step of Adam. camera: if given, statistics are accumulated first."""
+    ) -> Callable[[], np.ndarray] | None:
+        """Apply one step of Adam. camera: if given, statistics are accumulated first. Returns a function that
+        returns the gradient (6,) of the pose, if poses are refined."""
         if camera is not None:
             self.accumulate_statistics(gradients, camera, origin)
         arrays = {name: on_host(array) for name, array in gradients.items()}
@@ -109,6 +113,7 @@ class HostModel:
             sparse_adam_step(self._splats, contributing(arrays), raw, rate, self._settings, step)
         else:
             adam_step(self._splats, raw, rate, self._settings, step)
+        return (lambda: arrays["pose"]) if self._settings.refine_poses else None
 
     def add_noise(self, iteration: int, rate: float) -> None:
         """Add MCMC noise to the means. rate: learning rate of the means [m]."""

@@ -24,6 +24,8 @@ class Loss(NamedTuple):
     """the loss"""
     mse: float
     """mean squared error, for the PSNR"""
+    by_exposure: np.ndarray | None = None
+    """(2, 3) gradient by logarithms of gains, and offsets; None without an exposure"""
 
     @property
     def psnr(self) -> float:
@@ -76,6 +78,26 @@ def image_loss(
         ssim, slope = _ssim(image, truth)
         gradient -= slope * image.dtype.type(dssim_weight)
     return Loss((1 - dssim_weight) * l1 + dssim_weight * (1 - ssim), mse), gradient * weight
+
+
+def exposed_loss(
+    image: np.ndarray,
+    truth: np.ndarray,
+    mask: np.ndarray | None,
+    dssim_weight: float,
+    exposure: np.ndarray | None,
+) -> tuple[Loss, np.ndarray]:
+    """`image_loss` of an image with another exposure, and the gradient with respect to the image.
+
+    exposure: (2, 3) logarithms of gains, and offsets, by channel; None: as rendered.
+    """
+    if exposure is None:
+        return image_loss(image, truth, mask, dssim_weight)
+    gain, offset = np.exp(exposure[0]).astype(image.dtype), exposure[1].astype(image.dtype)
+    loss, slope = image_loss(gain * image + offset, truth, mask, dssim_weight)
+    by_gain = np.where(slope != 0, slope * gain * image, 0)  # ignored pixels may not be finite
+    sums = np.array([each.sum(axis=(0, 1), dtype=np.float64) for each in (by_gain, slope)])
+    return loss._replace(by_exposure=sums), slope * gain
 
 
 def _ssim(image: np.ndarray, truth: np.ndarray) -> tuple[float, np.ndarray]:

@@ -97,6 +97,20 @@ class TrainSettings:
     """decay of Adam's second moments"""
     epsilon: float = 1e-15
     """epsilon of Adam"""
+    refine_poses: bool = False
+    """refine the camera pose of each training view; held-out views are then localised before they are
+    evaluated"""
+    pose_rate: float = 5e-3
+    """initial learning rate of poses: radians, and metres per metre of depth"""
+    pose_rate_end: float = 5e-5
+    """learning rate of poses at the last iteration"""
+    fit_exposures: bool = False
+    """fit a gain and an offset of each channel for each training view: exposure and white balance; those of
+    held-out views are fitted before they are evaluated"""
+    exposure_rate: float = 0.01
+    """initial learning rate of the gains' logarithms and of the offsets"""
+    exposure_rate_end: float = 0.001
+    """learning rate of exposures at the last iteration"""
     sparse_adam: bool = False
     """update only splats that contribute to the frame; otherwise moments update all splats, as with the
     authors"""
@@ -155,8 +169,9 @@ class TrainSettings:
         if not isinstance(self.quality, str):  # checkpoints store it as text
             raise InputError(f"training: quality must be text such as 'surfel', got {self.quality!r}")
         Quality.of(self.quality)
-        if not isinstance(self.sparse_adam, bool):
-            raise InputError(f"training: sparse_adam must be True or False, got {self.sparse_adam!r}")
+        for name in ("sparse_adam", "refine_poses", "fit_exposures"):
+            if not isinstance(getattr(self, name), bool):
+                raise InputError(f"training: {name} must be True or False, got {getattr(self, name)!r}")
         for field in fields(self):
             value = getattr(self, field.name)
             if field.type == "float":
@@ -179,6 +194,19 @@ class TrainSettings:
         iteration = whole_number("iteration", iteration, 0, 2**63 - 1)
         share = min(iteration / self.position_steps, 1.0)
         return self.position_rate ** (1 - share) * self.position_rate_end**share
+
+    def pose_rate_at(self, iteration: int) -> float:
+        """Learning rate of poses at an iteration."""
+        return self._decayed(iteration, self.pose_rate, self.pose_rate_end)
+
+    def exposure_rate_at(self, iteration: int) -> float:
+        """Learning rate of exposures at an iteration."""
+        return self._decayed(iteration, self.exposure_rate, self.exposure_rate_end)
+
+    def _decayed(self, iteration: int, first: float, last: float) -> float:
+        """Exponential decay over all iterations."""
+        share = min(whole_number("iteration", iteration, 0, 2**63 - 1) / self.iterations, 1.0)
+        return first ** (1 - share) * last**share
 
     def degree_at(self, iteration: int) -> int:
         """SH degree at an iteration."""

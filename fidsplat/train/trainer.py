@@ -16,13 +16,16 @@ import numpy as np
 
 from fidsplat.backends.gradients import CapacityExceeded
 from fidsplat.backends.prepare import prepare
+from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import with_distortion
 from fidsplat.formats import save_ply
 from fidsplat.formats.collect import Progress
+from fidsplat.localisation.direct_alignment import MIN_INLIERS, align
 from fidsplat.render.renderer import Renderer
+from fidsplat.render.resident import ResidentCloud
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.train import densify, mcmc
 from fidsplat.train.boxes import outside_boxes
@@ -37,6 +40,7 @@ from fidsplat.train.parameters import Splats, TrainingError, initial_splats, spl
 from fidsplat.train.random_numbers import Purpose, permutation
 from fidsplat.train.scores import ViewScore, score_view
 from fidsplat.train.settings import TrainSettings
+from fidsplat.train.view_refinement import ViewRefinement, with_exposure_of
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import callback, instance, invalid, items, settings_with
 from fidsplat.util.errors import DeviceError, InputError
@@ -118,10 +122,15 @@ class Trainer:
             if backend.traits.trains
             else HostModel(backend, dataset.views, self.settings)
         )
+        self._refinement = None
+        if self.settings.refine_poses or self.settings.fit_exposures:
+            self._refinement = ViewRefinement(dataset, self.settings)
         self._state = self._begin(start, restart)
         self._model.load(self._state.splats)
-        self._pending: deque[tuple[int, str, Callable[[], Loss]]] = deque()
-        """iterations and views whose losses are not read yet"""
+        self._pending: deque[tuple[int, int, Callable[[], Loss]]] = deque()
+        """iterations and indices of views whose losses are not read yet"""
+        self._pose_gradients: deque[tuple[int, int, Callable[[], np.ndarray]]] = deque()
+        """the same for gradients of poses"""
         self._unreported: deque[tuple[int, str, Loss]] = deque()
         """unreported losses"""
         self._failure: TrainingError | None = None
@@ -184,6 +193,32 @@ class Trainer:
                 saved = time.monotonic()
         return self.cloud()
 
+    @property
+    def views(self) -> tuple[TrainingView, ...]:
+        """The training views, with refined cameras if poses are refined."""
+        self._refine_poses()
+        if self._refinement is None:
+            return self.dataset.views
+        pairs = zip(self.dataset.views, self._refinement.cameras, strict=True)
+        return tuple(replace(view, camera=camera) for view, camera in pairs)
+
+    def pose_changes(self) -> np.ndarray:
+        """(views, 2): metres and degrees by which the refined poses differ from those of the data set."""
+        self._refine_poses()
+        if self._refinement is None:
+            return np.zeros((len(self.dataset.views), 2))
+        return self._refinement.pose_changes()
+
+    @property
+    def exposures(self) -> np.ndarray:
+        """(views, 2, 3): gains, and offsets in display values, by channel, from the splats' colours to each
+        training image."""
+        self._read_losses()
+        if self._refinement is None:
+            return np.tile([[[1.0] * 3, [0.0] * 3]], (len(self.dataset.views), 1, 1))
+        gains = np.exp(self._refinement.exposures[:, :1])
+        return np.concatenate([gains, self._refinement.exposures[:, 1:]], axis=1)
+
     def cloud(self) -> SplatCloud:
         """The current splats, without those in the data set's boxes. Raises TrainingError if a value is not
         finite."""
@@ -207,14 +242,17 @@ class Trainer:
         if self.checkpoint is None:
             return
         self._state.splats = self._checked_splats()
-        state = TrainingState(self.iteration, self._state.splats, self.history)
+        self._refine_poses()
+        views = {} if self._refinement is None else self._refinement.arrays()
+        state = TrainingState(self.iteration, self._state.splats, self.history, views)
         title = self.renderer.device.title
         save_checkpoint(self.checkpoint, state, self.settings, self.dataset, title)
 
     def evaluate(
         self, views: tuple[TrainingView, ...] | None = None, progress: Progress | None = None
     ) -> list[ViewScore]:
-        """Metrics of views, by default of the held-out views.
+        """Metrics of views, by default of the held-out views. If poses are refined, each view is localised
+        first, starting at its own pose; if exposures are fitted, so are its gains and offsets.
 
         Args:
             progress: called with a description and the share of views done, 0 to 1.
@@ -222,14 +260,28 @@ class Trainer:
         progress = callback("progress", progress)
         views = self.dataset.held_out if views is None else views
         views = items("views", views, TrainingView, "a list of TrainingView")
+        resident = self.renderer.upload(self.cloud())
         captures = [self._capture(view) for view in views]
-        frames = self.renderer.render_views(self.cloud(), captures)
-        scores = []
+        if self.settings.refine_poses:
+            captures = [self._localised(*pair, resident) for pair in zip(views, captures, strict=True)]
+        frames = self.renderer.render_views(resident, captures)
+        scores, fitted = [], self.settings.fit_exposures
         for number, (view, frame) in enumerate(zip(views, frames, strict=True)):
-            scores.append(score_view(view, frame["rgb"]))
+            rgb = frame["rgb"]
+            scores.append(score_view(view, with_exposure_of(rgb, view) if fitted else rgb))
             if progress is not None:
                 progress("held-out views", (number + 1) / len(views))
         return scores
+
+    def _localised(self, view: TrainingView, capture: Capture, resident: ResidentCloud) -> Capture:
+        """The capture of a view at the pose at which the splats match its image; unchanged if none does."""
+
+        def render(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+            frame = self.renderer.render(resident, capture.with_(camera=camera, outputs=("rgb", "depth")))
+            return frame["rgb"], frame["depth"]
+
+        found = align(view.image.astype(np.float32) / 255, view.mask, view.camera, render)
+        return capture.with_(camera=found.camera) if found.inliers >= MIN_INLIERS else capture
 
     def _advance(self, late: bool) -> None:
         """Run one iteration. late: its loss may be read after later iterations."""
@@ -246,16 +298,24 @@ class Trainer:
         self._densify()
         iteration = state.iteration + 1
         number = self._view_at(iteration)
-        view = self.dataset.views[number]
+        self._refine_poses(of=number)
+        if settings.fit_exposures and self._refinement is not None:
+            first = (iteration - 1) % len(self.dataset.views) == 0
+            if first or any(of == number for _, of, _ in self._pending):
+                self._read_losses()
+            if first:
+                self._refinement.centre_exposures()
         try:
             loss, gradients = self._differentiated(iteration, number, waits=False)
         except CapacityExceeded:
             loss, gradients = self._differentiated(iteration, number, waits=True)
-        self._pending.append((iteration, view.name, loss))
+        self._pending.append((iteration, number, loss))
         full = len(self._pending) > self._model.max_pending_losses
         if not late or full or settings.densifies_after(iteration):
             self._read_losses()  # read late, so that the device is busy meanwhile
-        self._update(gradients, iteration, view)
+        by_pose = self._update(gradients, iteration, self._camera(number))
+        if by_pose is not None:
+            self._pose_gradients.append((iteration, number, by_pose))
         state.iteration = iteration
         state.history["counts"][iteration - 1] = len(self._model)
 
@@ -266,8 +326,8 @@ class Trainer:
             TrainingError: one is not finite, now or in an earlier call.
         """
         while self._failure is None and self._pending:
-            iteration, view, read = self._pending[0]
-            loss = read()
+            iteration, number, read = self._pending[0]
+            view, loss = self.dataset.views[number].name, read()
             if not math.isfinite(loss.value):
                 failure = TrainingError(
                     f"the loss is {loss.value} at iteration {iteration}, in the view {view}; "
@@ -282,8 +342,42 @@ class Trainer:
                 history["losses"][iteration - 1], history["psnrs"][iteration - 1] = loss.value, loss.psnr
                 self._unreported.append((iteration, view, loss))
                 self._pending.popleft()
+                if loss.by_exposure is not None and self._refinement is not None:
+                    self._refinement.expose(number, loss.by_exposure, iteration)
         if self._failure is not None:
             raise self._failure
+
+    def _refine_poses(self, of: int | None = None) -> None:
+        """Apply the gradients of poses that are not applied yet. A view is rendered with the pose after all
+        its earlier iterations, whenever their gradients are read.
+
+        of: only if one of them is of this view.
+        """
+        refinement = self._refinement
+        if refinement is None or (
+            of is not None and all(number != of for _, number, _ in self._pose_gradients)
+        ):
+            return
+        while self._pose_gradients:
+            iteration, number, read = self._pose_gradients.popleft()
+            by_pose = read()
+            if not np.isfinite(by_pose).all():
+                raise TrainingError(
+                    f"the gradient of the pose of {self.dataset.views[number].name} is not finite at "
+                    f"iteration {iteration}; " + self._checkpoint_state()
+                )
+            refinement.move(number, by_pose, iteration)
+            self._set_camera(number, refinement.cameras[number])
+
+    def _camera(self, number: int) -> Camera:
+        """The current camera of a training view."""
+        refined = self._refinement
+        return self.dataset.views[number].camera if refined is None else refined.cameras[number]
+
+    def _set_camera(self, number: int, camera: Camera) -> None:
+        """Render a training view with another camera from now on."""
+        self._captures[number] = replace(self._captures[number], camera=camera)
+        self._surface_captures[number] = replace(self._surface_captures[number], camera=camera)
 
     def _steps(self) -> Iterator[Step]:
         """Unreported steps."""
@@ -311,7 +405,9 @@ class Trainer:
                 self.renderer.backend.compile_in_background(upcoming)
         pipeline = self._differentiate(features)
         images = pipeline.forward(resident, prepared, waits)
-        loss, by_rgb = self._model.loss(images, number)
+        fitted = self._refinement if self.settings.fit_exposures else None
+        exposure = None if fitted is None else fitted.exposures[number].copy()
+        loss, by_rgb = self._model.loss(images, number, exposure)
         by_images = {"rgb": by_rgb}
         if by_normals:
             by_images |= self._model.normal_loss_gradients(images, number, by_normals)
@@ -350,6 +446,16 @@ class Trainer:
                 else splats_from_cloud(start, settings, dataset.origin)
             )
             state = TrainingState.initial(splats)
+        if self._refinement is not None and state.views:
+            try:
+                self._refinement.restore(state.views)
+            except (ValueError, LookupError) as error:
+                raise InputError(
+                    f"cannot read {self.checkpoint} as a checkpoint: {error}; remove it, or give --overwrite "
+                    "to start again"
+                ) from error
+            for number, camera in enumerate(self._refinement.cameras):
+                self._set_camera(number, camera)
         remaining = settings.iterations - state.iteration
         state.history = {
             name: np.append(a, np.zeros(remaining, a.dtype)) for name, a in state.history.items()
@@ -377,22 +483,24 @@ class Trainer:
             if iteration % settings.reset_every == 0:
                 self._model.reset_opacities()
 
-    def _update(self, gradients: Any, iteration: int, view: TrainingView) -> None:
+    def _update(self, gradients: Any, iteration: int, camera: Camera) -> Callable[[], np.ndarray] | None:
         """Update the splats by Adam, unless densification by the default strategy follows, as in the authors'
-        trainer (whose new splats have no gradient yet)."""
+        trainer (whose new splats have no gradient yet). Returns a function that reads the gradient of the
+        pose, if poses are refined."""
         settings, mcmc_runs = self.settings, self.settings.strategy == "mcmc"
         origin = self.dataset.origin
         if not mcmc_runs and settings.densifies_after(iteration):
-            self._model.accumulate_statistics(gradients, view.camera, origin)
-            return
-        camera = view.camera if not mcmc_runs and iteration < settings.densify_until else None
+            self._model.accumulate_statistics(gradients, camera, origin)
+            return None
+        counted = camera if not mcmc_runs and iteration < settings.densify_until else None
         rate = learning_rates(settings, iteration, self.dataset.extent)
-        self._model.step(gradients, rate, settings.adam_steps(iteration), camera, origin)
+        by_pose = self._model.step(gradients, rate, settings.adam_steps(iteration), counted, origin)
         if mcmc_runs:
             with self._all_or_failed():
                 if settings.densifies_after(iteration):
                     self._model.load(mcmc.relocate_and_grow(self._model.read(), settings, iteration))
                 self._model.add_noise(iteration, rate["means"])
+        return by_pose
 
     @contextmanager
     def _all_or_failed(self) -> Iterator[None]:

@@ -12,8 +12,9 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.formats.colmap_read import byte_colors
 from fidsplat.formats.ply_header import read_header
-from fidsplat.images.files import read_image, read_on_background
+from fidsplat.images.files import read_on_background
 from fidsplat.train.dataset import TrainingView
+from fidsplat.train.masks import Masks
 from fidsplat.train.undistorted_view import undistorted_view
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, path_of, read_text
@@ -41,7 +42,7 @@ def has_transforms(path: Path) -> bool:
     return named or any((path / name).is_file() for name in _NAMES)
 
 
-def load_transforms(path: Path, progress: Callable[[str, float], None]) -> DatasetContents:
+def load_transforms(path: Path, progress: Callable[[str, float], None], masks: Masks) -> DatasetContents:
     """Read the views and points of transforms.json. Views in its val_filenames and test_filenames, and in
     transforms_test.json next to it, are held out.
 
@@ -51,10 +52,10 @@ def load_transforms(path: Path, progress: Callable[[str, float], None]) -> Datas
     """
     file = path if path.is_file() else next(path / name for name in _NAMES if (path / name).is_file())
     table = _table(file)
-    views, held_out = _divided(file, table, _views(file, table, progress, "images"))
+    views, held_out = _divided(file, table, _views(file, table, progress, "images", masks))
     test = file.with_name("transforms_test.json")
     if test.is_file():
-        held_out += _views(test, _table(test), progress, "test images")
+        held_out += _views(test, _table(test), progress, "test images", masks)
     points, colors = _points(file, table)
     return DatasetContents(views, held_out, points, colors, _BLACK)
 
@@ -72,7 +73,9 @@ def _table(file: Path) -> dict[str, Any]:
     return table
 
 
-def _views(file: Path, table: dict, progress: Callable[[str, float], None], words: str) -> list[TrainingView]:
+def _views(
+    file: Path, table: dict, progress: Callable[[str, float], None], words: str, masks: Masks
+) -> list[TrainingView]:
     views: list[TrainingView] = []
     others: set[tuple[int, int]] = set()
     for number, frame in enumerate(table["frames"]):
@@ -84,9 +87,9 @@ def _views(file: Path, table: dict, progress: Callable[[str, float], None], word
                 f"{file}: frame {number} must have a file_path and a transform_matrix of 4 x 4 finite "
                 f"numbers, got {str(frame)[:80]!r}"
             ) from None
-        image, mask = _image(file, name, others), None
-        if "mask_path" in frame:
-            mask = read_image(file.parent / str(frame["mask_path"])).max(axis=2) > 0
+        place = _image_file(file, name, others)
+        given = file.parent / str(frame["mask_path"]) if "mask_path" in frame else None
+        image, mask = read_on_background(place, _BLACK), masks.of(place, name, given)
         views.append(undistorted_view(name, _camera(f"{file}: {name}", table, number, image), image, mask))
     return sorted(views, key=lambda view: view.name)
 
@@ -112,11 +115,11 @@ def _divided(
     return first, second
 
 
-def _image(file: Path, name: str, others: set[tuple[int, int]]) -> np.ndarray:
+def _image_file(file: Path, name: str, others: set[tuple[int, int]]) -> Path:
     candidates = [path_of(file.parent / (name + suffix)) for suffix in _SUFFIXES]
     image = next((one for one in candidates if one.is_file()), candidates[0])
     check_other_image(image, others)
-    return read_on_background(image, _BLACK)
+    return image
 
 
 def check_other_image(image: Path, others: set[tuple[int, int]]) -> None:

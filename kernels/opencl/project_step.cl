@@ -15,6 +15,7 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
     local float by_means[3 * STEP_ITEMS], by_scales[AXES * STEP_ITEMS], by_quats[4 * STEP_ITEMS], by_opacities[STEP_ITEMS];
     local float by_colors[3 * STEP_ITEMS], basis[TERMS_CAPACITY * STEP_ITEMS];
     local uchar skipped[STEP_ITEMS];
+//@@ step_local
     uint i = get_global_id(0), item = get_local_id(0), first = get_group_id(0) * STEP_ITEMS;
     if (i < count) {
         const SplatGradient own = splat_gradient(
@@ -38,8 +39,10 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
         bool depends = own.opacity != 0.0f;
         for (int k = 0; k < 3; k++) depends |= own.mean[k] != 0.0f || own.basis[0] * own.color[k] != 0.0f;
         skipped[item] = sparse && !depends;
+//@@ step_gradient
     }
     barrier(CLK_LOCAL_MEM_FENCE);
+//@@ step_sums
     if (!move) return;
 
 #if LANES > 1

@@ -41,7 +41,8 @@ MAY_IMPORT = {
     "worlds": DATA | {"scenes", "markers", "formats", "store", "sim"},
     "logs": {"splats", "cameras", "effects", "images", "vision"},
     "photographs": DATA | {"images", "markers", "formats", "vision", "scenes", "train"},
-    "train": DATA | {"formats", "markers", "images", "vision", "render", "backends", "effects"},
+    "train": DATA
+    | {"localisation", "formats", "markers", "images", "vision", "render", "backends", "effects"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}
 

@@ -67,7 +67,7 @@ _STEP = (
     *("prelude", "math", "splat", "bounds", "moments", "set_up_backward"),
     *("train/activation_functions", "train/adam", "project_step"),
 )
-_TRAINING = ("surface", "activation_functions", "activate", "gather_rows", "position_noise")
+_TRAINING = ("surface", "exposure", "activation_functions", "activate", "gather_rows", "position_noise")
 _HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")
 _HOOKS = re.compile(r"^[ \t]*//@@ (\w+)(?: \w+)?[ \t]*$", re.MULTILINE)
 _COMMENT = re.compile(r"[ \t]*//.*")
@@ -227,17 +227,21 @@ def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
     return _assemble_backward("gradients", _GRADIENTS, features, shape)
 
 
-def assemble_step(features: FeatureSet, shape: DeviceShape) -> Source:
-    """The source of a training step: the last stage of the derivatives, fused with Adam."""
-    return _assemble_backward("step", _STEP, features, shape)
+def assemble_step(features: FeatureSet, shape: DeviceShape, pose: bool = False) -> Source:
+    """The source of a training step: the last stage of the derivatives, fused with Adam. pose: also sums the
+    gradient with respect to the pose."""
+    return _assemble_backward("step", _STEP, features, shape, ("step_pose",) if pose else ())
 
 
-def _assemble_backward(name: str, stages: Sequence[str], features: FeatureSet, shape: DeviceShape) -> Source:
-    layouts = layouts_of(features)
+def _assemble_backward(
+    name: str, stages: Sequence[str], features: FeatureSet, shape: DeviceShape, parts: Sequence[str] = ()
+) -> Source:
+    layouts = layouts_of(features) | {part: LAYOUTS[part] for part in parts}
     # the backward pass needs the forward text of slots, but only the derivatives of outputs
     files = [layout.file for layout in layouts_of(replace(features, outputs=(), posts=())).values()]
     files += _dialect(shape, _scalars(features), features.slots)
     files += [layout.backward_file for layout in layouts.values()]
+    files += [LAYOUTS[part].file for part in parts]
     kernels = kernels_of(shape)
     declared = Declarations(_scalars(features), layouts, kernels=kernels)
     backward = {"BACK_ITEMS": backward_items(features, shape), "CHUNK": backward_chunk(features, shape)}

@@ -187,6 +187,9 @@ LAYOUTS: dict[str, Layout] = {
         ),
         project_step=takes("out float activated_thickness"),
     ),
+    "step_pose": Layout(
+        "train/step_pose.cl", project_step=takes("out real group_sums  // (work-groups, 6) by the pose")
+    ),
     "box_cover": Layout("part/box_cover.cl"),
     "box_edges": Layout(
         "part/box_edges.cl",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from copy import copy
 from typing import Any
@@ -81,15 +81,19 @@ class TileGradients:
         with self._last():
             return self._of.sum_tiles(self._frame)
 
-    def compile_step(self) -> None:
+    def compile_step(self, pose: bool = False) -> None:
         """Compile the kernel of `step`."""
-        self._of.compile_step()
+        self._of.compile_step(pose)
 
-    def step(self, given: Mapping[str, Any]) -> None:
-        """Submit an optimiser step (kernels/opencl/project_step.cl). given: arguments that are not the
-        frame's."""
+    def step(self, given: Mapping[str, Any], pose: bool = False) -> Callable[[], np.ndarray] | None:
+        """Submit an optimiser step (kernels/opencl/project_step.cl).
+
+        Args:
+            given: arguments that are not the frame's.
+            pose: whether to return a function that waits for the gradient (6,) with respect to the pose.
+        """
         with self._last():
-            self._of.step(self._frame, given)
+            return self._of.step(self._frame, given, pose)
 
     def _last(self) -> AbstractContextManager[None]:
         if not self._images.last:
@@ -120,7 +124,8 @@ class OpenCLGradients(GradientPipeline):
         self._pair_limit = 0
         """list capacity of frames for whose counts the host does not wait"""
         self._tile_commands, self._sum_commands = CommandList(self.program), CommandList(self.program)
-        self._step_commands: CommandList | None = None
+        self._step_commands: dict[bool, CommandList] = {}
+        """command lists of a step by whether it sums the gradient of the pose"""
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
         """Render one frame. waits: whether to wait for its counts; GPUs need not after the first frame."""
@@ -234,17 +239,22 @@ class OpenCLGradients(GradientPipeline):
         frame.launch("project backward", "add_up", ((3 + 6) * _GROUP,), (_GROUP,), **given)
         return found
 
-    def compile_step(self) -> None:
+    def compile_step(self, pose: bool = False) -> None:
         """Compile the kernel of `step`, which gradients do not need."""
-        if self._step_commands is None:
-            source = assemble_step(self._pipeline.features, self._pipeline.shape)
-            self._step_commands = CommandList(Program(self._pipeline.workspace, source))
+        if pose not in self._step_commands:
+            source = assemble_step(self._pipeline.features, self._pipeline.shape, pose)
+            self._step_commands[pose] = CommandList(Program(self._pipeline.workspace, source))
 
-    def step(self, frame: DeviceFrame, given: Mapping[str, Any]) -> None:
-        """Submit a step of Adam from the sums over tiles. given: arguments that are not the frame's."""
-        commands, count = self._step_commands, frame.resident.count
-        assert commands is not None  # `compile_step`
+    def step(
+        self, frame: DeviceFrame, given: Mapping[str, Any], pose: bool = False
+    ) -> Callable[[], np.ndarray] | None:
+        """Submit a step of Adam from the sums over tiles; `compile_step` comes first. given: arguments that
+        are not the frame's. pose: whether to return a function that waits for the gradient of the pose."""
+        commands, count = self._step_commands[pose], frame.resident.count
         given = {**given, "count": count}
+        groups = -(-count // _GROUP)
+        if pose:
+            frame.take("group_sums", 6 * self.source.scalars.dtype("real").itemsize * groups)
         arguments = commands.program.source.arguments["project_step"]
         values = {one.name: given[one.name] if one.name in given else frame.value(one) for one in arguments}
         if commands.key != count:
@@ -256,6 +266,29 @@ class OpenCLGradients(GradientPipeline):
         (event,) = commands.submit(frame.queue)
         frame.events.append(event)
         frame.stages.append("project backward")
+        return self._pose_readback(frame, groups) if pose else None
+
+    def _pose_readback(self, frame: DeviceFrame, groups: int) -> Callable[[], np.ndarray]:
+        """Sum the gradient of the pose over work-groups; returns a function that waits for it."""
+        frame = copy(frame)
+        frame.commands = self._sum_commands
+        self._sum_commands.clear()
+        arrays = {
+            name: frame.pool.array(frame.queue, name, (k,)) for name, k in (("background", 3), ("pose", 6))
+        }
+        given: dict[str, Any] = {name: array.data for name, array in arrays.items()}
+        given |= {"tiles": frame.tiles, "groups": groups}
+        frame.launch("project backward", "add_up", ((3 + 6) * _GROUP,), (_GROUP,), **given)
+        found = np.empty(6, np.float32)
+        copied = cl.enqueue_copy(frame.queue, found, given["pose"], is_blocking=False)
+        frame.queue.flush()
+
+        def read() -> np.ndarray:
+            with _differentiating(frame):
+                copied.wait()
+            return found
+
+        return read
 
     def _check_capacity(self, frame: DeviceFrame) -> None:
         """Raise CapacityExceeded if the lists were too small: then they are empty, and gradient buffer

@@ -114,6 +114,7 @@ _BLEND = takes(
     "out float raw  // 4 channels: r, g, b, transmittance",
 )
 
+_EXPOSURE = "float gain_red gain_green gain_blue offset_red offset_green offset_blue"
 _LOSS_SIZE = takes(
     "int width height  // values of a row: three of a pixel; rows",
     "int stride  // floats of an image's row",
@@ -269,6 +270,14 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "loss_strips_backward": takes(
         *(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK),
         *("float l1_share ssim_share", "in float images", "out float by_rgb"),
+    ),
+    "apply_exposure": takes("uint count  // pixels", _EXPOSURE, "in float rgb", "out float exposed"),
+    "exposure_backward": takes(
+        "uint count",
+        _EXPOSURE,
+        "in float rgb",
+        "out float by_rgb",
+        "out float exposure_sums  // (work-groups, 6)",
     ),
     "surface_normals": takes(
         _SURFACE,

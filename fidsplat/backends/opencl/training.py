@@ -27,6 +27,8 @@ _PANEL, _STRIP = 128, 64
 """values of a row and number of rows per work-item on CPUs (kernels/opencl/train/loss_strips.cl)"""
 _SUMS, _SUMMED = 512, 128
 """work-groups of the loss sums, and their work-items (SUM_ITEMS of kernels/opencl/train/loss.cl)"""
+_EXPOSURE_GROUPS = 64
+"""work-groups of the sums by the exposure"""
 _EACH_ROWS = 4
 """rows per work-item of the vertical passes (EACH_ROWS of kernels/opencl/train/loss.cl)"""
 _MOMENTS = ("first_", "second_")
@@ -205,10 +207,15 @@ class OpenCLTraining(TrainingKernels):
         return self._resident[1]
 
     def loss(
-        self, images: Any, view: int, dssim_weight: float
-    ) -> tuple[Callable[[], tuple[float, float]], Any]:
+        self, images: Any, view: int, dssim_weight: float, exposure: np.ndarray | None = None
+    ) -> tuple[Callable[[], tuple[Any, ...]], Any]:
         """Compare a frame with the image of a view."""
         rgb, (height, columns, _) = images.device_buffer("rgb")
+        rendered, shown = rgb, _exposure_arguments(exposure)
+        if shown:
+            rgb = self._scratch("exposed", 12 * height * columns)
+            given = shown | {"count": height * columns, "rgb": rendered, "exposed": rgb}
+            self._launch("apply_exposure", height * columns, given)
         target, size, strided = self._targets[view], 3 * height * columns, self._lanes > 1
         number, stride = target.values, self._stride(columns)
         grid = (-(-3 * columns // _PANEL), -(-height // _STRIP)) if strided else (_SUMS,)
@@ -239,14 +246,37 @@ class OpenCLTraining(TrainingKernels):
         events = self._replay("loss", (height, columns, dssim_weight), given, launches)
         sums.submitted(slot, events[0 if strided else -1])
 
-        def value() -> tuple[float, float]:
+        by_exposure: Callable[[], np.ndarray] | None = None
+        if shown:
+            given = shown | {"count": height * columns, "rgb": rendered, "by_rgb": gradient.data}
+            by_exposure = self._exposure_readback(given)
+
+        def value() -> tuple[Any, ...]:
             self._queue.flush()
             with self._workspace.failing("training"):
                 absolute, squared, ssim = sums.read(slot)
+                more = () if by_exposure is None else (by_exposure(),)
             loss = (1 - dssim_weight) * absolute / number + dssim_weight * (1 - ssim / size)
-            return float(loss), float(squared / number)
+            return float(loss), float(squared / number), *more
 
         return value, gradient
+
+    def _exposure_readback(self, given: Mapping[str, Any]) -> Callable[[], np.ndarray]:
+        """Continue the gradient of the loss to the render; returns a function that waits for the gradient by
+        the exposure."""
+        groups = _EXPOSURE_GROUPS
+        sums, found = self._scratch("exposure sums", 24 * groups), np.empty((groups, 6), np.float32)
+        launch = self._one(
+            "exposure_backward", (groups * _GROUP,), (_GROUP,), {**given, "exposure_sums": sums}
+        )
+        self._enqueue(launch)
+        copied = cl.enqueue_copy(self._queue, found, sums, is_blocking=False)
+
+        def read() -> np.ndarray:
+            copied.wait()
+            return found.sum(axis=0, dtype=np.float64).reshape(2, 3)
+
+        return read
 
     def normal_loss_gradients(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:
         """Gradients of the normal loss."""
@@ -278,18 +308,26 @@ class OpenCLTraining(TrainingKernels):
         numbers: Mapping[str, float],
         camera: Camera | None,
         origin: np.ndarray,
-    ) -> None:
+        pose: bool = False,
+    ) -> Callable[[], np.ndarray] | None:
         """Apply a step of Adam."""
         given = {f"size_{name}": size for name, size in sizes.items()} | dict(numbers)
         given |= {"rest1": 1 - numbers["beta1"], "rest2": 1 - numbers["beta2"]}
-        self._step(taken, given | {"move": 1, "sparse": int(numbers["sparse"])}, camera, origin)
+        return self._step(taken, given | {"move": 1, "sparse": int(numbers["sparse"])}, camera, origin, pose)
 
-    def _step(self, taken: Any, given: Mapping[str, Any], camera: Camera | None, origin: np.ndarray) -> None:
+    def _step(
+        self,
+        taken: Any,
+        given: Mapping[str, Any],
+        camera: Camera | None,
+        origin: np.ndarray,
+        pose: bool = False,
+    ) -> Callable[[], np.ndarray] | None:
         # compiling takes seconds: it is first, so that an interrupt leaves the statistics unchanged
-        taken.compile_step()
+        taken.compile_step(pose)
         if camera is not None:
             self._count_visible(camera, origin)
-        taken.step({**self._bound, **given, "counted": int(camera is not None)})
+        return taken.step({**self._bound, **given, "counted": int(camera is not None)}, pose)
 
     def _count_visible(self, camera: Camera, origin: np.ndarray) -> None:
         """Add the visible splats to `visible_counts`."""
@@ -386,6 +424,16 @@ class OpenCLTraining(TrainingKernels):
         cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.float32), 0, size)
         self._loss_images = (height, columns), buffer
         return buffer
+
+
+def _exposure_arguments(exposure: np.ndarray | None) -> dict[str, float]:
+    """Arguments of the kernels of exposure: gains and offsets; none without an exposure."""
+    if exposure is None:
+        return {}
+    logarithms, offsets = exposure
+    channels = ("red", "green", "blue")
+    gains = zip((f"gain_{name}" for name in channels), np.exp(logarithms).tolist(), strict=True)
+    return dict(gains) | dict(zip((f"offset_{name}" for name in channels), offsets.tolist(), strict=True))
 
 
 def _camera_arguments(camera: Camera, origin: np.ndarray) -> dict[str, float]:

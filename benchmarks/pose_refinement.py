@@ -1,0 +1,91 @@
+"""Training on views with disturbed poses: PSNR of held-out views with true poses, and with and without
+refinement of the disturbed ones.
+
+    python benchmarks/pose_refinement.py yard --iterations 2000 [--degrees 0.3] [--share 0.01] [--device D]
+
+The data set is that of `fidsplat demo views -o yard`. Each training pose is rotated by normal numbers of so
+many degrees, and moved by this share of the median depth of the points. Prints PSNR and SSIM of the held-out
+views, the errors of the poses relative to the first one, and milliseconds per step.
+"""
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+from measuring import PROGRESS, facts, keep, options, show
+
+import fidsplat as fs
+from fidsplat.cameras.pose_offset import offset_camera
+from fidsplat.train import Dataset, Trainer, load_dataset
+
+
+def main() -> None:
+    parser = options(__doc__)
+    parser.add_argument("dataset", help="folder")
+    parser.add_argument("--iterations", type=int, default=2000)
+    parser.add_argument("--max-splats", type=int, default=20000)
+    parser.add_argument("--degrees", type=float, default=0.3, help="standard deviation of rotations")
+    parser.add_argument("--share", type=float, default=0.01, help="of positions, relative to the depth")
+    parser.add_argument("--rate", type=float, help="learning rate of poses")
+    parser.add_argument("--refined-only", action="store_true", help="only the last of the three")
+    words = parser.parse_args()
+    renderer, given = fs.Renderer(words.device), load_dataset(words.dataset)
+    off = disturbed(given, math.radians(words.degrees), words.share)
+    changes = {} if words.rate is None else {"pose_rate": words.rate}
+    rows = {}
+    for name, dataset, refine in (
+        ("true poses", given, False),
+        ("disturbed poses", off, False),
+        ("disturbed poses, refined", off, True),
+    )[2 if words.refined_only else 0 :]:
+        trainer = Trainer(dataset, renderer, iterations=words.iterations, max_splats=words.max_splats,
+                          refine_poses=refine, **changes)  # fmt: skip
+        begun = time.process_time()
+        trainer.run()
+        took = 1e3 * (time.process_time() - begun) / words.iterations
+        scores = trainer.evaluate()
+        rows[name] = {
+            "PSNR, dB": float(np.mean([score.psnr for score in scores])),
+            "SSIM": float(np.mean([score.ssim for score in scores])),
+            "position, mm": 1e3 * pose_errors(trainer, given)[0],
+            "rotation, degrees": pose_errors(trainer, given)[1],
+            "processor ms a step": took,
+        }
+        PROGRESS.print(name, rows[name])
+    if not keep(facts(renderer) | {"rows": rows}, words.json):
+        heads = ("", *next(iter(rows.values())))
+        show(
+            given.name,
+            heads,
+            [(name, *(f"{value:.4g}" for value in row.values())) for name, row in rows.items()],
+        )
+
+
+def disturbed(dataset: Dataset, angle: float, share: float) -> Dataset:
+    random, views = np.random.default_rng(0), []
+    for view in dataset.views:
+        depth = np.median((dataset.points - view.camera.position) @ view.camera.world_to_camera[2, :3])
+        motion = random.normal(size=6) * np.repeat([angle, share * depth], 3)
+        # the rotation is about the camera
+        views.append(replace(view, camera=offset_camera(view.camera, motion)))
+    return replace(dataset, views=tuple(views))
+
+
+def pose_errors(trainer: Trainer, given: Dataset) -> tuple[float, float]:
+    """Root mean square errors of the training poses [m], [degrees], after the best rigid alignment."""
+    found = np.array([view.camera.camera_to_world for view in trainer.views])
+    true = np.array([view.camera.camera_to_world for view in given.views])
+    # mean rotation between the two, then the mean shift
+    left, _, right = np.linalg.svd(np.einsum("nij,nkj->ik", true[:, :3, :3], found[:, :3, :3]))
+    turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    positions = found[:, :3, 3] @ turn.T
+    shifts = positions - true[:, :3, 3]
+    shifts -= shifts.mean(axis=0)
+    rotations = np.einsum("nji,njk->nik", true[:, :3, :3], turn @ found[:, :3, :3])
+    angles = np.arccos(np.clip((np.trace(rotations, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    return float(np.sqrt((shifts**2).sum(1).mean())), math.degrees(float(np.sqrt((angles**2).mean())))
+
+
+if __name__ == "__main__":
+    main()

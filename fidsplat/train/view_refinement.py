@@ -1,0 +1,136 @@
+"""Refinement of the training views: camera poses, and exposures (a gain and an offset of each channel).
+
+Each view has its own numbers, optimised by Adam. A rotation is about a point in front of the camera, at the
+median depth of the data set's points, and a translation is in units of this depth. So the six numbers move
+the image by similar amounts and are hardly coupled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.cameras.pose_offset import offset_camera
+from fidsplat.train.dataset import Dataset, TrainingView
+from fidsplat.train.settings import TrainSettings
+
+_EPSILON = 1e-12
+"""relative to gradients, which are means over pixels"""
+_AT_ORIGIN = Camera.pinhole(4, 4, 4, 4, 2, 2)
+
+
+class _Adam:
+    """Adam's moments of six numbers of each view, in two groups of three. The numbers of a group have one
+    step size, so that the direction of a step does not depend on axes."""
+
+    def __init__(self, views: int, settings: TrainSettings) -> None:
+        self._betas = settings.beta1, settings.beta2
+        self.moments = np.zeros((2, views, 6))
+        self.steps = np.zeros(views, np.int64)
+
+    def direction(self, view: int, gradient: np.ndarray) -> np.ndarray:
+        """The step (6,) of a view, in units of the learning rate."""
+        self.steps[view] += 1
+        step, corrected = int(self.steps[view]), []
+        for moments, beta, sample in zip(self.moments, self._betas, (gradient, gradient**2), strict=True):
+            moments[view] += (1 - beta) * (sample - moments[view])
+            corrected.append(moments[view] / (1 - beta**step))
+        mean, square = corrected
+        return -mean / (np.repeat(np.sqrt(square.reshape(2, 3).mean(axis=1)), 3) + _EPSILON)
+
+
+class ViewRefinement:
+    """Refined cameras and exposures of the training views."""
+
+    def __init__(self, dataset: Dataset, settings: TrainSettings) -> None:
+        self._settings = settings
+        self._given = [view.camera for view in dataset.views]
+        self.cameras = list(self._given)
+        """current cameras"""
+        self.exposures = np.zeros((len(self._given), 2, 3))
+        """logarithms of gains, and offsets, by channel; their means over the views are 0"""
+        self._depths = [_median_depth(view, dataset) for view in dataset.views]
+        self._pose_adam, self._exposure_adam = (_Adam(len(self._given), settings) for _ in range(2))
+
+    def move(self, view: int, by_pose: np.ndarray, iteration: int) -> None:
+        """Apply a step to the camera of a view. by_pose: (6,) gradient `pose` of the loss at an iteration."""
+        depth, gradient = self._depths[view], by_pose.astype(np.float64)
+        pivot = np.array([0.0, 0.0, depth])
+        gradient[:3] -= np.cross(pivot, gradient[3:])
+        gradient[3:] *= depth
+        motion = self._settings.pose_rate_at(iteration) * self._pose_adam.direction(view, gradient)
+        motion[3:] *= depth
+        # the rotation about the camera moves the pivot; move it back
+        turned = offset_camera(_AT_ORIGIN, np.concatenate([motion[:3], np.zeros(3)]))
+        motion[3:] += pivot - turned.world_to_camera[:3, :3] @ pivot
+        self.cameras[view] = offset_camera(self.cameras[view], motion)
+
+    def expose(self, view: int, by_exposure: np.ndarray, iteration: int) -> None:
+        """Apply a step to the exposure of a view. by_exposure: (2, 3) gradient at an iteration."""
+        direction = self._exposure_adam.direction(view, by_exposure.ravel()).reshape(2, 3)
+        self.exposures[view] += self._settings.exposure_rate_at(iteration) * direction
+
+    def centre_exposures(self) -> None:
+        """Set the means of the exposures over the views to 0; the splats' colours include them."""
+        self.exposures -= self.exposures.mean(axis=0)
+
+    def pose_changes(self) -> np.ndarray:
+        """(views, 2): metres and degrees between the given and the refined cameras."""
+        return np.array([_distance(a, b) for a, b in zip(self._given, self.cameras, strict=True)])
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The state, for a checkpoint."""
+        return {
+            "poses": np.array([camera.world_to_camera for camera in self.cameras]),
+            "pose_moments": self._pose_adam.moments.copy(),
+            "pose_steps": self._pose_adam.steps.copy(),
+            "exposures": self.exposures.copy(),
+            "exposure_moments": self._exposure_adam.moments.copy(),
+            "exposure_steps": self._exposure_adam.steps.copy(),
+        }
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Set the state of a checkpoint. Raises ValueError or LookupError if it does not fit the views."""
+        for name, own in self.arrays().items():
+            array = arrays[name]
+            if array.shape != own.shape or array.dtype != own.dtype or not np.isfinite(array).all():
+                raise ValueError(f"{name} must be finite {own.dtype} of the shape {own.shape}")
+        self.cameras = [
+            camera if (pose == camera.world_to_camera).all() else camera.with_pose(pose)
+            for camera, pose in zip(self._given, arrays["poses"], strict=True)
+        ]
+        self.exposures = arrays["exposures"].copy()
+        for name, adam in (("pose", self._pose_adam), ("exposure", self._exposure_adam)):
+            adam.moments, adam.steps = arrays[f"{name}_moments"].copy(), arrays[f"{name}_steps"].copy()
+
+
+def with_exposure_of(rendered: np.ndarray, view: TrainingView) -> np.ndarray:
+    """A rendered image (h, w, 3) with the gain and offset of each channel that fit the image of a view."""
+    target = view.image.astype(np.float64) / 255
+    inside = np.ones(target.shape[:2], bool) if view.mask is None else view.mask
+    corrected = np.empty_like(rendered)
+    for channel in range(3):
+        x, y = rendered[:, :, channel], target[:, :, channel][inside]
+        terms = np.stack([x[inside].astype(np.float64), np.ones(len(y))], axis=1)
+        (gain, offset), *_ = np.linalg.lstsq(terms, y, rcond=None)
+        corrected[:, :, channel] = gain * x + offset
+    return corrected
+
+
+def _median_depth(view: TrainingView, dataset: Dataset) -> float:
+    """Median depth of the points in front of a camera; the scene extent without any."""
+    camera = view.camera
+    depths = (dataset.points - camera.position) @ camera.world_to_camera[2, :3]
+    depths = depths[depths > camera.near]
+    return float(np.median(depths)) if len(depths) else dataset.extent
+
+
+def _distance(one: Camera, other: Camera) -> tuple[float, float]:
+    """Metres and degrees."""
+    turn = one.world_to_camera[:3, :3] @ other.world_to_camera[:3, :3].T
+    sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    angle = math.degrees(math.atan2(float(sine), (float(np.trace(turn)) - 1) / 2))
+    return float(np.linalg.norm(one.position - other.position)), angle

@@ -1,0 +1,159 @@
+"""Refinement of training views: poses, exposures, and masks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from training_scene import BACKGROUND
+
+import fidsplat as fs
+from fidsplat.cameras.pose_offset import offset_camera
+from fidsplat.images.files import to_uint8, write_png
+from fidsplat.train import Dataset, Trainer, TrainingView, load_dataset
+from fidsplat.vision.pose import pose_error
+
+FIXED = {
+    **dict.fromkeys(("position_rate", "position_rate_end", "color_rate", "opacity_rate"), 0.0),
+    **dict.fromkeys(("scale_rate", "rotation_rate", "dssim_weight"), 0.0),
+    **{"sh_degree": 0, "densify_until": 0, "quality": "surfel"},
+}
+"""splats that do not change"""
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return fs.Renderer("opencl")
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    random = np.random.default_rng(0)
+    return fs.SplatCloud(
+        random.uniform(-0.5, 0.5, (40, 3)) + np.array([2.0, -1.0, 3.0]),
+        random.normal(size=(40, 4)),
+        random.uniform(0.05, 0.15, (40, 2)),
+        random.uniform(0.6, 0.95, 40),
+        colors=random.uniform(0, 1, (40, 3)),
+    )
+
+
+@pytest.fixture(scope="module")
+def given(renderer, cloud):
+    """Views from an arc away from the origin, with fx other than fy."""
+    views = []
+    for k, angle in enumerate(np.linspace(-1, 1, 4)):
+        position = (2 + 1.6 * np.sin(angle), -1 + 0.3 * np.cos(3 * angle), 3 - 1.6 * np.cos(angle))
+        pose = fs.Camera.look_at(32, 24, 0.9, position, (2, -1, 3)).world_to_camera
+        camera = fs.Camera.pinhole(32, 24, 33.0, 36.0, 16.5, 11.5, pose)
+        rgb = renderer.render(cloud, camera, quality="surfel", background=BACKGROUND)["rgb"]
+        views.append(TrainingView(f"{k}.png", camera, to_uint8(rgb)))
+    points = cloud.world_means()
+    return Dataset("arc", tuple(views), (), points, np.full(points.shape, 128, np.uint8), BACKGROUND)
+
+
+@pytest.fixture(scope="module")
+def disturbed(given):
+    random = np.random.default_rng(1)
+    motions = random.normal(size=(4, 6)) * np.repeat([0.01, 0.02], 3)
+    pairs = zip(given.views, motions, strict=True)
+    return replace(given, views=tuple(replace(v, camera=offset_camera(v.camera, m)) for v, m in pairs))
+
+
+def errors(views, truth):
+    """Largest distance [m] and angle [rad] between cameras."""
+    pairs = zip(views, truth.views, strict=True)
+    return np.max([pose_error(a.camera.camera_to_world, b.camera.camera_to_world) for a, b in pairs], axis=0)
+
+
+def test_poses_return_to_the_truth(renderer, cloud, given, disturbed):
+    trainer = Trainer(
+        disturbed, renderer, start=cloud, iterations=400, refine_poses=True, pose_rate_end=1e-4, **FIXED
+    )
+    trainer.run()
+    before, after = errors(disturbed.views, given), errors(trainer.views, given)
+    assert (before > (0.02, 0.008)).all()
+    assert (after < (0.002, 0.001)).all()
+    changes = trainer.pose_changes()
+    expected = [
+        pose_error(a.camera.camera_to_world, b.camera.camera_to_world)
+        for a, b in zip(disturbed.views, trainer.views, strict=True)
+    ]
+    np.testing.assert_allclose(changes, np.array(expected) * (1, 180 / np.pi), rtol=1e-6)
+
+
+def test_exposures_return_to_the_truth(renderer, cloud, given):
+    gains = np.exp(np.random.default_rng(2).normal(0, 0.1, (4, 3)))
+    gains /= np.exp(np.log(gains).mean(axis=0))
+    pairs = zip(given.views, gains, strict=True)
+    exposed = replace(
+        given, views=tuple(replace(v, image=to_uint8(v.image / 255 * gain)) for v, gain in pairs)
+    )
+    trainer = Trainer(exposed, renderer, start=cloud, iterations=400, fit_exposures=True, **FIXED)
+    trainer.run()
+    assert np.abs(trainer.exposures[:, 0] - gains).max() < 0.06
+    assert np.abs(trainer.exposures[:, 1]).max() < 0.03
+    assert trainer.evaluate(exposed.views)[0].psnr > 40
+    unfitted = Trainer(exposed, renderer, start=cloud, iterations=1, **FIXED)
+    assert unfitted.evaluate(exposed.views)[0].psnr < 30
+
+
+def test_devices_agree_on_refinement(renderer, cloud, disturbed):
+    """Kernels of the derivatives by pose and exposure against the float64 reference."""
+    found = []
+    for device in (renderer, fs.Renderer("reference")):
+        settings = {"iterations": 5, "refine_poses": True, "fit_exposures": True, "sh_degree": 0}
+        trainer = Trainer(disturbed, device, start=cloud, **settings)
+        trainer.run()
+        found.append((np.array([view.camera.world_to_camera for view in trainer.views]), trainer.exposures))
+    assert np.abs(found[0][0] - [view.camera.world_to_camera for view in disturbed.views]).max() > 5e-4
+    np.testing.assert_allclose(found[0][0], found[1][0], atol=2e-6)
+    np.testing.assert_allclose(found[0][1], found[1][1], atol=2e-6)
+
+
+def test_a_resumed_run_is_bit_identical(renderer, cloud, disturbed, tmp_path):
+    settings = {"iterations": 9, "refine_poses": True, "fit_exposures": True, "sh_degree": 0}
+    complete = Trainer(disturbed, renderer, start=cloud, **settings)
+    complete.run()
+    stopped = Trainer(disturbed, renderer, start=cloud, checkpoint=tmp_path / "a.npz", **settings)
+    for _ in range(6):
+        stopped.step()
+    stopped.save_checkpoint()
+    resumed = Trainer(disturbed, renderer, start=cloud, checkpoint=tmp_path / "a.npz", **settings)
+    assert resumed.iteration == 6
+    resumed.run()
+    for a, b in zip(resumed.views, complete.views, strict=True):
+        np.testing.assert_array_equal(a.camera.world_to_camera, b.camera.world_to_camera)
+    np.testing.assert_array_equal(resumed.exposures, complete.exposures)
+    np.testing.assert_array_equal(resumed.cloud().means, complete.cloud().means)
+
+
+def test_masks_of_a_folder_and_of_alpha(given, tmp_path):
+    import cv2
+
+    from fidsplat.formats.colmap import save_colmap
+
+    cameras = [view.camera for view in given.views]
+    names = [view.name for view in given.views]
+    save_colmap(tmp_path / "set" / "sparse" / "0", names, cameras, given.points, given.colors)
+    (tmp_path / "set" / "images").mkdir()
+    alpha = np.full((24, 32), 255, np.uint8)
+    alpha[:5] = 0
+    for view in given.views:
+        cv2.imwrite(str(tmp_path / "set" / "images" / view.name), np.dstack([view.image[:, :, ::-1], alpha]))
+    (tmp_path / "masks").mkdir()
+    mask = np.ones((24, 32), bool)
+    mask[:, :7] = False
+    write_png(tmp_path / "masks" / "0.png.png", mask)
+    plain = load_dataset(tmp_path / "set")
+    assert all(view.mask is None for view in plain.views)
+    assert (plain.views[0].image[:5] == 0).all()
+    found = load_dataset(tmp_path / "set", masks=tmp_path / "masks", alpha_masks=True)
+    np.testing.assert_array_equal(found.views[0].mask, mask & (alpha > 0))
+    np.testing.assert_array_equal(found.views[1].mask, alpha > 0)
+    with pytest.raises(fs.InputError, match=r"--masks must be a folder of masks NAME.png, got .*missing"):
+        load_dataset(tmp_path / "set", masks=tmp_path / "missing")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(fs.InputError, match=r"must have masks of the images, e\.g\. 0\.png\.png, got none"):
+        load_dataset(tmp_path / "set", masks=tmp_path / "empty")
+    with pytest.raises(fs.InputError, match="refine_poses must be True or False, got 'yes'"):
+        Trainer(given, refine_poses="yes")
