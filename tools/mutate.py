@@ -306,7 +306,7 @@ class Tree:
         path = os.pathsep.join(str(self._folder / name) for name in (".", "tools"))
         cache = str(self._folder / ".pycache")  # kernels are cached where the user's are: most do not change
         environment = os.environ | {"PYTHONPATH": path, "PYTHONPYCACHEPREFIX": cache, "COLUMNS": "999"}
-        options = ["-n", "0", "-x", "-v", "-p", "mutate", "-p", "no:cacheprovider"]
+        options = ["-n", "0", "-x", "-v", "--turn", "0", "-p", "mutate", "-p", "no:cacheprovider"]
         limits = resource.RLIMIT_CPU, (self._limit, self._limit + 5)
         with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as stream:
             child = subprocess.Popen(
