@@ -187,7 +187,7 @@ GOOD = {"width": 64, "height": 48, "fx": 50.0, "fy": 50.0, "cx": 32.0, "cy": 24.
         ({"far": math.nan}, "far must be above near"),
         ({"world_to_camera": np.eye(3)}, "world_to_camera must be a 4x4"),
         ({"world_to_camera": 2 * np.eye(4)}, "last row"),
-        ({"world_to_camera": np.diag([2, 2, 2, 1])}, "world_to_camera must be rigid.*scales by 2"),
+        ({"world_to_camera": np.diag([2, 2, 2, 1])}, "world_to_camera must be rigid.*got scale 2"),
         ({"world_to_camera": np.diag([1, 1, -1, 1])}, "reflection"),
         ({"world_to_camera": np.diag([1, 2, 1, 1])}, "world_to_camera must be a rotation"),
         ({"world_to_camera": np.full((4, 4), np.nan)}, "not finite"),
