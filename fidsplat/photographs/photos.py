@@ -10,6 +10,7 @@ import numpy as np
 from fidsplat.images.exif import read_exif, with_exif
 from fidsplat.images.files import (
     IMAGE_SUFFIXES,
+    VIDEO_SUFFIXES,
     declared_pixels,
     encode_image,
     is_video,
@@ -30,7 +31,9 @@ def source_files(source: Path) -> list[Path]:
     if is_video(source):
         return [source]
     if not source.is_dir():
-        raise InputError(f"PHOTOS must be a folder of images or a video, got {source}")
+        raise InputError(
+            f"PHOTOS must be a folder of images, or a video ({', '.join(VIDEO_SUFFIXES)}), got {source}"
+        )
     files = sorted(file for file in source.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
     if len(files) < MIN_PHOTOS:
         raise InputError(

@@ -13,7 +13,7 @@ LENSES = {"pinhole": "PINHOLE", "radial": "RADIAL", "opencv": "OPENCV", "fisheye
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """What is known about photographs, and sizes.
+    """Known sizes in the photographs, their lens, and sizes of the images.
 
     Raises InputError for invalid values.
     """

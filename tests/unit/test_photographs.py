@@ -1,6 +1,7 @@
 """Photographs to a metric data set: adjustment of tags, world frame, EXIF, frames of a video."""
 
 import math
+import sys
 from itertools import pairwise
 
 import cv2
@@ -17,7 +18,7 @@ from fidsplat.photographs.mapping import Model
 from fidsplat.photographs.photos import camera_groups, copy_photos
 from fidsplat.photographs.rolling_shutter import MIN_DISPLACEMENT, MIN_SHARE, readout_motion
 from fidsplat.photographs.settings import CaptureSettings
-from fidsplat.photographs.steps import parse_scale, scale_of
+from fidsplat.photographs.steps import parse_scale, photographs_to_scene, scale_of
 from fidsplat.photographs.tags import box_of, module_colors, parse_tags
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import quaternion_to_matrix, rigid_matrix
@@ -201,6 +202,12 @@ def test_a_rolling_shutter_of_moving_cameras_is_found(speed):
     assert (share > MIN_SHARE and displaced > MIN_DISPLACEMENT) == (speed > 0)
     if speed:
         assert displaced == pytest.approx(585 / 3 * 1.3 * speed, rel=0.5)
+
+
+def test_without_pycolmap_the_extra_is_named(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(InputError, match=r"pip install 'fidsplat\[capture\]'"):
+        photographs_to_scene(tmp_path, tmp_path / "scene")
 
 
 def exif(order, orientation):

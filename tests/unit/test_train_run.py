@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from training_scene import QUICK, scene
+from training_scene import BACKGROUND, QUICK, scene
 
 import fidsplat as fs
 from fidsplat.backends.gradients import CapacityExceeded
@@ -63,6 +63,17 @@ def test_splats_in_the_boxes_of_markers_are_not_saved(dataset, tmp_path):
     np.testing.assert_allclose(saved.opacities, complete.opacities[outside], rtol=1e-6)  # files have logits
     with pytest.raises(fs.InputError, match="a box of tiny must be an invertible matrix"):
         replace(dataset, boxes=(np.zeros((4, 4)),))
+
+
+def test_a_view_may_have_a_background_of_its_own(dataset):
+    trainer = Trainer(dataset, fs.Renderer("reference"), iterations=1, **QUICK)
+    views = (dataset.views[0], replace(dataset.views[0], background=(1.0, 0.0, 1.0)))
+    common, own = (score.image / 255.0 for score in trainer.evaluate(views))
+    alpha = trainer.renderer.render(trainer.cloud(), dataset.views[0].camera, outputs=("alpha",))["alpha"]
+    difference = (1 - alpha[..., None]) * (np.array((1.0, 0.0, 1.0)) - BACKGROUND)
+    np.testing.assert_allclose(own - common, difference, atol=1.2 / 255)  # both are rounded
+    digests = {replace(dataset, views=(view, *dataset.views[1:])).digest for view in views}
+    assert len(digests) == 2
 
 
 def test_training_raises_the_psnr_and_lowers_the_loss(whole, dataset):
