@@ -2,6 +2,8 @@
 
 import json
 import math
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -165,3 +167,11 @@ def test_errors_of_localisation(renderer, room, tmp_path, capsys):
     assert "--start must be 7 numbers X,Y,Z,QW,QX,QY,QZ" in capsys.readouterr().err
     assert main(words) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_example_of_gtsam(capsys):
+    pytest.importorskip("gtsam", reason="pip install gtsam")
+    runpy.run_path(str(Path(__file__).parents[2] / "examples" / "gtsam_localisation.py"))
+    errors = [float(line.split(": ")[1].split()[0]) for line in capsys.readouterr().out.splitlines()]
+    assert len(errors) == 4
+    assert max(errors) < 1
