@@ -62,7 +62,7 @@ def test_flying_pixels_are_the_phase_of_the_mixed_light(renderer):
 
 def test_structured_light_follows_the_published_error_and_casts_a_shadow(renderer):
     device, camera = StructuredLight(), pinhole(580.0)
-    for z in (1.0, 2.0, 3.0):  # 1.425e-3 z^2: Khoshelham and Elberink 2012, Sensors 12, equation 10
+    for z in (1.0, 2.0, 3.0):  # 1.425e-3 z^2, see devlog/depth-cameras.md
         found = device.measure(renderer, fs.Scene([board(z)]), camera)[:, :90]
         assert (found - z)[found > 0].std() == pytest.approx(1.425e-3 * z**2, rel=0.2)
     scene = fs.Scene([board(1.0, left=0.0), board(1.5)])
@@ -99,13 +99,13 @@ def test_active_stereo_matches_its_pattern(renderer):
     device = ActiveStereo()
     wall = fs.Scene([board(1.5)])
     errors = []
-    for seed in (0, 1, 2):
+    for seed in range(6):
         found = device.measure(renderer, wall, camera, seed)[16:-16, 68:-68]
         assert (found > 0).mean() > 0.98
         errors.append((found[found > 0] - 1.5) * 424.0 * device.baseline / 1.5**2)  # in pixels of disparity
     error = np.concatenate(errors)
     assert abs(error.mean()) < 0.04
-    assert error.std() == pytest.approx(0.08, rel=0.25)
+    assert error.std() == pytest.approx(0.08, rel=0.2)
     # without the pattern a blank wall has nothing to match
     blind = replace(device, pattern=0.0).measure(renderer, wall, camera)[16:-16, 60:-40]
     right = np.abs(blind - 1.5) < 0.05
