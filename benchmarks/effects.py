@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from rich.progress import track
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS
 from fidsplat.experiments.bench.catalogue import TIMED
+from fidsplat.scenes import PlacedMarker
 from fidsplat.scenes.random_clouds import SCENES, load_scene
 from fidsplat.util.timing import frame_timer, quartiles, ratios, time_interleaved
 
@@ -35,6 +37,11 @@ SENSORS = {
     "response srgb": fs.Sensor(response="srgb"),
     "response table": fs.Sensor(response=TABLE),
     "8 bits": fs.Sensor(bits=8),
+    "decode srgb": fs.Sensor(decode="srgb"),
+    "veiling glare": fs.Sensor(veiling_glare=0.1, glare_light=(0.2, 0.2, 0.2)),
+    "saturation": fs.Sensor(saturation=0.8),
+    "white balance": fs.Sensor(white_balance=(0.9, 1.0, 1.2)),
+    "auto-exposure": fs.Sensor(auto_exposure=0.18),
     "whole sensor": fs.Sensor(1.3, (-0.3, 0.05), 12000, 8, 1, 1.5, "srgb", 8),
 }
 
@@ -152,6 +159,38 @@ def measure(names: list[str], scene: str, device: str, repeats: int) -> list[dic
     return [about | row for row in rows]
 
 
+LIGHTS: dict[str, dict] = {
+    "light: 1 panorama": {"light": fs.Lighting(panoramas=1)},
+    "light: 3 x 3 panoramas": {"light": fs.Lighting(panoramas=3)},
+    "light: sun": {"light": fs.Lighting("lights"), "lights": [fs.Sun(direction=(0, 0.3, 1))]},
+    "light: gloss, any view": {"light": fs.Lighting(panoramas=1, roughness=0.5)},
+    "light: gloss, camera": {"light": fs.Lighting(panoramas=1, roughness=0.25, view="camera")},
+}
+"""light on one marker; computed when a scene is uploaded, not for each frame"""
+
+
+def measure_light(names: list[str], scene: str, device: str, repeats: int) -> list[dict]:
+    """Seconds to compute the light of an AprilTag in the scene, after a first time that compiles kernels."""
+    renderer = fs.Renderer(device)
+    cloud, camera = load_scene(scene)
+    tag, pose = fs.marker("apriltag:36h11:5", size=0.16), np.eye(4)
+    pose[:3, 3] = (0, 0, 1)
+    rows = []
+    for name in track([one for one in LIGHTS if one in names or not names], "light", console=PROGRESS):
+        parts = dict(LIGHTS[name])
+        placed = PlacedMarker(tag, pose, light=parts.pop("light"))
+        times = []
+        for _ in range(repeats + 1):
+            start = time.perf_counter()
+            lit = renderer.lit(fs.Scene([cloud], camera, [placed], background=(0.5, 0.5, 0.5), **parts))
+            times.append(time.perf_counter() - start)
+        low, middle, high = quartiles(times[1:])
+        splats = len(lit.markers[0].marker.cloud)
+        rows.append({"effect": name, "seconds": middle, "quartiles": [low, high], "splats": splats})
+    about = {"scene": scene, **facts(renderer), "repeats": repeats}
+    return [about | row for row in rows]
+
+
 def page_table(files: list[str]) -> str:
     """The results of several devices side by side, in Markdown; each file is what --json prints."""
     runs = [{row["effect"]: row for row in json.loads(Path(file).read_text("utf-8"))} for file in files]
@@ -173,7 +212,7 @@ def page_table(files: list[str]) -> str:
 
 def main() -> None:
     parser = options(__doc__, repeats=5)
-    known = list(effects(fs.Camera.pinhole(8, 8, 8, 8, 4, 4)))
+    known = [*effects(fs.Camera.pinhole(8, 8, 8, 8, 4, 4)), *LIGHTS]
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"default all of: {', '.join(known)}")
     parser.add_argument("--scene", default="r1m_1080p", choices=list(SCENES))
     parser.add_argument("--table", nargs="+", metavar="FILE", help="print results side by side instead")
@@ -183,8 +222,26 @@ def main() -> None:
         return
     if unknown := set(arguments.names) - set(known):
         parser.error(f"no effect is called {', '.join(sorted(unknown))}; there are: {', '.join(known)}")
-    rows = measure(arguments.names, arguments.scene, arguments.device, max(arguments.repeats, 2))
-    if keep(rows, arguments.json):
+    how = arguments.scene, arguments.device, max(arguments.repeats, 2)
+    frames = [name for name in arguments.names if name not in LIGHTS]
+    rows = measure(frames, *how) if frames or not arguments.names else []
+    lights = measure_light(arguments.names, *how) if len(frames) < len(arguments.names) or not frames else []
+    if lights and not arguments.json:
+        show(
+            "{scene}, {device}, {driver}, {date}, {repeats} times".format(**lights[0]),
+            ("light of a tag", "computed once in [s]", "quartiles", "splats"),
+            (
+                (
+                    row["effect"],
+                    f"{row['seconds']:.2f}",
+                    "{:.2f} to {:.2f}".format(*row["quartiles"]),
+                    str(row["splats"]),
+                )
+                for row in lights
+            ),
+        )
+    rows = [*rows, *lights] if arguments.json else rows
+    if not rows or keep(rows, arguments.json):
         return
     show(
         "{scene}, {device}, {driver}, {date}, {repeats} pairs".format(**rows[0]),
