@@ -6,8 +6,10 @@ interrupted run continues.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
+import signal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -68,6 +70,9 @@ def require_pycolmap() -> Any:
     except ImportError:
         raise InputError("capture needs pycolmap; pip install 'fidsplat[capture]'") from None
     pycolmap.logging.minloglevel = 3
+    with contextlib.suppress(ValueError):  # outside of the main thread
+        # its import replaces the handler by one that prints a stack trace
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
     return pycolmap
 
 
