@@ -45,6 +45,7 @@ COMMANDS = CommandTable(
     fly="fly.Fly",
     detect="detect.Detect",
     scan="scan.Scan",
+    serve="serve.Serve",
     convert="convert.Convert",
     check="check.Check",
     bench="bench.Bench",

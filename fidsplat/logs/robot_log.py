@@ -14,7 +14,7 @@ from fidsplat.cameras.foreign import PIXEL
 from fidsplat.effects import IMAGES
 from fidsplat.images.files import encode_image, pixels_of, to_uint8
 from fidsplat.logs.reader import SCENE
-from fidsplat.logs.writers import log_file, typestore
+from fidsplat.logs.writers import LogFile, log_file, typestore
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion, pose_matrix
 from fidsplat.util.arguments import instance, invalid, items, number, real_array, text
 from fidsplat.util.errors import InputError, unknown
@@ -54,10 +54,14 @@ class RobotLog:
         overwrite: bool = False,
         source: str = "",
     ) -> None:
+        self._begin(world, up)
+        self._path: Any = path
+        self._file: LogFile = log_file(path, self._store, overwrite, source)
+
+    def _begin(self, world: str, up: Any) -> None:
+        """Set what does not depend on where the messages go."""
         self._world_from_scene = None if up is None else _upright(up)
-        self._store = typestore()
-        self._file = log_file(path, self._store, overwrite, source)
-        self._path, self.world = path, world
+        self._store, self.world = typestore(), world
         self._last: dict[str, float] = {}
 
     def __enter__(self) -> RobotLog:

@@ -18,7 +18,7 @@ from fidsplat.capture.sensor import Sensor
 from fidsplat.capture.views import pose_matrices
 from fidsplat.formats.points import save_points
 from fidsplat.splats.rotations import check_similarity, pose_matrix
-from fidsplat.util.arguments import instance, invalid, number
+from fidsplat.util.arguments import instance, invalid, number, whole_number
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
@@ -125,6 +125,7 @@ def scan(
     motion: Motion | None = None,
     start: float | None = None,
     label: bool = False,
+    index: int = 0,
 ) -> Scan:
     """Scan a scene.
 
@@ -138,6 +139,7 @@ def scan(
             moves splats. None: the scene's groups move as its motion states.
         start: seconds, start of the scan; None: the time of the scene's shutter.
         label: whether the labels of the splats are requested.
+        index: number of the scan: scans with other numbers have other noise.
 
     Raises:
         InputError: no pose, or a pose that is not rigid; as `Renderer.render`.
@@ -146,7 +148,9 @@ def scan(
     request = _Request.of(lidar, scene, label, motion, start)
     capture = request.capture(pose)
     frame = renderer.render(resident, capture)
-    return request.decoded({name: frame[name] for name in frame.outputs}, capture, 0)
+    return request.decoded(
+        {name: frame[name] for name in frame.outputs}, capture, whole_number("index", index, 0, 2**32 - 1)
+    )
 
 
 def scan_batch(

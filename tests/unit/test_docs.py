@@ -43,6 +43,7 @@ def load_scene(example: Example) -> None:
 
 
 PARSED_ONLY = {
+    "serve": "ends by Ctrl-C; tests/unit/test_serve.py",
     "capture": "needs photographs; tests/unit/test_photographs_command.py",
     "bench": "times the machine",
     "check": "minutes; tests/selftest",
@@ -73,6 +74,7 @@ SMALLER = {
 EXTRAS = {
     "experiments": ("pandas", "matplotlib", "pupil_apriltags", "locus", "flip_evaluator", "jinja2"),
     "logs": ("mcap", "rosbags"),
+    "live": ("foxglove",),
     "mesh": ("coacd", "fast_simplification"),
     "sim": ("mujoco", "gymnasium"),
     "usd": ("pxr",),

@@ -71,6 +71,7 @@ HOME_OF = {
     "mujoco": ("sim.mujoco", "worlds.robot"),
     "gymnasium": ("sim.gymnasium",),
     "mcap": ("logs",),
+    "foxglove": ("logs.live",),
     "rosbags": ("logs",),
     "pandas": ("experiments",),
     "matplotlib": ("experiments.charts",),
