@@ -22,8 +22,8 @@ class Localise:
     """Find the poses of photographs in a scene, with covariance.
 
     The scene's camera has the size, intrinsics and lens of the photographs. Each search starts at --start, at
-    the pose by the scene's markers in the photograph, at the pose of the photograph before, or at the most
-    similar of --candidates, in this order. It continues by direct image alignment, which exposure and white
+    the pose by the scene's markers in the photograph, or at the most similar of --candidates and of the pose
+    of the photograph before, in this order. It continues by direct image alignment, which exposure and white
     balance do not change. Deviations are standard deviations. A pose is found if most of the textured pixels
     agree with the scene.
 
@@ -80,7 +80,7 @@ class Localise:
                         image,
                         scene,
                         None if start is None else camera.with_pose(camera_to_world=start),
-                        candidates=previous or candidates,
+                        candidates=[*previous, *candidates],
                         renderer=renderer,
                         resident=resident,
                     )
