@@ -121,7 +121,7 @@ def cases(poses: int) -> list[Case]:
     three = tuple(camera_at(rng, 320, 240, (3.0, 4.0)) for _ in range(3))
     sun = fs.Sun(direction=(0.25, 0.8, 0.75), intensity=4.0, angle=math.radians(2), samples=64)
     lamp = fs.PointLight(position=(0.4, 0.1, -0.5), intensity=0.25, radius=0.05, samples=64)
-    small = tuple(camera_at(rng, 160, 120, (3.0, 9.0)) for _ in range(poses))
+    small = tuple(camera_at(rng, 160, 120, (3.0, 12.0)) for _ in range(poses))
     return [
         Case("room", cameras=three),
         Case("room and sun", lights=(sun,), cameras=three),
@@ -133,7 +133,7 @@ def cases(poses: int) -> list[Case]:
         Case(
             "crumpled, shining", Crumpled(height=0.08 * SIZE, length=SIZE, seed=1), emits=True, cameras=three
         ),
-        Case("poses", lights=(sun,), cameras=small),
+        Case("poses", lights=(lamp,), cameras=small),
     ]
 
 

@@ -275,8 +275,8 @@ def _noise(view: View, electrons: float) -> View:
     return view.exposed(full_well=electrons)
 
 
-def _underexposed(view: View, factor: float) -> View:
-    return view.exposed(exposure=1 / factor, full_well=10_000.0, read_noise=5.0)
+def _underexposed(view: View, share: float) -> View:
+    return view.exposed(exposure=share, full_well=10_000.0, read_noise=5.0)
 
 
 def _overexposed(view: View, factor: float) -> View:
@@ -318,9 +318,9 @@ def _direction(placed: PlacedMarker, vector: tuple[float, float, float]) -> tupl
     return x, y, z
 
 
-def _backlight(view: View, factor: float) -> View:
+def _backlight(view: View, share: float) -> View:
     """The marker is darker than its surroundings, to which the camera is exposed."""
-    return replace(view, placed=_lit(view.placed, Lighting(exposure=1 / factor)))
+    return replace(view, placed=_lit(view.placed, Lighting(exposure=share)))
 
 
 def _shadow(view: View, ratio: float) -> View:
@@ -368,9 +368,9 @@ def _glare(view: View, ratio: float) -> View:
     return replace(view, placed=placed, lights=(sky, light))
 
 
-def _dusk(view: View, factor: float) -> View:
+def _dusk(view: View, share: float) -> View:
     """Less light, and a gain that makes up for it."""
-    return view.exposed(exposure=1 / factor, full_well=10_000.0, read_noise=5.0, gain=factor)
+    return view.exposed(exposure=share, full_well=10_000.0, read_noise=5.0, gain=1 / share)
 
 
 def _flare(view: View, share: float) -> View:
@@ -418,13 +418,13 @@ CAUSES = {
     "rolling": Cause("rolling shutter", CAMERA, _linear(80), "{:.0f}", "px per frame", _rolling),
     "defocus": Cause("defocus", CAMERA, _linear(12), "{:.1f}", "px radius", _defocused),
     "noise": Cause("shot noise", CAMERA, _geometric(10_000, 1), "{:.0f}", "electrons", _noise),
-    "dark": Cause("under-exposure", CAMERA, _geometric(1, 300), "1/{:.0f}", "light", _underexposed),
+    "dark": Cause("under-exposure", CAMERA, _geometric(1, 1 / 300), "{:.3f}", "of the light", _underexposed),
     "bright": Cause("over-exposure", CAMERA, _geometric(1, 40), "{:.1f}", "x light", _overexposed),
     "lens": Cause("distortion near a corner", CAMERA, _linear(0.35), "-{:.2f}", "k1", _lens),
-    "backlight": Cause("backlight", LIGHT, _geometric(1, 300), "1/{:.0f}", "light", _backlight),
+    "backlight": Cause("backlight", LIGHT, _geometric(1, 1 / 300), "{:.3f}", "of the light", _backlight),
     "shadow": Cause("shadows of planks", LIGHT, _geometric(0.1, 30), "{:.1f}", "sun / shade", _shadow),
     "glare": Cause("glare of a lamp", LIGHT, _geometric(0.01, 3), "{:.2f}", "lamp / light", _glare),
-    "dusk": Cause("dusk", LIGHT, _geometric(1, 3000), "1/{:.0f}", "light", _dusk),
+    "dusk": Cause("dusk", LIGHT, _geometric(1, 1 / 3000), "{:.4f}", "of the light", _dusk),
     "flare": Cause("veiling glare", LIGHT, _linear(0.98), "{:.2f}", "of the light", _flare),
     "cylinder": Cause("cylinder", SHAPE, _linear(140), "{:.0f}", "degrees of arc", _cylinder),
     "crumpled": Cause("crumpled", SHAPE, _linear(0.1), "{:.2f}", "edges high", _crumpled),

@@ -104,7 +104,7 @@ def compact(breaks: Frame) -> Frame:
     return pd.DataFrame(
         {"cause": cause, "to": rows["to"].iloc[0]}
         | {
-            f"{row['family']}: {' / '.join(names[row['family']])}": " / ".join(row[names[row["family"]]])
+            f"{row['family']}: {'/'.join(names[row['family']])}": "/".join(row[names[row["family"]]])
             for _, row in rows.iterrows()
         }
         for cause, rows in breaks.groupby("cause", sort=False)
