@@ -42,10 +42,11 @@ def mixtures() -> tuple[str, ...]:
 
 
 def method_names(chosen: tuple[str, ...] = (), trained: Path | None = None) -> tuple[str, ...]:
-    """Method names: "ideal", "MIXTURE/FILTER" for every mixture, "2dgs-N" for existing trained models.
+    """Names of methods: "ideal" (the exact image of the printed texture), "MIXTURE/FILTER" for each mixture
+    of splats, and "2dgs-N" for each trained model that exists, N being its number of training views.
 
     Args:
-        chosen: mixtures; by default all but `facets`, which needs order by depth.
+        chosen: mixtures; by default all except `facets`, which is opaque only with order by depth per pixel.
         trained: folder with trained models, see `MarkerRenderer`.
 
     Raises InputError for an unknown mixture.

@@ -135,5 +135,5 @@ def srgb(light: np.ndarray) -> np.ndarray:
 
 
 def from_srgb(value: float) -> float:
-    """A display value to linear light."""
+    """Convert a display value in [0, 1] to linear light."""
     return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4

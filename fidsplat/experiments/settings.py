@@ -181,7 +181,10 @@ class RenderSettings(MarkerSettings):
             )
         models = [method for method in self.methods if method.startswith("2dgs-")]
         if not models:
-            raise InputError(f"{folder} holds none of 2dgs-3, 2dgs-5, 2dgs-9 and 2dgs-17")
+            raise InputError(
+                f"--trained must have at least one of the folders 2dgs-3, 2dgs-5, 2dgs-9 and 2dgs-17, "
+                f"got {folder}; train models by `fidsplat experiment baseline`"
+            )
         for model, category, index in product(
             models, chosen_categories(self.category), range(self.marker_count)
         ):

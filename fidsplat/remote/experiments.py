@@ -70,8 +70,8 @@ class ExperimentWorker:
 def measure(
     points: Mapping[str, list[Key]], results: Mapping[str, Results], engine: Engine, workers: int
 ) -> Iterator[tuple[str, Record]]:
-    """Measure the missing points of experiments on workers; yields the experiment's name and each record once
-    it is in its file. Raises FidsplatError like `drain`.
+    """Measure the missing points of experiments on workers. Writes each record to its result file, then
+    yields the name of the experiment and the record. Raises FidsplatError like `drain`.
 
     Args:
         points, results: points and result files by the name of the experiment.

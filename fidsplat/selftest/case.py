@@ -44,7 +44,11 @@ CASES: list[Case] = []
 
 
 def case(name: str, title: str, trigger: str) -> Callable[[Callable[[Renderer], Found]], Callable]:
-    """Register a function as a case."""
+    """Decorator that registers a function as a hard case.
+
+    Args:
+        name, title, trigger: fields of `Case`.
+    """
 
     def register(run: Callable[[Renderer], Found]) -> Callable[[Renderer], Found]:
         CASES.append(Case(name, title, trigger, run))

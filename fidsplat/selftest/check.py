@@ -172,9 +172,10 @@ def _compared(renderer: Renderer, spec: FrameSpec, result: CaseResult, worst: Wo
 
 
 def worst_image(worst: Worst) -> np.ndarray:
-    """Contact sheet of device, reference, difference and certificate, (h, w, 3) uint8.
+    """Contact sheet (h, w, 3) uint8: the device's image, the reference image, their difference, its bound.
 
-    The difference and the certificate are scaled by a power of ten.
+    The bound (certificate) is the difference that rounding explains. Difference and bound are each scaled by
+    a power of ten.
     """
     from fidsplat.images.files import to_uint8
     from fidsplat.images.visualize import contact_sheet, write

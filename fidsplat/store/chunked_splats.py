@@ -205,7 +205,7 @@ class ChunkedSplats:
         return arrays
 
     def unplaced_chunk(self, number: int, node: int) -> dict[str, np.ndarray]:
-        """Arrays of a node of a placed store, before its pose is applied."""
+        """Arrays of a node of a placed store, in the frame of the store, without its pose."""
         return self._with_columns(self.stores[number].load(node, placed=False), self._first_groups[number])
 
     @cached_property

@@ -67,7 +67,8 @@ class Store(Summarised):
                 != header
             ):
                 raise InputError(
-                    f"{self.path / layout.HEADER} does not match its poses; place the store again"
+                    f"{self.path / layout.HEADER} does not match the poses of the store; "
+                    "place the store again"
                 )
         self._own = own
         self.nodes = layout.read_nodes(self._folder, own)

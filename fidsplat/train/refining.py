@@ -1,9 +1,10 @@
 """Marker refinement: optimise all Gaussians of a marker together, for sharp and opaque modules.
 
-Templates fit one rectangle each. Here all splats of a marker are optimised in position (within its plane),
-scale, opacity and colour. Each iteration renders the marker in the order of centres, as other renderers do,
-with a random tilt axis (which changes the order), a random sub-pixel shift and a random grey background. The
-loss compares the image with the printed marker and penalises transmitted light.
+A template (`fidsplat.markers`) is a fixed set of Gaussians for one rectangle. Here all splats of a marker
+are optimised together in position (within its plane), scale, opacity and colour. Each iteration renders the
+marker with splats sorted by their centres, as other renderers do, with a random tilt axis (which changes the
+order), a random sub-pixel shift and a random grey background. The loss compares the image with the
+printed marker and penalises transmitted light.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ kernel void project(
 
     // read before the first test, so that memory latency is paid once; arrays are aligned for vector loads (Resident)
     real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
-#if BATCH > 1       // no vectors, which prevent vectors across splats
+#if BATCH > 1       // scalars: vector types here prevent vectorization across splats
     struct { float x, y, z, w; } quat = {quats[4 * i], quats[4 * i + 1], quats[4 * i + 2], quats[4 * i + 3]};
     struct { float x, y; } scale_uv = {scales[2 * i], scales[2 * i + 1]};
 #else

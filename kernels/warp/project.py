@@ -35,9 +35,12 @@ NONE, BITS = wp.constant(wp.uint32(0)), wp.constant(wp.uint64(32))
 def make_project(
     effects: tuple[str, ...], outputs: tuple[str, ...], sh_terms: int, precision: str, every_bounds: bool
 ):
-    """Make the kernel for the effects and outputs that affect records. sh_terms: coefficients per colour, 0
-    for plain colours. every_bounds: write the bounds of all visible splats, not only of those that touch more
-    tiles than a window.
+    """Make the projection kernel for the effects and outputs that affect the records of projected splats.
+
+    Args:
+        sh_terms: SH coefficients per colour channel, 0 for plain colours.
+        every_bounds: write the tile bounds of all visible splats; otherwise only of those that touch more
+            tiles than the bit mask `windows` can hold.
     """
     layout = Layout(effects, outputs)
     lines_each = layout.lines

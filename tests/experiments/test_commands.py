@@ -167,7 +167,7 @@ def test_scenes_for_trainers(capsys, tmp_path):
         (["blender", "--environment", "nowhere"], "fidsplat experiment blender --install"),
         (["blender", "--samples", "0"], "--samples must be at least 1, got 0"),
         (["blender", "--threads", "0"], "--threads must be at least 1, got 0"),
-        (["views", "--trained", "."], "holds none of 2dgs-3, 2dgs-5, 2dgs-9 and 2dgs-17"),
+        (["views", "--trained", "."], "at least one of the folders 2dgs-3, 2dgs-5, 2dgs-9 and 2dgs-17"),
         (["localisation", "--category", "huge"], "--category must be apriltag or small, got huge"),
         (
             ["views", "--blender", "nowhere"],

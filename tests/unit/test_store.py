@@ -280,7 +280,7 @@ def test_an_instanced_store_repeats_the_splats(store, files, tmp_path):
     street = fs.Store(fs.place_store(flat, tmp_path / "street.fss", poses))
     wrong = fs.place_store(flat, tmp_path / "wrong.fss", poses)
     crafted(wrong, splats=len(flat))
-    with pytest.raises(fs.InputError, match="does not match its poses; place the store again"):
+    with pytest.raises(fs.InputError, match="does not match the poses of the store; place the store again"):
         fs.Store(wrong)
     assert len(street) == 2 * len(flat)
     assert street.chunks == 2 * flat.chunks

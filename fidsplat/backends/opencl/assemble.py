@@ -171,7 +171,8 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         DeviceError: an effect's file fills a hook that no file has.
     """
     layouts = layouts_of(features)
-    # blend and resolve are fused if a pixel has one sample of one pose, and only blending adds to it
+    # blend and resolve are fused if a pixel has one sample, all rows have one pose, and no other pass adds
+    # to a pixel
     separate = {"rays", "shutter_exposure", "shutter_rows"}
     fused = features.samples == 1 and "background_constant" in layouts and separate.isdisjoint(layouts)
     half = "blend_half" in layouts
@@ -459,7 +460,7 @@ def _shown(file: str) -> str:
 
 
 def with_scalars(text: str, wide: str = "float") -> str:
-    """Replace the type `wide` and its constants in kernel text by a C type."""
+    """Replace the type `wide`, and the suffix of its constants, in kernel text by "float" or "double"."""
     return _WIDE.sub(wide, _WIDE_CONSTANT.sub(r"\1" if wide == "double" else r"\1f", text))
 
 

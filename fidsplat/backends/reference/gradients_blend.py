@@ -149,7 +149,7 @@ class Blend:
         share = np.where(met, self._share, 0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             by_share = np.where(mirrored, by_z * (self._z_plane - self._pz), 0.0)
-            # with respect to rho / 2 on the plane
+            # derivative with respect to rho / 2, where rho / 2 is that of the intersection with the plane
             by_plane = np.where(mirrored, -by_share * share / self._plane, 0.0)
             by_plane -= np.where(on_plane, by_log, 0.0)
             by_disc = np.where(made.contributes & made.by_disc, by_log, 0.0)

@@ -193,7 +193,7 @@ class Measurement:
         return {name: ms for name, ms in taken.items() if name != "ms"}
 
     def first(self, references: References, file: Path) -> np.ndarray:
-        """Render the first frames and add the errors of their images; returns the first image (h, w, 3)."""
+        """Render the first frames; adds times and errors to `result`, returns the first image (h, w, 3)."""
         taken, images, memory = [], [], {}
         for view in references.chosen:
             taken.append(self.process.frame(self.setting, [view])["ms"])

@@ -129,7 +129,10 @@ class DeviceResults:
         return self.points.loc[key] if key in self.points.index else None
 
     def of(self, scene: str) -> Frame:
-        """Rows of a scene in the order of settings; `ms` is relative to the median of the base."""
+        """Measured rows of a scene, in the order of `SETTINGS`.
+
+        `ms` is the ratio of times to the base setting, times the median time of the base setting.
+        """
         found: Frame = self.points[self.points["scene"] == scene]
         order = found["knob"].map(list(("base", *SETTINGS)).index)
         found = found.iloc[order.argsort(kind="stable")]

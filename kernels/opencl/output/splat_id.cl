@@ -1,5 +1,5 @@
-// splat_id (h, w) int: index in the cloud of the fragment of maximum weight (of a layer its splat of maximum optical depth), the
-// nearest of equals; -1 where alpha is below 1/255.
+// splat_id (h, w) int: index in the cloud of the splat with the maximum weight at the pixel; of equal weights the nearest. A
+// coplanar layer is represented by its splat of maximum optical depth. -1 where alpha is below 1/255.
 //@ project
     record.splat_id = splat_ids[i];
 //@ state

@@ -4,7 +4,7 @@
 //@ blocks_functions
 #define BLOCKS_SLACK 1e-6f              // above the rounding error here and in the per-pixel test, relative to the terms of the affine forms
 //@ blocks_touched
-    // n_u^2 + n_v^2 >= h in all of a block for these lower bounds
+    // u and v are lower bounds of |n_u| and |n_v| over a block: no pixel of it is inside the ellipse if u^2 + v^2 > h
     const float half_x = 0.5f * (BLOCK_W - 1), half_y = 0.5f * (BLOCK_H - 1);
     float far_x = fmax(fabs(left - s->ax), fabs(left + TILE_W - s->ax)), far_y = fmax(fabs(top - s->ay), fabs(top + TILE_H - s->ay));
     float around_u = fabs(s->nux) * half_x + BLOCKS_SLACK * (fabs(s->nu0) + fabs(s->nux) * far_x);
