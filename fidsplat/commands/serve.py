@@ -55,7 +55,7 @@ class Serve(RenderInput):
 
     def run(self) -> int:
         import fidsplat as fs
-        from fidsplat.cameras.trajectory import check_rate
+        from fidsplat.cameras.trajectory import Trajectory, check_rate
         from fidsplat.formats import load_trajectory
         from fidsplat.logs.live import LiveLog
         from fidsplat.scenes.up import scene_up
@@ -79,7 +79,7 @@ class Serve(RenderInput):
             raise InputError(f"{self.source} must have a [camera] to be served, got none")
         moving = motion.camera
         begin, length = 0.0, 0.0
-        if isinstance(moving, fs.Trajectory):
+        if isinstance(moving, Trajectory):
             begin, length = float(moving.times[0]), float(moving.times[-1] - moving.times[0])
         with LiveLog(self.host, self.port, up=scene_up(scene)) as log:
             shown = console(self.json)

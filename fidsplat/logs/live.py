@@ -41,9 +41,12 @@ class LiveLog(RobotLog):
             raise InputError("host must be an address, got ''; 127.0.0.1 is this machine only")
         whole_number("port", port, 0, 65535)
         self._path = f"{host}:{port}"
-        self._file = _Server(self._store, host, port)
-        self.port: int = self._file.port
+        server = _Server(self._store, host, port)
+        self._file, self.port = server, int(server.port)
         """port on which the server listens"""
+
+    def __enter__(self) -> LiveLog:
+        return self
 
 
 class _Server:

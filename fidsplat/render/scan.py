@@ -93,7 +93,9 @@ class Scan:
         check_frame(frame)
         echo, beam = np.nonzero(self.range.T > 0)[::-1]
         points = (self.points if frame == "lidar" else self.world_points)[echo, beam]
-        columns = {name: points[:, k].astype(np.float32) for k, name in enumerate("xyz")}
+        columns: dict[str, np.ndarray] = {
+            name: points[:, k].astype(np.float32) for k, name in enumerate("xyz")
+        }
         columns["intensity"] = self.intensity[echo, beam]
         columns["ring"] = self.ring[beam].astype(np.uint16)
         columns["time"] = self.time[beam].astype(np.float32)
