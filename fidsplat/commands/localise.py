@@ -56,6 +56,7 @@ class Localise:
     def run(self) -> int:
         import fidsplat as fs
         from fidsplat.images.files import read_images
+        from fidsplat.localisation.localise import NoInitialPose
 
         if not self.images:
             raise InputError("localisation needs at least one IMAGE: a photograph, a folder or a video")
@@ -71,8 +72,9 @@ class Localise:
         with console(self.json).status("opening the device"):
             renderer = fs.Renderer(self.device)
             resident = renderer.upload(scene)
-        results: dict[str, Localisation] = {}
+        results: dict[str, Localisation | None] = {}
         previous: list[Camera] = []
+        missing = ""
         for path in self.images:
             for name, image in read_images(path):
                 try:
@@ -84,12 +86,20 @@ class Localise:
                         renderer=renderer,
                         resident=resident,
                     )
+                except NoInitialPose as error:
+                    results[name], previous, missing = None, [], str(error)
+                    continue
                 except InputError as error:
                     raise InputError(f"{name} and {self.scene}: {error}") from None
                 results[name] = found
                 previous = [found.camera] if found.found else []
+        if missing and not any(results.values()):
+            raise InputError(f"{', '.join(results)} and {self.scene}: {missing}")
         files = [] if self.out is None else [_write(self.out, results, camera)]
-        facts = [{"image": name, **found.as_dict()} for name, found in results.items()]
+        facts = [
+            {"image": name, "found": False, "start": None} | ({} if one is None else one.as_dict())
+            for name, one in results.items()
+        ]
         heads = ("image", "found", "position [m]", "deviation [mm]", "[deg]", "inliers", "start")
         table = (f"Poses in {self.scene}", heads, [_row(one) for one in facts])
         device = renderer.device.title
@@ -97,6 +107,8 @@ class Localise:
 
 
 def _row(facts: dict[str, Any]) -> tuple[str, ...]:
+    if facts["start"] is None:
+        return (facts["image"], "no", "", "", "", "", "no initial pose")
     return (
         facts["image"],
         "yes" if facts["found"] else "no",
@@ -129,14 +141,14 @@ def _candidates(path: str, camera: Camera) -> list[Camera]:
         return [camera.with_pose(camera_to_world=pose) for pose in load_trajectory(path).poses]
 
 
-def _write(out: str, results: dict[str, Localisation], camera: Camera) -> str:
+def _write(out: str, results: dict[str, Localisation | None], camera: Camera) -> str:
     """Write the found poses as a trajectory, one a second; returns the name of the file."""
     import numpy as np
 
     from fidsplat.cameras import Trajectory
     from fidsplat.formats import save_trajectory
 
-    found = {name: one.camera.camera_to_world for name, one in results.items() if one.found}
+    found = {name: one.camera.camera_to_world for name, one in results.items() if one and one.found}
     if not found:
         raise InputError(f"a pose must be found to write {out}, got none of {len(results)} images")
     trajectory = Trajectory(np.arange(len(found)), np.array(list(found.values())))

@@ -20,6 +20,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.cameras.pose_offset import offset_camera
+from fidsplat.util.errors import InputError
 from fidsplat.vision.pyramid import resized, smoothed
 
 Render = Callable[[Camera], tuple[np.ndarray, np.ndarray]]
@@ -44,6 +45,8 @@ MIN_NOISE, MAX_NOISE = 1e-3, 0.03
 """limits of the estimated noise of a pixel, display values; residuals above TUKEY * MAX_NOISE never fit"""
 GAINS = 0.05, 20.0
 """limits of the gain of the image relative to the render"""
+MIN_INFORMATION = 1e-9
+"""smallest eigenvalue of the scaled information matrix of a determined pose"""
 _DAMPING = 1e-3
 """initial damping of Levenberg-Marquardt, relative to the diagonal"""
 _SETTLED = {"huber": 0.03, "tukey": 0.01}
@@ -75,9 +78,10 @@ class Alignment:
 
     camera: Camera
     covariance: np.ndarray
-    """(6, 6) of a rotation vector [rad] and a translation [m] applied after `world_to_camera`"""
+    """(6, 6) of a rotation vector [rad] and a translation [m] applied after `world_to_camera`; infinite if
+    the image does not determine the pose"""
     inliers: float
-    """share of the textured pixels whose residuals are below the robust threshold"""
+    """share of the textured pixels whose residuals are below the robust threshold; 0 for a blank image"""
     noise: float
     """standard deviation of the residuals of a pixel, display values"""
     gain: np.ndarray
@@ -129,6 +133,11 @@ def target_of(image: np.ndarray, mask: np.ndarray | None, camera: Camera, stage:
         ignored = smoothed(resized(~mask, width, height)[:, :, None], max(stage.blur, 0.7))[:, :, 0]
         inner &= ignored < 1e-3
     rows = np.flatnonzero(inner)
+    if not len(rows):
+        raise InputError(
+            "localisation must have pixels away from the border and from ignored pixels, got none at "
+            f"{width} x {height}; give a larger image or a mask that ignores less"
+        )
     if len(rows) > MAX_PIXELS:
         across, down = values[1:-1, 2:] - values[1:-1, :-2], values[2:, 1:-1] - values[:-2, 1:-1]
         energy = np.einsum("hwc,hwc->hw", across, across) + np.einsum("hwc,hwc->hw", down, down)
@@ -222,7 +231,8 @@ class Residuals:
         return matrix, right
 
     def covariance(self) -> np.ndarray:
-        """(6, 6) covariance of the pose: a sandwich estimate from the scores of blocks."""
+        """(6, 6) covariance of the pose: a sandwich estimate from the scores of blocks. Infinite if the
+        pixels do not determine the pose."""
         across, down = self.motions
         (gx, gy), w, channels = self.slopes, self.weights, len(self.residuals)
         scores = -(across * (w * (gx * self.residuals).sum(0)) + down * (w * (gy * self.residuals).sum(0)))
@@ -235,8 +245,13 @@ class Residuals:
         # the derivative of the weighted residual, averaged over directions among the channels
         inner, weights = np.maximum(1 - self.share**2, 0), self.weights
         self.weights = np.maximum(inner**2 - 4 * self.share**2 * inner / channels, 0).astype(np.float32)
-        inverse = np.linalg.pinv(self.normal_equations(self.slopes)[0])
+        matrix = self.normal_equations(self.slopes)[0]
         self.weights = weights
+        deviations = np.sqrt(np.maximum(np.diag(matrix), 1e-30))
+        scaled = matrix / np.outer(deviations, deviations)
+        if np.linalg.matrix_rank(scaled, MIN_INFORMATION, hermitian=True) < 6:
+            return np.diag(np.full(6, np.inf))
+        inverse = np.linalg.inv(scaled) / np.outer(deviations, deviations)
         return inverse @ (sums @ sums.T) @ inverse * count / max(count - 6 - 2 * channels, 1)
 
     def _basis(self, channel: int) -> np.ndarray:
@@ -279,8 +294,10 @@ def align(
     if coarse:
         return Alignment(camera, np.full((6, 6), np.nan), 0.0, residuals.noise, residuals.gain)
     residuals = _minimise(residuals.weigh("tukey"), render, "tukey", stages[-1].steps)
-    camera, inliers = residuals.camera, float((residuals.share < 1).mean())
-    return Alignment(camera, residuals.covariance(), inliers, residuals.noise, residuals.gain)
+    # an image without the scene's contrast fits a render whose contrast the smallest gain removes
+    contrast = bool((residuals.gain > GAINS[0]).any())
+    inliers = float((residuals.share < 1).mean()) if contrast else 0.0
+    return Alignment(residuals.camera, residuals.covariance(), inliers, residuals.noise, residuals.gain)
 
 
 def _minimise(found: Residuals, render: Render, robust: str, steps: int) -> Residuals:

@@ -28,6 +28,10 @@ TRIED = 3
 """number of candidates that are aligned coarsely"""
 
 
+class NoInitialPose(InputError):
+    """No start, no marker of the scene in the image and no candidate."""
+
+
 @dataclass(frozen=True, eq=False)
 class Localisation:
     """Pose of a camera in a scene."""
@@ -36,7 +40,7 @@ class Localisation:
     """camera of the image at its pose"""
     covariance: np.ndarray
     """(6, 6) covariance of a rotation vector [rad] and a translation [m] applied after `world_to_camera`, in
-    camera axes, as the gradient `pose`"""
+    camera axes, as the gradient `pose`; infinite if the image does not determine the pose"""
     inliers: float
     """share of the textured pixels that agree with the scene, 0 to 1"""
     noise: float
@@ -51,8 +55,9 @@ class Localisation:
 
     @property
     def found(self) -> bool:
-        """Whether the image agrees with the scene: at least 0.6 of the textured pixels are inliers."""
-        return self.inliers >= MIN_INLIERS
+        """Whether the image determines the pose, and at least 0.6 of its textured pixels agree with the
+        scene."""
+        return self.inliers >= MIN_INLIERS and bool(np.isfinite(self.covariance).all())
 
     @property
     def position_deviation(self) -> float:
@@ -160,7 +165,7 @@ def localise(
         values = values.reshape(*pixels.shape)
     if not starts:
         if not len(candidates):
-            raise InputError(
+            raise NoInitialPose(
                 "localisation must have an initial pose, got no start, no marker of the scene in the image "
                 "and no candidates; give start= or candidates="
             )

@@ -20,6 +20,7 @@ from fidsplat.render.surface import MEDIAN
 from fidsplat.render.tsdf import DistanceField
 from fidsplat.scenes import Scene
 from fidsplat.splats.statistics import guess_up
+from fidsplat.util.arguments import items, number
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
 
@@ -27,6 +28,7 @@ VIEWS, SIDE, FOV = 64, 512, math.radians(50.0)
 """number, pixels per side and field of view of the views around a scene"""
 RESOLUTION = 200
 """voxels along the longest side of a scene"""
+_TINY = 1e-300
 MOST_VOXELS = 1 << 20
 """largest number of voxels per side"""
 
@@ -54,14 +56,18 @@ def scene_mesh(
     """
     low, high = _bounds(scene)
     size = float((high - low).max())
-    voxel = size / RESOLUTION if voxel is None else voxel
-    if not (math.isfinite(voxel) and voxel > 0):
-        raise InputError(f"voxel must be a positive length in metres, got {voxel!r}")
+    voxel = (
+        size / RESOLUTION if voxel is None else number("voxel", voxel, "a positive length in metres", _TINY)
+    )
     if size / voxel > MOST_VOXELS / 2:
         raise InputError(
             f"voxel must be at least {2 * size / MOST_VOXELS:.2g} m for this scene, got {voxel:g}"
         )
-    views = list(views_around(scene, low, high) if cameras is None else cameras)
+    views = list(
+        views_around(scene, low, high)
+        if cameras is None
+        else items("cameras", cameras, Camera, "a list of Camera")
+    )
     if not views:
         raise InputError("a mesh must have at least one camera, got none")
     renderer = Renderer(scene.device) if renderer is None else renderer

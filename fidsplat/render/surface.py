@@ -10,7 +10,7 @@ import numpy as np
 from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture.sensor import Sensor
 from fidsplat.scenes.surface import Surface, fit_surface
-from fidsplat.util.arguments import real_array
+from fidsplat.util.arguments import number, real_array
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
@@ -59,8 +59,8 @@ def surface_at(
     if camera is None and scene.camera is not None:
         camera = capture.motion.moved(scene.camera, capture.shutter.time)
     camera, pixel = _viewpoint(camera, pixel, ray)
-    if radius is not None and not (np.isfinite(radius) and radius > 0):
-        raise InputError(f"radius must be a positive length in metres, got {radius!r}")
+    if radius is not None:
+        radius = number("radius", radius, "a positive length in metres", 1e-9)
     if renderer is None:
         from fidsplat.render.renderer import Renderer  # here, as most callers have one
 

@@ -16,6 +16,7 @@ from fidsplat.scenes.read import read_scene
 from fidsplat.scenes.surface import Surface
 from fidsplat.scenes.up import scene_up
 from fidsplat.scenes.write import write_scene
+from fidsplat.util.arguments import instance
 from fidsplat.util.markup import Summarised, point
 
 if TYPE_CHECKING:
@@ -103,9 +104,12 @@ class Scene(SceneParts, Summarised):
         Raises:
             InputError: no plane in at least half of the patch; a pixel outside the image.
         """
+        from fidsplat.markers import Marker  # here, as most scenes load without them
+
+        instance("marker", marker, Marker, "a Marker, e.g. fs.marker('apriltag:36h11:5', 0.16)")
         found = self.surface_at(camera, pixel, **{"radius": marker.radius} | options)
         view = camera or self.camera
-        if "ray" in options or view is None:
+        if options.get("ray") is not None or view is None:
             directions = [options["ray"][1], *np.eye(3)]
         else:
             directions = [-view.world_to_camera[1, :3], view.world_to_camera[2, :3]]

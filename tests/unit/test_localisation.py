@@ -128,9 +128,12 @@ def test_a_tag_gives_the_initial_pose(renderer, tmp_path, capsys):
     assert off(found.camera, scene.camera)[0] < 3
     scene.save(tmp_path / "scene.toml")
     write_png(tmp_path / "photo.png", image)
+    write_png(tmp_path / "blank.png", 0 * image)  # without a tag: the other photograph is found all the same
     files = ["--scene", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "poses.tum")]
-    assert main(["localise", str(tmp_path / "photo.png"), *files, "--device", "opencl", "--json"]) == 0
-    (facts,) = json.loads(capsys.readouterr().out)["images"]
+    photos = [str(tmp_path / name) for name in ("blank.png", "photo.png")]
+    assert main(["localise", *photos, *files, "--device", "opencl", "--json"]) == 0
+    blank, facts = json.loads(capsys.readouterr().out)["images"]
+    assert (blank["found"], blank["start"]) == (False, None)
     assert facts["found"]
     assert np.shape(facts["covariance"]) == (6, 6)
     assert facts["position"] == pytest.approx(scene.camera.position, abs=2e-3)
@@ -150,6 +153,16 @@ def test_the_most_similar_candidate_is_the_start(renderer, room):
     assert off(found.camera, scene.camera)[0] < 3
 
 
+def test_an_image_without_contrast_is_not_found(renderer, room):
+    """A covered lens: the smallest gain makes every render as black as the image."""
+    scene, resident, image = room
+    away = scene.camera.with_pose(position=(3.0, -2.0, -500.0), target=(3.0, -2.0, -600.0))
+    for value, start in ((0, scene.camera), (1, scene.camera), (0, away)):
+        found = fs.localise(0 * image + value, scene, start, renderer=renderer, resident=resident)
+        assert not found.found
+    assert found.position_deviation == math.inf  # no splat is visible
+
+
 def test_errors_of_localisation(renderer, room, tmp_path, capsys):
     scene, resident, image = room
     with pytest.raises(fs.InputError, match="initial pose, got no start, no marker of the scene"):
@@ -160,6 +173,9 @@ def test_errors_of_localisation(renderer, room, tmp_path, capsys):
         fs.localise(image, scene.clouds[0], np.eye(4), renderer=renderer)
     with pytest.raises(fs.InputError, match="must be finite, got NaN"):
         fs.localise(image * np.nan, scene, scene.camera, renderer=renderer, resident=resident)
+    ignored = np.zeros((48, 64), bool)
+    with pytest.raises(fs.InputError, match="pixels away from the border and from ignored pixels, got none"):
+        fs.localise(image, scene, scene.camera, mask=ignored, renderer=renderer, resident=resident)
     scene.save(tmp_path / "scene.toml")
     write_png(tmp_path / "photo.png", image)
     words = ["localise", str(tmp_path / "photo.png"), "--scene", str(tmp_path / "scene.toml")]

@@ -131,6 +131,7 @@ def test_the_scenes_camera_is_at_the_time_of_the_shutter(renderer):
         ({"pixel": (80.0, 60.0), "ray": (AT, NORMAL)}, "a pixel or a ray, got both"),
         ({}, "a pixel or a ray, got neither"),
         ({"pixel": (80.0, 60.0), "radius": -1.0}, "radius must be a positive length"),
+        ({"pixel": (80.0, 60.0), "radius": "1"}, "radius must be a positive length"),
         ({"ray": (AT, (0.0, 0.0, 0.0))}, r"direction \(3,\), not 0"),
         ({"ray": 3}, "ray must be an origin"),
     ],
