@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -64,7 +64,7 @@ class RobotLog:
         self._store, self.world = typestore(), world
         self._last: dict[str, float] = {}
 
-    def __enter__(self) -> RobotLog:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type | None, *_: Any) -> None:

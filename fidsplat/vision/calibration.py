@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -86,7 +87,7 @@ def calibrate(views: Sequence[BoardView], start: Camera) -> Camera:
         ) from None
     lens = None
     if start.lens is not None:
-        kind = type(start.lens)
+        kind: Any = type(start.lens)
         lens = kind(**dict(zip(ESTIMATED[kind], np.ravel(values).tolist(), strict=False)))
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + PIXEL, matrix[1, 2] + PIXEL
     return Camera.pinhole(*size, *map(float, (fx, fy, cx, cy)), lens=lens)
