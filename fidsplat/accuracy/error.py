@@ -111,8 +111,8 @@ def reference_error(reference: Renderer, capture: Capture) -> float:
 
 
 def reference_renderer(renderer: Renderer, capture: Capture) -> Renderer:
-    """Renderer of reference images: the same one if it supports float64, else OpenCL on this machine's
-    processor if that does, else the same one."""
+    """Renderer of reference images: OpenCL on this machine's processor if only that supports float64, else
+    the renderer itself."""
     if supports_float64(renderer, capture):
         return renderer
     try:

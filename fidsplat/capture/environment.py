@@ -17,7 +17,8 @@ MAX_PANORAMA = 16384
 
 @dataclass(frozen=True)
 class Fog:
-    """Homogeneous fog: a surface at distance r retains exp(-density r) of its colour, the rest is the fog's.
+    """Homogeneous fog: a surface at distance r keeps the share exp(-density r) of its colour;
+    the other share is the fog's colour.
 
     The fog also replaces the background. Raises InputError for a negative density or a colour that is not
     three finite numbers.

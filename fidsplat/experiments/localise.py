@@ -61,7 +61,7 @@ class Variant:
 
     @property
     def rendering(self) -> Variant | None:
-        """The variant with the same images and default other settings; None without images."""
+        """The variant with the same images and default values of all other settings; None without images."""
         return None if self.mixture is None else replace(self, ideal=False, reach=math.inf)
 
 

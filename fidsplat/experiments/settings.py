@@ -166,7 +166,7 @@ class RenderSettings(MarkerSettings):
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Rows of the tables."""
+        """Names of the compared methods, a row of the tables each."""
         return method_names(self.mixture, self.trained)
 
     def check(self) -> None:

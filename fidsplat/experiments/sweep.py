@@ -183,7 +183,7 @@ class Sweep:
 def run_interleaved(sweeps: Sequence[Sweep]) -> Iterator[Record]:
     """Measure the missing points of sweeps, one batch of each in turn; yields each record.
 
-    A record is in its file when it is yielded, so an interrupt loses at most one batch.
+    Each record is written to its file before it is yielded, so an interrupt loses at most one batch.
     """
     batches = [
         [sweep.points[first : first + sweep.batch] for first in range(0, len(sweep.points), sweep.batch)]

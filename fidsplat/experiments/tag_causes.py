@@ -109,7 +109,7 @@ def _assembled(
     lights: tuple[Light, ...],
     camera: Camera | None,
 ) -> Scene:
-    """The same object for the same parts, so that its light is computed once."""
+    """The scene with a placed marker and other parts; cached, so that its light is computed once."""
     clouds = base.clouds if cover is None else (*base.clouds, cover.transformed(placed.pose))
     return replace(base, clouds=clouds, markers=(placed,), lights=lights, camera=camera)
 

@@ -267,7 +267,7 @@ def sog_parts(cloud: SplatCloud) -> dict[str, bytes]:
 
 
 def _pixels(n: int, values: np.ndarray, shape: tuple[int, int] | None = None) -> np.ndarray:
-    """An image (h, w, 4) uint8 whose first n pixels are values (n, 3 or 4); the rest is 0, opaque."""
+    """An image (h, w, 4) uint8 whose first n pixels are values (n, 3 or 4); the others are opaque black."""
     width = -(-int(np.ceil(np.sqrt(n))) // 4) * 4
     height, width = shape or (-(-n // width), width)
     if max(height, width) > _MAX_SIDE:

@@ -261,8 +261,8 @@ class Residuals:
     def _by_gains(
         self, across: np.ndarray, down: np.ndarray, slopes: np.ndarray
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """By channel: mixed second derivatives (6, 2) of pose, and gain and offset; and the inverse (2, 2) of
-        those of gain and offset."""
+        """For each channel the blocks of the normal equations that eliminate gain and offset: the mixed block
+        (6, 2) of pose and (gain, offset), and the inverse (2, 2) of the block of (gain, offset)."""
         gx, gy = slopes
         for channel in range(len(gx)):
             basis = self._basis(channel)

@@ -76,7 +76,8 @@ def log_images(path: str | os.PathLike[str], topic: str | None = None) -> Iterat
 
 def log_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int], np.ndarray]:
     """Poses (4, 4) in the scene by frame and nanoseconds, from `/tf`: relative to the frame `scene`, or else
-    to the frame without a parent. Frames between must have a pose of the same time.
+    to the frame without a parent. Each frame on the way must have a pose
+    of the same time.
 
     Raises:
         InputError: not a log, a damaged log, or an invalid pose.

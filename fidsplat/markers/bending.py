@@ -36,7 +36,7 @@ CELLS = 8
 
 
 def fine(printed: Printed) -> Printed:
-    """The same rectangles on a grid of `CELLS` times as many cells."""
+    """The same rectangles on a grid whose cells are `CELLS` times smaller."""
     return printed._replace(
         grid=printed.grid.repeat(CELLS, 0).repeat(CELLS, 1),
         boxes=printed.boxes * CELLS,

@@ -158,7 +158,7 @@ def _first_unit(positions: np.ndarray, offsets: np.ndarray) -> float | None:
 
 
 def _first_pose(corners: _Corners, tag: str, relative: np.ndarray, unit: float) -> np.ndarray:
-    """The tag's pose by that photograph whose pose fits the others best.
+    """Initial pose of a tag: of its poses from single photographs, the one that fits all photographs best.
 
     relative: (n, 4, 4) poses from each camera's position in metres.
     """

@@ -81,7 +81,7 @@ class Difference:
 
     @property
     def uncertified(self) -> float:
-        """Largest error beyond the certificate."""
+        """Largest part of an error that exceeds the error bound of its pixel (the certificate)."""
         return self.excess + tolerance_of(self.output)
 
     @property

@@ -33,7 +33,7 @@ def _wall(degrees: float) -> SplatCloud:
 
 
 def _crossing(count: int = 300, seed: int = 1) -> SplatCloud:
-    """Splats that may cross the camera plane, with centres in front of it or behind."""
+    """Splats that may cross the camera plane, with centres in front of it or behind it."""
     generator = np.random.default_rng(seed)
     scales = log_uniform(generator, 0.05, 2.0, (count, 2))
     depths = generator.uniform(-1, 1, count) * 3.33 * scales.max(axis=1)

@@ -52,7 +52,7 @@ def crowd() -> SplatCloud:
 
 
 def corrupted(cloud: SplatCloud, changes: Mapping[str, Any]) -> SplatCloud:
-    """A copy of the cloud with changed fields of the victim; an invalid victim is dropped."""
+    """A copy of the cloud with changed fields of the splat `VICTIM`, which is dropped if it is invalid."""
     arrays = {name: getattr(cloud, name).copy() for name in BROKEN}
     for name, value in changes.items():
         arrays[name][VICTIM] = value

@@ -88,7 +88,7 @@ class ChunkedSplats:
 
     @property
     def content(self) -> tuple:
-        """Identities of the stores and of the cloud in memory, to compute digests."""
+        """Identity of the content: of the stores and of the cloud in memory; used in digests."""
         return (*(store.identity for store in self.stores), self.in_memory)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:

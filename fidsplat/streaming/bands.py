@@ -91,7 +91,7 @@ class Band:
         return self._with_cache(replace(self, subchunks=masked))
 
     def missing_subchunks(self, termination: TerminationDepths, missing: NodeMasks) -> list[Subchunks]:
-        """Subchunks that can contribute but are not rendered: of its own nodes and of missing nodes."""
+        """Subchunks that can contribute but were not rendered, of the band's nodes and of missing nodes."""
         own = [
             each.only(self._can_contribute(each, termination) & ~used) for each, used in self.subchunks or ()
         ]

@@ -42,8 +42,8 @@ def _half_of_memory() -> int:
 
 
 def check_total(what: str, need: int, remedy: str) -> None:
-    """Raise InputError if the parts of a scene take more than half of the machine's memory together, or than
-    `FIDSPLAT_INPUT_LIMIT`."""
+    """Raise InputError if the parts of a scene together need more memory than `FIDSPLAT_INPUT_LIMIT`, by
+    default half of the machine's memory."""
     limit = input_limit(0) if VARIABLE in os.environ else _half_of_memory()
     if need > limit:
         raise InputError(

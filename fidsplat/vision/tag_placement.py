@@ -245,8 +245,10 @@ def _bound(
     value: float,
     objective: Objective,
 ) -> float:
-    """Upper bound of any selection of the same number, from the gains after the selection; infinite for an
-    objective that is not submodular."""
+    """Upper bound of the objective over all selections of the same size, from the gains after the selection.
+
+    It is infinite for an objective that is not submodular.
+    """
     if objective is not gain:
         return math.inf
     return value + sum(sorted((gain(covariance, one) for one in candidates), reverse=True)[: len(chosen)])

@@ -261,7 +261,7 @@ def test_adopted_values_that_are_not_finite_leave_no_trace(renderer, name, value
             r"the last axis of means must be 3, got shape \(200, 2\)",
         ),
         ({"scales": np.zeros((200, 4))}, r"the last axis of scales must be 2 or 3, got shape \(200, 4\)"),
-        ({"opacities": np.zeros(3, np.float32)}, "opacities holds 3 elements, but 200 means need 200"),
+        ({"opacities": np.zeros(3, np.float32)}, "opacities must have 200 elements for 200 means, got 3"),
         ({"sh": np.zeros((200, 4, 3), np.float32)}, "exactly one of colors"),
         (
             {"colors": None, "sh": np.zeros((200, 5, 3), np.float32)},

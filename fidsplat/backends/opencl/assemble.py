@@ -292,8 +292,11 @@ def assemble_check(file: str, shape: DeviceShape, float64: bool, effects: Iterab
 
 
 def backward_items(features: FeatureSet, shape: DeviceShape) -> int:
-    """Work-items of the backward pass over a chunk of a tile's list. Outputs other than rgb need more local
-    memory per pixel and have half as many: with distortion, 256 would exceed NVIDIA's 48 KiB."""
+    """Work-group size of the backward pass over a chunk of a tile's list.
+
+    It is halved for outputs other than rgb, which need more local memory per pixel: with distortion, 256
+    work-items would exceed NVIDIA's limit of 48 KiB.
+    """
     if shape.schedule == "lanes":
         return 1
     return min(shape.tile_width * shape.tile_height, 128 if features.outputs else 256)

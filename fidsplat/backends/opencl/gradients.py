@@ -212,9 +212,11 @@ class OpenCLGradients(GradientPipeline):
         frame.launch("blend backward", "blend_backward", (groups * items,), (items,), log_ceiling=log_ceiling)
 
     def _tape_bytes(self) -> int:
-        """Size of the record `Tape` (schedule/lanes_backward.cl), rounded up to vectors: transmittance and
-        opacity of each pixel for a chunk of splats, two words for each of eight times as many splats, one
-        more word."""
+        """Size in bytes of the struct `Tape` (schedule/lanes_backward.cl), rounded up to vectors.
+
+        It contains the transmittance and opacity of each pixel for a chunk of splats, two words for each
+        splat of eight chunks, and one more word.
+        """
         shape = self._pipeline.shape
         chunk, vector = backward_chunk(self._pipeline.features, shape), 4 * shape.lanes
         words = 2 * 8 * chunk + 1

@@ -134,7 +134,10 @@ class OpenCLTraining(TrainingKernels):
         self._splats_changed()
 
     def gather_rows(self, rows: np.ndarray, remaining: int) -> None:
-        """Replace the splats by rows of them."""
+        """Replace the splats by these rows of their arrays, in this order.
+
+        remaining: number of first rows that keep their moments of Adam; other rows have moments of 0.
+        """
         self._bound["rows"], self._count = self._put("rows", rows), len(rows)
         for name, shape in self._shapes.items():
             made = len(rows), *shape[1:]

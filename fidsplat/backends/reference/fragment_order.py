@@ -93,8 +93,8 @@ def by_depth(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
 
 def by_layers(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
     """Fragments in the order of the splats' centres, and layers of coplanar groups by depth at each sample:
-    fragments nearer than a layer are in front of it, the others behind. Those that do not contribute are left
-    out."""
+    fragments nearer than a layer are in front of it, the others behind. Fragments that do not contribute are
+    left out."""
     columns, lift, arrival = _with_layers(s, f, span)
     may, layered = columns.span.high > 0, arrival < 0
     depth, exists = columns.z - lift, columns.alpha > 0

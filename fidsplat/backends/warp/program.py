@@ -97,7 +97,7 @@ class _Needs:
         return cls(frozenset(effects), outputs, blending, steps)
 
     def among(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """The required effects of `names`."""
+        """The named effects that the program requires."""
         return tuple(name for name in names if name in self.effects)
 
 

@@ -94,7 +94,7 @@ class Resident(ResidentData):
         for name, array in arrays.items():
             expected = count * max(terms, 1) if name == "colors" else count
             if count and array.size != expected:
-                raise InputError(f"{name} holds {array.size} elements, but {count} means need {expected}")
+                raise InputError(f"{name} must have {expected} elements for {count} means, got {array.size}")
         sh_degree = int(np.sqrt(terms)) - 1 if terms else -1
         resident = cls(arrays, count, origin, sh_degree, ellipsoids=ellipsoids)
         resident.adopted = True

@@ -45,7 +45,7 @@ def _nvml() -> Callable[[], float] | None:
 
 
 def _nvidia_smi() -> Callable[[], float] | None:
-    """Draw at the time of the call, integrated between calls."""
+    """Energy meter of an NVIDIA GPU: joules, from the power draw at each call. None without nvidia-smi."""
     if shutil.which("nvidia-smi") is None:
         return None
     query = ("nvidia-smi", "-i", "0", "--query-gpu=power.draw", "--format=csv,noheader,nounits")

@@ -69,7 +69,7 @@ class Views:
 
 @dataclass(frozen=True)
 class SuiteScene:
-    """A scene of the suite."""
+    """A scene of `fidsplat bench --suite`, with its cameras."""
 
     regime: str
     about: str
@@ -186,7 +186,7 @@ def agents(views: int) -> Views:
 
 
 def _both(name: str, regime: str, make: Callable[[bool], Views], quick: bool = False) -> dict:
-    """A scene of disks, and the same of 3D Gaussians."""
+    """Two versions of a scene: with disks and with 3D Gaussians."""
     about = (make.__doc__ or "").partition(":")[0].rstrip(".")
     return {
         name: SuiteScene(regime, about, partial(make, False), quick),

@@ -139,7 +139,7 @@ class DeviceResults:
         return found.assign(ms=self.base_ms(scene) * found["ratio"])
 
     def same_definition(self, scene: str) -> Frame:
-        """Rows with the image definition of the base, whose errors are comparable."""
+        """Rows with the low-pass, samples and order of the base setting, whose errors are comparable."""
         found = self.of(scene)
         # gsplat's stop needs the order of centres, which is the base's without coplanar groups
         constants = found["quality"].str.replace("order=centre ", "")
@@ -171,7 +171,7 @@ class DeviceResults:
         return 1 + (point["ratio"] - 1) * point["base_ms"] / self.base_ms(point["scene"])
 
     def verdict(self, point: Row, other: Row) -> str:
-        """Verdict on a setting relative to another with the same image definition."""
+        """Verdict on a setting relative to another with the same low-pass, samples and order."""
         errors = {_sign(point[name], other[name]) for name in ("maximum", "rmse")}
         if {-1, 1} <= errors:
             return "mixed"
