@@ -111,5 +111,9 @@ def _words(made: Captured, facts: dict[str, Any], out: str, lens: str) -> list[s
         )
     lines += [f"{spec} was not detected" for spec in made.undetected]
     splats = Path(out) / "splats.ply"
-    lines.append(f"train it: fidsplat train {out} -o {splats}; then view it: fidsplat view {made.scene}")
+    again = " again if tags, --up or --scale changed" if splats.exists() else ""
+    lines.append(
+        f"train it{again}: fidsplat train {out} -o {splats}{' --overwrite' if again else ''}; then view it: "
+        f"fidsplat view {made.scene}"
+    )
     return lines

@@ -108,8 +108,7 @@ class Convert:
     def _mesh(self) -> int:
         import fidsplat as fs
         from fidsplat.formats.meshes import check_mesh_file, save_mesh
-        from fidsplat.render.mesh import cameras_of
-        from fidsplat.scenes.sources import load_source
+        from fidsplat.scenes.sources import cameras_of, load_source
 
         target = check_mesh_file(new_file(self.target, self.overwrite))
         with delayed_progress() as progress:

@@ -57,6 +57,7 @@ class Localise:
         import fidsplat as fs
         from fidsplat.images.files import read_images
         from fidsplat.localisation.localise import NoInitialPose
+        from fidsplat.scenes.sources import cameras_of
 
         if not self.images:
             raise InputError("localisation needs at least one IMAGE: a photograph, a folder or a video")
@@ -68,7 +69,7 @@ class Localise:
             raise InputError(
                 f"{self.scene} must have a [camera] table, the camera of the photographs, got none; add one"
             )
-        candidates = [] if self.candidates is None else _candidates(self.candidates, camera)
+        candidates = [] if self.candidates is None else cameras_of(self.candidates, scene)
         with console(self.json).status("opening the device"):
             renderer = fs.Renderer(self.device)
             resident = renderer.upload(scene)
@@ -129,16 +130,6 @@ def _pose(text: str) -> tuple[list[float], list[float]]:
     if len(numbers) != 7:
         raise InputError(f"--start must be 7 numbers X,Y,Z,QW,QX,QY,QZ separated by commas, got {text!r}")
     return numbers[:3], numbers[3:]
-
-
-def _candidates(path: str, camera: Camera) -> list[Camera]:
-    """Cameras at the poses of a file."""
-    from fidsplat.formats import load_cameras, load_trajectory
-
-    try:
-        return list(load_cameras(path).values())
-    except InputError:
-        return [camera.with_pose(camera_to_world=pose) for pose in load_trajectory(path).poses]
 
 
 def _write(out: str, results: dict[str, Localisation | None], camera: Camera) -> str:

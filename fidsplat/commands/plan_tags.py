@@ -12,7 +12,7 @@ from fidsplat.commands.options import Device, Json, Overwrite, require_packages
 from fidsplat.commands.output import delayed_progress, report
 from fidsplat.experiments.plan_tags import PlanSettings
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import path_of, writable_folder
+from fidsplat.util.files import writable_folder
 
 
 @dataclass
@@ -47,7 +47,7 @@ class PlanTags:
         from fidsplat.scenes.sources import load_source
 
         require_packages("the map", ("matplotlib",))
-        folder = path_of(self.out)
+        folder = writable_folder(self.out)
         if (folder / "scene.toml").exists() and not self.overwrite:
             raise InputError(f"{folder / 'scene.toml'} already exists; give another folder, or --overwrite")
         path = fs.load_trajectory(self.trajectory)
@@ -55,7 +55,6 @@ class PlanTags:
             scene = load_source(self.source)
             renderer = fs.Renderer(self.device or scene.device)
             plan = plan_tags(scene, path, self.settings, renderer, progress)
-        writable_folder(folder)
         files = write_plan(plan, folder, self.settings.size)
         facts = plan.facts()
         rows = [
@@ -75,6 +74,10 @@ class PlanTags:
         if facts["bound"] is not None:
             share = 100 * facts["objective"] / max(facts["bound"], 1e-9)
             lines.append(f"information {facts['objective']:.1f} nats, at least {share:.0f} % of the optimum")
+        if self.settings.target is None and len(rows) < self.settings.count:
+            lines.append(
+                f"fewer than {self.settings.count}: other candidates overlap these, or add no information"
+            )
         lines += map(str, files)
         head = ("tag", "position [m]", "poses", "predicted error [cm]")
         return report(

@@ -7,16 +7,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from fidsplat.cameras import Camera, Motion, Shutter, Trajectory
+from fidsplat.cameras import Camera, Trajectory
 from fidsplat.capture.sensor import Sensor
 from fidsplat.formats import Progress
 from fidsplat.markers import Marker, marker
 from fidsplat.render.renderer import Renderer
-from fidsplat.render.surface import MEDIAN, surface_of
+from fidsplat.render.surface import median_depth, surface_of
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.surface import Surface
 from fidsplat.scenes.up import scene_up
@@ -35,9 +35,6 @@ from fidsplat.vision.tag_placement import (
     position_error,
     updated,
 )
-
-if TYPE_CHECKING:
-    pass
 
 WIDEST = 640
 """pixels: largest width of the depth images"""
@@ -387,16 +384,7 @@ def _smaller(camera: Camera) -> Camera:
 
 
 def _depth_frames(scene: Scene, cameras: Sequence[Camera], renderer: Renderer):
-    capture = scene.capture
-    still = replace(
-        capture,
-        outputs=("depth_first",),
-        quality=replace(capture.quality, samples=1, first_hit=MEDIAN),
-        motion=Motion(None, capture.motion.groups),
-        shutter=Shutter(time=capture.shutter.time),
-        sensor=Sensor(),
-        fog=None,
-    )
+    still = median_depth(scene.capture)
     captures = [replace(still, camera=_smaller(camera)) for camera in cameras]
     return renderer.render_views(renderer.upload(scene), captures)
 

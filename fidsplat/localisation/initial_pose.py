@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.images.files import to_uint8
-from fidsplat.scenes import PlacedMarker, Scene
+from fidsplat.scenes import Scene
 from fidsplat.vision.boards import BOARDS
 from fidsplat.vision.detect import detect
 from fidsplat.vision.pose import marker_pose, points_pose
 from fidsplat.vision.pyramid import resized, smoothed
-from fidsplat.vision.readback import families_of
+from fidsplat.vision.readback import content_of, families_of
 
 DESCRIPTOR_WIDTH = 32
 """width in pixels of the descriptor of a view"""
@@ -29,15 +28,15 @@ def pose_of_markers(image: np.ndarray, scene: Scene, camera: Camera) -> tuple[Ca
     markers = [placed for placed in scene.markers if placed.marker.kind not in BOARDS]
     if not markers:
         return None
-    counts = Counter(_content(placed) for placed in markers)
-    known = {_content(placed): placed for placed in markers if counts[_content(placed)] == 1}
+    contents = [content_of(placed.marker) for placed in markers]
+    known = {
+        content: placed
+        for content, placed in zip(contents, markers, strict=True)
+        if contents.count(content) == 1
+    }
     qr = any(placed.marker.kind == "qr" for placed in markers)
     found = detect(to_uint8(image), families_of(placed.marker for placed in markers), qr=qr)
-    pairs = []
-    for code in found:
-        content = (code.kind, code.payload) if code.id is None else (code.kind, code.family, code.id)
-        if content in known:
-            pairs.append((code, known[content]))
+    pairs = [(code, known[content_of(code)]) for code in found if content_of(code) in known]
     if not pairs:
         return None
     if len(pairs) == 1:
@@ -84,8 +83,3 @@ def _descriptor(image: np.ndarray, width: int, height: int) -> np.ndarray:
     small = smoothed(resized(image, width, height), DESCRIPTOR_BLUR)
     small = small - small.mean(axis=(0, 1))
     return (small / (np.linalg.norm(small, axis=(0, 1)) + 1e-6)).ravel()
-
-
-def _content(placed: PlacedMarker) -> tuple:
-    made = placed.marker
-    return (made.kind, made.payload) if made.id is None else (made.kind, made.family, made.id)

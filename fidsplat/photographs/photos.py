@@ -34,7 +34,11 @@ def source_files(source: Path) -> list[Path]:
         raise InputError(
             f"PHOTOS must be a folder of images, or a video ({', '.join(VIDEO_SUFFIXES)}), got {source}"
         )
-    files = sorted(file for file in source.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+    files = sorted(
+        file
+        for file in source.iterdir()
+        if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
+    )
     if len(files) < MIN_PHOTOS:
         raise InputError(
             f"a capture must have at least {MIN_PHOTOS} photographs, got {len(files)} in {source}; take 20 "
@@ -46,8 +50,9 @@ def source_files(source: Path) -> list[Path]:
 def copy_photos(files: Sequence[Path], folder: Path, progress: Progress) -> None:
     """Copy photographs into a folder, rotated upright by their EXIF orientation, under names without blanks.
 
-    Raises InputError for an image that cannot be read.
+    Raises InputError for an image that cannot be read, or two names that differ by the suffix only.
     """
+    names: dict[str, str] = {}
     for number, file in enumerate(files):
         progress("photographs", number / len(files))
         data = read_input(file)
@@ -58,8 +63,12 @@ def copy_photos(files: Sequence[Path], folder: Path, progress: Progress) -> None
         if file.suffix.lower() in (".jpg", ".jpeg") and exif.orientation != 1:
             data = with_exif(encode_image(read_image(file), "jpeg", _QUALITY), exif)
         target = folder / f"{name}{file.suffix.lower()}"
-        if target.exists():
-            raise InputError(f"photographs must have different names, got {file.name} twice; rename one")
+        if name in names:  # their undistorted images would replace each other
+            raise InputError(
+                "photographs must have names that differ before the suffix, got "
+                f"{names[name]} and {file.name}; rename or remove one"
+            )
+        names[name] = file.name
         target.write_bytes(data)
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from fidsplat.cameras import Camera
 from fidsplat.photographs.mapping import Model
+from fidsplat.vision.fisher_information import pose_jacobian
 
 MIN_FEATURES = 30
 """features of a photograph for an estimate"""
 MIN_SHARE, MIN_DISPLACEMENT = 0.02, 0.15
 """share of the errors' squares, and pixels, from which on a rolling shutter is reported"""
-_STEP = 1e-6
 
 
 def readout_motion(model: Model) -> tuple[float, float]:
@@ -31,36 +30,16 @@ def readout_motion(model: Model) -> tuple[float, float]:
         if usable.sum() < MIN_FEATURES:
             continue
         errors = errors[usable]
-        by_motion = (
-            _by_motion(camera, points[usable]) * (pixels[usable, 1] / camera.height - 0.5)[:, None, None]
-        )
-        flat, wanted = by_motion.reshape(-1, 6), errors.ravel()
+        by_pose = np.nan_to_num(pose_jacobian(camera, points[usable]))
+        times = pixels[usable, 1] / camera.height - 0.5
+        flat, wanted = (by_pose * times[:, None, None]).reshape(-1, 6), errors.ravel()
         size = np.linalg.norm(flat, axis=0)  # columns of similar size
         motion = np.linalg.lstsq(flat / size, wanted, rcond=1e-6)[0] / size
         left = wanted - flat @ motion
         before, after = before + wanted @ wanted, after + left @ left
         by_chance += 6 / len(wanted) * (wanted @ wanted)
-        moved = (_by_motion(camera, points[usable]) @ motion).reshape(-1, 2)
+        moved = by_pose @ motion
         displacements.append(float(np.median(np.linalg.norm(moved, axis=1))))
     if not displacements or before == 0:
         return 0.0, 0.0
     return max(0.0, float(before - after - by_chance) / float(before)), float(np.median(displacements))
-
-
-def _by_motion(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Derivatives (n, 2, 6) of pixels by translations and rotations of the camera's frame."""
-    pinhole = camera.with_pose(np.eye(4))
-    local = (points - camera.position) @ camera.world_to_camera[:3, :3].T
-    scale = _STEP * np.median(local[:, 2])
-    found = np.empty((len(points), 2, 6))
-    for axis in range(3):
-        unit = np.eye(3)[axis]
-        for column, delta in (
-            (axis, np.broadcast_to(unit * scale, local.shape)),
-            (3 + axis, _STEP * np.cross(unit, local)),
-        ):
-            step = scale if column < 3 else _STEP
-            found[:, :, column] = (pinhole.project(local + delta) - pinhole.project(local - delta)) / (
-                2 * step
-            )
-    return np.nan_to_num(found)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fidsplat.markers import marker
 from fidsplat.photographs.adjustment import Adjustment, adjust
 from fidsplat.photographs.dataset import scaled, write_images, write_model
 from fidsplat.photographs.frame import WorldFrame, world_frame
@@ -26,7 +27,7 @@ from fidsplat.photographs.mapping import (
 from fidsplat.photographs.photos import camera_groups, copy_frames, copy_photos, source_files
 from fidsplat.photographs.rolling_shutter import MIN_DISPLACEMENT, MIN_SHARE, readout_motion
 from fidsplat.photographs.settings import CaptureSettings
-from fidsplat.photographs.tags import detect_tags, parse_tags
+from fidsplat.photographs.tags import detect_tags, parse_tags, same_tag
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.util.errors import InputError, unknown
 from fidsplat.util.files import atomic_write, from_json, path_of, read_text, writable_folder
@@ -76,7 +77,8 @@ def photographs_to_scene(
     """
     settings, report = settings or CaptureSettings(), progress or (lambda words, share: None)
     tags = parse_tags(settings.tag)
-    if settings.up is not None and settings.up not in tags:
+    up = None if settings.up is None else same_tag(tags, marker(settings.up, 1.0))
+    if settings.up is not None and up is None:
         raise InputError(f"--up must be a tag of --tag, got {settings.up}; give its size by --tag too")
     picks = None if settings.scale is None else parse_scale(settings.scale)
     require_pycolmap()
@@ -104,10 +106,10 @@ def photographs_to_scene(
     if tags:
         views = detect_tags(photos, model.names, model.cameras, tags, report)
         adjustment = adjust(pinholes, views, {spec: made.size for spec, made in tags.items()})
-        first = settings.up or next(iter(adjustment.poses))
+        first = next(iter(adjustment.poses)) if up is None else up.spec
         if first not in adjustment.poses:
             raise InputError(f"--up must be a tag in the photographs, got {first}, which was not detected")
-        frame = world_frame(pinholes, adjustment.scale, adjustment.poses[first], settings.up is not None)
+        frame = world_frame(pinholes, adjustment.scale, adjustment.poses[first], up is not None)
         placed = [
             PlacedMarker(tags[spec], frame.pose(pose), label=i + 1)
             for i, (spec, pose) in enumerate(adjustment.poses.items())

@@ -15,7 +15,7 @@ from fidsplat.photographs.mapping import Progress
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.util.errors import InputError
 from fidsplat.vision.detect import detect
-from fidsplat.vision.readback import families_of, same_code
+from fidsplat.vision.readback import content_of, families_of
 
 THICK = 0.15
 """half the thickness of a tag's box, as a share of its size"""
@@ -39,7 +39,7 @@ def parse_tags(texts: Sequence[str]) -> dict[str, Marker]:
                 "write for example apriltag:36h11:5=0.16"
             )
         made = marker(spec, metres)
-        other = next((each for each in found.values() if _identity(each) == _identity(made)), None)
+        other = same_tag(found, made)
         if other is not None:
             raise InputError(
                 f"each tag must have one size, got {other.size:g} and {made.size:g} m for {made.spec}; "
@@ -49,8 +49,9 @@ def parse_tags(texts: Sequence[str]) -> dict[str, Marker]:
     return found
 
 
-def _identity(made: Marker) -> tuple:
-    return (made.kind, made.payload if made.id is None else (made.family, made.id))
+def same_tag(tags: Mapping[str, Marker], made: Marker) -> Marker | None:
+    """The tag with the content of a marker, whose spec may be written differently."""
+    return next((each for each in tags.values() if content_of(each) == content_of(made)), None)
 
 
 def detect_tags(
@@ -70,7 +71,7 @@ def detect_tags(
         progress("tags", number / len(names))
         detections = detect(read_image(folder / name), families, qr)
         for spec, made in tags.items():
-            own = [code for code in detections if same_code(code, made)]
+            own = [code for code in detections if content_of(code) == content_of(made)]
             if len(own) > 1:
                 raise InputError(
                     f"{spec} must occur once in the scene, got {len(own)} of it in {name}; remove copies, or "

@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from fidsplat.cameras import Camera, Motion
-from fidsplat.capture.sensor import Sensor
-from fidsplat.formats.cameras import load_cameras
+from fidsplat.cameras import Camera
 from fidsplat.formats.collect import Progress
 from fidsplat.formats.meshes import TriangleMesh
-from fidsplat.formats.trajectories import load_trajectory
 from fidsplat.render.renderer import Renderer
-from fidsplat.render.surface import MEDIAN
+from fidsplat.render.surface import median_depth
 from fidsplat.render.tsdf import DistanceField
 from fidsplat.scenes import Scene
 from fidsplat.splats.statistics import guess_up
 from fidsplat.util.arguments import items, number
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import path_of
 
 VIEWS, SIDE, FOV = 64, 512, math.radians(50.0)
 """number, pixels per side and field of view of the views around a scene"""
@@ -72,18 +67,7 @@ def scene_mesh(
         raise InputError("a mesh must have at least one camera, got none")
     renderer = Renderer(scene.device) if renderer is None else renderer
     report: Callable[[str, float], object] = progress or (lambda step, share: None)
-    capture = scene.capture
-    quality = replace(capture.quality, samples=1, first_hit=MEDIAN)
-    motion = Motion(None, capture.motion.groups)
-    still = replace(
-        capture,
-        outputs=("rgb", "depth_first", "normal"),
-        quality=quality,
-        motion=motion,
-        sensor=Sensor(),
-        fog=None,
-        background=(0.0, 0.0, 0.0),
-    )
+    still = median_depth(scene.capture, "rgb", "normal")
     field = DistanceField(voxel, (low + high) / 2)
     images = []
     frames = renderer.render_views(renderer.upload(scene), [replace(still, camera=one) for one in views])
@@ -96,21 +80,6 @@ def scene_mesh(
         field.integrate(depth, cosine, rgb.astype(np.float32) / 255, views[k])
         report("fusing views", 0.5 + 0.5 * (k + 1) / len(views))
     return field.mesh()
-
-
-def cameras_of(path: str | os.PathLike[str], scene: Scene) -> list[Camera]:
-    """Cameras of a COLMAP model or transforms.json, or the scene's camera at the poses of a trajectory.
-
-    Raises:
-        InputError: an unreadable file; a trajectory for a scene without a camera.
-    """
-    file = path_of(path)
-    if file.is_dir() or file.suffix.lower() == ".json":
-        return list(load_cameras(file).values())
-    if scene.camera is None:
-        raise InputError(f"the scene of the trajectory {file} must have a camera, got none")
-    camera = scene.camera
-    return [camera.with_pose(camera_to_world=pose) for pose in load_trajectory(file).poses]
 
 
 def _cosine(normal: np.ndarray, camera: Camera) -> np.ndarray:

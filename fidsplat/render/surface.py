@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fidsplat.cameras import Camera, Motion, Shutter
+from fidsplat.capture.capture import Capture
 from fidsplat.capture.sensor import Sensor
 from fidsplat.scenes.surface import Surface, fit_surface
 from fidsplat.util.arguments import number, real_array
@@ -66,15 +67,7 @@ def surface_at(
 
         renderer = Renderer(scene.device)
     uploaded = renderer.upload(scene) if resident is None else resident
-    still = capture.with_(
-        outputs=("depth_first",),
-        quality=replace(capture.quality, samples=1, first_hit=MEDIAN),
-        motion=Motion(None, capture.motion.groups),
-        shutter=Shutter(time=capture.shutter.time),
-        sensor=Sensor(),
-        background=(0.0, 0.0, 0.0),
-    )
-    still = replace(still, fog=None, external_depth=None)
+    still = median_depth(capture)
 
     def depth_of(patch: Camera) -> np.ndarray:
         return renderer.render(uploaded, still.with_(camera=patch))["depth_first"]
@@ -119,6 +112,15 @@ def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = 
     )
     at = ((pixel[0] - left - 0.5) / step + 0.5, (pixel[1] - top - 0.5) / step + 0.5)
     return _fitted(patch, window, at, pixels / step, metres)
+
+
+def median_depth(capture: Capture, *outputs: str) -> Capture:
+    """The capture that renders the median depth `depth_first` at the time of the shutter, and more outputs,
+    without effects of the camera and the air."""
+    quality = replace(capture.quality, samples=1, first_hit=MEDIAN)
+    motion, shutter = Motion(None, capture.motion.groups), Shutter(time=capture.shutter.time)
+    still = capture.with_(outputs=("depth_first", *outputs), quality=quality, motion=motion, shutter=shutter)
+    return replace(still, sensor=Sensor(), background=(0.0, 0.0, 0.0), fog=None, external_depth=None)
 
 
 def default_radius(camera: Camera) -> float:

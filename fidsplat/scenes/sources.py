@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,8 +11,10 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.capture.quality import Quality
+from fidsplat.formats.cameras import load_cameras
 from fidsplat.formats.collect import Progress
 from fidsplat.formats.files import FORMATS, NAMED, load_splats
+from fidsplat.formats.trajectories import load_trajectory
 from fidsplat.scenes.scene import Scene
 from fidsplat.scenes.up import sampled
 from fidsplat.splats.cloud import SplatCloud
@@ -19,6 +22,7 @@ from fidsplat.splats.statistics import guess_up, level_rotation
 from fidsplat.store.layout import SUFFIX
 from fidsplat.store.store import Store
 from fidsplat.util.errors import InputError
+from fidsplat.util.files import path_of
 
 WIDTH, HEIGHT, FOV_X = 1280, 720, math.radians(60.0)
 ELEVATION = math.radians(15.0)
@@ -142,3 +146,18 @@ def _extent(cloud: SplatCloud | Store) -> tuple[np.ndarray, np.ndarray]:
     low = np.percentile(cloud.means - reach, share, axis=0)
     high = np.percentile(cloud.means + reach, 100 - share, axis=0)
     return low + cloud.origin, high + cloud.origin
+
+
+def cameras_of(path: str | os.PathLike[str], scene: Scene) -> list[Camera]:
+    """Cameras of a COLMAP model or transforms.json, or the scene's camera at the poses of a trajectory.
+
+    Raises:
+        InputError: an unreadable file; a trajectory for a scene without a camera.
+    """
+    file = path_of(path)
+    if file.is_dir() or file.suffix.lower() == ".json":
+        return list(load_cameras(file).values())
+    if scene.camera is None:
+        raise InputError(f"the scene of the trajectory {file} must have a camera, got none")
+    camera = scene.camera
+    return [camera.with_pose(camera_to_world=pose) for pose in load_trajectory(file).poses]

@@ -111,7 +111,7 @@ def match(
         (_distance(found.corners, expected[i]), i, found)
         for i, placed in enumerate(markers)
         for found in left
-        if same_code(found, placed.marker)
+        if content_of(found) == content_of(placed.marker)
     ]
     chosen: dict[int, Detection] = {}
     for _, i, found in sorted(pairs, key=lambda pair: pair[0]):
@@ -128,7 +128,7 @@ def match(
 def own_code(made: Marker, image: np.ndarray) -> Detection | None:
     """Detect a marker's code in an image, (h, w) or (h, w, 3) display values; None if not found."""
     found = detect(to_uint8(image), families_of([made]), qr=made.kind == "qr")
-    return next((code for code in found if same_code(code, made)), None)
+    return next((code for code in found if content_of(code) == content_of(made)), None)
 
 
 def corner_error(code: Detection, corners: np.ndarray) -> float:
@@ -158,11 +158,11 @@ def means(readings: Sequence[Reading]) -> dict[str, Any]:
     return counts | mean
 
 
-def same_code(found: Detection, made: Marker) -> bool:
-    """Whether a detection is of a marker: the same kind, and the same id or payload."""
-    if made.id is None:  # the family of a QR code is its version
-        return (found.kind, found.payload) == (made.kind, made.payload)
-    return (found.kind, found.family, found.id) == (made.kind, made.family, made.id)
+def content_of(code: Detection | Marker) -> tuple:
+    """Kind and content, equal for a marker and its detection."""
+    if code.id is None:  # the family of a QR code is its version
+        return code.kind, code.payload
+    return code.kind, code.family, code.id
 
 
 def _distance(one: np.ndarray, other: np.ndarray) -> float:

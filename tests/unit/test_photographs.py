@@ -19,7 +19,7 @@ from fidsplat.photographs.photos import camera_groups, copy_photos
 from fidsplat.photographs.rolling_shutter import MIN_DISPLACEMENT, MIN_SHARE, readout_motion
 from fidsplat.photographs.settings import CaptureSettings
 from fidsplat.photographs.steps import parse_scale, photographs_to_scene, scale_of
-from fidsplat.photographs.tags import box_of, module_colors, parse_tags
+from fidsplat.photographs.tags import box_of, module_colors, parse_tags, same_tag
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import quaternion_to_matrix, rigid_matrix
 from fidsplat.train.boxes import front_of
@@ -164,6 +164,13 @@ def test_wrong_settings_are_one_clear_line(options, message):
         parse_tags(CaptureSettings(**options).tag)
 
 
+def test_a_tag_has_many_specs():
+    tags = parse_tags(["apriltag:36h11:5=0.16", "qr:a=0.2"])
+    assert same_tag(tags, fs.marker("tag36h11:5", 1.0)) is tags["apriltag:36h11:5"]
+    assert same_tag(tags, fs.marker("aruco:4x4_50:5", 1.0)) is None
+    assert same_tag(tags, fs.marker("qr-v2-L:a", 1.0)) is tags["qr:a"]
+
+
 def test_two_picked_features_give_the_scale():
     points = np.array([[0.0, 0, 2], [1, 0, 2], [0, 1.5, 4]])
     camera = fs.Camera.pinhole(640, 480, 500, 500, 320, 240)
@@ -250,6 +257,10 @@ def test_exif_is_kept_with_upright_pixels(order, tmp_path):
     copied = read_image(tmp_path / "upright copies" / "a.jpg")
     np.testing.assert_allclose(copied, read_image(tmp_path / "a.jpg"), atol=3)
     assert read_exif((tmp_path / "upright copies" / "a.jpg").read_bytes()).orientation == 1
+    (tmp_path / "b.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    (tmp_path / "twice").mkdir()
+    with pytest.raises(InputError, match=r"differ before the suffix, got b\.jpg and b\.png"):
+        copy_photos([*files, tmp_path / "b.png"], tmp_path / "twice", lambda words, share: None)
     # portrait and landscape have different cameras
     assert camera_groups(tmp_path / "upright copies") == [["a.jpg"], ["b.jpg"]]
     for damaged in (rotated[:40], jpeg, b"", rotated.replace(b"II", b"XX").replace(b"MM", b"XX")):

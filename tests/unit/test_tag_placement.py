@@ -327,3 +327,10 @@ def test_the_command_writes_a_scene_and_a_map(hall, few_candidates, tmp_path, ca
 def test_impossible_plans_are_reported(hall, few_candidates, tmp_path, capsys, words, said):
     given = ["plan-tags", hall / "scene.toml", "--trajectory", hall / "path.tum", "-o", tmp_path / "p"]
     assert said in fails(capsys, *given, "--poses", "5", *words)[1]
+
+
+def test_a_folder_that_cannot_be_written_is_reported_before_the_search(hall, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("fidsplat.experiments.plan_tags.plan_tags", None)  # not called
+    (tmp_path / "file").touch()
+    given = ["plan-tags", hall / "scene.toml", "--trajectory", hall / "path.tum"]
+    assert "cannot write into the folder" in fails(capsys, *given, "-o", tmp_path / "file" / "p")[1]
