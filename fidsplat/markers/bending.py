@@ -58,7 +58,10 @@ def subdivide(
     while len(boxes):
         length = boxes[:, 2:] - boxes[:, :2]
         apart, by_axis = _deviations(printed, surface, boxes, owner)
-        halved = (apart > MARGIN * deviation) & ~(whole & (length.max(1) <= 1))
+        if surface.across is not None:
+            width = length * printed.module * (np.abs(surface.across) if printed.angles is None else 1.0)
+            by_axis = np.where(width > surface.longest(deviation), width, by_axis)
+        halved = (np.maximum(apart, by_axis.max(1)) > MARGIN * deviation) & ~(whole & (length.max(1) <= 1))
         done_boxes.append(boxes[~halved])
         done_owner.append(owner[~halved])
         done += len(boxes) - int(halved.sum())

@@ -17,6 +17,7 @@ from fidsplat.util.arguments import (
     instance,
     made_of,
     number,
+    own_scalars,
     parse_settings,
     real_array,
     whole_number,
@@ -61,6 +62,10 @@ class Surface:
     def frames(self, xy: np.ndarray) -> Frames:
         """Points and tangents at positions (n, 2) of the sheet."""
         raise NotImplementedError
+
+    def longest(self, deviation: float) -> float:
+        """Maximum length across the axis of a piece whose deviation, in metres, is measured by samples."""
+        return math.inf
 
     @property
     def across(self) -> np.ndarray | None:
@@ -146,8 +151,14 @@ class BentSheet(_Profile):
 
     def fit(self, half: tuple[float, float]) -> None:
         width = 2 * self._extent(half)
+        _require_length(self.length, SHARPEST * width)
         # beyond, the tangent rotates by more than 90 degrees, and waves touch each other
         _require_radius(self.radius, max(self.length / math.pi**2, SHARPEST * width), width)
+
+    def longest(self, deviation: float) -> float:
+        # samples of more than one wave may all be at equal phases
+        height = self.length**2 / (2 * math.pi**2 * abs(self.radius))
+        return self.length if height > deviation / 4 else math.inf
 
     def _profile(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         wave, most = 2 * math.pi / self.length, self.length / (2 * math.pi * self.radius)
@@ -155,13 +166,13 @@ class BentSheet(_Profile):
         def angle(at: np.ndarray) -> np.ndarray:
             return most * np.sin(wave * at)
 
-        # Gauss-Legendre quadrature, exact to rounding for pieces shorter than half a wave
-        pieces = max(int(np.ceil(2 * np.abs(s).max(initial=0.0) / self.length)), 1)
-        at, weight = np.polynomial.legendre.leggauss(24)
-        at = ((at + 1) / 2 + np.arange(pieces)[:, None]).ravel() / pieces
-        weight = np.tile(weight / 2 / pieces, pieces)
-        angles = angle(s[:, None] * at)
-        return s * (np.cos(angles) @ weight), s * (np.sin(angles) @ weight), angle(s)
+        # complete waves do not rise; the quadrature is exact to rounding for half a wave
+        at, weight = (np.polynomial.legendre.leggauss(24) + np.array([[1.0], [0.0]])) / 2
+        waves = np.round(s / self.length)
+        rest = s - waves * self.length
+        angles = angle(rest[:, None] * at)
+        forward = waves * self.length * (np.cos(angle(self.length / 2 * at)) @ weight)
+        return forward + rest * (np.cos(angles) @ weight), rest * (np.sin(angles) @ weight), angle(s)
 
 
 @dataclass(frozen=True)
@@ -288,12 +299,7 @@ class Crumpled(Surface):
         whole_number("shape: seed", self.seed, 0, 2**63 - 1)
 
     def fit(self, half: tuple[float, float]) -> None:
-        smallest = SHARPEST * max(half)
-        if self.length < smallest:
-            raise InputError(
-                f"shape: length must be at least {smallest:g} m for this marker, got {self.length:g}; use "
-                "longer creases"
-            )
+        _require_length(self.length, SHARPEST * max(half))
 
     def frames(self, xy: np.ndarray) -> Frames:
         xy = np.asarray(xy, np.float64)
@@ -372,12 +378,23 @@ _REMEDY = "e.g. fidsplat.markers.Cylinder(radius=0.05)"
 
 def _check(shape: Any, *lengths: str) -> None:
     """Validate the numbers, the axis and the deviation of a shape."""
+    own_scalars(shape)
     for name in lengths:
         number(f"shape: {name}", getattr(shape, name))
     if hasattr(shape, "axis"):
         axis_of(shape.axis)
+        if not isinstance(shape.axis, str):
+            object.__setattr__(shape, "axis", tuple(map(float, shape.axis)))
     if shape.deviation is not None:
         number("shape: deviation", shape.deviation, "a positive length in metres, or None", 1e-9)
+
+
+def _require_length(length: float, smallest: float) -> None:
+    if length < smallest:
+        raise InputError(
+            f"shape: length must be at least {smallest:g} m for this marker, got {length:g}; use a larger "
+            "length"
+        )
 
 
 def _require_radius(radius: float, smallest: float, width: float) -> None:

@@ -68,6 +68,24 @@ def test_splats_are_near_the_surface_with_its_normals(shape):
     assert area > SHEET**2
 
 
+@pytest.mark.parametrize("length", [0.05, 0.025])
+def test_pieces_do_not_skip_waves(length):
+    """Waves of a length that divides the sheet's: samples at equal distances are all at the same height."""
+    shape, share = BentSheet(0.3, length), np.linspace(-1, 1, 21)[:, None, None]
+    cloud = fs.marker(SPEC, SIZE, shape=shape).cloud
+    along = quaternion_to_matrix(cloud.quats)[:, :, 0] * cloud.scales[:, :1]
+    points = (cloud.world_means() + share * along).reshape(-1, 3)
+    curve = shape.frames(np.column_stack([np.linspace(-0.1, 0.1, 20001), np.zeros(20001)])).points
+    assert cKDTree(curve[:, ::2]).query(points[:, ::2])[0].max() < SIZE / 1500 + 1e-5
+
+
+def test_shapes_with_a_list_or_an_array_as_axis_are_values():
+    one, other = Cylinder(0.05, axis=[1, 2]), Cylinder(np.float32(0.05), axis=np.array([1.0, 2.0]))
+    assert one.axis == other.axis == (1.0, 2.0)
+    assert hash(one) == hash(Cylinder(0.05, axis=(1, 2)))
+    assert type(other.radius) is float
+
+
 @on_each
 def test_rectangles_keep_their_area_and_tangents(shape):
     """Numerical derivatives of the map are the axes of splats; lengths are those of the flat sheet."""
@@ -182,6 +200,7 @@ def test_shapes_in_scene_files(tmp_path):
         ("cylinder,radius=1,axis=z", "axis must be x, y or two numbers"),
         ("crumpled,height=0.02,length=0.1", "height must be 0 to a tenth of the length"),
         ("cylinder,radius=0.1,deviation=0", "deviation must be a positive length"),
+        ("bent,radius=1,length=1e-9", "length must be at least 2e-05 m for this marker"),
         (3, "shape must be a shape, its text or None"),
     ],
 )
