@@ -15,9 +15,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.cameras.lenses import Orthographic
-from fidsplat.capture.capture import Capture
-from fidsplat.capture.quality import Quality
-from fidsplat.capture.response import to_colors, to_light
+from fidsplat.capture.response import to_light
 from fidsplat.render.irradiance import LightField
 from fidsplat.render.reflection import (
     Gloss,
@@ -46,6 +44,8 @@ MEASURING = "fast,lowpass=none,samples=2"
 _DARK = 1e-6
 """radiance below which a panorama is black"""
 _CHUNK = 256
+_SAME = 0.03
+"""radians between normals of a bent marker that share the reflection of a panorama"""
 _WALL = 0.1
 """metres around a light in which splats on all sides mean that it is inside of something"""
 
@@ -107,13 +107,8 @@ class _Surroundings:
             pose = np.eye(4)
             pose[:3, 3] = -point
             cameras.append(Camera.equirectangular(2 * rows, rows, pose, near=near))
-        base = Capture(
-            quality=Quality.of(MEASURING),
-            background=self.scene.background,
-            motion=self.scene.motion,
-            fog=self.scene.fog,
-        )
-        captures = [base.with_(camera=camera, **parts) for camera in cameras]
+        base = self.scene.capture.with_(quality=MEASURING, **parts)
+        captures = [base.with_(camera=camera) for camera in cameras]
         return list(self.renderer.render_views(self.resident, captures))
 
     def refuse_inside(self, number: int, light: PointLight) -> None:
@@ -175,14 +170,13 @@ def _lit(placed: PlacedMarker, around: _Surroundings) -> PlacedMarker:
     if seen.shape[1] > 3:
         fragments = fragments + seen[:, 3:]
     largest = None if shiny is None or light.view == "camera" else FINEST
-    displayed = to_colors(light.exposure * fragments, light.response)
-    owner, corners, part = _split(points, displayed, light.step, largest)
+    owner, corners, part = _split(points, light.displayed(fragments), light.step, largest)
     means, scales = _placed_parts(cloud, points, owner, corners)
     count = np.bincount(part)
     mean = np.stack([np.bincount(part, values) / count for values in fragments.T], 1)
     colors: dict[str, np.ndarray] = {}
     if shiny is None or light.view == "camera":
-        colors["colors"] = to_colors(light.exposure * mean, light.response)
+        colors["colors"] = light.displayed(mean)
     else:
         shown = [(point, np.bincount(part, one) / count) for point, one in arriving.points]
         sh = _from_anywhere(placed, light, cloud, owner, means, mean, arriving._replace(points=shown))
@@ -242,7 +236,7 @@ def _measured(placed: PlacedMarker, light: Lighting, points: _Points, around: _S
     for number, one in enumerate(around.lights):
         extent = around.extent(placed.pose[:3, 3])
         for point in light_points(one, surface.points.mean(axis=0)):
-            seen = visibility(point, surface, around.black[0], extent, around.renderer)
+            seen = visibility(point, surface, around.black[0], around.scene.motion, extent, around.renderer)
             if seen.any():
                 around.arrived.add(number)
                 towards, power = point.arriving(surface.points)
@@ -289,9 +283,9 @@ def _field(placed: PlacedMarker, light: Lighting, points: _Points, around: _Surr
     return field
 
 
-def _by_normal(normals: np.ndarray) -> Iterator[np.ndarray]:
-    """Indices of the rows with each normal."""
-    _, group = np.unique(np.rint(normals * 1e4), axis=0, return_inverse=True)
+def _by_normal(normals: np.ndarray, within: float = 1e-4) -> Iterator[np.ndarray]:
+    """Indices of the rows with each normal, which are equal within an angle in radians."""
+    _, group = np.unique(np.rint(normals / within), axis=0, return_inverse=True)
     order = np.argsort(group.ravel(), kind="stable")
     yield from np.split(order, np.flatnonzero(np.diff(group.ravel()[order])) + 1)
 
@@ -399,7 +393,7 @@ def _from_anywhere(
     places = (means + cloud.origin) @ rotation.T + placed.pose[:3, 3]
     normals = -quaternion_to_matrix(cloud.quats)[owner, :, 2] @ rotation.T
     sh = np.empty((len(owner), 16, 3))
-    for same in _by_normal(normals):
+    for same in _by_normal(normals, _SAME):
         normal = normals[same[0]]
         views = view_directions(normal)
         directions, weights = lobe(views[None], normal[None], shiny)
@@ -412,7 +406,7 @@ def _from_anywhere(
             total = _highlights(places[rows], normals[rows], viewers, shiny, shown)
             total += factor[:, None] * diffuse[rows, None]
             total += arriving.field.interpolated(mirrored, means[rows, :2])
-            sh[rows] = fit_harmonics(views, to_colors(light.exposure * total, light.response))
+            sh[rows] = fit_harmonics(views, light.displayed(total))
     return sh
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.cameras import Camera, look_at_matrix
+from fidsplat.cameras import Camera, Motion, look_at_matrix
 from fidsplat.cameras.lenses import Orthographic
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.environment import ExternalDepth
@@ -67,19 +67,23 @@ def light_points(light: Light, middle: np.ndarray) -> list[LightPoint]:
     count = light.samples if size > 0 else 1
     i = np.arange(count)
     radius, angle = np.sqrt((i + 0.5) / count) * (count > 1), i * np.pi * (3 - np.sqrt(5))
+    share = np.full(count, 1 / count)
     disk = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
     if isinstance(light, Sun):
         axis = unit(np.array(light.direction))
-        places = unit(axis + np.tan(size / 2) * (disk @ _across(axis)))
+        sine = np.sin(size / 2) * radius
+        cosine = np.sqrt(1 - sine**2)
+        places = cosine[:, None] * axis + np.sin(size / 2) * (disk @ _across(axis))
+        share = share / cosine  # a surface that faces the sun receives its intensity
     else:
         assert isinstance(light, PointLight)
         center = np.array(light.position)
         places = center + size * (disk @ _across(unit(center - middle)))
-    return [LightPoint(light, place, 1 / count) for place in places]
+    return [LightPoint(light, *pair) for pair in zip(places, share, strict=True)]
 
 
 def visibility(
-    point: LightPoint, surface: Surface, black: ResidentCloud, extent: float, renderer: Any
+    point: LightPoint, surface: Surface, black: ResidentCloud, motion: Motion, extent: float, renderer: Any
 ) -> np.ndarray:
     """Transmittance (m,) float32 between the surface's points and a point of a light; 0 where the surface
     faces away.
@@ -87,7 +91,8 @@ def visibility(
     The marker is an opaque white surface in an external depth image, and the other splats are black, so that
     the image from the light is the transmittance.
 
-    black: the other splats with the colour 0. extent: largest distance of a splat from the marker.
+    black: the other splats with the colour 0, which `motion` moves. extent: largest distance of a splat from
+    the marker.
     """
     towards, irradiance = point.arriving(surface.points)
     found = np.zeros(len(towards), np.float32)
@@ -97,7 +102,7 @@ def visibility(
         camera = _camera(point, points, surface.pitch, extent + surface.clearance)
         depth = _depth_image(camera, points + surface.clearance * surface.normals[lit])
         image = ExternalDepth(np.ones((*depth.shape, 3), np.float32), depth)
-        seen = renderer.render(black, Capture(camera, external_depth=image))["rgb"][..., 0]
+        seen = renderer.render(black, Capture(camera, motion=motion, external_depth=image))["rgb"][..., 0]
         found[lit] = _bilinear(np.asarray(seen), camera.project(points))
     return found
 

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from fidsplat.capture.environment import three_numbers
+from fidsplat.capture.response import to_colors
 from fidsplat.capture.sensor import GAMMAS
 from fidsplat.scenes.table import Table, names_of
 from fidsplat.util.arguments import LARGEST, as_float, invalid, number, own_scalars, whole_number
@@ -78,13 +79,18 @@ class Lighting:
         ):
             number(f"light: {name}", getattr(self, name), f"a number from {low:g} to {high:g}", low, high)
         whole_number("light: rows", self.rows, 8, 1024)
-        if self.panoramas not in GRIDS:
+        if type(self.panoramas) is not int or self.panoramas not in GRIDS:
             raise invalid("light: panoramas", ", ".join(map(str, GRIDS)), self.panoramas)
         if self.ambient is not None:
             object.__setattr__(self, "ambient", _radiance("light: ambient", self.ambient))
         if self.response not in ("srgb", "linear") or isinstance(self.response, bool):
             requirement = '"srgb", "linear" or a gamma from {:g} to {:g}'.format(*GAMMAS)
             number("light: response", self.response, requirement, *GAMMAS)
+
+    def displayed(self, radiance: np.ndarray) -> np.ndarray:
+        """Colours of radiance that the marker reflects."""
+        with np.errstate(over="ignore"):
+            return np.minimum(to_colors(self.exposure * radiance, self.response), LARGEST)
 
     @staticmethod
     def of(value: Any) -> Lighting | None:

@@ -94,6 +94,27 @@ def test_a_sun_follows_the_cosine(degrees):
     assert np.allclose(light.max(0), 0.85 * max(math.cos(angle), 0) * np.array([1, 0.5, 0.25]), rtol=1e-5)
 
 
+def test_a_wide_sun_has_its_intensity_on_a_surface_that_faces_it():
+    light, _ = lit(of_lights(replace(SUN, angle=3.0, samples=64)))
+    assert light.max() == pytest.approx(0.85, rel=1e-5)
+
+
+def test_shadows_are_where_moving_objects_are_at_time_0():
+    """As in panoramas: a wall that moves in front of the marker, and one that leaves."""
+    here, away = np.eye(4), np.eye(4)
+    away[0, 3] = 5
+    for wall, pose, expected in ((screen(5, 0, -0.2, 1, 1), np.linalg.inv(away), 0.0),
+                                 (screen(0, 0, -0.2, 1, 1), away, 0.85)):  # fmt: skip
+        scene = replace(of_lights(SUN, clouds=[wall]), cloud_motions={0: lambda time, pose=pose: pose})
+        assert lit(scene)[0].max() == pytest.approx(expected, rel=1e-3)
+        assert lit(replace(scene, cloud_motions={0: lambda time: here}))[0].max() != pytest.approx(expected)
+
+
+def test_light_beyond_the_largest_colour_is_clamped():
+    _, cloud = lit(of_lights(replace(SUN, intensity=1e15), exposure=1e15, response=0.01))
+    assert cloud.colors.max() == pytest.approx(1e15)
+
+
 def test_point_and_spot_fall_with_the_square_of_the_distance():
     small = replace(TAG, cloud=TAG.cloud.transformed(np.diag([0.01, 0.01, 0.01, 1.0])))
     for lamp, share in (
@@ -343,6 +364,7 @@ def test_errors_of_scene_files(tmp_path, text, words):
         (lambda: fs.Lighting(roughness=0.01), "roughness must be a number from 0.1 to 1"),
         (lambda: fs.Lighting(response="log"), "response must be"),
         (lambda: fs.Lighting(ambient=(1, 1, -1)), "at least 0"),
+        (lambda: fs.Lighting(panoramas=2.0), "panoramas must be 1, 2, 3, 5, 9, 17, got 2.0"),
         (lambda: fs.Lighting(panoramas=4), "panoramas must be 1, 2, 3, 5, 9, 17, got 4"),
         (lambda: fs.Sun(direction=(0, 0, math.nan)), "three finite numbers"),
         (lambda: fs.SpotLight(position=(0, 0, 0), direction=(0, 0, 1), inner=0.8), "outer must be above"),
