@@ -78,7 +78,7 @@ class BrownConrady:
 
     @property
     def does_nothing(self) -> bool:
-        """Whether it is a pinhole."""
+        """Whether all coefficients are 0, so that the lens is a pinhole."""
         return not any(getattr(self, field.name) for field in fields(self))
 
     @cached_property

@@ -79,7 +79,7 @@ class CalibrationSettings:
 
     @cached_property
     def made(self) -> Marker:
-        """The board."""
+        """The ChArUco board as a marker."""
         return marker(self.board, size=0.3)
 
     def camera(self, rng: np.random.Generator) -> Camera:

@@ -46,7 +46,7 @@ class Sighting:
 
     @property
     def passed(self) -> bool | None:
-        """Whether it was found at its position; None for a marker that is not completely visible."""
+        """Whether the marker was found at its position; None for a marker that is not completely visible."""
         if self.reading.visible < COMPLETE:
             return None
         error = self.reading.position_error

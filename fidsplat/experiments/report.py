@@ -281,10 +281,11 @@ def _spread(rows: Frame) -> dict | None:
 
 
 def _enough(table: Frame) -> list[dict]:
-    """Smallest number of training views per category with which a marker is read as far as without training.
+    """For each category the smallest number of training views that suffices.
 
-    If no number suffices, the number with the smallest difference of tilts, and this difference in degrees,
-    `before`.
+    A number suffices if trained models are read up to the same tilt as markers without training. If none
+    does, the row has the number with the smallest difference of tilts, and `before`: this difference in
+    degrees.
     """
     ours, free, seconds = (
         pd.Series(pd.to_numeric(table[name], errors="coerce"))

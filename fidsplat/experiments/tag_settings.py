@@ -44,7 +44,7 @@ class TagSettings(ShardSettings):
 
     @property
     def steps(self) -> list[float]:
-        """Severities above 0."""
+        """Severities above 0 at which each cause is measured."""
         count = self.severities or (QUICK_STEPS if self.quick else STEPS)
         return [round((k + 1) / count, 6) for k in range(count)]
 

@@ -29,12 +29,12 @@ class TriangleMesh:
 
     @property
     def area(self) -> float:
-        """Square metres."""
+        """Area of the surface in square metres."""
         return float(np.linalg.norm(self._crosses, axis=1).sum() / 2)
 
     @property
     def volume(self) -> float:
-        """Cubic metres inside a closed mesh."""
+        """Volume inside a closed mesh in cubic metres."""
         return float((self.vertices[self.faces[:, 0]] * self._crosses).sum() / 6)
 
     @property

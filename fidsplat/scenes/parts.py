@@ -174,7 +174,7 @@ class SceneParts(PickledByFields):
 
     @property
     def content(self) -> SplatCloud | tuple:
-        """The splats for digests: a cloud, or the identities of stores and a cloud."""
+        """Identity of the splats for digests: the cloud, or the identities of stores and the cloud."""
         return self.splats.content if isinstance(self.splats, ChunkedSplats) else self.splats
 
     @cached_property
@@ -187,7 +187,7 @@ class SceneParts(PickledByFields):
 
     @cached_property
     def _labels(self) -> dict[int, int]:
-        """Labels of moving clouds, by their numbers."""
+        """Labels of moving clouds by the index of the cloud."""
         if not self.cloud_motions:
             return {}
         still = [cloud.labels for i, cloud in enumerate(self.clouds) if i not in self.cloud_motions]

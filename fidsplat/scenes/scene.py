@@ -31,7 +31,7 @@ class Scene(SceneParts, Summarised):
         return f"Scene({', '.join([*words, *(placed.marker.spec for placed in self.markers)])})"
 
     def summary(self) -> dict[str, str]:
-        """Its content in words."""
+        """Content of the scene in words, for tables."""
         rows = {f"store {i}": f"{len(s):,} splats in {s.path}" for i, s in enumerate(self.stores)}
         rows |= {f"cloud {i}": f"{len(cloud):,} splats" for i, cloud in enumerate(self.clouds)}
         for placed in self.markers:

@@ -197,7 +197,7 @@ class Digest:
         return cls(_sha256(*(images[name] for name in OUTPUTS)), each)
 
     def differing(self, other: Digest) -> list[str]:
-        """Outputs that differ."""
+        """Names of the outputs whose digests differ."""
         return [name for name in OUTPUTS if self.outputs[name] != other.outputs[name]]
 
 

@@ -147,7 +147,7 @@ class Store(Summarised):
 
     @property
     def origin(self) -> np.ndarray:
-        """(3,) float64 metres: the world's position of the means' zero."""
+        """World position (3,) float64 in metres that `means` are relative to."""
         return np.array(self.header.origin)
 
     @property
@@ -168,7 +168,7 @@ class Store(Summarised):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of its files; for an instanced store those of the other store."""
+        """Bytes of the files; of an instanced store those of the placed store."""
         return sum(file.stat().st_size for file in self._folder.iterdir() if file.is_file())
 
     @property
@@ -191,7 +191,7 @@ class Store(Summarised):
 
     @cached_property
     def detail_errors(self) -> list[DetailErrors]:
-        """Measured errors of its levels of detail; for an instanced store those of the other store."""
+        """Measured errors of the levels of detail; of an instanced store those of the placed store."""
         return load_detail_errors(self._folder, self.header.identity)
 
     @property

@@ -129,7 +129,7 @@ def _median_depth(view: TrainingView, dataset: Dataset) -> float:
 
 
 def _distance(one: Camera, other: Camera) -> tuple[float, float]:
-    """Metres and degrees."""
+    """Distance in metres and angle in degrees between the poses of two cameras."""
     turn = one.world_to_camera[:3, :3] @ other.world_to_camera[:3, :3].T
     sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
     angle = math.degrees(math.atan2(float(sine), (float(np.trace(turn)) - 1) / 2))

@@ -73,7 +73,7 @@ def whole_number(what: str, value: Any, low: int, high: int) -> int:
 
 
 def flag(what: str, value: Any) -> bool:
-    """True or False."""
+    """Validated bool. Raises InputError for a value of another type."""
     if isinstance(value, bool) or (type(value).__name__ in ("bool", "bool_") and hasattr(value, "item")):
         return bool(value)
     raise invalid(what, "True or False", value)

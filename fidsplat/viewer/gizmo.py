@@ -37,7 +37,7 @@ class GizmoTarget:
 
     @property
     def live(self) -> bool:
-        """Whether it is rendered while it is dragged."""
+        """Whether the object is rendered while it is dragged."""
         return self.splats is None or len(self.splats) <= LIVE_LIMIT
 
     def moved(self, scene: Scene, pose: np.ndarray) -> Scene | None:

@@ -85,7 +85,7 @@ class CommandList:
         return [command.name for command in self._commands]
 
     def clear(self) -> None:
-        """Start another recording."""
+        """Remove all commands, so that other launches can be appended."""
         self.key = None
         self._commands, self._used, self._named = [], {}, {}
 

@@ -41,7 +41,7 @@ class WarpDifferentiable(DifferentiableImages):
         return self.images.device_array(name, 0)
 
     def wait(self) -> None:
-        """Wait until the device has rendered it."""
+        """Wait until the device has rendered the frame."""
         self.images.wait()
 
 

@@ -218,8 +218,11 @@ def scaled(count: int, scale: float, width: int, height: int) -> Views:
 
 
 def _series() -> dict[str, SuiteScene]:
-    """Series of the regime `scaling` by scene name `SERIES@X`: splats with equal covered area, pixels, and
-    size of splats (overdraw)."""
+    """Scenes of the regime `scaling` by name, SERIES@X.
+
+    A series varies the number of splats at a constant covered area, the number of pixels, or the size of
+    splats (overdraw).
+    """
     million = 1_000_000
     found: dict[str, SuiteScene] = {}
     for count in (10_000, 30_000, 100_000, 300_000, million, 3 * million, 10 * million):

@@ -19,10 +19,10 @@ class Reduced:
 
     capture: Capture
     scene: Scene | None = None
-    """scene of its splats, if some are left out"""
+    """scene with the splats to render, if some are left out"""
 
     def cloud(self) -> SplatCloud | None:
-        """Its splats; None: all."""
+        """The splats to render; None: all splats of the complete scene."""
         return None if self.scene is None else self.scene.cloud()
 
 

@@ -41,7 +41,7 @@ class Recipe:
 
     @property
     def text(self) -> str:
-        """Readable description."""
+        """Description of the feature set for the printed table."""
         colors = "plain colours" if self.sh_degree < 0 else f"SH of degree {self.sh_degree}"
         quality = "" if self.quality == _STANDARD else "; no low-pass, 3 x 3 samples"
         return f"{' and '.join(self.kinds)}, {colors}: {', '.join(self.outputs)}{quality}"
