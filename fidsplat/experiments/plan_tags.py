@@ -14,6 +14,7 @@ import numpy as np
 from fidsplat.cameras import Camera, Trajectory
 from fidsplat.capture.sensor import Sensor
 from fidsplat.formats import Progress
+from fidsplat.images.tag_dictionaries import families, parse_family
 from fidsplat.markers import Marker, marker
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.surface import median_depth, surface_of
@@ -155,6 +156,7 @@ def plan_tags(
         InputError: a scene without a camera, no flat surface in view of the trajectory, or too many tags
             for the family.
     """
+    ids = _free_ids(scene, settings)
     survey = Survey(scene, path, settings, renderer, progress)
     poses = survey.candidate_poses()
     tag = survey.tag
@@ -180,7 +182,10 @@ def plan_tags(
     for k in selection.chosen:
         covariance = updated(covariance, seen[k])
         errors.append(position_error(covariance))
-    made = _tags(scene, settings, poses[list(selection.chosen)])
+    made = tuple(
+        PlacedMarker(marker(f"apriltag:{settings.family}:{ids[number]}", settings.size), poses[k])
+        for number, k in enumerate(selection.chosen)
+    )
     survey.report("selecting", 1.0)
     return Plan(
         replace(scene, markers=(*scene.markers, *made)),
@@ -404,17 +409,17 @@ def _exposed(
     ]
 
 
-def _tags(scene: Scene, settings: PlanSettings, poses: np.ndarray) -> tuple[PlacedMarker, ...]:
-    used = {
-        placed.marker.id
-        for placed in scene.markers
-        if (placed.marker.kind, placed.marker.family) == ("apriltag", settings.family)
-    }
-    ids = (number for number in range(100_000) if number not in used)
-    made = []
-    for pose, number in zip(poses, ids, strict=False):
-        made.append(PlacedMarker(marker(f"apriltag:{settings.family}:{number}", settings.size), pose))
-    return tuple(made)
+def _free_ids(scene: Scene, settings: PlanSettings) -> list[int]:
+    """Ids of the family that no marker of the scene has. Raises InputError for too few."""
+    kind, family = parse_family(f"apriltag:{settings.family}")
+    used = {placed.marker.id for placed in scene.markers if placed.marker.family == family}
+    free = [number for number in range(families(kind)[family].count) if number not in used]
+    if len(free) < settings.count:
+        raise InputError(
+            f"--count must be at most {len(free)}, the free ids of {family}, got {settings.count}; "
+            "give another --family"
+        )
+    return free
 
 
 def write_plan(plan: Plan, folder: Path, size: float) -> list[Path]:

@@ -67,8 +67,9 @@ def load_dataset(
     if chosen.folder is not None and not chosen.folder.is_dir():
         raise InputError(f"--masks must be a folder of masks NAME.png, got {chosen.folder}")
     found = (load_transforms if has_transforms(folder) else _load_colmap)(folder, report, chosen)
-    if chosen.folder is not None and all(view.mask is None for view in found.views):
-        example = found.views[0].name if found.views else "NAME"
+    names = [view.name for view in found.views]
+    if chosen.folder is not None and not any(mask_file(chosen.folder, name) for name in names):
+        example = names[0] if names else "NAME"
         raise InputError(f"{chosen.folder} must have masks of the images, e.g. {example}.png, got none")
     views, held_out = _divided(found.views, found.held_out, hold_out)
     points, colors = found.points, found.colors

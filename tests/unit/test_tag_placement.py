@@ -296,7 +296,8 @@ def test_planned_tags_are_detected_where_the_plan_says(hall, few_candidates):
         for code in detect(image.to_uint8(), ("apriltag:36h11",), qr=False):
             seen[code.id] += 1
     assert all(detected >= planned for detected, planned in zip(seen, plan.sightings, strict=True))
-    again = plan_tags(plan.scene, path, PlanSettings(count=1, size=0.4, poses=5, views=5), renderer)
+    settings = PlanSettings(count=1, size=0.4, family="tag36h11", poses=5, views=5)
+    again = plan_tags(plan.scene, path, settings, renderer)
     assert again.tags[0].marker.id == 3  # its own tags count, and keep their ids
     apart = [np.linalg.norm(again.tags[0].pose[:3, 3] - tag.pose[:3, 3]) for tag in plan.tags]
     assert min(apart) > 0.4 * 1.25 * math.sqrt(2)
@@ -319,6 +320,7 @@ def test_the_command_writes_a_scene_and_a_map(hall, few_candidates, tmp_path, ca
     ("words", "said"),
     [
         (["--count", "0"], "--count must be at least 1"),
+        (["--count", "31", "--family", "tag16h5"], "--count must be at most 30, the free ids of 16h5"),
         (["--size", "-1"], "--size must be above 0"),
         (["--target", "0"], "--target must be a positive length"),
         (["--size", "9"], "the trajectory must see a flat surface of the size of a tag"),

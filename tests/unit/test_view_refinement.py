@@ -154,6 +154,6 @@ def test_masks_of_a_folder_and_of_alpha(given, tmp_path):
         load_dataset(tmp_path / "set", masks=tmp_path / "missing")
     (tmp_path / "empty").mkdir()
     with pytest.raises(fs.InputError, match=r"must have masks of the images, e\.g\. 0\.png\.png, got none"):
-        load_dataset(tmp_path / "set", masks=tmp_path / "empty")
+        load_dataset(tmp_path / "set", masks=tmp_path / "empty", alpha_masks=True)
     with pytest.raises(fs.InputError, match="refine_poses must be True or False, got 'yes'"):
         Trainer(given, refine_poses="yes")
