@@ -101,37 +101,40 @@ class LightField:
             for index, share in self._between(places)
         )
 
-    def arriving(self, directions: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Radiance (m, k, 3) from directions (m, k, 3) at places (m, 2), interpolated in both."""
+    @property
+    def _images(self) -> np.ndarray:
+        """Panoramas (rows, columns, h, w, 3)."""
         rows = round(np.sqrt(len(self.angles) / 2))
-        images = self.radiance.reshape(*self.radiance.shape[:2], rows, 2 * rows, 3)
+        return self.radiance.reshape(*self.radiance.shape[:2], rows, 2 * rows, 3)
+
+    def _pixels(self, directions: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], np.ndarray]]:
+        """Indices (y, x) and weights of the four pixels of a panorama around each direction (..., 3)."""
+        rows, columns = self._images.shape[2:4]
         x, y, z = np.moveaxis(directions, -1, 0)
-        u = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * 2 * rows - 0.5
+        u = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * columns - 0.5
         v = (np.arcsin(np.clip(y, -1, 1)) / np.pi + 0.5) * rows - 0.5
         left, top = np.floor(u).astype(int), np.floor(v).astype(int)
-        found = np.zeros(directions.shape)
         for dy in (0, 1):
             for dx in (0, 1):
                 share = np.where(dx, u - left, left + 1 - u) * np.where(dy, v - top, top + 1 - v)
-                pixel = np.clip(top + dy, 0, rows - 1), (left + dx) % (2 * rows)
-                for (row, column), near in self._between(places):
-                    here = images[row[:, None], column[:, None], *pixel]
-                    found += here * (share * near[:, None])[..., None]
+                yield (np.clip(top + dy, 0, rows - 1), (left + dx) % columns), share
+
+    def arriving(self, directions: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Radiance (m, k, 3) from directions (m, k, 3) at places (m, 2), interpolated in both."""
+        found = np.zeros(directions.shape)
+        for pixel, share in self._pixels(directions):
+            for (row, column), near in self._between(places):
+                here = self._images[row[:, None], column[:, None], *pixel]
+                found += here * (share * near[:, None])[..., None]
         return found
 
     def reflected(self, directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Weighted sums (rows, columns, v, 3) of the radiance from directions (v, k, 3) at all
         measurements."""
-        height, width = self.radiance.shape[:2]
-        sides = (np.linspace(0, 1, count) for count in (width, height))
-        shares = np.stack(np.meshgrid(*sides), -1).reshape(-1, 2)
-        places = self.low + shares * (self.high - self.low)
-        flat = directions.reshape(1, -1, 3)
-        found = [
-            np.einsum("vk,vkc->vc", weights, self.arriving(flat, place[None]).reshape(*directions.shape))
-            for place in places
-        ]
-        return np.stack(found).reshape(height, width, -1, 3)
+        return sum(  # type: ignore[return-value]
+            np.einsum("vk,yxvkc->yxvc", weights * share, self._images[:, :, *pixel])
+            for pixel, share in self._pixels(directions)
+        )
 
     def irradiance(self, normal: np.ndarray, places: np.ndarray) -> np.ndarray:
         """Irradiance (m, 3) of surfaces with a normal (3,) at places (m, 2)."""
