@@ -145,7 +145,7 @@ def photographs_to_scene(
 
 
 def _step(folder: Path, make: Callable[[Path], None]) -> Path:
-    """A folder that is complete when it exists."""
+    """Make the folder of a step, unless it exists: it gets its name only when it is complete."""
     if not folder.exists():
         part = folder.with_name(f".{folder.name}.part")
         shutil.rmtree(part, ignore_errors=True)

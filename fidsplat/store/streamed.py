@@ -122,8 +122,8 @@ def _area(means: np.ndarray) -> float:
 def export_streamed(store: Store, path: Path) -> None:
     """Write a store as streamed SOG with its levels, next to a file lod-meta.json.
 
-    A leaf is the node of a level, with at most 262,144 splats of the scene; coarser levels of the store are
-    left out. Coplanar groups and labels are left out.
+    A leaf of the file is a node of the store that represents at most 262,144 splats of the scene; coarser
+    levels are left out. Coplanar groups and labels are left out.
 
     Raises InputError for an instanced store or a file that cannot be written.
     """

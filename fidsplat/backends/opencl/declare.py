@@ -26,7 +26,7 @@ _TYPES = {"float": "f4", "int": "i4", "uint": "u4", "short": "i2", "ulong": "u8"
 
 @dataclass(frozen=True)
 class Member:
-    """Fields of a record with one type and one note."""
+    """Fields of a record that share a type and a comment."""
 
     ctype: str
     names: tuple[tuple[str, int], ...]

@@ -213,7 +213,7 @@ def _agents(views: int, **how: Any) -> SuiteScene:
 
 
 def scaled(count: int, scale: float, width: int, height: int) -> Views:
-    """Random disks of a point of a series."""
+    """Random disks for one point of a series of the regime `scaling`."""
     return _single(random_cloud(count, scale), standard_camera(width, height))
 
 
