@@ -171,8 +171,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         DeviceError: an effect's file fills a hook that no file has.
     """
     layouts = layouts_of(features)
-    # blend and resolve are fused if a pixel has one sample, all rows have one pose, and no other pass adds
-    # to a pixel
+    # blend and resolve are fused if a pixel has one sample and one pose, and no other pass adds to it
     separate = {"rays", "shutter_exposure", "shutter_rows"}
     fused = features.samples == 1 and "background_constant" in layouts and separate.isdisjoint(layouts)
     half = "blend_half" in layouts
