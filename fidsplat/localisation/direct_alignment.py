@@ -103,14 +103,18 @@ class Target:
     """(2, c, n) derivatives by x and y"""
 
     @cached_property
-    def rays(self) -> tuple[np.ndarray, np.ndarray]:
-        """x / z and y / z (n,) of the pixels."""
-        camera = self.camera
-        y, x = np.divmod(self.rows, camera.width)
-        return (
-            ((x + (0.5 - camera.cx)) / camera.fx).astype(np.float32),
-            ((y + (0.5 - camera.cy)) / camera.fy).astype(np.float32),
-        )
+    def motions(self) -> tuple[np.ndarray, np.ndarray]:
+        """(2, 3, n) derivatives of pixel coordinates x and y by a rotation of the camera axes, and by a
+        translation of points at depth 1."""
+        camera, rays = self.camera, self.camera.rays(_centres(self.rows, self.camera.width))
+        if camera.lens is None:
+            by_point = np.zeros((len(rays), 2, 3))
+            by_point[:, [0, 1], [0, 1]], by_point[:, :, 2] = 1, -rays[:, :2]
+        else:
+            by_point = camera.lens.derivative(rays)
+        by_point = by_point * np.array([camera.fx, camera.fy])[:, None]
+        turning = np.cross(rays[:, None], by_point)  # g . (w x ray) = w . (ray x g)
+        return tuple(np.ascontiguousarray(np.moveaxis(a, 0, 2), np.float32) for a in (turning, by_point))
 
     @cached_property
     def blocks(self) -> np.ndarray:
@@ -128,10 +132,13 @@ def target_of(image: np.ndarray, mask: np.ndarray | None, camera: Camera, stage:
     values = smoothed(resized(image, width, height), stage.blur)
     inner = np.zeros((height, width), bool)
     inner[1:-1, 1:-1] = True
-    if mask is not None:
+    ignored = np.zeros((height, width), np.float32) if mask is None else resized(~mask, width, height)
+    if camera.lens is not None:  # the border of the field of view does not move with the camera
+        rays = small.rays(_centres(np.arange(width * height), width))
+        ignored[np.isnan(rays).any(axis=1).reshape(height, width)] = 1
+    if ignored.any():
         # pixels whose blur and gradient contain no ignored pixel
-        ignored = smoothed(resized(~mask, width, height)[:, :, None], max(stage.blur, 0.7))[:, :, 0]
-        inner &= ignored < 1e-3
+        inner &= smoothed(ignored[:, :, None], max(stage.blur, 0.7))[:, :, 0] < 1e-3
     rows = np.flatnonzero(inner)
     if not len(rows):
         raise InputError(
@@ -204,10 +211,8 @@ class Residuals:
     @cached_property
     def motions(self) -> tuple[np.ndarray, np.ndarray]:
         """(6, n) derivatives of pixel coordinates x and y of the points by a motion of the camera axes."""
-        camera, (x, y), z = self.target.camera, self.target.rays, self.inverse_depth
-        fx, fy, none = np.float32(camera.fx), np.float32(camera.fy), np.zeros_like(x)
-        across = fx * np.stack([-x * y, 1 + x * x, -y, z, none, -x * z])
-        down = fy * np.stack([-(1 + y * y), x * y, x, none, z, -y * z])
+        turning, shifting = self.target.motions
+        across, down = np.concatenate([turning, shifting * self.inverse_depth], axis=1)
         return across, down
 
     def moved_by(self, motion: np.ndarray) -> float:
@@ -280,7 +285,7 @@ def align(
     Args:
         image: (h, w, 3) or (h, w, 1) float32 display values.
         mask: (h, w) bool, False for ignored pixels.
-        start: pinhole camera of the image at its assumed pose.
+        start: camera of the image at its assumed pose.
         render: renders the scene.
         coarse: the stages of the coarsest level only, without a covariance.
     """
@@ -321,6 +326,11 @@ def _minimise(found: Residuals, render: Render, robust: str, steps: int) -> Resi
         if found.moved_by(motion) < _SETTLED[robust]:
             break
     return found
+
+
+def _centres(rows: np.ndarray, width: int) -> np.ndarray:
+    """(n, 2) coordinates x and y of the centres of pixels of the flat image."""
+    return np.stack([rows % width, rows // width], axis=1) + 0.5
 
 
 def _at(image: np.ndarray, rows: np.ndarray) -> np.ndarray:

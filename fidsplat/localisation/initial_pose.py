@@ -64,7 +64,7 @@ def most_similar(
 
     Args:
         image: (h, w, c) display values.
-        camera: pinhole camera of the image.
+        camera: camera of the image.
         render: renders cameras, (n, h, w, 3).
     """
     width = min(DESCRIPTOR_WIDTH, camera.width)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,6 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.util.arguments import instance, invalid
 from fidsplat.util.errors import InputError
-from fidsplat.vision.undistort import undistort_masked
 
 TRIED = 3
 """number of candidates that are aligned coarsely"""
@@ -158,11 +157,6 @@ def localise(
         starts = [camera.with_pose(pose)]
     elif isinstance(scene, Scene) and (detected := pose_of_markers(pixels, scene, camera)) is not None:
         starts, source = [detected[0]], ", ".join(detected[1])
-    pinhole, values = replace(camera, lens=None), pixels
-    if camera.lens is not None:
-        inside = np.ones(pixels.shape[:2], bool) if mask is None else np.asarray(mask)
-        values, mask = undistort_masked(pixels, camera, inside)
-        values = values.reshape(*pixels.shape)
     if not starts:
         if not len(candidates):
             raise NoInitialPose(
@@ -176,13 +170,11 @@ def localise(
                 "rgb"
             ]
 
-        best = most_similar(values, pinhole, candidates, render_all, TRIED)
-        tried = [align(values, mask, one, render, coarse=True) for one in best]
+        best = most_similar(pixels, camera, candidates, render_all, TRIED)
+        tried = [align(pixels, mask, one, render, coarse=True) for one in best]
         starts = [min(tried, key=lambda one: one.noise).camera]
-    found = align(values, mask, pinhole.with_pose(starts[0].world_to_camera), render)
-    return Localisation(
-        camera.with_pose(found.camera.world_to_camera), found.covariance, found.inliers, found.noise, source
-    )
+    found = align(pixels, mask, starts[0], render)
+    return Localisation(found.camera, found.covariance, found.inliers, found.noise, source)
 
 
 def _pixels(image: Any) -> np.ndarray:

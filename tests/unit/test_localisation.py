@@ -104,14 +104,20 @@ def test_the_covariance_has_the_scale_of_the_errors(renderer, room):
     assert 4 < np.mean(squares) < 8.5
 
 
-def test_a_lens_and_a_grey_image(renderer):
-    scene = scene_with()
-    camera = fs.Camera.pinhole(
-        64, 48, 62.0, 66.0, 33.0, 23.0, scene.camera.world_to_camera, lens=fs.BrownConrady(k1=-0.1)
-    )
+LENSES = {
+    "distorted": (fs.BrownConrady(k1=-0.1), 62.0, 66.0),
+    "fisheye with a black border": (fs.Fisheye(), 15.0, 14.0),
+}
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_a_lens_and_a_grey_image(renderer, name):
+    scene, (lens, fx, fy) = scene_with(), LENSES[name]
+    camera = fs.Camera.pinhole(64, 48, fx, fy, 33.0, 23.0, scene.camera.world_to_camera, lens=lens)
     image = renderer.render(scene, camera)["rgb"].mean(axis=2)
     found = fs.localise(image, scene, offset_camera(camera, START / 2), renderer=renderer)
-    assert off(found.camera, camera)[0] < 6
+    assert off(found.camera, camera)[0] < 0.5
+    assert off(found.camera, camera)[0] < 4e3 * found.position_deviation
     assert found.camera.lens == camera.lens
 
 
