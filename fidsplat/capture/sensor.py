@@ -208,5 +208,6 @@ def _numbers(name: str, values: Any, lowest: int, highest: int) -> tuple[float, 
         or not lowest <= len(numbers) <= highest
         or not all(abs(value) <= LARGEST for value in numbers)
     ):
-        raise invalid(f"sensor: {name}", f"{lowest} to {highest} finite numbers up to {LARGEST:g}", values)
+        counts = highest if lowest == highest else f"{lowest} to {highest}"
+        raise invalid(f"sensor: {name}", f"{counts} finite numbers up to {LARGEST:g}", values)
     return numbers

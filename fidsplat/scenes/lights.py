@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,7 +13,7 @@ from fidsplat.capture.environment import three_numbers
 from fidsplat.capture.response import to_colors
 from fidsplat.capture.sensor import GAMMAS
 from fidsplat.scenes.table import Table, names_of
-from fidsplat.util.arguments import LARGEST, as_float, invalid, number, own_scalars, whole_number
+from fidsplat.util.arguments import LARGEST, as_float, changes_of, invalid, number, own_scalars, whole_number
 from fidsplat.util.errors import InputError, unknown
 
 SOURCES = ("scene", "lights")
@@ -191,7 +191,7 @@ class SpotLight(PointLight):
 
 
 LIGHTS: dict[str, type[Light]] = {kind.kind: kind for kind in (Sun, PointLight, SpotLight)}
-_ANGLES = ("angle", "inner", "outer")
+_ANGLES = {"angle", "inner", "outer"}
 """fields in radians, whose keys in scene files are NAME_deg"""
 
 
@@ -200,22 +200,10 @@ def read_lights(top: Table) -> tuple[Light, ...]:
     found = []
     every = {_key(name) for kind in LIGHTS.values() for name in names_of(kind)}
     for any_kind in top.tables("lights", ("kind", *sorted(every))):
-        name = any_kind.text("kind")
-        if name not in LIGHTS:
-            raise any_kind.error("kind", f"must be {', '.join(LIGHTS)}, got {name!r}")
-        kind = LIGHTS[name]
-        table = any_kind.narrowed(("kind", *map(_key, names_of(kind))))
-        values = {}
-        for field in fields(kind):
-            key = _key(field.name)
-            if key not in table and field.default is not MISSING:
-                continue
-            if str(field.type).startswith("tuple"):
-                value = table.numbers(key, 3)
-            else:
-                value = table.whole(key) if field.type == "int" else table.number(key)
-            values[field.name] = math.radians(value) if key != field.name else value
+        kind, table = any_kind.of_kind(LIGHTS, _key)
         with table.at():
+            values = table.values(kind, _key)
+            values |= {name: math.radians(values[name]) for name in _ANGLES & values.keys()}
             found.append(kind(**values))
     return tuple(found)
 
@@ -223,14 +211,9 @@ def read_lights(top: Table) -> tuple[Light, ...]:
 def light_tables(lights: tuple[Light, ...]) -> Iterator[dict[str, Any]]:
     """Content of the tables [[lights]]."""
     for light in lights:
-        table: dict[str, Any] = {"kind": light.kind}
-        for field in fields(light):
-            value = getattr(light, field.name)
-            if value != field.default:
-                key = _key(field.name)
-                value = math.degrees(value) if key != field.name else value
-                table[key] = list(value) if isinstance(value, tuple) else value
-        yield table
+        changes = changes_of(light)
+        changes |= {name: math.degrees(changes[name]) for name in _ANGLES & changes.keys()}
+        yield {"kind": light.kind} | {_key(name): value for name, value in changes.items()}
 
 
 def read_lighting(marker: Table) -> Lighting | None:
@@ -249,13 +232,8 @@ def lighting_value(light: Lighting | None) -> dict[str, Any]:
     """The key `light` of a [[markers]] table; empty without light."""
     if light is None:
         return {}
-    plain = Lighting()
-    changes = {name: getattr(light, name) for name in names_of(Lighting)}
-    changes = {name: value for name, value in changes.items() if value != getattr(plain, name)}
-    if set(changes) <= {"source"}:
-        return {"light": light.source}
-    lists = {name: list(value) if isinstance(value, tuple) else value for name, value in changes.items()}
-    return {"light": lists}
+    changes = changes_of(light)
+    return {"light": light.source if set(changes) <= {"source"} else changes}
 
 
 def _key(name: str) -> str:

@@ -222,11 +222,7 @@ def _splats(table: Table, load: Callable[[str], SplatCloud]) -> tuple[SplatCloud
 def _surface(table: Table) -> Surface:
     """Shape of a marker: the inline table `shape`."""
     names = dict.fromkeys(name for kind in SURFACES.values() for name in names_of(kind))
-    name = table.table("shape", ("kind", *names)).text("kind")
-    if name not in SURFACES:
-        raise table.error("shape.kind", f"must be {', '.join(SURFACES)}, got {name!r}")
-    kind = SURFACES[name]
-    own = table.table("shape", ("kind", *names_of(kind)))
+    kind, own = table.table("shape", ("kind", *names)).of_kind(SURFACES)
     with own.at():
         return kind(**own.values(kind))
 

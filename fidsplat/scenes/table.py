@@ -1,7 +1,7 @@
 """Tables of scene files, with checked keys, types and lengths; errors name the key."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from typing import Any
@@ -50,7 +50,12 @@ class Table:
         try:
             yield
         except InputError as error:
-            raise InputError(f"{self._file}: {self._name(key) if key else self._path}: {error}") from error
+            message, name = str(error), self._name(key) if key else self._path
+            if message.startswith(f"{self._file}: "):
+                raise
+            # the last part of the name is often the object that the message begins with
+            message = message.removeprefix(f"{name.rpartition('.')[2]}: ")
+            raise InputError(f"{self._file}: {name}: {message}") from error
 
     def _get(self, key: str, default: Any) -> Any:
         if key in self._values:
@@ -70,9 +75,13 @@ class Table:
         """Whether a key has a string."""
         return isinstance(self._values.get(key), str)
 
-    def narrowed(self, known: tuple[str, ...]) -> "Table":
-        """The table with fewer known keys. Raises InputError if it has another key."""
-        return Table(self._values, self._file, self._path, known)
+    def of_kind(self, kinds: Mapping[str, type], key: Callable[[str], str] = str) -> "tuple[type, Table]":
+        """Class that `kind` names, and the table with its keys only. key: key of a field."""
+        name = self.text("kind")
+        if name not in kinds:
+            raise self.error("kind", f"must be {', '.join(kinds)}, got {name!r}")
+        known = ("kind", *map(key, names_of(kinds[name])))
+        return kinds[name], Table(self._values, self._file, self._path, known)
 
     def texts(self, key: str, default: Any = _MISSING) -> Any:
         """A tuple of one or more strings, or the default."""
@@ -120,11 +129,11 @@ class Table:
             raise self.error(key, f"must be a list of 4 rows of 4 numbers, got {_kind(value)}")
         return [self._vector(f"{key}[{i}]", row, 4) for i, row in enumerate(value)]
 
-    def values(self, kind: type) -> dict[str, Any]:
+    def values(self, kind: type, key: Callable[[str], str] = str) -> dict[str, Any]:
         """Values for the fields of a dataclass, in their types.
 
         Fields without a default are required. Fields with a default factory have their own table, and are
-        omitted. A value may be infinite only if its default is.
+        omitted. A value may be infinite only if its default is. key: key of a field.
         """
         readers: dict[str, Callable[[str], Any]] = {
             "int": self.whole,
@@ -136,15 +145,16 @@ class Table:
         found = {}
         for field in fields(kind):
             has_own_table = field.default_factory is not MISSING
-            if has_own_table or (field.name not in self and field.default is not MISSING):
+            name = key(field.name)
+            if has_own_table or (name not in self and field.default is not MISSING):
                 continue
             type_name = str(field.type).removesuffix(" | None")
             if " | " in type_name:  # by the type of the value
-                given = type(self._get(field.name, _MISSING))
+                given = type(self._get(name, _MISSING))
                 type_name = {str: "str", list: "tuple[float, ...]"}.get(given, "float")
             infinite = field.default == math.inf
             read = readers.get(type_name, lambda key, infinite=infinite: self.number(key, infinite=infinite))
-            found[field.name] = read(field.name)
+            found[field.name] = read(name)
         return found
 
     def table(self, key: str, known: tuple[str, ...]) -> "Table":

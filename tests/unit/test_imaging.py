@@ -212,7 +212,7 @@ def test_a_panorama_of_no_file_cannot_be_written(tmp_path):
     ("tables", "words"),
     [
         ("[sensor]\nexposre = 2.0", "'sensor.exposre' .did you mean 'exposure'"),
-        ("[sensor]\nexposure = -2.0", "sensor: sensor: exposure must be .* got -2.0"),
+        ("[sensor]\nexposure = -2.0", r"\.toml: sensor: exposure must be .* got -2.0"),
         ("[sensor]\nresponse = true", "sensor.response must be a number"),
         ("[sensor]\nvignetting = 0.1", "sensor.vignetting must be a list of numbers"),
         ("[fog]\ncolor = [1, 1, 1]", "fog.density is missing"),

@@ -341,6 +341,7 @@ def test_scene_files_have_lights(tmp_path):
     [
         ('[[lights]]\nkind = "moon"', "lights[0].kind must be sun, point, spot, got 'moon'"),
         ('[[lights]]\nkind = "sun"', "lights[0].direction is missing"),
+        ('[[lights]]\nkind = "sun"\ndirection = [0, 0]', "scene.toml: lights[0].direction must be a list of"),
         ('[[lights]]\nkind = "sun"\nposition = [0, 0, 1]', "position"),
         ('[[lights]]\nkind = "sun"\ndirection = [0, 0, 0]', "three numbers, not all 0"),
         ('[[lights]]\nkind = "point"\nposition = [0, 0, 1]\nradius = -1', "radius must be a number from 0"),

@@ -140,5 +140,5 @@ def test_wrong_wear_is_refused(tmp_path):
     with pytest.raises(fs.InputError, match="edges along modules"):
         fs.marker(f"svg-16:{drawing}", wear="fading=0.5")
     (tmp_path / "scene.toml").write_text(f'[[markers]]\nspec = "{SPEC}"\nsize = 1.0\nwear = {{dirt = 2}}\n')
-    with pytest.raises(fs.InputError, match=r"markers\[0\]\.wear: wear: dirt must be a severity"):
+    with pytest.raises(fs.InputError, match=r"markers\[0\]\.wear: dirt must be a severity"):
         fs.Scene.load(tmp_path / "scene.toml")

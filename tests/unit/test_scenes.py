@@ -323,7 +323,7 @@ def test_quality_settings_of_a_scene_file(tmp_path):
     [
         ("[quality]\npreset = 'fats'", "quality.preset: unknown quality 'fats'"),
         ("[quality]\nalpha_cutof = 1", "unknown key 'quality.alpha_cutof' (did you mean 'alpha_cutoff'"),
-        ("[quality]\nalpha_cutoff = 2", "quality: quality: alpha_cutoff must be in (0, 1), got 2.0"),
+        ("[quality]\nalpha_cutoff = 2", "a.toml: quality: alpha_cutoff must be in (0, 1), got 2.0"),
         ("[quality]\nsamples = 'big'", "quality.samples must be a whole number"),
         (
             "[quality.marker]\ntemplate = 4",
