@@ -199,13 +199,15 @@ class Trainer:
         self._refine_poses()
         if self._refinement is None:
             return self.dataset.views
-        pairs = zip(self.dataset.views, self._refinement.cameras, strict=True)
+        refinement = self._refinement
+        cameras = refinement.aligned() if self.settings.refine_poses else refinement.cameras
+        pairs = zip(self.dataset.views, cameras, strict=True)
         return tuple(replace(view, camera=camera) for view, camera in pairs)
 
     def pose_changes(self) -> np.ndarray:
         """(views, 2): metres and degrees by which the refined poses differ from those of the data set."""
         self._refine_poses()
-        if self._refinement is None:
+        if self._refinement is None or not self.settings.refine_poses:
             return np.zeros((len(self.dataset.views), 2))
         return self._refinement.pose_changes()
 
@@ -220,12 +222,18 @@ class Trainer:
         return np.concatenate([gains, self._refinement.exposures[:, 1:]], axis=1)
 
     def cloud(self) -> SplatCloud:
-        """The current splats, without those in the data set's boxes. Raises TrainingError if a value is not
-        finite."""
-        splats, origin = self._checked_splats(), self.dataset.origin
+        """The current splats, without those in the data set's boxes. If poses are refined, they are moved by
+        the similarity that aligns the refined poses with the given ones. Raises TrainingError if a value is
+        not finite."""
+        splats, origin, matrix = self._checked_splats(), self.dataset.origin, np.eye(4)
+        if self._refinement is not None and self.settings.refine_poses:
+            self._refine_poses()
+            matrix = self._refinement.to_given()
         if self.dataset.boxes:
-            splats = splats.select(outside_boxes(splats.values["means"] + origin, self.dataset.boxes))
-        return splats.cloud(self.settings.sh_degree, origin)
+            means = (splats.values["means"] + origin) @ matrix[:3, :3].T + matrix[:3, 3]
+            splats = splats.select(outside_boxes(means, self.dataset.boxes))
+        cloud = splats.cloud(self.settings.sh_degree, origin)
+        return cloud.transformed(matrix) if self.settings.refine_poses else cloud
 
     def save(self, path: str | Path) -> None:
         """Write the current splats to a PLY file. Raises InputError if it cannot be written, TrainingError

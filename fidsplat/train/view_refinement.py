@@ -8,7 +8,7 @@ the image by similar amounts and are hardly coupled.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -77,9 +77,19 @@ class ViewRefinement:
         """Set the means of the exposures over the views to 0; the splats' colours include them."""
         self.exposures -= self.exposures.mean(axis=0)
 
+    def to_given(self) -> np.ndarray:
+        """(4, 4) similarity that aligns the refined cameras with the given ones. Images determine a scene up
+        to a similarity, along which refinement drifts."""
+        return alignment(self.cameras, self._given)
+
+    def aligned(self) -> list[Camera]:
+        """The refined cameras, aligned with the given ones."""
+        matrix = self.to_given()
+        return [moved(camera, matrix) for camera in self.cameras]
+
     def pose_changes(self) -> np.ndarray:
         """(views, 2): metres and degrees between the given and the refined cameras."""
-        return np.array([_distance(a, b) for a, b in zip(self._given, self.cameras, strict=True)])
+        return np.array([_distance(a, b) for a, b in zip(self._given, self.aligned(), strict=True)])
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The state, for a checkpoint."""
@@ -105,6 +115,33 @@ class ViewRefinement:
         self.exposures = arrays["exposures"].copy()
         for name, adam in (("pose", self._pose_adam), ("exposure", self._exposure_adam)):
             adam.moments, adam.steps = arrays[f"{name}_moments"].copy(), arrays[f"{name}_steps"].copy()
+
+
+def alignment(cameras: Sequence[Camera], given: Sequence[Camera]) -> np.ndarray:
+    """(4, 4) similarity that moves cameras to given ones, as near as possible: the mean rotation, and the
+    scale and translation of their centres."""
+    pairs = [
+        (one.world_to_camera[:3, :3], other.world_to_camera[:3, :3])
+        for one, other in zip(cameras, given, strict=True)
+    ]
+    left, _, right = np.linalg.svd(np.sum([other.T @ one for one, other in pairs], axis=0))
+    rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    centres, goals = (np.array([camera.position for camera in each]) for each in (cameras, given))
+    spread = (centres - centres.mean(axis=0)) @ rotation.T
+    overlap = float((spread * (goals - goals.mean(axis=0))).sum())
+    scale = overlap / float((spread**2).sum()) if overlap > 0 else 1.0
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * rotation
+    matrix[:3, 3] = goals.mean(axis=0) - matrix[:3, :3] @ centres.mean(axis=0)
+    return matrix
+
+
+def moved(camera: Camera, matrix: np.ndarray) -> Camera:
+    """The camera moved by a similarity (4, 4) of the world."""
+    pose = np.eye(4)
+    pose[:3, :3] = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3])) @ camera.world_to_camera[:3, :3].T
+    pose[:3, 3] = matrix[:3, :3] @ camera.position + matrix[:3, 3]
+    return camera.with_pose(camera_to_world=pose)
 
 
 def with_exposure_of(rendered: np.ndarray, view: TrainingView) -> np.ndarray:

@@ -9,7 +9,10 @@ from training_scene import BACKGROUND
 import fidsplat as fs
 from fidsplat.cameras.pose_offset import offset_camera
 from fidsplat.images.files import to_uint8, write_png
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.train import Dataset, Trainer, TrainingView, load_dataset
+from fidsplat.train.settings import TrainSettings
+from fidsplat.train.view_refinement import ViewRefinement, alignment, moved
 from fidsplat.vision.pose import pose_error
 
 FIXED = {
@@ -69,8 +72,15 @@ def test_poses_return_to_the_truth(renderer, cloud, given, disturbed):
     trainer = Trainer(
         disturbed, renderer, start=cloud, iterations=400, refine_poses=True, pose_rate_end=1e-4, **FIXED
     )
-    trainer.run()
-    before, after = errors(disturbed.views, given), errors(trainer.views, given)
+    trained = trainer.run()
+    # aligned with the disturbed poses, the cameras and splats are moved by one similarity
+    matrix = alignment([view.camera for view in given.views], [view.camera for view in trainer.views])
+    expected = cloud.world_means() @ matrix[:3, :3].T + matrix[:3, 3]
+    assert np.abs(trained.world_means() - expected).max() < 0.003
+    truth = replace(
+        given, views=tuple(replace(view, camera=moved(view.camera, matrix)) for view in given.views)
+    )
+    before, after = errors(disturbed.views, given), errors(trainer.views, truth)
     assert (before > (0.02, 0.008)).all()
     assert (after < (0.002, 0.001)).all()
     changes = trainer.pose_changes()
@@ -79,6 +89,16 @@ def test_poses_return_to_the_truth(renderer, cloud, given, disturbed):
         for a, b in zip(disturbed.views, trainer.views, strict=True)
     ]
     np.testing.assert_allclose(changes, np.array(expected) * (1, 180 / np.pi), rtol=1e-6)
+
+
+def test_refinement_does_not_drift_by_a_similarity(given):
+    """Cameras that turn, move and grow together are those that were given."""
+    refinement = ViewRefinement(given, TrainSettings(refine_poses=True))
+    drift = 1.03 * rigid_matrix((0.2, -0.1, 0.4), (0.98, 0.1, -0.1, 0.15))
+    drift[3, 3] = 1.0
+    refinement.cameras = [moved(view.camera, drift) for view in given.views]
+    np.testing.assert_allclose(refinement.to_given() @ drift, np.eye(4), atol=1e-12)
+    assert refinement.pose_changes().max() < 1e-10
 
 
 def test_exposures_return_to_the_truth(renderer, cloud, given):
