@@ -114,7 +114,10 @@ class Target:
             by_point = camera.lens.derivative(rays)
         by_point = by_point * np.array([camera.fx, camera.fy])[:, None]
         turning = np.cross(rays[:, None], by_point)  # g . (w x ray) = w . (ray x g)
-        return tuple(np.ascontiguousarray(np.moveaxis(a, 0, 2), np.float32) for a in (turning, by_point))
+        by_turn, by_move = (
+            np.ascontiguousarray(np.moveaxis(a, 0, 2), np.float32) for a in (turning, by_point)
+        )
+        return by_turn, by_move
 
     @cached_property
     def blocks(self) -> np.ndarray:
