@@ -15,8 +15,8 @@ import numpy as np
 from measuring import facts, keep, options, show
 
 import fidsplat as fs
-from fidsplat.capture.response import to_colors
 from fidsplat.sim.depth_cameras import PRESETS, depth_camera
+from fidsplat.util.response import to_colors
 
 DISTANCES = (0.5, 0.8, 1.0, 1.5, 2.0, 3.0, 3.8)
 TILTS = (30, 50, 60, 70, 80)

@@ -22,7 +22,6 @@ import cv2
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.capture.response import to_colors, to_light
 from fidsplat.experiments.blender import default_environment, image_job, ready, run_worker
 from fidsplat.experiments.intervals import wilson
 from fidsplat.images.files import to_uint8, write_png
@@ -33,6 +32,7 @@ from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.util.files import atomic_write, writable_folder
 from fidsplat.util.provenance import run_facts
+from fidsplat.util.response import to_colors, to_light
 from fidsplat.vision.readers import Target, attempt, readers
 
 SIZE = 0.2

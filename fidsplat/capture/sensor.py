@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.capture.response import to_light
 from fidsplat.util.arguments import as_float, invalid, items, number, own_scalars, whole_number
 from fidsplat.util.errors import InputError
+from fidsplat.util.response import to_light
 
 RESPONSES = ("linear", "srgb")
 BITS = (8, 16)

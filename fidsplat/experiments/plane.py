@@ -13,6 +13,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.util.errors import InputError
+from fidsplat.util.response import to_colors, to_light
 
 
 def plane_image(
@@ -130,10 +131,9 @@ def _pieces(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 def srgb(light: np.ndarray) -> np.ndarray:
     """Linear light in [0, 1] to display values (IEC 61966-2-1)."""
-    light = np.clip(light, 0.0, 1.0)
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return to_colors(np.clip(light, 0.0, 1.0), "srgb")
 
 
 def from_srgb(value: float) -> float:
     """Convert a display value in [0, 1] to linear light."""
-    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
+    return float(to_light(np.array(value), "srgb"))

@@ -14,7 +14,6 @@ import numpy as np
 from fidsplat.cameras import BrownConrady, Camera, Motion, Shutter
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.environment import Fog
-from fidsplat.capture.response import to_colors
 from fidsplat.capture.sensor import Sensor
 from fidsplat.formats.files import load_splats
 from fidsplat.markers import BoxEdge, Crumpled, Cylinder, Marker, Wear, marker
@@ -25,6 +24,7 @@ from fidsplat.scenes.lights import Light, Lighting, PointLight, Sun
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.util.arguments import number
+from fidsplat.util.response import to_colors
 from fidsplat.worlds.greenhouse import AISLE, Greenhouse, facing
 
 WIDTH, HEIGHT, FOV = 640, 480, math.radians(60.0)

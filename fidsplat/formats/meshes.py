@@ -11,6 +11,7 @@ import numpy as np
 from fidsplat.formats.gltf import pack_glb
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
+from fidsplat.util.response import to_light
 
 MESH_FORMATS = (".glb", ".ply", ".obj", ".stl", ".xml")
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -143,8 +144,7 @@ def _glb(mesh: TriangleMesh) -> bytes:
     points, faces = mesh.vertices.astype("<f4"), mesh.faces.astype("<u4")
     arrays = [(faces.reshape(-1, 1), 5125, "SCALAR"), (points, 5126, "VEC3")]
     if len(mesh.colors):
-        display = np.clip(mesh.colors, 0, 1)  # colours of vertices are linear in glTF
-        linear = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+        linear = to_light(np.clip(mesh.colors, 0, 1), "srgb")  # as glTF requires
         arrays.append((linear.astype("<f4"), 5126, "VEC3"))
     views, accessors, place = [], [], 0
     for array, component, kind in arrays:

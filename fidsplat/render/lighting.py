@@ -15,7 +15,6 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.cameras.lenses import Orthographic
-from fidsplat.capture.response import to_light
 from fidsplat.render.irradiance import LightField
 from fidsplat.render.reflection import (
     Gloss,
@@ -32,6 +31,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import rotation_of_coefficients
 from fidsplat.splats.rotations import quaternion_to_matrix
 from fidsplat.util.errors import InputError
+from fidsplat.util.response import to_light
 
 FINEST = 8
 """parts per module along a side of a box, the smallest that light is measured on"""

@@ -13,13 +13,13 @@ import numpy as np
 from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.lidar import Lidar, Spinning
-from fidsplat.capture.response import to_light
-from fidsplat.capture.sensor import Sensor
+from fidsplat.capture.sensor import LUMINANCE, Sensor
 from fidsplat.capture.views import pose_matrices
 from fidsplat.formats.points import save_points
 from fidsplat.splats.rotations import check_similarity, pose_matrix
 from fidsplat.util.arguments import instance, invalid, number, whole_number
 from fidsplat.util.errors import InputError
+from fidsplat.util.response import to_light
 
 if TYPE_CHECKING:
     from fidsplat.render.renderer import Renderer
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 LINK_FROM_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 """the lidar's axes (x forward, y left, z up) from those of a camera (z forward, y down)"""
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _REFERENCE = 0.1  # reflectivity of `Lidar.detection_range`
 _DETECTED = math.log(9)  # logit of a probability of 90 %
 _SHARPNESS = 4.0  # logits per factor e of the signal: from 90 % to 10 % by a factor of 3
@@ -261,7 +260,7 @@ class _Request:
         hit = rays["range"] > 0
         rows, columns = np.nonzero(used)
         at = rows[hit], columns[hit]
-        reflectivity = to_light(np.clip(images["rgb"][at], 0, 1), "srgb") @ _LUMINANCE
+        reflectivity = to_light(np.clip(images["rgb"][at], 0, 1), "srgb") @ LUMINANCE
         for label, value in lidar.reflectivity.items():
             reflectivity[rays["label"][hit] == label] = value
         directions = camera.lens.directions[at]  # type: ignore[union-attr]

@@ -10,11 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from fidsplat.capture.environment import three_numbers
-from fidsplat.capture.response import to_colors
 from fidsplat.capture.sensor import GAMMAS
 from fidsplat.scenes.table import Table, names_of
 from fidsplat.util.arguments import LARGEST, as_float, changes_of, invalid, number, own_scalars, whole_number
 from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.response import to_colors
 
 SOURCES = ("scene", "lights")
 VIEWS = ("any", "camera")

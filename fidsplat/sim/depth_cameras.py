@@ -15,13 +15,13 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
-from fidsplat.capture.response import to_light
 from fidsplat.capture.sensor import LUMINANCE, Sensor
 from fidsplat.images.stereo import disparity_of
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.util.arguments import instance, number, whole_number
 from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.response import to_light
 
 DOT = 3.0
 """pixels between the random values of the projected pattern"""

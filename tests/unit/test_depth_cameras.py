@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.capture.response import to_colors
 from fidsplat.cli import main
 from fidsplat.images.stereo import disparity_of
 from fidsplat.scenes import PlacedMarker
 from fidsplat.sim.depth_cameras import ActiveStereo, StructuredLight, TimeOfFlight, depth_camera
+from fidsplat.util.response import to_colors
 
 BACKEND = "opencl"  # for the fixture `renderer`
 

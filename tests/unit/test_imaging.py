@@ -10,9 +10,9 @@ import pytest
 from sampling import in_turn
 
 import fidsplat as fs
-from fidsplat.capture.response import to_light
 from fidsplat.cli import main
 from fidsplat.images.files import write_png
+from fidsplat.util.response import to_light
 
 BACKEND = "opencl"
 

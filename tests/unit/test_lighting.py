@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.capture.response import to_colors, to_light
 from fidsplat.render.irradiance import LightField, cosine_weights, panorama_directions
 from fidsplat.render.reflection import (
     Gloss,
@@ -20,6 +19,7 @@ from fidsplat.render.reflection import (
 )
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.harmonics import sh_basis
+from fidsplat.util.response import to_colors, to_light
 
 TAG = fs.marker("aruco:4x4_50:7", size=0.16)
 UP = np.array([0.0, 0.0, 1.0])

@@ -8,11 +8,11 @@ from scipy.integrate import quad
 from scipy.spatial import cKDTree
 
 import fidsplat as fs
-from fidsplat.capture.response import to_light
 from fidsplat.images.files import to_uint8
 from fidsplat.markers import BentSheet, BoxEdge, Cone, Crumpled, Cylinder
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import quaternion_to_matrix
+from fidsplat.util.response import to_light
 from fidsplat.vision.detect import detect
 from fidsplat.vision.readback import read_back
 from fidsplat.vision.truth import truth_of

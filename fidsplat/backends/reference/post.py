@@ -7,7 +7,7 @@ import numpy as np
 from fidsplat.backends.reference.optics import rays_of
 from fidsplat.backends.view import View
 from fidsplat.capture.environment import Gradient, Panorama
-from fidsplat.capture.response import to_light
+from fidsplat.util.response import to_colors, to_light
 
 _ROUND = 2e-6
 """relative rounding error of float32 before each step"""
@@ -101,7 +101,7 @@ def _step(name: str, value: np.ndarray, view: View, x: np.ndarray, y: np.ndarray
         case "response_gamma":
             return inside ** sensor.uniform("inverse_gamma")[0]
         case "response_srgb":
-            return np.where(inside <= 0.0031308, 12.92 * inside, 1.055 * inside ** (1 / 2.4) - 0.055)
+            return to_colors(inside, "srgb")
         case "response_table":
             curve = np.asarray(sensor.response, np.float32)
             return np.interp(inside, np.linspace(0, 1, len(curve)), curve)
