@@ -30,10 +30,7 @@ class WorldFrame:
 
     def camera(self, camera: Camera) -> Camera:
         """A camera in the world."""
-        pose = np.eye(4)
-        pose[:3, :3] = self.rotation @ camera.world_to_camera[:3, :3].T
-        pose[:3, 3] = self.points(camera.position[None])[0]
-        return camera.with_pose(camera_to_world=pose)
+        return camera.with_pose(camera_to_world=self.pose(camera.camera_to_world))
 
     def pose(self, pose: np.ndarray) -> np.ndarray:
         """A rigid pose (4, 4) in the world."""

@@ -16,6 +16,7 @@ from fidsplat.cameras import Camera
 from fidsplat.cameras.pose_offset import offset_camera
 from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.settings import TrainSettings
+from fidsplat.vision.pose import pose_error
 
 _EPSILON = 1e-12
 """relative to gradients, which are means over pixels"""
@@ -89,7 +90,9 @@ class ViewRefinement:
 
     def pose_changes(self) -> np.ndarray:
         """(views, 2): metres and degrees between the given and the refined cameras."""
-        return np.array([_distance(a, b) for a, b in zip(self._given, self.aligned(), strict=True)])
+        pairs = zip(self._given, self.aligned(), strict=True)
+        apart = [pose_error(a.camera_to_world, b.camera_to_world) for a, b in pairs]
+        return np.array(apart) * (1, 180 / math.pi)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The state, for a checkpoint."""
@@ -163,11 +166,3 @@ def _median_depth(view: TrainingView, dataset: Dataset) -> float:
     depths = (dataset.points - camera.position) @ camera.world_to_camera[2, :3]
     depths = depths[depths > camera.near]
     return float(np.median(depths)) if len(depths) else dataset.extent
-
-
-def _distance(one: Camera, other: Camera) -> tuple[float, float]:
-    """Distance in metres and angle in degrees between the poses of two cameras."""
-    turn = one.world_to_camera[:3, :3] @ other.world_to_camera[:3, :3].T
-    sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
-    angle = math.degrees(math.atan2(float(sine), (float(np.trace(turn)) - 1) / 2))
-    return float(np.linalg.norm(one.position - other.position)), angle

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.cameras import Camera, Orthographic
+from fidsplat.cameras import Camera
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.splats.rotations import check_similarity, pose_matrix
 from fidsplat.util.arguments import instance, invalid, real_array
@@ -156,13 +156,8 @@ def points_of(depth: np.ndarray, camera: Camera) -> np.ndarray:
         )
     y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
     pixels = np.stack([x.ravel(), y.ravel()], 1)
-    far = np.where(depth > 0, depth, np.nan).astype(np.float64).reshape(-1, 1)
-    if isinstance(camera.lens, Orthographic):
-        flat = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-        in_camera = np.concatenate([flat, far], 1)
-    else:
-        in_camera = camera.rays(pixels) * far
-    return (in_camera @ camera.world_to_camera[:3, :3] + camera.position).reshape(*depth.shape, 3)
+    far = np.where(depth > 0, depth, np.nan)
+    return camera.unproject(pixels, far.ravel()).reshape(*depth.shape, 3)
 
 
 def optical_flow(
