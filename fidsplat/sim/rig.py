@@ -90,7 +90,7 @@ class Rig:
         self._renderer = renderer
         self.cameras = _cameras_of(cameras)
         """RigCamera by name, in the order of the images' axis `camera`"""
-        self.labels = _bodies_of({} if bodies is None else bodies, self.scene.cloud())
+        self.labels = _bodies_of({} if bodies is None else bodies, self.scene)
         """name of the body by label"""
         mounts = (camera.body for camera in self.cameras.values() if camera.body is not None)
         self.bodies = tuple(dict.fromkeys((*self.labels.values(), *mounts)))
@@ -342,10 +342,10 @@ def _cameras_of(cameras: Any) -> dict[str, RigCamera]:
     return found
 
 
-def _bodies_of(bodies: Mapping[int, str], cloud: SplatCloud) -> dict[int, str]:
+def _bodies_of(bodies: Mapping[int, str], scene: Scene) -> dict[int, str]:
     if not isinstance(bodies, Mapping):
         raise invalid("bodies", "{label of splats: name of the body}", bodies)
-    known = set(np.unique(cloud.labels).tolist())
+    known = set(np.unique(scene.cloud().labels).tolist()) if bodies else set()  # stores are read completely
     found: dict[int, str] = {}
     for label, name in bodies.items():
         if isinstance(label, bool) or not isinstance(label, int | np.integer) or not isinstance(name, str):

@@ -23,7 +23,6 @@ from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import with_distortion
 from fidsplat.formats import save_ply
 from fidsplat.formats.collect import Progress
-from fidsplat.localisation.direct_alignment import MIN_INLIERS, align
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.splats.cloud import SplatCloud
@@ -283,6 +282,8 @@ class Trainer:
 
     def _localised(self, view: TrainingView, capture: Capture, resident: ResidentCloud) -> Capture:
         """The capture of a view at the pose at which the splats match its image; unchanged if none does."""
+        # here, since it imports detectors, which other trainings do not need
+        from fidsplat.localisation.direct_alignment import MIN_INLIERS, align
 
         def render(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
             frame = self.renderer.render(resident, capture.with_(camera=camera, outputs=("rgb", "depth")))
