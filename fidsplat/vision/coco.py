@@ -33,7 +33,7 @@ class CocoAnnotations:
     def __init__(self, groups: Mapping[int, str] | None = None) -> None:
         self._groups = {} if groups is None else dict(groups)
         self._categories: dict[str, dict[str, Any]] = {}
-        self._images: list[dict[str, Any]] = []
+        self._images: dict[str, dict[str, Any]] = {}
         self._annotations: list[dict[str, Any]] = []
 
     def add(self, file_name: str, truth: Truth) -> None:
@@ -44,11 +44,11 @@ class CocoAnnotations:
         """
         text("file_name", file_name)
         instance("truth", truth, Truth, "what truth_of returns")
-        if any(image["file_name"] == file_name for image in self._images):
+        if file_name in self._images:
             raise InputError(f"file_name must be new, got {file_name!r} again; use another name")
         camera = truth.camera
         image = {"id": len(self._images) + 1, "file_name": file_name}
-        self._images.append(image | {"width": camera.width, "height": camera.height})
+        self._images[file_name] = image | {"width": camera.width, "height": camera.height}
         for marker in truth.markers:
             if marker.visible > 0:
                 self._keep(image["id"], marker.placed.marker.spec, self._of_marker(marker, truth), True)
@@ -60,7 +60,7 @@ class CocoAnnotations:
         """Write the annotations as JSON. Raises InputError for a file that cannot be written."""
         content = {
             "info": {"description": "rendered by fidsplat"},
-            "images": self._images,
+            "images": list(self._images.values()),
             "annotations": self._annotations,
             "categories": list(self._categories.values()),
         }
@@ -109,21 +109,25 @@ class CocoAnnotations:
 
 
 def _of_group(group: GroupTruth) -> dict[str, Any]:
-    x0, y0, x1, y1 = group.box
+    x0, y0, x1, y1 = map(int, group.box)
+    height, width = group.labels.shape
+    counts = run_lengths(group.labels[:, x0:x1] == group.label, height * x0, height * (width - x1))
     return {
-        "segmentation": {"counts": run_lengths(group.mask), "size": list(group.mask.shape)},
-        "bbox": [x0, y0, x1 - x0, y1 - y0],
-        "area": float(group.mask.sum()),
+        "segmentation": {"counts": counts, "size": [height, width]},
+        "bbox": [float(x) for x in (x0, y0, x1 - x0, y1 - y0)],
+        "area": float(sum(counts[1::2])),
         "iscrowd": 0,
     }
 
 
-def run_lengths(mask: np.ndarray) -> list[int]:
-    """Encode a mask (h, w) bool as COCO's uncompressed run lengths: column by column, False first."""
-    columns = np.flatnonzero(mask.any(0))
-    first, end = (columns[0], columns[-1] + 1) if len(columns) else (0, 0)
-    flat = np.concatenate([[False], mask[:, first:end].ravel(order="F"), [False]])
-    edges = np.flatnonzero(flat[1:] != flat[:-1]) + first * mask.shape[0]
+def run_lengths(mask: np.ndarray, before: int = 0, after: int = 0) -> list[int]:
+    """Encode a mask (h, w) bool as COCO's uncompressed run lengths: column by column, False first.
+
+    before, after: numbers of False pixels that precede and follow the mask's columns.
+    """
+    flat = np.concatenate([[False], mask.ravel(order="F"), [False]])
+    edges = np.flatnonzero(flat[1:] != flat[:-1]) + before
+    size = before + mask.size + after
     lengths = np.diff(np.concatenate([[0], edges])).tolist()
-    rest = mask.size - int(edges[-1]) if len(edges) else mask.size
+    rest = size - int(edges[-1]) if len(edges) else size
     return [*lengths, rest] if rest else lengths

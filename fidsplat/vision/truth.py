@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -54,10 +55,15 @@ class GroupTruth:
     """Mask and box of the splats of one label."""
 
     label: int
-    mask: np.ndarray
-    """(h, w) bool"""
+    labels: np.ndarray = field(repr=False)
+    """(h, w) int32, the labels of the image"""
     box: Box
     """bounding box of the mask"""
+
+    @cached_property
+    def mask(self) -> np.ndarray:
+        """(h, w) bool: pixels of this label."""
+        return self.labels == self.label
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,15 +139,16 @@ def marker_truth(placed: PlacedMarker, camera: Camera, label: np.ndarray | None 
 
 def groups_of(label: np.ndarray) -> dict[int, GroupTruth]:
     """Masks and boxes of the labels of an image, (h, w) int32; -1 is the background."""
+    starts = np.ones(label.shape, bool)  # of the runs of equal labels in rows, which are fewer than pixels
+    starts[:, 1:] = label[:, 1:] != label[:, :-1]
+    at = np.flatnonzero(starts)
+    values, ends = label.reshape(-1)[at], np.append(at[1:], label.size)
     found = {}
-    starts = label[:, 1:] != label[:, :-1]  # values of runs are much fewer than those of pixels
-    for value in np.unique(np.concatenate([label[:, 0], label[:, 1:][starts]])).tolist():
-        if value < 0:
-            continue
-        mask = label == value
-        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-        box = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
-        found[value] = GroupTruth(value, mask, tuple(map(float, box)))  # type: ignore[arg-type]
+    for value in np.unique(values[values >= 0]).tolist():
+        first, last = at[values == value], ends[values == value] - 1
+        (top, bottom), width = first[[0, -1]] // label.shape[1], label.shape[1]
+        box = (first % width).min(), top, (last % width).max() + 1, bottom + 1
+        found[value] = GroupTruth(value, label, tuple(map(float, box)))  # type: ignore[arg-type]
     return found
 
 

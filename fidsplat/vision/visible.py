@@ -43,7 +43,10 @@ def visible_part(placed: PlacedMarker, camera: Camera) -> tuple[shapely.Geometry
 def _flat(placed: PlacedMarker, camera: Camera, corners: np.ndarray) -> shapely.Geometry:
     """Image of a rectangle (4, 2) of a flat sheet."""
     points = placed.marker.points(corners) @ placed.pose[:3, :3].T + placed.pose[:3, 3]
-    if camera.lens is None or isinstance(camera.lens, Orthographic):
+    parallel = isinstance(camera.lens, Orthographic)
+    if not parallel and (points[0] - camera.position) @ placed.pose[:3, 2] <= 0:
+        return shapely.Polygon()  # the camera is behind the sheet
+    if camera.lens is None or parallel:
         depth = points @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
         points = points if (depth > camera.near).all() else _clipped(points, depth - camera.near)
     else:  # sides are curved
