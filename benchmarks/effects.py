@@ -226,7 +226,7 @@ def main() -> None:
     frames = [name for name in arguments.names if name not in LIGHTS]
     rows = measure(frames, *how) if frames or not arguments.names else []
     lights = measure_light(arguments.names, *how) if len(frames) < len(arguments.names) or not frames else []
-    if lights and not arguments.json:
+    if lights and arguments.json != "-":
         show(
             "{scene}, {device}, {driver}, {date}, {repeats} times".format(**lights[0]),
             ("light of a tag", "computed once in [s]", "quartiles", "splats"),
@@ -240,8 +240,7 @@ def main() -> None:
                 for row in lights
             ),
         )
-    rows = [*rows, *lights] if arguments.json else rows
-    if not rows or keep(rows, arguments.json):
+    if keep([*rows, *lights], arguments.json) or not rows:
         return
     show(
         "{scene}, {device}, {driver}, {date}, {repeats} pairs".format(**rows[0]),

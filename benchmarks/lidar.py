@@ -41,10 +41,13 @@ def times(renderer: fs.Renderer, name: str, batch: int, repeats: int) -> tuple[s
         else:
             fs.scan_batch(resident, lidar, poses, renderer=renderer)
         seconds.append((time.perf_counter() - begun, time.process_time() - used))
-    camera = lidar.camera().with_pose(camera_to_world=POSE)
-    outputs = ("rgb", "normal", "distance_first")
-    frames = [renderer.render(resident, camera, outputs, "standard,lowpass=none") for _ in range(repeats + 1)]
-    device = [sum(frame.timings.values()) for frame in frames[1:]]
+    capture = fs.Capture(
+        lidar.camera().with_pose(camera_to_world=POSE),
+        outputs=("rgb", "normal", "distance_first"),
+        quality=fs.Quality.of("standard,lowpass=none"),
+    )
+    frames = [renderer.render_batch(resident, capture, poses=poses) for _ in range(repeats + 1)]
+    device = [sum(frame.timings.values()) / batch for frame in frames[1:]]
     complete, cpu = 1e3 / batch * np.median(seconds[1:], axis=0)
     return name, f"{lidar.pattern.beams:,}", *(f"{ms:.2f}" for ms in (np.median(device), complete, cpu))
 
@@ -100,7 +103,7 @@ def main() -> int:
     renderer = fs.Renderer(arguments.device)
     print(measuring.facts(renderer))
     rows = [times(renderer, name, arguments.batch, arguments.repeats) for name in SENSORS]
-    measuring.show("ms per scan", ("sensor", "beams", "device, one scan", "scan", "CPU time"), rows)
+    measuring.show("ms per scan", ("sensor", "beams", "device", "scan", "CPU time"), rows)
     if arguments.errors:
         precise, elsewhere, one_sided = device_error(renderer)
         print(f"against float64: 99 % {precise:.2g}, elsewhere {elsewhere:.2g}, on one only {one_sided:.2g}")

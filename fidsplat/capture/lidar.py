@@ -239,30 +239,32 @@ class Lidar:
 
     def rows_per_band(self, moving: bool) -> int:
         """Rows of the rendered image that share a pose."""
-        height = self.layout(moving).shape[0]
+        height = self.camera(0.0, moving).height
         return height if not moving else -(-height // self.bands)
 
-    def layout(self, moving: bool, start: float = 0.0) -> np.ndarray:
-        """(h, w) int: index of the ray of each pixel of the rendered image, -1 for none; rows are in the
-        order of firing. Ray k of beam i has the index i x rays + k."""
-        return _layout(self, moving, start if isinstance(self.pattern, Rosette) else 0.0)[0]
-
     def camera(self, start: float = 0.0, moving: bool = False) -> Camera:
-        """The camera whose pixels are the rays of a scan from a time in seconds, in the lidar's frame."""
-        start = start if isinstance(self.pattern, Rosette) else 0.0
-        _, lens = _layout(self, moving, start)
+        """The camera whose pixels are the rays of a scan from a time in seconds, in the lidar's frame. Rows
+        are in the order of firing."""
+        lens = self._rays(start, moving)[0]
         height, width = lens.directions.shape[:2]
         return Camera(width, height, 1.0, 1.0, 0.0, 0.0, near=min(self.near, 0.05), far=self.far, lens=lens)
+
+    def pixels(self, start: float = 0.0, moving: bool = False) -> np.ndarray:
+        """(beams, rays) int: pixel of each ray in the image of `camera`, counted row by row."""
+        return self._rays(start, moving)[1]
 
     def directions(self, start: float = 0.0) -> np.ndarray:
         """(beams, 3) unit directions of the beams of a scan from a time in seconds, in the order of firing,
         as float32 rays round them."""
-        return self.pattern.directions(start, self.duration).astype(np.float32).astype(np.float64)
+        return self._rays(start, False)[2]
+
+    def _rays(self, start: float, moving: bool) -> tuple[RayTable, np.ndarray, np.ndarray]:
+        return _rays(self, start if isinstance(self.pattern, Rosette) else 0.0, moving)
 
 
 @lru_cache(maxsize=8)
-def _layout(lidar: Lidar, moving: bool, start: float) -> tuple[np.ndarray, RayTable]:
-    """Pixels and rays of a scan: see `Lidar.layout`."""
+def _rays(lidar: Lidar, start: float, moving: bool) -> tuple[RayTable, np.ndarray, np.ndarray]:
+    """Lens of the camera, pixels and directions of a scan: see methods of `Lidar`."""
     pattern, n = lidar.pattern, lidar.rays
     beams = pattern.directions(start, lidar.duration)
     rays = _spread(beams, lidar.divergence, n)
@@ -277,8 +279,13 @@ def _layout(lidar: Lidar, moving: bool, start: float) -> tuple[np.ndarray, RayTa
             [_grid(rays, begin * n, end * n, rows, width) for begin, end in pairwise(edges)]
         )
     table = np.where(order[..., None] >= 0, rays[order], np.nan)
-    order.flags.writeable = False
-    return order, RayTable(table, lidar.divergence / math.sqrt(n))
+    pixels = np.empty(len(rays), np.int64)
+    used = np.flatnonzero(order >= 0)
+    pixels[order.reshape(-1)[used]] = used
+    directions = beams.astype(np.float32).astype(np.float64)
+    for array in (pixels, directions):
+        array.flags.writeable = False
+    return RayTable(table, lidar.divergence / math.sqrt(n)), pixels.reshape(-1, n), directions
 
 
 def _grid(rays: np.ndarray, begin: int, end: int, rows: int, width: int) -> np.ndarray:

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 LINK_FROM_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 """the lidar's axes (x forward, y left, z up) from those of a camera (z forward, y down)"""
 _REFERENCE = 0.1  # reflectivity of `Lidar.detection_range`
-_DETECTED = math.log(9)  # logit of a probability of 90 %
-_SHARPNESS = 4.0  # logits per factor e of the signal: from 90 % to 10 % by a factor of 3
+_ODDS = 9  # of a probability of 90 %
+_SHARPNESS = 4  # power of the signal in the odds of detection: from 90 % to 10 % by a factor of 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,44 +250,38 @@ class _Request:
 
     def decoded(self, images: dict[str, np.ndarray], capture: Capture, number_of_scan: int) -> Scan:
         """The scan of rendered images."""
-        lidar, pattern, camera = self.lidar, self.lidar.pattern, capture.camera
+        lidar, camera = self.lidar, capture.camera
         assert camera is not None
-        order = lidar.layout(self.moving, self.start)
-        used, shape = order >= 0, (pattern.beams, lidar.rays)
-        rays = {"range": images["distance_first"][used].astype(np.float64)}
+        pixels = lidar.pixels(self.start, self.moving)
+
+        def of_rays(image: np.ndarray) -> np.ndarray:
+            return image.reshape(-1, *image.shape[2:])[pixels]
+
+        ranges = of_rays(images["distance_first"]).astype(np.float64)
+        reflectivity = to_light(np.clip(of_rays(images["rgb"]), 0, 1), "srgb") @ LUMINANCE
+        rays = {"range": ranges}
         if "label" in images:
-            rays["label"] = images["label"][used]
-        hit = rays["range"] > 0
-        rows, columns = np.nonzero(used)
-        at = rows[hit], columns[hit]
-        reflectivity = to_light(np.clip(images["rgb"][at], 0, 1), "srgb") @ LUMINANCE
-        for label, value in lidar.reflectivity.items():
-            reflectivity[rays["label"][hit] == label] = value
-        directions = camera.lens.directions[at]  # type: ignore[union-attr]
-        incidence = np.abs((directions * images["normal"][at]).sum(1))
-        rays["intensity"] = np.zeros(len(hit))
-        rays["intensity"][hit] = reflectivity * incidence
-        index = order[used]
-        by_beam = {}
-        for name, values in rays.items():
-            by_beam[name] = np.empty(shape, values.dtype)
-            by_beam[name].reshape(-1)[index] = values
-        found = _returns(by_beam, lidar)
+            rays["label"] = of_rays(images["label"])
+            for label, value in lidar.reflectivity.items():
+                reflectivity[rays["label"] == label] = value
+        directions = of_rays(camera.lens.directions)  # type: ignore[union-attr]
+        incidence = np.abs(np.einsum("brk,brk->br", directions, of_rays(images["normal"])))
+        rays["intensity"] = np.where(ranges > 0, reflectivity * incidence, 0.0)
+        found = _returns(rays, lidar)
         _measure(found, lidar, np.random.default_rng((lidar.seed, number_of_scan)))
-        top = np.empty(shape, np.int64)  # row of each ray
-        top.reshape(-1)[index] = rows
         bands = capture.shutter.bands(camera.height)
+        ends = [end * camera.width for _, end, _ in bands]
         return Scan(
             lidar=lidar,
             start=self.start,
             range=found["range"].astype(np.float32),
             intensity=found["intensity"].astype(np.float32),
             label=found["label"].astype(np.int32) if self.label else None,
-            time=pattern.fractions() * lidar.duration,
-            ring=pattern.ring_of(),
+            time=lidar.pattern.fractions() * lidar.duration,
+            ring=lidar.pattern.ring_of(),
             directions=lidar.directions(self.start),
             poses=np.stack([capture.motion.moved(camera, middle).camera_to_world for _, _, middle in bands]),
-            band=np.searchsorted([end for _, end, _ in bands], top[:, 0], side="right"),
+            band=np.searchsorted(ends, pixels[:, 0], side="right"),
         )
 
 
@@ -353,10 +347,9 @@ def _measure(found: dict[str, np.ndarray], lidar: Lidar, random: np.random.Gener
     ranges = found["range"]
     kept = (ranges >= lidar.near) & (ranges <= lidar.far)
     if math.isfinite(lidar.detection_range):
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            signal = found["intensity"] / _REFERENCE * (lidar.detection_range / ranges) ** 2
-            chance = 1 / (1 + np.exp(-_DETECTED - _SHARPNESS * np.log(signal)))
-        kept &= random.random(ranges.shape) < chance
+        signal = found["intensity"] * lidar.detection_range**2 / _REFERENCE  # times the square of the range
+        signal, lost = _ODDS * signal**_SHARPNESS, ranges ** (2 * _SHARPNESS)
+        kept &= random.random(ranges.shape) * (signal + lost) < signal
     if lidar.dropouts:
         kept &= random.random(ranges.shape) >= lidar.dropouts
     if lidar.noise or lidar.noise_growth:
