@@ -278,7 +278,9 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     "RobotLog.odometry": _log(
         "odometry", time=0.0, pose=np.eye(4), velocity=(0, 0, 0), angular_velocity=(0, 0, 0), frame="base", topic="/odom", covariance=np.eye(6)
     ),
-    "RobotLog.imu": _log("imu", time=0.0, angular_velocity=(0, 0, 0), acceleration=(0, 0, 0), frame="imu", topic="/imu"),
+    "RobotLog.imu": _log("imu", time=0.0, angular_velocity=(0, 0, 0), acceleration=(0, 0, 0), frame="imu_link", topic="/imu/data_raw"),
+    "RobotLog.clock": _log("clock", time=0.0),
+    "RobotLog.camera_pose": _log("camera_pose", time=0.0, camera="eye", pose=np.eye(4), base=None),
     "RobotLog.detections": _log("detections", time=0.0, camera="eye", found=[]),
     "SplatCloud": lambda _: (
         fs.SplatCloud,

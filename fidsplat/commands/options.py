@@ -80,12 +80,14 @@ def new_file(path: str | Path, overwrite: bool) -> Path:
 
 
 def require_packages(
-    what: str = "a report", packages: Sequence[str] = ("pandas", "matplotlib", "jinja2")
+    what: str = "a report",
+    packages: Sequence[str] = ("pandas", "matplotlib", "jinja2"),
+    extra: str = "experiments",
 ) -> None:
-    """Raise InputError where packages of the extra `experiments` are missing."""
+    """Raise InputError where packages of an extra are missing."""
     missing = [name for name in packages if find_spec(name) is None]
     if missing:
-        raise InputError(f"{what} needs {' and '.join(missing)}; pip install 'fidsplat[experiments]'")
+        raise InputError(f"{what} needs {' and '.join(missing)}; pip install 'fidsplat[{extra}]'")
 
 
 def check_plot(name: str, *packages: str) -> None:

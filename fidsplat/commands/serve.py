@@ -2,37 +2,47 @@
 
 from __future__ import annotations
 
+import math
 import time
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
+from fidsplat.cameras.screw import exponential
 from fidsplat.commands.declarations import option, switch
-from fidsplat.commands.options import Json
+from fidsplat.commands.options import Json, require_packages
 from fidsplat.commands.output import console, report
 from fidsplat.commands.scenes import RenderInput, Size
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
+    from fidsplat.cameras import Camera
     from fidsplat.capture.lidar import Lidar
     from fidsplat.logs.live import LiveLog
 
 CAMERA, LIDAR = "camera", "lidar"
 """names of frames and topics"""
+TIMEOUT = 0.5
+"""seconds after which the robot stops without a new /cmd_vel"""
 
 
 @dataclass
 class Serve(RenderInput):
-    """Send live images, poses and LiDAR points of a scene as ROS 2 messages over a WebSocket.
+    """Send live images, poses and LiDAR points of a scene as ROS 2 messages.
 
-    Open ws://127.0.0.1:8765 in Foxglove. The camera follows --trajectory or the scene's [[camera.motion]],
-    again and again, or does not move. Topics are those of `fidsplat fly --log`: /camera/image_raw,
-    /camera/camera_info, /tf, and with --lidar /lidar/points. Frames that would be late are dropped and
-    counted. Ctrl-C ends it. Needs the extra `live`.
+    Without options, open ws://127.0.0.1:8765 in Foxglove. --ros2 publishes ROS 2 topics over DDS; ROS need
+    not be installed here, and nodes on this machine need ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST. The camera
+    follows --trajectory or the scene's [[camera.motion]], again and again. Otherwise it does not move, or
+    with --ros2 by /cmd_vel (Twist) and /pose (PoseStamped) of its robot. Topics: /camera/image_raw,
+    /camera/camera_info, /tf, /clock, and with --lidar /lidar/points. Frames that would be late are dropped
+    and counted. Ctrl-C ends it. Needs the extra `live`.
 
     Examples:
       fidsplat serve scene.toml
+      fidsplat serve scene.toml --ros2 --compress --rate 20
       fidsplat serve scene.toml --trajectory flight.tum --outputs rgb,depth --lidar vlp-16 --rate 10
     """
 
@@ -43,11 +53,14 @@ class Serve(RenderInput):
     lidar: str | None = None
     """NAME: also scan with this sensor, at the camera; `fidsplat scan --help` lists them"""
     compress: Annotated[bool, switch("send rgb as JPEG, as CompressedImage")] = False
-    foxglove: Annotated[bool, switch("use Foxglove's WebSocket protocol, which is the default")] = False
+    ros2: Annotated[bool, switch("publish ROS 2 topics, in the domain ROS_DOMAIN_ID")] = False
+    foxglove: Annotated[bool, switch("serve Foxglove's WebSocket protocol; the default without --ros2")] = (
+        False
+    )
     host: str = "127.0.0.1"
     """ADDRESS: address to listen on; the default is this machine only, 0.0.0.0 opens it to the network"""
     port: int = 8765
-    """N: port, 0 for any free one"""
+    """N: port of Foxglove's protocol, 0 for any free one"""
     duration: float | None = None
     """S: seconds after which it ends (default: never)"""
     size: Size = None
@@ -57,11 +70,15 @@ class Serve(RenderInput):
         import fidsplat as fs
         from fidsplat.cameras.trajectory import Trajectory, check_rate
         from fidsplat.formats import load_trajectory
-        from fidsplat.logs.live import LiveLog
         from fidsplat.scenes.up import scene_up
 
         self.check()
         check_rate(self.rate)
+        foxglove = self.foxglove or not self.ros2
+        packages = ["rosbags", "mcap"] + ["foxglove"] * foxglove + ["cyclonedds"] * self.ros2
+        require_packages("fidsplat serve", packages, "live")
+        from fidsplat.logs.live import LiveLog
+
         if self.duration is not None and not self.duration > 0:
             raise InputError(f"--duration must be a number of seconds above 0, got {self.duration:g}")
         lidar = None if self.lidar is None else fs.Lidar.preset(self.lidar)
@@ -81,11 +98,13 @@ class Serve(RenderInput):
         begin, length = 0.0, 0.0
         if isinstance(moving, Trajectory):
             begin, length = float(moving.times[0]), float(moving.times[-1] - moving.times[0])
-        with LiveLog(self.host, self.port, up=scene_up(scene)) as log:
+        port = self.port if foxglove else None
+        with LiveLog(self.host, port, ros2=self.ros2, up=scene_up(scene)) as log:
             shown = console(self.json)
-            shown.print(f"ws://{self.host}:{log.port}")
+            shown.print("ROS 2 topics" if port is None else f"ws://{self.host}:{log.port}")
             shown.file.flush()
-            sender = _Sender(renderer, resident, capture, lidar, log, self.compress)
+            driver = _Driver(log, capture.camera) if self.ros2 and moving is None else None
+            sender = _Sender(renderer, resident, capture, lidar, log, self.compress, driver)
             clock = _Clock(self.rate, self.duration)
             try:
                 for step, elapsed in clock:
@@ -93,7 +112,10 @@ class Serve(RenderInput):
             except KeyboardInterrupt:
                 pass
         facts = {"frames": clock.sent, "dropped": clock.dropped, "seconds": clock.seconds, "port": log.port}
+        facts["dropped_messages"] = log.dropped
         rows = [("frames", f"{clock.sent:,}"), ("dropped", f"{clock.dropped:,}")]
+        if self.ros2:
+            rows.append(("dropped messages", f"{log.dropped:,}"))
         return report(self.json, facts, table=(f"{self.source} on {renderer.device.title}", ("", ""), rows))
 
 
@@ -107,6 +129,7 @@ class _Sender:
     lidar: Lidar | None
     log: LiveLog
     compress: bool
+    driver: _Driver | None
 
     def send(self, step: int, moment: float) -> None:
         """Send the images, the pose and the points at a moment of the scene's clock."""
@@ -115,14 +138,19 @@ class _Sender:
 
         capture, now = self.capture, time.time()
         capture = capture.with_(shutter=replace(capture.shutter, time=moment))
+        base = None
+        if self.driver is not None:
+            base = self.driver.base_at(moment)
+            capture = capture.with_(camera=self.driver.camera(capture.camera))
         frame = self.renderer.render(self.resident, capture)
         camera = capture.motion.moved(capture.camera, moment)
+        self.log.clock(now)
         for name in capture.outputs:
             self.log.camera_info(now, CAMERA, camera, name)
             self.log.image(
                 now, CAMERA, frame[name], name, "jpeg" if self.compress and name == "rgb" else None
             )
-        self.log.camera_pose(now, CAMERA, camera.camera_to_world)
+        self.log.camera_pose(now, CAMERA, camera.camera_to_world, base)
         if self.lidar is not None:
             pose = camera.camera_to_world @ np.linalg.inv(LINK_FROM_OPTICAL)
             still = fs.Motion(None, capture.motion.groups)
@@ -137,6 +165,37 @@ class _Sender:
             )
             self.log.transform(now, LIDAR, pose)
             self.log.points(now, LIDAR, scan.cloud())
+
+
+class _Driver:
+    """Pose of a robot from ROS 2's /cmd_vel and /pose. Its frame base_link is at the camera, upright."""
+
+    def __init__(self, log: LiveLog, camera: Camera) -> None:
+        self._log, self._twist, self._time, self._until = log, np.zeros(6), 0.0, 0.0
+        there = log.world_from_scene @ camera.camera_to_world
+        half = math.atan2(there[1, 2], there[0, 2]) / 2
+        self._base = rigid_matrix(there[:3, 3], (math.cos(half), 0, 0, math.sin(half)))
+        self._mount = np.linalg.inv(self._base) @ there
+
+    def base_at(self, time: float) -> np.ndarray:
+        """Pose of base_link in the world (4, 4) at a time, which must not decrease."""
+        moved = self._base @ exponential(self._twist * max(0.0, min(time, self._until) - self._time))
+        if np.isfinite(moved).all():
+            self._base = moved
+        self._time = time
+        for stamped in self._log.received("/pose", "geometry_msgs/msg/PoseStamped"):
+            at, turn = stamped.pose.position, stamped.pose.orientation
+            with suppress(InputError):  # an invalid pose of another program must not end the server
+                self._base = rigid_matrix((at.x, at.y, at.z), (turn.w, turn.x, turn.y, turn.z))
+        for twist in self._log.received("/cmd_vel", "geometry_msgs/msg/Twist"):
+            parts = [getattr(part, axis) for part in (twist.angular, twist.linear) for axis in "xyz"]
+            self._twist, self._until = np.array(parts), time + TIMEOUT
+        return self._base
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera at the current pose of the robot."""
+        pose = np.linalg.inv(self._log.world_from_scene) @ self._base @ self._mount
+        return camera.with_pose(camera_to_world=pose)
 
 
 class _Clock:

@@ -1,59 +1,97 @@
-"""LiveLog: the messages of a RobotLog over a network, by Foxglove's WebSocket protocol."""
+"""LiveLog: the messages of a RobotLog over a network, by Foxglove's protocol and as ROS 2 topics."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from fidsplat.logs.robot_log import RobotLog
+from fidsplat.logs.writers import LogFile
 from fidsplat.util.arguments import text, whole_number
 from fidsplat.util.errors import InputError
-
-try:
-    import foxglove
-except ImportError as error:
-    raise InputError(f"live messages need more packages ({error}); pip install 'fidsplat[live]'") from None
 
 BACKLOG = 64
 """messages that wait for a slow client; the oldest are dropped"""
 
 
 class LiveLog(RobotLog):
-    """A RobotLog whose messages go to clients of a WebSocket server, as ROS 2 messages in CDR; a context
+    """A RobotLog whose ROS 2 messages go to clients of a WebSocket server, to ROS 2 nodes, or both; a context
     manager.
 
-    Clients are Foxglove (app.foxglove.dev, `ws://HOST:PORT`) and programs of the protocol
-    `foxglove.sdk.v1`.
+    Clients of the server are Foxglove (app.foxglove.dev, `ws://HOST:PORT`) and programs of the protocol
+    `foxglove.sdk.v1`. ROS 2 nodes receive topics over DDS; ROS need not be installed here.
 
     Args:
         host: address to listen on; 127.0.0.1 is this machine only.
-        port: 0 for any free port.
+        port: 0 for any free port, None for no server.
+        ros2: whether the messages are ROS 2 topics, in the domain ROS_DOMAIN_ID.
         world, up: as in `RobotLog`.
 
     Raises:
-        InputError: the server cannot listen there, or the package is missing (extra `live`).
+        InputError: the server cannot listen there, or a package is missing (extra `live`).
     """
 
     def __init__(
-        self, host: str = "127.0.0.1", port: int = 8765, *, world: str = "map", up: Any = None
+        self,
+        host: str = "127.0.0.1",
+        port: int | None = 8765,
+        *,
+        ros2: bool = False,
+        world: str = "map",
+        up: Any = None,
     ) -> None:
         self._begin(world, up)
         if not text("host", host):
             raise InputError("host must be an address, got ''; 127.0.0.1 is this machine only")
-        whole_number("port", port, 0, 65535)
-        self._path = f"{host}:{port}"
-        server = _Server(self._store, host, port)
-        self._file, self.port = server, int(server.port)
-        """port on which the server listens"""
+        self._path, self.port, self._topics = host, None, None
+        self._file = _Both()
+        if ros2:
+            from fidsplat.logs.ros2 import Ros2Topics
 
-    def __enter__(self) -> LiveLog:
-        return self
+            self._topics = Ros2Topics(self._store, host)
+            self._file.append(self._topics)
+        if port is not None:
+            whole_number("port", port, 0, 65535)
+            server = _Server(self._store, host, port)
+            self.port = int(server.port)
+            """port on which the server listens"""
+            self._file.append(server)
+
+    @property
+    def dropped(self) -> int:
+        """Number of messages that slow ROS 2 subscribers did not accept."""
+        return 0 if self._topics is None else self._topics.dropped
+
+    def received(self, topic: str, kind: str) -> list[Any]:
+        """Messages of a ROS 2 topic since the last call, oldest first; the first call subscribes to it.
+
+        kind: type, such as geometry_msgs/msg/Twist.
+        """
+        return [] if self._topics is None else self._topics.received(topic, kind)
+
+
+class _Both(list[LogFile]):
+    """A `LogFile` that passes messages to several."""
+
+    def write(self, topic: str, kind: str, time: int, data: bytes) -> None:
+        for file in self:
+            file.write(topic, kind, time, data)
+
+    def close(self, keep: bool) -> None:
+        for file in self:
+            file.close(keep)
 
 
 class _Server:
-    """A `LogFile` that sends its messages."""
+    """A `LogFile` that sends its messages to clients of Foxglove's protocol."""
 
     def __init__(self, store: Any, host: str, port: int) -> None:
-        self._store, self._context = store, foxglove.Context()
+        try:
+            import foxglove
+        except ImportError as error:
+            raise InputError(
+                f"Foxglove's protocol needs another package ({error}); pip install 'fidsplat[live]'"
+            ) from None
+        self._store, self._foxglove, self._context = store, foxglove, foxglove.Context()
         self._channels: dict[str, Any] = {}
         try:
             self._server = foxglove.start_server(
@@ -68,8 +106,8 @@ class _Server:
     def write(self, topic: str, kind: str, time: int, data: bytes) -> None:
         if topic not in self._channels:
             definition, _ = self._store.generate_msgdef(kind, ros_version=2)
-            schema = foxglove.Schema(name=kind, encoding="ros2msg", data=definition.encode())
-            self._channels[topic] = foxglove.Channel(
+            schema = self._foxglove.Schema(name=kind, encoding="ros2msg", data=definition.encode())
+            self._channels[topic] = self._foxglove.Channel(
                 topic, schema=schema, message_encoding="cdr", context=self._context
             )
         self._channels[topic].log(data, log_time=time)

@@ -60,7 +60,8 @@ class RobotLog:
 
     def _begin(self, world: str, up: Any) -> None:
         """Set what does not depend on where the messages go."""
-        self._world_from_scene = None if up is None else _upright(up)
+        self.world_from_scene: Any = None if up is None else _upright(up)
+        """rotation (4, 4) of the scene in the world; None without `up`"""
         self._store, self.world = typestore(), world
         self._last: dict[str, float] = {}
 
@@ -132,22 +133,30 @@ class RobotLog:
         )  # fmt: skip
         self._write(f"{_namespace(name, output)}/camera_info", time, message)
 
-    def camera_pose(self, time: float, camera: str, pose: Any) -> None:
+    def camera_pose(self, time: float, camera: str, pose: Any, base: Any = None) -> None:
         """Pose of a camera in the scene (4, 4), with OpenCV's axes, as `/tf`.
 
         If the log has `up`, three transforms are written: world to scene, world to CAMERA_link (x forward,
         z up), and CAMERA_link to CAMERA_optical_frame. Otherwise one: world to CAMERA.
+
+        base: pose in the world (4, 4) of the robot that carries the camera. With it, CAMERA_link is relative
+        to the frame base_link.
         """
-        if self._world_from_scene is None:
+        if self.world_from_scene is None:
             return self.transform(time, camera, pose)
         given = _rigid(pose, f"the pose of {text('the name of a frame', camera)}")
-        link = self._world_from_scene @ given @ np.linalg.inv(OPTICAL)
-        self._transforms(
-            time,
-            (self.world, SCENE, self._world_from_scene),
-            (self.world, f"{camera}_link", link),
-            (f"{camera}_link", self._frame(camera), OPTICAL),
-        )
+        link, parent = self.world_from_scene @ given @ np.linalg.inv(OPTICAL), self.world
+        transforms = [(self.world, SCENE, self.world_from_scene)]
+        if base is not None:
+            carrier, parent = _rigid(base, "the pose of base_link"), "base_link"
+            transforms.append((self.world, parent, carrier))
+            link = np.linalg.inv(carrier) @ link
+        transforms += [(parent, f"{camera}_link", link), (f"{camera}_link", self._frame(camera), OPTICAL)]
+        self._transforms(time, *transforms)
+
+    def clock(self, time: float) -> None:
+        """The time as `/clock`, for nodes that use it instead of their own."""
+        self._write("/clock", time, self._of("rosgraph_msgs/msg/Clock")(self._stamp(time)))
 
     def transform(self, time: float, frame: str, pose: Any, parent: str | None = None) -> None:
         """Pose of a frame in its parent (4, 4), by default the world, as `/tf`. A camera's frame has OpenCV's
@@ -186,11 +195,11 @@ class RobotLog:
         time: float,
         angular_velocity: Any,
         acceleration: Any = None,
-        frame: str = "imu",
-        topic: str = "/imu",
+        frame: str = "imu_link",
+        topic: str = "/imu/data_raw",
     ) -> None:
-        """An IMU message without orientation. Angular velocity (3,) is in rad/s, acceleration (3,) in m/s^2;
-        None: not measured."""
+        """An IMU message without orientation, named by REP-145. Angular velocity (3,) is in rad/s,
+        acceleration (3,) in m/s^2; None: not measured."""
         vector, none = self._of("geometry_msgs/msg/Vector3"), np.zeros(9)
         unknown = np.array([-1.0, *np.zeros(8)])  # ROS's value for a missing reading
         message = self._of("sensor_msgs/msg/Imu")(
@@ -245,17 +254,19 @@ class RobotLog:
 
     def _header(self, time: float, frame: str) -> Any:
         text("the name of a frame", frame)
-        seconds, rest = divmod(_nanoseconds(time), 10**9)
-        return self._of("std_msgs/msg/Header")(self._of("builtin_interfaces/msg/Time")(seconds, rest), frame)
+        return self._of("std_msgs/msg/Header")(self._stamp(time), frame)
+
+    def _stamp(self, time: float) -> Any:
+        return self._of("builtin_interfaces/msg/Time")(*divmod(_nanoseconds(time), 10**9))
 
     def _frame(self, camera: str) -> str:
         """The frame of a camera's data."""
         text("the name of a frame", camera)
-        return camera if self._world_from_scene is None else f"{camera}_optical_frame"
+        return camera if self.world_from_scene is None else f"{camera}_optical_frame"
 
     def _in_world(self, pose: np.ndarray) -> np.ndarray:
         """A pose in the scene as a pose in the world."""
-        return pose if self._world_from_scene is None else self._world_from_scene @ pose
+        return pose if self.world_from_scene is None else self.world_from_scene @ pose
 
     def _transforms(self, time: float, *transforms: tuple[str, str, np.ndarray]) -> None:
         """Write one `/tf` message of parents, frames and poses."""

@@ -74,7 +74,7 @@ SMALLER = {
 EXTRAS = {
     "experiments": ("pandas", "matplotlib", "pupil_apriltags", "locus", "flip_evaluator", "jinja2"),
     "logs": ("mcap", "rosbags"),
-    "live": ("foxglove",),
+    "live": ("foxglove", "cyclonedds"),
     "mesh": ("coacd", "fast_simplification"),
     "sim": ("mujoco", "gymnasium"),
     "usd": ("pxr",),

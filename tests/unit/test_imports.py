@@ -72,6 +72,7 @@ HOME_OF = {
     "gymnasium": ("sim.gymnasium",),
     "mcap": ("logs",),
     "foxglove": ("logs.live",),
+    "cyclonedds": ("logs.ros2",),
     "rosbags": ("logs",),
     "pandas": ("experiments",),
     "matplotlib": ("experiments.charts",),

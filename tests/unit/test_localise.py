@@ -248,12 +248,12 @@ def test_the_drive_as_a_log(tmp_path, monkeypatch):
     ros2 = pytest.importorskip("mcap_ros2.decoder", reason="pip install mcap-ros2-support")
     with (tmp_path / "run.mcap").open("rb") as stream:
         made = reader.make_reader(stream, decoder_factories=[ros2.DecoderFactory()])
-        turned = next(made.iter_decoded_messages(topics=["/imu"]))[-1]
+        turned = next(made.iter_decoded_messages(topics=["/imu/data_raw"]))[-1]
     assert turned.linear_acceleration_covariance[0] == -1  # no accelerometer
     assert (
         counts["/eye/image_raw/compressed"] == counts["/tf"] == counts["/eye/detections"] == len(images) > 3
     )
-    assert counts["/odom"] == counts["/imu"] > 50 * len(images)
+    assert counts["/odom"] == counts["/imu/data_raw"] > 50 * len(images)
     with pytest.raises(fs.InputError, match=r"must have images, e.g. exact, got"):
         list(write_log(requested, "odometry", None, str(tmp_path / "other.mcap"), False))
 

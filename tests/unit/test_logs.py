@@ -90,7 +90,7 @@ def test_their_own_readers_read_what_we_write(tmp_path, name, read):
         found.setdefault(topic, []).append((time, message))
     assert set(found) == {
         *(f"/front/{part}" for part in ("image_raw", "depth/image_raw", "label/image_raw", "camera_info")),
-        *("/front/image_raw/compressed", "/front/detections", "/tf", "/odom", "/imu"),
+        *("/front/image_raw/compressed", "/front/detections", "/tf", "/odom", "/imu/data_raw"),
     }
     assert [[time for time, _ in each] for each in found.values()] == [[500_000_000, 1_250_000_000]] * 9
     first = {topic: each[0][1] for topic, each in found.items()}
@@ -111,8 +111,11 @@ def test_their_own_readers_read_what_we_write(tmp_path, name, read):
     np.testing.assert_allclose(rigid_matrix((1, 2, 3), (turn.w, turn.x, turn.y, turn.z)), POSE, atol=1e-12)
     odometry = first["/odom"]
     assert (odometry.pose.pose.position.z, odometry.twist.twist.angular.z) == (3, 0.5)
-    assert (first["/imu"].linear_acceleration.z, first["/imu"].orientation_covariance[0]) == (9.81, -1)
-    not_measured = [each.linear_acceleration_covariance[0] for _, each in found["/imu"]]
+    assert (
+        first["/imu/data_raw"].linear_acceleration.z,
+        first["/imu/data_raw"].orientation_covariance[0],
+    ) == (9.81, -1)
+    not_measured = [each.linear_acceleration_covariance[0] for _, each in found["/imu/data_raw"]]
     assert not_measured == [0, -1]
     (tag,) = first["/front/detections"].detections
     assert (tag.family, tag.id, tag.corners[2].x, tag.centre.y) == ("36h11", 5, 2.5, 2.5)

@@ -1,4 +1,5 @@
-"""Live messages, read by a client that knows Foxglove's protocol and ROS 2's CDR, and nothing of ours."""
+"""Live messages, read by clients that know Foxglove's protocol and ROS 2's CDR, and by a DDS participant with
+types of its own."""
 
 import json
 import os
@@ -6,6 +7,7 @@ import struct
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -16,7 +18,16 @@ from fidsplat.commands.serve import _Clock
 
 pytest.importorskip("foxglove", reason="pip install 'fidsplat[live]'")
 pytest.importorskip("rosbags", reason="pip install 'fidsplat[logs]'")
+pytest.importorskip("cyclonedds", reason="pip install 'fidsplat[live]'")
 websockets = pytest.importorskip("websockets.sync.client", reason="the client of this test")
+from cyclonedds.domain import Domain, DomainParticipant  # noqa: E402
+from cyclonedds.idl import IdlStruct  # noqa: E402
+from cyclonedds.idl import types as dds  # noqa: E402
+from cyclonedds.pub import DataWriter  # noqa: E402
+from cyclonedds.qos import Policy, Qos  # noqa: E402
+from cyclonedds.sub import DataReader  # noqa: E402
+from cyclonedds.topic import Topic  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
 
 SCENE = """[camera]
 width = 64
@@ -66,25 +77,33 @@ def subscribed(port: int, wanted: set[str]) -> list[tuple[str, str, int, bytes]]
     return found
 
 
-def test_a_client_receives_images_poses_and_points(tmp_path):
-    from rosbags.typesys import Stores, get_typestore
-
-    file = tmp_path / "scene.toml"
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    """Port of Foxglove's protocol, and domain of ROS 2, of a server in another process."""
+    file = tmp_path_factory.mktemp("served") / "scene.toml"
     file.write_text(SCENE)
-    options = ("--port", "0", "--lidar", "vlp-16", "--rate", "5", "--duration", "60", "--json")
-    command = [sys.executable, "-m", "fidsplat", "serve", str(file), *options]
+    domain = str(1 + os.getpid() % 200)
+    options = ("--port", "0", "--lidar", "vlp-16", "--rate", "10", "--duration", "60", "--json")
+    command = [sys.executable, "-m", "fidsplat", "serve", str(file), "--foxglove", "--ros2", *options]
     quiet = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL, "text": True}
-    with subprocess.Popen(command, **quiet, env=os.environ | {"COLUMNS": "200"}) as served:
+    environment = os.environ | {"COLUMNS": "200", "ROS_DOMAIN_ID": domain}
+    with subprocess.Popen(command, **quiet, env=environment) as server:
         try:
             line = ""
             while "ws://" not in line:
-                line = served.stderr.readline()
+                line = server.stderr.readline()
                 assert line, "the server ended"
-            port = int(line.rsplit(":", 1)[1])
-            topics = {"/camera/image_raw", "/camera/camera_info", "/tf", "/lidar/points"}
-            messages = subscribed(port, topics)
+            yield file, int(line.rsplit(":", 1)[1]), int(domain)
         finally:
-            served.terminate()
+            server.terminate()
+
+
+def test_a_client_receives_images_poses_and_points(served):
+    from rosbags.typesys import Stores, get_typestore
+
+    file, port, _ = served
+    topics = {"/camera/image_raw", "/camera/camera_info", "/tf", "/lidar/points"}
+    messages = subscribed(port, topics)
     store = get_typestore(Stores.ROS2_HUMBLE)
     read = {}
     for topic, kind, stamp, data in messages:
@@ -107,6 +126,180 @@ def test_a_client_receives_images_poses_and_points(tmp_path):
     assert {"camera_link", "camera_optical_frame"} <= frames
 
 
+@dataclass
+class Time(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
+    sec: dds.int32
+    nanosec: dds.uint32
+
+
+@dataclass
+class Header(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
+    stamp: Time
+    frame_id: str
+
+
+@dataclass
+class Image(IdlStruct, typename="sensor_msgs.msg.dds_.Image_"):
+    header: Header
+    height: dds.uint32
+    width: dds.uint32
+    encoding: str
+    is_bigendian: dds.uint8
+    step: dds.uint32
+    data: dds.sequence[dds.uint8]
+
+
+@dataclass
+class Vector3(IdlStruct, typename="geometry_msgs.msg.dds_.Vector3_"):
+    x: dds.float64
+    y: dds.float64
+    z: dds.float64
+
+
+@dataclass
+class Point(IdlStruct, typename="geometry_msgs.msg.dds_.Point_"):
+    x: dds.float64
+    y: dds.float64
+    z: dds.float64
+
+
+@dataclass
+class Quaternion(IdlStruct, typename="geometry_msgs.msg.dds_.Quaternion_"):
+    x: dds.float64
+    y: dds.float64
+    z: dds.float64
+    w: dds.float64
+
+
+@dataclass
+class Twist(IdlStruct, typename="geometry_msgs.msg.dds_.Twist_"):
+    linear: Vector3
+    angular: Vector3
+
+
+@dataclass
+class Pose(IdlStruct, typename="geometry_msgs.msg.dds_.Pose_"):
+    position: Point
+    orientation: Quaternion
+
+
+@dataclass
+class PoseStamped(IdlStruct, typename="geometry_msgs.msg.dds_.PoseStamped_"):
+    header: Header
+    pose: Pose
+
+
+@dataclass
+class Transform(IdlStruct, typename="geometry_msgs.msg.dds_.Transform_"):
+    translation: Vector3
+    rotation: Quaternion
+
+
+@dataclass
+class TransformStamped(IdlStruct, typename="geometry_msgs.msg.dds_.TransformStamped_"):
+    header: Header
+    child_frame_id: str
+    transform: Transform
+
+
+@dataclass
+class TFMessage(IdlStruct, typename="tf2_msgs.msg.dds_.TFMessage_"):
+    transforms: dds.sequence[TransformStamped]
+
+
+@dataclass
+class Clock(IdlStruct, typename="rosgraph_msgs.msg.dds_.Clock_"):
+    clock: Time
+
+
+LOOPBACK = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
+<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex><Peers>
+<Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
+
+
+def test_a_ros2_node_receives_and_drives(served):
+    """Names, types and frames as another participant knows them; then it places and drives the robot."""
+    file, _, number = served
+    domain = Domain(number, LOOPBACK)
+    node = DomainParticipant(number)
+    reliable = Qos(Policy.Reliability.Reliable(10**9), Policy.History.KeepLast(10))
+    images, transforms, clocks = (
+        DataReader(node, Topic(node, name, kind), reliable)
+        for name, kind in (("rt/camera/image_raw", Image), ("rt/tf", TFMessage), ("rt/clock", Clock))
+    )
+    drive, place = (
+        DataWriter(node, Topic(node, name, kind), reliable)
+        for name, kind in (("rt/cmd_vel", Twist), ("rt/pose", PoseStamped))
+    )
+
+    def next_of(reader, wanted=lambda message: True):
+        until = time.monotonic() + 30
+        while time.monotonic() < until:
+            for message in reader.take(20):
+                if wanted(message):
+                    return message
+            time.sleep(0.01)
+        raise AssertionError("no such message")
+
+    def base(message):
+        """Matrix of map to base_link, in the message of the camera."""
+        by_frame = {one.child_frame_id: one for one in message.transforms}
+        if "base_link" not in by_frame:
+            return None
+        assert {name: one.header.frame_id for name, one in by_frame.items()} == {
+            "scene": "map", "base_link": "map", "camera_link": "base_link",
+            "camera_optical_frame": "camera_link",
+        }  # fmt: skip
+        at, turn = by_frame["base_link"].transform.translation, by_frame["base_link"].transform.rotation
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+        matrix[:3, 3] = at.x, at.y, at.z
+        return matrix
+
+    until = time.monotonic() + 30
+    while not (drive.get_matched_subscriptions() and place.get_matched_subscriptions()):
+        assert time.monotonic() < until, "nobody subscribes to /cmd_vel and /pose"
+        time.sleep(0.01)
+    image = next_of(images)
+    expected = fs.Renderer().render(fs.Scene.load(file))["rgb"]
+    pixels = np.array(image.data, np.uint8).reshape(48, 64, 3)
+    np.testing.assert_allclose(pixels / 255, np.clip(expected, 0, 1), atol=0.5 / 255 + 1e-6)
+    assert (image.encoding, image.step, image.header.frame_id) == ("rgb8", 192, "camera_optical_frame")
+    assert abs(next_of(clocks).clock.sec - time.time()) < 5
+    stands = base(next_of(transforms, lambda message: base(message) is not None))
+
+    here = stands.copy()
+    here[:3, 3] += 0.5 * stands[:3, 0]  # half a metre forward
+    turn = Rotation.from_matrix(here[:3, :3]).as_quat()
+    stamped = PoseStamped(Header(Time(0, 0), "map"), Pose(Point(*here[:3, 3]), Quaternion(*turn)))
+    place.write(stamped)
+    moved = next_of(transforms, lambda m: (b := base(m)) is not None and not np.allclose(b, stands))
+    np.testing.assert_allclose(base(moved), here, atol=1e-9)
+    stamp = moved.transforms[0].header.stamp
+    image = next_of(
+        images, lambda one: (one.header.stamp.sec, one.header.stamp.nanosec) == (stamp.sec, stamp.nanosec)
+    )
+    pixels = np.array(image.data, np.uint8).reshape(48, 64, 3)
+    camera = fs.Scene.load(file).camera
+    nearer = camera.camera_to_world
+    nearer[:3, 3] += 0.5 * nearer[:3, 2] * [1, 0, 1] / np.linalg.norm(nearer[[0, 2], 2])
+    expected = fs.Renderer().render(fs.Scene.load(file), camera.with_pose(camera_to_world=nearer))["rgb"]
+    np.testing.assert_allclose(pixels / 255, np.clip(expected, 0, 1), atol=0.5 / 255 + 1e-5)
+
+    place.write(PoseStamped(stamped.header, Pose(Point(np.nan, 0.0, 0.0), Quaternion(*turn))))  # ignored
+    drive.write(Twist(Vector3(0.4, 0.0, 0.0), Vector3(0.0, 0.0, 0.2)))
+    # it drives for half a second, since no other command follows: 0.2 m along an arc to the left
+    arc = 0.1
+    turned = np.eye(4)
+    turned[:3, :3] = Rotation.from_euler("z", arc).as_matrix()
+    turned[:2, 3] = 2 * np.sin(arc), 2 * (1 - np.cos(arc))
+    after = here @ turned
+    moved = next_of(transforms, lambda m: (b := base(m)) is not None and np.allclose(b, after, atol=1e-6))
+    time.sleep(0.2)
+    np.testing.assert_allclose(base(next_of(transforms, lambda m: base(m) is not None)), after, atol=1e-6)
+    del images, transforms, clocks, drive, place, node, domain
+
+
 def test_late_steps_are_dropped_and_counted(monkeypatch):
     now = [100.0]
     monkeypatch.setattr("fidsplat.commands.serve.time.monotonic", lambda: now[0])
@@ -125,7 +318,7 @@ def test_late_steps_are_dropped_and_counted(monkeypatch):
     assert (clock.sent, clock.dropped) == (8, 2)
 
 
-def test_a_port_in_use_and_wrong_options_are_one_line(tmp_path, capsys):
+def test_a_port_in_use_and_wrong_options_are_one_line(tmp_path, capsys, monkeypatch):
     from fidsplat.logs.live import LiveLog
 
     with LiveLog(port=0) as log, pytest.raises(fs.InputError, match="cannot listen on"):
@@ -134,3 +327,13 @@ def test_a_port_in_use_and_wrong_options_are_one_line(tmp_path, capsys):
     file.write_text(SCENE)
     assert main(["serve", str(file), "--lidar", "vlp"]) == 2
     assert "unknown lidar 'vlp'" in capsys.readouterr().err
+    monkeypatch.setenv("ROS_DOMAIN_ID", "233")
+    assert main(["serve", str(file), "--ros2"]) == 2
+    assert "ROS_DOMAIN_ID must be a number from 0 to 232, got '233'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("package", "options"), [("foxglove", []), ("cyclonedds", ["--ros2"])])
+def test_a_missing_package_names_its_extra(tmp_path, capsys, monkeypatch, package, options):
+    monkeypatch.setattr("fidsplat.commands.options.find_spec", lambda name: None if name == package else name)
+    assert main(["serve", str(tmp_path / "scene.toml"), *options]) == 2
+    assert f"fidsplat serve needs {package}; pip install 'fidsplat[live]'" in capsys.readouterr().err
