@@ -274,18 +274,23 @@ class Tree:
         The result is `caught`, `survived`, `limit` (time is up and no test has failed) or `invalid` (it does
         not compile).
         """
-        file, broken = self._folder / mutation.path, []
+        file, broken, turn = self._folder / mutation.path, [], 0
         text = file.read_text("utf-8")
         while True:
             file.write_text(mutation.applied(text), "utf-8")
             try:
-                status, test, output = self._pytest([*tests_for(mutation, self._folder), *broken])
+                status, test, output = self._pytest(
+                    ["--turn", str(turn), *tests_for(mutation, self._folder), *broken]
+                )
             finally:
                 file.write_text(text, "utf-8")
             if mutation.path.startswith("kernels/") and INVALID.search(output):
                 return "invalid", test, ""
             if status == LIMIT:
                 return "limit", test, f"{self._limit} s of CPU time"
+            if status in (0, 5) and not turn:
+                turn = 1  # with each file on the other device
+                continue
             if status in (0, 5):  # 5: no test is left
                 return "survived", "", ""
             if "ImportError while loading conftest" in output:
@@ -306,7 +311,7 @@ class Tree:
         path = os.pathsep.join(str(self._folder / name) for name in (".", "tools"))
         cache = str(self._folder / ".pycache")  # kernels are cached where the user's are: most do not change
         environment = os.environ | {"PYTHONPATH": path, "PYTHONPYCACHEPREFIX": cache, "COLUMNS": "999"}
-        options = ["-n", "0", "-x", "-v", "--turn", "0", "-p", "mutate", "-p", "no:cacheprovider"]
+        options = ["-n", "0", "-x", "-v", "-p", "mutate", "-p", "no:cacheprovider"]
         limits = resource.RLIMIT_CPU, (self._limit, self._limit + 5)
         with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as stream:
             child = subprocess.Popen(

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from combined import LENSES, combination, everything
 from optimisation import as_users_compile, level
-from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.selftest.catalogue import all_cases
@@ -53,7 +52,6 @@ def digests_of(device, frames):
     return level(), digests
 
 
-@in_turn()
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("frames", ["base", LENS, pytest.param("the others", marks=pytest.mark.exhaustive)])
 def test_optimised_kernels_are_bit_identical(device, frames):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, compare, random_splats, reference_pixels
 from derivative_errors import stretched
-from sampling import by, in_turn
 
 import fidsplat as fs
 from fidsplat.cameras.pinhole import FOCAL_LENGTHS
@@ -43,7 +42,6 @@ def test_two_thousand_random_splats(renderer):
     assert_agrees(renderer, cloud, SMALL)
 
 
-@in_turn()
 @pytest.mark.parametrize("quality", ["standard", "reference", "gsplat", "surfel"])
 def test_splats_around_and_behind_the_camera(renderer, quality):
     assert_agrees(renderer, random_splats(200, seed=1), CAMERA, quality=quality)
@@ -68,7 +66,6 @@ def test_splats_much_smaller_than_a_pixel(renderer):
     assert_agrees(renderer, random_splats(500, seed=7, depth=(1, 6), scale=(1e-6, 1e-2)), CAMERA)
 
 
-@in_turn(1)
 @pytest.mark.parametrize(
     ("lowpass", "samples"), [("none", 1), ("none", 3), ("screen", 2), ("pixel", 1), ("pixel", 2)]
 )
@@ -89,7 +86,6 @@ def test_fast_preset_is_as_accurate_as_its_constants(renderer):
     assert excess.max() < 2.0 / 255
 
 
-@in_turn()
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_spherical_harmonics(renderer, degree):
     cloud = random_splats(200, seed=11, depth=(1, 6), scale=(0.02, 0.4), sh_degree=degree)
@@ -97,7 +93,6 @@ def test_spherical_harmonics(renderer, degree):
     assert_agrees(renderer, cloud, camera, outputs=("rgb",))
 
 
-@in_turn()
 @pytest.mark.parametrize("tilt", [0, 20, 45, 60, 75])
 @pytest.mark.parametrize(
     "spec", ["charuco:4x5:4x4_50", "qr-v5-L:" + "fidsplat " * 10], ids=["charuco", "qr5"]
@@ -197,7 +192,6 @@ def rotation_about(axis):
     return np.eye(3) + math.sin(angle) * skew + (1 - math.cos(angle)) * skew @ skew
 
 
-@in_turn(1, by("samples"))
 @pytest.mark.parametrize("seed", [0, 1, pytest.param(2, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize(("samples", "camera"), [(1, CAMERA), (2, SMALL)], ids=["1 sample", "2 x 2 samples"])
 def test_coplanar_splats_are_one_layer(renderer, seed, samples, camera):

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats
-from sampling import in_turn
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
@@ -63,7 +62,6 @@ def test_the_bits_are_the_same_on_every_device():
         assert np.array_equal(logarithm, found[0][1])
 
 
-@in_turn()
 @pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
 def test_images_move_by_the_rounding_of_opacities(renderer, cloud):
     for quality in (FAST, PRECISE):
@@ -88,7 +86,6 @@ def test_faint_fragments_stay_faint(renderer):
         assert np.abs(precise[name] - fast[name]).max() <= 2e-6
 
 
-@in_turn(1)
 @pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
 def test_both_schedules_are_bit_identical(renderer, cloud):
     image = FrameSpec(cloud, CAMERA, FAST, ALL_OUTPUTS)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, random_splats
 from derivative_errors import stretched
-from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.capture.views import views_of
@@ -128,7 +127,6 @@ LENSES = {
 }
 
 
-@in_turn()
 @pytest.mark.parametrize("lens", LENSES)
 def test_effects_are_those_of_single_views(renderer, cloud, lens):
     """Rays of samples, fog, a sensor that counts in pixels, several samples; view by view where an image has
@@ -151,7 +149,6 @@ BACKGROUNDS = {
 }
 
 
-@in_turn(1)
 @pytest.mark.parametrize("name", BACKGROUNDS)
 def test_each_view_sees_the_background_in_its_own_direction(renderer, cloud, name):
     """With fog and a sensor, whose noise is that of single frames too."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats
-from sampling import SAMPLES, alternate, by, in_turn
+from sampling import SAMPLES, alternate
 
 import fidsplat as fs
 from fidsplat.selftest.clouds import quaternion, splats
@@ -34,7 +34,6 @@ def area_sampled(made, px_per_module, center, size, background):
     return light + background * (1 - down.sum(1)[:, None] * across.sum(1))
 
 
-@in_turn(0, by("samples"))
 @pytest.mark.parametrize("samples", [1, 3])
 @pytest.mark.parametrize("px_per_module", [0.37, 2.5, 4.571])
 def test_an_exact_marker_is_its_area_sampled_texture(renderer, px_per_module, samples):
@@ -168,7 +167,6 @@ def corners_of(cloud):
     return cloud.means[0] + np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ axes.T
 
 
-@in_turn(1)
 @pytest.mark.parametrize(("seed", "quality"), list(enumerate(("standard", "reference", "gsplat"))))
 def test_boxes_around_and_behind_the_camera(renderer, seed, quality):
     """Bounds lose nothing: every device agrees with the reference, which asks every pixel."""
@@ -197,7 +195,6 @@ def test_boxes_end_at_the_near_plane(renderer):
     assert np.abs(frame["rgb"] - whole["rgb"]).max() > 0.1
 
 
-@in_turn()
 @pytest.mark.parametrize(("lowpass", "samples"), alternate({"none": "none", "screen": "screen"}, SAMPLES))
 def test_a_scene_of_both_footprints(renderer, lowpass, samples):
     cloud = random_splats(150, seed=4, depth=(-0.5, 6.0))
@@ -222,7 +219,6 @@ def hidden(cloud):
     return fs.SplatCloud(-cloud.means, cloud.quats, cloud.scales * 0.01, cloud.opacities, colors=cloud.colors)
 
 
-@in_turn(1)
 @pytest.mark.parametrize("tilt", [0, 35, 70])
 def test_markers_of_boxes_between_splats(renderer, tilt):
     """Layers of boxes and of Gaussians and splats of no plane, all outputs."""

@@ -6,21 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats, reference_pixels
-from sampling import SAMPLES, alternate, by_lens, in_turn
+from sampling import SAMPLES, alternate
 from test_boxes import EXACT, boxes_of, cut
-from test_lens_frames import CAMERAS, lens_of
+from test_lens_frames import CAMERAS, each_camera
 
 import fidsplat as fs
 from fidsplat.cameras.raster import raster_of
 from fidsplat.splats.rotations import quaternion_to_matrix
 
 SEAM = 1e-3
-
-
-def each_camera(test):
-    """A case for each camera. A lens is on one device, on which test_lens_frames.py does not have it."""
-    cases = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
-    return in_turn(1, by_lens)(cases(test))
 
 
 @each_camera
@@ -64,7 +58,6 @@ def test_boxes_much_larger_than_the_image(renderer, camera):
 
 
 # those that test_layers of test_lens_frames.py leaves out, each on another device
-@in_turn(1, by_lens)
 @pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, dict(reversed(SAMPLES.items()))))
 def test_boxes_and_gaussians_in_layers(renderer, camera, samples):
     pose = np.eye(4)
@@ -82,7 +75,6 @@ LARGE = {
 }
 
 
-@in_turn(1, by_lens)
 @pytest.mark.parametrize("camera", LARGE.values(), ids=LARGE)
 def test_a_small_box_is_listed_for_few_tiles(renderer, camera):
     """No more than 1.2 times those of a Gaussian cut off at 3.3 standard deviations (1/255), while it is not
@@ -161,8 +153,6 @@ def test_light_is_that_of_the_image(renderer, camera, size, shifts):
     assert np.mean(areas) == pytest.approx(area, rel=0.03)
 
 
-# each on a device on which test_lens_frames.py does not have that lens
-@in_turn(1, lens_of)
 @pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama"])
 def test_boxes_through_lenses_in_single_precision(renderer, name):
     """The set-up of devices without float64, held as Gaussians are: to a tenth of an 8-bit step."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, against_reference, random_splats
-from sampling import SAMPLES, alternate, in_turn
+from sampling import SAMPLES, alternate
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
@@ -56,13 +56,11 @@ def assert_agrees(renderer, **image):
     assert all(difference.agrees for difference in differences), differences
 
 
-@in_turn()
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 def test_outputs_and_sensors_behind_every_lens(renderer, camera):
     assert_agrees(renderer, camera=camera, outputs=("rgb", *OUTPUTS), sensor=SENSOR)
 
 
-@in_turn(1)
 @pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, SAMPLES))
 def test_fog_and_distances_behind_lenses(renderer, camera, samples):
     outputs = ("rgb", "distance", "distance_median", "distance_first")
@@ -71,7 +69,6 @@ def test_fog_and_distances_behind_lenses(renderer, camera, samples):
 
 
 # where test_outputs_and_sensors_behind_every_lens has compiled it
-@in_turn(1)
 @pytest.mark.parametrize("name", ALONG)
 def test_distances_are_depths_where_depths_are_along_the_ray(renderer, name):
     frame = renderer.render(CLOUD, ALONG[name], ("rgb", *OUTPUTS), sensor=SENSOR)
@@ -79,7 +76,6 @@ def test_distances_are_depths_where_depths_are_along_the_ray(renderer, name):
     assert np.array_equal(frame["depth"], frame["distance"])
 
 
-@in_turn()
 @pytest.mark.parametrize(
     ("around", "shutter"),
     alternate(
@@ -122,7 +118,6 @@ def test_fog_is_averaged_over_the_poses_of_a_shutter(renderer):
     assert np.allclose(both, (near + none) / 2, atol=1e-5)
 
 
-@in_turn()
 @pytest.mark.parametrize(
     ("camera", "behind", "samples"), alternate(CAMERAS, {"sky": SKY, "panorama": PANORAMA}, SAMPLES)
 )

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, against_reference, assert_agrees, random_splats
-from sampling import by, in_turn
 
 import fidsplat as fs
 from fidsplat.capture.quality import ELLIPSOID
@@ -40,14 +39,12 @@ def mixed(seed):
     return fs.SplatCloud.concatenate([disks, thick(seed), boxes, marker.transformed(pose)])
 
 
-@in_turn()
 @pytest.mark.parametrize("way", ["exact", "ewa"])
 def test_all_kinds_of_splats_in_one_frame(renderer, way):
     """Around the camera and across its plane, with every output."""
     assert_agrees(renderer, mixed(5), CAMERA, quality=fs.Quality(ellipsoid=way))
 
 
-@in_turn(1)
 @pytest.mark.parametrize("way", ["exact", "ewa"])
 def test_each_fragment_by_its_own_depth(renderer, way):
     disks = random_splats(20, 3, depth=(0.5, 4.0), scale=(0.05, 0.5), across=1.2)
@@ -63,7 +60,6 @@ ALONE = {
 }
 
 
-@in_turn(0, by("order"))
 @pytest.mark.parametrize("order", ["centre", "pixel"])
 @pytest.mark.parametrize("place", ALONE)
 def test_ellipsoids_are_bit_identical_in_any_cloud(renderer, place, order):
@@ -91,7 +87,6 @@ def test_exact_behind_a_fisheye(renderer):
     assert_agrees(renderer, mixed(7), camera, quality=fs.Quality())
 
 
-@in_turn(1)
 @pytest.mark.parametrize("anisotropy", [1e3, 1e6])
 def test_needles_and_pancakes(renderer, anisotropy):
     """Also straight along a needle and edge-on to a pancake."""
@@ -172,7 +167,6 @@ def thick_scene_of(seed: int) -> FrameSpec:
     return replace(flat, cloud=thick, quality=flat.quality.with_(ellipsoid=way))
 
 
-@in_turn()
 @pytest.mark.parametrize("seeds", [range(3), range(3, 6), REST], ids="{0.start} to {0.stop}".format)
 def test_random_hard_scenes(renderer, seeds):
     """The fuzzer's splats with a third scale; 1000 scenes have 100,000. `pytest -s` shows the figures."""

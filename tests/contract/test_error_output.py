@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from brute_force import ideal
-from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.effects.catalogue import CATALOGUE
@@ -91,7 +90,6 @@ def check(renderer, cloud, camera, quality=None, background=(0.0, 0.0, 0.0)):
     return frame, off
 
 
-@in_turn()
 @pytest.mark.parametrize(
     ("n", "opacity", "camera", "wrong"),
     [(300, 1e-3, HAZE, 1.4), (1000, 1e-3, RIM, 4.0), (3000, 1e-3, RIM, 7.9), (10_000, 9.9e-6, MIDDLE, 48.0)],
@@ -123,7 +121,6 @@ def test_float32_rounding_is_counted(renderer):
     assert frame["error"].max() < 5e-3
 
 
-@in_turn(1)
 @pytest.mark.parametrize("seed", range(4))
 def test_the_bound_holds_for_anything(renderer, seed):
     check(renderer, *anything(seed))

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import compare, random_splats
-from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.backends.opencl.assemble import assemble
@@ -60,7 +59,6 @@ def differences(pipeline, resident, cloud, capture):
     return compare(found, truth.render_view(reference.upload(cloud), view).arrays_of(0), capture.outputs)
 
 
-@in_turn()
 @pytest.mark.parametrize("case", CASES)
 def test_every_output_is_the_references(renderer, case):
     cloud, requested = CASES[case]
@@ -86,7 +84,6 @@ def test_both_schedules_agree(renderer):
         assert not wrong, wrong
 
 
-@in_turn()
 def test_a_plane_that_crosses_the_surface_is_occluded_where_it_is_behind(renderer):
     """Not by its centre: pixel by pixel, by its own depth there."""
     plane = fs.SplatCloud([[0, 0, 0]], [[1, 0, 0, 0]], [[3.0, 3.0]], [0.9], colors=[[1, 0, 0]]).with_boxes()

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from agreement import random_splats, reference_images
 from optimisation import hardly
-from sampling import in_turn
 from test_lens_frames import CAMERAS
 
 import fidsplat as fs
@@ -61,7 +60,6 @@ PICTURES = {
 }
 
 
-@in_turn()
 @pytest.mark.parametrize("name", PICTURES)
 def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
     image = PICTURES[name]()

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from agreement import compare, random_splats, some_thick
 from combined import LENSES, SIZE, Combination, combination, everything, sliding, turning
-from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
@@ -56,7 +55,6 @@ PICTURES = {
 }
 
 
-@in_turn()
 @pytest.mark.parametrize("name", PICTURES)
 def test_it_agrees_with_the_reference(renderer, name):
     requested = PICTURES[name]()

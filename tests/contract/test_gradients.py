@@ -16,7 +16,6 @@ from derivative_errors import (
     random_picture,
     reference_derivatives,
 )
-from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.backends.gradients import CapacityExceeded, on_host
@@ -61,7 +60,6 @@ def backend(renderer):
     return renderer.backend
 
 
-@in_turn()
 @pytest.mark.parametrize("case", CASES)
 def test_derivatives_are_the_references(backend, case):
     found = assert_same(backend, *random_picture(1, **CASES[case]))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, against_reference, assert_agrees, random_splats, reference_pixels
-from sampling import LENSES, SAMPLES, alternate, by_lens, in_turn
+from sampling import SAMPLES, alternate
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
@@ -39,22 +39,7 @@ CAMERAS = {
 }
 
 
-def lens_of(call):
-    """Number of a case for `in_turn`: a kind of lens is on one device."""
-    return by_lens(call, CAMERAS)
-
-
-each_lens = in_turn(0, lens_of)
-
-
-def through(kind):
-    """Marks a test of one kind of lens, which is on the same device as in the other tests here."""
-    return in_turn(LENSES.index(kind), lambda _: 0)
-
-
-def each_camera(test):
-    """A case for each camera, each lens on one device."""
-    return each_lens(pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)(test))
+each_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 
 
 @each_camera
@@ -63,7 +48,6 @@ def test_splats_all_around_the_camera(renderer, camera, seed):
     assert_agrees(renderer, random_splats(200, seed, depth=(-5.0, 6.0)), camera)
 
 
-@each_lens
 @pytest.mark.parametrize("name", ["distortion", "fisheye 200", "panorama", "parallel"])
 def test_near_and_far_planes_amid_the_splats(renderer, name):
     """Whole disks end at the far plane, fragments at the near one."""
@@ -74,7 +58,6 @@ def test_near_and_far_planes_amid_the_splats(renderer, name):
     assert np.abs(frame["rgb"] - whole["rgb"]).max() > 0.1
 
 
-@each_lens
 @pytest.mark.parametrize("name", ["pinhole", "distortion", "fisheye 200", "panorama", "parallel"])
 def test_depths_of_a_tilted_wall_are_right_to_a_hundred_thousandth(renderer, name):
     """Without a certificate: nothing is hard here."""
@@ -111,7 +94,6 @@ TO_THE_RIM = fs.Quality(alpha_cutoff=math.exp(-0.5), lowpass="none")
 """opaque disks of one standard deviation, whose rims are visible"""
 
 
-@through("fisheye")
 @pytest.mark.parametrize("name", RIMS)
 def test_rims_that_bulge_behind_a_fisheye(renderer, name):
     mean, *axes = np.array(RIMS[name])
@@ -125,7 +107,6 @@ def test_rims_that_bulge_behind_a_fisheye(renderer, name):
     assert (alpha > 0.6).any()
 
 
-@through("fisheye")
 def test_a_disk_whose_middle_a_fisheye_nearly_touches(renderer):
     """All of it is within its radius of the camera, so that it reaches around it: almost half of all rays
     meet it, and the arcs of its bounding polygon are short nevertheless. Found at random."""
@@ -148,7 +129,6 @@ def test_a_rim_ahead_of_a_disk_that_reaches_behind_the_camera(renderer):
     assert (alpha == 0).any()
 
 
-@through("equirectangular")
 @pytest.mark.parametrize(("seed", "depth", "scale"), [(6, 4.0, (0.1, 3.0)), (18, 1.0, (0.05, 0.5))])
 def test_rims_in_a_panorama(renderer, seed, depth, scale):
     cloud = random_splats(60, seed, depth=(-depth, depth), scale=scale)
@@ -157,21 +137,18 @@ def test_rims_in_a_panorama(renderer, seed, depth, scale):
     assert_agrees(renderer, opaque, camera, quality=TO_THE_RIM)
 
 
-@each_lens
 @pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, SAMPLES))
 def test_layers(renderer, camera, samples):
     assert_agrees(renderer, coplanar_cloud(1), camera, quality=fs.Quality(samples=samples))
 
 
 # test_all_effects of both matrices has them behind every lens
-@each_lens
 @pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama", "parallel"])
 def test_colours_that_depend_on_the_view(renderer, name):
     cloud = random_splats(100, 11, depth=(1, 6), scale=(0.02, 0.4), sh_degree=3)
     assert_agrees(renderer, cloud, CAMERAS[name])
 
 
-@each_lens
 @pytest.mark.parametrize("name", ["fisheye 200", "panorama"])
 def test_splats_that_cross_the_rim_seam_and_poles(renderer, name):
     """Splats centred within a few degrees of where the image ends, or of its poles and seam."""
@@ -203,7 +180,6 @@ def fs_move(position):
     return matrix
 
 
-@through("fisheye")
 def test_outside_the_lens_is_background(renderer):
     camera = CAMERAS["fisheye 200"]
     frame = renderer.render(
@@ -221,7 +197,6 @@ def test_outside_the_lens_is_background(renderer):
     assert frame["alpha"][~outside].max() > 0.5
 
 
-@each_lens
 @pytest.mark.parametrize("name", ["fold", "fisheye 200"])
 def test_outside_of_a_lens_there_is_no_distance_and_no_gradient(renderer, name):
     image = FrameSpec(
@@ -244,7 +219,6 @@ def test_outside_of_a_lens_there_is_no_distance_and_no_gradient(renderer, name):
     assert all(difference.agrees for difference in against_reference(renderer, image))
 
 
-@through("fisheye")
 def test_a_splat_next_to_the_camera_that_is_viewed_edge_on_leaves_its_dot(renderer):
     """All of its plane lies at z = 0: only the forms' z is not 0."""
     cloud = fs.SplatCloud([[1, 0.1, 0]], [[1, 0, 0, 0]], [[0.1, 0.2]], [0.9], colors=[[1, 0.5, 0.2]])
@@ -253,7 +227,6 @@ def test_a_splat_next_to_the_camera_that_is_viewed_edge_on_leaves_its_dot(render
     assert frame["alpha"].max() > 0.3
 
 
-@through("brown_conrady")
 def test_a_slight_distortion_is_nearly_a_pinhole(renderer):
     cloud = random_splats(200, 1, depth=(0.5, 6.0), scale=(0.02, 0.3))
     plain, bent = seen_through(None), seen_through(BrownConrady(k1=1e-7))
@@ -264,7 +237,6 @@ def test_a_slight_distortion_is_nearly_a_pinhole(renderer):
     assert np.quantile(np.abs(a["depth"] - b["depth"]), 0.999) < 1e-2
 
 
-@through("fisheye")
 def test_depths_of_a_fisheye_are_distances(renderer):
     """A wall at z = 2: the distance grows as 1 / cos; along z with parallel rays it is 2."""
     wall = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[50, 50]], [1.0], colors=[[1, 1, 1]])
@@ -276,7 +248,6 @@ def test_depths_of_a_fisheye_are_distances(renderer):
     np.testing.assert_allclose(renderer.render(wall, parallel, ALL_OUTPUTS)["depth"], 2, rtol=1e-5)
 
 
-@each_lens
 @pytest.mark.parametrize("name", ["fisheye", "parallel"])
 def test_bands_are_bit_identical(renderer, name):
     cloud, camera = random_splats(300, 2, depth=(-4.0, 5.0)), CAMERAS[name]
@@ -291,7 +262,6 @@ def test_bands_are_bit_identical(renderer, name):
         backend.pair_budget = held
 
 
-@each_lens
 @pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama", "parallel"])
 def test_lenses_in_single_precision(renderer, name):
     """The set-up of devices without float64, held as the pinhole's is: to a tenth of an 8-bit step."""

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats
-from sampling import by, by_lens, in_turn
 from test_lens_frames import CAMERAS, EVERY_TERM
 
 import fidsplat as fs
@@ -21,7 +20,6 @@ LENSES = {
 }
 
 
-@in_turn(0, by("samples"))
 @pytest.mark.parametrize("samples", [1, 2])
 @pytest.mark.parametrize("place", ["ahead", "near", "aside"])
 def test_the_screen_dot_of_splats_about_as_wide_as_it(renderer, place, samples):
@@ -55,7 +53,6 @@ def edge_on(tilt, size=1.0):
     return fs.SplatCloud([(1e-7, 0, 2)], quats, [(size, 1e-3)], [0.9], colors=[(1, 0.5, 0.2)])
 
 
-@in_turn()
 @pytest.mark.parametrize("order", ["centre", "pixel"])
 def test_depths_of_splats_viewed_edge_on_are_in_their_visible_part(renderer, order):
     """The low-pass shows pixels where the ray meets the plane right before the camera, or behind it."""
@@ -90,7 +87,6 @@ def test_depths_change_steadily_as_a_splat_rotates_through_edge_on(renderer):
     assert steps.max() < 0.5 * ends
 
 
-@in_turn(1)
 @pytest.mark.parametrize("order", ["centre", "pixel"])
 def test_fog_does_not_depend_on_the_cut_off(renderer, order):
     """The cut-off changes a single splat by at most the cut-off, with fog and without."""
@@ -119,7 +115,6 @@ def test_tilted_to_edge_on(renderer, tilt):
     assert_agrees(renderer, cloud, fs.Camera.pinhole(60, 60, 50.0, 50.0, 30.0, 30.0), quality=PIXEL)
 
 
-@in_turn(1, by_lens)
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 @pytest.mark.parametrize("scale", [(1e-6, 1e-2), (1e-3, 2.0)], ids=["small", "any"])
 def test_splats_of_every_size_through_every_lens(renderer, camera, scale):
@@ -127,7 +122,6 @@ def test_splats_of_every_size_through_every_lens(renderer, camera, scale):
     assert_agrees(renderer, cloud, camera, quality=PIXEL)
 
 
-@in_turn(1, by_lens)
 @pytest.mark.parametrize("camera", [CAMERA, *LENSES.values()], ids=["pinhole", *LENSES])
 def test_splats_that_are_viewed_nearly_edge_on(renderer, camera):
     """From a hundredth of a degree to thirty, on all sides: the depth of what a sample sees counts."""
@@ -208,7 +202,6 @@ def test_splats_whose_centres_lie_beyond_the_fold(renderer):
     assert_agrees(renderer, cloud, CAMERAS["fold"], quality=PIXEL)
 
 
-@in_turn(1, lambda call: by_lens(call, LENSES))
 @pytest.mark.parametrize(("name", "mean"), [("fisheye", (0, 0, 1.5)), ("panorama", (0, -1.5, 0))])
 def test_a_splat_where_the_derivative_has_no_direction(renderer, name, mean):
     """On the axis of a fisheye, at a pole of a panorama."""
@@ -230,7 +223,6 @@ def test_the_screen_dot_of_walls_that_are_viewed_nearly_edge_on(renderer):
             assert_agrees(renderer, wall, camera)
 
 
-@in_turn(1, by_lens)
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 def test_a_lens_keeps_the_light_of_a_splat(renderer, camera):
     """The sum of alpha over the image is 2 pi opacity times the area of the image of the one-sigma square

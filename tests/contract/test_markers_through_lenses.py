@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 from ideal_effects import assert_as_good, ideal_image
-from sampling import alternate, in_turn
+from sampling import alternate
 
 import fidsplat as fs
 from fidsplat.vision.detect import detect
@@ -80,14 +80,12 @@ def assert_found(renderer, name, turn, **effects):
     assert errors[1] < 0.01 * np.linalg.norm(position)
 
 
-@in_turn()
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("turn_deg", [0, 30])
 def test_a_tag_is_found_where_it_is(renderer, name, turn_deg):
     assert_found(renderer, name, math.radians(turn_deg))
 
 
-@in_turn(1)
 @pytest.mark.parametrize("name", CASES)
 def test_a_tag_that_moves_is_found_in_blur_and_noise_through_every_lens(renderer, name):
     """It turns about the camera by 0.4 rad a second, up to 2 px during the exposure; light falls off, and
@@ -106,7 +104,6 @@ def test_a_tag_that_moves_is_found_in_blur_and_noise_through_every_lens(renderer
     )
 
 
-@in_turn(1)
 @pytest.mark.parametrize(
     ("turn_deg", "blurred"), alternate({"0": 0, "30": 30}, {"sharp": False, "blurred": True})
 )
@@ -138,7 +135,6 @@ def test_parallel_rays_show_where_a_tag_is_across_them_and_its_rotation(renderer
     assert errors[1] < 0.01 * 1.5
 
 
-@in_turn()
 @pytest.mark.parametrize("modules", [0.1, 1.0, 4.0])
 def test_a_blurred_tag_is_found_wherever_the_ideal_plane_is(renderer, modules):
     """From a tenth of a module, with which all is well, to four, with which no code can be read."""
@@ -168,7 +164,6 @@ def test_exact_corners_give_the_exact_pose(name):
     assert angle < 1e-6
 
 
-@in_turn(1)
 def test_a_rolling_shutter_shows_the_tag_at_its_rows_time(renderer):
     """The camera turns, so the image is sheared; rows at the tag's height are read at a known time."""
     camera, position = CASES["pinhole"]
@@ -188,7 +183,6 @@ def test_a_rolling_shutter_shows_the_tag_at_its_rows_time(renderer):
     assert errors[1] < 0.01 * np.linalg.norm(position)
 
 
-@in_turn()
 @pytest.mark.parametrize(
     ("wide", "position", "target", "up"),
     [

@@ -8,7 +8,6 @@ beyond each side of the image.
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS
-from sampling import in_turn
 
 import fidsplat as fs
 
@@ -59,7 +58,6 @@ def camera(way, lens):
 
 
 # each kind of splat is on both devices, with half of the lenses
-@in_turn(0, lambda call: call.indices["name"] + call.indices["kind"])
 @pytest.mark.parametrize("way", ["mirrored", "transposed"])
 @pytest.mark.parametrize("name", list(LENSES))
 @pytest.mark.parametrize("kind", ["disks", "ewa", "exact"])

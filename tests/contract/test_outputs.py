@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 from agreement import assert_agrees, random_splats
-from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS
@@ -15,20 +14,17 @@ ALL = tuple(OUTPUTS)
 KINDS = ("", "_median", "_first")
 
 
-@in_turn()
 @pytest.mark.parametrize(("seed", "quality"), [(0, "standard"), (1, "reference"), (2, "gsplat")])
 def test_outputs_of_splats_around_the_camera(renderer, seed, quality):
     assert_agrees(renderer, random_splats(150, seed), CAMERA, ALL, quality)
 
 
-@in_turn()
 @pytest.mark.parametrize("samples", [2, 3])
 def test_outputs_of_several_samples(renderer, samples):
     cloud = random_splats(100, 5, depth=(0.5, 5.0))
     assert_agrees(renderer, cloud, CAMERA, ALL, fs.Quality(samples=samples, first_hit=0.6))
 
 
-@in_turn(1)
 @pytest.mark.parametrize("mixture", ["fitted", "exact"])
 def test_outputs_of_layers(renderer, mixture):
     tag = fs.marker("aruco:4x4_50:7", size=1.0, mixture=mixture).cloud
@@ -46,7 +42,6 @@ def test_a_layer_shows_the_mean_of_what_its_splats_show(renderer):
     assert_agrees(renderer, cloud.with_coplanar_groups(np.arange(40) // 4), CAMERA, ALL)
 
 
-@in_turn()
 @pytest.mark.parametrize("name", ALL)
 def test_an_output_equals_itself_among_all_outputs(renderer, name):
     cloud = random_splats(150, 4)
@@ -237,7 +232,6 @@ def covered(frame, name):
     return plane.any(-1) if plane.ndim == 3 else plane
 
 
-@in_turn(1)
 @pytest.mark.parametrize("samples", [1, 2])
 def test_masks_do_not_grow_with_a_low_cutoff(renderer, samples):
     """They end where 1/255 is covered, whatever is rendered beyond it for the sake of colours."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from agreement import against_reference, random_splats
 from ideal_effects import assert_as_good, ideal_image
-from sampling import SAMPLES, alternate, in_turn
+from sampling import SAMPLES, alternate
 
 import fidsplat as fs
 from fidsplat.backends.reference.post import variates
@@ -56,19 +56,16 @@ SENSORS = {
 }
 
 
-@in_turn()
 @pytest.mark.parametrize("name", SENSORS)
 def test_steps_of_the_sensor(renderer, name):
     agree(renderer, FrameSpec(CLOUD, CAMERA, outputs=("rgb",), sensor=SENSORS[name]))
 
 
-@in_turn()
 @pytest.mark.parametrize("name", ["all", "vignetting"])
 def test_the_sensor_sees_pixels_not_samples(renderer, name):
     agree(renderer, FrameSpec(CLOUD, CAMERA, fs.Quality(samples=2), sensor=SENSORS[name]))
 
 
-@in_turn(1)
 @pytest.mark.parametrize(
     ("density", "samples"), alternate({"thin": 0.05, "fog": 1.0, "thick": 30.0}, SAMPLES)
 )
@@ -84,7 +81,6 @@ def test_fog(renderer, density, samples):
 SKIES = {"gradient": fs.Gradient((0.2, 0.4, 0.9), (0.3, 0.2, 0.1), (0.1, -2, 0.3)), "panorama": panorama()}
 
 
-@in_turn()
 @pytest.mark.parametrize(("background", "samples"), alternate(SKIES, {"1 sample": 1, "3 x 3 samples": 3}))
 def test_backgrounds(renderer, background, samples):
     for target in ((0.0, 0.1, 3.0), (0.0, 0.1, -3.0), (0.3, -9.0, 0.0)):
@@ -221,7 +217,6 @@ def test_nothing_is_read_beyond_the_end_of_a_table(renderer, monkeypatch):
     assert (frame["rgb"] == 1).all()
 
 
-@in_turn(1)
 @pytest.mark.parametrize("samples", [1, 2])
 def test_light_falls_off_from_the_principal_point(renderer, samples):
     """By the formula, at the centres of pixels; black, not negative, in the corners."""
@@ -265,7 +260,6 @@ def test_the_sensor_keeps_the_other_outputs(renderer):
     assert not np.array_equal(plain["rgb"], seen["rgb"])
 
 
-@in_turn()
 @pytest.mark.parametrize("mixture", ["fitted", "exact"])
 def test_a_tag_is_found_where_it_is_in_fog_and_noise(renderer, mixture):
     """Position error under 1 % of the distance, as the ideal plane's: the images are for robots."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import random_splats, some_thick
-from sampling import SAMPLES, alternate, in_turn
+from sampling import SAMPLES, alternate
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
@@ -70,14 +70,12 @@ def assert_exposed(renderer, cloud, camera, motion, shutter, quality=None, outpu
     return frame
 
 
-@in_turn()
 @pytest.mark.parametrize(("camera", "shutter"), alternate(CAMERAS, SHUTTERS))
 def test_shutters_before_every_lens(renderer, camera, shutter):
     cloud = random_splats(150, 3, depth=(-2.0, 5.0), scale=(0.01, 0.5))
     assert_exposed(renderer, cloud, camera, MOTION, shutter)
 
 
-@in_turn()
 @pytest.mark.parametrize("samples", [1, 2])
 def test_moving_layers(renderer, samples):
     cloud = coplanar_cloud(1)
@@ -160,7 +158,6 @@ def test_many_views_share_a_motion_and_a_shutter(renderer):
         assert all(np.array_equal(moved[name], single[name]) for name in outputs)
 
 
-@in_turn()
 @pytest.mark.parametrize(("lowpass", "samples"), alternate({"screen": "screen", "none": "none"}, SAMPLES))
 def test_what_bands_leave_out_by_its_sphere_renders_nothing_there(renderer, lowpass, samples):
     """The same bits with and without `shutter_rows`: near, behind, large and far below a pixel."""

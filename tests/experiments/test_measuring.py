@@ -4,7 +4,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.experiments import angles, counts, localisation, plane, views
@@ -58,7 +57,6 @@ def test_scans_of_the_ideal_texture_find_its_ceiling(pool):
         )
 
 
-@in_turn()
 def test_scans_do_not_hang_on_the_number_of_threads(renderer):
     markers = MarkerRenderer(renderer)
     parts = angles.angles_points(
@@ -73,7 +71,6 @@ def test_scans_do_not_hang_on_the_number_of_threads(renderer):
         assert "1" in results[0]["readers"]["pupil"]["read"]
 
 
-@in_turn()
 @pytest.mark.parametrize(
     ("category", "tilts"), [("small", "0:44:22"), ("apriltag", "72:84:6"), ("medium", "0:40:20")]
 )
@@ -99,7 +96,6 @@ def test_every_mixture_but_facets_is_a_row_with_both_filters():
         method_names(("boxes",))
 
 
-@in_turn()
 def test_every_method_puts_the_marker_where_the_ideal_has_it(renderer):
     spec = CATEGORIES["small"].spec(0)
     protocol = PROTOCOLS["fixed-plane"]
@@ -115,7 +111,6 @@ def test_every_method_puts_the_marker_where_the_ideal_has_it(renderer):
         assert match > shifted + 3
 
 
-@in_turn()
 def test_trained_models_are_rows_where_they_are(renderer, tmp_path):
     """A model that is our own marker, saved as a trainer saves it, is rendered like our own marker."""
     spec = CATEGORIES["apriltag"].spec(2)
@@ -184,7 +179,6 @@ def test_images_are_rendered_once_for_all_truths(pool, tmp_path):
     assert rendered == ["small-0", "small-0", "small-1", "small-1"]
 
 
-@in_turn()
 def test_views_by_the_renderer_with_every_metric(renderer, pool, tmp_path):
     point = part_of("fitted/best", "exact")
     found = views.measure_views(

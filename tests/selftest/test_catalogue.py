@@ -2,7 +2,6 @@
 
 import pytest
 from agreement import reference_images
-from sampling import in_turn
 
 from fidsplat.selftest import check
 from fidsplat.selftest.catalogue import GROUPS, all_cases
@@ -11,7 +10,6 @@ from fidsplat.selftest.intersection import QUALITY, grazing_errors
 SIZES = {"A": 7, "B": 8, "C": 4, "D": 5, "E": 5, "F": 6, "G": 5}
 
 
-@in_turn()
 @pytest.mark.parametrize("case", all_cases(), ids=lambda case: case.name)
 def test_case(renderer, case, monkeypatch):
     """All frames agree with the reference, and all findings hold. Each case is on one device in a run."""

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.cli import main
@@ -163,7 +162,6 @@ def test_the_reference_passes_its_own_cases(found, reference):
     assert all(each.holds for each in findings), findings
 
 
-@in_turn()
 def test_the_command(renderer, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(catalogue, "all_cases", lambda: (GOOD,))
     words = ["check", "--device", renderer.device.name, "--out", str(tmp_path / "here")]
@@ -181,7 +179,6 @@ def test_the_command(renderer, tmp_path, capsys, monkeypatch):
     assert facts["picture"].endswith("worst.png")
 
 
-@in_turn(1)
 def test_the_command_fails_with_the_device(renderer, tmp_path, capsys, monkeypatch):
     bad = Case("C1", "bad", "", lambda _: [Finding("slip", 2.0, 1.0)])
     monkeypatch.setattr(catalogue, "all_cases", lambda: (bad,))
@@ -192,7 +189,6 @@ def test_the_command_fails_with_the_device(renderer, tmp_path, capsys, monkeypat
     assert not (tmp_path / "worst.png").exists()
 
 
-@in_turn()
 def test_the_command_fuzzes(renderer, tmp_path, capsys):
     words = ["check", "--device", renderer.device.name, "-o", str(tmp_path), "--fuzz", "300"]
     assert main(words) == 0

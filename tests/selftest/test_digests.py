@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 
 import pytest
-from sampling import in_turn
 
 from fidsplat.backends.opencl import pipeline
 from fidsplat.cli import main
@@ -15,7 +14,6 @@ def test_the_table_has_all_scenes():
     assert list(digests.read_table()) == list(range(digests.COUNT))
 
 
-@in_turn()
 @pytest.mark.parametrize("kind", digests.KINDS, ids=lambda kind: kind.name)
 def test_devices_render_the_digests_of_the_table(renderer, monkeypatch, kind):
     """Each kind of scene is on one device in a run, which compiles a feature set for it."""

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from sampling import in_turn
 
 from fidsplat.selftest import fuzz
 from fidsplat.splats.rotations import quaternion_to_matrix
@@ -80,7 +79,6 @@ def test_the_scenes_are_hard():
     assert opacities == set(fuzz.OPACITIES.tolist())
 
 
-@in_turn()
 def test_a_stopped_run_resumes(renderer, tmp_path, monkeypatch):
     monkeypatch.setattr(fuzz, "_SAVE_EVERY", 0.0)
     file = tmp_path / "fuzz.json"
@@ -98,7 +96,6 @@ def test_a_stopped_run_resumes(renderer, tmp_path, monkeypatch):
     assert next(fuzz.fuzz_run(renderer, 300, file)).scenes == 1
 
 
-@in_turn()
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"key": 3}', '{"key": "%s", "scenes": "a", "new": 1}'])
 def test_an_invalid_state_file_is_replaced(renderer, tmp_path, content):
     file = tmp_path / "fuzz.json"
@@ -106,7 +103,6 @@ def test_an_invalid_state_file_is_replaced(renderer, tmp_path, content):
     assert next(fuzz.fuzz_run(renderer, 50, file)).scenes == 1
 
 
-@in_turn(1)
 def test_a_failing_seed_is_reported(renderer, monkeypatch):
     class Wrong(dict):
         """Images with a small error where the certificate is small."""

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, against_reference, assert_agrees, random_splats
-from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.cameras import Camera
@@ -68,7 +67,6 @@ def test_intersecting_splats_equal_their_composited_images(renderer, name):
     assert np.abs(centre - expected).max() > 0.1
 
 
-@in_turn()
 @pytest.mark.parametrize(
     "cloud",
     # the last has more splats in a tile than a chunk
@@ -212,7 +210,6 @@ def test_several_layers_in_the_k_buffer(renderer):
     assert np.abs(got - expected).max() < 1e-6
 
 
-@in_turn()
 @pytest.mark.parametrize("seed", [1, 2])
 def test_intersecting_coplanar_groups(renderer, seed):
     """More layers at a pixel than the k-buffer holds; a completed layer may be in front of others."""
@@ -228,7 +225,6 @@ def test_a_real_marker_does_not_jump(renderer):
     assert largest_jump(renderer, camera_path(cloud, "centre", steps=3))[0] > 0.2
 
 
-@in_turn(1)
 @pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
 def test_a_marker_changes_no_pixel_that_it_does_not_cover(renderer, lens):
     """By `auto` the other splats are bit-identical to those by centre without the marker."""

@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.cli import main
@@ -249,7 +248,6 @@ def test_the_command_writes_as_many_bits_as_the_sensor_has(tmp_path, bits):
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
-@in_turn()
 @pytest.mark.parametrize("name", sorted(file.stem for file in EXAMPLES.glob("*.toml")))
 def test_the_examples_are_rendered(name, renderer):
     scene = fs.Scene.load(EXAMPLES / f"{name}.toml")

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from brute_force import ideal
 from random_scenes import HELD_OUT, random_scene
-from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.accuracy import cache, candidates, search
@@ -119,7 +118,6 @@ def coarse(renderer):
     return Choice(fs.Quality.named("fast"), 0.0, 1.0, 1.0, "measured", renderer.device.name, {})
 
 
-@in_turn()
 def test_a_choice_is_refined_until_certified(renderer):
     haze = layers(300, 1e-3)
     scene = fs.Scene([haze], camera=SMALL)
@@ -165,7 +163,6 @@ def test_the_definition_stays():
 # measured errors
 
 
-@in_turn()
 def test_a_measured_error_is_the_error(renderer, held_out):
     for scene, want in held_out[:6]:
         for bound in BOUNDS:
@@ -195,7 +192,6 @@ def test_errors_are_measured_before_the_sensor(renderer, held_out):
     assert dark.error == plain.error
 
 
-@in_turn(1)
 def test_a_measured_quality_is_faster_than_a_promised_one(renderer, held_out):
     """Most scenes need less than the hardest one."""
     cutoff = fs.quality_within(error=1e-3, device=renderer).alpha_cutoff
@@ -203,7 +199,6 @@ def test_a_measured_quality_is_faster_than_a_promised_one(renderer, held_out):
     assert np.median(own) > cutoff
 
 
-@in_turn()
 def test_choices_are_cached_and_a_damaged_file_is_replaced(renderer, scene, monkeypatch):
     first = within(renderer, scene, 1e-3)
     (file,) = cache.folder().iterdir()
@@ -222,7 +217,6 @@ def test_choices_are_cached_and_a_damaged_file_is_replaced(renderer, scene, monk
         assert json.loads(file.read_bytes())["settings"]
 
 
-@in_turn(1)
 def test_cache_keys_differ_by_question(renderer, scene):
     within(renderer, scene, 1e-3)
     within(renderer, scene, 1e-2)
@@ -234,7 +228,6 @@ def test_cache_keys_differ_by_question(renderer, scene):
     assert len(list(cache.folder().iterdir())) == 6
 
 
-@in_turn()
 def test_a_cache_folder_that_cannot_be_written_is_ignored(renderer, scene, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setattr(cache, "folder", lambda: tmp_path / "file" / "cache")
@@ -358,7 +351,6 @@ def test_an_impossible_time(renderer, scene, clock, ms):
         within(renderer, scene, ms=ms)
 
 
-@in_turn(1)
 def test_frames_are_timed(renderer, scene):
     choice = within(renderer, scene, ms=10_000)
     assert 0 < choice.ms <= choice.ms_late <= 10_000

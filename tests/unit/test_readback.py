@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
-from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.cli import main
@@ -138,7 +137,6 @@ def test_what_the_images_edge_cuts_off():
     assert visible(behind, camera).share == 0.0
 
 
-@in_turn()
 @pytest.mark.parametrize("spec", ["charuco:5x4:4x4_50", "gridboard:3x2:5x5_100", "aprilgrid:3x2:36h11"])
 def test_a_board_gives_one_pose(renderer, spec):
     """From half of its tags too, and a tag of another place in the image stays what it is."""

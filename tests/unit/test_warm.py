@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sampling import in_turn, sampled
+from sampling import sampled
 
 import fidsplat as fs
 from fidsplat.cli import main
@@ -31,7 +31,6 @@ def test_recipes_are_what_scenes_call_for():
     assert select(fs.SplatCloud.concatenate([capture, tag]), fs.Capture(outputs=("depth",))) in called_for
 
 
-@in_turn()
 @pytest.mark.parametrize("recipe", sampled(warming.recipes(), 3, 2), ids=lambda recipe: recipe.text)
 def test_a_recipe_compiles_what_its_words_say(renderer, recipe):
     ((done, seconds),) = warming.warm(renderer, [recipe])
