@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, from_json, read_text, user_cache
+from fidsplat.util.files import from_json, read_text, user_cache, write_json
 
 
 def folder() -> Path:
@@ -32,7 +31,6 @@ def save(key: str | None, value: dict[str, Any]) -> None:
         return
     try:
         folder().mkdir(parents=True, exist_ok=True)
-        with atomic_write(folder() / f"{key}.json") as stream:
-            stream.write(json.dumps(value, indent=1, allow_nan=False).encode())
+        write_json(folder() / f"{key}.json", value, indent=1)
     except (OSError, InputError):
         pass

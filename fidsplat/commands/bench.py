@@ -18,7 +18,7 @@ from fidsplat.commands.output import (
 from fidsplat.commands.scenes import Cameras, UserScenes, load_user_scenes
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write
+from fidsplat.util.files import write_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -180,9 +180,7 @@ class Bench:
     def _save(self, measuring: "Measuring", scenes: tuple[str, ...], interrupted: bool) -> None:
         if self.json in (None, "-"):
             return
-        with atomic_write(self.json) as stream:
-            stream.write(json_text(_record(measuring.results, scenes, interrupted)).encode())
-            stream.write(b"\n")
+        write_file(self.json, json_text(_record(measuring.results, scenes, interrupted)) + "\n")
 
 
 def _record(results: "list[Result]", scenes: tuple[str, ...], interrupted: bool) -> dict[str, Any]:

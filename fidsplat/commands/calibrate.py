@@ -39,7 +39,7 @@ class Calibrate:
 
         require_packages()
         from fidsplat.experiments.calibrate import errors_by_count, needed, rendered_views, write_chart
-        from fidsplat.util.files import atomic_write, writable_folder
+        from fidsplat.util.files import writable_folder, write_file
         from fidsplat.vision.calibration import parameters
 
         settings, folder = self.camera, writable_folder(self.out)
@@ -60,8 +60,7 @@ class Calibrate:
             "corner_rms_px": corner,
         }
         facts |= {"truth": parameters(settings.truth), "rows": rows, "needed": needed(rows)}
-        with atomic_write(file) as stream:
-            stream.write(json_text(facts).encode())
+        write_file(file, json_text(facts))
         write_chart(rows, Path(self.out) / "calibrate.svg")
         names = list(facts["truth"])
         table = [

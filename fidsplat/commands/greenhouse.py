@@ -7,7 +7,7 @@ from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Json, Overwrite
 from fidsplat.commands.output import report
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, path_of, writable_folder
+from fidsplat.util.files import path_of, writable_folder, write_file
 from fidsplat.worlds.greenhouse import Greenhouse as World
 from fidsplat.worlds.greenhouse import GreenhouseSettings
 
@@ -46,8 +46,7 @@ class Greenhouse:
             raise InputError(f"{scene_file} already exists; give another folder, or --overwrite")
         scene = made.scene
         writable_folder(folder)
-        with atomic_write(model) as stream:
-            stream.write(made.mjcf().encode())
+        write_file(model, made.mjcf())
         scene.save(scene_file)  # last, since the scene file marks a complete greenhouse
         plants, splats, markers = settings.rows * settings.plants, len(scene.cloud()), len(made.markers)
         facts = {"scene": str(scene_file), "model": str(model), "splats": splats, "markers": markers}

@@ -19,7 +19,7 @@ from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.setup import BACKGROUND, PROTOCOLS, Category, novel_cameras, training_cameras
 from fidsplat.util import interrupts
 from fidsplat.util.errors import DeviceError, InputError, unknown
-from fidsplat.util.files import atomic_write, from_json, read_text, user_cache, writable_folder
+from fidsplat.util.files import from_json, read_text, user_cache, writable_folder, write_json
 
 BPY = "bpy==5.0.1"
 VIEW_NAMES = ("standard", "raw")
@@ -61,8 +61,7 @@ def record_images(folder: Path, view: str, seed: int, samples: int) -> None:
     """Record the settings of the images of a view. Raises InputError for other settings."""
     check_images(folder, view, seed, samples)
     writable_folder(folder / view)
-    with atomic_write(_settings_file(folder, view)) as stream:
-        stream.write(json.dumps({"seed": seed, "samples": samples}).encode())
+    write_json(_settings_file(folder, view), {"seed": seed, "samples": samples})
 
 
 def _settings_file(folder: Path, view: str) -> Path:

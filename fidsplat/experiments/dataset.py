@@ -9,7 +9,6 @@ SCENE/marker.json                 spec, sizes, corners
 
 from __future__ import annotations
 
-import json
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
@@ -32,7 +31,7 @@ from fidsplat.experiments.views import exact_view
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.images.files import read_image, write_png
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, from_json, read_text, writable_folder
+from fidsplat.util.files import from_json, read_text, writable_folder, write_json
 
 POINTS = 1000
 """initial 3D points for trainers: random points on the plane with its colours"""
@@ -91,8 +90,7 @@ def write_scene(scene: dict, out: Path, seed: int, truth: str, blender: Path) ->
                 image = np.repeat(exact_view(spec, camera, truth == "exact-linear")[:, :, None], 3, axis=2)
             write_png(place / "images" / name, image)
         save_colmap(place / "sparse" / "0", names, cameras, points, colors)
-    with atomic_write(file) as stream:
-        stream.write(json.dumps(facts, indent=1).encode())
+    write_json(file, facts, indent=1)
     return folder
 
 

@@ -1,6 +1,5 @@
 """Demo: markers from text to splats, three rendered views, detection and comparison with ground truth."""
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from fidsplat.render.output_files import save_output
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.scenes.captured import fetch_scene
-from fidsplat.util.files import atomic_write, writable_folder
+from fidsplat.util.files import writable_folder, write_json
 from fidsplat.vision.readback import Reading, read_back
 from fidsplat.worlds.yard import OUTPUTS, demo_scene, demo_views, sunlit
 
@@ -159,8 +158,7 @@ def run_demo(
         seconds=time.perf_counter() - begun,
         files=[*files, folder / "demo.json"],
     )
-    with atomic_write(folder / "demo.json") as stream:
-        stream.write(json.dumps(result.as_dict(), indent=2).encode())
+    write_json(folder / "demo.json", result.as_dict(), indent=2)
     return result
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from fidsplat.formats.colmap import save_colmap
 from fidsplat.images.files import write_png
 from fidsplat.scenes import Scene
 from fidsplat.util.arguments import whole_number
-from fidsplat.util.files import atomic_write, writable_folder
+from fidsplat.util.files import writable_folder, write_json
 from fidsplat.worlds.yard import FOV_X, demo_scene
 
 POINTS = 6000
@@ -81,8 +80,7 @@ def write_demo_views(
                 progress("images", done / (views + test))
         save_colmap(out / "sparse" / "0", names, cameras, *_points(scene, seed))
     # written last, since it marks a complete data set
-    with atomic_write(folder / "dataset.json") as stream:
-        stream.write(json.dumps({"background": scene.background, "seed": seed}).encode())
+    write_json(folder / "dataset.json", {"background": scene.background, "seed": seed})
     return folder
 
 

@@ -12,10 +12,11 @@ import pandas as pd
 from markupsafe import Markup
 
 from fidsplat.experiments.summary import Frame
-from fidsplat.util.files import atomic_write, printable, writable_folder
+from fidsplat.util.files import printable, writable_folder, write_file
 from fidsplat.util.markup import escaped
 
 NOTHING = "-"
+TEMPLATES = Path(__file__).with_name("templates")
 
 
 def page_and_folder(out: Path) -> tuple[Path, Path]:
@@ -31,11 +32,12 @@ def page_and_folder(out: Path) -> tuple[Path, Path]:
 
 def write_page(page: Path, folder: Path, template: str, context: Mapping[str, Any]) -> None:
     """Fill a template and write the report. Arguments: see `fill_template`."""
-    with atomic_write(page) as stream:
-        stream.write(printable(fill_template(page, folder, template, context)).encode())
+    write_file(page, printable(fill_template(page, folder, template, context)))
 
 
-def fill_template(page: Path, folder: Path, template: str, context: Mapping[str, Any]) -> str:
+def fill_template(
+    page: Path, folder: Path, template: str, context: Mapping[str, Any], templates: Path = TEMPLATES
+) -> str:
     """Text of a template.
 
     Args:
@@ -43,9 +45,10 @@ def fill_template(page: Path, folder: Path, template: str, context: Mapping[str,
         folder: folder of charts; its name relative to the page is the variable `folder`.
         context: variables of the template; pandas tables have the filter `table`. Text except a `Markup` is
             escaped, since names of data sets and files may contain HTML.
+        templates: folder of the template.
     """
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
+        loader=jinja2.FileSystemLoader(templates),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

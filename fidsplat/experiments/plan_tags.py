@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.surface import Surface
 from fidsplat.scenes.up import scene_up
 from fidsplat.util.errors import InputError
+from fidsplat.util.files import write_json
 from fidsplat.vision.fisher_information import CornerNoise, tag_information
 from fidsplat.vision.tag_placement import (
     Objective,
@@ -424,11 +424,9 @@ def _free_ids(scene: Scene, settings: PlanSettings) -> list[int]:
 
 def write_plan(plan: Plan, folder: Path, size: float) -> list[Path]:
     """Write scene.toml, plan.json and map.svg into a folder; returns the files."""
-    from fidsplat.util.files import atomic_write
 
     plan.scene.save(folder / "scene.toml")
-    with atomic_write(folder / "plan.json") as stream:
-        stream.write(json.dumps(plan.facts(), indent=2).encode())
+    write_json(folder / "plan.json", plan.facts(), indent=2)
     _write_map(plan, folder / "map.svg", size)
     return [folder / name for name in ("scene.toml", "plan.json", "map.svg")]
 

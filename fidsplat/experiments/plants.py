@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -19,7 +18,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.train import Step, Trainer, TrainSettings, load_dataset
 from fidsplat.util.arguments import whole_number
 from fidsplat.util.errors import InputError, unknown
-from fidsplat.util.files import atomic_write, from_json, read_text, writable_folder
+from fidsplat.util.files import from_json, read_text, writable_folder, write_json
 from fidsplat.util.provenance import code_hash
 from fidsplat.worlds.plants import GOLDEN, KINDS, Mesh
 
@@ -150,8 +149,7 @@ def _record(settings: PlantSettings, folder: Path) -> None:
         raise InputError(f"cannot read {file}: {error}") from error
     if before != own:
         raise InputError(f"{folder} holds plants of {before}, not {own}; give another folder")
-    with atomic_write(file) as stream:
-        stream.write(json.dumps(own).encode())
+    write_json(file, own)
 
 
 def _render(settings: PlantSettings, mesh: Mesh, out: Path, python: Path, progress: Progress) -> None:
@@ -174,8 +172,7 @@ def _render(settings: PlantSettings, mesh: Mesh, out: Path, python: Path, progre
     points, colors = disks.world_means(), np.rint(255 * disks.colors).astype(np.uint8)
     for folder, names, cameras in sets:
         save_colmap(folder / "sparse" / "0", names, cameras, points, colors)
-    with atomic_write(out / "dataset.json") as stream:
-        stream.write(json.dumps({"background": BACKGROUND, "seed": settings.seed}).encode())
+    write_json(out / "dataset.json", {"background": BACKGROUND, "seed": settings.seed})
 
 
 def _train(

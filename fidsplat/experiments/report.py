@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from fidsplat.experiments.setup import CATEGORIES, COLLECTIONS, PROTOCOLS
 from fidsplat.experiments.sheets import sheet_files
 from fidsplat.experiments.summary import Frame, Row, provenance
 from fidsplat.experiments.views import LINEAR, TRUTHS
-from fidsplat.util.files import atomic_write, open_input
+from fidsplat.util.files import read_input, write_file
 
 _READERS = {"apriltag": ("pupil", "aruco"), "qr": ("zxing-tall", "zxing", "cv2")}
 """detectors of each kind by limit on the ideal texture; the first available one is shown"""
@@ -57,8 +56,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
     sheets = next((found for place in (*folders, folder) if (found := sheet_files(place))), [])
     for sheet in sheets:
         if sheet.parent.resolve() != folder.resolve():
-            with atomic_write(folder / sheet.name) as stream, open_input(sheet) as source:
-                shutil.copyfileobj(source, stream)
+            write_file(folder / sheet.name, read_input(sheet))
     commands = {name: "baseline" if name == trained.NAME else name for name in summaries}
     context |= {
         "sheets": [sheet.name for sheet in sheets],

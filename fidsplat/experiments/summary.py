@@ -20,7 +20,7 @@ import pandas as pd
 
 from fidsplat.experiments.sweep import Record
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, from_json, read_text
+from fidsplat.util.files import from_json, read_text, write_file
 
 _MARK = "# "
 Frame: TypeAlias = Any
@@ -55,8 +55,7 @@ class Summary:
             rows[name] = rows[name].mask(rows[name].eq(rows[name].shift()), "")
         text = "".join(f"{_MARK}{json.dumps(line)}\n" for line in lines)
         text += rows.to_csv(index=False, float_format="%.4g", lineterminator="\n")
-        with atomic_write(file) as stream:
-            stream.write(text.encode())
+        write_file(file, text)
         return read_summary(file)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, writable_folder
+from fidsplat.util.files import writable_folder, write_file
 
 _PINHOLE = 1  # id of the camera model PINHOLE: fx, fy, cx, cy
 _HEADS = {
@@ -85,8 +85,7 @@ def save_colmap(
     for name, head in _HEADS.items():
         for suffix, data in ((".txt", (head + texts[name]).encode()), (".bin", binaries[name])):
             files.append(target / f"{name}{suffix}")
-            with atomic_write(files[-1]) as stream:
-                stream.write(data)
+            write_file(files[-1], data)
     return files
 
 

@@ -31,7 +31,7 @@ from fidsplat.formats.plain import (
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, from_json, read_input
+from fidsplat.util.files import from_json, read_input, write_file
 from fidsplat.util.limits import check_expansion
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -123,8 +123,7 @@ def save_gltf(cloud: SplatCloud, path: Path) -> None:
         out = json.dumps(document).encode()
     else:
         out = pack_glb(document, binary)
-    with atomic_write(path) as stream:
-        stream.write(out)
+    write_file(path, out)
 
 
 def _primitive(names: list[str]) -> dict[str, Any]:

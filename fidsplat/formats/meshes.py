@@ -10,7 +10,7 @@ import numpy as np
 
 from fidsplat.formats.gltf import pack_glb
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write
+from fidsplat.util.files import write_file
 from fidsplat.util.response import to_light
 
 MESH_FORMATS = (".glb", ".ply", ".obj", ".stl", ".xml")
@@ -109,8 +109,7 @@ def save_mesh(mesh: TriangleMesh, path: Path, parts: int = 32) -> list[Path]:
     if suffix == ".xml":
         return _save_mujoco(mesh.convex_parts(parts), path)
     writer = {".glb": _glb, ".ply": _ply, ".obj": _obj, ".stl": _stl}[suffix]
-    with atomic_write(path) as stream:
-        stream.write(writer(mesh))
+    write_file(path, writer(mesh))
     return [path]
 
 
@@ -128,15 +127,13 @@ def check_mesh_file(path: Path) -> Path:
 def _save_mujoco(parts: list[TriangleMesh], path: Path) -> list[Path]:
     files = [path.with_name(f"{path.stem}-{k}.obj") for k in range(len(parts))]
     for part, file in zip(parts, files, strict=True):
-        with atomic_write(file) as stream:
-            stream.write(_obj(part))
+        write_file(file, _obj(part))
     names = [file.stem for file in files]
     assets = [f'    <mesh name="{n}" file="{n}.obj" inertia="convex"/>' for n in names]
     geoms = [f'      <geom type="mesh" mesh="{name}"/>' for name in names]
     lines = [f'<mujoco model="{path.stem}">', "  <asset>", *assets, "  </asset>", "  <worldbody>"]
     lines += [f'    <body name="{path.stem}">', *geoms, "    </body>", "  </worldbody>", "</mujoco>", ""]
-    with atomic_write(path) as stream:
-        stream.write("\n".join(lines).encode())
+    write_file(path, "\n".join(lines))
     return [path, *files]
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from fidsplat.formats.plain import cloud_of, coefficients, refuse_boxes, three_scales, world_means
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, from_json, open_input, read_input
+from fidsplat.util.files import atomic_write, from_json, open_input, read_input, write_file
 from fidsplat.util.limits import check_expansion
 
 MAX_PART, MAX_META = 2**30, 2**24
@@ -210,8 +210,7 @@ def save_sog_folder(cloud: SplatCloud, path: Path) -> None:
     parts = sog_parts(cloud)
     parts[path.name] = parts.pop("meta.json")  # last: it marks a complete scene
     for name, data in parts.items():
-        with atomic_write(path.with_name(name)) as stream:
-            stream.write(data)
+        write_file(path.with_name(name), data)
 
 
 def sog_parts(cloud: SplatCloud) -> dict[str, bytes]:

@@ -4,7 +4,6 @@ of splats of a SOG folder. Level 0 is the scene. Format: developer.playcanvas.co
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -16,7 +15,7 @@ import numpy as np
 from fidsplat.formats.sog import load_sog_folder, neighbour, save_sog_folder
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, from_json, read_input, writable_folder
+from fidsplat.util.files import from_json, read_input, writable_folder, write_json
 from fidsplat.util.limits import check_total
 
 META = "lod-meta.json"
@@ -180,5 +179,4 @@ def save_streamed(
         "filenames": files,
         "tree": children[0] if len(children) == 1 else {"bound": bound, "children": children},
     }
-    with atomic_write(path) as stream:
-        stream.write(json.dumps(document).encode())
+    write_json(path, document)

@@ -14,7 +14,7 @@ from fidsplat.formats.plain import cloud_of, plain_colors, refuse_boxes, three_s
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import C0
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, regular_file
+from fidsplat.util.files import regular_file, write_file
 from fidsplat.util.limits import check_expansion
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -51,5 +51,4 @@ def save_splat(cloud: SplatCloud, path: Path) -> None:
     rgba = np.column_stack([plain_colors(cloud), cloud.opacities])
     rows["rgba"] = np.rint(np.clip(rgba, 0, 1) * 255)
     rows["quat"] = np.clip(np.rint(cloud.quats * 128 + 128), 0, 255)
-    with atomic_write(path) as stream:
-        stream.write(rows.tobytes())
+    write_file(path, rows.tobytes())

@@ -22,7 +22,7 @@ from fidsplat.formats.plain import world_means as means_of
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util import zstd
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write
+from fidsplat.util.files import write_file
 from fidsplat.util.limits import check_expansion
 
 _HEAD = struct.Struct("<IIIBBBB")
@@ -224,8 +224,7 @@ def save_spz(cloud: SplatCloud, path: Path, version: int = 4) -> None:
         data = gzip.compress(head + b"".join(parts), mtime=0)
     else:
         data = _version_4(cloud, degree, point, [part for part in parts if part])
-    with atomic_write(path) as stream:
-        stream.write(data)
+    write_file(path, data)
 
 
 def _version_4(cloud: SplatCloud, degree: int, point: int, parts: list[bytes]) -> bytes:

@@ -24,7 +24,7 @@ from fidsplat.formats.colmap_read import image_poses
 from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.util.arguments import instance
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, from_json, path_of, read_input
+from fidsplat.util.files import from_json, path_of, read_input, write_file
 
 MAX_BYTES = 2**28
 """maximum bytes of a file; about two million poses in TUM's format"""
@@ -118,8 +118,7 @@ def save_trajectory(
         text = json.dumps(_transforms_json(trajectory, _camera(camera, file), names), indent=2) + "\n"
     else:
         raise InputError(f"the suffix of a trajectory must be one of {_SUFFIXES}, got {file}")
-    with atomic_write(file) as stream:
-        stream.write(text.encode())
+    write_file(file, text)
 
 
 def _rows(rows: np.ndarray) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from fidsplat.util.arguments import array_of
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, path_of, read_input, utf8_path
+from fidsplat.util.files import path_of, read_input, utf8_path, write_file
 from fidsplat.util.limits import check_expansion
 from fidsplat.util.streams import without_stderr
 
@@ -209,8 +209,7 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
     Raises InputError when the folder cannot be written, and for another shape.
     """
     data = encode_png(image)
-    with atomic_write(path) as stream:
-        stream.write(data)
+    write_file(path, data)
     return Path(path)
 
 

@@ -16,7 +16,7 @@ from fidsplat.render.output_files import save_output, suffixes_of
 from fidsplat.render.renderer import Renderer
 from fidsplat.store.store import Store
 from fidsplat.util.errors import FidsplatError, InputError
-from fidsplat.util.files import atomic_write
+from fidsplat.util.files import write_file
 
 Files = dict[tuple[str, str], bytes]
 """bytes of an image's files by output and suffix"""
@@ -99,8 +99,7 @@ def render_flight(folder: FlightFolder, engine: Engine, workers: int) -> Iterato
     complete here. Raises FidsplatError like `drain`."""
     for k, files in drain(engine, folder.remaining(), workers):
         for (name, suffix), content in _checked(files, k, folder.flight.capture.outputs).items():
-            with atomic_write(folder.file(k, name, suffix)) as stream:
-                stream.write(content)
+            write_file(folder.file(k, name, suffix), content)
         yield k
 
 

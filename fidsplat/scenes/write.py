@@ -17,7 +17,7 @@ from fidsplat.scenes.quality_settings import marker_settings, quality_tables
 from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.util.arguments import changes_of
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, path_of
+from fidsplat.util.files import path_of, write_file
 
 
 def write_scene(scene: SceneParts, path: str | os.PathLike[str]) -> None:
@@ -59,8 +59,7 @@ def write_scene(scene: SceneParts, path: str | os.PathLike[str]) -> None:
         raise InputError(
             f"cannot write {file}: a text in the scene is not Unicode ({error.reason})"
         ) from error
-    with atomic_write(file) as stream:
-        stream.write(content)
+    write_file(file, content)
 
 
 def marker_block(placed: PlacedMarker, folder: Path, quality: Quality | str | None = None) -> str:

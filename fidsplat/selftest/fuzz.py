@@ -24,7 +24,7 @@ from fidsplat.selftest.agreement import ALL_OUTPUTS, RARE, RISKY, FrameSpec, com
 from fidsplat.selftest.clouds import quaternion
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import quaternion_multiply, quaternion_to_matrix
-from fidsplat.util.files import atomic_write, from_json, read_text
+from fidsplat.util.files import from_json, read_text, write_file
 from fidsplat.util.provenance import code_hash
 
 LARGEST_SCENE = 200
@@ -206,8 +206,7 @@ def fuzz_run(renderer: Renderer, splats: int, file: Path | None = None) -> Itera
         now = time.monotonic()
         state.seconds = before + now - began
         if file is not None and (now - saved > _SAVE_EVERY or state.splats >= splats):
-            with atomic_write(file) as stream:
-                stream.write(json.dumps(asdict(state), indent=1).encode())
+            write_file(file, json.dumps(asdict(state), indent=1))  # errors may be infinite
             saved = now
         yield state
 

@@ -192,6 +192,19 @@ def atomic_write(path: str | os.PathLike[str], durable: bool = False) -> Iterato
             os.close(folder)
 
 
+def write_file(path: str | os.PathLike[str], content: bytes | str) -> Path:
+    """Write a file atomically, text as UTF-8. Raises InputError if it cannot be written."""
+    with atomic_write(path) as stream:
+        stream.write(content.encode() if isinstance(content, str) else content)
+    return Path(path)
+
+
+def write_json(path: str | os.PathLike[str], value: Any, indent: int | None = None) -> Path:
+    """Write plain data as a JSON file, atomically. Raises InputError if it cannot be written, and ValueError
+    for infinities and NaN."""
+    return write_file(path, json.dumps(value, indent=indent, allow_nan=False))
+
+
 @contextmanager
 def atomic_path(path: str | os.PathLike[str], suffix: str = "") -> Iterator[Path]:
     """An empty temporary file that is renamed to ``path`` after success, for libraries that open files.

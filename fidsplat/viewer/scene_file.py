@@ -12,7 +12,7 @@ import numpy as np
 from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.store.layout import SUFFIX as STORE
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, read_input
+from fidsplat.util.files import read_input, write_file
 
 _HEAD = re.compile(r"^[ \t]*\[.*$", re.MULTILINE)
 _TABLES = {
@@ -83,8 +83,7 @@ class SceneFile:
             raise InputError(
                 f"{self.path} was edited by another program; it is loaded again, and nothing was written"
             )
-        with atomic_write(self.path.resolve()) as stream:  # preserves symbolic links
-            stream.write(text.encode("utf-8"))
+        write_file(self.path.resolve(), text)  # preserves symbolic links
         self.text = self._last_read = text
 
     def _read(self) -> str:

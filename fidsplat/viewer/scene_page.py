@@ -24,7 +24,7 @@ from fidsplat.scenes.scene import Scene
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, path_of, read_input, user_cache
+from fidsplat.util.files import path_of, read_input, user_cache, write_file
 
 ENGINE = "FIDSPLAT_PLAYCANVAS"
 """environment variable with the path of a playcanvas.min.js that replaces the downloaded one"""
@@ -85,8 +85,7 @@ def save_page(scene: Scene, path: str | os.PathLike[str], title: str = "fidsplat
         engine=_in_script(engine),
         view=_in_script(json.dumps(view)),
     )
-    with atomic_write(path) as stream:
-        stream.write(page.encode())
+    write_file(path, page)
 
 
 def _in_script(text: str) -> str:
@@ -148,8 +147,7 @@ def _obtain(folder: Path, run: Callable[[list[str]], str]) -> None:
                 found = hashlib.sha256(data).hexdigest()
                 if found != expected:
                     raise InputError(f"{name} of playcanvas must have the SHA-256 {expected}, got {found}")
-                with atomic_write(folder / Path(name).name) as stream:
-                    stream.write(data)
+                write_file(folder / Path(name).name, data)
 
 
 def _npm(words: list[str]) -> str:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.images.files import write_png
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, from_json, read_text, writable_folder
+from fidsplat.util.files import from_json, read_text, writable_folder, write_json
 from fidsplat.vision.truth import Box, MarkerTruth, Truth
 from fidsplat.vision.visible import POINTS, outline
 
@@ -167,5 +166,4 @@ def _known(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _write(path: os.PathLike[str], content: Any) -> None:
-    with atomic_write(path) as stream:
-        stream.write(json.dumps(content, allow_nan=False).encode())
+    write_json(path, content)

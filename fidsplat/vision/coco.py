@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Mapping
@@ -12,7 +11,7 @@ import numpy as np
 
 from fidsplat.util.arguments import instance, text
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, ordinary_file
+from fidsplat.util.files import ordinary_file, write_json
 from fidsplat.vision.truth import GroupTruth, MarkerTruth, Truth
 from fidsplat.vision.visible import outline
 
@@ -64,8 +63,7 @@ class CocoAnnotations:
             "annotations": self._annotations,
             "categories": list(self._categories.values()),
         }
-        with atomic_write(ordinary_file(path)) as stream:
-            stream.write(json.dumps(content, allow_nan=False).encode())
+        write_json(ordinary_file(path), content)
 
     def _keep(self, image: Any, name: str, annotation: dict[str, Any], marker: bool) -> None:
         if name not in self._categories:

@@ -8,7 +8,6 @@ import pytest
 from ewa_error import linear_error
 
 import fidsplat as fs
-from fidsplat.backends.opencl.resident import Resident
 from fidsplat.capture.quality import ELLIPSOID, PRESETS, MarkerQuality
 from fidsplat.experiments.tradeoff import compare, run
 from fidsplat.experiments.tradeoff import session as session_module
@@ -23,7 +22,7 @@ from fidsplat.experiments.tradeoff.points import (
     quality_of,
 )
 from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make_view
-from fidsplat.experiments.tradeoff.session import QUICK, Effort, Session, memory_of, time_point
+from fidsplat.experiments.tradeoff.session import QUICK, Session, time_point
 from fidsplat.scenes.random_clouds import SCENES
 from fidsplat.selftest.clouds import camera, splats
 from fidsplat.selftest.hard_scene import CELLS, cell_window, hard_scene
@@ -143,13 +142,10 @@ def test_errors_are_those_of_the_cut_off():
     result = compare.compare_image(rendered(renderer, scene, cut), exact, scene, cut)
     # just outside the radius alpha is just below the cut-off
     assert 0.09 < result["maximum"] < 0.1
-    assert result["p999"] <= result["maximum"]
     assert result["rmse"] == pytest.approx(np.sqrt(((rendered(renderer, scene, cut) - exact) ** 2).mean()))
-    assert result["psnr"] == pytest.approx(-20 * np.log10(result["rmse"]))
     # no pixel's decision hangs on rounding, so certificates take nothing away
     assert result["maximum_sure"] == pytest.approx(result["maximum"], abs=1e-4)
-    same = compare.compare_image(exact.astype(np.float32), exact, scene, EXACT)
-    assert same["psnr"] is None or same["psnr"] > 120
+    assert compare.compare_image(exact.astype(np.float32), exact, scene, EXACT)["rmse"] < 1e-6
 
 
 def test_a_certified_flip_is_not_an_error():
@@ -191,27 +187,7 @@ def test_a_marker_is_compared_with_the_printed_texture(session):
         assert found["repeats"] >= QUICK.minimum
         assert found["ms"] > 0
         assert found["base_ms"] > 0
-        assert found["memory_bytes"] > 0
         assert found["ratio_quartiles"][0] <= found["ratio"] <= found["ratio_quartiles"][1]
-
-
-def test_memory_is_that_of_the_setting_only(session):
-    def memory(quality):
-        return time_point(session, "apriltag@0", quality, Effort(1, 1, 0.0))[1]["memory_bytes"]
-
-    small = memory(BASE)
-    assert memory(BASE.with_(samples=3, lowpass="none")) > 2 * small
-    assert memory(BASE) == small
-
-
-def test_memory_does_not_depend_on_earlier_frames(session, monkeypatch):
-    """As on a GPU, where a cloud keeps its colours once an image has requested them."""
-    held = property(lambda self: sum(buffer.size for buffer in self._buffers.values()))
-    monkeypatch.setattr(Resident, "memory_bytes", held)
-    before = memory_of(session, "apriltag@0", BASE)
-    session.render("apriltag@0", BASE.with_(samples=2))
-    assert before is not None
-    assert memory_of(session, "apriltag@0", BASE) == before
 
 
 def test_a_device_without_float64_is_compared_with_one_with_it(session, monkeypatch):
@@ -229,10 +205,6 @@ def test_a_definition_has_a_truth_of_its_own(session):
     )
     centre = BASE.with_(order="centre")
     assert np.abs(session.reference("apriltag@0", BASE) - session.reference("apriltag@0", centre)).max() > 0.1
-    full = session.full("hard", BASE)
-    found = compare.check_reference(session.reference("hard", BASE), session.scene("hard", BASE.marker), full)
-    assert found["pixels"] == 64
-    assert found["maximum"] < 2e-6
 
 
 def test_omissions_of_standard_are_invisible(session):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 from collections.abc import Callable
 
 import numpy as np
@@ -13,28 +12,22 @@ from fidsplat.capture.quality import MarkerQuality, Quality
 from fidsplat.experiments.angles import parse_tilts
 from fidsplat.experiments.plane import plane_image
 from fidsplat.experiments.setup import BACKGROUND
-from fidsplat.experiments.tradeoff.scenes import GREY, HARD, PROTOCOL, SEED, TradeScene, placed_marker
+from fidsplat.experiments.tradeoff.scenes import GREY, PROTOCOL, TradeScene, placed_marker
 from fidsplat.experiments.tradeoff.session import Session
 from fidsplat.images.files import to_uint8
 from fidsplat.selftest.agreement import FrameSpec, reference_images
-from fidsplat.selftest.hard_scene import CELLS, cell_window
 from fidsplat.util.errors import FidsplatError
-from fidsplat.vision.metrics import flip, has_flip, psnr
+from fidsplat.vision.metrics import psnr
 from fidsplat.vision.readback import corner_error, own_code
 from fidsplat.vision.readers import Target, attempt
 
 FULL_TILTS, QUICK_TILTS = "0:40:20,46:88:1", "0:40:40,48:88:4"
 READERS = {"apriltag": "aruco", "qr": "zxing"}
 """detectors: one installed detector for each kind of marker"""
-FLIP_SIDE = 256
-"""pixels: edge of the middle square for FLIP; the scene of hard cases is used completely"""
-NO_FLIP = "flip-evaluator is not installed; pip install 'fidsplat[experiments]'"
 _PAIRS = 2_000_000
 """maximum pixels times splats of the reference renderer per image"""
 _MAX_CERTIFICATES, _MIN_CERTIFICATES = 64, 12
 """pixels with certificates; none if fewer are possible"""
-_MAX_CHECKED = 64
-"""maximum number of pixels of a reference image that are checked"""
 
 
 def scan(session: Session, name: str, quality: Quality | None, tilts: str) -> Callable[[], dict]:
@@ -72,22 +65,16 @@ def compare_image(image: np.ndarray, reference: np.ndarray, scene: TradeScene, q
     """Errors of rgb (h, w, 3) relative to a reference image with the same image definition (order, low-pass
     ...).
 
-    Returns `maximum`, `p999`, `rmse`, `psnr` (None for equal images), `maximum_sure` (see
-    `beyond_certificates`), `flip`; for the hard cases `cells`, the largest error in each; for markers the
-    result of `compare_marker`.
+    Returns `maximum`, `rmse`, `maximum_sure` (see `beyond_certificates`), and for markers the result of
+    `compare_marker`.
     """
     found = errors(image, reference)
     difference = np.abs(image - reference).max(-1)
     result = {
         "maximum": found.maximum,
-        "p999": found.p999,
         "rmse": found.rmse,
-        "psnr": found.psnr if math.isfinite(found.psnr) else None,
         "maximum_sure": beyond_certificates(difference, scene, quality),
-        **_flip(image, reference, complete=scene.name == HARD),
     }
-    if scene.name == HARD:
-        result["cells"] = {name: float(difference[cell_window(i)].max()) for i, name in enumerate(CELLS)}
     return result if scene.marker is None else result | compare_marker(image, scene)
 
 
@@ -123,8 +110,8 @@ def beyond_certificates(difference: np.ndarray, scene: TradeScene, quality: Qual
 def compare_marker(image: np.ndarray, scene: TradeScene) -> dict:
     """Compare a marker with the ideal area-sampled texture.
 
-    Returns `ideal_psnr` in dB, `ideal_maximum`, `corners_px` (root mean square of corner errors; None if the
-    marker is not detected), and `rectangles` of the partition.
+    Returns `ideal_psnr` in dB, `corners_px` (root mean square of corner errors; None if the marker is not
+    detected), and `rectangles` of the partition.
     """
     marker = scene.marker
     assert marker is not None
@@ -134,34 +121,6 @@ def compare_marker(image: np.ndarray, scene: TradeScene) -> dict:
     ratio = psnr(grey, ideal)
     return {
         "ideal_psnr": ratio if math.isfinite(ratio) else None,
-        "ideal_maximum": float(np.abs(grey - ideal).max()),
         "corners_px": None if code is None else corner_error(code, scene.camera.project(marker.corners)),
         "rectangles": len(marker.boxes),
     }
-
-
-def check_reference(reference: np.ndarray, scene: TradeScene, full: Quality) -> dict:
-    """Compare a reference image with the NumPy reference at random pixels.
-
-    Returns their number `pixels` and `maximum`, the largest difference of their colours.
-    """
-    height, width = reference.shape[:2]
-    count = max(4, min(_MAX_CHECKED, _PAIRS // max(1, len(scene.cloud) * full.samples**2)))
-    chosen = random.Random(SEED).sample(range(height * width), min(count, height * width))
-    rows, columns = np.unravel_index(chosen, (height, width))
-    plain = full.with_(blend_precision="float32")
-    frame = FrameSpec(scene.cloud, scene.camera, plain, ("rgb",), scene.background)
-    expected = reference_images(frame, (rows, columns))["rgb"]
-    return {"pixels": len(rows), "maximum": float(np.abs(reference[rows, columns] - expected).max())}
-
-
-def _flip(rgb: np.ndarray, reference: np.ndarray, complete: bool) -> dict:
-    """FLIP of display values, and the part of the image."""
-    if not has_flip():
-        return {"flip": None, "flip_of": NO_FLIP}
-    height, width = reference.shape[:2]
-    side = (height, width) if complete else (min(FLIP_SIDE, height), min(FLIP_SIDE, width))
-    top, left = (height - side[0]) // 2, (width - side[1]) // 2
-    window = slice(top, top + side[0]), slice(left, left + side[1])
-    a, b = (np.clip(image[window], 0.0, 1.0) for image in (rgb, reference))
-    return {"flip": flip(a, b), "flip_of": f"{side[1]} x {side[0]} px in the middle"}

@@ -2,67 +2,28 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import pandas as pd
 
 from fidsplat.experiments.charts import Axes, chart, label_points, literal, plain_ticks
 from fidsplat.experiments.pages import NOTHING, fixed, number, page_and_folder, percent, write_page
-from fidsplat.experiments.summary import Frame, provenance
+from fidsplat.experiments.summary import Frame, Row, provenance
 from fidsplat.experiments.tradeoff.points import ABLATION, COMBINED, MARKER, PRESET
-from fidsplat.experiments.tradeoff.run import REFERENCE
-from fidsplat.experiments.tradeoff.scenes import GAUSSIANS_3D, HARD, RANDOM
+from fidsplat.experiments.tradeoff.scenes import HARD, RANDOM, is_marker
 from fidsplat.experiments.tradeoff.summary import TILT, DeviceResults, load
 from fidsplat.util.errors import InputError
 
 INVISIBLE = 1 / 512
 """half an 8-bit level"""
-_SMALLEST = 1e-7
+SMALLEST = 1e-7
 """lower limit of the error axis; smaller errors are plotted at this value"""
 SHOWN_MARKER = "qr10"
 """marker of the table of mixtures"""
-
-
-_EXACT = (ABLATION, "exact")
-"""setting and value of the exact image"""
-
-
-class Constant(NamedTuple):
-    """A constant of splat renderers, and the point that measures it."""
-
-    text: str
-    users: str
-    setting: str
-    value: str
-
-
-CONSTANTS = (
-    Constant("alpha below 1/255 is skipped", "3DGS, 2DGS, gsplat", ABLATION, "alpha_cutoff 1/255"),
-    Constant(
-        "splats are truncated at 3 sigma", "3DGS, 2DGS (bounding boxes)", ABLATION, "alpha_cutoff 3 sigma"
-    ),
-    Constant("blending stops at T = 1e-4", "our `standard`", ABLATION, "transmittance_stop 0.0001"),
-    Constant("blending stops at T = 1/256", "our `fast`", ABLATION, "transmittance_stop 1/256"),
-    Constant("stop at 1e-4 without the last fragment", "3DGS, 2DGS, gsplat", ABLATION, "stop_rule exclusive"),
-    Constant("alpha is clamped to 0.99", "3DGS, 2DGS, gsplat", ABLATION, "opacity_ceiling 0.99"),
-    Constant("projection in float32", "3DGS, 2DGS, gsplat, our `fast`", ABLATION, "setup_precision float32"),
-    Constant("exponentials by polynomials", "our `standard`, `fast`", ABLATION, "arithmetic fast"),
-    Constant("exponentials by GPU instructions", "3DGS, gsplat, HiGS", ABLATION, "arithmetic approximate"),
-    Constant("colours and transmittance in float16", "HiGS", ABLATION, "blend_precision float16"),
-    Constant("**`gsplat`**: gsplat's constants together", "gsplat, 2DGS", PRESET, "gsplat"),
-    Constant("**`fast`**: 2/255, T = 1/256, float32 set-up", "ours", PRESET, "fast"),
-    Constant("**`standard`**: 1e-5, T = 1e-4, exponentials", "ours", PRESET, "standard"),
-)
-ELLIPSOIDS = {
-    "ewa": "`ewa`: as 3DGS and gsplat",
-    "ewa_antialiased": "`ewa_antialiased`: as Mip-Splatting",
-    "exact": "`exact`",
-}
-"""projections of 3D Gaussians"""
+BASE, EXACT = ("base", "base"), (ABLATION, "exact")
+"""setting and value of the baseline, and of the exact image"""
 _LABELS = {
     (PRESET, "gsplat"): "gsplat",
     (PRESET, "fast"): "fast",
@@ -91,48 +52,50 @@ def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
     Raises InputError when there are no results or the folder cannot be written.
     """
     page, folder = page_and_folder(out)
-    context, files = report_content(folders, folder)
-    write_page(page, folder, "accuracy.md.j2", context)
+    devices, files = save_results(folders, folder)
+    every = list(devices.values())
+    repeated = {one.title for one, other in combinations(every, 2) if one.title == other.title}
+    titles = {
+        name: f"{device.title} ({name})" if device.title in repeated else device.title
+        for name, device in devices.items()
+    }
+    refused = (row for device in every for row in device.refused.itertuples())
+    context = {
+        "devices": [
+            {
+                "name": name,
+                "title": titles[name],
+                "chart": folder / f"{name}.svg" in files,
+                "settings": settings_table(device),
+                "markers": markers_table(device),
+            }
+            for name, device in devices.items()
+        ],
+        "choices": recommendations(every),
+        "refused": sorted({f"{row.knob} {row.value} ({row.error})" for row in refused}),
+        "runs": provenance({titles[name]: device.summary for name, device in devices.items()}),
+        "notes": [note for device in every for note in device.summary.notes],
+        "marker": f"{SHOWN_MARKER} at {TILT} degrees",
+    }
+    write_page(page, folder, "tradeoff.md.j2", context)
     return [page, *files]
 
 
-def report_content(folders: Sequence[Path], folder: Path) -> tuple[dict[str, Any], list[Path]]:
-    """Write the tables and charts of a report; returns the context of its template, and the files."""
+def save_results(folders: Sequence[Path], folder: Path) -> tuple[dict[str, DeviceResults], list[Path]]:
+    """Write a table and a chart of each device into a folder; returns the results by file name (cpu, gpu,
+    gpu-2 ...), and the files."""
     loaded = load(folders)
     names = _short_names(loaded)
     files = [folder / f"{name}.csv" for name in names]
-    devices = [DeviceResults(device.summary.write(file)) for device, file in zip(loaded, files, strict=True)]
-    shown = []
-    for device, name in zip(devices, names, strict=True):
-        scene = next(iter(_disk_scenes(device)), "")
-        if scene:
-            files.append(folder / f"{name}.svg")
-            write_chart([device], scene, files[-1])
-        facts = {"name": name, "kind": device.kind, "title": device.title, "scene": scene}
-        shown.append(facts | {"facts": _facts(device)})
-    repeated = {one.title for one, other in combinations(devices, 2) if one.title == other.title}
-    titles = {
-        f"{device.title} ({name})" if device.title in repeated else device.title: device.summary
-        for device, name in zip(devices, names, strict=True)
+    devices = {
+        name: DeviceResults(device.summary.write(file))
+        for name, device, file in zip(names, loaded, files, strict=True)
     }
-    disks = [device for device in devices if _disk_scenes(device)]
-    return {
-        "devices": shown,
-        "constants": constants_table(disks) if disks else None,
-        "ellipsoids": ellipsoids_table(devices),
-        "orders": orders_table(devices),
-        "markers": markers_table(devices[0]),
-        "choices": recommendations(disks),
-        "standard": max(_preset_error(device, "standard") for device in devices),
-        "fast": max(_preset_error(device, "fast") for device in devices),
-        "refused": sorted({f"{r.knob} {r.value} ({r.error})" for d in devices for r in _refused(d)}),
-        "checked": max(_reference_error(device) for device in devices),
-        "runs": provenance(titles),
-        "notes": [note for device in devices for note in device.summary.notes],
-        "marker": f"{SHOWN_MARKER} at {TILT} degrees",
-        "invisible": INVISIBLE,
-        "summary": False,
-    }, files
+    for name, device in devices.items():
+        if scenes := disk_scenes(device):
+            files.append(folder / f"{name}.svg")
+            write_chart([device], scenes[0], files[-1])
+    return devices, files
 
 
 def write_plot(folders: Sequence[Path], file: Path) -> None:
@@ -143,7 +106,7 @@ def write_plot(folders: Sequence[Path], file: Path) -> None:
     """
     devices = load(folders)
     first = devices[0]
-    for scene in dict.fromkeys((*_disk_scenes(first), *first.scenes)):
+    for scene in dict.fromkeys((*disk_scenes(first), *first.scenes)):
         if all(scene in device.scenes for device in devices):
             write_chart(devices, scene, file)
             return
@@ -169,7 +132,7 @@ def _plot(axes: Axes, device: DeviceResults, scene: str) -> list[tuple[float, fl
     points = device.same_definition(scene)
     points = points[points["value"] != "float64"]  # for reference images, and much slower
     points = points.assign(
-        error=points["maximum"].clip(lower=_SMALLEST),
+        error=points["maximum"].clip(lower=SMALLEST),
         label=[_LABELS.get(key) for key in zip(points["knob"], points["value"], strict=True)],
     )
     labelled = points[points["label"].notna()]
@@ -195,77 +158,30 @@ def _plot(axes: Axes, device: DeviceResults, scene: str) -> list[tuple[float, fl
     return list(labelled[["ms", "error", "label"]].itertuples(index=False, name=None))
 
 
-def constants_table(devices: Sequence[DeviceResults]) -> Frame:
-    """Time that each constant saves relative to the exact image, and its error; only measured constants."""
-    rows = []
-    shared = _shared_scene(devices)
-    has_hard = any(HARD in device.scenes for device in devices)
-    for constant in CONSTANTS:
-        point = (constant.setting, constant.value)
-        times, error = _compare(devices, shared, point, _EXACT)
-        errors = {shared: error} | ({HARD: _compare(devices, HARD, point, _EXACT)[1]} if has_hard else {})
-        if all(error is None for error in errors.values()):
-            continue
-        verdicts = [_verdict(device, constant) for device in devices]
-        rows.append(
-            {"constant": constant.text, "used by": constant.users}
-            | ({} if shared == HARD else {f"time, {device.kind}": NOTHING for device in devices} | times)
-            | {f"largest error, {scene}": number(error) for scene, error in errors.items()}
-            | {"verdict": " / ".join(dict.fromkeys(filter(None, verdicts)))}
-        )
-    return pd.DataFrame(rows)
+def settings_table(device: DeviceResults) -> Frame:
+    """Time of each setting relative to the base, its largest error, and a verdict on the first scene that has
+    it; for all scenes without markers."""
+    rows: dict[tuple[str, str], dict[str, str]] = {}
+    for scene in (name for name in device.scenes if not is_marker(name)):
+        for _, point in device.of(scene).iterrows():
+            key = point["knob"], point["value"]
+            row = rows.setdefault(
+                key, {"setting": key[0], "value": key[1], "verdict": verdict(device, point)}
+            )
+            row[f"time, {scene}"] = percent(point["ratio"])
+            row[f"largest error, {scene}"] = number(point["maximum"])
+    return pd.DataFrame(rows.values()).fillna(NOTHING)
 
 
-def _compare(
-    devices: Sequence[DeviceResults], scene: str, setting: tuple[str, str], base: tuple[str, str]
-) -> tuple[dict[str, str], float | None]:
-    """Columns of the time of a setting relative to another, and its largest error; None if not measured."""
-    times, errors = {}, []
-    for device in devices:
-        row, other = device.at(scene, *setting), device.at(scene, *base)
-        if row is not None and other is not None:
-            times[f"time, {device.kind}"] = percent(row["ratio"] / other["ratio"])
-            errors.append(row["maximum"])
-    return times, max(errors, default=None)
-
-
-def _verdict(device: DeviceResults, constant: Constant) -> str:
-    scene = _shared_scene([device])
-    point, exact = device.at(scene, constant.setting, constant.value), device.at(scene, *_EXACT)
-    if point is None or exact is None:
+def verdict(device: DeviceResults, point: Row, base: tuple[str, str] | None = None) -> str:
+    """Verdict on a setting relative to another one, by default to the base, or to the exact image if it is
+    changed there; empty for another definition of the image."""
+    base = base or (EXACT if point["knob"] == ABLATION else BASE)
+    other = device.at(point["scene"], *base)
+    if other is None or (point["knob"], point["value"]) == base or not device.is_comparable(point):
         return ""
-    verdict = device.verdict(point, exact)
-    return "no effect" if verdict == "dominated" and point["maximum"] <= INVISIBLE / 2 else verdict
-
-
-def ellipsoids_table(devices: Sequence[DeviceResults]) -> Frame:
-    """Time of each projection of 3D Gaussians relative to `ewa`, and its largest error."""
-    rows = []
-    for name, text in ELLIPSOIDS.items():
-        row = {"3D Gaussians": text}
-        for scene in GAUSSIANS_3D:
-            times, error = _compare(devices, scene, ("ellipsoid", name), ("ellipsoid", "ewa"))
-            if error is not None:
-                row |= {time.replace("time", f"time, {scene}"): value for time, value in times.items()}
-                row[f"largest error, {scene}"] = number(error)
-        if len(row) > 1:
-            rows.append(row)
-    return pd.DataFrame(rows)
-
-
-def orders_table(devices: Sequence[DeviceResults]) -> Frame:
-    """Time of compositing by depth per pixel relative to the order of centres, and the errors of both.
-
-    Errors are relative to the exact image in the same order.
-    """
-    rows, pixel, centre = [], ("order", "pixel"), ("order", "centre")
-    for scene in dict.fromkeys(scene for device in devices for scene in device.scenes):
-        times, error = _compare(devices, scene, pixel, centre)
-        if times:
-            errors = {"pixel": error, "centre": _compare(devices, scene, centre, pixel)[1]}
-            columns = {f"largest error, `{name}`": number(error) for name, error in errors.items()}
-            rows.append({"`pixel` relative to `centre`": scene} | columns | times)
-    return pd.DataFrame(rows).fillna(NOTHING)
+    found = device.verdict(point, other)
+    return "no effect" if found == "dominated" and point["maximum"] <= INVISIBLE / 2 else found
 
 
 def markers_table(device: DeviceResults) -> Frame:
@@ -297,7 +213,7 @@ def recommendations(devices: Sequence[DeviceResults]) -> list[dict[str, str]]:
     """Cheapest setting with an invisible error on each device, for random scenes and for all scenes."""
     found = []
     for device in devices:
-        every = _disk_scenes(device)
+        every = disk_scenes(device)
         kind = "one's own scenes" if device.own else "random scenes"
         for text, scenes in ((kind, [s for s in every if s != HARD]), ("all scenes", every)):
             best = device.cheapest_within(scenes, INVISIBLE) if scenes else []
@@ -309,53 +225,10 @@ def recommendations(devices: Sequence[DeviceResults]) -> list[dict[str, str]]:
     return found
 
 
-def _facts(device: DeviceResults) -> dict[str, str]:
-    """Comparison of `standard` with gsplat's constants on the plotted scene."""
-    scene = _shared_scene([device])
-    ours, theirs = (device.at(scene, PRESET, name) for name in ("standard", "gsplat"))
-    if ours is None or theirs is None:
-        return {}
-    same = device.same_definition(scene)
-    fastest = same[same["maximum"] <= theirs["maximum"]]["ratio"].min()
-    most_accurate = same[same["ratio"] <= theirs["ratio"] * 1.02]["maximum"].min()
-    return {
-        "time": percent(ours["ratio"] / theirs["ratio"]),
-        "better": f"{math.floor(theirs['maximum'] / max(ours['maximum'], _SMALLEST))}",
-        "at_error": percent(fastest / theirs["ratio"]),
-        "in_time": f"{math.floor(theirs['maximum'] / max(most_accurate, _SMALLEST))}",
-        "noise": f"{device.noise(scene):.0%}",
-    }
-
-
-def _preset_error(device: DeviceResults, preset: str) -> float:
-    """Largest error of a preset on scenes of disks."""
-    points = [device.at(scene, PRESET, preset) for scene in _disk_scenes(device)]
-    return max((point["maximum"] for point in points if point is not None), default=0.0)
-
-
-def _disk_scenes(device: DeviceResults) -> list[str]:
+def disk_scenes(device: DeviceResults) -> list[str]:
     """The user's scenes, random scenes of disks, the largest first, and the hard cases."""
     order = [*device.own, *reversed(RANDOM), HARD]
-    return sorted((s for s in device.scenes if s in order), key=order.index)
-
-
-def _shared_scene(devices: Sequence[DeviceResults]) -> str:
-    """First of the `_disk_scenes` that all devices have."""
-    shared = (s for s in _disk_scenes(devices[0]) if all(s in device.scenes for device in devices))
-    return next(shared, HARD)
-
-
-def _refused(device: DeviceResults):
-    rows = device.summary.rows
-    return rows[rows["error"].notna()].itertuples()
-
-
-def _reference_error(device: DeviceResults) -> float:
-    """Largest error of reference images with order `centre`; with `pixel`, the order of ties is undefined."""
-    rows = device.summary.rows
-    checks = rows[(rows["what"] == REFERENCE) & ~rows["value"].str.endswith(", pixel", na=False)]
-    worst = checks["maximum"].max()
-    return 0.0 if pd.isna(worst) else float(worst)
+    return sorted((scene for scene in device.scenes if scene in order), key=order.index)
 
 
 def _short_names(devices: Sequence[DeviceResults]) -> list[str]:

@@ -9,32 +9,30 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from fidsplat.accuracy.error import REFERENCE_CUTOFF
 from fidsplat.experiments.angles import parse_tilts
 from fidsplat.experiments.run import device_name
 from fidsplat.experiments.sweep import Key, Results, Sweep, TimeLimit, Work, thread_pool
 from fidsplat.experiments.tradeoff import compare, points, scenes
 from fidsplat.experiments.tradeoff.points import ABLATION, BASE, MARKER, PRESET, Point
-from fidsplat.experiments.tradeoff.session import DEFINITION, FULL, QUICK, Effort, Session, time_point
+from fidsplat.experiments.tradeoff.session import FULL, QUICK, Effort, Session, time_point
 from fidsplat.render.renderer import Renderer
 from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.provenance import run_facts
 from fidsplat.util.timing import frame_timer
-from fidsplat.vision.metrics import metric_versions
 from fidsplat.vision.readers import reader_versions
 
 NAME = "tradeoff"
 FILE = f"{NAME}.jsonl"
-POINT, DECODE, REFERENCE = "point", "decode", "truth"
-"""measurements in stored keys: of a quality, of the largest readable tilt, of a reference image"""
+POINT, DECODE = "point", "decode"
+"""measurements in stored keys: of a quality, of the largest readable tilt"""
 IDEAL = "ideal"
 _EARLY = ("base", PRESET, ABLATION, "alpha_cutoff", "transmittance_stop", MARKER)
 QUICK_SECONDS = 150.0
 """time limit of the measurement of --quick, which promises 3 minutes with loading and the last batch"""
 QUICK_VIEWS = 2
 """maximum number of views of a user's scene with --quick"""
-OVERHEAD, REFERENCE_FRAMES = 0.7, 8
-"""estimates: seconds of a point for compilation and evaluation; time of a reference image, in frames"""
+OVERHEAD = 0.7
+"""estimated seconds of a point for compilation and evaluation"""
 _BATCH = 16
 """maximum number of points whose images wait for evaluation"""
 
@@ -74,7 +72,7 @@ def prepared(
     info = renderer.device
     if info.always_float64:
         raise InputError(f"--device must not be the reference itself, got {info.name}; give another --device")
-    versions = reader_versions() | metric_versions() | {"pyopencl": version("pyopencl")}
+    versions = reader_versions() | {"pyopencl": version("pyopencl")}
     facts = run_facts(device_name(renderer), scenes.SEED, versions)
     facts |= {"kind": info.kind, "title": info.title} | ({"scene": scenes.digests(own)} if own else {})
     results = Results(out / FILE, facts, options.overwrite)
@@ -105,9 +103,6 @@ def estimated_seconds(session: Session, keys: list[Key], effort: Effort) -> floa
         if name not in frames:
             frames[name] = _frame_ms(session, key["scene"])
         frame = 1e-3 * frames[name]
-        if key["what"] == REFERENCE:
-            total += OVERHEAD + REFERENCE_FRAMES * frame * key["samples"] ** 2
-            continue
         samples = key["quality"].get("samples", 1) ** 2
         rounds = min(max(effort.minimum, effort.seconds / max(frame * (1 + samples), 1e-6)), effort.maximum)
         # own frames: the image, its memory, warm-up and rounds; of the baseline: warm-up and rounds
@@ -162,18 +157,11 @@ def own_points(views: Iterable[str], settings: tuple[str, ...], quick: bool) -> 
 
 
 def _view_points(view: str, varied: Iterable[Point], quick: bool) -> list[tuple[int, Key]]:
-    """Points of a view and checks of their reference images, with priorities."""
-    found: list[tuple[int, Key]] = []
-    definitions: set[tuple] = set()
-    for point in varied:
-        tier = 0 if point.setting in _EARLY else 2
-        found.append((tier, {"what": POINT, "scene": view, **point.key(), "quick": quick}))
-        definition = tuple(getattr(point.quality, name) for name in DEFINITION)
-        if point.setting != MARKER and definition not in definitions:
-            definitions.add(definition)
-            key = {"what": REFERENCE, "scene": view, **dict(zip(DEFINITION, definition, strict=True))}
-            found.append((tier + 1, key))
-    return found
+    """Points of a view, with priorities."""
+    return [
+        (0 if point.setting in _EARLY else 2, {"what": POINT, "scene": view, **point.key(), "quick": quick})
+        for point in varied
+    ]
 
 
 def _by_priority(found: list[tuple[int, Key]]) -> list[Key]:
@@ -186,12 +174,6 @@ def _begin(session: Session, key: Key, quick: bool) -> Work:
     if key["what"] == DECODE:
         quality = None if key["quality"] is None else points.quality_of(key["quality"])
         return compare.scan(session, view, quality, key["tilts"])
-    if key["what"] == REFERENCE:
-        quality = BASE.with_(**{name: key[name] for name in DEFINITION})
-        full, reference = session.full(view, quality), session.reference(view, quality)
-        scene = session.scene(view, quality.marker)
-        facts = {"blend_precision": full.blend_precision, "alpha_cutoff": REFERENCE_CUTOFF}
-        return lambda: facts | compare.check_reference(reference, scene, full)
     quality = points.quality_of(key["quality"])
     frame, times = time_point(session, view, quality, QUICK if quick else FULL)
     image, reference = frame["rgb"], session.reference(view, quality)

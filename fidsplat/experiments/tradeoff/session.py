@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from fidsplat.accuracy.error import full_precision, reference_image, reference_renderer
+from fidsplat.accuracy.error import reference_image, reference_renderer
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import MarkerQuality, Quality
 from fidsplat.experiments.tradeoff.points import BASE
@@ -74,11 +74,6 @@ class Session:
         ellipsoid = quality.ellipsoid if view in self._own else "exact"
         return BASE.with_(**defined, ellipsoid=ellipsoid, marker=quality.marker)
 
-    def full(self, view: str, quality: Quality) -> Quality:
-        """Quality of the reference image."""
-        capture = Capture(quality=self.definition(view, quality))
-        return full_precision(capture, self._precise).quality
-
 
 @dataclass(frozen=True)
 class Effort:
@@ -91,17 +86,16 @@ class Effort:
 
 FULL, QUICK = Effort(), Effort(3, 5, 0.2)
 SLOW = 3.0
-"""seconds of a first frame, with compilation, above which a quick measurement has one round"""
+"""seconds of a frame above which a quick measurement has one round"""
 
 
 def time_point(session: Session, view: str, quality: Quality, effort: Effort) -> tuple[Frame, dict]:
     """Render a view with a quality and with the base, interleaved; splats and images stay on the device.
 
     Returns the image, and `ms`, `base_ms` (medians), their quartiles, `ratio` (median of the pairs' ratios,
-    and its quartiles), `repeats`, `stages_ms` by the device's own clock, `memory_bytes` (scratch, cloud and
-    image; None if the backend does not report it), `splats`, `pairs`.
+    and its quartiles), `repeats`, `splats`, `pairs`.
     """
-    memory = memory_of(session, view, quality)
+    session.render(view, quality).wait()  # compiles
     begun = time.perf_counter()
     frame = session.render(view, quality).wait()
     slow = effort is QUICK and time.perf_counter() - begun > SLOW
@@ -121,20 +115,8 @@ def time_point(session: Session, view: str, quality: Quality, effort: Effort) ->
         seconds=effort.seconds,
         warm_up=1,
     )
-    result: dict = {"repeats": len(own.ms), "stages_ms": own.part_medians, "memory_bytes": memory}
+    result: dict = {"repeats": len(own.ms)}
     for name, values in (("ms", own.ms), ("base_ms", base.ms), ("ratio", ratios(own, base))):
         low, result[name], high = quartiles(values)
         result[f"{name.removesuffix('_ms')}_quartiles"] = [low, high]
     return frame, result | {name: frame.stats[name] for name in ("splats", "pairs")}
-
-
-def memory_of(session: Session, view: str, quality: Quality) -> int | None:
-    """Device memory of a frame in bytes: scratch, cloud and image; None if the backend does not report it."""
-    backend, scene = session.renderer.backend, session.scene(view, quality.marker)
-    if not backend.traits.measures_rates:
-        return None
-    backend.release_scratch()
-    # a cloud caches converted colours, so a new cloud is uploaded
-    resident = session.renderer.upload(scene.cloud)
-    session.renderer.render(resident, scene.capture, quality=quality)
-    return backend.memory_bytes + resident.memory_bytes + 12 * scene.camera.width * scene.camera.height

@@ -15,7 +15,7 @@ from fidsplat.experiments.angles import largest, parse_tilts
 from fidsplat.experiments.summary import Frame, Row, Summary, join, read_summary, summarise
 from fidsplat.experiments.sweep import Record, folder_records
 from fidsplat.experiments.tradeoff.points import PRESET, SETTINGS, Point, preset
-from fidsplat.experiments.tradeoff.run import DECODE, NAME, POINT, REFERENCE
+from fidsplat.experiments.tradeoff.run import DECODE, NAME, POINT
 from fidsplat.experiments.tradeoff.scenes import NAMES, is_marker, views_of
 from fidsplat.experiments.tradeoff.session import DEFINITION
 from fidsplat.util.errors import InputError
@@ -57,13 +57,9 @@ def rows_of(record: Record) -> Iterator[dict[str, Any]]:
         row["quality"] = quality_text(key["quality"])
         if "rectangles" in found:
             row["per_rectangle"] = found["splats"] / found["rectangles"]
-    elif kind == DECODE:
+    else:
         row["read_to"] = largest(parse_tilts(key["tilts"]), found["read"])[1]
         row["amount"] = len(found["read"])
-    else:
-        row["maximum"] = found["maximum"]
-        if kind == REFERENCE:
-            row["value"] = ", ".join(str(key[name]) for name in DEFINITION)
     yield row
 
 
@@ -137,6 +133,15 @@ class DeviceResults:
         order = found["knob"].map(list(("base", *SETTINGS)).index)
         found = found.iloc[order.argsort(kind="stable")]
         return found.assign(ms=self.base_ms(scene) * found["ratio"])
+
+    @property
+    def refused(self) -> Frame:
+        """Rows of settings that the device did not render, with the `error`."""
+        return self.summary.rows[self.summary.rows["error"].notna()]
+
+    def is_comparable(self, point: Row) -> bool:
+        """Whether a row has the low-pass, samples and order of the base setting."""
+        return point.name in self.same_definition(point["scene"]).index
 
     def same_definition(self, scene: str) -> Frame:
         """Rows with the low-pass, samples and order of the base setting, whose errors are comparable."""
