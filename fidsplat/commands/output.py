@@ -87,26 +87,21 @@ def progress_bar(where: Console, *columns: Any) -> Any:
 
 @contextmanager
 def steps_shown(where: Console, first: str) -> Iterator[Callable[[str], None]]:
-    """A callback that shows the current step of work of unknown length; for files and pipes, a line on stderr
-    every 30 s."""
-    if where.is_interactive:
-        with where.status(first) as status:
-            yield status.update
-        return
-    with progress_bar(where) as lines:
-        task = lines.add_task(first, total=None)
-        yield lambda step: lines.update(task, description=step)
+    """A callback that shows the current step of work of unknown length."""
+    from rich.progress import SpinnerColumn, TextColumn
+
+    with progress_bar(where, SpinnerColumn(), TextColumn("{task.description}")) as bar:
+        task = bar.add_task(first, total=None)
+        yield lambda step: bar.update(task, description=step)
 
 
 @contextmanager
-def delayed_progress(
-    where: Console | None = None, after: float = 1.0
-) -> Iterator[Callable[[str, float], None]]:
+def delayed_progress(after: float = 1.0) -> Iterator[Callable[[str, float], None]]:
     """A progress callback (description, share done) whose bar appears on stderr after some seconds.
 
     A thread watches the time, so that long work between two calls also shows the bar.
     """
-    bar = progress_bar(where or console(True))
+    bar = progress_bar(console(True))
     task = bar.add_task("", total=1.0)
     timer = threading.Timer(after, bar.start)
     timer.daemon = True

@@ -5,98 +5,55 @@ from __future__ import annotations
 import contextlib
 import sys
 import threading
-import time
-from dataclasses import dataclass, field
 from typing import Any
+
+from rich.console import Console
+from rich.progress import Progress, Task, TaskID
 
 PERIOD = 30.0
 """seconds between two lines"""
 
 
-@dataclass
-class Task:
-    """A task and its progress."""
-
-    description: str
-    total: float | None
-    """None: unknown"""
-    completed: float
-    fields: dict[str, Any]
-    first: float = field(init=False)
-    begun: float = field(default_factory=time.monotonic)
-
-    def __post_init__(self) -> None:
-        self.first = self.completed
-
-    def line(self) -> str:
-        """Description, amount done and time left, for example `training: 200 of 700, 1 min 20 s left`."""
-        elapsed, done = time.monotonic() - self.begun, self.completed - self.first
-        if self.total is None:
-            amount = f"{duration(elapsed)} so far"
-        elif self.total > 1:
-            amount = f"{self.completed:,.0f} of {self.total:,.0f}"
-        else:
-            amount = f"{100 * self.completed:.0f} %"
-        if self.total is not None and done > 0:
-            amount += f", {duration(max(elapsed * (self.total - self.completed) / done, 0.0))} left"
-        head = f"{self.description.strip()}: " if self.description.strip() else ""
-        now = str(self.fields.get("now", "")).strip()
-        return head + amount + (f" ({now})" if now else "")
-
-
-class ProgressLines:
-    """A line on stderr every 30 seconds, with the interface of rich's Progress."""
+class ProgressLines(Progress):
+    """rich's Progress that prints a line per task every 30 seconds instead of bars."""
 
     def __init__(self) -> None:
-        self._tasks: list[Task] = []
-        self._ended: threading.Event | None = None
+        super().__init__(console=Console(stderr=True))
+        self._ended = threading.Event()
 
-    def add_task(self, description: str, total: float | None, completed: float = 0.0, **fields: Any) -> int:
-        """Add a task; returns its number."""
-        self._tasks.append(Task(description, total, completed, fields))
-        return len(self._tasks) - 1
-
-    def update(
-        self,
-        number: int,
-        *,
-        completed: float | None = None,
-        advance: float = 0.0,
-        description: str | None = None,
-        **fields: Any,
-    ) -> None:
-        """Update the progress, description or fields of a task."""
-        task = self._tasks[number]
-        task.completed = (task.completed if completed is None else completed) + advance
-        task.description = task.description if description is None else description
-        task.fields |= fields
-
-    def advance(self, number: int, advance: float = 1.0) -> None:
-        """Advance a task."""
-        self.update(number, advance=advance)
+    def add_task(self, *words: Any, completed: int = 0, **options: Any) -> TaskID:
+        """Add a task, of which an earlier run may have completed a part."""
+        return super().add_task(*words, completed=completed, first=completed, **options)
 
     def start(self) -> None:
         """Start printing, by a thread, so that long work between two updates is also reported."""
-        self._ended = threading.Event()
-        threading.Thread(target=self._print, args=(self._ended,), name="progress", daemon=True).start()
+        threading.Thread(target=self._print, name="progress", daemon=True).start()
 
     def stop(self) -> None:
         """Stop printing."""
-        if self._ended is not None:
-            self._ended.set()
+        self._ended.set()
 
-    def __enter__(self) -> ProgressLines:
-        self.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.stop()
-
-    def _print(self, ended: threading.Event) -> None:
-        while not ended.wait(PERIOD):
+    def _print(self) -> None:
+        while not self._ended.wait(PERIOD):
             with contextlib.suppress(OSError, ValueError):  # stderr is closed
-                for task in self._tasks:
-                    print(task.line(), file=sys.stderr, flush=True)
+                for task in self.tasks:
+                    print(line_of(task), file=sys.stderr, flush=True)
+
+
+def line_of(task: Task) -> str:
+    """Description, amount done and time left, for example `training: 200 of 700, 1 min 20 s left`."""
+    elapsed, done = task.elapsed or 0.0, task.completed - task.fields["first"]
+    if task.total is None:
+        amount = f"{duration(elapsed)} so far"
+    elif task.total > 1:
+        amount = f"{task.completed:,.0f} of {task.total:,.0f}"
+    else:
+        amount = f"{100 * task.completed:.0f} %"
+    if task.remaining is not None and done > 0:
+        amount += f", {duration(max(elapsed * task.remaining / done, 0.0))} left"
+    head = f"{task.description.strip()}: " if task.description.strip() else ""
+    now = str(task.fields.get("now", "")).strip()
+    return head + amount + (f" ({now})" if now else "")
 
 
 def duration(seconds: float) -> str:

@@ -12,7 +12,7 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands import progress_lines
 from fidsplat.commands.output import console, delayed_progress, show_progress, steps_shown
-from fidsplat.commands.progress_lines import Task, duration
+from fidsplat.commands.progress_lines import ProgressLines, duration, line_of
 
 
 @pytest.fixture
@@ -58,10 +58,14 @@ def test_work_of_unknown_length_shows_its_step(capsys):
 
 
 def test_the_time_left_is_that_of_this_run():
-    task = Task("training", 7000, 2000, {"now": "loss 0.0412"})
-    task.begun -= 60
-    task.completed = 3000  # 1000 in a minute, 4000 are left; the first 2000 are of an earlier run
-    assert task.line() == "training: 3,000 of 7,000, 4 min 0 s left (loss 0.0412)"
+    now = [0.0]
+    bar = ProgressLines()
+    bar.get_time = lambda: now[0]
+    task = bar.add_task("training", total=7000, completed=2000, now="")
+    for now[0], completed in ((0.0, 2000), (30.0, 2500), (60.0, 3000)):
+        bar.update(task, completed=completed, now="loss 0.0412")
+    # 1000 in a minute, 4000 are left; the first 2000 are of an earlier run
+    assert line_of(bar.tasks[0]) == "training: 3,000 of 7,000, 4 min 0 s left (loss 0.0412)"
 
 
 def test_durations():
@@ -97,7 +101,7 @@ def test_a_closed_stderr_does_not_stop_the_work():
         "p.PERIOD = 0.01\n"
         "sys.stderr.close()\n"
         "with p.ProgressLines() as bar:\n"
-        "    bar.add_task('work', 2)\n"
+        "    bar.add_task('work', total=2)\n"
         "    time.sleep(0.1)\n"
         "print('done')\n"
     )
