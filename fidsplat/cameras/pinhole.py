@@ -345,6 +345,12 @@ class Camera(PickledByFields, Summarised):
         z = np.where(z > 0, z, np.nan)
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=1)
 
+    @property
+    def pixel_centres(self) -> np.ndarray:
+        """Pixel coordinates x, y of the centres of all pixels, (h, w, 2) float64."""
+        y, x = np.mgrid[0.5 : self.height, 0.5 : self.width]
+        return np.stack([x, y], -1)
+
     def rays(self, pixels) -> np.ndarray:
         """Directions (n, 3) float64 in the camera frame of pixel coordinates (n, 2), NaN outside
         the field of view.

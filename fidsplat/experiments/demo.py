@@ -1,15 +1,20 @@
-"""Demo: markers from text to splats, three rendered views, detection and comparison with ground truth."""
+"""Demo: markers from text to splats, three rendered views, detection and comparison with ground truth; and an
+AprilTag and a QR code in a captured scene."""
 
+from __future__ import annotations
+
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.experiments.captured_demo import run_captured
 from fidsplat.formats import save_ply
+from fidsplat.formats.files import load_splats
 from fidsplat.images.files import to_uint8, write_png
 from fidsplat.images.visualize import (
     colour_depth,
@@ -20,10 +25,13 @@ from fidsplat.images.visualize import (
     draw_outlines,
     normal_key,
 )
+from fidsplat.markers import marker
 from fidsplat.render.output_files import save_output
 from fidsplat.render.renderer import Renderer
-from fidsplat.scenes import Scene
-from fidsplat.scenes.captured import fetch_scene
+from fidsplat.scenes import PlacedMarker, Scene
+from fidsplat.scenes.captured import captured_scenes, fetch_scene
+from fidsplat.scenes.lights import Lighting
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util.files import writable_folder, write_json
 from fidsplat.vision.readback import Reading, read_back
 from fidsplat.worlds.yard import OUTPUTS, demo_scene, demo_views, sunlit
@@ -122,39 +130,32 @@ def run_demo(
     scene = Scene.load(files[0])
     resident = renderer.upload(scene)
 
-    sightings, unexpected, frame_ms, visible, columns = [], [], {}, {}, {}
-    for view, camera in demo_views().items():
-        progress(f"rendering and detecting: {view}")
-        images, frame_ms[view], visible[view] = _render(renderer, resident, scene, camera)
-        readings, others = read_back(images, scene, camera)
-        sightings += [Sighting(view, reading) for reading in readings]
-        unexpected += [code.name for code in others]
-        detected = [(r.detection.corners, r.placed.marker.spec) for r in readings if r.detection is not None]
-        outlined = draw_outlines(to_uint8(images["rgb"]), detected)
-        stem = folder / view.replace(" ", "-")
-        for name, image in images.items():
-            files += save_output(name, image, lambda kind, suffix, stem=stem: Path(f"{stem}-{kind}{suffix}"))
-        files.append(write_png(f"{stem}-detection.png", outlined))
-        columns[view] = (outlined, images["depth"], images["normal"])
-    files.append(write_png(folder / "contact-sheet.png", _sheet(columns)))
-    marker_splats = {p.marker.spec: len(p.marker.cloud) for p in scene.markers}
+    views = []
+    for name, camera in demo_views().items():
+        progress(f"rendering and detecting: {name}")
+        view = render_view(renderer, resident, scene, name, camera)
+        views.append(view)
+        stem = folder / name.replace(" ", "-")
+        for output, image in view.images.items():
+            files += save_output(output, image, lambda kind, end, stem=stem: Path(f"{stem}-{kind}{end}"))
+        files.append(write_png(f"{stem}-detection.png", view.outlined))
+    files.append(write_png(folder / "contact-sheet.png", _sheet(views)))
+    marker_splats = {placed.marker.spec: len(placed.marker.cloud) for placed in scene.markers}
     if captured is not None:
-        views, splats, image = run_captured(captured, renderer, folder, progress)
-        files.append(image)
+        shown, splats = run_captured(captured, renderer, progress)
+        views += shown
         marker_splats = splats | marker_splats
-        for one in views:
-            sightings += [Sighting(one.name, reading) for reading in one.readings]
-            unexpected += one.others
-            frame_ms[one.name], visible[one.name] = one.frame_ms, one.visible
+        row = [(view.name, view.outlined) for view in shown]
+        files.append(write_png(folder / f"{captured}.png", contact_sheet([row], width=_WIDTH)))
 
     result = DemoResult(
         device=renderer.device.title,
         background_splats=sum(len(cloud) for cloud in scene.clouds),
         marker_splats=marker_splats,
-        sightings=sightings,
-        unexpected=unexpected,
-        frame_ms=frame_ms,
-        visible_splats=visible,
+        sightings=[Sighting(view.name, reading) for view in views for reading in view.readings],
+        unexpected=[name for view in views for name in view.others],
+        frame_ms={view.name: view.frame_ms for view in views},
+        visible_splats={view.name: view.visible for view in views},
         seconds=time.perf_counter() - begun,
         files=[*files, folder / "demo.json"],
     )
@@ -162,24 +163,135 @@ def run_demo(
     return result
 
 
+@dataclass(frozen=True, eq=False)
+class DemoView:
+    """A rendered view with the markers that were read in it."""
+
+    name: str
+    images: dict[str, np.ndarray]
+    """output images by name"""
+    outlined: np.ndarray
+    """(h, w, 3) uint8, the image with the outlines of detected markers"""
+    readings: list[Reading]
+    others: list[str]
+    """names of detected codes that are not in the scene"""
+    frame_ms: float
+    """device time of a warm frame in milliseconds"""
+    visible: int
+    """splats after culling"""
+
+
+def render_view(
+    renderer: Renderer, resident: Any, scene: Scene, name: str, camera: Camera, outputs: Any = OUTPUTS
+) -> DemoView:
+    """Render a view, detect its markers and time warm frames."""
+    frame, frame_ms = _render(renderer, resident, scene, camera, outputs)
+    images = {output: frame[output] for output in frame.outputs}
+    readings, others = read_back(images, scene, camera)
+    detected = [(r.detection.corners, r.placed.marker.spec) for r in readings if r.detection is not None]
+    outlined = draw_outlines(to_uint8(images["rgb"]), detected)
+    names, visible = [code.name for code in others], int(frame.stats["visible"])
+    return DemoView(name, images, outlined, readings, names, frame_ms, visible)
+
+
 def _render(
-    renderer: Renderer, resident, scene: Scene, camera: Camera
-) -> tuple[dict[str, np.ndarray], float, int]:
-    """Output images, milliseconds of a warm frame, number of splats after culling."""
+    renderer: Renderer, resident: Any, scene: Scene, camera: Camera, outputs: Any
+) -> tuple[Any, float]:
+    """A frame, and the median device time of warm frames in milliseconds."""
     times = []
     for _ in range(1 + _FRAMES):
-        frame = renderer.render(resident, camera, outputs=OUTPUTS, background=scene.background)
+        frame = renderer.render(resident, camera, outputs=outputs, background=scene.background)
         times.append(sum(frame.timings.values()))
-    return {name: frame[name] for name in OUTPUTS}, float(np.median(times[1:])), int(frame.stats["visible"])
+    return frame, float(np.median(times[1:]))
 
 
-def _sheet(columns: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
+def _sheet(views: list[DemoView]) -> np.ndarray:
     """Contact sheet with a column per view: detections, depth and normals, with keys."""
-    span = depth_span(depth for _, depth, _ in columns.values())
+    span = depth_span(view.images["depth"] for view in views)
     rows = [
-        [(f"{view}: what was read", outlined) for view, (outlined, _, _) in columns.items()],
-        [(f"{view}: depth", colour_depth(depth, span)) for view, (_, depth, _) in columns.items()],
-        [(f"{view}: normals", colour_normals(normal)) for view, (_, _, normal) in columns.items()],
+        [(f"{view.name}: what was read", view.outlined) for view in views],
+        [(f"{view.name}: depth", colour_depth(view.images["depth"], span)) for view in views],
+        [(f"{view.name}: normals", colour_normals(view.images["normal"])) for view in views],
     ]
     keys = (lambda height: None, lambda height: depth_key(span, height), normal_key)
     return contact_sheet(rows, width=560, key=lambda row, height: keys[row](height))
+
+
+_WIDTH, _HEIGHT, _FOV_X = 800, 450, math.radians(50.0)
+_ANGLES = (-10.0, 30.0)
+"""degrees of the views about the vertical, from the front"""
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Positions of markers and cameras in a captured scene [m], y down."""
+
+    tag: tuple[float, float, float]
+    code: tuple[float, float, float]
+    size: float
+    target: tuple[float, float, float]
+    distance: float
+    background: tuple[float, float, float]
+    ambient: tuple[float, float, float]
+    """light of the studio, which the background does not show"""
+
+
+_LAYOUTS = {
+    "biker": _Layout(
+        (0.75, -1.3, -0.2),
+        (-1.15, -1.3, -0.2),
+        0.6,
+        (-0.15, -1.6, 0),
+        7.0,
+        (0.72, 0.74, 0.76),
+        (0.6, 0.61, 0.63),
+    ),
+    "playbot": _Layout(
+        (0.6, -0.2, -0.55),
+        (-0.6, -0.2, -0.55),
+        0.24,
+        (0, -0.45, -0.1),
+        3.0,
+        (0.16, 0.17, 0.2),
+        (0.45, 0.45, 0.5),
+    ),
+}
+
+
+def captured_scene(name: str, progress: Callable[[str, float], None] = lambda *_: None) -> Scene:
+    """A captured scene with an AprilTag and a QR code. Raises InputError as `fetch_scene`."""
+    path, layout = fetch_scene(name, progress), _LAYOUTS[name]
+    specs = (("apriltag:36h11:5", layout.tag), ("qr:fidsplat", layout.code))
+    placed = tuple(
+        PlacedMarker(
+            marker(spec, size=layout.size),
+            rigid_matrix(place),
+            light=Lighting(ambient=layout.ambient, rows=16, panoramas=2),
+        )
+        for spec, place in specs
+    )
+    return Scene((load_splats(path),), markers=placed, background=layout.background)
+
+
+def captured_views(name: str) -> dict[str, Camera]:
+    """Cameras on a circle around the front of a captured scene, slightly above."""
+    layout, views = _LAYOUTS[name], {}
+    for degrees in _ANGLES:
+        turn = math.radians(degrees)
+        away = layout.distance * np.array([math.sin(turn), -0.12, -math.cos(turn)])
+        position = np.array(layout.target) + away
+        views[f"{degrees:+.0f} degrees"] = Camera.look_at(_WIDTH, _HEIGHT, _FOV_X, position, layout.target)
+    return views
+
+
+def run_captured(
+    name: str, renderer: Renderer, progress: Callable[[str], None] = lambda _: None
+) -> tuple[list[DemoView], dict[str, int]]:
+    """Render and detect the markers of a captured scene; returns its views, and the splats of each marker."""
+    progress(f"reading the captured scene {name}")
+    scene, title, views = captured_scene(name), captured_scenes()[name].title, []
+    resident = renderer.upload(scene)
+    for view, camera in captured_views(name).items():
+        progress(f"rendering and detecting: {name}, {view}")
+        views.append(render_view(renderer, resident, scene, f"{title}, {view}", camera, ("rgb",)))
+    return views, {placed.marker.spec: len(placed.marker.cloud) for placed in scene.markers}

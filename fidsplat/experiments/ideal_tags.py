@@ -67,7 +67,6 @@ def _window(pose: np.ndarray, tag: PlacedMarker, camera: Camera) -> tuple[int, i
 
 def _depth(pose: np.ndarray, camera: Camera) -> np.ndarray:
     """Depth along z of the plane of a marker at each pixel, (h, w) metres."""
-    y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
-    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
+    rays = camera.rays(camera.pixel_centres.reshape(-1, 2)).reshape(camera.height, camera.width, 3)
     with np.errstate(divide="ignore"):
         return pose[:3, 2] @ pose[:3, 3] / (rays @ pose[:3, 2])

@@ -17,7 +17,7 @@ from fidsplat.capture.environment import Fog
 from fidsplat.capture.sensor import Sensor
 from fidsplat.formats.files import load_splats
 from fidsplat.markers import BoxEdge, Crumpled, Cylinder, Marker, Wear, marker
-from fidsplat.markers.surfaces import Surface
+from fidsplat.markers.surfaces import SheetShape
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.captured import fetch_scene
 from fidsplat.scenes.lights import Light, Lighting, PointLight, Sun
@@ -75,7 +75,7 @@ def scene_of(name: str) -> tuple[Scene, np.ndarray, float]:
 
 @cache
 def marker_of(
-    spec: str, size: float, lit: bool = False, shape: Surface | None = None, wear: Wear | None = None
+    spec: str, size: float, lit: bool = False, shape: SheetShape | None = None, wear: Wear | None = None
 ) -> Marker:
     """A marker with the colours of ink and paper; lit: black and white, for `Lighting`."""
     black, white = ((0.0,) * 3, (1.0,) * 3) if lit else _PRINT
@@ -96,7 +96,7 @@ def _lit(placed: PlacedMarker, light: Lighting) -> PlacedMarker:
 
 
 @lru_cache(32)
-def _changed(placed: PlacedMarker, shape: Surface | None = None, wear: Wear | None = None) -> PlacedMarker:
+def _changed(placed: PlacedMarker, shape: SheetShape | None = None, wear: Wear | None = None) -> PlacedMarker:
     made = placed.marker
     return replace(placed, marker=marker_of(made.spec, made.size, False, shape, wear))
 

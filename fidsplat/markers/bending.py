@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from fidsplat.markers.printing import Printed, refuse_more
-from fidsplat.markers.surfaces import Frames, Surface
+from fidsplat.markers.surfaces import Frames, SheetShape
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrices_to_quaternions, quaternion_multiply
 
@@ -45,7 +45,7 @@ def fine(printed: Printed) -> Printed:
 
 
 def subdivide(
-    spec: str, printed: Printed, surface: Surface, deviation: float, max_splats: int, whole: bool = False
+    spec: str, printed: Printed, surface: SheetShape, deviation: float, max_splats: int, whole: bool = False
 ) -> Printed:
     """Halve rectangles until they deviate from a surface by at most a bound.
 
@@ -100,7 +100,7 @@ def _rotated(pieces: np.ndarray, boxes: np.ndarray, angles: np.ndarray) -> np.nd
 
 
 def _deviations(
-    printed: Printed, surface: Surface, boxes: np.ndarray, owner: np.ndarray
+    printed: Printed, surface: SheetShape, boxes: np.ndarray, owner: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Maximum distances (n,) of rectangles from a surface, and (n, 2) those along their two axes."""
     module, middle = printed.module, np.array(printed.grid.shape[::-1]) / 2
@@ -122,7 +122,7 @@ def _deviations(
 
 
 def bend(
-    cloud: SplatCloud, surface: Surface, half: tuple[float, float], overlap: float, deviation: float
+    cloud: SplatCloud, surface: SheetShape, half: tuple[float, float], overlap: float, deviation: float
 ) -> SplatCloud:
     """Move the splats of a flat sheet to the tangent planes of a surface.
 
@@ -151,7 +151,7 @@ def bend(
 
 
 def _groups(
-    cloud: SplatCloud, surface: Surface, half: tuple[float, float], overlap: float
+    cloud: SplatCloud, surface: SheetShape, half: tuple[float, float], overlap: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows of the splats of all coplanar groups, their groups, and whether they are copies from a
     neighbour."""
@@ -171,7 +171,7 @@ def _groups(
     return found, groups, own[found] != groups
 
 
-def _borders(surface: Surface, way: np.ndarray, low: float, high: float) -> list[float]:
+def _borders(surface: SheetShape, way: np.ndarray, low: float, high: float) -> list[float]:
     """Positions across a surface between which its normal rotates by at most `TURN`."""
     normals = surface.frames(np.linspace(low, high, 65)[:, None] * way).normals
     if np.arccos(np.clip(normals @ normals.T, -1, 1)).max() <= TURN:
@@ -180,7 +180,7 @@ def _borders(surface: Surface, way: np.ndarray, low: float, high: float) -> list
     return [*_borders(surface, way, low, middle), *_borders(surface, way, middle, high)[1:]]
 
 
-def surface_frames(surface: Surface | None, xy: np.ndarray) -> Frames:
+def surface_frames(surface: SheetShape | None, xy: np.ndarray) -> Frames:
     """Points and tangents of positions (n, 2) of a sheet; None: a flat one."""
     if surface is not None:
         return surface.frames(xy)

@@ -35,7 +35,7 @@ from fidsplat.markers.printing import (
 )
 from fidsplat.markers.regions import label_components, polygons
 from fidsplat.markers.spec import Spec
-from fidsplat.markers.surfaces import Surface, surface_of
+from fidsplat.markers.surfaces import SheetShape, shape_of
 from fidsplat.markers.wear import Wear, wear_of, worn
 from fidsplat.util.arguments import (
     PickledByFields,
@@ -134,7 +134,7 @@ class Marker(PickledByFields):
     """modules of the code on each side of the square that `size` and `corners` measure"""
     inks: tuple[Ink, Ink] | None = None
     """RGB of the dark and of the light modules, as given; None: black and white, or a drawing's colours"""
-    shape: Surface | None = None
+    shape: SheetShape | None = None
     """surface that the sheet is bent to; None: flat"""
     wear: Wear | None = None
     """print defects and wear of the splats; grid and rectangles are those of the new marker; None: none"""
@@ -244,7 +244,7 @@ def marker(
     black: Ink | None = None,
     white: Ink | None = None,
     quality: MarkerQuality | None = None,
-    shape: Surface | str | None = None,
+    shape: SheetShape | str | None = None,
     wear: Wear | str | None = None,
     max_splats: int = MAX_SPLATS,
     progress: Progress | None = None,
@@ -296,7 +296,7 @@ def marker(
     each = 1 if chosen.mixture == "exact" else min(len(template.gaussians) for template in templates)
     inks = None if black is None and white is None else _inks(parsed, black, white)
     palette = np.array(parsed.colors or (inks or _INKS)[::-1], np.float32)
-    surface, old = surface_of(shape), wear_of(wear)
+    surface, old = shape_of(shape), wear_of(wear)
     if chosen.mixture == "facets" and not (surface is None and old is None):
         raise InputError("shape and wear must be left out with mixture facets; use exact or fitted")
     if surface is not None:
@@ -364,7 +364,7 @@ class _Sheet(NamedTuple):
     size: float
     module: float
     max_splats: int
-    surface: Surface | None
+    surface: SheetShape | None
 
     def boxes(self, printed: Printed, progress: Progress) -> SplatCloud:
         """One box for each rectangle, or for each piece of it."""

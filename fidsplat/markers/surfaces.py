@@ -50,7 +50,7 @@ class Frames(NamedTuple):
         return np.cross(self.along_x, self.along_y)
 
 
-class Surface:
+class SheetShape:
     """Base of the shapes, which are dataclasses; `kind` is their name in scene files."""
 
     kind: ClassVar[str]
@@ -74,8 +74,8 @@ class Surface:
         return None
 
 
-class _Along(Surface):
-    """Surface with an axis: straight lines of the sheet along `axis` stay straight."""
+class _Along(SheetShape):
+    """Shape with an axis: straight lines of the sheet along `axis` stay straight."""
 
     axis: str | tuple[float, ...]
 
@@ -275,7 +275,7 @@ class Cone(_Along):
 
 
 @dataclass(frozen=True)
-class Crumpled(Surface):
+class Crumpled(SheetShape):
     """Crumpled sheet: a height field of creases in random directions.
 
     Each plane wave of creases is shortened in its direction so that lengths are preserved; where waves cross,
@@ -339,26 +339,26 @@ def _squared_slopes(phase: np.ndarray) -> np.ndarray:
     return (phase / 2 + np.sin(phase) / 2 + CREASE**2 * phase - 2 * CREASE * grown * angle) / 4
 
 
-SURFACES: dict[str, type[Surface]] = {
+SHAPES: dict[str, type[SheetShape]] = {
     kind.kind: kind for kind in (Cylinder, Cone, BentSheet, BoxEdge, Crumpled)
 }
 """classes of shapes by their names in scene files"""
 
 
-def surface_of(shape: Surface | str | None) -> Surface | None:
+def shape_of(shape: SheetShape | str | None) -> SheetShape | None:
     """Convert a shape, its text or None (flat) to a shape: "cylinder,radius=0.05,axis=x".
 
     Raises:
         InputError: an unknown shape or field, a missing field, or a value out of range.
     """
+    if shape is None:
+        return None
     if not isinstance(shape, str):
-        return (
-            None if shape is None else instance("shape", shape, Surface, "a shape, its text or None", _REMEDY)
-        )
+        return instance("shape", shape, SheetShape, "a shape, its text or None", _REMEDY)
     name, *settings = (part.strip() for part in shape.split(","))
-    if name not in SURFACES:
-        raise InputError(unknown("shape", name, SURFACES))
-    return made_of("shape", SURFACES[name], parse_settings("shape", SURFACES[name], settings))
+    if name not in SHAPES:
+        raise InputError(unknown("shape", name, SHAPES))
+    return made_of("shape", SHAPES[name], parse_settings("shape", SHAPES[name], settings))
 
 
 def axis_of(axis: str | tuple[float, ...]) -> np.ndarray:

@@ -24,7 +24,7 @@ from fidsplat.render.reflection import (
     lobe,
     view_directions,
 )
-from fidsplat.render.shadows import LightPoint, Surface, light_points, unit, visibility
+from fidsplat.render.shadows import LightPoint, ReceiverPoints, light_points, unit, visibility
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.lights import GRIDS, Lighting, PointLight
 from fidsplat.splats.cloud import SplatCloud
@@ -133,7 +133,7 @@ class _Points(NamedTuple):
     """(m,) index of the splat"""
     counts: np.ndarray
     """(n, 2) points along the tangents of each splat"""
-    surface: Surface
+    surface: ReceiverPoints
     """the points in the world"""
 
     @property
@@ -221,7 +221,7 @@ def _points(placed: PlacedMarker, light: Lighting) -> _Points:
     # a marker is visible from its -z
     normals = -turns[owner, :, 2] @ pose[:3, :3].T
     clearance = placed.marker.size / 20 if light.clearance is None else light.clearance
-    surface = Surface(local @ pose[:3, :3].T + pose[:3, 3], normals, pitch, clearance)
+    surface = ReceiverPoints(local @ pose[:3, :3].T + pose[:3, 3], normals, pitch, clearance)
     return _Points(local, owner, counts, surface)
 
 

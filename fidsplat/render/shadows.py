@@ -23,7 +23,7 @@ _WIDEST = np.tan(np.radians(80))
 """tangent of the largest half field of view of a shadow map; beyond it there are no shadows"""
 
 
-class Surface(NamedTuple):
+class ReceiverPoints(NamedTuple):
     """Measured points of a marker."""
 
     points: np.ndarray
@@ -83,7 +83,12 @@ def light_points(light: Light, middle: np.ndarray) -> list[LightPoint]:
 
 
 def visibility(
-    point: LightPoint, surface: Surface, black: ResidentCloud, motion: Motion, extent: float, renderer: Any
+    point: LightPoint,
+    surface: ReceiverPoints,
+    black: ResidentCloud,
+    motion: Motion,
+    extent: float,
+    renderer: Any,
 ) -> np.ndarray:
     """Transmittance (m,) float32 between the surface's points and a point of a light; 0 where the surface
     faces away.

@@ -16,7 +16,7 @@ from fidsplat.capture.environment import Fog
 from fidsplat.capture.quality import MarkerQuality, Quality, setting_types
 from fidsplat.capture.sensor import Sensor
 from fidsplat.formats import Progress, load_splats
-from fidsplat.markers.surfaces import SURFACES, Surface
+from fidsplat.markers.surfaces import SHAPES, SheetShape
 from fidsplat.markers.wear import Wear
 from fidsplat.scenes.camera import POSE, TABLES, read_focal_lengths, read_keyframes, read_lens, read_shutter
 from fidsplat.scenes.environment import read_background, read_part
@@ -219,10 +219,10 @@ def _splats(table: Table, load: Callable[[str], SplatCloud]) -> tuple[SplatCloud
         return (cloud.transformed(pose) if moved else cloud), motion
 
 
-def _surface(table: Table) -> Surface:
+def _shape(table: Table) -> SheetShape:
     """Shape of a marker: the inline table `shape`."""
-    names = dict.fromkeys(name for kind in SURFACES.values() for name in names_of(kind))
-    kind, own = table.table("shape", ("kind", *names)).of_kind(SURFACES)
+    names = dict.fromkeys(name for kind in SHAPES.values() for name in names_of(kind))
+    kind, own = table.table("shape", ("kind", *names)).of_kind(SHAPES)
     with own.at():
         return kind(**own.values(kind))
 
@@ -240,7 +240,7 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progre
 
     limit = {} if max_splats is None else {"max_splats": max_splats}
     limit |= {name: table.numbers(name, 3) for name in ("black", "white") if name in table}
-    limit |= {"shape": _surface(table)} if "shape" in table else {}
+    limit |= {"shape": _shape(table)} if "shape" in table else {}
     if "wear" in table:
         own_wear = table.table("wear", names_of(Wear))
         with own_wear.at():

@@ -298,17 +298,11 @@ def _view(renderer: Renderer, scene: Scene, camera: Camera) -> DepthView:
     outputs = ("rgb", "depth_median", "normal")
     capture: Capture = replace(scene.capture, camera=camera, outputs=outputs, sensor=Sensor(), fog=None)
     frame = renderer.render(scene, capture)
-    rays = camera.rays(_pixels(camera)).reshape(camera.height, camera.width, 3)
+    rays = camera.rays(camera.pixel_centres.reshape(-1, 2)).reshape(camera.height, camera.width, 3)
     cosine = -(frame["normal"] * rays).sum(2) / np.linalg.norm(rays, axis=2)
     depth = frame["depth_median"].astype(np.float64)
     grey = to_light(frame["rgb"], "srgb") @ LUMINANCE
     return DepthView(depth, np.clip(grey, 0, 1), np.clip(cosine, 0, 1))
-
-
-def _pixels(camera: Camera) -> np.ndarray:
-    """Centres (n, 2) of all pixels, row by row."""
-    y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
-    return np.stack([x.ravel(), y.ravel()], 1)
 
 
 def _shifted(camera: Camera, right: float) -> Camera:
@@ -333,7 +327,7 @@ def _finer(camera: Camera, samples: int) -> Camera:
 
 def _stretch(camera: Camera) -> np.ndarray:
     """Distance along each pixel's ray per depth, (h, w)."""
-    rays = camera.rays(_pixels(camera))
+    rays = camera.rays(camera.pixel_centres.reshape(-1, 2))
     return np.linalg.norm(rays / rays[:, 2:], axis=1).reshape(camera.height, camera.width)
 
 
@@ -346,7 +340,7 @@ def _pooled(values: np.ndarray, samples: int) -> np.ndarray:
 def _seen_from(other: Camera, camera: Camera, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels x, y and depth (h, w) in another camera of the points of a depth image; cameras are parallel."""
     shift = (camera.world_to_camera - other.world_to_camera)[0, 3]
-    y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
+    x, y = np.moveaxis(camera.pixel_centres, -1, 0)
     moved = other.cx - camera.cx - camera.fx * shift / np.where(depth > 0, depth, math.inf)
     return x + moved, y, depth
 

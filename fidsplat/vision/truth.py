@@ -161,10 +161,8 @@ def points_of(depth: np.ndarray, camera: Camera) -> np.ndarray:
         raise InputError(
             f"the depth must have the camera's shape {(camera.height, camera.width)}, got {depth.shape}"
         )
-    y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
-    pixels = np.stack([x.ravel(), y.ravel()], 1)
     far = np.where(depth > 0, depth, np.nan)
-    return camera.unproject(pixels, far.ravel()).reshape(*depth.shape, 3)
+    return camera.unproject(camera.pixel_centres.reshape(-1, 2), far.ravel()).reshape(*depth.shape, 3)
 
 
 def optical_flow(
@@ -201,5 +199,4 @@ def optical_flow(
             matrix, own = np.asarray(motion, np.float64), label == value
             points[own] = points[own] @ matrix[:3, :3].T + matrix[:3, 3]
     moved = after.project(points.reshape(-1, 3)).reshape(*depth.shape, 2)
-    y, x = np.mgrid[0.5 : before.height, 0.5 : before.width]
-    return (moved - np.stack([x, y], -1)).astype(np.float32)
+    return (moved - before.pixel_centres).astype(np.float32)

@@ -8,8 +8,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.experiments import demo
-from fidsplat.experiments.captured_demo import run_captured
-from fidsplat.experiments.demo import Sighting
+from fidsplat.experiments.demo import Sighting, run_captured
 from fidsplat.images.files import read_image
 from fidsplat.worlds.yard import demo_scene
 
@@ -32,10 +31,10 @@ def drawn_once(pictures, monkeypatch):
     """One frame of each view is timed, and none is rendered again for a second demo."""
     draw = demo._render
 
-    def kept(renderer, resident, scene, camera):
+    def kept(renderer, resident, scene, camera, outputs):
         place = tuple(camera.position)
         if place not in pictures:
-            pictures[place] = draw(renderer, resident, scene, camera)
+            pictures[place] = draw(renderer, resident, scene, camera, outputs)
         return pictures[place]
 
     monkeypatch.setattr(demo, "_FRAMES", 1)
@@ -113,10 +112,9 @@ def test_the_demo_has_markers_in_a_captured_scene(tmp_path, monkeypatch):
     """A single splat stands for the capture, which would be downloaded."""
     blob = fs.SplatCloud([[0, -1.6, 0]], [[1, 0, 0, 0]], [[0.1, 0.1]], [0.9], colors=[[1, 0, 0]])
     fs.save_splats(blob, tmp_path / "blob.ply")
-    monkeypatch.setattr("fidsplat.experiments.captured_demo.fetch_scene", lambda *_: tmp_path / "blob.ply")
+    monkeypatch.setattr("fidsplat.experiments.demo.fetch_scene", lambda *_: tmp_path / "blob.ply")
     for name in ("biker", "playbot"):
-        views, splats, image = run_captured(name, fs.Renderer("opencl"), tmp_path)
-        assert image.name == f"{name}.png"
+        views, splats = run_captured(name, fs.Renderer("opencl"))
         assert set(splats) == {"apriltag:36h11:5", "qr:fidsplat"}
         assert all(Sighting(view.name, reading).passed for view in views for reading in view.readings)
         assert not any(view.others for view in views)
