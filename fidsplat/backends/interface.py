@@ -304,8 +304,8 @@ class GradientPipeline(ABC):
 
     @abstractmethod
     def backward(self, images: Any, gradients: Mapping[str, Any]) -> dict[str, Any]:
-        """Gradients of a loss with respect to splats, background and pose, from its gradients with respect to
-        the output images.
+        """Gradients of a loss with respect to splats, background and camera, from its gradients with respect
+        to the output images.
 
         Steps (the alpha cut-off, the transmittance stop, the near plane, the order of splats) have no
         derivative: they are constants of the frame.
@@ -321,8 +321,9 @@ class GradientPipeline(ABC):
             (quaternions need not be normalised); `screen` (n,), the norm of the gradient with respect to the
             projected centre in units of half images (dL_dmean2D of 2DGS trainers, for densification);
             `background` (3,); `pose` (6,): rotation vector [1 / rad] and translation [1 / m] of a motion
-            after world_to_camera, in the camera's axes. Splats that are not rendered have zeros. The arrays
-            are bit-identical on every run and valid until the next call.
+            after world_to_camera, in the camera's axes; `intrinsics` (4,): fx, fy, cx, cy [1 / px].
+            Splats that are not rendered have zeros. The arrays are bit-identical on every run and valid
+            until the next call.
 
         Raises:
             CapacityExceeded: `forward` did not wait, and the buffers were too small; the next frame has
@@ -413,7 +414,7 @@ class TrainingKernels(ABC):
         numbers: Mapping[str, float],
         camera: Camera | None,
         origin: np.ndarray,
-        pose: bool = False,
+        by_camera: bool = False,
     ) -> Callable[[], np.ndarray] | None:
         """Apply a step of Adam.
 
@@ -425,8 +426,8 @@ class TrainingKernels(ABC):
                 `opacity_penalty`, added to the gradients; `sparse`: 1 where splats on which the frame does
                 not depend are left unchanged.
             camera: if given, statistics are accumulated first, as by `accumulate_statistics`.
-            pose: whether to return a function that waits for the gradient (6,) of the loss with respect to
-                the camera pose.
+            by_camera: whether to return a function that waits for the gradient (10,) of the loss with
+                respect to the camera: pose and intrinsics.
         """
 
     @abstractmethod

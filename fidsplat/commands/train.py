@@ -128,6 +128,11 @@ class Train:
                 f"; poses moved by {moved['mean_m']:.4g} m and {moved['mean_deg']:.3g} degrees on average, "
                 f"{moved['largest_m']:.4g} m and {moved['largest_deg']:.3g} degrees at most"
             )
+        if settings.refine_intrinsics:
+            pairs = [(old.camera, new.camera) for old, new in zip(dataset.views, trainer.views, strict=True)]
+            focal = max(abs(new.fx / old.fx - 1) for old, new in pairs)
+            middle = max(abs(new.cx - old.cx) + abs(new.cy - old.cy) for old, new in pairs)
+            words += f"; focal lengths changed by {100 * focal:.3g} % and principal points by {middle:.3g} px"
         table = (title, ("view", "PSNR, dB", "SSIM"), rows) if scores else None
         return report(self.json, facts, words, facts["file"], *facts.get("report", []), table=table)
 
@@ -174,12 +179,13 @@ def _facts(trainer: Trainer, scores: list[ViewScore], seconds: float, done: int)
             **{"mean_m": float(mean_m), "mean_deg": float(mean_deg)},
             **{"largest_m": float(largest_m), "largest_deg": float(largest_deg)},
         }
-    if settings.refine_poses or settings.fit_exposures:
+    if settings.refines_cameras or settings.fit_exposures:
         gains = trainer.exposures
         refined["training_views"] = [
             {
                 "name": view.name,
                 "world_to_camera": view.camera.world_to_camera.tolist(),
+                **{key: getattr(view.camera, key) for key in ("fx", "fy", "cx", "cy")},
                 "gain": gain.tolist(),
                 "offset": offset.tolist(),
             }

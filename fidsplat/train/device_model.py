@@ -32,7 +32,6 @@ class DeviceModel:
         self._kernels, self._settings = kernels, settings
         self.max_pending_losses = kernels.max_pending_losses
         kernels.load_views([(view.image, view.mask) for view in views])
-        self._intrinsics = [view.camera for view in views]
         self._number = 0
 
     def load(self, splats: Splats) -> None:
@@ -86,9 +85,11 @@ class DeviceModel:
         value, gradient = self._kernels.loss(images, view, self._settings.dssim_weight, exposure)
         return lambda: Loss(*value()), gradient
 
-    def normal_loss_gradients(self, images: Images, view: int, weight: float) -> dict[str, Any]:
+    def normal_loss_gradients(
+        self, images: Images, view: int, camera: Camera, weight: float
+    ) -> dict[str, Any]:
         """Gradients of the weighted normal loss with respect to `depth` and `normal`."""
-        return self._kernels.normal_loss_gradients(images, view, self._intrinsics[view], weight)
+        return self._kernels.normal_loss_gradients(images, view, camera, weight)
 
     def backward_to_tiles(self, pipeline: Any, images: Images, gradients: Mapping[str, Any]) -> Any:
         """The backward pass up to the sums over tiles, for `accumulate_statistics` and `step`."""
@@ -107,7 +108,7 @@ class DeviceModel:
         origin: np.ndarray,
     ) -> Callable[[], np.ndarray] | None:
         """Apply one step of Adam. camera: if given, statistics are accumulated first. Returns a function that
-        waits for the gradient (6,) of the pose, if poses are refined."""
+        waits for the gradient (10,) of the camera, pose and intrinsics, if it is refined."""
         settings, count = self._settings, max(1, self._number)
         by_names = {
             "means": "means",
@@ -127,7 +128,7 @@ class DeviceModel:
             "scale_penalty": settings.scale_penalty / (settings.axes * count) if mcmc else 0.0,
             "opacity_penalty": settings.opacity_penalty / count if mcmc else 0.0,
         }
-        return self._kernels.step(taken, sizes, numbers, camera, origin, settings.refine_poses)
+        return self._kernels.step(taken, sizes, numbers, camera, origin, settings.refines_cameras)
 
     def add_noise(self, iteration: int, rate: float) -> None:
         """Add MCMC noise to the means. rate: learning rate of the means [m]."""

@@ -72,10 +72,11 @@ class HostModel:
         loss, gradient = exposed_loss(images.read("rgb", 0), target, of.mask, weight, exposure)
         return lambda: loss, gradient
 
-    def normal_loss_gradients(self, images: Images, view: int, weight: float) -> dict[str, np.ndarray]:
+    def normal_loss_gradients(
+        self, images: Images, view: int, camera: Camera, weight: float
+    ) -> dict[str, np.ndarray]:
         """Gradients of the weighted normal loss with respect to `depth` and `normal`."""
-        of = self._views[view]
-        camera, weights = of.camera, np.float32(weight) * images.read("alpha", 0)
+        of, weights = self._views[view], np.float32(weight) * images.read("alpha", 0)
         if of.mask is not None:
             weights *= of.mask
         lens = (camera.fx, camera.fy), (camera.cx, camera.cy)
@@ -104,7 +105,7 @@ class HostModel:
         origin: np.ndarray,
     ) -> Callable[[], np.ndarray] | None:
         """Apply one step of Adam. camera: if given, statistics are accumulated first. Returns a function that
-        returns the gradient (6,) of the pose, if poses are refined."""
+        returns the gradient (10,) of the camera, pose and intrinsics, if it is refined."""
         if camera is not None:
             self.accumulate_statistics(gradients, camera, origin)
         arrays = {name: on_host(array) for name, array in gradients.items()}
@@ -113,7 +114,9 @@ class HostModel:
             sparse_adam_step(self._splats, contributing(arrays), raw, rate, self._settings, step)
         else:
             adam_step(self._splats, raw, rate, self._settings, step)
-        return (lambda: arrays["pose"]) if self._settings.refine_poses else None
+        if not self._settings.refines_cameras:
+            return None
+        return lambda: np.concatenate([arrays["pose"], arrays["intrinsics"]])
 
     def add_noise(self, iteration: int, rate: float) -> None:
         """Add MCMC noise to the means. rate: learning rate of the means [m]."""

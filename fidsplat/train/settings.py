@@ -100,10 +100,14 @@ class TrainSettings:
     refine_poses: bool = False
     """refine the camera pose of each training view; held-out views are then localised before they are
     evaluated"""
+    refine_intrinsics: bool = False
+    """refine fx, fy, cx and cy of each camera; views and held-out views with equal intrinsics share them.
+    Distortion is not refined"""
     pose_rate: float = 5e-3
-    """initial learning rate of poses: radians, and metres per metre of depth"""
+    """initial learning rate of poses and intrinsics: radians, metres per metre of depth, and pixels per pixel
+    of focal length"""
     pose_rate_end: float = 5e-5
-    """learning rate of poses at the last iteration"""
+    """learning rate of poses and intrinsics at the last iteration"""
     fit_exposures: bool = False
     """fit a gain and an offset of each channel for each training view: exposure and white balance; those of
     held-out views are fitted before they are evaluated"""
@@ -169,7 +173,7 @@ class TrainSettings:
         if not isinstance(self.quality, str):  # checkpoints store it as text
             raise InputError(f"training: quality must be text such as 'surfel', got {self.quality!r}")
         Quality.of(self.quality)
-        for name in ("sparse_adam", "refine_poses", "fit_exposures"):
+        for name in ("sparse_adam", "refine_poses", "refine_intrinsics", "fit_exposures"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(f"training: {name} must be True or False, got {getattr(self, name)!r}")
         for field in fields(self):
@@ -196,7 +200,7 @@ class TrainSettings:
         return self.position_rate ** (1 - share) * self.position_rate_end**share
 
     def pose_rate_at(self, iteration: int) -> float:
-        """Learning rate of poses at an iteration."""
+        """Learning rate of poses and intrinsics at an iteration."""
         return self._decayed(iteration, self.pose_rate, self.pose_rate_end)
 
     def exposure_rate_at(self, iteration: int) -> float:
@@ -241,6 +245,11 @@ class TrainSettings:
         every += [self.normal_from + 1] if self.normal_weight else []
         every += [self.distortion_from + 1] if self.distortion_weight else []
         return min((one for one in every if iteration < one <= self.iterations), default=None)
+
+    @property
+    def refines_cameras(self) -> bool:
+        """Whether steps need the gradient of the camera."""
+        return self.refine_poses or self.refine_intrinsics
 
     @property
     def axes(self) -> int:

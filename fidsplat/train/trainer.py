@@ -39,7 +39,7 @@ from fidsplat.train.parameters import Splats, TrainingError, initial_splats, spl
 from fidsplat.train.random_numbers import Purpose, permutation
 from fidsplat.train.scores import ViewScore, score_view
 from fidsplat.train.settings import TrainSettings
-from fidsplat.train.view_refinement import ViewRefinement, with_exposure_of
+from fidsplat.train.view_refinement import INTRINSICS_EVERY, ViewRefinement, with_exposure_of
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import callback, instance, invalid, items, settings_with
 from fidsplat.util.errors import DeviceError, InputError
@@ -122,14 +122,14 @@ class Trainer:
             else HostModel(backend, dataset.views, self.settings)
         )
         self._refinement = None
-        if self.settings.refine_poses or self.settings.fit_exposures:
+        if self.settings.refines_cameras or self.settings.fit_exposures:
             self._refinement = ViewRefinement(dataset, self.settings)
         self._state = self._begin(start, restart)
         self._model.load(self._state.splats)
         self._pending: deque[tuple[int, int, Callable[[], Loss]]] = deque()
         """iterations and indices of views whose losses are not read yet"""
-        self._pose_gradients: deque[tuple[int, int, Callable[[], np.ndarray]]] = deque()
-        """the same for gradients of poses"""
+        self._camera_gradients: deque[tuple[int, int, Callable[[], np.ndarray]]] = deque()
+        """the same for gradients of cameras"""
         self._unreported: deque[tuple[int, str, Loss]] = deque()
         """unreported losses"""
         self._failure: TrainingError | None = None
@@ -194,8 +194,8 @@ class Trainer:
 
     @property
     def views(self) -> tuple[TrainingView, ...]:
-        """The training views, with refined cameras if poses are refined."""
-        self._refine_poses()
+        """The training views, with refined cameras."""
+        self._refine_cameras()
         if self._refinement is None:
             return self.dataset.views
         refinement = self._refinement
@@ -205,7 +205,7 @@ class Trainer:
 
     def pose_changes(self) -> np.ndarray:
         """(views, 2): metres and degrees by which the refined poses differ from those of the data set."""
-        self._refine_poses()
+        self._refine_cameras()
         if self._refinement is None or not self.settings.refine_poses:
             return np.zeros((len(self.dataset.views), 2))
         return self._refinement.pose_changes()
@@ -226,7 +226,7 @@ class Trainer:
         not finite."""
         splats, origin, matrix = self._checked_splats(), self.dataset.origin, np.eye(4)
         if self._refinement is not None and self.settings.refine_poses:
-            self._refine_poses()
+            self._refine_cameras()
             matrix = self._refinement.to_given()
         if self.dataset.boxes:
             means = (splats.values["means"] + origin) @ matrix[:3, :3].T + matrix[:3, 3]
@@ -249,7 +249,7 @@ class Trainer:
         if self.checkpoint is None:
             return
         self._state.splats = self._checked_splats()
-        self._refine_poses()
+        self._refine_cameras()
         views = {} if self._refinement is None else self._refinement.arrays()
         state = TrainingState(self.iteration, self._state.splats, self.history, views)
         title = self.renderer.device.title
@@ -268,6 +268,10 @@ class Trainer:
         views = self.dataset.held_out if views is None else views
         views = items("views", views, TrainingView, "a list of TrainingView")
         resident = self.renderer.upload(self.cloud())
+        refined = self._refinement
+        if refined is not None:
+            cameras = (refined.with_intrinsics(view.camera, view.camera) for view in views)
+            views = tuple(replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True))
         captures = [self._capture(view) for view in views]
         if self.settings.refine_poses:
             captures = [self._localised(*pair, resident) for pair in zip(views, captures, strict=True)]
@@ -307,7 +311,12 @@ class Trainer:
         self._densify()
         iteration = state.iteration + 1
         number = self._view_at(iteration)
-        self._refine_poses(of=number)
+        if settings.refine_intrinsics and iteration % INTRINSICS_EVERY == 0:
+            self._refine_cameras()
+            assert self._refinement is not None
+            self._refinement.change_intrinsics(iteration)
+        self._refine_cameras(of=number)
+        self._use_camera(number)
         if settings.fit_exposures and self._refinement is not None:
             first = (iteration - 1) % len(self.dataset.views) == 0
             if first or any(of == number for _, of, _ in self._pending):
@@ -322,9 +331,9 @@ class Trainer:
         full = len(self._pending) > self._model.max_pending_losses
         if not late or full or settings.densifies_after(iteration):
             self._read_losses()  # read late, so that the device is busy meanwhile
-        by_pose = self._update(gradients, iteration, self._camera(number))
-        if by_pose is not None:
-            self._pose_gradients.append((iteration, number, by_pose))
+        by_camera = self._update(gradients, iteration, self._camera(number))
+        if by_camera is not None:
+            self._camera_gradients.append((iteration, number, by_camera))
         state.iteration = iteration
         state.history["counts"][iteration - 1] = len(self._model)
 
@@ -356,37 +365,40 @@ class Trainer:
         if self._failure is not None:
             raise self._failure
 
-    def _refine_poses(self, of: int | None = None) -> None:
-        """Apply the gradients of poses that are not applied yet. A view is rendered with the pose after all
+    def _refine_cameras(self, of: int | None = None) -> None:
+        """Apply the gradients of cameras that are not applied yet. A view is rendered with the pose after all
         its earlier iterations, whenever their gradients are read.
 
         of: only if one of them is of this view.
         """
         refinement = self._refinement
         if refinement is None or (
-            of is not None and all(number != of for _, number, _ in self._pose_gradients)
+            of is not None and all(number != of for _, number, _ in self._camera_gradients)
         ):
             return
-        while self._pose_gradients:
-            iteration, number, read = self._pose_gradients.popleft()
-            by_pose = read()
-            if not np.isfinite(by_pose).all():
+        while self._camera_gradients:
+            iteration, number, read = self._camera_gradients.popleft()
+            by_camera = read()
+            if not np.isfinite(by_camera).all():
                 raise TrainingError(
-                    f"the gradient of the pose of {self.dataset.views[number].name} is not finite at "
+                    f"the gradient of the camera of {self.dataset.views[number].name} is not finite at "
                     f"iteration {iteration}; " + self._checkpoint_state()
                 )
-            refinement.move(number, by_pose, iteration)
-            self._set_camera(number, refinement.cameras[number])
+            if self.settings.refine_poses:
+                refinement.move(number, by_camera[:6], iteration)
+            refinement.add_intrinsics(number, by_camera[6:])
 
     def _camera(self, number: int) -> Camera:
         """The current camera of a training view."""
         refined = self._refinement
         return self.dataset.views[number].camera if refined is None else refined.cameras[number]
 
-    def _set_camera(self, number: int, camera: Camera) -> None:
-        """Render a training view with another camera from now on."""
-        self._captures[number] = replace(self._captures[number], camera=camera)
-        self._surface_captures[number] = replace(self._surface_captures[number], camera=camera)
+    def _use_camera(self, number: int) -> None:
+        """Render a training view with its current camera from now on."""
+        camera = self._camera(number)
+        if self._captures[number].camera is not camera:
+            self._captures[number] = replace(self._captures[number], camera=camera)
+            self._surface_captures[number] = replace(self._surface_captures[number], camera=camera)
 
     def _steps(self) -> Iterator[Step]:
         """Unreported steps."""
@@ -419,7 +431,7 @@ class Trainer:
         loss, by_rgb = self._model.loss(images, number, exposure)
         by_images = {"rgb": by_rgb}
         if by_normals:
-            by_images |= self._model.normal_loss_gradients(images, number, by_normals)
+            by_images |= self._model.normal_loss_gradients(images, number, self._camera(number), by_normals)
         if by_distortions:
             view = self.dataset.views[number]
             mask = np.ones(view.image.shape[:2], np.float32) if view.mask is None else view.mask
@@ -463,8 +475,6 @@ class Trainer:
                     f"cannot read {self.checkpoint} as a checkpoint: {error}; remove it, or give --overwrite "
                     "to start again"
                 ) from error
-            for number, camera in enumerate(self._refinement.cameras):
-                self._set_camera(number, camera)
         remaining = settings.iterations - state.iteration
         state.history = {
             name: np.append(a, np.zeros(remaining, a.dtype)) for name, a in state.history.items()
@@ -495,7 +505,7 @@ class Trainer:
     def _update(self, gradients: Any, iteration: int, camera: Camera) -> Callable[[], np.ndarray] | None:
         """Update the splats by Adam, unless densification by the default strategy follows, as in the authors'
         trainer (whose new splats have no gradient yet). Returns a function that reads the gradient of the
-        pose, if poses are refined."""
+        camera, if it is refined."""
         settings, mcmc_runs = self.settings, self.settings.strategy == "mcmc"
         origin = self.dataset.origin
         if not mcmc_runs and settings.densifies_after(iteration):
@@ -503,13 +513,13 @@ class Trainer:
             return None
         counted = camera if not mcmc_runs and iteration < settings.densify_until else None
         rate = learning_rates(settings, iteration, self.dataset.extent)
-        by_pose = self._model.step(gradients, rate, settings.adam_steps(iteration), counted, origin)
+        by_camera = self._model.step(gradients, rate, settings.adam_steps(iteration), counted, origin)
         if mcmc_runs:
             with self._all_or_failed():
                 if settings.densifies_after(iteration):
                     self._model.load(mcmc.relocate_and_grow(self._model.read(), settings, iteration))
                 self._model.add_noise(iteration, rate["means"])
-        return by_pose
+        return by_camera
 
     @contextmanager
     def _all_or_failed(self) -> Iterator[None]:

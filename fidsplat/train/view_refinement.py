@@ -1,6 +1,8 @@
-"""Refinement of the training views: camera poses, and exposures (a gain and an offset of each channel).
+"""Refinement of the training views: camera poses, intrinsics, and exposures (a gain and an offset of each
+channel).
 
-Each view has its own numbers, optimised by Adam. A rotation is about a point in front of the camera, at the
+Views have their own poses and exposures; views with equal intrinsics share theirs. Adam optimises them. A
+rotation is about a point in front of the camera, at the
 median depth of the data set's points, and a translation is in units of this depth. So the six numbers move
 the image by similar amounts and are hardly coupled.
 """
@@ -9,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,26 +24,29 @@ from fidsplat.vision.pose import pose_error
 _EPSILON = 1e-12
 """relative to gradients, which are means over pixels"""
 _AT_ORIGIN = Camera.pinhole(4, 4, 4, 4, 2, 2)
+INTRINSICS_EVERY = 10
+"""iterations between two steps of the intrinsics, by the sums of their gradients: views of one camera need
+the gradients of each other, for which a GPU would have to wait in each iteration"""
 
 
 class _Adam:
-    """Adam's moments of six numbers of each view, in two groups of three. The numbers of a group have one
-    step size, so that the direction of a step does not depend on axes."""
+    """Adam's moments of `size` numbers of each row, in two groups. The numbers of a group have one step size,
+    so that the direction of a step does not depend on axes."""
 
-    def __init__(self, views: int, settings: TrainSettings) -> None:
+    def __init__(self, rows: int, size: int, settings: TrainSettings) -> None:
         self._betas = settings.beta1, settings.beta2
-        self.moments = np.zeros((2, views, 6))
-        self.steps = np.zeros(views, np.int64)
+        self.moments = np.zeros((2, rows, size))
+        self.steps = np.zeros(rows, np.int64)
 
-    def direction(self, view: int, gradient: np.ndarray) -> np.ndarray:
-        """The step (6,) of a view, in units of the learning rate."""
-        self.steps[view] += 1
-        step, corrected = int(self.steps[view]), []
+    def direction(self, row: int, gradient: np.ndarray) -> np.ndarray:
+        """The step (size,) of a row, in units of the learning rate."""
+        self.steps[row] += 1
+        step, corrected = int(self.steps[row]), []
         for moments, beta, sample in zip(self.moments, self._betas, (gradient, gradient**2), strict=True):
-            moments[view] += (1 - beta) * (sample - moments[view])
-            corrected.append(moments[view] / (1 - beta**step))
-        mean, square = corrected
-        return -mean / (np.repeat(np.sqrt(square.reshape(2, 3).mean(axis=1)), 3) + _EPSILON)
+            moments[row] += (1 - beta) * (sample - moments[row])
+            corrected.append(moments[row] / (1 - beta**step))
+        mean, square = (one.reshape(2, -1) for one in corrected)
+        return (-mean / (np.sqrt(square.mean(axis=1, keepdims=True)) + _EPSILON)).ravel()
 
 
 class ViewRefinement:
@@ -54,7 +60,15 @@ class ViewRefinement:
         self.exposures = np.zeros((len(self._given), 2, 3))
         """logarithms of gains, and offsets, by channel; their means over the views are 0"""
         self._depths = [_median_depth(view, dataset) for view in dataset.views]
-        self._pose_adam, self._exposure_adam = (_Adam(len(self._given), settings) for _ in range(2))
+        intrinsics = [camera_intrinsics(camera) for camera in self._given]
+        self._kinds = {numbers: row for row, numbers in enumerate(dict.fromkeys(intrinsics))}
+        """rows of `intrinsics` by the given ones"""
+        self.intrinsics = np.array([*self._kinds])[:, 2:]
+        """(cameras, 4): fx, fy, cx, cy"""
+        self._intrinsics_sums = np.zeros(self.intrinsics.shape)
+        """sums of the gradients since the last step"""
+        self._pose_adam, self._exposure_adam = (_Adam(len(self._given), 6, settings) for _ in range(2))
+        self._intrinsics_adam = _Adam(len(self.intrinsics), 4, settings)
 
     def move(self, view: int, by_pose: np.ndarray, iteration: int) -> None:
         """Apply a step to the camera of a view. by_pose: (6,) gradient `pose` of the loss at an iteration."""
@@ -68,6 +82,32 @@ class ViewRefinement:
         turned = offset_camera(_AT_ORIGIN, np.concatenate([motion[:3], np.zeros(3)]))
         motion[3:] += pivot - turned.world_to_camera[:3, :3] @ pivot
         self.cameras[view] = offset_camera(self.cameras[view], motion)
+
+    def add_intrinsics(self, view: int, by_intrinsics: np.ndarray) -> None:
+        """Add the gradient (4,) `intrinsics` of the loss of a view."""
+        self._intrinsics_sums[self._kinds[camera_intrinsics(self._given[view])]] += by_intrinsics
+
+    def change_intrinsics(self, iteration: int) -> None:
+        """Apply a step to the intrinsics, in units of the focal lengths, and clear the sums."""
+        rate = self._settings.pose_rate_at(iteration)
+        for row, sums in enumerate(self._intrinsics_sums):
+            if sums.any():
+                focal = np.tile(self.intrinsics[row, :2], 2)
+                self.intrinsics[row] += rate * focal * self._intrinsics_adam.direction(row, sums * focal)
+        self._intrinsics_sums[:] = 0
+        self.cameras = [
+            self.with_intrinsics(camera, given)
+            for camera, given in zip(self.cameras, self._given, strict=True)
+        ]
+
+    def with_intrinsics(self, camera: Camera, given: Camera) -> Camera:
+        """The camera with the refined intrinsics of the training views that have the given ones; unchanged
+        without such views."""
+        row = self._kinds.get(camera_intrinsics(given))
+        if row is None:
+            return camera
+        fx, fy, cx, cy = self.intrinsics[row].tolist()
+        return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def expose(self, view: int, by_exposure: np.ndarray, iteration: int) -> None:
         """Apply a step to the exposure of a view. by_exposure: (2, 3) gradient at an iteration."""
@@ -100,6 +140,10 @@ class ViewRefinement:
             "poses": np.array([camera.world_to_camera for camera in self.cameras]),
             "pose_moments": self._pose_adam.moments.copy(),
             "pose_steps": self._pose_adam.steps.copy(),
+            "intrinsics": self.intrinsics.copy(),
+            "intrinsics_sums": self._intrinsics_sums.copy(),
+            "intrinsics_moments": self._intrinsics_adam.moments.copy(),
+            "intrinsics_steps": self._intrinsics_adam.steps.copy(),
             "exposures": self.exposures.copy(),
             "exposure_moments": self._exposure_adam.moments.copy(),
             "exposure_steps": self._exposure_adam.steps.copy(),
@@ -111,13 +155,23 @@ class ViewRefinement:
             array = arrays[name]
             if array.shape != own.shape or array.dtype != own.dtype or not np.isfinite(array).all():
                 raise ValueError(f"{name} must be finite {own.dtype} of the shape {own.shape}")
+        self.intrinsics, self._intrinsics_sums, self.exposures = (
+            arrays[name].copy() for name in ("intrinsics", "intrinsics_sums", "exposures")
+        )
         self.cameras = [
-            camera if (pose == camera.world_to_camera).all() else camera.with_pose(pose)
+            self.with_intrinsics(
+                camera if (pose == camera.world_to_camera).all() else camera.with_pose(pose), camera
+            )
             for camera, pose in zip(self._given, arrays["poses"], strict=True)
         ]
-        self.exposures = arrays["exposures"].copy()
-        for name, adam in (("pose", self._pose_adam), ("exposure", self._exposure_adam)):
+        adams = self._pose_adam, self._intrinsics_adam, self._exposure_adam
+        for name, adam in zip(("pose", "intrinsics", "exposure"), adams, strict=True):
             adam.moments, adam.steps = arrays[f"{name}_moments"].copy(), arrays[f"{name}_steps"].copy()
+
+
+def camera_intrinsics(camera: Camera) -> tuple[float, ...]:
+    """Size and intrinsics of a camera."""
+    return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
 
 
 def alignment(cameras: Sequence[Camera], given: Sequence[Camera]) -> np.ndarray:

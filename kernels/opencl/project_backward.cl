@@ -1,12 +1,12 @@
-// Gradients with respect to the cloud's arrays and the camera pose, from those of set_up_backward.cl.
+// Gradients with respect to the cloud's arrays and the camera, from those of set_up_backward.cl.
 // Index space: one work-item per splat, in groups of POSE_ITEMS.
 // Reads:  view, the cloud, splats, keys, windows, big_bounds, splat_slots, moments.
-// Writes: gradients with respect to the cloud's arrays, 0 for culled splats; group_sums, with respect to the pose.
+// Writes: gradients with respect to the cloud's arrays, 0 for culled splats; group_sums, with respect to the camera.
 #define POSE_ITEMS 64
 kernel __attribute__((reqd_work_group_size(POSE_ITEMS, 1, 1))) void project_backward(
 //@@ arguments project_backward
 ) {
-    local real pose[6][POSE_ITEMS];
+    local real camera[10][POSE_ITEMS];
     uint i = get_global_id(0), item = get_local_id(0);
     SplatGradient own = {{0}};
     if (i < count) {
@@ -25,22 +25,17 @@ kernel __attribute__((reqd_work_group_size(POSE_ITEMS, 1, 1))) void project_back
         for (int k = 0; k < SH_TERMS; k++)
             for (int c = 0; c < 3; c++) by_terms[3 * k + c] = own.basis[k] * own.color[c];
     }
-    pose[0][item] = own.by_rotation.x;
-    pose[1][item] = own.by_rotation.y;
-    pose[2][item] = own.by_rotation.z;
-    pose[3][item] = own.by_translation.x;
-    pose[4][item] = own.by_translation.y;
-    pose[5][item] = own.by_translation.z;
+    for (int k = 0; k < 10; k++) camera[k][item] = own.by_camera[k];
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item < 6) {
+    if (item < 10) {
         real sum = 0;
-        for (uint other = 0; other < POSE_ITEMS; other++) sum += pose[item][other];
-        group_sums[6 * get_group_id(0) + item] = sum;
+        for (uint other = 0; other < POSE_ITEMS; other++) sum += camera[item][other];
+        group_sums[10 * get_group_id(0) + item] = sum;
     }
 }
 
 // Sums over rows in a fixed order.
-// Index space: work-groups of SUM_ITEMS, one per column: three of tile_sums, then six of group_sums. Writes: background, pose.
+// Index space: work-groups of SUM_ITEMS, one per column: three of tile_sums, then ten of group_sums. Writes: background, pose, intrinsics.
 #define SUM_ITEMS 64
 kernel __attribute__((reqd_work_group_size(SUM_ITEMS, 1, 1))) void add_up(
 //@@ arguments add_up
@@ -49,13 +44,13 @@ kernel __attribute__((reqd_work_group_size(SUM_ITEMS, 1, 1))) void add_up(
     bool of_tiles = get_group_id(0) < 3;
     global const real *parts = of_tiles ? tile_sums : group_sums;
     uint item = get_local_id(0), column = get_group_id(0) - (of_tiles ? 0 : 3);
-    uint rows = of_tiles ? tiles : groups, columns = of_tiles ? 3 : 6;
+    uint rows = of_tiles ? tiles : groups, columns = of_tiles ? 3 : 10;
     real sum = 0;
     for (uint row = item; row < rows; row += SUM_ITEMS) sum += parts[(size_t)row * columns + column];
     partial[item] = sum;
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item == 0) {
         for (uint other = 1; other < SUM_ITEMS; other++) sum += partial[other];
-        (of_tiles ? background : pose)[column] = (float)sum;
+        *(of_tiles ? background + column : column < 6 ? pose + column : intrinsics + column - 6) = (float)sum;
     }
 }

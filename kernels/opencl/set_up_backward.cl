@@ -1,5 +1,5 @@
 // Backward pass of the projection: from gradients of a splat's record, summed over its tiles, to gradients of its mean,
-// rotation, scales, opacity and colour, and of the camera pose. Branches are taken as in project.cl. The common factor of a
+// rotation, scales, opacity and colour, and of the camera. Branches are taken as in project.cl. The common factor of a
 // record's affine forms (splat.cl) has no gradient, since nothing depends on it.
 
 #define MIN_SCALE 1e-20f   // as in project.cl
@@ -39,7 +39,7 @@ typedef struct {            // gradients with respect to the parameters of one s
     float mean[3], quat[4], scale[2], opacity;
     float color[3], basis[SH_TERMS];    // by coefficient k of the colour: basis[k] times `color`
     float screen;
-    real3_ by_rotation, by_translation;               // contribution to the gradient of the pose
+    real by_camera[10];     // contribution to the gradient of the pose, of fx, fy, cx and cy
 //@@ footprint_gradient
 } SplatGradient;
 
@@ -96,6 +96,10 @@ static inline SplatGradient splat_gradient(
     real3_ by_a = {view->focal_x * by_tu.x, view->focal_y * by_tv.x, by_tw.x};
     real3_ by_b = {view->focal_x * by_tu.y, view->focal_y * by_tv.y, by_tw.y};
     real3_ by_p = {view->focal_x * by_tu.z, view->focal_y * by_tv.z, by_tw.z};
+    own.by_camera[6] = dot3(by_tu, row_x);
+    own.by_camera[7] = dot3(by_tv, row_y);
+    own.by_camera[8] = dot3(by_tu, tw);
+    own.by_camera[9] = dot3(by_tv, tw);
     // by the projected centre, in half images
     real across_x = by_tu.z * view->width, across_y = by_tv.z * view->height;
     own.screen = (float)(REAL(0.5) * pz * sqrt(across_x * across_x + across_y * across_y));
@@ -105,8 +109,15 @@ static inline SplatGradient splat_gradient(
     real3_ by_unit_a = scaled(su, by_a), by_unit_b = scaled(sv, by_b);
 //@@ facet_backward
 //@@ footprint_backward
-    own.by_rotation = add3(cross3(p, by_p), add3(cross3(unit_a, by_unit_a), cross3(unit_b, by_unit_b)));
-    own.by_translation = add3(by_p, rotate_to_camera(view, by_ray));
+    const real3_ by_motion[2] = {
+        add3(cross3(p, by_p), add3(cross3(unit_a, by_unit_a), cross3(unit_b, by_unit_b))),
+        add3(by_p, rotate_to_camera(view, by_ray)),
+    };
+    for (int k = 0; k < 2; k++) {
+        own.by_camera[3 * k] = by_motion[k].x;
+        own.by_camera[3 * k + 1] = by_motion[k].y;
+        own.by_camera[3 * k + 2] = by_motion[k].z;
+    }
     real3_ by_mean = add3(rotate_to_world(view, by_p), by_ray);
     real3_ by_u = rotate_to_world(view, by_unit_a);
     real3_ by_v = rotate_to_world(view, by_unit_b);

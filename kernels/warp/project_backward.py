@@ -1,6 +1,5 @@
 """Backward pass of the projection: from derivatives with respect to a splat's record, which its tiles have
-stored, to those with respect to mean, rotation, scales, opacity, colour and camera pose. Decisions are
-constant.
+stored, to those with respect to mean, rotation, scales, opacity, colour and camera. Decisions are constant.
 
 With a = s_u t_u and b = s_v t_v, a ray r meets the splat where n_u = (b x p) r, n_v = (p x a) r, D = (a x b)
 r, up to a common factor, which has no effect. The moment over the rays g = sum dL/dn_u r gives the
@@ -17,8 +16,9 @@ from .common import CULLED, STRICT, View, line_of
 from .project import SMALLEST_SCALE
 from .records import Layout
 
-SIX = wp.types.vector(6, wp.float64)
-"""gradient with respect to a motion after world_to_camera: rotation vector [1 / rad], translation [1 / m]"""
+TEN = wp.types.vector(10, wp.float64)
+"""gradient with respect to a motion after world_to_camera: rotation vector [1 / rad], translation [1 / m];
+and with respect to fx, fy, cx, cy [1 / px]"""
 _ZERO, _HALF, _ONE, _TWO = (wp.constant(wp.float64(x)) for x in (0.0, 0.5, 1.0, 2.0))
 _SQRT_HALF = wp.constant(wp.float64(math.sqrt(0.5)))
 
@@ -98,7 +98,7 @@ def make_project_backward(
         by_opacities: wp.array(dtype=wp.float32),
         by_colors: wp.array(dtype=wp.vec3),
         screen: wp.array(dtype=wp.float32),  # norm of that by the projected centre, in half pictures
-        by_poses: wp.array(dtype=SIX),
+        by_cameras: wp.array(dtype=TEN),
     ):
         view = views[0]
         i = first + wp.tid()
@@ -107,7 +107,7 @@ def make_project_backward(
         by_scales[i] = wp.vec2()
         by_opacities[i] = 0.0
         screen[i] = 0.0
-        by_poses[i] = SIX()
+        by_cameras[i] = TEN()
         for k in range(terms):
             by_colors[i * terms + k] = wp.vec3()
         if keys[i] == CULLED:
@@ -190,6 +190,11 @@ def make_project_backward(
         across = wp.float64(view.width) * by_p[0] * per_x
         down = wp.float64(view.height) * by_p[1] * per_y
         screen[i] = float(_HALF * p[2] * wp.sqrt(across * across + down * down))
+        # frames depend on fx x + cx z and fy y + cy z of a, b and p
+        by_fx = per_x * (by_a[0] * a[0] + by_b[0] * b[0] + by_p[0] * p[0])
+        by_fy = per_y * (by_a[1] * a[1] + by_b[1] * b[1] + by_p[1] * p[1])
+        by_cx = per_x * (by_a[0] * a[2] + by_b[0] * b[2] + by_p[0] * p[2])
+        by_cy = per_y * (by_a[1] * a[2] + by_b[1] * b[2] + by_p[1] * p[2])
         if wp.static(has_depth):
             by_p[2] = by_p[2] + total[z_numerator + 3]
         by_su, by_sv = wp.dot(by_a, unit_a), wp.dot(by_b, unit_b)
@@ -206,7 +211,9 @@ def make_project_backward(
 
         turned = wp.cross(p, by_p) + wp.cross(unit_a, by_unit_a) + wp.cross(unit_b, by_unit_b)
         moved = by_p + turn * by_ray
-        by_poses[i] = SIX(turned[0], turned[1], turned[2], moved[0], moved[1], moved[2])
+        by_cameras[i] = TEN(
+            turned[0], turned[1], turned[2], moved[0], moved[1], moved[2], by_fx, by_fy, by_cx, by_cy
+        )
         back = wp.transpose(turn)
         by_mean = back * by_p + by_ray
         u, v = back * by_unit_a, back * by_unit_b

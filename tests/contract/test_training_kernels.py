@@ -147,7 +147,9 @@ def test_loss_of_normals(renderer, views, works):
             device_array=lambda name, shown=shown: on_device(renderer, shown[name]),
             read=lambda name, view, shown=shown: shown[name],
         )
-        found, wanted = (work.normal_loss_gradients(images, number, 0.3) for work in (device, host))
+        found, wanted = (
+            work.normal_loss_gradients(images, number, views[number].camera, 0.3) for work in (device, host)
+        )
         for name, array in wanted.items():
             assert np.abs(array).max() > 0
             np.testing.assert_allclose(found[name].get(), array, rtol=1e-4, atol=1e-5 * np.abs(array).max())

@@ -12,7 +12,7 @@ from fidsplat.images.files import to_uint8, write_png
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.train import Dataset, Trainer, TrainingView, load_dataset
 from fidsplat.train.settings import TrainSettings
-from fidsplat.train.view_refinement import ViewRefinement, alignment, moved
+from fidsplat.train.view_refinement import ViewRefinement, alignment, camera_intrinsics, moved
 from fidsplat.vision.pose import pose_error
 
 FIXED = {
@@ -21,6 +21,7 @@ FIXED = {
     **{"sh_degree": 0, "densify_until": 0, "quality": "surfel"},
 }
 """splats that do not change"""
+ALL = {"refine_poses": True, "refine_intrinsics": True, "fit_exposures": True}
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +92,29 @@ def test_poses_return_to_the_truth(renderer, cloud, given, disturbed):
     np.testing.assert_allclose(changes, np.array(expected) * (1, 180 / np.pi), rtol=1e-6)
 
 
+def wrong_intrinsics(dataset, held_out=0):
+    """Wrong focal lengths and principal point in all cameras, which the first `held_out` views share."""
+    change = {"fx": 34.0, "fy": 35.0, "cx": 16.1, "cy": 12.0}
+    views = tuple(replace(view, camera=replace(view.camera, **change)) for view in dataset.views)
+    return replace(dataset, views=views[held_out:], held_out=views[:held_out])
+
+
+def test_intrinsics_return_to_the_truth(renderer, cloud, given):
+    wrong = wrong_intrinsics(given, held_out=1)
+    trainer = Trainer(wrong, renderer, start=cloud, iterations=400, refine_intrinsics=True, **FIXED)
+    before = trainer.evaluate()[0].psnr
+    trainer.run()
+    for found, view in zip(trainer.views, given.views[1:], strict=True):
+        camera, true = found.camera, view.camera
+        assert abs(camera.fx - true.fx) < 0.1
+        assert abs(camera.fy - true.fy) < 0.1
+        assert abs(camera.cx - true.cx) < 0.05
+        assert abs(camera.cy - true.cy) < 0.05
+        np.testing.assert_array_equal(camera.world_to_camera, true.world_to_camera)
+    assert before < 28
+    assert trainer.evaluate()[0].psnr > 35
+
+
 def test_refinement_does_not_drift_by_a_similarity(given):
     """Cameras that turn, move and grow together are those that were given."""
     refinement = ViewRefinement(given, TrainSettings(refine_poses=True))
@@ -108,7 +132,7 @@ def test_exposures_return_to_the_truth(renderer, cloud, given):
     exposed = replace(
         given, views=tuple(replace(v, image=to_uint8(v.image / 255 * gain)) for v, gain in pairs)
     )
-    trainer = Trainer(exposed, renderer, start=cloud, iterations=400, fit_exposures=True, **FIXED)
+    trainer = Trainer(exposed, renderer, start=cloud, iterations=240, fit_exposures=True, **FIXED)
     trainer.run()
     assert np.abs(trainer.exposures[:, 0] - gains).max() < 0.06
     assert np.abs(trainer.exposures[:, 1]).max() < 0.03
@@ -117,21 +141,27 @@ def test_exposures_return_to_the_truth(renderer, cloud, given):
     assert unfitted.evaluate(exposed.views)[0].psnr < 30
 
 
-def test_devices_agree_on_refinement(renderer, cloud, disturbed):
-    """Kernels of the derivatives by pose and exposure against the float64 reference."""
+def test_devices_agree_on_refinement(renderer, cloud, disturbed, monkeypatch):
+    """Kernels of the derivatives by camera and exposure against the float64 reference."""
+    monkeypatch.setattr("fidsplat.train.trainer.INTRINSICS_EVERY", 2)
     found = []
     for device in (renderer, fs.Renderer("reference")):
-        settings = {"iterations": 5, "refine_poses": True, "fit_exposures": True, "sh_degree": 0}
+        settings = {"iterations": 5, "sh_degree": 0} | ALL
         trainer = Trainer(disturbed, device, start=cloud, **settings)
         trainer.run()
-        found.append((np.array([view.camera.world_to_camera for view in trainer.views]), trainer.exposures))
+        (intrinsics,) = {camera_intrinsics(view.camera)[2:] for view in trainer.views}
+        poses = np.array([view.camera.world_to_camera for view in trainer.views])
+        found.append((poses, trainer.exposures, np.array(intrinsics)))
     assert np.abs(found[0][0] - [view.camera.world_to_camera for view in disturbed.views]).max() > 5e-4
     np.testing.assert_allclose(found[0][0], found[1][0], atol=2e-6)
     np.testing.assert_allclose(found[0][1], found[1][1], atol=2e-6)
+    np.testing.assert_allclose(found[0][2], found[1][2], atol=1e-5)
+    assert np.abs(found[0][2] - (33, 36, 16.5, 11.5)).min() > 0.005
 
 
-def test_a_resumed_run_is_bit_identical(renderer, cloud, disturbed, tmp_path):
-    settings = {"iterations": 9, "refine_poses": True, "fit_exposures": True, "sh_degree": 0}
+def test_a_resumed_run_is_bit_identical(renderer, cloud, disturbed, tmp_path, monkeypatch):
+    monkeypatch.setattr("fidsplat.train.trainer.INTRINSICS_EVERY", 4)
+    settings = {"iterations": 9, "sh_degree": 0} | ALL
     complete = Trainer(disturbed, renderer, start=cloud, **settings)
     complete.run()
     stopped = Trainer(disturbed, renderer, start=cloud, checkpoint=tmp_path / "a.npz", **settings)
@@ -143,6 +173,7 @@ def test_a_resumed_run_is_bit_identical(renderer, cloud, disturbed, tmp_path):
     resumed.run()
     for a, b in zip(resumed.views, complete.views, strict=True):
         np.testing.assert_array_equal(a.camera.world_to_camera, b.camera.world_to_camera)
+        assert camera_intrinsics(a.camera) == camera_intrinsics(b.camera)
     np.testing.assert_array_equal(resumed.exposures, complete.exposures)
     np.testing.assert_array_equal(resumed.cloud().means, complete.cloud().means)
 

@@ -227,10 +227,10 @@ def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
     return _assemble_backward("gradients", _GRADIENTS, features, shape)
 
 
-def assemble_step(features: FeatureSet, shape: DeviceShape, pose: bool = False) -> Source:
-    """The source of a training step: the last stage of the derivatives, fused with Adam. pose: also sums the
-    gradient with respect to the pose."""
-    return _assemble_backward("step", _STEP, features, shape, ("step_pose",) if pose else ())
+def assemble_step(features: FeatureSet, shape: DeviceShape, camera: bool = False) -> Source:
+    """The source of a training step: the last stage of the derivatives, fused with Adam. camera: also sums
+    the gradient with respect to the camera."""
+    return _assemble_backward("step", _STEP, features, shape, ("step_camera",) if camera else ())
 
 
 def _assemble_backward(

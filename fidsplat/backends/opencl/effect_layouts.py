@@ -187,8 +187,8 @@ LAYOUTS: dict[str, Layout] = {
         ),
         project_step=takes("out float activated_thickness"),
     ),
-    "step_pose": Layout(
-        "train/step_pose.cl", project_step=takes("out real group_sums  // (work-groups, 6) by the pose")
+    "step_camera": Layout(
+        "train/step_camera.cl", project_step=takes("out real group_sums  // (work-groups, 10) by the camera")
     ),
     "box_cover": Layout("part/box_cover.cl"),
     "box_edges": Layout(

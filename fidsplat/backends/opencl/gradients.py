@@ -39,6 +39,10 @@ from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
 from fidsplat.util.errors import DeviceError, InputError
 
 _GROUP = 64  # work-group size: RESERVE_ITEMS, POSE_ITEMS, SUM_ITEMS and STEP_ITEMS of the kernels
+_SUMS = {"background": 3, "pose": 6, "intrinsics": 4}
+"""gradients that are sums over tiles or splats, and their numbers"""
+_CAMERA = 10
+"""numbers of a camera: pose and intrinsics"""
 _F32 = np.dtype(np.float32)
 _ZERO = np.zeros(1, np.uint32)  # also zeroes floats
 
@@ -81,19 +85,20 @@ class TileGradients:
         with self._last():
             return self._of.sum_tiles(self._frame)
 
-    def compile_step(self, pose: bool = False) -> None:
+    def compile_step(self, by_camera: bool = False) -> None:
         """Compile the kernel of `step`."""
-        self._of.compile_step(pose)
+        self._of.compile_step(by_camera)
 
-    def step(self, given: Mapping[str, Any], pose: bool = False) -> Callable[[], np.ndarray] | None:
+    def step(self, given: Mapping[str, Any], by_camera: bool = False) -> Callable[[], np.ndarray] | None:
         """Submit an optimiser step (kernels/opencl/project_step.cl).
 
         Args:
             given: arguments that are not the frame's.
-            pose: whether to return a function that waits for the gradient (6,) with respect to the pose.
+            by_camera: whether to return a function that waits for the gradient (10,) with respect to the
+                camera: pose and intrinsics.
         """
         with self._last():
-            return self._of.step(self._frame, given, pose)
+            return self._of.step(self._frame, given, by_camera)
 
     def _last(self) -> AbstractContextManager[None]:
         if not self._images.last:
@@ -125,7 +130,7 @@ class OpenCLGradients(GradientPipeline):
         """list capacity of frames for whose counts the host does not wait"""
         self._tile_commands, self._sum_commands = CommandList(self.program), CommandList(self.program)
         self._step_commands: dict[bool, CommandList] = {}
-        """command lists of a step by whether it sums the gradient of the pose"""
+        """command lists of a step by whether it sums the gradient of the camera"""
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
         """Render one frame. waits: whether to wait for its counts; GPUs need not after the first frame."""
@@ -228,35 +233,40 @@ class OpenCLGradients(GradientPipeline):
         frame.commands = self._sum_commands
         self._sum_commands.clear()
         count, real = frame.resident.count, self.source.scalars.dtype("real").itemsize
-        groups = -(-count // _GROUP)  # of the sums for the pose
-        frame.take("group_sums", 6 * real * groups)
+        groups = -(-count // _GROUP)  # of the sums for the camera
+        frame.take("group_sums", _CAMERA * real * groups)
         found = self._allocate_results(frame)
         if count:
             arrays: dict[str, Any] = {
                 name: frame.resident.part(name, 0, count) for name in self._cloud_arrays
             }
             frame.launch("project backward", "project_backward", (count,), (_GROUP,), count=count, **arrays)
-        given: dict[str, Any] = {name: found[name].data for name in ("background", "pose")}
-        given |= {"tiles": frame.tiles, "groups": groups}
-        frame.launch("project backward", "add_up", ((3 + 6) * _GROUP,), (_GROUP,), **given)
+        self._add_up(frame, found, groups)
         return found
 
-    def compile_step(self, pose: bool = False) -> None:
+    def _add_up(self, frame: DeviceFrame, found: Mapping[str, Array], groups: int) -> None:
+        """Sum the gradients of the background over tiles, and those of the camera over work-groups."""
+        given: dict[str, Any] = {name: found[name].data for name in _SUMS}
+        given |= {"tiles": frame.tiles, "groups": groups}
+        frame.launch("project backward", "add_up", (sum(_SUMS.values()) * _GROUP,), (_GROUP,), **given)
+
+    def compile_step(self, by_camera: bool = False) -> None:
         """Compile the kernel of `step`, which gradients do not need."""
-        if pose not in self._step_commands:
-            source = assemble_step(self._pipeline.features, self._pipeline.shape, pose)
-            self._step_commands[pose] = CommandList(Program(self._pipeline.workspace, source))
+        if by_camera not in self._step_commands:
+            source = assemble_step(self._pipeline.features, self._pipeline.shape, by_camera)
+            self._step_commands[by_camera] = CommandList(Program(self._pipeline.workspace, source))
 
     def step(
-        self, frame: DeviceFrame, given: Mapping[str, Any], pose: bool = False
+        self, frame: DeviceFrame, given: Mapping[str, Any], by_camera: bool = False
     ) -> Callable[[], np.ndarray] | None:
         """Submit a step of Adam from the sums over tiles; `compile_step` comes first. given: arguments that
-        are not the frame's. pose: whether to return a function that waits for the gradient of the pose."""
-        commands, count = self._step_commands[pose], frame.resident.count
+        are not the frame's. by_camera: whether to return a function that waits for the gradient (10,) of the
+        camera."""
+        commands, count = self._step_commands[by_camera], frame.resident.count
         given = {**given, "count": count}
         groups = -(-count // _GROUP)
-        if pose:
-            frame.take("group_sums", 6 * self.source.scalars.dtype("real").itemsize * groups)
+        if by_camera:
+            frame.take("group_sums", _CAMERA * self.source.scalars.dtype("real").itemsize * groups)
         arguments = commands.program.source.arguments["project_step"]
         values = {one.name: given[one.name] if one.name in given else frame.value(one) for one in arguments}
         if commands.key != count:
@@ -268,26 +278,25 @@ class OpenCLGradients(GradientPipeline):
         (event,) = commands.submit(frame.queue)
         frame.events.append(event)
         frame.stages.append("project backward")
-        return self._pose_readback(frame, groups) if pose else None
+        return self._camera_readback(frame, groups) if by_camera else None
 
-    def _pose_readback(self, frame: DeviceFrame, groups: int) -> Callable[[], np.ndarray]:
-        """Sum the gradient of the pose over work-groups; returns a function that waits for it."""
+    def _camera_readback(self, frame: DeviceFrame, groups: int) -> Callable[[], np.ndarray]:
+        """Sum the gradient of the camera over work-groups; returns a function that waits for it."""
         frame = copy(frame)
         frame.commands = self._sum_commands
         self._sum_commands.clear()
-        arrays = {
-            name: frame.pool.array(frame.queue, name, (k,)) for name, k in (("background", 3), ("pose", 6))
-        }
-        given: dict[str, Any] = {name: array.data for name, array in arrays.items()}
-        given |= {"tiles": frame.tiles, "groups": groups}
-        frame.launch("project backward", "add_up", ((3 + 6) * _GROUP,), (_GROUP,), **given)
-        found = np.empty(6, np.float32)
-        copied = cl.enqueue_copy(frame.queue, found, given["pose"], is_blocking=False)
+        arrays = {name: frame.pool.array(frame.queue, name, (k,)) for name, k in _SUMS.items()}
+        self._add_up(frame, arrays, groups)
+        found = np.empty(_CAMERA, np.float32)
+        copied = [
+            cl.enqueue_copy(frame.queue, part, arrays[name].data, is_blocking=False)
+            for name, part in (("pose", found[:6]), ("intrinsics", found[6:]))
+        ]
         frame.queue.flush()
 
         def read() -> np.ndarray:
             with _differentiating(frame):
-                copied.wait()
+                cl.wait_for_events(copied)
             return found
 
         return read
@@ -325,7 +334,8 @@ class OpenCLGradients(GradientPipeline):
         count, features = frame.resident.count, self._pipeline.features
         shapes: dict[str, tuple[int, ...]] = {
             **{"means": (count, 3), "quats": (count, 4), "scales": (count, 2), "opacities": (count,)},
-            **{"screen": (count,), "background": (3,), "pose": (6,)},
+            **{"screen": (count,)},
+            **{name: (k,) for name, k in _SUMS.items()},
         }
         if "color_sh" in features.slots:
             shapes["sh"] = (count, (features.sh_degree + 1) ** 2, 3)

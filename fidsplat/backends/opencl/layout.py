@@ -231,7 +231,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float by_scales  // (n, 2)",
         "out float by_opacities  // (n)",
         "out float screen  // (n)",
-        "out real group_sums  // (work-groups, 6) by the pose",
+        "out real group_sums  // (work-groups, 10) by the camera",
     ),
     "project_step": takes(
         *("uint count", "in View view", "in Splat splats", "in uint keys", _TILES),
@@ -251,8 +251,8 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float activated_quats activated_scales activated_opacities activated_sh",
     ),
     "add_up": takes(
-        *("uint tiles groups", "in real tile_sums group_sums  // (tiles, 3), (groups, 6)"),
-        "out float background pose",
+        *("uint tiles groups", "in real tile_sums group_sums  // (tiles, 3), (groups, 10)"),
+        "out float background pose intrinsics",
     ),
     # training
     "loss_take": takes(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK, _IMAGES),

@@ -311,12 +311,14 @@ class OpenCLTraining(TrainingKernels):
         numbers: Mapping[str, float],
         camera: Camera | None,
         origin: np.ndarray,
-        pose: bool = False,
+        by_camera: bool = False,
     ) -> Callable[[], np.ndarray] | None:
         """Apply a step of Adam."""
         given = {f"size_{name}": size for name, size in sizes.items()} | dict(numbers)
         given |= {"rest1": 1 - numbers["beta1"], "rest2": 1 - numbers["beta2"]}
-        return self._step(taken, given | {"move": 1, "sparse": int(numbers["sparse"])}, camera, origin, pose)
+        return self._step(
+            taken, given | {"move": 1, "sparse": int(numbers["sparse"])}, camera, origin, by_camera
+        )
 
     def _step(
         self,
@@ -324,13 +326,13 @@ class OpenCLTraining(TrainingKernels):
         given: Mapping[str, Any],
         camera: Camera | None,
         origin: np.ndarray,
-        pose: bool = False,
+        by_camera: bool = False,
     ) -> Callable[[], np.ndarray] | None:
         # compiling takes seconds: it is first, so that an interrupt leaves the statistics unchanged
-        taken.compile_step(pose)
+        taken.compile_step(by_camera)
         if camera is not None:
             self._count_visible(camera, origin)
-        return taken.step({**self._bound, **given, "counted": int(camera is not None)}, pose)
+        return taken.step({**self._bound, **given, "counted": int(camera is not None)}, by_camera)
 
     def _count_visible(self, camera: Camera, origin: np.ndarray) -> None:
         """Add the visible splats to `visible_counts`."""

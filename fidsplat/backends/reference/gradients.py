@@ -98,9 +98,10 @@ class FrozenFrame:
         }
 
     def _blend(self, parameters: Parameters) -> Iterator[tuple[Blend, Decisions]]:
-        placed = place(parameters, self._view)
+        view = parameters.view(self._view)
+        placed = place(parameters, view)
         for x, y, made in self._blocks:
-            yield Blend(placed, self._view, self._features, made, x, y), made
+            yield Blend(placed, view, self._features, made, x, y), made
 
 
 def _images(samples: Samples, made: Decisions, parameters: Parameters) -> dict[str, np.ndarray]:

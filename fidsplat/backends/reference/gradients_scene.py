@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -28,6 +28,8 @@ class Parameters:
     pose: np.ndarray
     """(6,): rotation vector [rad] and translation [m] of a motion applied after world_to_camera, in camera
     axes"""
+    intrinsics: np.ndarray
+    """(4,): fx, fy, cx, cy [samples]"""
     thickness: np.ndarray | None = None
     """(n,) third standard deviations of 3D Gaussians [m], 0 of disks; None if all are disks"""
 
@@ -40,12 +42,21 @@ class Parameters:
         given = [None if array is None else array.astype(np.float64) for array in (*arrays, color, sh)]
         thickness = None if cloud.thickness is None else cloud.thickness.astype(np.float64)
         background = np.array(view.background, np.float64)
-        return cls(*given, background, np.zeros(6), thickness)  # type: ignore[arg-type]
+        intrinsics = np.array([view.focal_x, view.focal_y, view.center_x, view.center_y], np.float64)
+        return cls(*given, background, np.zeros(6), intrinsics, thickness)  # type: ignore[arg-type]
 
     @property
     def names(self) -> list[str]:
         """Names of the parameters of this cloud."""
         return [one.name for one in fields(self) if getattr(self, one.name) is not None]
+
+    def view(self, view: View) -> View:
+        """The view with these intrinsics. The limits of EWA's slopes are constant in samples."""
+        fx, fy, cx, cy = self.intrinsics.tolist()
+        x, y = (fx, view.focal_x, cx - view.center_x), (fy, view.focal_y, cy - view.center_y)
+        limits = zip(view.slopes, (x, x, y, y), (1, -1, 1, -1), strict=True)
+        slopes = tuple((limit * old + sign * moved) / new for limit, (new, old, moved), sign in limits)
+        return replace(view, focal_x=fx, focal_y=fy, center_x=cx, center_y=cy, slopes=slopes)
 
 
 @dataclass
@@ -63,12 +74,15 @@ class Placed:
     """(n, 3) rendered scales [m]; the third is 0 for disks"""
     log_opacity: np.ndarray
     rgb: np.ndarray
+    intrinsics: np.ndarray
+    """(n, 4), of derivatives: the shares of the splats in those with respect to fx, fy, cx, cy; without
+    `center`"""
 
     @classmethod
     def zeros(cls, n: int) -> Placed:
         """Zero derivatives of n splats."""
         a, b, p, scales, rgb = np.zeros((5, n, 3))
-        return cls(a, b, p, np.zeros((n, 2)), scales, np.zeros(n), rgb)
+        return cls(a, b, p, np.zeros((n, 2)), scales, np.zeros(n), rgb, np.zeros((n, 4)))
 
     def select(self, rows: np.ndarray) -> Placed:
         """Some of the splats, by index."""
@@ -108,6 +122,7 @@ def place(parameters: Parameters, view: View) -> Placed:
         np.column_stack([np.maximum(parameters.scales, _SMALLEST), third]),
         log_opacity,
         _rgb(parameters, _eye(parameters, view)),
+        np.zeros((len(p), 4)),
     )
 
 
@@ -123,6 +138,8 @@ def place_backward(parameters: Parameters, view: View, placed: Placed, slopes: P
     moved = by_p.sum(0) + by_ray.sum(0) @ rotation.T
     with np.errstate(divide="ignore", invalid="ignore"):
         by_opacity = slopes.log_opacity / parameters.opacities
+        tangents = np.where(slopes.center != 0, placed.p[:, :2] / placed.p[:, 2:], 0.0)
+    by_focal = (slopes.center * tangents).sum(0)
     rendered = slopes.scales[:, :2]
     found = {
         "means": by_p @ rotation + by_ray,
@@ -131,6 +148,7 @@ def place_backward(parameters: Parameters, view: View, placed: Placed, slopes: P
         "opacities": np.where(slopes.log_opacity != 0, by_opacity, 0.0),
         "sh" if parameters.colors is None else "colors": by_color,
         "pose": np.concatenate([turned, moved]),
+        "intrinsics": slopes.intrinsics.sum(0) + np.concatenate([by_focal, slopes.center.sum(0)]),
     }
     if parameters.thickness is not None:
         found["thickness"] = np.where(parameters.thickness >= _SMALLEST, slopes.scales[:, 2], 0.0)

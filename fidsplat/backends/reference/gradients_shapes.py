@@ -51,18 +51,24 @@ def shapes_of(
     thick = placed.scales[:, 2] > 0
     flat, solid = np.flatnonzero(~thick), np.flatnonzero(thick)
     rays = rays_of(view, x, y)[0][:, None, :]
-    found: list[tuple[np.ndarray, Shapes]] = [(flat, _Disks(placed.select(flat), rays))]
+    found: list[tuple[np.ndarray, Shapes]] = [(flat, _Disks(placed.select(flat), rays, view))]
     if len(solid) and "ellipsoid_exact" in features.slots:
-        found.append((solid, _Ellipsoids(placed.select(solid), rays)))
+        found.append((solid, _Ellipsoids(placed.select(solid), rays, view)))
     elif len(solid):
         antialiased = "ellipsoid_ewa_antialiased" in features.slots
         found.append((solid, _Projected(placed.select(solid), view, antialiased, x, y)))
     return found
 
 
+def _by_intrinsics(by_rays: np.ndarray, rays: np.ndarray, view: View) -> np.ndarray:
+    """Derivatives (n, 4) with respect to fx, fy, cx, cy, from those (k, n, 3) with respect to rays."""
+    across = -by_rays[..., :2] / (view.focal_x, view.focal_y)
+    return np.concatenate([(across * rays[..., :2]).sum(0), across.sum(0)], axis=1)
+
+
 class _Disks:
-    def __init__(self, placed: Placed, rays: np.ndarray) -> None:
-        self._placed, self._rays = placed, rays
+    def __init__(self, placed: Placed, rays: np.ndarray, view: View) -> None:
+        self._placed, self._rays, self._view = placed, rays, view
         self._su, self._sv = placed.scales[:, :2].T
         self._normal = np.cross(placed.unit_a, placed.unit_b)
         height = (self._normal * placed.p).sum(1)
@@ -90,6 +96,9 @@ class _Disks:
         out.unit_a[:] = np.einsum("kn,knc->nc", by_u, off) + np.cross(unit_b, by_normal)
         out.unit_b[:] = np.einsum("kn,knc->nc", by_v, off) + np.cross(by_normal, unit_a)
         out.p[:] = by_plane_z.sum(0)[:, None] * self._normal - by_off.sum(0)
+        by_rays = by_off - by_plane_z[..., None] * self._normal
+        by_rays *= np.where(used, self.z, 0.0)[..., None]
+        out.intrinsics[:] = _by_intrinsics(by_rays, self._rays, self._view)
 
 
 class _Solid:
@@ -127,10 +136,10 @@ class _Ellipsoids(_Solid):
     """The maximum along each ray. With y the centre and r the ray after whitening, it is where the distance
     |y x r| / |r| is reached."""
 
-    def __init__(self, placed: Placed, rays: np.ndarray) -> None:
+    def __init__(self, placed: Placed, rays: np.ndarray, view: View) -> None:
         super().__init__(placed)
         self.faint = np.zeros(len(placed.p))
-        self._rays, scales = rays[:, 0], placed.scales
+        self._rays, self._view, scales = rays[:, 0], view, placed.scales
         self._y = self._along / scales
         self._r = np.einsum("nkc,sc->snk", self._axes, self._rays) / scales
         self._square = (self._r**2).sum(2)
@@ -148,6 +157,8 @@ class _Ellipsoids(_Solid):
         by_axes = np.einsum("snk,sc->nkc", by_r, self._rays) + by_y[..., None] * self._p[:, None]
         out.p += np.einsum("nk,nkc->nc", by_y / scales, self._axes)
         out.scales -= (by_y * self._y + (by_r * self._r).sum(0)) / scales
+        by_rays = np.einsum("snk,nkc->snc", by_r / scales, self._axes)
+        out.intrinsics[:] = _by_intrinsics(by_rays, self._rays[:, None], self._view)
         self._finish(out, by_axes / scales[..., None], by_facing)
 
 
@@ -157,7 +168,8 @@ class _Projected(_Solid):
 
     def __init__(self, placed: Placed, view: View, antialiased: bool, x: np.ndarray, y: np.ndarray) -> None:
         super().__init__(placed)
-        self._antialiased, self._per = antialiased, np.divide((view.focal_x, view.focal_y), placed.p[:, 2:])
+        self._antialiased, self._focal = antialiased, np.array([view.focal_x, view.focal_y])
+        self._per = self._focal / placed.p[:, 2:]
         left, right, up, down = view.slopes
         slopes = placed.p[:, :2] / placed.p[:, 2:]
         self._slopes = np.clip(slopes, (-left, -up), (right, down))
@@ -196,7 +208,10 @@ class _Projected(_Solid):
         by_flat = by_images * per[:, None]
         by_scaled = np.concatenate([by_flat, -(by_flat * self._slopes[:, None]).sum(2, keepdims=True)], 2)
         scaled_z = self._axes[:, :, 2] * scales
-        by_slopes = -np.einsum("nki,nk->ni", by_flat, scaled_z) * self._inside
+        by_slopes = -np.einsum("nki,nk->ni", by_flat, scaled_z)
+        by_limits = -by_slopes * ~self._inside / self._focal
+        out.intrinsics[:] = np.concatenate([by_per / pz + by_limits * self._slopes, by_limits], axis=1)
+        by_slopes *= self._inside
         out.p[:, :2] += by_slopes / pz
         out.p[:, 2] += by_z.sum(0) - ((by_slopes * self._slopes + by_per * per) / pz).sum(1)
         out.scales += (by_scaled * self._axes).sum(2)

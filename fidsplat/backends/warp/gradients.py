@@ -96,7 +96,7 @@ class _Backward:
         if self._pairs:
             self._launcher.launch(self._made.project, self._count, self._given)
         else:  # no splat is visible, so there are no moments
-            for array in (*found.values(), self._given["by_poses"]):
+            for array in (*found.values(), self._given["by_cameras"]):
                 array.zero_()
         view = self._frame.view
         pixels = view.width * view.height
@@ -105,7 +105,7 @@ class _Backward:
         given = self._given | sizes | {"parts": parts}
         self._launcher.launch(self._made.sums.background_parts, _SHARES, given)
         self._sum_rows(parts, _SHARES, 3, found["background"])
-        self._sum_rows(flat_of(self._given["by_poses"]), self._count, 6, found["pose"])
+        self._sum_rows(flat_of(self._given["by_cameras"]), self._count, 10, self._given["by_camera"])
         self._launcher.stage(None)
         return found
 
@@ -193,9 +193,10 @@ class _Backward:
             found["sh"] = colors.reshape((count, terms))
         else:
             found["colors"] = colors
-        self._take("by_poses", count, kernels("project_backward").SIX)
+        self._take("by_cameras", count, kernels("project_backward").TEN)
         found["background"] = self._take("by_background", 3, wp.float32)
-        found["pose"] = self._take("by_pose", 6, wp.float32)
+        by_camera = self._take("by_camera", 10, wp.float32)
+        found["pose"], found["intrinsics"] = by_camera[:6], by_camera[6:]
         return found
 
     def _take(self, name: str, size: int, dtype: Any) -> Any:

@@ -38,4 +38,11 @@
         by_p.x += by_slope_x * ahead;
         by_p.y += by_slope_y * ahead;
         by_p.z -= (by_slope_x * slope_x + by_slope_y * slope_y + by_per_x * per_x + by_per_y * per_y) * ahead;
+        // The image depends on fx x + cx z and fy y + cy z of the axes and the centre; limits of slopes are constant in pixels.
+        const real3_ xs = {su * unit_a.x, sv * unit_b.x, c.x}, ys = {su * unit_a.y, sv * unit_b.y, c.y};
+        const real3_ by_xs = {by_a.x, by_b.x, by_c.x}, by_ys = {by_a.y, by_b.y, by_c.y};
+        own.by_camera[6] = (dot3(by_xs, xs) + by_p.x * p.x) / view->focal_x;
+        own.by_camera[7] = (dot3(by_ys, ys) + by_p.y * p.y) / view->focal_y;
+        own.by_camera[8] = (dot3(by_xs, depths) + by_p.x * pz) / view->focal_x;
+        own.by_camera[9] = (dot3(by_ys, depths) + by_p.y * pz) / view->focal_y;
     }
