@@ -65,21 +65,11 @@ def subdivide(
         done_boxes.append(boxes[~halved])
         done_owner.append(owner[~halved])
         done += len(boxes) - int(halved.sum())
-        boxes, owner, length, by_axis = boxes[halved], owner[halved], length[halved], by_axis[halved]
+        boxes, owner, by_axis = boxes[halved], owner[halved], by_axis[halved]
         refuse_more(f"on its surface {spec}", done + 2 * len(boxes), max_splats, "at least ")
-        # a twisted rectangle has straight lines along its axes
-        straight = by_axis.max(1) < MARGIN * deviation / 2
-        axis = np.where(straight, length[:, 1] > length[:, 0], by_axis[:, 1] > by_axis[:, 0]).astype(int)
-        each = np.arange(len(boxes))
-        if whole:
-            axis = np.where(length[each, axis] > 1, axis, 1 - axis)
-        middle = (boxes[each, axis] + boxes[each, axis + 2]) / 2
-        middle = np.floor(middle) if whole else middle
-        first, second = boxes.copy(), boxes.copy()
-        first[each, axis + 2] = second[each, axis] = middle
-        if printed.angles is not None:  # pieces rotate about their own centres
-            first, second = (_rotated(piece, boxes, printed.angles[owner]) for piece in (first, second))
-        boxes, owner = np.concatenate([first, second]), np.concatenate([owner, owner])
+        angles = None if printed.angles is None else printed.angles[owner]
+        boxes = _halves(boxes, by_axis, MARGIN * deviation / 2, whole, angles)
+        owner = np.concatenate([owner, owner])
     found, owner = np.concatenate(done_boxes), np.concatenate(done_owner)
     order = np.argsort(owner, kind="stable")
     found, owner = found[order], owner[order]
@@ -88,6 +78,26 @@ def subdivide(
         values=printed.values[owner],
         angles=None if printed.angles is None else printed.angles[owner],
     )
+
+
+def _halves(
+    boxes: np.ndarray, by_axis: np.ndarray, straight_below: float, whole: bool, angles: np.ndarray | None
+) -> np.ndarray:
+    """The first halves of rectangles (n, 4), then the second ones."""
+    # a twisted rectangle has straight lines along its axes
+    length = boxes[:, 2:] - boxes[:, :2]
+    straight = by_axis.max(1) < straight_below
+    axis = np.where(straight, length[:, 1] > length[:, 0], by_axis[:, 1] > by_axis[:, 0]).astype(int)
+    each = np.arange(len(boxes))
+    if whole:
+        axis = np.where(length[each, axis] > 1, axis, 1 - axis)
+    middle = (boxes[each, axis] + boxes[each, axis + 2]) / 2
+    middle = np.floor(middle) if whole else middle
+    first, second = boxes.copy(), boxes.copy()
+    first[each, axis + 2] = second[each, axis] = middle
+    if angles is not None:  # pieces rotate about their own centres
+        first, second = (_rotated(piece, boxes, angles) for piece in (first, second))
+    return np.concatenate([first, second])
 
 
 def _rotated(pieces: np.ndarray, boxes: np.ndarray, angles: np.ndarray) -> np.ndarray:
