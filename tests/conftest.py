@@ -24,7 +24,7 @@ def pytest_generate_tests(metafunc):
 
 
 def pytest_addoption(parser):
-    words = "sample of devices and pixels (tests/sampling.py), 0 to 3; each run draws one"
+    words = "sample of devices, pixels and cases (tests/sampling.py), 0 to 7; each run draws one"
     parser.addoption("--turn", type=int, help=words)
 
 
@@ -32,7 +32,7 @@ def pytest_configure(config):
     if hasattr(config, "workerinput"):
         config.option.turn = config.workerinput["turn"]
     elif config.option.turn is None:
-        config.option.turn = random.randrange(4)
+        config.option.turn = random.randrange(8)
     if config.option.markexpr == "not exhaustive":
         sampling.TURN = config.option.turn
 
@@ -44,7 +44,7 @@ def pytest_configure_node(node):
 
 
 def pytest_report_header(config):
-    return f"devices and pixels in turn: this sample by --turn={config.option.turn}"
+    return f"devices, pixels and cases in turn: this sample by --turn={config.option.turn}"
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -10,7 +10,9 @@ import pytest
 SAMPLES = {"1 sample": 1, "2 x 2 samples": 2}
 """samples along a pixel's side, for `alternate`"""
 TURN: int | None = None
-"""the option `--turn`, 0 to 3: two halves of the pixels on two devices; None: sweeps are complete"""
+"""the option `--turn`, 0 to 7, whose bits choose devices, pixels and cases; None: sweeps are complete"""
+SWEEP = 4
+WITHOUT_KERNELS = "tests/unit/", "tests/experiments/"
 
 
 def sampled(cases: Sequence, count: int, seed: int) -> list:
@@ -34,8 +36,7 @@ def alternate(*axes: Mapping[str, object]) -> list:
 
 def chessboard(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray] | None:
     """Rows and columns of every other pixel of an image (h, w), as the fields of a chessboard of one colour,
-    the other one two turns later, since the next `TURN` has the other devices. None, for all pixels, in
-    complete sweeps."""
+    the other one two turns later. None, for all pixels, in complete sweeps."""
     if TURN is None:
         return None
     rows, columns = np.indices(size)
@@ -43,18 +44,25 @@ def chessboard(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def take_turns(items: Sequence[pytest.Item], devices: Sequence[str], turn: int = 0) -> None:
-    """Mark tests `exhaustive` so that each file's tests of several of these devices run on one of them, which
-    then compiles a feature set for the complete file. The next `turn` runs the file on the next device."""
+    """Mark tests `exhaustive` that another run has, of the 8 that differ in `turn`.
+
+    A file's tests of several of these devices run on one of them, which then compiles a feature set for the
+    complete file. Of `SWEEP` or more cases of a test of kernels every other one runs.
+    """
     found: dict[str, dict[str, list[pytest.Item]]] = {}
     for item in items:
         params = getattr(getattr(item, "callspec", None), "params", {})
         device = params.get("renderer", params.get("device"))
-        if device in devices:
-            found.setdefault(item.nodeid.partition("[")[0], {}).setdefault(device, []).append(item)
+        if params and not item.get_closest_marker("exhaustive"):
+            test = item.nodeid.partition("[")[0]
+            found.setdefault(test, {}).setdefault(device if device in devices else "", []).append(item)
     for test, by_device in found.items():
         # a hash of the file's name, so that its device does not depend on which other tests are collected
-        own = devices[(crc32(test.partition("::")[0].encode()) + turn) % len(devices)]
+        own = devices[(crc32(test.partition("::")[0].encode()) + turn) % len(devices)] if devices else ""
         for device, cases in by_device.items():
-            if own in by_device and device != own:
-                for item in cases:
+            elsewhere = own in by_device and device not in ("", own)
+            sweep = len(cases) >= SWEEP and not test.startswith(WITHOUT_KERNELS)
+            for number, item in enumerate(cases):
+                # the parity of the number's bits: of two short axes, no run has one value of one axis only
+                if elsewhere or (sweep and (number.bit_count() + turn // 4) % 2):
                     item.add_marker(pytest.mark.exhaustive)

@@ -19,39 +19,50 @@ class Item:
     def __init__(self, file, device, case):
         self.nodeid = f"{file}::test[{device}-{case}]"
         self.callspec = SimpleNamespace(params={"renderer": device})
-        self.kept = True
+        self.marks = []
+
+    def get_closest_marker(self, name):
+        return name in self.marks
 
     def add_marker(self, mark):
-        self.kept &= mark.name != "exhaustive"
+        self.marks.append(mark.name)
 
 
-def kept(turn, devices=DEVICES, files="abcdefgh"):
-    """Of two cases per file and device, the names of those that plain pytest runs."""
-    items = [Item(file, device, case) for file in files for device in devices for case in (0, 1)]
+def kept(turn, devices=DEVICES, files="abcdefgh", cases=2):
+    """Of the cases per file and device, those that plain pytest runs, as (file, device, case)."""
+    items = [Item(file, device, case) for file in files for device in devices for case in range(cases)]
     take_turns(items, DEVICES[:2], turn)
-    return {item.nodeid for item in items if item.kept}
+    ids = [item.nodeid.replace("::test[", " ").replace("-", " ")[:-1] for item in items if not item.marks]
+    return {tuple(each.split()) for each in ids}
 
 
 def test_each_file_runs_on_one_device_of_the_processor_and_on_every_gpu():
     run = kept(0)
-    for file in "abcdefgh":
-        cases = {each.partition("[")[2] for each in run if each.startswith(file)}
-        assert cases in (
-            {f"{device}-{case}]" for device in (own, "gpu") for case in (0, 1)} for own in ("one", "two")
-        )
-    assert len({each.partition("[")[2][:3] for each in run}) == 3
+    own = {file: device for file, device, _ in run if device != "gpu"}
+    assert run == {(file, device, case) for file in own for device in (own[file], "gpu") for case in "01"}
+    assert set(own.values()) == {"one", "two"}
     # a selection of files keeps their devices
     assert kept(0, files="c") == {each for each in run if each[0] == "c"}
 
 
-def test_two_runs_have_every_case_on_every_device():
-    runs = kept(0), kept(1)
-    assert len(runs[0] | runs[1]) == 8 * 3 * 2
-    assert all("gpu" in each for each in runs[0] & runs[1])
+def test_a_sweep_of_kernels_runs_every_other_case():
+    for cases in (sampling.SWEEP, 9):
+        run = kept(0, files="a", devices=("one",), cases=cases)
+        assert abs(len(run) - cases / 2) <= 0.5
+        assert len({int(case) % 2 for *_, case in run}) == 2
+    unit = "tests/unit/test_a.py"
+    assert len(kept(0, files=[unit], devices=("one",), cases=9)) == 9
+
+
+def test_all_turns_have_every_case_on_every_device():
+    runs = [kept(turn, cases=9) for turn in range(8)]
+    assert len(set.union(*runs)) == 8 * 3 * 9
+    assert set.intersection(*runs) == set()
+    assert max(map(len, runs)) < 8 * 3 * 9 / 2
 
 
 def test_tests_of_one_device_run_always():
-    assert kept(0, ("one", "gpu")) == kept(1, ("one", "gpu")) == kept(2, ("one", "gpu"))
+    assert kept(0, ("one", "gpu")) == kept(1, ("one", "gpu")) == kept(4, ("one", "gpu"))
     assert len(kept(0, ("one", "gpu"))) == 8 * 2 * 2
 
 
