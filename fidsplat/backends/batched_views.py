@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -133,8 +134,11 @@ class ViewBatch:
         indices = self.batch_indices[first:end].copy()
         if end - first == 1:
             return replace(ViewBatch.single(self.one(first)), batch_indices=indices, total=self.total)
+        external = self.view.external_depth
         return ViewBatch(
-            self.view,
+            replace(self.view, external_depth=external.part(slice(first, end)))
+            if external and external.stacked
+            else self.view,
             self.rotation[:, first:end],
             self.translation[:, first:end],
             self.eye[:, first:end],
@@ -148,7 +152,10 @@ class ViewBatch:
         """One of the rendered views, by its number."""
         if self.views:
             return self.views[number]
-        own = {name: _plain(each[number]) for name, each in self.numbers.items()}
+        own: dict[str, Any] = {name: _plain(each[number]) for name, each in self.numbers.items()}
+        external = self.view.external_depth
+        if external and external.stacked:
+            own["external_depth"] = external.part(number)
 
         def at(view: View, group: int) -> View:
             arrays = {name: getattr(self, name)[group, number] for name in ("rotation", "translation", "eye")}

@@ -64,6 +64,9 @@ def prepare_batch(cloud: Origined, views: Views) -> tuple[FeatureSet, ViewBatch]
             numbers, groups = indices.astype(np.intp), sorted((views.groups or {}).items())
             poses = None if views.poses is None else views.poses[numbers]
             moved = {label: each[numbers] for label, each in groups}
+            external = views.captures[0].external_depth
+            if external and external.stacked:
+                view = replace(view, external_depth=external.part(numbers))
             return features, ViewBatch.of_poses(view, cloud.origin, poses, moved, indices, len(views))
     own = [prepare(cloud, views.capture(number)) for number in range(len(views))]
     features = own[0][0]

@@ -72,7 +72,7 @@ class View:
     surroundings: Gradient | Panorama | None = None
     """a background that is a gradient or a panorama"""
     external_depth: ExternalDepth | None = None
-    """external depth image: an opaque surface among the splats"""
+    """external depth image: an opaque surface among the splats; in a batch possibly one for each view"""
     raster: RayRaster | None = None
     """rays of the samples for a camera with a lens; None for a pinhole and for parallel rays"""
     along_ray: bool = False
@@ -177,7 +177,7 @@ class View:
         if external is not None and external.depth.shape != (camera.height, camera.width):
             raise InputError(
                 f"external_depth must have the camera's {camera.width} x {camera.height} pixels, got "
-                f"{external.depth.shape[1]} x {external.depth.shape[0]}; render it with this camera"
+                f"{' x '.join(map(str, reversed(external.depth.shape)))}; render it with this camera"
             )
         plain = isinstance(backdrop, tuple)
         rotation = camera.world_to_camera[:3, :3]

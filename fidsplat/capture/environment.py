@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -105,15 +106,16 @@ class ExternalDepth(PickledByFields):
     """An image with depths from another renderer, composited with the splats as an opaque surface.
 
     In each pixel the surface occludes the splats behind it, and splats in front are composited over it.
+    For the one capture of a batch, the arrays may be those of all views: (views, h, w) instead of (h, w).
     Raises InputError for arrays of other shapes, colours that are not finite, or depths below 0.
     """
 
-    rgb: np.ndarray
+    rgb: Any
     """(h, w, 3) float32 in display space, read-only; uint8 is divided by 255"""
-    depth: np.ndarray
+    depth: Any
     """(h, w) float32 metres, along z (along the ray for a fisheye or panorama); infinite where there is no
     surface, which may also be given as 0 or NaN"""
-    label: np.ndarray | int = 0
+    label: Any = 0
     """(h, w) int32, or one label for all pixels"""
 
     def __post_init__(self) -> None:
@@ -121,7 +123,7 @@ class ExternalDepth(PickledByFields):
             array_of(f"{name} of external_depth", getattr(self, name), "an array of numbers", "fiu")
             for name in ("rgb", "depth", "label")
         )
-        if depth.ndim != 2 or rgb.shape != (*depth.shape, 3):
+        if depth.ndim not in (2, 3) or rgb.shape != (*depth.shape, 3):
             raise InputError(
                 f"rgb and depth of external_depth must have shapes (h, w, 3) and (h, w), got {rgb.shape} and "
                 f"{depth.shape}"
@@ -148,6 +150,38 @@ class ExternalDepth(PickledByFields):
             array = array.copy() if array is getattr(self, name) else array
             array.flags.writeable = False
             object.__setattr__(self, name, array)
+
+    @property
+    def stacked(self) -> bool:
+        """Whether it has the images of all views of a batch."""
+        return len(self.depth.shape) > 2
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of its arrays on a device."""
+        return 20 * math.prod(self.depth.shape)
+
+    def part(self, views: int | slice | np.ndarray) -> ExternalDepth:
+        """The images of one view of a batch, or of some."""
+        part = copy.copy(self)
+        for name in ("rgb", "depth", "label"):
+            array = getattr(self, name)
+            if isinstance(views, np.ndarray) and not isinstance(array, np.ndarray):
+                array = array.numpy()
+            object.__setattr__(part, name, array[views])
+        return part
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceExternalDepth(ExternalDepth):
+    """External depth images of a batch in the memory of a Warp renderer's device, which are not checked.
+
+    rgb: (views, h, w) wp.vec3. depth: (views, h, w) wp.float32, infinite where there is no surface. label:
+    (views, h, w) wp.int32. The arrays must not change until the images are read.
+    """
+
+    def __post_init__(self) -> None:
+        pass
 
 
 Background = tuple[float, float, float] | Gradient | Panorama

@@ -35,6 +35,8 @@ class Views:
         counts = {"captures": len(self.captures)} if len(self.captures) != 1 else {}
         counts |= {} if self.poses is None else {"poses": len(self.poses)}
         counts |= {f"groups[{label}]": len(each) for label, each in (self.groups or {}).items()}
+        external = self.captures[0].external_depth if len(self.captures) == 1 else None
+        counts |= {"external_depth": len(external.depth)} if external and external.stacked else {}
         if not counts:
             counts = {"captures": 1}
         counts |= {} if self.mask is None else {"mask": len(self.mask)}
@@ -60,8 +62,11 @@ class Views:
         """Number of views, masked ones included."""
         if len(self.captures) > 1:
             return len(self.captures)
-        of_poses = () if self.poses is None else (self.poses,)
-        return next((len(each) for each in (*of_poses, *(self.groups or {}).values())), len(self.captures))
+        external = self.captures[0].external_depth if self.captures else None
+        arrays = [] if self.poses is None else [self.poses]
+        arrays += [*(self.groups or {}).values()]
+        arrays += [external.depth] if external and external.stacked else []
+        return len(arrays[0]) if arrays else len(self.captures)
 
     @property
     def active(self) -> list[int]:
@@ -72,6 +77,8 @@ class Views:
         """Capture of one view, which renders bit-identically to the view in the batch."""
         base = self.captures[number if len(self.captures) > 1 else 0]
         camera, motion = base.camera, base.motion
+        if base.external_depth and base.external_depth.stacked:
+            base = base.with_(external_depth=base.external_depth.part(number))
         if self.poses is not None and camera is not None:
             camera = camera_at(camera, self.poses[number])
         if self.groups:

@@ -12,14 +12,12 @@ import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye, fisheye_focal_length, focal_length
 from fidsplat.capture.sensor import Sensor
-from fidsplat.sim.poses import IDENTITY, check_poses, compose, inverse, matrix_of
+from fidsplat.sim.poses import IDENTITY, OPTICAL, check_poses, compose, inverse, matrix_of
 from fidsplat.sim.rig import RigCamera
 from fidsplat.splats.rotations import quaternion_multiply
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import open_input, path_of
 
-OPTICAL = np.array([0.0, 0.0, 0.0, 0.5, -0.5, 0.5, -0.5])
-"""rotation from camera to sensor axes: SDF sensors look along x with z up, our cameras along z with y down"""
 KINDS = {
     "camera": ("rgb",),
     "wideanglecamera": ("rgb",),

@@ -14,7 +14,6 @@ import numpy as np
 from fidsplat.cameras import Camera, focal_length
 from fidsplat.sim.camera_element import (
     KINDS,
-    OPTICAL,
     Place,
     camera_sensor,
     name_of,
@@ -23,7 +22,7 @@ from fidsplat.sim.camera_element import (
     pose_element,
     pose_of_angles,
 )
-from fidsplat.sim.poses import IDENTITY, compose, inverse, matrix_of
+from fidsplat.sim.poses import IDENTITY, OPTICAL, compose, inverse, matrix_of
 from fidsplat.sim.rig import RigCamera
 from fidsplat.util.errors import InputError, unknown
 from fidsplat.util.files import path_of

@@ -10,8 +10,10 @@ import numpy as np
 
 from fidsplat.cameras import Camera, Orthographic
 from fidsplat.capture.environment import ExternalDepth
+from fidsplat.render.device_surface import device_surface
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
+from fidsplat.sim.poses import OPENGL
 from fidsplat.sim.rig import Rig, RigCamera, RigImages
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrices_to_quaternions, quaternion_multiply
@@ -25,8 +27,6 @@ except ImportError as error:
 
 mujoco: Any = _mujoco  # type checkers do not know its names
 
-_OPENCV = np.array([0.0, 1.0, 0.0, 0.0])
-"""180 degrees about x: MuJoCo's cameras look along -z with y up, ours along z with y down"""
 MESH = -2
 """label of geom 0 among `meshes`; geom i has MESH - i"""
 MESH_OFFSET = 2e-3
@@ -85,6 +85,7 @@ class MujocoRig(Rig):
                 raise InputError(unknown("body", name, filter(None, names)))
         self._counts = model.nbody, model.ncam
         self._model, self._renderers = model, dict[tuple[int, int], Any]()
+        self._contexts: tuple[Any, ...] = (None,)
         self._body_ids = [names.index(name) for name in self.bodies]
         self._camera_ids = [names_of_model.index(name) for name in self.cameras]
 
@@ -98,7 +99,7 @@ class MujocoRig(Rig):
         position, rotation, at, axes = (np.concatenate([part[k] for part in parts]) for k in range(4))
         bodies = np.concatenate([position, rotation], -1)[:, self._body_ids]
         camera_rotation = quaternion_multiply(
-            matrices_to_quaternions(axes), np.broadcast_to(_OPENCV, (*axes.shape[:2], 4))
+            matrices_to_quaternions(axes), np.broadcast_to(OPENGL[3:], (*axes.shape[:2], 4))
         )
         cameras = np.concatenate([at, camera_rotation], -1)[:, self._camera_ids]
         return bodies, cameras
@@ -108,7 +109,7 @@ class MujocoRig(Rig):
         data: Any,
         *,
         outputs: Iterable[str] | None = None,
-        external_depths: Mapping[str, Sequence[ExternalDepth]] | None = None,
+        external_depths: Mapping[str, Sequence[ExternalDepth] | ExternalDepth] | None = None,
         mask: Any = None,
         meshes: bool | Iterable[int] = False,
     ) -> RigImages:
@@ -118,23 +119,67 @@ class MujocoRig(Rig):
             data: an MjData, a list of MjData, one for each environment, or mujoco_warp's Data; after
                 `mj_forward` or `mj_step`, which compute the poses of bodies and cameras.
             outputs, external_depths, mask: as in `Rig.render`.
-            meshes: whether the model's geoms, rendered by MuJoCo, are composited with the splats by depth; or
-                their geom groups, by default 0, 1 and 2. They have the label `MESH` - id of the geom. They
-                are moved 2 mm away from the camera, so that markers on their surfaces are visible.
+            meshes: whether the model's geoms, rendered by MuJoCo or mujoco_warp, are composited with the
+                splats by depth; or their geom groups, by default 0, 1 and 2. They have the label `MESH` - id
+                of the geom. They are moved 2 mm away from the camera, so that markers on their surfaces are
+                visible.
 
         Raises:
-            InputError: as `Rig.render`; data without poses; meshes with external_depths, with mujoco_warp's
-                Data, with an orthographic camera, or without OpenGL.
+            InputError: as `Rig.render`; data without poses; meshes with external_depths; without mujoco_warp:
+                meshes with an orthographic camera, or without OpenGL.
         """
         bodies, cameras = self.poses(data)
         if meshes is not False:
             if external_depths is not None:
                 raise InputError("meshes and external_depths exclude each other; give one of them")
-            external_depths = self._meshes(data if isinstance(data, list | tuple) else [data], meshes)
+            ours = self._world_meshes if hasattr(data, "nworld") else self._meshes
+            external_depths = ours(data, self._groups_of(meshes))
         return super().render(bodies, cameras, outputs=outputs, external_depths=external_depths, mask=mask)
 
-    def _meshes(self, data: Sequence[Any], groups: Any) -> dict[str, list[ExternalDepth]]:
-        """Images of the model's geoms for each camera and environment."""
+    @staticmethod
+    def _groups_of(meshes: Any) -> list[int]:
+        """The geom groups to render."""
+        if meshes is True:
+            return [0, 1, 2]
+        groups = meshes if isinstance(meshes, Iterable) else [meshes]
+        return [whole_number("a geom group of meshes", group, 0, mujoco.mjNGROUP - 1) for group in groups]
+
+    def _world_meshes(self, data: Any, groups: list[int]) -> dict[str, ExternalDepth]:
+        """Images of the model's geoms for each camera and all worlds, by mujoco_warp's ray caster."""
+        import mujoco_warp as mjw  # type: ignore[import-not-found]
+        import warp as wp  # type: ignore[import-not-found]
+
+        if not (np.isin(self._model.geom_group, groups).any() or self._model.nflex):
+            return {}  # mujoco_warp 4.0 crashes without geoms
+        kind = data.nworld, tuple(groups)
+        with wp.ScopedDevice(data.qpos.device):
+            if self._contexts[0] != kind:
+                sizes = [(each.camera.width, each.camera.height) for each in self.cameras.values()]
+                context = mjw.create_render_context(
+                    self._model, data.nworld, sizes, True, True, True,
+                    enabled_geom_groups=groups, cam_active=self._camera_ids,
+                )  # fmt: skip
+                self._contexts = kind, mjw.put_model(self._model), context
+            _, model, context = self._contexts
+            mjw.refit_bvh(model, data, context)
+            mjw.render(model, data, context)
+            pairs = context.seg_data  # of an id and a type of object
+            ids = wp.array(
+                ptr=pairs.ptr, dtype=wp.int32, shape=pairs.shape, strides=pairs.strides, device=pairs.device
+            )
+            found, first = {}, 0
+            for name, each in self.cameras.items():
+                size = each.camera.height, each.camera.width
+                own = slice(first, first := first + size[0] * size[1])
+                arrays = context.rgb_data[:, own], context.depth_data[:, own], ids[:, own]
+                found[name] = device_surface(
+                    self.renderer, *arrays, size, red=16, label=MESH, offset=MESH_OFFSET
+                )
+        return found
+
+    def _meshes(self, data: Any, groups: list[int]) -> dict[str, list[ExternalDepth]]:
+        """Images of the model's geoms for each camera and environment, by MuJoCo."""
+        data = data if isinstance(data, list | tuple) else [data]
         for one in data:
             instance("data with meshes", one, mujoco.MjData, "a mujoco.MjData")
         for name, camera in self.cameras.items():
@@ -144,12 +189,8 @@ class MujocoRig(Rig):
                     f"{camera.camera.lens.kind}; leave it out by cameras="
                 )
         option = mujoco.MjvOption()
-        if groups is not True:
-            option.geomgroup[:] = 0
-            for group in groups if isinstance(groups, Iterable) else [groups]:
-                option.geomgroup[
-                    whole_number("a geom group of meshes", group, 0, len(option.geomgroup) - 1)
-                ] = 1
+        option.geomgroup[:] = 0
+        option.geomgroup[groups] = 1
         found: dict[str, list[ExternalDepth]] = {}
         for (name, camera), number in zip(self.cameras.items(), self._camera_ids, strict=True):
             renderer = self._mesh_renderer(camera.camera.width, camera.camera.height)

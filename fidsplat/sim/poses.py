@@ -14,6 +14,10 @@ from fidsplat.util.arguments import LARGEST, real_array
 from fidsplat.util.errors import InputError
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+OPENGL = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+"""180 degrees about x: cameras of OpenGL look along -z with y up, ours along z with y down"""
+OPTICAL = np.array([0.0, 0.0, 0.0, 0.5, -0.5, 0.5, -0.5])
+"""rotation from camera to sensor axes: SDF sensors look along x with z up, our cameras along z with y down"""
 UNIT = 1e-3
 """tolerance of a quaternion's length, for rounding of float32 and integrators"""
 

@@ -121,7 +121,7 @@ class Rig:
         cameras: Mapping[str, Any] | Any = None,
         *,
         outputs: Iterable[str] | None = None,
-        external_depths: Mapping[str, Sequence[ExternalDepth]] | None = None,
+        external_depths: Mapping[str, Sequence[ExternalDepth] | ExternalDepth] | None = None,
         mask: Any = None,
     ) -> RigImages:
         """Render every environment by every camera.
@@ -134,8 +134,8 @@ class Rig:
             cameras: poses, world from camera, OpenCV axes: {name: (env, 7)} of some cameras, or
                 (env, camera, 7). Cameras without one use their mounts.
             outputs: names of the output images; default the rig's.
-            external_depths: {camera name: [an ExternalDepth for each environment]}, rendered by another
-                renderer from the same pose.
+            external_depths: {camera name: [an ExternalDepth for each environment], or one with the images of
+                all}, rendered by another renderer from the same pose.
             mask: (env,) bool; environments with False are not rendered: images are 0, labels -1.
 
         Raises:
@@ -193,23 +193,31 @@ class Rig:
         on = np.broadcast_to(IDENTITY, (count, 7)) if camera.body is None else bodies[camera.body]
         return compose(on, camera.mount)
 
-    def _external_of(self, external_depths: Any, count: int) -> dict[str, Sequence[ExternalDepth]]:
+    def _external_of(
+        self, external_depths: Any, count: int
+    ) -> dict[str, Sequence[ExternalDepth] | ExternalDepth]:
         if not isinstance(external_depths, Mapping | None):
             raise invalid("external_depths", "{camera name: list of ExternalDepth}", external_depths)
         for name, each in (external_depths or {}).items():
             if name not in self.cameras:
                 raise InputError(unknown("camera", name, self.cameras))
-            if not isinstance(each, Sequence):
+            stacked = isinstance(each, ExternalDepth) and each.stacked
+            if not (stacked or isinstance(each, Sequence)):
                 raise invalid(f"external_depths[{name!r}]", "a list, one for each environment", each)
-            if len(each) != count:
+            images = len(each.depth) if isinstance(each, ExternalDepth) else len(each)
+            if images != count:
                 raise InputError(
-                    f"external_depths[{name!r}] must have {count} images, got {len(each)}; give one for "
+                    f"external_depths[{name!r}] must have {count} images, got {images}; give one for "
                     "each environment"
                 )
         return dict(external_depths or {})
 
     def _captures_of(
-        self, name: str, outputs: tuple[str, ...] | None, external: Sequence[ExternalDepth], count: int
+        self,
+        name: str,
+        outputs: tuple[str, ...] | None,
+        external: Sequence[ExternalDepth] | ExternalDepth,
+        count: int,
     ) -> list[Capture]:
         """Captures of a camera: one for all environments, or one for each if there is noise or an external
         depth image."""
@@ -217,7 +225,10 @@ class Rig:
         capture = self._capture.with_(
             camera=own.camera, sensor=own.sensor, outputs=outputs or self.outputs_of(name)
         )
-        if "noise" not in capture.sensor.steps:
+        noisy = "noise" in capture.sensor.steps
+        if isinstance(external, ExternalDepth):
+            external = [external.part(i) for i in range(count)] if noisy else [external]
+        if not noisy:
             return [capture.with_(external_depth=one) for one in external] or [capture]
         place = list(self.cameras).index(name)
         seeds = [

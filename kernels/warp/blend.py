@@ -73,9 +73,9 @@ def make_blend(
             wp.static(stores[k])(p, at, samples)
 
     @wp.func
-    def new_sample(x: int, y: int, rays: Rays, view: View):
+    def new_sample(x: int, y: int, number: int, rays: Rays, view: View):
         """Initial state of a sample; one outside the image is finished."""
-        p = start(x, y, rays, view)
+        p = start(x, y, number, rays, view)
         if x >= view.width or y >= view.height:
             p.t = 0.0
         return p
@@ -166,13 +166,13 @@ def make_blend(
         cell = cell_y * (4 * across) + cell_x
         x0 = left + cell_x * CELL_W + own % CELL_W
         y0 = top + cell_y * CELL_H + own / CELL_W * each
-        p = new_sample(x0, y0, rays, view)
+        p = new_sample(x0, y0, number, rays, view)
         end = starts[tile + 1]
         if wp.static(layered):
             p.layers.exist = has_groups(starts[tile], end, lists, coplanar_groups, view)
         open = unfinished(p, view)
         if wp.static(pair):
-            q = new_sample(x0, y0 + 1, rays, view)
+            q = new_sample(x0, y0 + 1, number, rays, view)
             open = open or unfinished(q, view)
         ray, slopes = wp.vec3(), SLOPES()
         if wp.static(bent):
@@ -235,11 +235,11 @@ def make_blend(
         view = views[reread(number)]
         at = first_sample(number, view) + y0 * view.tiles_x * view.tile_w + x0
         if wp.static(opaque):
-            p = cover(p, x0, y0, rays, view)
+            p = cover(p, x0, y0, number, rays, view)
         store(finish(p), at, samples)
         if wp.static(pair):
             if wp.static(opaque):
-                q = cover(q, x0, y0 + 1, rays, view)
+                q = cover(q, x0, y0 + 1, number, rays, view)
             store(finish(q), at + view.tiles_x * view.tile_w, samples)
 
     @wp.kernel(name=f"blend_cpu_{words}", **options)
@@ -268,7 +268,7 @@ def make_blend(
         if wp.static(layered):
             exist = has_groups(starts[tile], end, lists, coplanar_groups, view)
         for k in range(view.tile_w * view.tile_h):
-            p = start(x0 + k % view.tile_w, y0 + k / view.tile_w, rays, view)
+            p = start(x0 + k % view.tile_w, y0 + k / view.tile_w, number, rays, view)
             if wp.static(layered):
                 p.layers.exist = exist
             state[state_first + k] = p
@@ -326,7 +326,7 @@ def make_blend(
             for across in range(view.tile_w):
                 p = state[state_first + down * view.tile_w + across]
                 if wp.static(opaque):
-                    p = cover(p, x0 + across, y0 + down, rays, view)
+                    p = cover(p, x0 + across, y0 + down, number, rays, view)
                 at = corner + down * stride + across
                 store(finish(p), at, samples)
 

@@ -67,12 +67,13 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
     Pixel = struct_of("Pixel", "State of a sample.", fields)
 
     @wp.func
-    def pixel_at(x: int, y: int, view: View) -> int:
-        """Number of the pixel that a sample belongs to, row by row."""
-        return y / view.samples * (view.width / view.samples) + x / view.samples
+    def pixel_at(x: int, y: int, number: int, view: View) -> int:
+        """Number of the pixel that a sample of view `number` belongs to, view after view, row by row."""
+        row = number * (view.height / view.samples) + y / view.samples
+        return row * (view.width / view.samples) + x / view.samples
 
     @wp.func
-    def start(x: int, y: int, rays: Rays, view: View):
+    def start(x: int, y: int, number: int, rays: Rays, view: View):
         """Initial state of a sample."""
         p = Pixel()
         p.t = 1.0
@@ -87,7 +88,8 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
             p.opaque_z = wp.inf
             # tiles extend beyond the image
             if x < view.width and y < view.height:
-                p.opaque_z = rays.external_depth[pixel_at(x, y, view)]
+                at = pixel_at(x, y, number, view)
+                p.opaque_z = rays.external_depth[at % rays.external_depth.shape[0]]
         for k in range(wp.static(len(starts))):
             p = wp.static(starts[k])(p, length, view)
         return p
@@ -219,12 +221,13 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         return p
 
     @wp.func
-    def cover(pixel: Pixel, x: int, y: int, rays: Rays, view: View):
+    def cover(pixel: Pixel, x: int, y: int, number: int, rays: Rays, view: View):
         """Composite the external opaque surface, with all transmittance that is left, even below the stop."""
         p = pixel
         if p.opaque_z < wp.inf:
             attributes = Attributes()
-            attributes.rgb = rays.external_rgb[pixel_at(x, y, view)]
+            at = pixel_at(x, y, number, view)
+            attributes.rgb = rays.external_rgb[at % rays.external_rgb.shape[0]]
             attributes.z = p.opaque_z
             for k in range(wp.static(len(covers))):
                 attributes = wp.static(covers[k])(attributes)

@@ -8,7 +8,7 @@ class PixelGrid:
     """The samples of one pixel."""
 
     pixel: int  # of the images, view after view, row by row
-    here: int  # of its own view
+    here: int  # of the rendered views, view after view
     row: int  # of all views, one after the other
     splats: int  # of the cloud
     first: int  # place of the first sample in a buffer

@@ -20,7 +20,7 @@ def struct_of_rays(bent: bool, sloped: bool = False, opaque: bool = False):
     if bent:  # X, Y, Z along the rows of samples; NaN outside of the field of view
         fields |= {"rays": wp.array(dtype=wp.vec3)}
         fields |= {"slopes": wp.array(dtype=SLOPES)} if sloped else {}
-    if opaque:  # of each pixel, row by row; a depth that is infinite where there is none
+    if opaque:  # of each pixel, row by row, of all views or of each; a depth is infinite where there is none
         fields |= {"external_depth": wp.array(dtype=wp.float32), "external_rgb": wp.array(dtype=wp.vec3)}
     return struct_of("Rays", "The samples' rays, and an external depth image.", fields)
 

@@ -51,12 +51,13 @@ def make_resolve(
         number = place / pixels
         view = views[number]
         grid = PixelGrid()
-        grid.here = place - number * pixels
-        grid.pixel = batch_indices[number] * pixels + grid.here
-        own_row = grid.here / width
+        here = place - number * pixels
+        grid.here = place
+        grid.pixel = batch_indices[number] * pixels + here
+        own_row = here / width
         grid.row = number * (view.height / n) + own_row
         grid.splats = view.splats
-        x = (grid.here % width) * n
+        x = (here % width) * n
         y = own_row * n
         grid.stride = view.tiles_x * view.tile_w
         grid.first = first_sample(number, view) + y * grid.stride + x

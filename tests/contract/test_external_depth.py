@@ -11,6 +11,7 @@ from fidsplat.backends.opencl.assemble import assemble
 from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
+from fidsplat.capture.environment import DeviceExternalDepth
 from fidsplat.effects import select
 from fidsplat.splats.rotations import rigid_matrix
 
@@ -110,6 +111,38 @@ def test_only_a_surface_in_front_of_all_splats_is_visible(renderer):
     np.testing.assert_array_equal(frame["depth"], near.depth)
     assert (frame["label"] == 77).all()
     assert (frame["alpha"] == 1).all()
+
+
+def test_views_of_a_batch_have_images_of_their_own(renderer):
+    """As alone, bit for bit: of all views, with a masked view, and one image for all views."""
+    surfaces = [a_surface(seed, label) for seed, label in ((0, 77), (1, 78), (2, 79))]
+    arrays = (np.stack([getattr(one, name) for one in surfaces]) for name in ("rgb", "depth", "label"))
+    poses = np.tile([0, 0, 0, 1.0, 0, 0, 0], (3, 1))
+    poses[:, 0] = 0.0, 0.1, 0.2
+    capture, cloud = fs.Capture(CAMERA, OUTPUTS, external_depth=fs.ExternalDepth(*arrays)), a_cloud()
+    batch = renderer.render_batch(cloud, capture, poses=poses, mask=np.array([True, False, True]))
+    shared = renderer.render_batch(cloud, capture.with_(external_depth=surfaces[0]), poses=poses)
+    for images, number, surface in ((batch, 0, 0), (batch, 2, 2), (shared, 1, 0)):
+        camera = CAMERA.with_pose(position=poses[number, :3])
+        own = capture.with_(camera=camera, external_depth=surfaces[surface])
+        alone = renderer.render(cloud, own)
+        for name in OUTPUTS:
+            np.testing.assert_array_equal(images[name][number], alone[name], err_msg=name)
+    assert (batch["label"][1] == -1).all()
+    np.testing.assert_array_equal(batch.frame(2).capture.external_depth.depth, surfaces[2].depth)
+    if renderer.device.name.startswith("warp"):  # arrays of the device
+        import warp as wp
+
+        types = {"rgb": wp.vec3, "depth": wp.float32, "label": wp.int32}
+        host, device = capture.external_depth, renderer.backend.device
+        own = [wp.array(getattr(host, name), dtype=kind, device=device) for name, kind in types.items()]
+        same = renderer.render_batch(
+            cloud, capture.with_(external_depth=DeviceExternalDepth(*own)), poses=poses
+        )
+        for name in OUTPUTS:
+            np.testing.assert_array_equal(same[name][::2], batch[name][::2], err_msg=name)
+    with pytest.raises(fs.InputError, match="external_depth has 3, mask has 2"):
+        renderer.render_batch(cloud, capture, mask=np.array([True, True]))
 
 
 def test_an_empty_surface_changes_no_bit(renderer):

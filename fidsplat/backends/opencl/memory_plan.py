@@ -114,7 +114,9 @@ class MemoryPlanner:
         if not count:
             return
         plan = self.frame(resident, views.one(0), others)
+        external = views.view.external_depth
         together = views.stacked and not (resident.streamed or self._separate)
+        together = together and not (external and external.stacked)
         if plan.chunk or not together or (views.numbers and self._of_cameras):
             for k in range(count):
                 yield Part(k, k + 1, self.frame(resident, views.one(k), others))

@@ -73,6 +73,8 @@ class MemoryPlanner:
         if not count or not batch.stacked or (self._same_settings and batch.numbers):
             return iter([(k, k + 1) for k in range(count)])
         each = resident.count * (self._splat_bytes + _VISIBLE) + self.sample_bytes(batch.view)
+        external = batch.view.external_depth
+        each += external.nbytes // count if external and external.stacked else 0
         free = workspace.memory_budget - resident.memory_bytes - reserved
         # half of the budget is for the lists
         fitting = min(free // 2, _MAX_PART_BYTES[workspace.device.is_cuda]) // each

@@ -187,7 +187,8 @@ class FrameRenderer:
         workspace, labels = self._workspace, tuple(label for label, _ in view.groups)
         budgets = workspace.memory_budget, workspace.pair_budget, reserved
         states = workspace.pool.state, cached.inputs.state
-        return cached.capacity, budgets, states, view.raster, view.surroundings, labels
+        external = view.external_depth and view.external_depth.depth.shape
+        return cached.capacity, budgets, states, view.raster, view.surroundings, labels, external
 
     def _update_capacity(self, resident: Resident, views: ViewBatch, visible: int, pairs: int) -> None:
         kinds, kind = self._cached.setdefault(resident, {}), (views.view.width, views.view.height, len(views))

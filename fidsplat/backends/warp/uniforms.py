@@ -170,7 +170,7 @@ def memory_bytes(view: View, workspace: Workspace) -> int:
     if isinstance(around, Panorama):
         size += around.image.nbytes
     if external is not None:
-        size += external.rgb.nbytes + external.depth.nbytes + np.asarray(external.label).nbytes
+        size += external.nbytes
     return size
 
 

@@ -55,11 +55,12 @@ class ArrayPool:
             part = self._parts[name, dtype] = whole[:size]
         return part
 
-    def filled(self, name: str, values: np.ndarray, dtype: Any) -> Any:
-        """Copy host values to a scratch array of the same size."""
+    def filled(self, name: str, values: Any, dtype: Any) -> Any:
+        """Copy a host array, or an array of this device, to a scratch array of the same size."""
         wp = load()
-        if self.device.is_cuda:
-            given = wp.array(values, dtype=dtype, device="cpu")
+        on_device = isinstance(values, wp.array)
+        if self.device.is_cuda or on_device:
+            given = values.flatten() if on_device else wp.array(values, dtype=dtype, device="cpu")
             array = self.exact(name, given.size, dtype)
             wp.copy(array, given)
             return array

@@ -16,7 +16,7 @@ def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
     for k in range(grid.count):
         weight = wp.max(weight, samples.weight[sample_at(grid, k)])
     if weight > 0.0 and heaviest_of(grid, samples) < 0:
-        out.label[grid.pixel] = out.external_label[grid.here]
+        out.label[grid.pixel] = out.external_label[grid.here % out.external_label.shape[0]]
 
 
 OUTPUT = Output(needs=("heaviest",), view_arrays={"external_label": wp.int32}, resolve=resolve, over="label")

@@ -1,0 +1,242 @@
+"""Isaac Lab's camera interface (`TiledCamera`, in Isaac Lab 3.0 `Camera`) for rigs.
+
+Follows the documentation of Isaac Lab 3.0 and 2.3; Isaac Lab itself is not needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.sim.poses import IDENTITY, OPENGL, OPTICAL, compose, inverse, pose_of
+from fidsplat.sim.rig import Rig
+from fidsplat.util.arguments import instance, invalid, whole_number
+from fidsplat.util.errors import InputError, unknown
+
+_FROM_ROS = {"ros": IDENTITY, "opengl": OPENGL, "world": OPTICAL}
+"""(7,) axes of the convention from OpenCV axes"""
+_OUTPUTS = {
+    "rgb": "rgb",
+    "depth": "depth",
+    "distance_to_image_plane": "depth",
+    "distance_to_camera": "distance",
+    "normals": "normal_world",
+    "semantic_segmentation": "label",
+}
+"""our output of each data type"""
+
+
+@dataclass
+class CameraData:
+    """Data of the cameras of all environments as torch tensors, by the names of Isaac Lab."""
+
+    image_shape: tuple[int, int]
+    """height and width"""
+    intrinsic_matrices: Any
+    """(N, 3, 3)"""
+    pos_w: Any
+    """(N, 3) metres in the world of the simulation"""
+    quat_w_ros: Any
+    """(N, 4) OpenCV axes"""
+    quat_w_world: Any
+    """(N, 4) x forward, z up"""
+    quat_w_opengl: Any
+    """(N, 4) -z forward, y up"""
+    output: dict[str, Any]
+    """(N, h, w, channels) by data type: rgb uint8, semantic_segmentation int32, else float32"""
+
+
+class TiledCamera:
+    """A camera in each environment, with the interface of Isaac Lab's `TiledCamera`.
+
+    Images are torch tensors on the device of the renderer, without a copy to the host if it is a Warp device.
+
+    Args:
+        rig: splats, markers and one camera.
+        num_instances: N, number of environments.
+        data_types: rgb, depth, distance_to_image_plane, distance_to_camera (infinite for empty pixels),
+            normals (world axes) and semantic_segmentation (labels of splats, -1 for none).
+        bodies: function that returns the current poses {name: (N, 7)} of the rig's bodies in the world of the
+            simulation, for example of `RigidObject.data.root_pose_w`; arrays of torch, Warp or NumPy.
+        origins: (N, 3) positions of the environments (`scene.env_origins`); splats are relative to them.
+        update_period: seconds between images; 0: new images in every step.
+        quaternions: order of all quaternions: xyzw (Isaac Lab 3.0) or wxyz (2.x).
+
+    Raises:
+        InputError: a rig with several cameras, bodies without `bodies`, or an unknown data type.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        num_instances: int,
+        data_types: Sequence[str] = ("rgb",),
+        *,
+        bodies: Callable[[], Mapping[str, Any]] | None = None,
+        origins: Any = None,
+        update_period: float = 0.0,
+        quaternions: Literal["xyzw", "wxyz"] = "xyzw",
+    ) -> None:
+        instance("rig", rig, Rig)
+        if len(rig.cameras) != 1:
+            raise InputError(f"the rig of a TiledCamera must have one camera, got {', '.join(rig.cameras)}")
+        if rig.bodies and bodies is None:
+            raise InputError(f"bodies must return the poses of {', '.join(rig.bodies)}, got None")
+        for name in data_types:
+            if name not in _OUTPUTS:
+                raise InputError(unknown("data type", name, _OUTPUTS))
+        if quaternions not in ("xyzw", "wxyz"):
+            raise InputError(unknown("order of quaternions", quaternions, ("xyzw", "wxyz")))
+        self.num_instances = whole_number("num_instances", num_instances, 1, 2**31 - 1)
+        self._rig, self._types, self._bodies = rig, tuple(data_types), bodies
+        (self._name,) = rig.cameras
+        self._outputs = tuple(_OUTPUTS[name] for name in data_types)
+        origins = np.zeros((num_instances, 3)) if origins is None else _host(origins)
+        self._origins = np.concatenate([origins, np.tile(IDENTITY[3:], (len(origins), 1))], -1)
+        self._to_wxyz = [0, 1, 2, 3] if quaternions == "wxyz" else [3, 0, 1, 2]
+        self._from_wxyz = [0, 1, 2, 3] if quaternions == "wxyz" else [1, 2, 3, 0]
+        self._period = update_period
+        self._poses: np.ndarray | None = None
+        """(N, 7) poses in the world of the simulation that `set_world_poses` has set"""
+        self._tensors: dict[str, Any] = {}
+        self.frame = np.zeros(num_instances, np.int64)
+        """number of images of each environment since its reset"""
+        self._times, self._taken = np.zeros((2, num_instances))
+        self._outdated = np.ones(num_instances, bool)
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Height and width."""
+        return self._camera.height, self._camera.width
+
+    @property
+    def _camera(self) -> Camera:
+        return self._rig.cameras[self._name].camera
+
+    @property
+    def data(self) -> CameraData:
+        """The current data; renders environments whose images are outdated."""
+        bodies = self._body_poses()
+        if self._outdated.any():
+            self._render(bodies, self._world_poses(bodies))
+        poses, camera = self._world_poses(bodies), self._camera
+        tensor = next(iter(self._tensors.values())).new_empty(0).float().new_tensor  # on their device
+        quats = {
+            name: tensor(compose(poses, inverse(axes))[:, 3:][:, self._from_wxyz])
+            for name, axes in _FROM_ROS.items()
+        }
+        matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+        return CameraData(
+            self.image_shape, tensor([matrix] * len(poses)), tensor(poses[:, :3]),
+            quats["ros"], quats["world"], quats["opengl"], dict(self._tensors),
+        )  # fmt: skip
+
+    def update(self, dt: float, force_recompute: bool = False) -> None:
+        """Advance the time; images of environments whose period has passed are rendered when `data` is read,
+        or now if `force_recompute`."""
+        self._times += dt
+        self._outdated |= self._times - self._taken + 1e-6 >= self._period
+        if force_recompute:
+            self._outdated[:] = True
+            _ = self.data
+
+    def reset(self, env_ids: Any = None) -> None:
+        """Set the time and the number of images of environments to 0; their images become outdated."""
+        which = self._which(env_ids)
+        self.frame[which] = self._times[which] = self._taken[which] = 0
+        self._outdated[which] = True
+
+    def set_world_poses(
+        self,
+        positions: Any = None,
+        orientations: Any = None,
+        env_ids: Any = None,
+        convention: Literal["opengl", "ros", "world"] = "ros",
+    ) -> None:
+        """Set poses in the world of the simulation, instead of those of the camera's mount.
+
+        Args:
+            positions: (n, 3) metres; None: unchanged.
+            orientations: (n, 4) quaternions, axes of the convention; None: unchanged.
+            env_ids: environments; None: all.
+            convention: opengl (-z forward, y up), ros (z forward, y down) or world (x forward, z up).
+        """
+        if convention not in _FROM_ROS:
+            raise InputError(unknown("convention", convention, _FROM_ROS))
+        which, poses = self._which(env_ids), self._world_poses(self._body_poses())
+        if positions is not None:
+            poses[which, :3] = _host(positions)
+        if orientations is not None:
+            turned = np.zeros((len(poses[which]), 7))
+            turned[:, 3:] = _host(orientations)[..., self._to_wxyz]
+            poses[which, 3:] = compose(turned, _FROM_ROS[convention])[:, 3:]
+        self._poses = poses
+        self._outdated[which] = True
+
+    def set_world_poses_from_view(self, eyes: Any, targets: Any, env_ids: Any = None) -> None:
+        """Set poses from eyes and targets (n, 3); z is up."""
+        eyes, targets = _host(eyes).reshape(-1, 3), _host(targets).reshape(-1, 3)
+        poses = [
+            inverse(pose_of(Camera.look_at(2, 2, 1.0, eye, target, up=(0, 0, 1)).world_to_camera))
+            for eye, target in zip(eyes, targets, strict=True)
+        ]
+        self.set_world_poses(eyes, np.array(poses)[:, 3:][:, self._from_wxyz], env_ids)
+
+    def _which(self, env_ids: Any) -> Any:
+        return slice(None) if env_ids is None else _host(env_ids).astype(int)
+
+    def _body_poses(self) -> dict[str, np.ndarray]:
+        """Poses (N, 7) of the bodies in the world of the simulation."""
+        given = {} if self._bodies is None else self._bodies()
+        if not isinstance(given, Mapping):
+            raise invalid("the result of bodies", "{name of a body: poses (N, 7)}", given)
+        order = [0, 1, 2, *(3 + k for k in self._to_wxyz)]
+        return {name: _host(poses)[:, order] for name, poses in given.items()}
+
+    def _world_poses(self, bodies: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Poses (N, 7) of the cameras in the world of the simulation, OpenCV axes."""
+        if self._poses is not None:
+            return self._poses.copy()
+        if self._rig.cameras[self._name].body is None:
+            return compose(self._origins, self._rig.cameras[self._name].mount)
+        return self._rig._mounted_pose(self._name, bodies, self.num_instances)
+
+    def _render(self, bodies: Mapping[str, np.ndarray], poses: np.ndarray) -> None:
+        mask, back = self._outdated.copy(), inverse(self._origins)
+        images = self._rig.render(
+            {name: compose(back, each) for name, each in bodies.items()},
+            {self._name: compose(back, poses)},
+            outputs=self._outputs,
+            mask=mask,
+        ).of(self._name)
+        made = {name: self._tensor(name, images) for name in self._types}
+        for name, tensor in made.items():
+            if self._tensors and not mask.all():
+                which = np.flatnonzero(mask).tolist()
+                self._tensors[name][which] = tensor[which]
+            else:
+                self._tensors[name] = tensor
+        self.frame[mask] += 1
+        self._taken[mask] = self._times[mask]
+        self._outdated[:] = False
+
+    def _tensor(self, name: str, images: Any) -> Any:
+        """The tensor (N, h, w, channels) of a data type."""
+        image = images.to_torch(_OUTPUTS[name])
+        if name == "rgb":
+            return (image.clamp(0, 1) * 255).round().byte()
+        if _OUTPUTS[name] in ("depth", "distance"):
+            image = image.masked_fill(image == 0, float("inf"))
+        return image if image.ndim == 4 else image.unsqueeze(-1)
+
+
+def _host(value: Any) -> np.ndarray:
+    """An array of torch, Warp or Isaac Lab's `ProxyArray` as NumPy array on the host."""
+    value = getattr(value, "torch", value) if not isinstance(value, np.ndarray) else value
+    if hasattr(value, "detach"):
+        value = value.detach().cpu()
+    return np.array(value.numpy() if hasattr(value, "numpy") else value, np.float64)
