@@ -466,6 +466,10 @@ class Backend(ABC):
             DeviceError: the device does not support a feature, or the compiler fails.
         """
 
+    def frame_shape(self, view: View, count: int = 1) -> Any:
+        """The `shape` of `pipeline` that renders `count` views of this size fastest, with the same bits."""
+        return None
+
     def render_every(
         self,
         pipeline: Any,

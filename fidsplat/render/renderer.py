@@ -390,7 +390,8 @@ class Renderer:
         with self._lock:
             rendered = (batch.one(number) for number in range(len(batch)))
             data, ids = resident.gather(rendered, features, (capture.quality for capture in views.captures))
-            images = self.backend.pipeline(features).render(data, batch)
+            shape = self.backend.frame_shape(batch.view, len(batch))
+            images = self.backend.pipeline(features, shape).render(data, batch)
         return FrameBatch(images, views, ids)
 
     def _resident(self, scene: Scene | SplatCloud | Store | ResidentCloud) -> ResidentCloud:
@@ -428,12 +429,13 @@ class Renderer:
             view = _banded(view, band)
         ideal = ideal_of(resident.data, capture, self.backend) if "error" in capture.outputs else None
         with self._lock:  # scratch buffers and kernel arguments belong to one frame at a time
-            pipeline, data = self.backend.pipeline(features), resident.data
+            shape, data = self.backend.frame_shape(view), resident.data
+            pipeline = self.backend.pipeline(features, shape)
             if not isinstance(data, Residency):
                 error, images = None, render(pipeline, data, view)
                 if ideal is not None:
                     ideal_view = ideal.view if band is None else _banded(ideal.view, band)
-                    ideal_images = render(self.backend.pipeline(ideal.features), data, ideal_view)
+                    ideal_images = render(self.backend.pipeline(ideal.features, shape), data, ideal_view)
                     error = ErrorImage(images, ideal_images, ideal)
                 return Frame(images, capture, error=error)
 

@@ -22,17 +22,26 @@ from fidsplat.backends.opencl.probe import OpenCLProbe
 from fidsplat.backends.opencl.program import build_options
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.roofline import measure_rates
-from fidsplat.backends.opencl.shapes import DeviceShape, cpu_shape, gpu_shape, other_shapes, shape_for
+from fidsplat.backends.opencl.shapes import (
+    DeviceShape,
+    cpu_shape,
+    gpu_shape,
+    other_shapes,
+    shape_for,
+    small_frame_shape,
+)
 from fidsplat.backends.opencl.training import OpenCLTraining
 from fidsplat.backends.opencl.vendors import intel_registered, processor_flags
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.termination_depth import TerminationDepths
+from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import DeviceError, UnknownDeviceError
 from fidsplat.util.files import user_cache
 
+_FEW_SAMPLES = 2560  # for each compute unit: one of an H200 runs 2048 work-items at once
 _PYOPENCL_FILES = ("binary", "info", "source.cl")
 _NO_PATCH_NEEDED = (
     "a newer PoCL (Debian: pocl-opencl-icd; conda: pocl) or Intel's runtime for CPUs needs no patch "
@@ -106,8 +115,11 @@ class OpenCLBackend(Workspace, Backend):
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
         self._gradients: dict[OpenCLPipeline, OpenCLGradients] = {}
         self._background = BackgroundCompiler()
-        self._own: tuple[DeviceShape, dict[FeatureSet, OpenCLPipeline]] = self.shape, {}
-        """pipelines with the device's default shape, by requested features"""
+        self._requested: tuple[DeviceShape, dict[tuple[FeatureSet, DeviceShape | None], OpenCLPipeline]] = (
+            self.shape,
+            {},
+        )
+        """the device's own shape, and pipelines by the arguments of `pipeline`"""
 
     def upload(self, cloud: SplatCloud) -> Resident:
         """Copy a cloud to device buffers; a CPU reads the host's arrays."""
@@ -141,7 +153,10 @@ class OpenCLBackend(Workspace, Backend):
         Raises:
             DeviceError: the device does not support a feature.
         """
-        if shape is None and self._own[0] is self.shape and (known := self._own[1].get(features)) is not None:
+        if self._requested[0] is not self.shape:
+            self._requested = self.shape, {}
+        known = self._requested[1].get((features, shape))
+        if known is not None:
             return known
         if why := self.unsupported(features):
             raise DeviceError(why)
@@ -153,11 +168,17 @@ class OpenCLBackend(Workspace, Backend):
             )
         if key not in self._pipelines:
             self._pipelines[key] = OpenCLPipeline(self, assemble(*key), *key, self.pipeline)
-        if shape is None:
-            if self._own[0] is not self.shape:
-                self._own = self.shape, {}
-            self._own[1][features] = self._pipelines[key]
+        self._requested[1][features, shape] = self._pipelines[key]
         return self._pipelines[key]
+
+    def frame_shape(self, view: View, count: int = 1) -> DeviceShape | None:
+        """Small tiles for frames that would not occupy a GPU (devlog/tuning.md, small frames). Not with a
+        small memory budget, as there are more pairs of a splat and a tile."""
+        if self.shape.schedule != "group" or self.memory_budget < self.info.memory_bytes // 2:
+            return None
+        samples = count * view.width * view.height
+        few = samples <= _FEW_SAMPLES * self.info.compute_units
+        return small_frame_shape(self.shape) if few else None
 
     def differentiate(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLGradients:
         """The pipeline with derivatives; `shape` replaces the device's own build constants (tests)."""
@@ -170,7 +191,7 @@ class OpenCLBackend(Workspace, Backend):
 
     def compile_in_background(self, features: FeatureSet) -> None:
         """Start to compile `differentiate` in the background."""
-        if self._own[1].get(features) not in self._gradients:
+        if self._requested[1].get((features, None)) not in self._gradients:
             self._background.begin(features, lambda: self.differentiate(features).compile_step())
 
     def training(self) -> OpenCLTraining:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 from fidsplat.effects import FeatureSet
 
@@ -63,6 +64,12 @@ def gpu_shape(scan_items: int = 1024, fast_fma: bool = True, dialect: str = "") 
     return DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, scan_items, fast_fma, 8, dialect=dialect)
 
 
+@cache
+def small_frame_shape(own: DeviceShape) -> DeviceShape:
+    """The shape of a GPU for frames with too few tiles to occupy it: more work-groups and work-items."""
+    return replace(own, tile_width=8, tile_height=8, rows=1)
+
+
 def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:
     """`shape` with the tiles and the schedule that these features require."""
     if "blend_double" in features.slots and shape.schedule == "lanes":
@@ -98,18 +105,21 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
         return {"own": own, "not fused": plain, **scalar}
     if kind == "sorting":
         return {"own": own, "in 7 pieces": replace(own, chunks=7, radix_bits=5), "groups": _groups(own, 16)}
-    sizes = [(8, 8), (32, 32)]
-    if own.schedule == "lanes":
-        # a tile is as wide as the vector
-        sizes = [(8, 8), (own.lanes, 32), (4, 16)]
-    lanes = [{"lanes": width} if own.schedule == "lanes" else {} for width, _ in sizes]
+    if own.schedule == "group":
+        return {
+            "small frames": small_frame_shape(own),
+            "32 x 32": replace(own, tile_width=32, tile_height=32),
+        }
+    # a tile is as wide as the vector
     return {
-        f"{width} x {height}": replace(own, tile_width=width, tile_height=height, **lane)
-        for (width, height), lane in zip(sizes, lanes, strict=True)
+        f"{width} x {height}": replace(own, lanes=width, tile_width=width, tile_height=height)
+        for width, height in ((8, 8), (own.lanes, 32), (4, 16))
     }
 
 
 def _groups(own: DeviceShape, side: int) -> DeviceShape:
-    """The schedule of a GPU with tiles of side x side pixels."""
-    groups = replace(own, schedule="group", tile_width=side, tile_height=side)
-    return replace(groups, lists="tiled", lanes=1, scan_items=64, k_buffer_size=8, batch=1)
+    """The schedule of a GPU with tiles of side x side pixels, those of 8 for small frames."""
+    groups = replace(own, schedule="group", lists="tiled", lanes=1, scan_items=64, k_buffer_size=8, batch=1)
+    if side == 8:
+        return small_frame_shape(groups)
+    return replace(groups, tile_width=side, tile_height=side)
