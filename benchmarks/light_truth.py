@@ -23,7 +23,7 @@ import numpy as np
 
 import fidsplat as fs
 from fidsplat.experiments.blender import default_environment, image_job, ready, run_worker
-from fidsplat.experiments.intervals import wilson
+from fidsplat.experiments.tags_report import wilson
 from fidsplat.images.files import to_uint8, write_png
 from fidsplat.images.filters import grey_of
 from fidsplat.images.visualize import contact_sheet

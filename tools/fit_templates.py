@@ -32,7 +32,7 @@ from scipy.optimize import minimize
 from fidsplat.markers import marker
 from fidsplat.markers.mixture import in_pieces
 from fidsplat.markers.partition import partition
-from fidsplat.markers.seams import grow
+from fidsplat.markers.printing import grow
 from fidsplat.util.files import atomic_write
 
 GROWTH = 0.4  # modules; measured together with the templates, see docs/markers.md

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from fidsplat.accuracy.candidates import DEFAULTS
-from fidsplat.accuracy.choice import Choice
+from fidsplat.accuracy.candidates import DEFAULTS, Choice
 from fidsplat.accuracy.error import supports_float64
 from fidsplat.accuracy.search import SceneMeasurement
 from fidsplat.capture.capture import Capture

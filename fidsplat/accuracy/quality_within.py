@@ -6,11 +6,11 @@ import math
 import pickle
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
-from fidsplat.accuracy import cache, candidates
-from fidsplat.accuracy.candidates import Candidate
-from fidsplat.accuracy.choice import Choice
+from fidsplat.accuracy import candidates
+from fidsplat.accuracy.candidates import Candidate, Choice
 from fidsplat.accuracy.search import CandidateSearch, SceneMeasurement, late_ms
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
@@ -23,6 +23,7 @@ from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.store.store import Store
 from fidsplat.util.arguments import as_float
 from fidsplat.util.errors import DeviceError, InputError
+from fidsplat.util.files import from_json, read_text, user_cache, write_json
 from fidsplat.util.provenance import code_hash, digest_of
 
 LAYERS = 100
@@ -122,8 +123,7 @@ def choose(
         return _search(CandidateSearch(measurement, front), error, ms)
 
     choice = _best_of(dict.fromkeys(bases), search_with, first=error is not None)
-    numbers = {"error": choice.error, "ms": choice.ms, "ms_late": choice.ms_late}
-    cache.save(key, {"settings": choice.settings, **numbers})
+    _save(key, choice)
     return choice
 
 
@@ -275,13 +275,30 @@ def _key(*question: object) -> str | None:
 
 
 def _cached(key: str | None, base: Quality, device: str) -> Choice | None:
-    """The cached choice of a key, if it is valid."""
-    value = cache.load(key)
+    """The cached choice of a key; None if there is none or its file is damaged."""
+    if key is None:
+        return None
     try:
-        if value is None:
-            return None
+        value = from_json(read_text(cache_folder() / f"{key}.json"))
         candidate = Candidate(value["settings"], 0, 0, 0, 0)
         error, ms, late = (float(value[name]) for name in ("error", "ms", "ms_late"))
         return Choice(candidate.quality(base), error, ms, late, "cached", device, candidate.settings)
-    except (KeyError, TypeError, ValueError, AttributeError):
+    except (OSError, KeyError, TypeError, ValueError, AttributeError):
         return None
+
+
+def _save(key: str | None, choice: Choice) -> None:
+    """Cache a choice. Errors of writing are ignored."""
+    if key is None:
+        return
+    value = {name: getattr(choice, name) for name in ("settings", "error", "ms", "ms_late")}
+    try:
+        cache_folder().mkdir(parents=True, exist_ok=True)
+        write_json(cache_folder() / f"{key}.json", value, indent=1)
+    except (OSError, InputError):
+        pass
+
+
+def cache_folder() -> Path:
+    """Folder of the measured choices, in the user's cache folder."""
+    return user_cache() / "fidsplat" / "quality_within"

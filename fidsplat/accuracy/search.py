@@ -10,8 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from fidsplat.accuracy.candidates import Candidate
-from fidsplat.accuracy.choice import Choice
+from fidsplat.accuracy.candidates import Candidate, Choice
 from fidsplat.accuracy.error import errors, reference_error, reference_image, reference_renderer
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality

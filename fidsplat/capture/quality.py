@@ -24,7 +24,7 @@ MIXTURES = ("exact", "fitted", "paper", "facets")
 BY_FORMULA = LADDER, NESTED = 121, 562
 TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41, *BY_FORMULA)
 """Gaussians per rectangle in the templates of fidsplat/markers/templates.json, and in those computed by
-fidsplat/markers/nested.py"""
+fidsplat/markers/mixture.py"""
 MAX_LEVELS, MAX_DENSITY = 8, 100
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from fidsplat.commands.calibrate import Calibrate
+from fidsplat.commands.calibrate import Calibrate, Tags
 from fidsplat.commands.experiment_data import (
     Baseline,
     Blender,
@@ -17,9 +17,14 @@ from fidsplat.commands.experiment_data import (
 )
 from fidsplat.commands.experiment_localise import Localise
 from fidsplat.commands.options import Json, RayAddress, repeatable, require_packages
-from fidsplat.commands.output import console, print_lines, report, show_progress
-from fidsplat.commands.sweeps import measure_on_cluster, run_sweeps
-from fidsplat.commands.tags import Tags
+from fidsplat.commands.output import (
+    console,
+    measure_on_cluster,
+    print_lines,
+    report,
+    run_sweeps,
+    show_progress,
+)
 from fidsplat.experiments.settings import (
     AngleSettings,
     ExperimentSettings,

@@ -18,8 +18,14 @@ from fidsplat.commands.options import (
     repeatable,
     require_packages,
 )
-from fidsplat.commands.output import console, delayed_progress, report, show_progress, steps_shown
-from fidsplat.commands.sweeps import run_interleaved
+from fidsplat.commands.output import (
+    console,
+    delayed_progress,
+    report,
+    run_interleaved,
+    show_progress,
+    steps_shown,
+)
 from fidsplat.experiments.plants import PlantSettings
 from fidsplat.experiments.settings import BlenderSettings, DatasetSettings
 from fidsplat.experiments.trained import BaselineSettings

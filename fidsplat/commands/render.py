@@ -26,7 +26,7 @@ from fidsplat.util.files import path_of, writable_folder
 if TYPE_CHECKING:
     import numpy as np
 
-    from fidsplat.accuracy.choice import Choice
+    from fidsplat.accuracy.candidates import Choice
     from fidsplat.capture.quality import Quality
     from fidsplat.render.frame import Frame
     from fidsplat.render.renderer import Renderer

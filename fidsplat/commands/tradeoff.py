@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Devices, Folders, Json, ReportTo, check_plot, require_packages
-from fidsplat.commands.output import console, print_lines, print_table, report
+from fidsplat.commands.output import console, point_label, print_lines, print_table, report, run_sweeps
 from fidsplat.commands.progress_lines import duration
 from fidsplat.commands.scenes import Cameras, UserScenes, load_user_scenes
-from fidsplat.commands.sweeps import point_label, run_sweeps
 from fidsplat.experiments.tradeoff.run import TradeoffSettings
 from fidsplat.util import interrupts
 

@@ -1,4 +1,4 @@
-"""Writing of COLMAP models, text and binary: cameras, images and points3D.
+"""Reading and writing of COLMAP models, text and binary: cameras, images and points3D.
 
 Format: COLMAP's documentation, "Output format". Poses are world to camera with OpenCV's axes, as in fidsplat.
 """
@@ -6,15 +6,16 @@ Format: COLMAP's documentation, "Output format". Poses are world to camera with 
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.splats.rotations import matrix_to_quaternion
+from fidsplat.splats.rotations import matrix_to_quaternion, quaternion_to_matrix
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import writable_folder, write_file
+from fidsplat.util.files import read_input, read_text, writable_folder, write_file
 
 _PINHOLE = 1  # id of the camera model PINHOLE: fx, fy, cx, cy
 _HEADS = {
@@ -99,3 +100,193 @@ def _lines(rows) -> str:
         " ".join(repr(float(v)) if isinstance(v, float) else str(v) for v in row).replace(" \n", "\n") + "\n"
         for row in rows
     )
+
+
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+}
+"""name and number of parameters of COLMAP's camera models by id"""
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """Images, cameras and points of a COLMAP model."""
+
+    names: tuple[str, ...]
+    """names of the images, paths below the image folder, sorted"""
+    cameras: tuple[Camera, ...]
+    """camera of each image"""
+    points: np.ndarray
+    """(m, 3) float64 in the unit of the model"""
+    colors: np.ndarray
+    """(m, 3) uint8"""
+
+
+def load_colmap(folder: Path) -> ColmapModel:
+    """Read cameras, images and optionally points3D from a folder; binary files are preferred.
+
+    Raises InputError for a missing or damaged file, or an unsupported camera model.
+    """
+    lenses = dict(_read(folder, "cameras", _binary_cameras, _text_cameras))
+    views = sorted(_read(folder, "images", _binary_images, _text_images), key=lambda view: view[0])
+    found = list(_read(folder, "points3D", _binary_points, _text_points, needed=False))
+    if not views:
+        raise InputError(f"the COLMAP model in {folder} must have images, got none")
+    cameras = []
+    for name, number, pose in views:
+        if number not in lenses:
+            raise InputError(f"{folder}: the camera of image {name} must be in cameras, got {number}")
+        matrix = np.eye(4)
+        # a quaternion of about 0 becomes NaN, which Camera rejects
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            matrix[:3, :3], matrix[:3, 3] = quaternion_to_matrix(np.array(pose[:4])), pose[4:]
+        try:
+            cameras.append(Camera.from_colmap(lenses[number], matrix))
+        except InputError as error:
+            raise InputError(f"{folder}: image {name}: {error}") from error
+    values = np.array(found, np.float64).reshape(-1, 6)
+    return ColmapModel(
+        tuple(name for name, _, _ in views),
+        tuple(cameras),
+        values[:, :3],
+        byte_colors(f"{folder}: points3D", values[:, 3:]),
+    )
+
+
+def byte_colors(name: str, values: np.ndarray) -> np.ndarray:
+    """Convert colours of points to uint8. Raises InputError for numbers outside 0 to 255."""
+    if not ((values >= 0) & (values <= 255)).all():
+        raise InputError(f"{name} must have colours from 0 to 255, got {values.min():g} to {values.max():g}")
+    return values.astype(np.uint8)
+
+
+def image_poses(file: Path) -> list[tuple[str, tuple[float, ...]]]:
+    """Read images.bin or images.txt: sorted names, and poses world to camera (quaternion w, x, y, z and
+    translation) as stored. Raises InputError for a damaged file."""
+    views = _read_file(file, _binary_images, _text_images)
+    return sorted((name, pose) for name, _, pose in views)
+
+
+def has_colmap(folder: Path) -> bool:
+    """Whether a folder has a COLMAP model."""
+    return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
+
+
+def _read(folder: Path, name: str, binary, text, needed: bool = True) -> list:
+    for suffix in (".bin", ".txt"):
+        if (folder / f"{name}{suffix}").exists():
+            return _read_file(folder / f"{name}{suffix}", binary, text)
+    if not needed:
+        return []
+    raise InputError(f"a COLMAP model must have {name}.bin or {name}.txt, got neither in {folder}")
+
+
+def _read_file(file: Path, binary, text) -> list:
+    try:
+        if file.suffix.lower() == ".bin":
+            return list(binary(_Bytes(read_input(file))))
+        lines = read_text(file).splitlines()
+        return list(text([line.strip() for line in lines if not line.lstrip().startswith("#")]))
+    except InputError:
+        raise
+    except (ValueError, IndexError, KeyError, struct.error) as error:
+        raise InputError(f"cannot read {file} as COLMAP's: {error}; export the model again") from error
+
+
+class _Bytes:
+    """Sequential reader of a binary file."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data, self._place = data, 0
+
+    def take(self, form: str) -> tuple:
+        """Read the next numbers. form: a format of `struct`."""
+        values = struct.unpack_from("<" + form, self._data, self._place)
+        self._place += struct.calcsize("<" + form)
+        return values
+
+    def count(self) -> int:
+        """Read a number of items; it is limited by the size of the file."""
+        (count,) = self.take("Q")
+        if count > len(self._data):
+            raise ValueError(f"it declares {count} items")
+        return count
+
+    def word(self) -> str:
+        """Read a zero-terminated text."""
+        end = self._data.index(b"\0", self._place)
+        text = self._data[self._place : end].decode()
+        self._place = end + 1
+        return text
+
+    def skip(self, size: int) -> None:
+        """Skip some bytes."""
+        if self._place + size > len(self._data):
+            raise ValueError("it is truncated")
+        self._place += size
+
+
+_Intrinsics = tuple[str, int, int, tuple[float, ...]]
+_View = tuple[str, int, tuple[float, ...]]
+
+
+def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, _Intrinsics]]:
+    for _ in range(data.count()):
+        number, model, width, height = data.take("iiQQ")
+        if model not in _MODELS:
+            raise ValueError(f"the model of camera {number} must be 0 to 11, got {model}")
+        name, parameters = _MODELS[model]
+        yield number, (name, width, height, data.take(f"{parameters}d"))
+
+
+def _text_cameras(lines: list[str]) -> Iterator[tuple[int, _Intrinsics]]:
+    for line in filter(None, lines):
+        number, model, width, height, *parameters = line.split()
+        expected = dict(_MODELS.values()).get(model, len(parameters))
+        if len(parameters) != expected:
+            raise ValueError(
+                f"camera {number} of model {model} must have {expected} parameters, got {len(parameters)}"
+            )
+        yield int(number), (model, int(width), int(height), tuple(map(float, parameters)))
+
+
+def _binary_images(data: _Bytes) -> Iterator[_View]:
+    for _ in range(data.count()):
+        _, *pose, camera = data.take("i7di")
+        name = data.word()
+        data.skip(24 * data.count())  # keypoints
+        yield name, camera, tuple(pose)
+
+
+def _text_images(lines: list[str]) -> Iterator[_View]:
+    # every second line has the keypoints and may be empty
+    for line in lines[::2]:
+        if line:
+            words = line.split(maxsplit=9)
+            if len(words) < 10:
+                raise ValueError(f"the line of an image must have 10 words, got {line!r}")
+            yield words[9], int(words[8]), tuple(map(float, words[1:8]))
+
+
+def _binary_points(data: _Bytes) -> Iterator[tuple]:
+    for _ in range(data.count()):
+        _, *values, _ = data.take("Q3d3Bd")
+        data.skip(8 * data.count())  # track
+        yield tuple(values)
+
+
+def _text_points(lines: list[str]) -> Iterator[tuple]:
+    for line in filter(None, lines):
+        _, x, y, z, r, g, b, *_ = line.split()
+        yield tuple(map(float, (x, y, z, r, g, b)))

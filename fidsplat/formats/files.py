@@ -11,8 +11,7 @@ import numpy as np
 
 from fidsplat.formats.collect import Progress
 from fidsplat.formats.gltf import load_gltf, save_gltf
-from fidsplat.formats.ply import load_ply
-from fidsplat.formats.ply_write import save_ply
+from fidsplat.formats.ply import load_ply, save_ply
 from fidsplat.formats.sog import load_sog, load_sog_folder, save_sog, save_sog_folder
 from fidsplat.formats.sog_streamed import META, load_streamed
 from fidsplat.formats.splat import load_splat, save_splat

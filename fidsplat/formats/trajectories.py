@@ -1,4 +1,4 @@
-"""Trajectory files: TUM, KITTI, COLMAP and nerfstudio's transforms.json.
+"""Trajectory files: TUM, KITTI, COLMAP and nerfstudio's transforms.json; cameras of the last two.
 
 Poses are converted to camera to world with OpenCV's axes; transforms.json has OpenGL's (y up, z backwards),
 COLMAP world to camera. Sources: the TUM RGB-D benchmark's "File Formats", KITTI's odometry
@@ -19,12 +19,11 @@ import numpy as np
 from fidsplat.cameras import BrownConrady, Camera, Fisheye, Lens, Trajectory
 from fidsplat.cameras.foreign import COEFFICIENTS, OPENGL
 from fidsplat.cameras.trajectory import check_rate
-from fidsplat.formats.colmap import save_colmap
-from fidsplat.formats.colmap_read import image_poses
+from fidsplat.formats.colmap import has_colmap, image_poses, load_colmap, save_colmap
 from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.util.arguments import instance
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import from_json, path_of, read_input, write_file
+from fidsplat.util.files import from_json, path_of, read_input, read_text, write_file
 
 MAX_BYTES = 2**28
 """maximum bytes of a file; about two million poses in TUM's format"""
@@ -266,3 +265,39 @@ def _colmap(file: Path) -> list[np.ndarray]:
         for name, pose in image_poses(file)
     ]
     return list(Trajectory(np.arange(len(found)), np.array(found)).inverse().poses) if found else []
+
+
+_MODELS = (".", "sparse/0", "sparse", "colmap/sparse/0")
+_TRANSFORMS = ("transforms.json", "transforms_train.json")
+
+
+def load_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
+    """Cameras by the names of their images, from a COLMAP model (its folder, or one that contains
+    `sparse/0`) or nerfstudio's transforms.json (the file or its folder).
+
+    Raises:
+        InputError: neither of them, a damaged file, or an unsupported lens.
+    """
+    file = path_of(path)
+    for place in (file / name for name in _MODELS):
+        if has_colmap(place):
+            model = load_colmap(place)
+            return dict(zip(model.names, model.cameras, strict=True))
+    found = [one for one in (file, *(file / name for name in _TRANSFORMS)) if one.is_file()]
+    if not found:
+        raise InputError(
+            "path must be a transforms.json, or a folder with one or with a COLMAP model (cameras.bin), "
+            f"got {file}"
+        )
+    try:
+        transforms = from_json(read_text(found[0]))
+        names = [str(frame["file_path"]) for frame in transforms["frames"]]
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(f"cannot read {found[0]} as a transforms.json: {error}") from None
+    cameras = {}
+    for number, name in enumerate(names):
+        try:
+            cameras[name] = Camera.from_nerfstudio(transforms, number)
+        except InputError as error:
+            raise InputError(f"{found[0]}: {name}: {error}") from error
+    return cameras

@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 
 from fidsplat.images.family_names import foreign_family
-from fidsplat.markers import boards, images, qr, svg, tags
+from fidsplat.markers import boards, codes, svg
 from fidsplat.markers.spec import Detector, Kind, Spec
 from fidsplat.util.arguments import instance, invalid
 from fidsplat.util.errors import InputError, did_you_mean
 from fidsplat.util.plugins import load_plugins
 
-_kinds = {kind.name: kind for module in (tags, qr, images, svg, boards) for kind in module.KINDS}
+_kinds = {kind.name: kind for module in (codes, svg, boards) for kind in module.KINDS}
 
 
 def register(kind: Kind) -> None:

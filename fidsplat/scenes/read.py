@@ -19,10 +19,9 @@ from fidsplat.formats import Progress, load_splats
 from fidsplat.markers.surfaces import SHAPES, SheetShape
 from fidsplat.markers.wear import Wear
 from fidsplat.scenes.camera import POSE, TABLES, read_focal_lengths, read_keyframes, read_lens, read_shutter
-from fidsplat.scenes.environment import read_background, read_part
+from fidsplat.scenes.environment import read_background, read_part, read_quality
 from fidsplat.scenes.lights import read_lighting, read_lights
 from fidsplat.scenes.parts import PlacedMarker
-from fidsplat.scenes.quality_settings import read_quality
 from fidsplat.scenes.table import Table, names_of
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import rigid_matrix

@@ -11,10 +11,9 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.capture.quality import Quality
-from fidsplat.formats.cameras import load_cameras
 from fidsplat.formats.collect import Progress
 from fidsplat.formats.files import FORMATS, NAMED, load_splats
-from fidsplat.formats.trajectories import load_trajectory
+from fidsplat.formats.trajectories import load_cameras, load_trajectory
 from fidsplat.scenes.scene import Scene
 from fidsplat.scenes.up import sampled
 from fidsplat.splats.cloud import SplatCloud

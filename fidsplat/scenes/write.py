@@ -10,10 +10,9 @@ from fidsplat.formats import save_ply
 from fidsplat.markers import with_file
 from fidsplat.markers.printing import MAX_SPLATS
 from fidsplat.scenes.camera import keyframe_tables, lens_table, shutter_table
-from fidsplat.scenes.environment import environment_tables
+from fidsplat.scenes.environment import environment_tables, marker_settings, quality_tables
 from fidsplat.scenes.lights import Lighting, light_tables, lighting_value
 from fidsplat.scenes.parts import PlacedMarker, SceneParts
-from fidsplat.scenes.quality_settings import marker_settings, quality_tables
 from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.util.arguments import changes_of
 from fidsplat.util.errors import InputError

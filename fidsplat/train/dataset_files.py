@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.formats.colmap_read import has_colmap, load_colmap
+from fidsplat.formats.colmap import has_colmap, load_colmap
 from fidsplat.images.files import read_on_background
 from fidsplat.train.boxes import MarkerBox, read_boxes, without_markers
 from fidsplat.train.dataset import MAX_POINTS, Dataset, TrainingView

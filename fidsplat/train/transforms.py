@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.formats.colmap_read import byte_colors
+from fidsplat.formats.colmap import byte_colors
 from fidsplat.formats.ply_header import read_header
 from fidsplat.images.files import read_on_background
 from fidsplat.train.dataset import TrainingView

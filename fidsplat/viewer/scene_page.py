@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.formats.ply_write import save_ply
+from fidsplat.formats.ply import save_ply
 from fidsplat.formats.sog import save_sog
 from fidsplat.scenes.scene import Scene
 from fidsplat.splats.cloud import SplatCloud

@@ -29,9 +29,8 @@ from fidsplat.util.arguments import settings_with
 from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.markup import escaped
 from fidsplat.viewer.controls import NO_TARGET, Controls
-from fidsplat.viewer.gizmo import GizmoTarget, find_target, target_names
 from fidsplat.viewer.guard import guarded
-from fidsplat.viewer.nodes import Nodes
+from fidsplat.viewer.nodes import GizmoTarget, Nodes, find_target, target_names
 from fidsplat.viewer.scene_file import SceneFile, SplatFile
 from fidsplat.viewer.session import Session, StillImage
 from fidsplat.viewer.settings import PageSettings, Viewpoint

@@ -11,10 +11,15 @@ import shapely
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.experiments.intervals import bootstrap, percentile, root_mean_square, wilson
 from fidsplat.experiments.tag_causes import CAUSES, EDGES, view_of
 from fidsplat.experiments.tags import begin_point, detectors_of, errors_of
-from fidsplat.experiments.tags_report import breaking_severity
+from fidsplat.experiments.tags_report import (
+    bootstrap,
+    breaking_severity,
+    percentile,
+    root_mean_square,
+    wilson,
+)
 from fidsplat.scenes.lights import PointLight
 from fidsplat.splats.rotations import quaternion_to_matrix
 

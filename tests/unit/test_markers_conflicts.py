@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from fidsplat.markers.conflicts import maximum_independent_set
+from fidsplat.markers.partition import maximum_independent_set
 
 
 def matching(n_left: int, neighbours: list[list[int]]) -> dict[int, int]:
@@ -78,7 +78,7 @@ def test_long_alternating_paths_are_followed_to_their_end():
 
 def test_trees_need_no_search(monkeypatch):
     """Random forests and stars are matched from their leaves, thousands at once."""
-    monkeypatch.setattr("fidsplat.markers.conflicts._hopcroft_karp", None)
+    monkeypatch.setattr("fidsplat.markers.partition._hopcroft_karp", None)
     n = 3000
     right = np.arange(n) // 3  # stars of three
     keep_left, keep_right = maximum_independent_set(n, n, np.arange(n), right)

@@ -22,7 +22,7 @@ from fidsplat.markers.mixture import (
     place,
 )
 from fidsplat.markers.partition import partition
-from fidsplat.markers.seams import LONG, grow
+from fidsplat.markers.printing import LONG, grow
 from fidsplat.util.errors import InputError
 
 

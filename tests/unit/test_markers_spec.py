@@ -6,8 +6,8 @@ import pytest
 
 from fidsplat.images.tag_dictionaries import dictionary_bits, families
 from fidsplat.markers import marker, parse_spec
+from fidsplat.markers.codes import qr_capacity
 from fidsplat.markers.kinds import bits_of
-from fidsplat.markers.qr import qr_capacity
 from fidsplat.util.errors import InputError
 from fidsplat.vision.detect import detect
 

@@ -11,9 +11,9 @@ from brute_force import ideal
 from random_scenes import HELD_OUT, random_scene
 
 import fidsplat as fs
-from fidsplat.accuracy import cache, candidates, search
+from fidsplat.accuracy import candidates, quality_within, search
+from fidsplat.accuracy.candidates import Choice
 from fidsplat.accuracy.certification import certify
-from fidsplat.accuracy.choice import Choice
 from fidsplat.accuracy.error import errors, reference_image
 from fidsplat.accuracy.quality_within import _key, choose
 from fidsplat.util.errors import InputError
@@ -29,7 +29,7 @@ SMALL = fs.Camera.pinhole(2, 2, 1.0, 1.0, 1.0, 1.0)
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
     """A cache folder of this test."""
-    monkeypatch.setattr(cache, "folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr(quality_within, "cache_folder", lambda: tmp_path / "cache")
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +201,7 @@ def test_a_measured_quality_is_faster_than_a_promised_one(renderer, held_out):
 
 def test_choices_are_cached_and_a_damaged_file_is_replaced(renderer, scene, monkeypatch):
     first = within(renderer, scene, 1e-3)
-    (file,) = cache.folder().iterdir()
+    (file,) = quality_within.cache_folder().iterdir()
     with monkeypatch.context() as patch:
         patch.setattr(search.SceneMeasurement, "error", lambda *_: pytest.fail("it was measured again"))
         again = within(renderer, scene, 1e-3)
@@ -225,12 +225,12 @@ def test_cache_keys_differ_by_question(renderer, scene):
     within(renderer, random_scene(HELD_OUT + 2), 1e-3)
     moved = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, cx=scene.camera.cx + 1))
     within(renderer, moved, 1e-3)
-    assert len(list(cache.folder().iterdir())) == 6
+    assert len(list(quality_within.cache_folder().iterdir())) == 6
 
 
 def test_a_cache_folder_that_cannot_be_written_is_ignored(renderer, scene, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("no folder")
-    monkeypatch.setattr(cache, "folder", lambda: tmp_path / "file" / "cache")
+    monkeypatch.setattr(quality_within, "cache_folder", lambda: tmp_path / "file" / "cache")
     assert within(renderer, scene, 1e-2).source == "measured"
 
 

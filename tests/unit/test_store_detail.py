@@ -9,8 +9,8 @@ import pytest
 from test_store_rendering import splats
 
 import fidsplat as fs
+from fidsplat.accuracy.candidates import Choice
 from fidsplat.accuracy.candidates import load as load_candidates
-from fidsplat.accuracy.choice import Choice
 from fidsplat.accuracy.detail_errors import SIZES, cameras_around, errors_of, measure_detail
 from fidsplat.accuracy.error import reference_image
 from fidsplat.backends.prepare import prepare

@@ -9,8 +9,7 @@ import pytest
 from training_scene import BACKGROUND, scene, write
 
 import fidsplat as fs
-from fidsplat.formats.colmap import save_colmap
-from fidsplat.formats.colmap_read import load_colmap
+from fidsplat.formats.colmap import load_colmap, save_colmap
 from fidsplat.images.files import read_rgba, write_png
 from fidsplat.train import Dataset, TrainingView, load_dataset
 from fidsplat.train.dataset import viewed_cube

@@ -252,12 +252,12 @@ def test_a_gizmo_moves_a_splat_file(viewer, tmp_path):
 
 
 def test_large_splat_files_move_once_they_are_let_go(monkeypatch):
-    from fidsplat.viewer import gizmo
+    from fidsplat.viewer import nodes
 
     cloud = fs.SplatCloud([[0, 0, 0]], [[1, 0, 0, 0]], [[0.1, 0.1]], [1], colors=[[1, 0, 0]])
-    taken = gizmo.find_target(fs.Scene([cloud]), [SplatFile(0, "a.ply", np.eye(4))], "file 1: a.ply")
+    taken = nodes.find_target(fs.Scene([cloud]), [SplatFile(0, "a.ply", np.eye(4))], "file 1: a.ply")
     assert taken.live
-    monkeypatch.setattr(gizmo, "LIVE_LIMIT", 0)
+    monkeypatch.setattr(nodes, "LIVE_LIMIT", 0)
     assert not taken.live
 
 

@@ -1,12 +1,19 @@
-"""QR codes, encoded by segno in byte mode."""
+"""Tags, QR codes and images as markers: parsing of their specs, and their modules.
+
+Tags are those of OpenCV's predefined dictionaries and of AprilTag 3; segno encodes QR codes, in byte mode;
+images have two grey levels and one pixel per module.
+"""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from fidsplat.images.apriltag3 import outside
+from fidsplat.images.family_names import canonical_family
 from fidsplat.markers.spec import Kind, Spec
 from fidsplat.util.errors import InputError
 
@@ -14,6 +21,23 @@ _HEAD = re.compile(r"qr(?:-v(?P<version>\d+))?(?:-(?P<level>[A-Za-z]))?", re.IGN
 _LEVELS = "LMQH"
 _VERSIONS = range(1, 41)
 _DEFAULT_LEVEL = "L"
+
+
+def _parse_tag(text: str, head: str, rest: str) -> Spec:
+    kind = head.lower()
+    family, _, number = rest.rpartition(":")
+    if not family:
+        raise InputError(f"the spec of a tag must be {kind}:FAMILY:ID, got {text!r}")
+    if not re.fullmatch(r"[0-9]{1,9}", number):
+        raise InputError(f"the id of {text!r} must be a whole number from 0, got {number!r}")
+    return Spec(text=text, kind=kind, family=canonical_family(family), id=int(number))
+
+
+def _tag_bits(spec: Spec) -> tuple[Spec, np.ndarray]:
+    from fidsplat.images.tag_dictionaries import dictionary_bits
+
+    bits = dictionary_bits(spec.kind, spec.family or "", spec.id or 0)
+    return replace(spec, outside=outside(spec.family)), bits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +50,7 @@ class QrSpec(Spec):
     """error level, one of L, M, Q, H"""
 
 
-def _parse(text: str, head: str, rest: str) -> QrSpec:
+def _parse_qr(text: str, head: str, rest: str) -> QrSpec:
     code = _HEAD.fullmatch(head)
     if code is None:
         raise InputError(f"a QR spec must be qr:TEXT, qr-v22-L:TEXT, qr-v22:TEXT or qr-L:TEXT, got {head!r}")
@@ -42,7 +66,7 @@ def _parse(text: str, head: str, rest: str) -> QrSpec:
     return QrSpec(text=text, kind="qr", payload=rest, version=number, level=level)
 
 
-def _bits(spec: QrSpec) -> tuple[Spec, np.ndarray]:
+def _qr_bits(spec: QrSpec) -> tuple[Spec, np.ndarray]:
     """Modules of a QR code in byte mode, at exactly the requested level; by default the smallest version."""
     import segno
     from segno.encoder import DataOverflowError
@@ -83,4 +107,20 @@ def qr_capacity(version: int, level: str) -> int:
     return (bits - 4 - (8 if version < 10 else 16)) // 8
 
 
-KINDS = (Kind("qr", "qr:TEXT, qr-v22-L:TEXT", 4, _parse, _bits),)
+def _parse_image(text: str, head: str, rest: str) -> Spec:
+    if not rest:
+        raise InputError(f"the spec of an image must be image:FILE.png, got {text!r}")
+    return Spec(text=text, kind="image", payload=rest)
+
+
+def _image_bits(spec: Spec) -> tuple[Spec, np.ndarray]:
+    from fidsplat.images.files import read_bits
+
+    return spec, np.ascontiguousarray(read_bits(Path(spec.payload or "")), np.uint8)
+
+
+KINDS = (
+    *(Kind(name, f"{name}:FAMILY:ID", 1, _parse_tag, _tag_bits) for name in ("apriltag", "aruco")),
+    Kind("qr", "qr:TEXT, qr-v22-L:TEXT", 4, _parse_qr, _qr_bits),
+    Kind("image", "image:FILE.png", 0, _parse_image, _image_bits, is_file=True),
+)
