@@ -17,8 +17,7 @@ import pandas as pd
 
 from fidsplat.experiments import angles, counts, trained, views
 from fidsplat.experiments.methods import IDEAL
-from fidsplat.experiments.report import ANGLES, VIEWS
-from fidsplat.experiments.results import load
+from fidsplat.experiments.report import ANGLES, VIEWS, load
 from fidsplat.experiments.summary import Frame
 from fidsplat.experiments.sweep import Record, folder_records
 from fidsplat.experiments.views import LINEAR

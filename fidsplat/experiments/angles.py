@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor, Future
 
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.experiments.methods import IDEAL, MarkerRenderer, plain_marker
-from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS, Category
+from fidsplat.experiments.methods import IDEAL, MarkerRenderer
+from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS
 from fidsplat.images.files import to_uint8
+from fidsplat.markers import marker
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
 from fidsplat.vision.readers import Attempt, Target, attempt, readers
@@ -40,24 +41,6 @@ def parse_tilts(text: str) -> list[float]:
     return sorted(found)
 
 
-def angles_points(
-    categories: Iterable[Category],
-    protocols: Iterable[str],
-    methods: Iterable[str],
-    tilts: str = FULL_TILTS,
-    markers: int = 5,
-) -> list[dict]:
-    """Points of the experiment: scans by marker, method and protocol."""
-    parse_tilts(tilts)
-    return [
-        {"protocol": p, "category": c.name, "index": i, "method": m, "tilts": tilts}
-        for p in protocols
-        for c in categories
-        for i in range(markers)
-        for m in methods
-    ]
-
-
 def measure_angles(point: dict, markers: MarkerRenderer, seed: int, pool: Executor, workers: int) -> dict:
     """Scan a marker over tilts with every detector.
 
@@ -66,7 +49,7 @@ def measure_angles(point: dict, markers: MarkerRenderer, seed: int, pool: Execut
     """
     category, protocol = CATEGORIES[point["category"]], PROTOCOLS[point["protocol"]]
     spec = category.spec(point["index"], seed)
-    made = plain_marker(spec)
+    made = marker(spec)
     module = protocol.module(made.grid.shape[0])
     render = markers.prepare(point["method"], f"{category.name}-{point['index']}", spec, module)
     names = readers(category.kind)

@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from fidsplat.cameras import Camera
-from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.setup import BACKGROUND, PROTOCOLS, Category, novel_cameras, training_cameras
+from fidsplat.markers import marker
 from fidsplat.util import interrupts
 from fidsplat.util.errors import DeviceError, InputError, unknown
 from fidsplat.util.files import from_json, read_text, user_cache, writable_folder, write_json
@@ -107,7 +107,7 @@ def _call(command: list[str]) -> None:
 
 def marker_job(category: Category, index: int, seed: int, folder: Path, view: str, training: bool) -> dict:
     """Worker job for the test images of a marker, and optionally its training images."""
-    grid = plain_marker(category.spec(index, seed)).grid
+    grid = marker(category.spec(index, seed)).grid
     cameras = {TEST: novel_cameras(category, index, seed), TRAINING: training_cameras() if training else []}
     return {
         "name": f"{category.name}-{index}",

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 
-from fidsplat.experiments.methods import mixtures, plain_marker
+from fidsplat.experiments.methods import mixtures
 from fidsplat.experiments.plane import runs
-from fidsplat.experiments.setup import CATEGORIES, Category
+from fidsplat.experiments.setup import CATEGORIES
 from fidsplat.markers import marker
 from fidsplat.markers.mixture import fitted_templates, paper_template, place
 
 NAME = "counts"
 FULL_REPEATS, QUICK_REPEATS = 15, 3
-
-
-def counts_points(categories: Iterable[Category], repeats: int, markers: int = 5) -> list[dict]:
-    """Points of the experiment: one per marker."""
-    return [{"category": c.name, "index": i, "repeats": repeats} for c in categories for i in range(markers)]
 
 
 def measure_counts(point: dict, seed: int) -> dict:
@@ -29,7 +22,7 @@ def measure_counts(point: dict, seed: int) -> dict:
     by mixture: one for each repeat, from the text to the splats, after a warm-up.
     """
     spec = CATEGORIES[point["category"]].spec(point["index"], seed)
-    plain = plain_marker(spec)
+    plain = marker(spec)
     grid = plain.grid
     y, x0, x1, _ = runs(grid)
     by_runs = np.stack([x0, y, x1, y + 1], 1)

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.experiments.blender import TEST, TRAINING, image_file
-from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.setup import (
     BACKGROUND,
     CATEGORIES,
@@ -30,6 +29,7 @@ from fidsplat.experiments.setup import (
 from fidsplat.experiments.views import exact_view
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.images.files import read_image, write_png
+from fidsplat.markers import marker
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, read_text, writable_folder, write_json
 
@@ -102,7 +102,7 @@ def _is_complete(file: Path, facts: dict) -> bool:
 
 
 def _facts(spec: str, views: int, seed: int, truth: str) -> dict:
-    plain = plain_marker(spec)
+    plain = marker(spec)
     module = PROTOCOLS["fixed-plane"].module(plain.grid.shape[0])
     return {
         "spec": spec,
@@ -118,7 +118,7 @@ def _facts(spec: str, views: int, seed: int, truth: str) -> dict:
 
 
 def _points(spec: str, seed: str) -> tuple[np.ndarray, np.ndarray]:
-    grid = plain_marker(spec).grid
+    grid = marker(spec).grid
     generator = np.random.default_rng(zlib.crc32(seed.encode()))
     uv = generator.uniform(0, 1, (POINTS, 2))
     column, row = (uv * grid.shape[::-1]).astype(int).T

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Iterable
 from concurrent.futures import Executor
 
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.experiments.methods import MarkerRenderer, plain_marker
-from fidsplat.experiments.setup import CATEGORIES, Category
-from fidsplat.markers import Marker
+from fidsplat.experiments.methods import MarkerRenderer
+from fidsplat.experiments.setup import CATEGORIES
+from fidsplat.markers import Marker, marker
 from fidsplat.util import interrupts
 from fidsplat.vision.pose import marker_pose, pose_error
 from fidsplat.vision.readback import corner_error, own_code
@@ -22,28 +21,9 @@ LOCATED = ("apriltag", "small")
 SIZE = 0.16
 """edge of the code in metres"""
 WIDTH, HEIGHT, FOV = 1280, 720, 60.0
-DISTANCES = (0.5, 1.0, 2.0, 3.0, 4.0)
-"""distances in metres"""
-TILTS = (0.0, 20.0, 40.0, 60.0, 70.0)
-"""tilts in degrees"""
-QUICK_DISTANCES, QUICK_TILTS = (0.5, 1.0, 2.0), (0.0, 40.0, 60.0)
-
-
-def localisation_points(
-    categories: Iterable[Category],
-    methods: Iterable[str],
-    distances: Iterable[float] = DISTANCES,
-    tilts: Iterable[float] = TILTS,
-    markers: int = 5,
-) -> list[dict]:
-    """Points of the experiment: a marker and a method, at every distance and tilt."""
-    distances, tilts = list(distances), list(tilts)
-    return [
-        {"category": c.name, "index": i, "method": m, "distances": distances, "tilts": tilts}
-        for c in categories
-        for i in range(markers)
-        for m in methods
-    ]
+FULL = (0.5, 1.0, 2.0, 3.0, 4.0), (0.0, 20.0, 40.0, 60.0, 70.0)
+"""distances in metres and tilts in degrees"""
+QUICK = (0.5, 1.0, 2.0), (0.0, 40.0, 60.0)
 
 
 def measure_localisation(point: dict, markers: MarkerRenderer, seed: int, pool: Executor) -> dict:
@@ -58,7 +38,7 @@ def measure_localisation(point: dict, markers: MarkerRenderer, seed: int, pool: 
     category = CATEGORIES[point["category"]]
     name = f"{category.name}-{point['index']}"
     spec = category.spec(point["index"], seed)
-    plain = plain_marker(spec)
+    plain = marker(spec)
     render = markers.prepare(point["method"], name, spec, SIZE / plain.bits.shape[1])
     pending = []
     for distance in point["distances"]:

@@ -13,7 +13,7 @@ from fidsplat.capture.quality import Quality
 from fidsplat.capture.sensor import Sensor
 from fidsplat.experiments.plane import from_srgb, plane_image
 from fidsplat.experiments.setup import BACKGROUND, COLLECTIONS, PLANE
-from fidsplat.markers import Marker, marker
+from fidsplat.markers import marker
 from fidsplat.render.renderer import Renderer
 from fidsplat.util.errors import InputError, unknown
 
@@ -91,7 +91,7 @@ class MarkerRenderer:
 
         Raises InputError for an unknown method or a trained model that is missing.
         """
-        plain = plain_marker(spec)
+        plain = marker(spec)
         if method == IDEAL:
             return lambda camera: plane_image(plain.grid, module, camera, background=BACKGROUND)
         renderer = self.renderer
@@ -121,8 +121,3 @@ class MarkerRenderer:
             return frame["rgb"].mean(2) if not filtered else frame["rgb"][:, :, 0]
 
         return render
-
-
-def plain_marker(spec: str) -> Marker:
-    """A marker for its bits and grid."""
-    return marker(spec)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import statistics
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -12,11 +13,12 @@ from fidsplat.experiments import angles, counts, localisation, trained, views
 from fidsplat.experiments.charts import bars, chart, legend_above
 from fidsplat.experiments.methods import FILTERS, IDEAL, mixtures, with_linear_light
 from fidsplat.experiments.pages import NOTHING, fixed, number, page_and_folder, write_page
-from fidsplat.experiments.results import load
 from fidsplat.experiments.setup import CATEGORIES, COLLECTIONS, PROTOCOLS
 from fidsplat.experiments.sheets import sheet_files
-from fidsplat.experiments.summary import Frame, Row, provenance
+from fidsplat.experiments.summary import Frame, Row, Summary, join, provenance, read_summary, summarise
+from fidsplat.experiments.sweep import Record, folder_records
 from fidsplat.experiments.views import LINEAR, TRUTHS
+from fidsplat.util.errors import InputError
 from fidsplat.util.files import read_input, write_file
 
 _READERS = {"apriltag": ("pupil", "aruco"), "qr": ("zxing-tall", "zxing", "cv2")}
@@ -32,7 +34,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
     The summaries suffice to make the same report again.
 
     Args:
-        folders: folders with results, see `fidsplat.experiments.results.load`, and sheets of images.
+        folders: folders with results, see `load`, and sheets of images.
         out: folder for report.md and its files; or a name that ends in .md, whose files are written to a
             folder of that name without .md.
 
@@ -47,7 +49,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
         angles.NAME: _angles,
         views.NAME: _views,
         localisation.NAME: lambda own, _: _localisation(own),
-        trained.NAME: lambda own, _: _trained(own, rows.get(views.NAME), rows.get(angles.NAME)),
+        trained.NAME: lambda own, _: _trained(own, rows.get(angles.NAME)),
     }
     context: dict[str, Any] = {
         name: section(rows[name], folder) if name in rows else None for name, section in sections.items()
@@ -194,104 +196,32 @@ def _views(rows: Frame, folder: Path) -> dict:
     return {"tables": tables, "views": int(rows["amount"].max()), "rows": len(rows), "measured": count}
 
 
-def _trained(rows: Frame, viewed: Frame | None, scans: Frame | None) -> dict:
-    """Section on the paper's baseline: figures of the paper and ours by category and number of views.
-
-    Ours are of the first seed; the other seeds show the random spread of PSNR.
-    """
-    first = rows[rows["seed"] == 0]
-    read, flips = {}, {}
+def _trained(rows: Frame, scans: Frame | None) -> dict:
+    """Baseline by category and number of views: the paper's figures, and ours of the first seed."""
+    first, read = rows[rows["seed"] == 0], {}
     if scans is not None:
         plane = _best_reader(scans[scans["protocol"] == "fixed-plane"])
         read = {key: _angle(own["read"]) for key, own in plane.groupby(["category", "method"])}
-    if viewed is not None:
-        means = viewed[viewed["truth"] == "exact"].groupby(["category", "method"])["flip"].mean()
-        flips = {key: fixed(mean, 3) for key, mean in means.items()}
     table = []
     for category in category_order(first["category"]):
         for count, own in first[first["category"] == category].groupby("views"):
             psnr, ssim, _ = VIEWS[category][count]
-            theirs, method = ANGLES.get(category, {}).get(count), f"2dgs-{count}"
+            theirs = ANGLES.get(category, {}).get(count)
             table.append(
                 {
                     "marker, views": f"{CATEGORIES[category].title}, {count}",
                     "markers": own["marker"].nunique(),
                     "PSNR/SSIM, paper": f"{psnr:.1f}/{ssim:.2f}",
                     "ours": f"{own['psnr'].mean():.1f}/{own['ssim'].mean():.3f}",
-                    "FLIP": flips.get((category, method), NOTHING),
                     "read to, paper": NOTHING if theirs is None else f"{theirs[1]:.1f}",
-                    "read to, ours": read.get((category, method), NOTHING),
+                    "read to, ours": read.get((category, f"2dgs-{count}"), NOTHING),
                     "read to, training-free": read.get((category, "exact/best"), NOTHING),
                     "splats": fixed(own["splats"].mean(), 0),
                     "seconds, paper": f"{TRAINING_SECONDS[count]:.0f}",
                     "seconds, several at once": fixed(own["seconds"].median()),
                 }
             )
-    shown, markers = pd.DataFrame(table), ""
-    if len(numbers := set(shown["markers"])) == 1:
-        markers = f", {numbers.pop()} of each"
-        shown = shown.drop(columns="markers")
-    return {
-        "rows": shown,
-        "trainings": len(rows),
-        "markers": markers,
-        "iterations": int(rows["amount"].max()),
-        "spread": _spread(rows),
-        "unread": "" if scans is None else _unread(first, scans),
-        "enough": _enough(shown),
-    }
-
-
-def _unread(rows: Frame, scans: Frame) -> str:
-    """Categories and numbers of views with trainings that the detectors did not read."""
-    keys = ["category", "views", "marker"]
-    scans = scans.assign(views=pd.to_numeric(scans["method"].str.extract(r"^2dgs-(\d+)$")[0]))
-    scanned = set(scans[keys].itertuples(index=False, name=None))
-    missing = rows[[key not in scanned for key in rows[keys].itertuples(index=False, name=None)]]
-    return "; ".join(f"{name}, {counts}" for name, counts in _views_by_category(missing).items())
-
-
-def _views_by_category(rows: Frame) -> dict[str, str]:
-    """Numbers of views as text by title of the category."""
-    return {
-        CATEGORIES[name].title: ", ".join(
-            map(str, sorted(rows.loc[rows["category"] == name, "views"].unique()))
-        )
-        for name in category_order(rows["category"])
-    }
-
-
-def _spread(rows: Frame) -> dict | None:
-    """Range of PSNR of markers that were trained with several seeds; None without any."""
-    psnr = rows.groupby(["category", "views", "marker"])["psnr"].agg(["size", "min", "max"])
-    several = psnr[psnr["size"] > 1]
-    if several.empty:
-        return None
-    spread = several["max"] - several["min"]
-    named = _views_by_category(several.reset_index())
-    return {
-        "of": ", ".join(f"{name} on {counts} views" for name, counts in named.items()),
-        "seeds": int(several["size"].max()),
-        "median": float(spread.median()),
-        "most": float(spread.max()),
-    }
-
-
-def _enough(table: Frame) -> list[dict]:
-    """For each category the smallest number of training views that suffices.
-
-    A number suffices if trained models are read up to the same tilt as markers without training. If none
-    does, the row has the number with the smallest difference of tilts, and `before`: this difference in
-    degrees.
-    """
-    ours, free, seconds = (
-        pd.Series(pd.to_numeric(table[name], errors="coerce"))
-        for name in ("read to, ours", "read to, training-free", "seconds, several at once")
-    )
-    names = table["marker, views"].str.rpartition(", ")
-    rows = {"marker": names[0], "views": names[2], "before": (free - ours).clip(lower=0), "seconds": seconds}
-    ordered = pd.DataFrame(rows).dropna(subset=["before"]).sort_values("before", kind="stable")
-    return ordered.drop_duplicates("marker").sort_index().to_dict("records")
+    return {"rows": pd.DataFrame(table), "trainings": len(rows), "iterations": int(rows["amount"].max())}
 
 
 def _localisation(rows: Frame) -> Frame:
@@ -390,3 +320,130 @@ VIEWS = {
     },
 }  # fmt: skip
 """table 4: PSNR in dB, SSIM and LPIPS over 20 test views"""
+
+
+Rows = Iterator[dict[str, Any]]
+
+
+class Kind(NamedTuple):
+    """Conversion of the results of an experiment to rows."""
+
+    keys: tuple[str, ...]
+    """columns that identify a row"""
+    columns: tuple[str, ...]
+    rows: Callable[[Record], Rows]
+
+
+def load(folders: Sequence[Path]) -> dict[str, Summary]:
+    """Results of folders by experiment, raw (NAME.jsonl) or summarised (NAME.csv).
+
+    Of two measurements the larger one is used.
+
+    Raises InputError when there are none, or they are from another version.
+    """
+    where, found = ", ".join(map(str, folders)), {}
+    for name, kind in KINDS.items():
+        records = [record for folder in folders for record in folder_records(folder, name)]
+        summaries = [read_summary(file) for folder in folders if (file := folder / f"{name}.csv").is_file()]
+        try:
+            if records:
+                summaries.insert(0, summarise(records, kind.rows, (*kind.keys, "amount", *kind.columns)))
+            if summaries:
+                found[name] = join(summaries, kind.keys)
+                rows = found[name].rows
+                rows[list(kind.columns)] = rows[list(kind.columns)].apply(pd.to_numeric)
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(
+                f"results of {name} in {where} are damaged or of another version of fidsplat "
+                f"({type(error).__name__}: {error}); measure again with --overwrite"
+            ) from error
+    if not found:
+        raise InputError(f"no results in {where}; run fidsplat experiment all first, or give their folder")
+    return found
+
+
+def _counts_rows(record: Record) -> Rows:
+    key, found = record.key, record.result
+    for mixture, numbers in found["gaussians"].items():
+        seconds = found["seconds"][mixture]
+        row = {"category": key["category"], "marker": key["index"], "mixture": mixture}
+        row |= {"amount": len(seconds), "gaussians": numbers["rectangles"]}
+        row |= {f"gaussians_of_{name}": numbers.get(name) for name in ("runs", "cells")}
+        for name in ("components", "cells", "runs", "rectangles"):
+            row |= {f"{name}_{colour}": found[name][colour] for colour in ("dark", "light")}
+        spread = statistics.stdev(seconds) if len(seconds) > 1 else 0.0
+        yield row | {"seconds": statistics.median(seconds), "seconds_spread": spread}
+
+
+def _angles_rows(record: Record) -> Rows:
+    key, tilts = record.key, angles.parse_tilts(record.key["tilts"])
+    for reader, hits in record.result["readers"].items():
+        row = {"protocol": key["protocol"], "category": key["category"], "marker": key["index"]}
+        row |= {"method": key["method"], "reader": reader, "amount": len(tilts), "tilts": key["tilts"]}
+        for name in ("found", "read"):
+            row[name], row[f"{name}_all"] = angles.largest(tilts, hits[name])
+        yield row
+
+
+def _views_rows(record: Record) -> Rows:
+    key = record.key
+    row = {name: key[name] for name in ("truth", "category", "method")} | {"marker": key["index"]}
+    # prefer records with more views, then with more metrics
+    row["amount"] = key["views"] + 0.1 * bool(key["flip"]) + 0.2 * bool(key["lpips"])
+    for name in ("psnr", "ssim", "flip", "lpips"):
+        values = [value for value in record.result[name] or () if value is not None]
+        row[name] = statistics.fmean(values) if values else None
+    yield row
+
+
+def _localisation_rows(record: Record) -> Rows:
+    """Rows by distance: medians over the tilts at which the marker was read."""
+    key = record.key
+    for distance in key["distances"]:
+        every = [view for view in record.result["views"] if view["distance_m"] == distance]
+        read = [view for view in every if view["position_mm"] is not None]
+        row = {"category": key["category"], "method": key["method"], "marker": key["index"]}
+        row |= {"distance_m": distance, "amount": len(every), "read": len(read)}
+        for name in ("position_mm", "angle_deg", "corners_px"):
+            row[name] = statistics.median(view[name] for view in read) if read else None
+        yield row
+
+
+def _trained_rows(record: Record) -> Rows:
+    """Row of a training; a resumed one has no total time."""
+    key, found = record.key, record.result
+    row = {name: key[name] for name in ("category", "views", "seed")} | {"marker": key["index"]}
+    row |= {name: found[name] for name in ("psnr", "ssim", "splats")}
+    complete = found["iterations"] == key["iterations"]
+    yield row | {"amount": key["iterations"], "seconds": found["seconds"] if complete else None}
+
+
+KINDS = {
+    counts.NAME: Kind(
+        ("category", "marker", "mixture"),
+        (
+            "gaussians", "gaussians_of_runs", "gaussians_of_cells",
+            *(f"{n}_{c}" for n in ("components", "cells", "runs", "rectangles") for c in ("dark", "light")),
+            "seconds", "seconds_spread",
+        ),
+        _counts_rows,
+    ),
+    angles.NAME: Kind(
+        ("protocol", "category", "marker", "method", "reader"),
+        ("found", "found_all", "read", "read_all"),
+        _angles_rows,
+    ),
+    views.NAME: Kind(
+        ("truth", "category", "method", "marker"), ("psnr", "ssim", "flip", "lpips"), _views_rows
+    ),
+    localisation.NAME: Kind(
+        ("category", "method", "marker", "distance_m"),
+        ("read", "position_mm", "angle_deg", "corners_px"),
+        _localisation_rows,
+    ),
+    trained.NAME: Kind(
+        ("category", "views", "marker", "seed"), ("psnr", "ssim", "splats", "seconds"), _trained_rows
+    ),
+}  # fmt: skip

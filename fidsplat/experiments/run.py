@@ -6,12 +6,13 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from functools import partial
+from itertools import product
 from typing import Any
 
 from fidsplat.experiments import angles, counts, localisation, views
 from fidsplat.experiments.methods import IDEAL, MarkerRenderer
 from fidsplat.experiments.settings import ImageSettings, MeasureSettings, ShardSettings
-from fidsplat.experiments.setup import MARKERS, PROTOCOLS, TEST_VIEWS, chosen_categories
+from fidsplat.experiments.setup import MARKERS, PROTOCOLS, TEST_VIEWS, Category, chosen_categories
 from fidsplat.experiments.sweep import Key, Results, Sweep, shard, thread_pool
 from fidsplat.render.renderer import Renderer
 from fidsplat.util.files import writable_folder
@@ -75,21 +76,24 @@ def _points(name: str, options: Any) -> list[Key]:
     categories, count = chosen_categories(options.category), options.marker_count
     if name == counts.NAME:
         repeats = counts.QUICK_REPEATS if options.quick else counts.FULL_REPEATS
-        # all five markers take a second
-        return counts.counts_points(categories, repeats, MARKERS if options.markers is None else count)
-    if name == localisation.NAME:
-        categories = tuple(c for c in categories if c.name in localisation.LOCATED)
-        spans = (localisation.DISTANCES, localisation.TILTS)
-        if options.quick:
-            spans = (localisation.QUICK_DISTANCES, localisation.QUICK_TILTS)
-        return localisation.localisation_points(categories, options.methods, *spans, count)
+        count = MARKERS if options.markers is None else count  # all five markers take a second
+        return [{**one, "repeats": repeats} for one in _markers(categories, count)]
     if name == views.NAME:
         number = QUICK_VIEWS if options.quick else TEST_VIEWS
         weights = None if options.lpips is None else weights_name(options.lpips)
         return views.views_points(categories, options.methods, options.blender_folder, count, number, weights)
+    if name == localisation.NAME:
+        distances, tilts = localisation.QUICK if options.quick else localisation.FULL
+        located = _markers((c for c in categories if c.name in localisation.LOCATED), count)
+        spans = {"distances": list(distances), "tilts": list(tilts)}
+        return [{**one, "method": m, **spans} for one, m in product(located, options.methods)]
     tilts = options.tilts or (angles.QUICK_TILTS if options.quick else angles.FULL_TILTS)
-    protocols = options.protocol or tuple(PROTOCOLS)
-    return angles.angles_points(categories, protocols, options.methods, tilts, count)
+    scans = product(options.protocol or PROTOCOLS, _markers(categories, count), options.methods)
+    return [{"protocol": p, **one, "method": m, "tilts": tilts} for p, one, m in scans]
+
+
+def _markers(categories: Iterable[Category], count: int) -> list[Key]:
+    return [{"category": c.name, "index": i} for c in categories for i in range(count)]
 
 
 def _measure(name: str, options: Any, markers: MarkerRenderer, pool: Executor) -> Callable[[Key], dict]:

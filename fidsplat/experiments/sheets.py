@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.experiments.methods import MarkerRenderer, plain_marker
+from fidsplat.experiments.methods import MarkerRenderer
 from fidsplat.experiments.setup import PROTOCOLS, Category
 from fidsplat.images.files import to_uint8, write_png
 from fidsplat.images.visualize import contact_sheet
+from fidsplat.markers import marker
 from fidsplat.util.files import writable_folder
 
 TILTS = (0.0, 45.0, 70.0)
@@ -35,7 +36,7 @@ def write_sheets(
     methods = list(methods)
     for category in categories:
         spec = category.spec(0, seed)
-        module = protocol.module(plain_marker(spec).grid.shape[0])
+        module = protocol.module(marker(spec).grid.shape[0])
         prepared = {name: markers.prepare(name, f"{category.name}-0", spec, module) for name in methods}
         rows = [
             [

@@ -17,12 +17,12 @@ from fidsplat.experiments.methods import (
     IDEAL,
     MarkerRenderer,
     in_linear_light,
-    plain_marker,
     with_linear_light,
 )
 from fidsplat.experiments.plane import from_srgb, plane_image, srgb
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS, TEST_VIEWS, Category, novel_cameras
 from fidsplat.images.files import read_image, to_uint8
+from fidsplat.markers import marker
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
 from fidsplat.vision.metrics import flip, has_flip, psnr, ssim
@@ -110,9 +110,9 @@ def measure_views(
     """
     category, truth, cache = CATEGORIES[point["category"]], point["truth"], cache or ImageCache()
     spec = category.spec(point["index"], seed)
-    module = PROTOCOLS["fixed-plane"].module(plain_marker(spec).grid.shape[0])
-    marker = (point["category"], point["index"], seed)
-    method = (*marker, point["method"])
+    module = PROTOCOLS["fixed-plane"].module(marker(spec).grid.shape[0])
+    subject = (point["category"], point["index"], seed)
+    method = (*subject, point["method"])
     # prepared lazily: splats are uploaded only if an image is missing
     prepared = lru_cache(1)(
         lambda: markers.prepare(point["method"], f"{category.name}-{point['index']}", spec, module)
@@ -121,7 +121,7 @@ def measure_views(
     def compare(number: int, camera: Camera, image: np.ndarray) -> dict[str, float | None]:
         if truth.startswith("exact"):
             render = partial(exact_view, spec, camera, truth == "exact-linear")
-            reference = cache.get(truth, marker, number, render)
+            reference = cache.get(truth, subject, number, render)
         else:
             view = truth.removeprefix("blender-")
             file = image_file(blender, view, category.name, point["index"], TEST, number)
@@ -151,7 +151,7 @@ def exact_view(spec: str, camera: Camera, linear: bool) -> np.ndarray:
 
     linear: average linear light and encode the mean, as in Blender's 'Standard' view.
     """
-    grid = plain_marker(spec).grid
+    grid = marker(spec).grid
     module = PROTOCOLS["fixed-plane"].module(grid.shape[0])
     if not linear:
         return plane_image(grid, module, camera, background=BACKGROUND)

@@ -15,10 +15,10 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.experiments import blender
-from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.plane import from_srgb, plane_image, srgb
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES
 from fidsplat.images.files import read_image
+from fidsplat.markers import marker
 from fidsplat.vision.metrics import psnr
 
 DATA = Path(__file__).parent / "data"
@@ -45,7 +45,7 @@ BOXES = tuple(name for name, shot in IMAGES.items() if shot[3] == "BOX")
 
 def grid_of(name: str) -> np.ndarray:
     """The modules that a shot shows."""
-    return plain_marker(CATEGORIES[IMAGES[name][0]].spec(0)).grid
+    return marker(CATEGORIES[IMAGES[name][0]].spec(0)).grid
 
 
 def ours(name: str, finer: int = 1, border: int = 0) -> np.ndarray:

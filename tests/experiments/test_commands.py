@@ -99,17 +99,14 @@ def test_a_quick_run_has_few_tilts_and_distances(tmp_path):
     quick, full = (ExperimentSettings(tmp_path, quick=quick) for quick in (True, False))
     for options, tilts in ((full, angles.FULL_TILTS), (quick, angles.QUICK_TILTS)):
         assert {point["tilts"] for point in run_module._points(angles.NAME, options)} == {tilts}
-    spans = (localisation.DISTANCES, localisation.TILTS)
-    few = (localisation.QUICK_DISTANCES, localisation.QUICK_TILTS)
-    for options, (distances, tilts) in ((full, spans), (quick, few)):
+    for options, (distances, tilts) in ((full, localisation.FULL), (quick, localisation.QUICK)):
         for point in run_module._points(localisation.NAME, options):
             assert (tuple(point["distances"]), tuple(point["tilts"])) == (distances, tilts)
 
 
 def test_everything_quick_and_its_report(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(angles, "QUICK_TILTS", "0:40:40")
-    monkeypatch.setattr(localisation, "QUICK_DISTANCES", (1.0,))
-    monkeypatch.setattr(localisation, "QUICK_TILTS", (0.0, 40.0))
+    monkeypatch.setattr(localisation, "QUICK", ((1.0,), (0.0, 40.0)))
     monkeypatch.setattr(views, "flip", lambda ours, theirs: abs(ours - theirs).mean())
     for name, plane in PROTOCOLS.items():  # images of a quarter of the pixels
         module = plane.module_px and plane.module_px / 2

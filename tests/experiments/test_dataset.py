@@ -11,11 +11,11 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.experiments.dataset import POINTS, dataset_scenes, scene_name, write_scene
-from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.setup import CATEGORIES, novel_cameras, training_cameras
 from fidsplat.experiments.views import exact_view
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.images.files import read_image, to_uint8, write_png
+from fidsplat.markers import marker
 
 # pycolmap and OpenCV bring two libraries of one name and cannot live in one process
 READ = """
@@ -60,7 +60,7 @@ def test_colmap_reads_what_was_written(scene, tmp_path, suffix, which):
     assert len(points) == POINTS
     assert np.all(points[:, 2] == 0)
     assert np.abs(points[:, :2]).max() <= 1.0
-    grid = plain_marker(CATEGORIES["small"].spec(3)).grid
+    grid = marker(CATEGORIES["small"].spec(3)).grid
     column, row = np.floor((points[:, :2] + 1) / 2 * grid.shape[0]).astype(int).T
     assert np.array_equal(points[:, 3:], np.repeat(255 * (1 - grid[row, column])[:, None], 3, 1))
 

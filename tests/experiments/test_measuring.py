@@ -7,9 +7,10 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.experiments import angles, counts, localisation, plane, views
-from fidsplat.experiments.methods import IDEAL, MarkerRenderer, method_names, mixtures, plain_marker
+from fidsplat.experiments.methods import IDEAL, MarkerRenderer, method_names, mixtures
 from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS, novel_cameras
 from fidsplat.images.files import to_uint8, write_png
+from fidsplat.markers import marker
 from fidsplat.vision.metrics import psnr
 
 pytestmark = pytest.mark.usefixtures("optimised")
@@ -41,8 +42,17 @@ def test_the_largest_tilt_and_the_largest_without_a_miss_below(hits, expected):
     assert angles.largest([0, 1, 2, 3, 4], hits) == expected
 
 
+def scan(protocol, category, method, tilts):
+    return {"protocol": protocol, "category": category, "index": 0, "method": method, "tilts": tilts}
+
+
+def located(category, distances, tilts, pool):
+    point = {"category": category, "index": 0, "method": IDEAL, "distances": distances, "tilts": tilts}
+    return localisation.measure_localisation(point, CEILING, 0, pool)["views"]
+
+
 def test_scans_of_the_ideal_texture_find_its_ceiling(pool):
-    point = angles.angles_points([CATEGORIES["small"]], ["fixed-module"], [IDEAL], "0:60:20,76:89:1", 1)[0]
+    point = scan("fixed-module", "small", IDEAL, "0:60:20,76:89:1")
     result = angles.measure_angles(point, CEILING, 0, pool, 2)
     tilts = angles.parse_tilts(point["tilts"])
     ends = {name: angles.largest(tilts, seen["read"]) for name, seen in result["readers"].items()}
@@ -59,10 +69,8 @@ def test_scans_of_the_ideal_texture_find_its_ceiling(pool):
 
 def test_scans_do_not_hang_on_the_number_of_threads(renderer):
     markers = MarkerRenderer(renderer)
-    parts = angles.angles_points(
-        [CATEGORIES["apriltag"]], ["fixed-plane"], [IDEAL, "fitted/best"], "0:88:22", 1
-    )
-    for point in parts:
+    for method in (IDEAL, "fitted/best"):
+        point = scan("fixed-plane", "apriltag", method, "0:88:22")
         results = []
         for workers in (1, 4):
             with ThreadPoolExecutor(workers) as threads:
@@ -78,7 +86,7 @@ def test_fitted_markers_are_read_wherever_the_ideal_is(renderer, pool, category,
     """OpenCV's detectors stumble over grey in the quiet zone, which ends of long rectangles would leave."""
     seen = []
     for method in (IDEAL, "fitted/best"):
-        point = angles.angles_points([CATEGORIES[category]], ["fixed-plane"], [method], tilts, 1)[0]
+        point = scan("fixed-plane", category, method, tilts)
         found = angles.measure_angles(point, MarkerRenderer(renderer), 0, pool, 2)["readers"]
         seen.append({name: one["read"] for name, one in found.items()})
     assert "0" not in seen[0]["aruco" if category == "apriltag" else "cv2"]
@@ -99,7 +107,7 @@ def test_every_mixture_but_facets_is_a_row_with_both_filters():
 def test_every_method_puts_the_marker_where_the_ideal_has_it(renderer):
     spec = CATEGORIES["small"].spec(0)
     protocol = PROTOCOLS["fixed-plane"]
-    module = protocol.module(plain_marker(spec).grid.shape[0])
+    module = protocol.module(marker(spec).grid.shape[0])
     markers = MarkerRenderer(renderer)
     camera = protocol.camera(35.0)
     ideal = markers.prepare(IDEAL, "small-0", spec, module)(camera)
@@ -219,9 +227,8 @@ def test_the_srgb_curve_and_its_inverse():
 
 
 def test_counts_of_a_marker_that_one_can_count():
-    point = counts.counts_points([CATEGORIES["apriltag"]], 2, 1)[0]
-    result = counts.measure_counts(point, 0)
-    grid = plain_marker("apriltag:36h11:0").grid
+    result = counts.measure_counts({"category": "apriltag", "index": 0, "repeats": 2}, 0)
+    grid = marker("apriltag:36h11:0").grid
     dark = int(grid.sum())
     assert result["cells"] == {"dark": dark, "light": grid.size - dark}
     rows = [[len(list(run)) for run in np.split(row, np.flatnonzero(np.diff(row)) + 1)] for row in grid]
@@ -252,8 +259,7 @@ def test_gaussians_of_the_minimum_partition_by_the_rule_for_others():
 
 @pytest.mark.parametrize("category", localisation.LOCATED)
 def test_localisation_on_the_ideal_texture(category, pool):
-    points = localisation.localisation_points([CATEGORIES[category]], [IDEAL], [0.6, 1.0], [0.0, 50.0], 1)
-    found = localisation.measure_localisation(points[0], CEILING, 0, pool)["views"]
+    found = located(category, [0.6, 1.0], [0.0, 50.0], pool)
     assert [(v["distance_m"], v["tilt_deg"]) for v in found] == [(0.6, 0), (0.6, 50), (1, 0), (1, 50)]
     for view in found:
         assert view["position_mm"] < 0.01 * 1000 * view["distance_m"]
@@ -263,14 +269,12 @@ def test_localisation_on_the_ideal_texture(category, pool):
 
 def test_errors_of_poses_are_millimetres_and_degrees(pool, monkeypatch):
     monkeypatch.setattr(localisation, "pose_error", lambda found, true: (0.0015, np.radians(2.0)))
-    points = localisation.localisation_points([CATEGORIES["small"]], [IDEAL], [0.6], [0.0], 1)
-    (view,) = localisation.measure_localisation(points[0], CEILING, 0, pool)["views"]
+    (view,) = located("small", [0.6], [0.0], pool)
     assert (view["position_mm"], view["angle_deg"]) == pytest.approx((1.5, 2.0))
 
 
 def test_a_marker_that_is_not_read_has_no_errors(pool):
-    points = localisation.localisation_points([CATEGORIES["small"]], [IDEAL], [40.0], [0.0], 1)
-    (view,) = localisation.measure_localisation(points[0], CEILING, 0, pool)["views"]
+    (view,) = located("small", [40.0], [0.0], pool)
     assert (view["position_mm"], view["angle_deg"], view["corners_px"]) == (None, None, None)
 
 

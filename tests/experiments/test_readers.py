@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.plane import plane_image
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS
 from fidsplat.images.files import to_uint8
+from fidsplat.markers import marker
 from fidsplat.vision.readers import Attempt, Target, attempt, overlap, reader_versions, readers
 
 ALL = [("apriltag", name) for name in readers("apriltag")] + [("qr", name) for name in readers("qr")]
@@ -19,7 +19,7 @@ ALL = [("apriltag", name) for name in readers("apriltag")] + [("qr", name) for n
 
 def ideal(category: str, tilt: float, protocol: str = "fixed-module") -> tuple[np.ndarray, Target]:
     spec = CATEGORIES[category].spec(1)
-    made, setting = plain_marker(spec), PROTOCOLS[protocol]
+    made, setting = marker(spec), PROTOCOLS[protocol]
     module, camera = setting.module(made.grid.shape[0]), setting.camera(tilt)
     image = plane_image(made.grid, module, camera, background=BACKGROUND)
     corners = camera.project(made.corners / made.module * module)

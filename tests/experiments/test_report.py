@@ -14,8 +14,7 @@ from matplotlib.figure import Figure
 
 import fidsplat as fs
 from fidsplat.experiments import charts, pages
-from fidsplat.experiments.report import make_report
-from fidsplat.experiments.results import load
+from fidsplat.experiments.report import load, make_report
 from fidsplat.experiments.summary import Summary, join, read_summary
 from fidsplat.experiments.sweep import Results, folder_records
 from fidsplat.images.files import write_png

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.setup import (
     CATEGORIES,
     COLLECTIONS,
@@ -17,6 +16,7 @@ from fidsplat.experiments.setup import (
     novel_cameras,
     training_cameras,
 )
+from fidsplat.markers import marker
 
 VERSIONS = {"small": 2, "medium": 5, "large": 10, "huge": 22}
 LENGTHS = {"small": 20, "medium": 100, "large": 250, "huge": 1000}
@@ -29,12 +29,12 @@ def tilt_of(camera: fs.Camera) -> float:
 def test_markers_are_those_of_the_paper():
     assert [CATEGORIES["apriltag"].spec(i) for i in range(5)] == [f"apriltag:36h11:{i}" for i in range(5)]
     for name, version in VERSIONS.items():
-        made = plain_marker(CATEGORIES[name].spec(3))
+        made = marker(CATEGORIES[name].spec(3))
         assert made.family == f"v{version}-L"
         assert made.bits.shape[0] == 17 + 4 * version
         assert len(made.payload) == LENGTHS[name]
         # the smallest version that holds such a text, as the paper's is
-        assert plain_marker(f"qr:{made.payload}").family == made.family
+        assert marker(f"qr:{made.payload}").family == made.family
 
 
 def test_texts_are_seeded_and_differ():
