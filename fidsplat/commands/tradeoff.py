@@ -171,12 +171,10 @@ def _print_estimate(sweep: Sweep) -> None:
 
 def _print_results(sweeps: Sequence[Sweep], as_json: bool) -> None:
     """Print the measured points of each device: time relative to the baseline and largest error."""
-    from fidsplat.experiments.tradeoff.run import POINT
-
     for sweep in sweeps:
         found: dict[tuple[str, str], list[dict[str, Any]]] = {}
         for record in sweep.records:
-            if record.key["what"] == POINT and not record.failed:
+            if not record.failed:
                 found.setdefault((record.key["knob"], record.key["value"]), []).append(record.result)
         if found:
             rows = [

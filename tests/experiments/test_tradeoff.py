@@ -16,7 +16,6 @@ from fidsplat.experiments.tradeoff.points import (
     BASE,
     EXACT,
     SETTINGS,
-    decode_points,
     ellipsoid_points,
     points,
     quality_of,
@@ -79,7 +78,7 @@ def test_the_constants_of_other_systems_are_among_the_options():
         ("lowpass", "none"), ("preset", "gsplat"), (ABLATION, "alpha_cutoff 1/255"),
         (ABLATION, "transmittance_stop 0.0001"),
     } <= found  # fmt: skip
-    assert {point.quality.marker.mixture for point in decode_points(SETTINGS)} == {"fitted", "paper", "exact"}
+    assert {point.quality.marker.mixture for point in points(SETTINGS, True)} == {"fitted", "paper", "exact"}
 
 
 def test_parts_are_all_different_and_the_informative_ones_come_first():

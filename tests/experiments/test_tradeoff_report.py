@@ -17,7 +17,6 @@ from fidsplat.experiments.tradeoff.points import (
     EXACT,
     SETTINGS,
     Point,
-    decode_points,
     ellipsoid_points,
     points,
     preset,
@@ -41,7 +40,7 @@ def result(ratio: float, maximum: float, **more) -> dict:
 
 
 def record(scene: str, point: Point, found: dict, quick: bool = False, **run) -> Record:
-    key = {"what": "point", "scene": scene, **point.key(), "quick": quick}
+    key = {"scene": scene, **point.key(), "quick": quick}
     return Record(json.loads(json.dumps(key)), found, RUN | run)
 
 
@@ -74,13 +73,10 @@ def plain_records(scene: str, **run) -> list[Record]:
 
 def marker_records() -> list[Record]:
     records = []
-    for point in decode_points(SETTINGS):
+    for point in points(SETTINGS, True):
         for tilt in (0, 60):
             marked = {"ideal_psnr": 30.0 + tilt / 10, "corners_px": 0.05, "rectangles": 4}
             records.append(record(f"qr10@{tilt}", point, result(1.0, 0.01, **marked)))
-        key = {"what": "decode", "scene": "qr10", **point.key(), "tilts": "0:80:20"}
-        scan = {"reader": "zxing", "read": "11101", "splats": 100, "rectangles": 4}
-        records.append(Record(json.loads(json.dumps(key)), scan, RUN))
     return records
 
 

@@ -1,64 +1,25 @@
-"""Errors of frames relative to references, and the largest readable tilt of a marker."""
+"""Errors of frames relative to references."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 
 from fidsplat.accuracy.error import errors
-from fidsplat.capture.quality import MarkerQuality, Quality
-from fidsplat.experiments.angles import parse_tilts
+from fidsplat.capture.quality import Quality
 from fidsplat.experiments.plane import plane_image
 from fidsplat.experiments.setup import BACKGROUND
-from fidsplat.experiments.tradeoff.scenes import GREY, PROTOCOL, TradeScene, placed_marker
-from fidsplat.experiments.tradeoff.session import Session
-from fidsplat.images.files import to_uint8
+from fidsplat.experiments.tradeoff.scenes import TradeScene
 from fidsplat.selftest.agreement import FrameSpec, reference_images
 from fidsplat.util.errors import FidsplatError
 from fidsplat.vision.metrics import psnr
 from fidsplat.vision.readback import corner_error, own_code
-from fidsplat.vision.readers import Target, attempt
 
-FULL_TILTS, QUICK_TILTS = "0:40:20,46:88:1", "0:40:40,48:88:4"
-READERS = {"apriltag": "aruco", "qr": "zxing"}
-"""detectors: one installed detector for each kind of marker"""
 _PAIRS = 2_000_000
 """maximum pixels times splats of the reference renderer per image"""
 _MAX_CERTIFICATES, _MIN_CERTIFICATES = 64, 12
 """pixels with certificates; none if fewer are possible"""
-
-
-def scan(session: Session, name: str, quality: Quality | None, tilts: str) -> Callable[[], dict]:
-    """Render a marker at every tilt; returns work that reads the images.
-
-    quality: None for the ideal area-sampled texture, the ceiling that the detector has. The result: `reader`,
-    `read` (a string of 0 and 1, one for each tilt), `splats`, `rectangles`.
-    """
-    marker = placed_marker(name, MarkerQuality() if quality is None else quality.marker)
-    cameras = [PROTOCOL.camera(tilt) for tilt in parse_tilts(tilts)]
-    rendered: list[np.ndarray] = []
-    if quality is not None:
-        resident = session.renderer.upload(marker.cloud)
-        for camera in cameras:
-            frame = session.renderer.render(resident, camera, ("rgb",), quality, background=GREY)
-            rendered.append(to_uint8(frame["rgb"][:, :, 0]))
-
-    def decode() -> dict:
-        images = rendered or [
-            to_uint8(plane_image(marker.grid, marker.module, camera, background=BACKGROUND))
-            for camera in cameras
-        ]
-        reader, read = READERS[marker.kind], ""
-        for camera, grey in zip(cameras, images, strict=True):
-            corners = camera.project(marker.corners)
-            target = Target(marker.kind, marker.family or "", marker.id, marker.payload, corners)
-            read += "01"[attempt(reader, grey, target).read]
-        splats = None if quality is None else len(marker.cloud)
-        return {"reader": reader, "read": read, "splats": splats, "rectangles": len(marker.boxes)}
-
-    return decode
 
 
 def compare_image(image: np.ndarray, reference: np.ndarray, scene: TradeScene, quality: Quality) -> dict:

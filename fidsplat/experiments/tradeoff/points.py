@@ -173,20 +173,6 @@ def ellipsoid_points(settings: Iterable[str]) -> list[Point]:
     return [BASE_POINT, *(Point("ellipsoid", value, EXACT.with_(ellipsoid=value)) for value in values)]
 
 
-def decode_points(settings: Iterable[str], quick: bool = False) -> list[Point]:
-    """Points for the largest readable tilt: settings that change edges."""
-    settings = tuple(settings)
-    found = [BASE_POINT]
-    if PRESET in settings:
-        found.append(Point(PRESET, "gsplat", preset("gsplat")))
-    if MARKER in settings:
-        found += _marker_points(quick)
-    for setting in ("lowpass", "samples"):
-        if setting in settings and not quick:
-            found += [_variation(setting, value) for value in _VALUES[setting]]
-    return found
-
-
 def preset(name: str) -> Quality:
     """A preset with the marker quality of the base."""
     return PRESETS[name].with_(marker=BASE.marker)

@@ -185,10 +185,8 @@ def verdict(device: DeviceResults, point: Row, base: tuple[str, str] | None = No
 
 
 def markers_table(device: DeviceResults) -> Frame:
-    """Marker qualities: time, PSNR relative to the printed texture, largest readable tilt.
-
-    Rendered without a low-pass with nine samples per pixel.
-    """
+    """Time of marker qualities, without a low-pass with nine samples per pixel, and errors relative to the
+    printed texture."""
     view, rows = f"{SHOWN_MARKER}@{TILT}", []
     if view not in device.scenes:
         return pd.DataFrame()
@@ -203,7 +201,6 @@ def markers_table(device: DeviceResults) -> Frame:
                     "time": percent(point["ratio"]),
                     "PSNR, dB": fixed(point["ideal_psnr"]),
                     "corner error, px": number(point["corners_px"]),
-                    "read up to": fixed(device.read_to(SHOWN_MARKER, point["knob"], point["value"]), 0),
                 }
             )
     return pd.DataFrame(rows)

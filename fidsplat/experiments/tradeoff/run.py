@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from fidsplat.experiments.angles import parse_tilts
 from fidsplat.experiments.run import device_name
 from fidsplat.experiments.sweep import Key, Results, Sweep, TimeLimit, Work, thread_pool
 from fidsplat.experiments.tradeoff import compare, points, scenes
@@ -23,9 +22,6 @@ from fidsplat.vision.readers import reader_versions
 
 NAME = "tradeoff"
 FILE = f"{NAME}.jsonl"
-POINT, DECODE = "point", "decode"
-"""measurements in stored keys: of a quality, of the largest readable tilt"""
-IDEAL = "ideal"
 _EARLY = ("base", PRESET, ABLATION, "alpha_cutoff", "transmittance_stop", MARKER)
 QUICK_SECONDS = 150.0
 """time limit of the measurement of --quick, which promises 3 minutes with loading and the last batch"""
@@ -97,9 +93,6 @@ def estimated_seconds(session: Session, keys: list[Key], effort: Effort) -> floa
     total = 0.0
     for key in keys:
         name = key["scene"].partition("@")[0]
-        if key["what"] == DECODE:
-            total += OVERHEAD * len(parse_tilts(key["tilts"]))
-            continue
         if name not in frames:
             frames[name] = _frame_ms(session, key["scene"])
         frame = 1e-3 * frames[name]
@@ -138,11 +131,6 @@ def all_points(names: tuple[str, ...], settings: tuple[str, ...], quick: bool) -
             varied = [point for point in varied if point.quality.samples <= 2]
         for view in scenes.views_of(name):
             found += _view_points(view, varied, quick)
-        if on_marker:
-            tilts = compare.QUICK_TILTS if quick else compare.FULL_TILTS
-            ideal = {"knob": IDEAL, "value": IDEAL, "quality": None}
-            keys = [ideal, *(point.key() for point in points.decode_points(settings, quick))]
-            found += [(1, {"what": DECODE, "scene": name, **key, "tilts": tilts}) for key in keys]
     return _by_priority(found)
 
 
@@ -159,7 +147,7 @@ def own_points(views: Iterable[str], settings: tuple[str, ...], quick: bool) -> 
 def _view_points(view: str, varied: Iterable[Point], quick: bool) -> list[tuple[int, Key]]:
     """Points of a view, with priorities."""
     return [
-        (0 if point.setting in _EARLY else 2, {"what": POINT, "scene": view, **point.key(), "quick": quick})
+        (0 if point.setting in _EARLY else 2, {"scene": view, **point.key(), "quick": quick})
         for point in varied
     ]
 
@@ -171,9 +159,6 @@ def _by_priority(found: list[tuple[int, Key]]) -> list[Key]:
 def _begin(session: Session, key: Key, quick: bool) -> Work:
     """Render the images of a point; returns their evaluation."""
     view = key["scene"]
-    if key["what"] == DECODE:
-        quality = None if key["quality"] is None else points.quality_of(key["quality"])
-        return compare.scan(session, view, quality, key["tilts"])
     quality = points.quality_of(key["quality"])
     frame, times = time_point(session, view, quality, QUICK if quick else FULL)
     image, reference = frame["rgb"], session.reference(view, quality)

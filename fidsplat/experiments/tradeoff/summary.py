@@ -11,19 +11,18 @@ from typing import Any
 import pandas as pd
 
 from fidsplat.capture.quality import PRESETS
-from fidsplat.experiments.angles import largest, parse_tilts
 from fidsplat.experiments.summary import Frame, Row, Summary, join, read_summary, summarise
 from fidsplat.experiments.sweep import Record, folder_records
 from fidsplat.experiments.tradeoff.points import PRESET, SETTINGS, Point, preset
-from fidsplat.experiments.tradeoff.run import DECODE, NAME, POINT
+from fidsplat.experiments.tradeoff.run import NAME
 from fidsplat.experiments.tradeoff.scenes import NAMES, is_marker, views_of
 from fidsplat.experiments.tradeoff.session import DEFINITION
 from fidsplat.util.errors import InputError
 
-KEYS = ("what", "scene", "knob", "value")
+KEYS = ("scene", "knob", "value")
 COLUMNS = (
     *KEYS, "quality", "amount", "base_ms", "ratio", "ratio_low", "ratio_high", "maximum", "beyond",
-    "rmse", "per_rectangle", "ideal_psnr", "corners_px", "read_to", "error",
+    "rmse", "per_rectangle", "ideal_psnr", "corners_px", "error",
 )  # fmt: skip
 TILT = 60
 """degrees: tilt of the marker images of a summary"""
@@ -43,23 +42,20 @@ _VERDICTS = {
 
 def rows_of(record: Record) -> Iterator[dict[str, Any]]:
     """Rows of a record; none for markers at tilts other than `TILT`."""
-    key, found, kind = record.key, record.result, record.key["what"]
-    if kind == POINT and is_marker(key["scene"]) and not key["scene"].endswith(f"@{TILT}"):
+    key, found = record.key, record.result
+    if is_marker(key["scene"]) and not key["scene"].endswith(f"@{TILT}"):
         return
     row: dict[str, Any] = {name: key.get(name) for name in KEYS}
     row["amount"] = 0 if record.failed else 1 if key.get("quick") else 2
     if record.failed:
         row["error"] = found["error"]
-    elif kind == POINT:
+    else:
         low, high = found["ratio_quartiles"]
         row |= {name: found[name] for name in COLUMNS if name in found}
         row |= {"ratio_low": low, "ratio_high": high, "beyond": found["maximum_sure"]}
         row["quality"] = quality_text(key["quality"])
         if "rectangles" in found:
             row["per_rectangle"] = found["splats"] / found["rectangles"]
-    else:
-        row["read_to"] = largest(parse_tilts(key["tilts"]), found["read"])[1]
-        row["amount"] = len(found["read"])
     yield row
 
 
@@ -74,7 +70,7 @@ def load(folders: Iterable[Path]) -> list[DeviceResults]:
     for folder in folders:
         records: dict[str, list[Record]] = {}
         for record in folder_records(folder, NAME):
-            if "what" not in record.key:
+            if "knob" not in record.key:
                 raise InputError(
                     f"{folder} must contain results of fidsplat tradeoff, got other ones; give another folder"
                 )
@@ -107,7 +103,7 @@ class DeviceResults:
         self.title, self.kind = run.get("title", self.name), run.get("kind", "device")
         presets = rows["knob"] == PRESET
         stale = presets & (rows["quality"] != rows["value"].map(_current_quality))
-        points: Frame = rows[(rows["what"] == POINT) & rows["error"].isna() & ~stale]
+        points: Frame = rows[rows["error"].isna() & ~stale]
         for name in rows.loc[presets, "value"].unique():
             same = points[points["quality"] == _current_quality(name)].drop_duplicates("scene")
             named = same.assign(knob=PRESET, value=name)
@@ -200,16 +196,6 @@ class DeviceResults:
             if len(own) == len(scenes) and error <= bound and cost < best[0]:
                 best = cost, own
         return best[1]
-
-    def read_to(self, marker: str, setting: str, value: str) -> float | None:
-        """Largest tilt in degrees up to which a marker is read at every tilt of the scan.
-
-        None if it was not scanned or is not read frontally.
-        """
-        rows = self.summary.rows
-        key = dict(zip(KEYS, (DECODE, marker, setting, value), strict=True))
-        found = rows.loc[rows[list(KEYS)].eq(pd.Series(key)).all(axis=1), "read_to"].dropna()
-        return None if found.empty else float(found.iloc[0])
 
 
 def _sign(error: float, other: float) -> int:
