@@ -266,10 +266,12 @@ def test_devices(capsys):
     assert "reference" in capsys.readouterr().out
 
 
-def test_progress_is_shown_for_long_work():
+def test_progress_is_shown_for_long_work(monkeypatch):
     for after in (60.0, 0.0):
         shown = io.StringIO()
-        with delayed_progress(Console(file=shown, force_terminal=True), after) as progress:
+        terminal = Console(file=shown, force_terminal=True)
+        monkeypatch.setattr("fidsplat.commands.output.console", lambda as_json, terminal=terminal: terminal)
+        with delayed_progress(after) as progress:
             progress("squares", 0.5)
             deadline = time.monotonic() + 30
             while not after and "squares" not in shown.getvalue() and time.monotonic() < deadline:

@@ -48,7 +48,7 @@ ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}
 
 # third-party module: the places that alone may import it
 HOME_OF = {
-    "cv2": ("images", "vision"),
+    "cv2": ("images", "vision", "markers.regions"),
     "zxingcpp": ("vision",),
     "pupil_apriltags": ("vision",),
     "locus": ("vision",),
