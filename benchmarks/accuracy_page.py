@@ -2,20 +2,22 @@
 
     python benchmarks/accuracy_page.py [DIR ...]
 
-DIR: folders with results or their tables; by default devlog/accuracy. Replaces the generated block of
-docs/accuracy.md, and writes devlog/accuracy.md, the report of `fidsplat tradeoff report`.
+DIR: folders with results of `fidsplat tradeoff` or their tables; by default devlog/accuracy. Replaces the
+generated block of docs/accuracy.md, with a chart for each device of benchmarks/results/suite-*.json, and
+writes devlog/accuracy.md, the report of `fidsplat tradeoff report`.
 """
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import pandas as pd
+import splatmark
 
+from fidsplat.experiments.charts import chart, label_points, literal, plain_ticks
 from fidsplat.experiments.pages import NOTHING, fill_template, number, percent
 from fidsplat.experiments.summary import Frame
 from fidsplat.experiments.tradeoff.points import ABLATION, PRESET
@@ -32,6 +34,9 @@ from fidsplat.util.files import write_file
 TREE = Path(__file__).parents[1]
 PAGE, REPORT = TREE / "docs" / "accuracy.md", TREE / "devlog" / "accuracy.md"
 SCENE = "r1m_1080p"
+SUITES = sorted((TREE / "benchmarks" / "results").glob("suite-*.json"))
+SHOWN = {"r100k_720p": "disks", "biker_720p": "3D Gaussians"}
+"""scenes of the charts of the suite"""
 BEGIN, END = "<!-- begin generated -->\n", "<!-- end generated -->\n"
 
 
@@ -76,7 +81,7 @@ def write_accuracy(folders: Sequence[Path], page: Path = PAGE, report: Path = RE
     }
     context = {
         "scene": SCENE,
-        "facts": {device.title: facts_of(device) for device in devices},
+        "facts": [suite_facts(device, folder) for device in splatmark.load(SUITES)],
         "constants": constants_table(devices),
     }
     before, _, rest = page.read_text("utf-8").partition(BEGIN)
@@ -108,18 +113,50 @@ def constants_table(devices: Sequence[DeviceResults]) -> Frame:
     return pd.DataFrame(rows)
 
 
-def facts_of(device: DeviceResults) -> dict[str, str]:
-    """Comparison of `standard` with gsplat's constants."""
-    ours, theirs = (device.at(SCENE, PRESET, name) for name in ("standard", "gsplat"))
-    same = device.same_definition(SCENE)
-    fastest = same[same["maximum"] <= theirs["maximum"]]["ratio"].min()
-    most_accurate = same[same["ratio"] <= theirs["ratio"] * 1.02]["maximum"].min()
+def suite_facts(device: splatmark.Device, folder: Path) -> dict[str, str]:
+    """Chart of a device, and comparison of `standard` with gsplat's constants."""
+    scene = next(iter(SHOWN))
+    settings = {one["setting"]: one for one in device.results[::-1] if one["scene"] == scene}
+    ours, theirs = settings["standard"], settings["gsplat"]
+    file = folder / f"{device.name.replace(' ', '-')}.svg"
+    write_chart(device, file)
     return {
-        "time": percent(ours["ratio"] / theirs["ratio"]),
-        "better": f"{math.floor(theirs['maximum'] / ours['maximum'])}",
-        "at_error": percent(fastest / theirs["ratio"]),
-        "in_time": f"{math.floor(theirs['maximum'] / most_accurate)}",
+        "title": device.title,
+        "chart": file.name,
+        "scene": scene,
+        "better": f"{theirs['largest_error'] / ours['largest_error']:.0f}",
+        "time": percent(ours["quartiles_ms"][1] / theirs["quartiles_ms"][1]),
     }
+
+
+def write_chart(device: splatmark.Device, file: Path) -> None:
+    """Write a chart of the time and largest error of every renderer and setting, a panel for each scene."""
+    renderers = list(dict.fromkeys(one["renderer"] for one in device.results))
+    with chart(file, len(SHOWN), (11.0, 4.6)) as (figure, panels):
+        points = []
+        for axes, scene in zip(panels, SHOWN, strict=True):
+            found = [one for one in device.results if one["scene"] == scene]
+            labels = []
+            for one in found:
+                at, name = (one["quartiles_ms"][1], one["largest_error"]), one["renderer"]
+                colour = splatmark.COLOURS[renderers.index(name) % len(splatmark.COLOURS)]
+                axes.plot(*at, "o", color=colour, label=literal(name))
+                labels.append((*at, one["setting"] if name.startswith("fidsplat") else name))
+            points.append(labels)
+            axes.set(xscale="log", yscale="log", xlabel="milliseconds per frame")
+            axes.axhline(splatmark.LIMIT, color="#777777", linestyle="--", linewidth=0.8)
+            axes.margins(0.1)
+            plain_ticks(axes.xaxis)
+            axes.set_title(f"{scene}: {SHOWN[scene]}")
+        panels[0].set_ylabel("largest error; dashed: 1/255")
+        entries = {
+            name: handle
+            for axes in panels
+            for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(entries.values(), entries, loc="outside lower center", ncols=4, frameon=False)
+        for axes, labels in zip(panels, points, strict=True):
+            label_points(figure, axes, labels)
 
 
 if __name__ == "__main__":

@@ -49,9 +49,9 @@ class Bench:
     --suite compares renderers by time and error on scenes of every regime: uniform, skewed, haze, street,
     markers, captured, batches, scaling. Each renderer runs in a process of its own: fidsplat on every device
     of this machine (or --device), and the renderers of --adapters. Images are compared with float64
-    references. It takes about 10 minutes on two cores, with --quick under 3. Results are written after each
-    scene; an interrupted run resumes. --scenes selects scenes or regimes. benchmarks/splatmark.py makes a
-    site of the results.
+    references. It takes about 10 minutes on two cores, with --quick 90 seconds. Results are written after
+    each scene; an interrupted run resumes. --scenes selects scenes (haze, street: one scene) or all scenes of
+    the other regimes. benchmarks/splatmark.py makes a site of the results.
 
     --scene measures your own scene with everything that it requests (quality, outputs, lens, shutter,
     motions, markers, fog, sensor), from its camera or from eight poses of --cameras. The table shows the time

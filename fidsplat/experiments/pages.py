@@ -12,22 +12,29 @@ import pandas as pd
 from markupsafe import Markup
 
 from fidsplat.experiments.summary import Frame
-from fidsplat.util.files import printable, writable_folder, write_file
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import printable, read_text, writable_folder, write_file
 from fidsplat.util.markup import escaped
 
 NOTHING = "-"
 TEMPLATES = Path(__file__).with_name("templates")
 
 
-def page_and_folder(out: Path) -> tuple[Path, Path]:
+def page_and_folder(out: Path, template: str) -> tuple[Path, Path]:
     """Report file, and folder of its charts and tables.
 
     These are report.md in a folder, or a name that ends in .md and a folder of that name without .md. Raises
-    InputError when the folder cannot be written.
+    InputError when the folder cannot be written, or the file exists and is not a report of the template.
     """
-    if out.suffix == ".md":
-        return out, writable_folder(out.with_suffix(""))
-    return writable_folder(out) / "report.md", out
+    if out.suffix != ".md":
+        return writable_folder(out) / "report.md", out
+    title = read_text(TEMPLATES / template).splitlines()[0].partition("{{")[0]
+    if out.exists() and not read_text(out).startswith(title):
+        raise InputError(
+            f"-o must be a new file or an earlier report, got {out}, which does not start with {title!r}; "
+            "give another name"
+        )
+    return out, writable_folder(out.with_suffix(""))
 
 
 def write_page(page: Path, folder: Path, template: str, context: Mapping[str, Any]) -> None:

@@ -41,7 +41,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
     Raises InputError when there are no results or the folder cannot be written.
     """
     loaded = load(folders)
-    page, folder = page_and_folder(out)
+    page, folder = page_and_folder(out, "results.md.j2")
     summaries = {name: summary.write(folder / f"{name}.csv") for name, summary in loaded.items()}
     rows = {name: summary.rows for name, summary in summaries.items()}
     sections = {

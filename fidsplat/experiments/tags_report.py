@@ -148,7 +148,7 @@ def write_report(records: Sequence[Record], folder: Path, out: Path, seed: int) 
 
     Returns the files, the page first, and the table of `breaks_of`.
     """
-    summary, (page, charts) = view_table(records), page_and_folder(out)
+    summary, (page, charts) = view_table(records), page_and_folder(out, "tags.md.j2")
     views = summary.rows
     views["read"] = views["read"].astype(bool)
     table = Summary(statistics_of(views, seed).assign(run=0), summary.runs)

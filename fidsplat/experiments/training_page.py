@@ -31,7 +31,7 @@ def write_training_page(
 
     Raises InputError when they cannot be written.
     """
-    page, folder = page_and_folder(out)
+    page, folder = page_and_folder(out, "training.md.j2")
     files = [page, folder / "training.svg"]
     draw_curves(trainer.history, files[1])
     shown = []

@@ -200,6 +200,12 @@ def test_the_report_says_what_the_numbers_say(capsys, tmp_path):
     assert main(["tradeoff", "report", str(tmp_path / "docs" / "accuracy"), "-o", str(page)]) == 0
     assert {file: file.read_bytes() for file in (tmp_path / "docs").rglob("*.*")} == before
 
+    # another page is not overwritten
+    page.write_text("# Accuracy\n")
+    assert main(["tradeoff", "report", str(tmp_path / "docs" / "accuracy"), "-o", str(page)]) == 2
+    assert "new file or an earlier report" in capsys.readouterr().err
+    assert page.read_text() == "# Accuracy\n"
+
 
 def test_a_device_that_rendered_only_3d_gaussians_takes_nothing_from_the_others(tmp_path):
     write(tmp_path / "a", plain_records("r100k_720p"))

@@ -1,4 +1,8 @@
-"""gsplat's `rasterization_2dgs`: disks, all views of a batch in one call."""
+"""gsplat's `rasterization_2dgs`: disks, one view in a call.
+
+Of several cameras in a call, 1.6 refuses unpacked ones (it expands opacities to a tensor that is not
+contiguous), and packed ones read colours by the index of a visible pair, beyond the colours of the splats.
+"""
 
 import gsplat
 from torch_gpu import TorchAdapter
@@ -11,9 +15,7 @@ class Adapter(TorchAdapter):
         super().__init__("gsplat 2DGS", gsplat.__version__)
 
     def draw(self, setting, views):
-        splats = self.means, self.quats, self.scales, self.opacities
-        colors = self.colors.expand(len(views), *self.colors.shape)
-        cameras = self.viewmats[views], self.K.expand(len(views), 3, 3), self.width, self.height
-        # 1.6 refuses several cameras unpacked
-        images, *_ = gsplat.rasterization_2dgs(*splats, colors, *cameras, packed=len(views) > 1)
-        return images
+        splats = self.means, self.quats, self.scales, self.opacities, self.colors[None]
+        size = self.width, self.height
+        cameras = ((self.viewmats[view][None], self.K[None]) for view in views)
+        return [gsplat.rasterization_2dgs(*splats, *camera, *size)[0] for camera in cameras]

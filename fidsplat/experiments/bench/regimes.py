@@ -266,7 +266,7 @@ SUITE: dict[str, SuiteScene] = {
         large=True,
     ),
     "tags": SuiteScene("markers", "24 AprilTags of Gaussians", partial(tags, False), quick=True),
-    "tags_exact": SuiteScene("markers", "24 AprilTags of exact rectangles", partial(tags, True), quick=True),
+    "tags_exact": SuiteScene("markers", "24 AprilTags of exact rectangles", partial(tags, True)),
     "qr_wall": SuiteScene(
         "markers", "200 QR codes of exact rectangles", lambda: _single(*qr_wall()), large=True
     ),
@@ -285,7 +285,8 @@ REGIMES = tuple(dict.fromkeys(scene.regime for scene in SUITE.values()))
 
 
 def suite_scenes(words: Iterable[str], quick: bool, large: bool) -> dict[str, SuiteScene]:
-    """Scenes by name or regime; all that suit the machine if none is given.
+    """Scenes by name or regime; all that suit the machine if none is given. A word that is both (`haze`) is
+    the scene.
 
     Args:
         quick: only those of quick runs. large: also those for GPUs.
@@ -298,5 +299,6 @@ def suite_scenes(words: Iterable[str], quick: bool, large: bool) -> dict[str, Su
         if word not in SUITE and word not in REGIMES:
             raise InputError(unknown("scene of the suite", word, (*REGIMES, *SUITE)))
     if words:
-        return {name: one for name, one in SUITE.items() if name in words or one.regime in words}
+        regimes = set(words) - set(SUITE)
+        return {name: one for name, one in SUITE.items() if name in words or one.regime in regimes}
     return {name: one for name, one in SUITE.items() if (one.quick or not quick) and (large or not one.large)}

@@ -7,6 +7,7 @@ with the same file measures the scenes and renderers that it lacks.
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -38,9 +39,8 @@ from fidsplat.vision.readback import means, read_back
 
 SCHEMA = 1
 """version of the format of the results"""
-SLOW, TOO_SLOW = 1000.0, 10_000.0
-"""Milliseconds of a frame. Above SLOW, a renderer is measured at its first setting, and interleaved
-separately, so that faster renderers have more rounds. Above TOO_SLOW it is left out."""
+TOO_SLOW = 10_000.0
+"""milliseconds of a submission above which a renderer is left out"""
 SHORT = 50.0
 """milliseconds: shorter frames follow untimed ones, since another process used device and caches before"""
 Progress = Callable[[str, float], None]
@@ -59,13 +59,16 @@ class Effort:
     seconds: float
     """time after which no round is started, after `min_rounds` rounds"""
     min_rounds: int = 3
+    slow: float = 1000.0
+    """Milliseconds of a submission above which a renderer is measured at its first setting, and interleaved
+    separately, so that faster renderers have more rounds"""
     burst: float = 0.5
     """seconds of frames for the energy of a frame"""
     compared_views: int = 3
     """maximum number of views whose images are compared"""
 
 
-FULL, QUICK = Effort(40, 6.0), Effort(7, 1.0, compared_views=1)
+FULL, QUICK = Effort(40, 6.0), Effort(7, 1.0, min_rounds=1, slow=250.0, compared_views=1)
 
 
 class RendererProcess:
@@ -177,8 +180,8 @@ class Measurement:
     ) -> None:
         """submissions: views of each frame; after the last one they start again."""
         self.process, self.setting, self.result, self.submissions = process, setting, result, submissions
-        self.second_ms = 0.0
-        """milliseconds of the second frame of the first view"""
+        self.second_ms = math.inf
+        """milliseconds of the first submission after the first frames"""
         self.timer = Timer(self._render, process.clock, catch_errors=True)
         self._next = cycle(range(len(submissions)))
 
@@ -199,7 +202,9 @@ class Measurement:
             taken.append(self.process.frame(self.setting, [view])["ms"])
             memory = self.process.ask("image", file=str(file))
             images.append(np.load(file)[0])
-        self.second_ms = self.process.frame(self.setting, references.chosen[:1])["ms"]
+        self.second_ms = self.timer.run()
+        if self.timer.error:
+            raise AdapterError(self.timer.error)
         off = np.abs(np.stack(images) - references.image(self.result["claim"]))
         if not np.isfinite(off).all():
             raise AdapterError(f"{self.setting}: the image has values that are not finite")
@@ -376,13 +381,20 @@ class Suite:
                     self._failed(renderer)
                     self._add(name, [renderer], {"error": str(error)})
         report("interleaved frames")
-        for slow in (False, True):
+        effort = self._effort
+        seconds = effort.seconds * (0.5 if scene.x is not None else 1.0)
+        fast = [one for one in found if one.second_ms <= effort.slow]
+        slow = [one for one in found if one.second_ms > effort.slow]
+        for one in fast:  # the frame so far had no warm-up
+            one.timer.ms.clear()
+            one.timer.parts.clear()
+        for timed, done in ((fast, 0), (slow, 1)):
             time_interleaved(
-                [one.timer for one in found if (one.second_ms > SLOW) == slow],
-                self._effort.rounds,
-                min_rounds=self._effort.min_rounds,
-                seconds=self._effort.seconds * (0.5 if scene.x is not None else 1.0),
-                warm_up=0 if slow else 1,
+                [one.timer for one in timed],
+                effort.rounds - done,
+                min_rounds=effort.min_rounds - done,
+                seconds=seconds - done * sum(one.second_ms for one in timed) / 1e3,
+                warm_up=1 - done,
                 tick=interrupts.check,
             )
         metered: set[str] = set()
@@ -426,7 +438,7 @@ class Suite:
                 self._add(name, [renderer], {"setting": setting, "skipped": reason})
             else:
                 found.append(one)
-            if one.second_ms > SLOW or self._scenes[name].x is not None:
+            if one.second_ms > self._effort.slow or self._scenes[name].x is not None:
                 break
         return found
 

@@ -51,7 +51,7 @@ def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
 
     Raises InputError when there are no results or the folder cannot be written.
     """
-    page, folder = page_and_folder(out)
+    page, folder = page_and_folder(out, "tradeoff.md.j2")
     devices, files = save_results(folders, folder)
     every = list(devices.values())
     repeated = {one.title for one, other in combinations(every, 2) if one.title == other.title}
