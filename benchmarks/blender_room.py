@@ -1,4 +1,5 @@
-"""Blender worker: a lit marker in a room of glowing panels. Runs in Blender's Python without fidsplat.
+"""Blender worker: lit markers in a room of glowing panels, and diffuse meshes. Runs in Blender's Python
+without fidsplat.
 
     python blender_room.py JOB.json
 
@@ -22,7 +23,8 @@ def main(job: dict) -> None:
     """Render all images of all scenes."""
     for one in job["objects"]:
         scene = prepare({**job, "view": "raw", "filter": "BOX", "background": 0.0})
-        scene.cycles.max_bounces = scene.cycles.diffuse_bounces = scene.cycles.glossy_bounces = 1
+        bounces = one.get("bounces", 1)
+        scene.cycles.max_bounces = scene.cycles.diffuse_bounces = scene.cycles.glossy_bounces = bounces
         scene.cycles.use_denoising = job["denoise"]
         scene.render.image_settings.file_format = "OPEN_EXR"
         scene.render.image_settings.color_depth = "32"
@@ -31,7 +33,10 @@ def main(job: dict) -> None:
             add(f"panel {number}", panel["corners"], [(0, 1, 2, 3)], emission(panel["radiance"]))
         for light in one["lights"]:
             add_light(light)
-        sheet(one)
+        if "mesh" in one:
+            diffuse_mesh(one["mesh"])
+        for each in one.get("sheets", [one]):
+            sheet(each)
         for image in one["images"]:
             aim(scene, image)
             part = f"{image['file']}.{os.getpid()}.exr"
@@ -75,6 +80,19 @@ def emission(radiance: list):
     shader.inputs["Color"].default_value = (*radiance, 1.0)
     tree.links.new(shader.outputs[0], output.inputs["Surface"])
     return made
+
+
+def diffuse_mesh(given: dict) -> None:
+    """A mesh that reflects diffusely, with an albedo of each face."""
+    made, tree, output = nodes("diffuse")
+    albedo = tree.nodes.new("ShaderNodeAttribute")
+    albedo.attribute_name = "albedo"
+    shader = tree.nodes.new("ShaderNodeBsdfDiffuse")
+    tree.links.new(albedo.outputs["Color"], shader.inputs["Color"])
+    tree.links.new(shader.outputs[0], output.inputs["Surface"])
+    mesh = add("mesh", given["vertices"], given["faces"], made)
+    colors = np.pad(np.array(given["albedo"], np.float32), ((0, 0), (0, 1)), constant_values=1)
+    mesh.attributes.new("albedo", "FLOAT_COLOR", "FACE").data.foreach_set("color", colors.ravel())
 
 
 def add_light(light: dict) -> None:
