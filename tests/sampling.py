@@ -47,7 +47,8 @@ def take_turns(items: Sequence[pytest.Item], devices: Sequence[str], turn: int =
     """Mark tests `exhaustive` that another run has, of the 8 that differ in `turn`.
 
     A file's tests of several of these devices run on one of them, which then compiles a feature set for the
-    complete file. Of `SWEEP` or more cases of a test of kernels every other one runs.
+    complete file. Of `SWEEP` or more cases of a test of kernels, or with the mark `sweep`, every other one
+    runs.
     """
     found: dict[str, dict[str, list[pytest.Item]]] = {}
     for item in items:
@@ -61,8 +62,8 @@ def take_turns(items: Sequence[pytest.Item], devices: Sequence[str], turn: int =
         own = devices[(crc32(test.partition("::")[0].encode()) + turn) % len(devices)] if devices else ""
         for device, cases in by_device.items():
             elsewhere = own in by_device and device not in ("", own)
-            sweep = len(cases) >= SWEEP and not test.startswith(WITHOUT_KERNELS)
+            sweep = not test.startswith(WITHOUT_KERNELS) or cases[0].get_closest_marker("sweep")
             for number, item in enumerate(cases):
                 # the parity of the number's bits: of two short axes, no run has one value of one axis only
-                if elsewhere or (sweep and (number.bit_count() + turn // 4) % 2):
+                if elsewhere or (sweep and len(cases) >= SWEEP and (number.bit_count() + turn // 4) % 2):
                     item.add_marker(pytest.mark.exhaustive)

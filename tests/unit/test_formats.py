@@ -46,6 +46,7 @@ def assert_same_bits(a: fs.SplatCloud, b: fs.SplatCloud):
     np.testing.assert_allclose(a.quats, b.quats, atol=1.2e-7)  # made of unit length once more
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("suffix", [".glb", ".gltf", *USD])
 @pytest.mark.parametrize("thick", [True, False])
 def test_what_keeps_every_bit(tmp_path, suffix, thick):
@@ -263,6 +264,7 @@ def test_a_gltf_may_begin_with_as_many_spaces_as_it_likes(tmp_path):
         fs.load_splats(path)
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("suffix", [".spz", ".splat", ".glb", ".gltf", *USD[:2]])
 def test_files_that_are_cut_short_or_something_else(tmp_path, suffix):
     need(suffix)

@@ -2,7 +2,7 @@
 
 Every input is used, or refused in one line, within limits of time and memory. A longer run:
 
-    FIDSPLAT_HOSTILE=1000 python -m pytest -n 0 tests/unit/test_hostile.py --hypothesis-seed=33
+    FIDSPLAT_HOSTILE=1000 python -m pytest -m "" -n 0 tests/unit/test_hostile.py --hypothesis-seed=33
 """
 
 import contextlib
@@ -403,6 +403,7 @@ def good(tmp_path_factory):
     return of
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("kind", list(INPUTS))
 def test_damaged_files_are_used_or_refused(kind, good, tmp_path):
     if kind.startswith(".usd"):
@@ -533,6 +534,7 @@ def test_a_scene_that_repeats_one_file_of_splats(tmp_path, monkeypatch):
 ODD = (object(), [10**400] * 3, np.float16(1), np.zeros((0, 3)), 10**400, "\ud800", float("nan"))
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("name", sorted(CALLS))
 def test_every_argument_is_validated(name, tmp_path, monkeypatch):
     """Each argument of a public function in turn takes four values that nobody expects: it does its work, or
@@ -553,6 +555,7 @@ MISSING = {"read_description": "world.sdf", "load_trajectory": "a.tum", "Scene.l
 """calls whose good path names no file yet"""
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("name", sorted(CALLS.keys() - {"Frame.device_array"}))  # the reference has none
 def test_good_arguments_are_used(name, tmp_path, monkeypatch):
     """Otherwise odd ones next to them would be refused for another reason."""

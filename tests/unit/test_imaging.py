@@ -248,6 +248,7 @@ def test_the_command_writes_as_many_bits_as_the_sensor_has(tmp_path, bits):
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("name", sorted(file.stem for file in EXAMPLES.glob("*.toml")))
 def test_the_examples_are_rendered(name, renderer):
     scene = fs.Scene.load(EXAMPLES / f"{name}.toml")

@@ -34,6 +34,7 @@ def clouds():
     }
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 @pytest.mark.parametrize("kind", clouds())
 def test_a_splat_that_is_left_out_of_a_tile_is_not_visible_there(monkeypatch, camera, kind):

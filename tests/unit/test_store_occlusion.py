@@ -76,7 +76,7 @@ def view(turn=0.0, along=0.0, size=(192, 108)):
 SMALL = 96, 54
 """for what takes processors long: fragments by their own depth, schedules of GPUs, many samples"""
 PLACES = [(0.0, 0.0), (0.05, 0.1), (1.6, -2.0), (1.7, -7.0)]
-PATH = [view(*place) for place in PLACES]
+PATH = [view(*place, SMALL) for place in PLACES]
 QUALITIES = {
     "centres": "lowpass=screen",
     "pixels": "lowpass=screen,order=pixel",
@@ -88,6 +88,7 @@ QUALITIES = {
 }
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize(
     ("name", "schedule"),
     [*((name, "own") for name in QUALITIES), ("centres", "groups"), ("pixels", "groups")],
@@ -99,9 +100,9 @@ def test_frames_are_bit_identical_to_those_of_all_splats(town, culling, name, sc
     cloud, resident = town.cloud(), renderer.upload(town)
     asking, path = {"quality": QUALITIES[name], "outputs": ALL_OUTPUTS}, PATH
     if "pixels" in name:
-        path = [view(*place, SMALL) for place in PLACES]
+        path = PATH[::2]
     if schedule == "groups":
-        asking["outputs"], path = ("rgb", "splat_id"), [view(size=SMALL)]
+        asking["outputs"], path = ("rgb", "splat_id"), [view(size=(64, 36))]
     for number, frame in enumerate(renderer.render_views(resident, path, **asking)):
         whole = renderer.render(cloud, path[number], **asking)
         for output in whole:
@@ -138,12 +139,13 @@ def test_a_repeated_view_is_rendered_in_one_pass(town, culling, monkeypatch):
     assert len(times) == 1
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("name", ["centres", "pixels", "samples", "odd samples", "groups", "bands"])
 def test_missing_chunks_are_rendered_in_their_tiles(town, culling, monkeypatch, name):
     """With termination depths that are too near, visible chunks are missing in the first pass."""
     monkeypatch.setattr(occlusion_culling, "_MOTION_SLACK", -6.0)
     monkeypatch.setattr(occlusion_culling, "_PATCH_RATIO", 1)
-    size = SMALL if name in ("odd samples", "groups") else (192, 108)
+    size = {"odd samples": (48, 27), "groups": SMALL, "pixels": (128, 72)}.get(name, (192, 108))
     path = [view(*place, size) for place in ((0.0, 0.0), (0.02, 0.1), (0.03, 0.5))]
     renderer, taken = fs.Renderer("opencl"), []
     backend = type(renderer.backend)
@@ -253,6 +255,7 @@ CAPTURES = {
 }
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("name", CAPTURES)
 def test_splats_are_within_the_bounds_of_their_box(name):
     """Each splat, against the key and rectangle that the device computes."""
@@ -274,7 +277,7 @@ def test_splats_are_within_the_bounds_of_their_box(name):
     records, rectangles = trace["records"], np.full((len(cloud), 4), -1)
     for i in shown:
         rectangles[i] = records["y0"][i], records["y1"][i], records["x0"][i], records["x1"][i]
-    for i in shown[:: max(1, len(shown) // 150)]:
+    for i in shown[:: max(1, len(shown) // 50)]:
         depths = np.full((view.height, view.width), -np.inf, np.float32)
         y0, y1, x0, x1 = rectangles[i]
         for row, column in ((y0, x0), (y0, x1 - 1), (y1 - 1, x0), (y1 - 1, x1 - 1)):
@@ -285,6 +288,7 @@ def test_splats_are_within_the_bounds_of_their_box(name):
             depths[row, column] = -np.inf
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("schedule", ["own", "groups"])
 @pytest.mark.parametrize("order", ["centre", "pixel"])
 def test_tiles_terminate_where_all_pixels_are_opaque(order, schedule):

@@ -62,6 +62,7 @@ def reference():
     return fs.Renderer("reference")
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("name", CAPTURES)
 def test_views_read_visible_chunks_only(stores, reference, name):
     kinds = ["thick"] if name in ("pinhole", "off-centre", "fisheye", "aside") else []

@@ -63,6 +63,7 @@ def crafted(folder, target, column, rows, value):
     return target
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("column", list(VALUES))
 def test_damaged_splats_are_harmless_when_rendered(folder, tmp_path, monkeypatch, renderer, column):
     monkeypatch.setattr(

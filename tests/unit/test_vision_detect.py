@@ -28,6 +28,7 @@ def corner_error(found, corners):
     return float(np.linalg.norm(found - corners, axis=1).max())
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("family", families())
 def test_every_family_is_found_and_its_corners_are_those_of_the_print(family):
     kind, _ = parse_family(family)
