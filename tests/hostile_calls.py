@@ -281,6 +281,7 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     "RobotLog.imu": _log("imu", time=0.0, angular_velocity=(0, 0, 0), acceleration=(0, 0, 0), frame="imu_link", topic="/imu/data_raw"),
     "RobotLog.clock": _log("clock", time=0.0),
     "RobotLog.camera_pose": _log("camera_pose", time=0.0, camera="eye", pose=np.eye(4), base=None),
+    "RobotLog.joint_states": _log("joint_states", time=0.0, names=["left"], positions=[0.0]),
     "RobotLog.detections": _log("detections", time=0.0, camera="eye", found=[]),
     "SplatCloud": lambda _: (
         fs.SplatCloud,

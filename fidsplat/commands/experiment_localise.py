@@ -19,21 +19,24 @@ if TYPE_CHECKING:
 
 @dataclass
 class Localise:
-    """Localisation of a robot by tags in a greenhouse, with ideal and simulated cameras.
+    """Localisation of a robot by tags and a LiDAR in a greenhouse, with ideal and simulated sensors.
 
-    MuJoCo drives the robot up one aisle and down the next; an error-state filter fuses wheels, gyroscope and
-    tags. Variants: odometry only, ideal corners, an ideal texture, mixtures of the markers, lens, blur,
-    rolling shutter, noise, speeds, and the largest distance of tags. Results: absolute and relative
-    trajectory errors, corner errors by distance, trajectories as TUM for evo, a page. An interrupted run
-    resumes. Needs the extra `sim`.
+    MuJoCo drives the robot up one aisle and down the next; an error-state filter fuses wheels, gyroscope,
+    tags and matches of LiDAR scans, which it reads from logs of ROS 2 messages (MCAP). Variants: odometry
+    only, ideal corners, an ideal texture, mixtures of the markers, lens, blur, rolling shutter, noise,
+    speeds, the largest distance of tags, and a LiDAR with each sensor left out. Results: absolute and
+    relative trajectory errors, corner errors by distance, logs, trajectories as TUM for evo, a page. An
+    interrupted run resumes. Needs the extras `sim` and `logs`.
 
     Examples:
       fidsplat experiment localise --quick
+      fidsplat experiment localise --sensors -o greenhouse
       fidsplat experiment localise --variant odometry --variant exact -o drive
     """
 
     out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-localise"
     quick: Annotated[bool, switch("measure one row of four plants and the first three variants")] = False
+    sensors: Annotated[bool, switch("measure with a LiDAR and each sensor left out")] = False
     drive: Drive = field(default_factory=Drive)
     variant: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -49,15 +52,18 @@ class Localise:
 
     def run(self) -> int:
         import fidsplat as fs
-        from fidsplat.experiments.localise import VARIANTS
+        from fidsplat.experiments.localise import SENSORS, VARIANTS
         from fidsplat.images.video import check_video
         from fidsplat.util.provenance import digest_of
 
         require_packages()
+        require_packages("the robot's drive", ("rosbags", "mcap"), "logs")
+        require_packages("the robot's drive", ("mujoco", "small_gicp"), "sim")
         from fidsplat.experiments.localise_sweep import drive_sweep, found_of, table_of, write_report
 
         drive = replace(self.drive, rows=1, plants=4) if self.quick else self.drive
-        names = list(self.variant) or (list(VARIANTS)[:3] if self.quick else list(VARIANTS))
+        names = list(SENSORS) if self.sensors else list(VARIANTS)[:3] if self.quick else list(VARIANTS)
+        names = list(self.variant) or names
         if self.video is not None:
             check_video(self.video)
         _ = drive.house  # check it before a device is opened
@@ -83,7 +89,7 @@ class Localise:
         page = write_report(folder, drive, device, found)
         self._record(drive, renderer, None if log_is_complete else source)
         rows, length = table_of(found), found[names[0]]["length_m"]
-        rows = rows.iloc[:, :6]  # the width of a terminal; the page has all columns
+        rows = rows.iloc[:, :7]  # the width of a terminal; the page has all columns
         return report(
             self.json,
             {"run": sweep.results.run, "variants": found},

@@ -1,7 +1,8 @@
-"""Localisation of a robot by tags in a greenhouse, with variants of its simulated camera."""
+"""Localisation of a robot by tags and a LiDAR in a greenhouse, with variants of its simulated sensors."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections import deque
@@ -9,17 +10,20 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Motion, Shutter, Trajectory
 from fidsplat.capture.capture import Capture
+from fidsplat.capture.lidar import Lidar
 from fidsplat.capture.sensor import Sensor
 from fidsplat.experiments.ideal_tags import tag_depth_image
 from fidsplat.render.renderer import Renderer
+from fidsplat.render.scan import scan
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.sim.localiser import Localiser
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
 from fidsplat.vision.detect import Detection, detect
@@ -29,20 +33,30 @@ from fidsplat.worlds import robot
 from fidsplat.worlds.greenhouse import AISLE, Greenhouse
 from fidsplat.worlds.robot import BODY, Errors, Run, camera_at
 
+if TYPE_CHECKING:
+    from fidsplat.logs import RobotLog
+
 RATE = 4.0
 """images per second"""
 DISTANCES = 1.0, 2.0, 3.0
 """distance bins of corner errors in metres"""
 FAMILY = "apriltag:36h11"
-CAMERA = "eye"
-"""name of the camera in logs"""
+CAMERA, LIDAR = "eye", "lidar"
+"""names of the sensors in logs"""
+WHEELS, GYROSCOPE, CODES, POINTS = (
+    "/joint_states",
+    "/imu/data_raw",
+    f"/{CAMERA}/detections",
+    f"/{LIDAR}/points",
+)
+"""topics of the measurements"""
 _LENS = BrownConrady(k1=-0.18, k2=0.03, p1=0.0005, p2=-0.0003)
 _SENSOR = Sensor(full_well=2000.0, read_noise=6.0, bits=8)
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Variant of the robot's camera and tags."""
+    """Variant of the robot's sensors and tags."""
 
     mixture: str | None = "exact"
     """mixture of the markers; None: no images"""
@@ -58,11 +72,15 @@ class Variant:
     """maximum distance of tags in metres"""
     speed: float | None = None
     """metres per second; None: that of the experiment"""
+    lidar: bool = False
+    """scan with a LiDAR at the times of the images"""
+    without: str = ""
+    """sensor that the filter does not use: wheels, gyroscope, tags or lidar"""
 
     @property
-    def rendering(self) -> Variant | None:
-        """The variant with the same images and default values of all other settings; None without images."""
-        return None if self.mixture is None else replace(self, ideal=False, reach=math.inf)
+    def rendering(self) -> Variant:
+        """The variant with the same measurements and default values of all other settings."""
+        return replace(self, ideal=False, reach=math.inf, without="")
 
 
 VARIANTS = {
@@ -81,9 +99,16 @@ VARIANTS = {
     "1 m/s, blur": Variant(exposure_time=0.03, speed=1.0),
     "up to 1 m": Variant(reach=1.0),
     "up to 2 m": Variant(reach=2.0),
+    "all sensors": Variant(lidar=True),
+    "no wheels": Variant(lidar=True, without="wheels"),
+    "no gyroscope": Variant(lidar=True, without="gyroscope"),
+    "no tags": Variant(lidar=True, without="tags"),
+    "no LiDAR": Variant(lidar=True, without="lidar"),
 }
-"""variants by name: odometry only, ideal corners, mixtures, and effects, speeds and tag distances of
-`exact`"""
+"""variants by name: odometry only, ideal corners, mixtures, effects, speeds and tag distances of `exact`, and
+a LiDAR with each sensor left out"""
+SENSORS = "odometry", *(name for name, variant in VARIANTS.items() if variant.lidar)
+"""variants with each sensor left out"""
 
 
 @dataclass(frozen=True)
@@ -159,17 +184,34 @@ class Drive:
                 frame = renderer.render(resident, capture.with_(external_depth=ideal))
             yield frame.to_uint8()
 
-    def detections(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[list[Detection]]:
-        """Detected tags of each image; detection overlaps with rendering."""
+    def frames(
+        self, variant: Variant, run: Run, renderer: Renderer
+    ) -> Iterator[tuple[np.ndarray, list[Detection]]]:
+        """Images and their detected tags; detection overlaps with rendering."""
         workers = os.cpu_count() or 1
         pending = deque()
         with ThreadPoolExecutor(workers) as pool:
             for image in self.images(variant, run, renderer):
-                pending.append(pool.submit(detect, image, (FAMILY,), qr=False))
+                pending.append((image, pool.submit(detect, image, (FAMILY,), qr=False)))
                 if len(pending) > 2 * workers:
-                    yield interrupts.result_of(pending.popleft())
+                    image, found = pending.popleft()
+                    yield image, interrupts.result_of(found)
             while pending:
-                yield interrupts.result_of(pending.popleft())
+                image, found = pending.popleft()
+                yield image, interrupts.result_of(found)
+
+    def detections(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[list[Detection]]:
+        """Detected tags of each image."""
+        return (codes for _, codes in self.frames(variant, run, renderer))
+
+    def scans(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[np.ndarray]:
+        """Points of a VLP-16 at 20 scans per second (900 columns), as of `Scan.cloud`, at the images."""
+        lidar = Lidar.preset("vlp-16", rate=20.0, seed=self.seed)
+        lidar = replace(lidar, pattern=replace(lidar.pattern, columns=900))
+        resident = renderer.upload(self.scene(variant.mixture))
+        for k in self.image_indices(run).tolist():
+            pose = run.poses[k] @ rigid_matrix(robot.LIDAR_AT)
+            yield scan(resident, lidar, pose, renderer=renderer, index=k).cloud()
 
     def localise(
         self,
@@ -178,6 +220,8 @@ class Drive:
         camera: Camera,
         noise: float = 0.5,
         reach: float = math.inf,
+        scans: list[np.ndarray] | None = None,
+        without: str = "",
     ) -> tuple[Trajectory, dict[str, Any]]:
         """Estimated poses and their errors.
 
@@ -185,20 +229,44 @@ class Drive:
             detections: detected tags of each image; None: no camera.
             noise: standard deviation of corners in pixels.
             reach: maximum distance of tags in metres.
+            scans: points (n, 3) of each scan; None: no LiDAR.
+            without: sensor that is not used.
         """
         first = run.poses[0]
-        localiser = Localiser(np.array([*first[:2, 3], math.atan2(first[1, 0], first[0, 0])]), noise)
-        by_pose = {} if detections is None else {k: codes for k, codes, _ in self._known(run, detections)}
-        poses, used = [first], 0
+        localiser = Localiser(
+            np.array([*first[:2, 3], math.atan2(first[1, 0], first[0, 0])]),
+            noise,
+            drift=0.1 if without == "wheels" else 0.0,
+            bias=0.05 if without == "gyroscope" else 0.005,
+        )
+        used_codes = None if without == "tags" else detections
+        by_pose = {} if used_codes is None else {k: codes for k, codes, _ in self._known(run, used_codes)}
+        clouds = {}
+        if scans and without != "lidar":
+            from fidsplat.sim.scan_matching import ScanMatcher  # here, since it needs another package
+
+            clouds, matcher = (
+                dict(zip(self.image_indices(run), scans, strict=True)),
+                ScanMatcher(robot.LIDAR_AT[2]),
+            )
+        poses, used, matched, speed, last = [first], 0, 0, 0.0, 0
         for k in range(1, len(run.times)):
-            localiser.move(run.wheels[k], float(run.gyro[k]), float(run.times[k] - run.times[k - 1]))
+            seconds = float(run.times[k] - run.times[k - 1])
+            wheels = np.full(2, speed * seconds) if without == "wheels" else run.wheels[k]
+            turned = float(wheels[1] - wheels[0]) / robot.TRACK / seconds
+            localiser.move(wheels, turned if without == "gyroscope" else float(run.gyro[k]), seconds)
             for code, tag in by_pose.get(k, []):
                 pose = marker_pose(code.corners, tag.marker.size, camera)
                 if np.linalg.norm(pose[:3, 3]) <= reach:
                     used += localiser.correct(code.corners, tag.corners, partial(camera_at, camera))
+            if k in clouds:
+                matched += matcher.correct(localiser, clouds[k])
+                # without wheels, the speed is that since the last scan
+                ahead = np.linalg.inv(poses[last]) @ localiser.pose
+                speed, last = float(ahead[0, 3] / (run.times[k] - run.times[last])), k
             poses.append(localiser.pose)
         facts = errors_of(run, np.array(poses))
-        facts |= {"tags": used, "refused": localiser.rejected}
+        facts |= {"tags": used, "scans": matched, "refused": localiser.rejected}
         return Trajectory(run.times, np.array(poses)), facts
 
     def _known(
@@ -254,12 +322,62 @@ def errors_of(run: Run, poses: np.ndarray) -> dict[str, float]:
     }
 
 
+def record(
+    drive: Drive, variant: Variant, run: Run, renderer: Renderer, log: RobotLog, images: bool = False
+) -> Iterator[tuple[np.ndarray, list[Detection]]]:
+    """Log the measurements of a drive as ROS 2 messages; yields images and detected tags.
+
+    Logged are wheels, gyroscope, intrinsics, detections, points, camera poses (/tf), and if requested images
+    as JPEG.
+    """
+    has_images = variant.mixture is not None
+    frames = drive.frames(variant, run, renderer) if has_images else iter(())
+    scans = drive.scans(variant, run, renderer) if variant.lidar else iter(())
+    camera, angles = replace(drive.camera, lens=variant.lens), run.wheels.cumsum(0) / robot.WHEEL
+    shown = set(drive.image_indices(run).tolist() if has_images else ())
+    for k, time in enumerate(run.times.tolist()):
+        log.imu(time, (0, 0, run.gyro[k]), frame="base_link")
+        log.joint_states(time, ("left", "right"), angles[k])
+        if k in shown:
+            image, codes = next(frames)
+            if images:
+                log.image(time, CAMERA, image, compress="jpeg")
+            log.camera_info(time, CAMERA, camera)
+            log.camera_pose(time, CAMERA, run.camera.poses[k], base=run.poses[k])
+            log.detections(time, CAMERA, codes)
+            for points in itertools.islice(scans, 1):
+                log.transform(time, LIDAR, rigid_matrix(robot.LIDAR_AT), parent="base_link")
+                log.points(time, LIDAR, points)
+            yield image, codes
+
+
+def recorded(path: str | os.PathLike[str], truth: Run) -> tuple[Run, list[list[Detection]], list[np.ndarray]]:
+    """Measurements of a log: wheels and gyroscope with the true poses, detected tags, and points (n, 3).
+
+    Raises:
+        InputError: not a log.
+    """
+    from fidsplat.logs import messages
+    from fidsplat.logs.reader import detections_of, points_of
+
+    gyro, angles, codes, scans = [], [], [], []
+    for topic, message in messages(path, WHEELS, GYROSCOPE, CODES, POINTS):
+        if topic == GYROSCOPE:
+            gyro.append(message.angular_velocity.z)
+        elif topic == WHEELS:
+            angles.append(message.position)
+        elif topic == CODES:
+            codes.append(detections_of(message))
+        else:
+            scans.append(points_of(message))
+    wheels = robot.WHEEL * np.diff(angles, axis=0, prepend=0)
+    return replace(truth, wheels=wheels, gyro=np.array(gyro)), codes, scans
+
+
 def write_log(
     drive: Drive, name: str, renderer: Renderer, path: str, overwrite: bool, source: str = ""
 ) -> Iterator[np.ndarray]:
-    """Write the drive of a variant as a log; yields the logged images.
-
-    Logged are JPEG images, intrinsics, detections, gyroscope, camera poses (/tf), estimated poses (/odom).
+    """Write the drive of a variant as a log with images and estimated poses (/odom); yields the images.
 
     Raises:
         InputError: a variant without images, or if the log cannot be written.
@@ -269,19 +387,11 @@ def write_log(
     variant = VARIANTS[name]
     if variant.mixture is None:
         raise InputError(f"a logged variant must have images, e.g. exact, got {name!r}")
-    run = drive.run()
-    indices, camera = drive.image_indices(run), replace(drive.camera, lens=variant.lens)
-    detections = []
+    run, detections = drive.run(), []
     with RobotLog(path, up=(0, 0, 1), overwrite=overwrite, source=source) as log:
-        for k, image in zip(indices.tolist(), drive.images(variant, run, renderer), strict=True):
-            time, codes = float(run.times[k]), detect(image, (FAMILY,), qr=False)
+        for image, codes in record(drive, variant, run, renderer, log, images=True):
             detections.append(codes)
-            log.image(time, CAMERA, image, compress="jpeg")
-            log.camera_info(time, CAMERA, camera)
-            log.camera_pose(time, CAMERA, run.camera.poses[k])
-            log.detections(time, CAMERA, codes)
             yield image
-        estimate, _ = drive.localise(run, detections, camera)
+        estimate, _ = drive.localise(run, detections, replace(drive.camera, lens=variant.lens))
         for k, time in enumerate(run.times.tolist()):
-            log.imu(time, (0, 0, run.gyro[k]), frame="base_link")
             log.odometry(time, estimate.poses[k])

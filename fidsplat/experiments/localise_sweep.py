@@ -14,15 +14,15 @@ import pandas as pd
 
 from fidsplat.cameras import Trajectory
 from fidsplat.experiments.charts import COLOURS, chart, legend_above
-from fidsplat.experiments.localise import DISTANCES, RATE, VARIANTS, Drive, Variant
+from fidsplat.experiments.localise import DISTANCES, RATE, VARIANTS, Drive, Variant, record, recorded
 from fidsplat.experiments.pages import fixed, write_page
 from fidsplat.experiments.summary import Frame
 from fidsplat.experiments.sweep import Key, Results, Sweep, Work
 from fidsplat.formats import load_trajectory, save_trajectory
+from fidsplat.logs import RobotLog, check_log
 from fidsplat.render.renderer import Renderer
 from fidsplat.util.errors import InputError, unknown
-from fidsplat.util.provenance import run_facts
-from fidsplat.vision.detect import Detection
+from fidsplat.util.provenance import digest_of, run_facts
 from fidsplat.worlds.robot import Run
 
 RESULTS, REPORT, CHART = "localise.jsonl", "localise.md", "localise.svg"
@@ -67,38 +67,45 @@ def drive_sweep(
         save_trajectory(Trajectory(run.times, run.poses), out / _tum(_truth(speed)))
         return run
 
-    detected: dict[Variant, list[list[Detection]]] = {}
-
-    def detections(name: str, rendering: Variant, run: Run) -> list[list[Detection]]:
-        if rendering not in detected:
-            found, count = [], len(drive.image_indices(run))
-            for codes in drive.detections(rendering, run, renderer):
-                found.append(codes)
-                progress(name, len(found) / count)
-            detected[rendering] = found
-        return detected[rendering]
+    @cache
+    def log_of(rendering: Variant, name: str) -> Path:
+        """The log of the measurements of variants, which an interrupted sweep reads again."""
+        path, run = out / f"{_stem(name)}.mcap", run_at(rendering.speed)
+        source = digest_of((drive, rendering, facts["code"], facts["device"]))
+        if not check_log(path, overwrite, source):
+            count = len(drive.image_indices(run))
+            with RobotLog(path, up=(0, 0, 1), overwrite=overwrite, source=source) as log:
+                for done, _ in enumerate(record(drive, rendering, run, renderer, log), 1):
+                    progress(name, done / count)
+        return path
 
     def begin(key: Key) -> Work:
-        """Render and detect for a variant; returns the estimation."""
+        """Log the measurements for a variant; returns the estimation."""
         name = key["variant"]
         variant = VARIANTS[name]
-        run = run_at(variant.speed)
-        rendering = variant.rendering
-        codes = None if rendering is None else detections(name, rendering, run)
-        return partial(_estimate, out / _tum(name), drive, variant, run, codes)
+        first = next(each for each in VARIANTS if VARIANTS[each].rendering == variant.rendering)
+        log = log_of(variant.rendering, first)
+        return partial(_estimate, out / _tum(name), drive, variant, run_at(variant.speed), log)
 
     return Sweep("drive", results, [{"variant": name} for name in names], begin)
 
 
-def _estimate(
-    file: Path, drive: Drive, variant: Variant, run: Run, detections: list[list[Detection]] | None
-) -> dict[str, Any]:
-    """Write the estimated trajectory of a variant; returns its errors."""
+def _estimate(file: Path, drive: Drive, variant: Variant, truth: Run, log: Path) -> dict[str, Any]:
+    """Write the trajectory of a variant estimated from a log; returns its errors."""
     camera = replace(drive.camera, lens=variant.lens)
-    if variant.ideal and detections is not None:
+    run, detections, scans = recorded(log, truth)
+    if variant.ideal:
         detections = drive.ideal_corners(run, detections)
-    path, facts = drive.localise(run, detections, camera, 0.05 if variant.ideal else 0.5, variant.reach)
-    if detections is not None:
+    path, facts = drive.localise(
+        run,
+        detections or None,
+        camera,
+        0.05 if variant.ideal else 0.5,
+        variant.reach,
+        scans or None,
+        variant.without,
+    )
+    if detections:
         facts["corners"] = drive.corner_errors(run, detections, camera)
     save_trajectory(path, file)
     return facts | {"length_m": run.length}
@@ -120,6 +127,7 @@ def table_of(found: Found) -> Frame:
             "RPE": f"{100 * facts['rpe_m']:.2f}",
             "heading [deg]": f"{facts['heading_deg']:.3f}",
             "tags": facts["tags"],
+            "scans": facts["scans"],
             "refused": facts["refused"],
         }
         | {
@@ -172,4 +180,8 @@ def _truth(speed: float | None) -> str:
 
 
 def _tum(name: str) -> str:
-    return f"{re.sub('[^a-z0-9.]+', '-', name)}.tum"
+    return f"{_stem(name)}.tum"
+
+
+def _stem(name: str) -> str:
+    return re.sub("[^a-z0-9.]+", "-", name.lower())

@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.cameras.foreign import PIXEL
 from fidsplat.images.files import decode_rgb
 from fidsplat.logs.bags import log_messages
 from fidsplat.logs.writers import typestore
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
+from fidsplat.vision.detect import Detection
 
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 MAX_DEPTH = 16
@@ -46,6 +48,19 @@ class LogImage:
     """frame of its camera"""
     stamp: int
     """nanoseconds"""
+
+
+def messages(path: str | os.PathLike[str], *topics: str) -> Iterator[tuple[str, Any]]:
+    """Topic and message of each message of a log in its order; of all topics if none is given.
+
+    Raises:
+        InputError: not a log, or a damaged log.
+    """
+    file, store = path_of(path), typestore()
+    with _as_input_error(file):
+        for name, kind, _, data in log_messages(file):
+            if not topics or name in topics:
+                yield name, store.deserialize_cdr(data, kind)
 
 
 def log_images(path: str | os.PathLike[str], topic: str | None = None) -> Iterator[LogImage]:
@@ -115,6 +130,30 @@ def _as_input_error(file: Path) -> Iterator[None]:
         raise
     except Exception as error:  # errors of five packages that read, decompress and decode
         raise InputError(f"cannot read {file} as a log: {error}") from None
+
+
+def detections_of(message: Any) -> list[Detection]:
+    """Tags of an AprilTagDetectionArray, as `RobotLog.detections` writes them."""
+    found = []
+    for one in message.detections:
+        corners = np.array([(corner.x, corner.y) for corner in one.corners]) + PIXEL
+        found.append(Detection("apriltag", one.family, one.id, None, corners))
+    return found
+
+
+def points_of(message: Any) -> np.ndarray:
+    """Points (n, 3) of a PointCloud2 with x, y and z of one type, as `RobotLog.points` writes them."""
+    offsets = {field.name: field.offset for field in message.fields}
+    kind = np.dtype(
+        {
+            "names": list("xyz"),
+            "formats": ["<f4"] * 3,
+            "offsets": [offsets[axis] for axis in "xyz"],
+            "itemsize": message.point_step,
+        }
+    )
+    points = np.frombuffer(np.asarray(message.data, np.uint8).tobytes(), kind)
+    return np.stack([points[axis] for axis in "xyz"], 1)
 
 
 def _stamp(header: Any) -> int:

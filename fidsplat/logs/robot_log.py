@@ -210,6 +210,17 @@ class RobotLog:
         )  # fmt: skip
         self._write(topic, time, message)
 
+    def joint_states(
+        self, time: float, names: Iterable[str], positions: Any, topic: str = "/joint_states"
+    ) -> None:
+        """Positions of joints: radians, or metres of prismatic joints."""
+        named = list(items("names", names, str, "names of joints"))
+        given = real_array("positions", positions, "a number for each joint")
+        if given.shape != (len(named),) or not np.isfinite(given).all():
+            raise invalid("positions", f"{len(named)} finite numbers", positions)
+        message = self._of("sensor_msgs/msg/JointState")
+        self._write(topic, time, message(self._header(time, ""), named, given, np.zeros(0), np.zeros(0)))
+
     def points(self, time: float, lidar: str, cloud: np.ndarray, topic: str | None = None) -> None:
         """Points of a scan (`Scan.cloud`) as `/LIDAR/points`: PointCloud2 in the frame LIDAR. `time` is the
         start of the scan; the field `time` of a point is in seconds after it.

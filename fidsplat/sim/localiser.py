@@ -1,5 +1,5 @@
-"""Error-state Kalman filter for a robot on a floor, from wheel odometry, a gyroscope and tags of known
-pose."""
+"""Error-state Kalman filter for a robot on a floor, from wheel odometry, a gyroscope, tags of known pose and
+LiDAR scans."""
 
 from __future__ import annotations
 
@@ -24,25 +24,37 @@ class Localiser:
 
     State: x, y [m] and heading [rad] of the robot, bias of the gyroscope [rad/s], common scale of the wheels.
 
-    Wheels measure the distance, the gyroscope the rotation; corners of tags in an image correct the pose. The
-    covariance is that of the error state; a correction is added to the state at once.
+    Wheels measure the distance, the gyroscope the rotation; corners of tags in an image and matches of scans
+    correct the pose. The covariance is that of the error state; a correction is added to the state at once. A
+    scan is matched to an earlier one, the reference, whose pose is a part of the error state (stochastic
+    cloning), since the errors of both poses are correlated.
 
     Args:
         start: x, y, heading.
         corner_noise: pixels, standard deviation of a detected corner.
+        drift: standard deviation of the position after a second in addition to that of the wheels, metres.
+        bias: standard deviation of the bias of the gyroscope at the start, radians per second.
     """
 
-    def __init__(self, start: np.ndarray, corner_noise: float = 0.5) -> None:
+    def __init__(
+        self, start: np.ndarray, corner_noise: float = 0.5, drift: float = 0.0, bias: float = 0.005
+    ) -> None:
         self.state = np.array([*start, 0.0, 1.0])
-        self._noise = corner_noise
-        self.covariance = np.diag([0.01, 0.01, 0.01, 0.005, 0.02]) ** 2
+        self._noise, self._drift = corner_noise, drift
+        self.covariance = np.diag([0.01, 0.01, 0.01, bias, 0.02]) ** 2
+        self._reference = self.state[:3].copy()
         self.rejected = 0
-        """number of tags rejected as outliers"""
+        """number of tags and scans rejected as outliers"""
 
     @property
     def pose(self) -> np.ndarray:
         """(4, 4) world from robot."""
         return _pose(self.state)
+
+    @property
+    def relative(self) -> np.ndarray:
+        """(4, 4) pose of the robot in its pose at the reference scan."""
+        return np.linalg.inv(_pose(self._reference)) @ self.pose
 
     def move(self, wheels: np.ndarray, gyro: float, seconds: float) -> None:
         """Predict the state from readings of wheels (2,) [m] and gyroscope [rad/s] over some seconds."""
@@ -52,13 +64,37 @@ class Localiser:
         middle, distance = heading + turned / 2, scale * rolled
         cos, sin = math.cos(middle), math.sin(middle)
         self.state[:3] += [distance * cos, distance * sin, turned]
-        transition = np.eye(5)
-        transition[0, 2:] = -distance * sin, distance * sin * seconds / 2, rolled * cos
-        transition[1, 2:] = distance * cos, -distance * cos * seconds / 2, rolled * sin
+        transition = np.eye(len(self.covariance))
+        transition[0, 2:5] = -distance * sin, distance * sin * seconds / 2, rolled * cos
+        transition[1, 2:5] = distance * cos, -distance * cos * seconds / 2, rolled * sin
         transition[2, 3] = -seconds
         slip, turn = 0.003**2 * abs(rolled), (0.003 * seconds) ** 2 + 1e-6 * abs(rolled)
-        added = np.diag([slip, slip, turn, 1e-10 * seconds, 1e-9 * abs(rolled)])
-        self.covariance = transition @ self.covariance @ transition.T + added
+        slip += self._drift**2 * seconds
+        self.covariance = transition @ self.covariance @ transition.T
+        self.covariance[range(5), range(5)] += slip, slip, turn, 1e-10 * seconds, 1e-9 * abs(rolled)
+
+    def set_reference(self) -> None:
+        """Make the current pose that of the reference scan."""
+        clone = np.vstack([np.eye(5), np.eye(3, 5)])
+        self.covariance = clone @ self.covariance[:5, :5] @ clone.T
+        self._reference = self.state[:3].copy()
+
+    def match(self, relative: np.ndarray, noise: np.ndarray) -> bool:
+        """Correct the state by a matched scan; returns False if the match was rejected.
+
+        Args:
+            relative: (3,) measured x, y and heading of the robot in its pose at the reference scan.
+            noise: (3, 3) covariance of the measurement.
+        """
+        expected, heading = self.relative, self._reference[2]
+        back = np.array([[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]])
+        by = np.zeros((3, 8))
+        by[:2, :2], by[:2, 5:7] = back, -back
+        by[:2, 7] = expected[1, 3], -expected[0, 3]
+        by[2, 2], by[2, 7] = 1, -1
+        off = relative - [*expected[:2, 3], self.state[2] - heading]
+        off[2] = math.remainder(off[2], math.tau)
+        return self._correct(off, by, noise)
 
     def correct(self, corners: np.ndarray, tag: np.ndarray, camera: Callable[[np.ndarray], Camera]) -> bool:
         """Correct the state by a detected tag; returns False if the tag was rejected.
@@ -74,7 +110,7 @@ class Localiser:
         def derivative(moved: np.ndarray) -> np.ndarray:
             return (camera(moved).project(tag) - projected).ravel() / _STEP
 
-        by = np.zeros((8, 5))
+        by = np.zeros((8, len(self.covariance)))
         for k in range(3):
             state = self.state.copy()
             state[k] += _STEP
@@ -83,14 +119,19 @@ class Localiser:
         off = (corners - projected).ravel()
         if not (np.isfinite(off).all() and np.isfinite(by).all() and np.isfinite(tilted).all()):
             return False
-        noise = self._noise**2 * np.eye(8) + tilted.T @ tilted
+        return self._correct(off, by, self._noise**2 * np.eye(8) + tilted.T @ tilted)
+
+    def _correct(self, off: np.ndarray, by: np.ndarray, noise: np.ndarray) -> bool:
+        """Correct the state by a residual with its derivative and noise, unless it is an outlier."""
         spread = by @ self.covariance @ by.T + noise
-        if off @ np.linalg.solve(spread, off) > GATE**2 * 8:
+        if off @ np.linalg.solve(spread, off) > GATE**2 * len(off):
             self.rejected += 1
             return False
         gain = np.linalg.solve(spread, by @ self.covariance).T
-        self.state += gain @ off
-        reduction = np.eye(5) - gain @ by
+        change = gain @ off
+        self.state += change[:5]
+        self._reference += change[5:] if len(change) > 5 else 0.0
+        reduction = np.eye(len(self.covariance)) - gain @ by
         self.covariance = reduction @ self.covariance @ reduction.T + gain @ noise @ gain.T
         return True
 

@@ -17,6 +17,8 @@ WHEEL, TRACK = 0.08, 0.3
 """metres: radius of a wheel, distance between the wheels"""
 CAMERA_AT = (0.1, 0.0, 0.32)
 """metres from the middle of the axle on the floor; the camera faces forward"""
+LIDAR_AT = (0.0, 0.0, 0.7)
+"""metres from the middle of the axle on the floor; the LiDAR has the axes of the robot"""
 CONTROL = 0.02
 """seconds between commands, and between sensor readings"""
 MAX_ACCELERATION = 0.5

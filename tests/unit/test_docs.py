@@ -76,7 +76,7 @@ EXTRAS = {
     "logs": ("mcap", "rosbags"),
     "live": ("foxglove", "cyclonedds"),
     "mesh": ("coacd", "fast_simplification"),
-    "sim": ("mujoco", "gymnasium"),
+    "sim": ("mujoco", "gymnasium", "small_gicp"),
     "usd": ("pxr",),
     "video": ("imageio_ffmpeg",),
     "viewer": ("viser",),

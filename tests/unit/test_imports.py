@@ -70,6 +70,7 @@ HOME_OF = {
     "warp": ("backends.warp", "sim.mujoco", "sim.newton"),
     "mujoco": ("sim.mujoco", "worlds.robot"),
     "gymnasium": ("sim.gymnasium",),
+    "small_gicp": ("sim.scan_matching",),
     "mcap": ("logs",),
     "foxglove": ("logs.live",),
     "cyclonedds": ("logs.ros2",),

@@ -14,7 +14,14 @@ from fidsplat.splats.rotations import rigid_matrix
 
 mujoco = pytest.importorskip("mujoco", reason="pip install 'fidsplat[sim]'")
 
-from fidsplat.experiments.localise import Drive, errors_of, write_log  # noqa: E402 (needs MuJoCo)
+from fidsplat.experiments.localise import (  # noqa: E402 (needs MuJoCo)
+    VARIANTS,
+    Drive,
+    errors_of,
+    record,
+    recorded,
+    write_log,
+)
 from fidsplat.experiments.localise_sweep import write_report  # noqa: E402
 from fidsplat.worlds.greenhouse import Greenhouse  # noqa: E402
 from fidsplat.worlds.robot import (  # noqa: E402
@@ -171,6 +178,47 @@ def test_one_number_that_is_not_finite_changes_nothing(bad):
     assert filtered.rejected == 0
 
 
+def test_a_match_of_scans_corrects_the_motion_and_not_the_place():
+    """Wheels slip by a tenth; a scan measures the motion since its reference, not the place."""
+    filtered = Localiser(np.array([1.0, 2.0, 0.5]), drift=0.2)
+    filtered.covariance[:3, :3] = np.diag([0.3, 0.2, 0.1]) ** 2
+    before = filtered.covariance[:3, :3].copy()
+    filtered.set_reference()
+    for _ in range(50):
+        filtered.move(np.full(2, 0.022), 0.22, 0.02)
+    true = headed(0.2, 0.98, 0.1)
+    assert np.linalg.norm(filtered.relative[:2, 3] - true[:2, 3]) > 0.05
+    assert filtered.match(np.array([0.98, 0.1, 0.2]), np.diag([1e-4, 1e-4, 1e-4]) ** 2)
+    np.testing.assert_allclose(filtered.relative, true, atol=1e-3)
+    np.testing.assert_allclose(filtered.covariance[5:, 5:], before, rtol=0.02, atol=1e-9)
+    assert not filtered.match(np.array([2.0, 0.1, 0.2]), np.diag([1e-4, 1e-4, 1e-4]) ** 2)
+    assert filtered.rejected == 1
+
+
+def test_scans_of_a_room_give_the_motion():
+    """Against the closed form: corners of a room, from two places; then a turn too far for the old
+    reference."""
+    matching = pytest.importorskip("fidsplat.sim.scan_matching", reason="pip install 'fidsplat[sim]'")
+    rng = np.random.default_rng(0)
+    wall = np.stack([np.full(4000, 3.0), rng.uniform(-2, 2, 4000), rng.uniform(-1, 1, 4000)], 1)
+    side = np.stack([rng.uniform(-3, 3, 4000), np.full(4000, 2.0), rng.uniform(-1, 1, 4000)], 1)
+    floor = np.stack([rng.uniform(-3, 3, 4000), rng.uniform(-2, 2, 4000), np.full(4000, -1.0)], 1)
+    room = np.concatenate([wall, side, floor, wall * [-1, 1, 1], side * [1, -1, 1]])
+
+    def seen(pose):
+        return (room - pose[:3, 3]) @ pose[:3, :3] + rng.normal(0, 0.005, room.shape)
+
+    filtered, matcher = Localiser(np.zeros(3), drift=0.1), matching.ScanMatcher(0.7)
+    assert not matcher.correct(filtered, seen(np.eye(4)))  # the reference
+    filtered.move(np.full(2, 0.15), 0.41, 0.25)
+    assert matcher.correct(filtered, seen(headed(0.1, 0.2, 0.05)))
+    np.testing.assert_allclose(filtered.pose, headed(0.1, 0.2, 0.05), atol=0.012)
+    np.testing.assert_allclose(filtered.relative, filtered.pose, atol=1e-9)  # still of the first scan
+    filtered.move(np.zeros(2), 2.4, 0.25)
+    matcher.correct(filtered, seen(headed(0.7, 0.2, 0.05)))
+    np.testing.assert_allclose(filtered.relative, np.eye(4), atol=1e-12)
+
+
 def test_errors_are_those_of_evo():
     times = np.linspace(0, 10, 400)
     truth = np.array([headed(0.1 * t, 0.5 * t, math.sin(t)) for t in times])
@@ -258,6 +306,35 @@ def test_the_drive_as_a_log(tmp_path, monkeypatch):
         list(write_log(requested, "odometry", None, str(tmp_path / "other.mcap"), False))
 
 
+def test_the_filter_reads_what_the_sensors_logged(tmp_path, monkeypatch):
+    """Wheels, gyroscope, tags and points after ROS 2's messages are those before."""
+    from fidsplat.logs import RobotLog
+    from fidsplat.vision.detect import Detection
+
+    monkeypatch.setattr("fidsplat.experiments.localise.RATE", 1.0)
+    requested, rng = Drive(1, 1), np.random.default_rng(0)
+    run = drive(requested.house.mjcf(BODY), np.array([[-0.5, -0.75], [0.5, -0.75]]))
+    count = len(requested.image_indices(run))
+    codes = [[Detection("apriltag", "36h11", k, None, rng.uniform(0, 640, (4, 2)))] for k in range(count)]
+    kind = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("ring", "u2")])
+    clouds = [np.zeros(k + 1, kind) for k in range(count)]
+    for k, cloud in enumerate(clouds):
+        cloud["x"], cloud["z"] = k, rng.normal(size=k + 1)
+    monkeypatch.setattr(Drive, "frames", lambda *_: ((None, each) for each in codes))
+    monkeypatch.setattr(Drive, "scans", lambda *_: iter(clouds))
+    variant = VARIANTS["all sensors"]
+    with RobotLog(tmp_path / "run.mcap", up=(0, 0, 1)) as log:
+        assert len(list(record(requested, variant, run, None, log))) == count > 1
+    read, tags, scans = recorded(tmp_path / "run.mcap", run)
+    np.testing.assert_allclose(read.wheels, run.wheels, atol=1e-12)
+    np.testing.assert_array_equal(read.gyro, run.gyro)
+    for one, other in zip(codes, tags, strict=True):
+        assert (other[0].id, other[0].family) == (one[0].id, "36h11")
+        np.testing.assert_allclose(other[0].corners, one[0].corners, atol=1e-10)
+    for one, other in zip(clouds, scans, strict=True):
+        np.testing.assert_array_equal(other, np.stack([one["x"], one["y"], one["z"]], 1))
+
+
 def test_with_ideal_corners_it_knows_its_way():
     """The filter alone: every tag that the camera could see, with corners where they are."""
     requested = Drive(1, 3)
@@ -296,6 +373,7 @@ def test_with_ideal_corners_it_knows_its_way():
 def test_a_drive_at_another_speed_only_has_a_page(tmp_path):
     times = np.arange(20) / 10
     fs.save_trajectory(fs.Trajectory(times, np.tile(np.eye(4), (20, 1, 1))), tmp_path / "truth-0.25-m-s.tum")
-    facts = {"ate_m": 0.01, "worst_m": 0.02, "rpe_m": 0.01, "heading_deg": 0.1, "tags": 3, "refused": 0}
+    facts = {"ate_m": 0.01, "worst_m": 0.02, "rpe_m": 0.01, "heading_deg": 0.1, "tags": 3}
+    facts |= {"scans": 0, "refused": 0}
     page = write_report(tmp_path, Drive(), "a device", {"0.25 m/s, blur": facts | {"length_m": 60.2}})
     assert "0.25 m/s, blur" in page.read_text()
