@@ -11,6 +11,7 @@ from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Device, Json
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.util.errors import InputError
+from fidsplat.util.files import path_of
 
 if TYPE_CHECKING:
     from fidsplat.cameras import Camera
@@ -55,12 +56,18 @@ class Localise:
 
     def run(self) -> int:
         import fidsplat as fs
+        from fidsplat.formats.trajectories import check_trajectory_file
         from fidsplat.images.files import read_images
         from fidsplat.localisation.localise import NoInitialPose
         from fidsplat.scenes.sources import cameras_of
 
         if not self.images:
             raise InputError("localisation needs at least one IMAGE: a photograph, a folder or a video")
+        if path_of(self.scene).suffix.lower() != ".toml":
+            raise InputError(
+                "--scene must be a scene file (.toml) with the camera of the photographs, got "
+                f'{self.scene}; write one with [camera] and [[splats]] file = "{self.scene}"'
+            )
         start = None if self.start is None else _pose(self.start)
         with delayed_progress() as progress:
             scene = fs.Scene.load(self.scene, progress=progress)
@@ -69,6 +76,8 @@ class Localise:
             raise InputError(
                 f"{self.scene} must have a [camera] table, the camera of the photographs, got none; add one"
             )
+        if self.out is not None:
+            check_trajectory_file(self.out, camera)
         candidates = [] if self.candidates is None else cameras_of(self.candidates, scene)
         with console(self.json).status("opening the device"):
             renderer = fs.Renderer(self.device)

@@ -99,9 +99,10 @@ def save_trajectory(
         raise InputError(f"images must have a name for each of {len(trajectory)} poses, got {images!r}")
     if not all(isinstance(name, str) for name in names):
         raise InputError(f"images must be names as text, got {images!r}")
+    check_trajectory_file(file, camera)
     suffix = file.suffix.lower()
     if suffix == "" or file.is_dir():
-        lens = _pinhole(camera, file)
+        lens = _camera(camera, file)
         poses = trajectory.inverse().poses
         cameras = [
             Camera.pinhole(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, p) for p in poses
@@ -113,11 +114,23 @@ def save_trajectory(
         text = "# timestamp tx ty tz qx qy qz qw\n" + _rows(rows)
     elif suffix == ".kitti":
         text = _rows(trajectory.poses[:, :3, :].reshape(-1, 12))
-    elif suffix == ".json":
-        text = json.dumps(_transforms_json(trajectory, _camera(camera, file), names), indent=2) + "\n"
     else:
-        raise InputError(f"the suffix of a trajectory must be one of {_SUFFIXES}, got {file}")
+        text = json.dumps(_transforms_json(trajectory, _camera(camera, file), names), indent=2) + "
+"
     write_file(file, text)
+
+
+def check_trajectory_file(path: str | os.PathLike[str], camera: Camera | None) -> None:
+    """Raise InputError for an unknown suffix, and a camera that the format lacks, before work is done."""
+    file = path_of(path)
+    suffix = file.suffix.lower()
+    if suffix == "" or file.is_dir():
+        if (lens := _camera(camera, file).lens) is not None:
+            raise InputError(f"the camera of {file} must be a pinhole, got the lens {lens.kind}")
+    elif suffix == ".json":
+        _camera(camera, file)
+    elif suffix not in (".tum", ".txt", ".kitti"):
+        raise InputError(f"the suffix of a trajectory must be one of {_SUFFIXES}, got {file}")
 
 
 def _rows(rows: np.ndarray) -> str:
@@ -128,13 +141,6 @@ def _rows(rows: np.ndarray) -> str:
 def _camera(camera: Camera | None, file: Path) -> Camera:
     if not isinstance(camera, Camera):
         raise InputError(f"{file} needs a Camera for size and focal lengths, got {camera!r}; give camera=")
-    return camera
-
-
-def _pinhole(camera: Camera | None, file: Path) -> Camera:
-    camera = _camera(camera, file)
-    if camera.lens is not None:
-        raise InputError(f"the camera of {file} must be a pinhole, got the lens {camera.lens.kind}")
     return camera
 
 

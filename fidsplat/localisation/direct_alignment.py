@@ -2,29 +2,35 @@
 
 Efficient second-order minimisation (Malis 2004) of robust photometric residuals, from coarse to fine. The
 Jacobian of a rendered pixel is its image gradient times the motion of its point, which the rendered depth
-determines; this takes one render per step (Lucas-Kanade), and central differences take twelve. Gain and
-offset of each channel are eliminated, so the result does not depend on exposure and white balance.
+determines; this takes one render per step (Lucas-Kanade). Gain and offset of each channel are unknowns too,
+so the result does not depend on exposure and white balance.
 
-The covariance is a cluster-robust sandwich estimate: blocks of pixels are independent, the pixels within a
-block may be correlated.
+The last step and the covariance are those of an M-estimator (Huber 1967): the sandwich of the derivative of
+the score, by finite differences of renders, and of the covariance of the score. Blocks of pixels are
+independent, the pixels within a block may be correlated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.alignment import (
+    AlignmentFit,
+    AlignmentKernels,
+    AlignmentStage,
+    AlignmentSums,
+)
 from fidsplat.cameras import Camera
 from fidsplat.cameras.pose_offset import offset_camera
 from fidsplat.util.errors import InputError
-from fidsplat.vision.pyramid import resized, smoothed
 
-Render = Callable[[Camera], tuple[np.ndarray, np.ndarray]]
-"""rgb (h, w, 3) and depth (h, w) of a camera"""
+Render = Callable[[Camera], Any]
+"""a Frame with rgb and depth of a camera"""
 
 MAX_PIXELS = 20_000
 """maximum number of pixels of a level; those of the largest gradients are used"""
@@ -35,41 +41,22 @@ COARSE = 2
 """stages of the coarsest level"""
 MIN_BLOCK, BLOCKS = 4, 30
 """independent blocks of the covariance: minimum side in pixels, and number along the shorter side"""
-_MEDIAN = {1: 0.4549, 3: 2.3660}
-"""median of the sum of squares of so many normal numbers"""
 MIN_INLIERS = 0.6
 """share of inliers from which a pose counts as found"""
-HUBER, TUKEY = 1.5, 4.685
-"""robust thresholds in standard deviations of the noise: coarse levels, finest level"""
-MIN_NOISE, MAX_NOISE = 1e-3, 0.03
-"""limits of the estimated noise of a pixel, display values; residuals above TUKEY * MAX_NOISE never fit"""
 GAINS = 0.05, 20.0
 """limits of the gain of the image relative to the render"""
 MIN_INFORMATION = 1e-9
 """smallest eigenvalue of the scaled information matrix of a determined pose"""
 _DAMPING = 1e-3
 """initial damping of Levenberg-Marquardt, relative to the diagonal"""
-_SETTLED = {"huber": 0.03, "tukey": 0.01}
-"""root mean square motion of the pixels below which a level has converged"""
-
-
-class Stage(NamedTuple):
-    """One level of the pyramid with one blur."""
-
-    shrink: int
-    blur: float
-    """standard deviation in pixels of the level"""
-    steps: int
-    """maximum number of steps"""
-
-
-def stages_of(width: int, height: int) -> list[Stage]:
-    """Stages from coarse to fine for an image size. The first is blurred more, for a larger basin of
-    convergence; the last is not blurred, so that its noise is that of the image."""
-    shrinks = [2**k for k in range(MAX_LEVELS) if k == 0 or min(width, height) >> k >= MIN_SIDE]
-    coarsest = shrinks[-1]
-    middle = [Stage(shrink, 0.7, 5 if shrink > 2 else 3) for shrink in reversed(shrinks[1:-1])]
-    return [Stage(coarsest, 2.0, 10), Stage(coarsest, 1.0, 5), *middle, Stage(1, 0.0, 4)]
+_SETTLED, _SETTLED_FINE = 0.3, 0.04
+"""motion in pixels of a step that ends a stage, and the last stage"""
+_REPEATED, _REPEATED_PIXELS = 4.0, 0.02
+"""standard deviations, and pixels, of a last step above which it is repeated at its result"""
+_LAST_STEPS = 4
+"""maximum number of last steps"""
+_DIFFERENCE = 0.01
+"""motion in pixels of the finite differences"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,200 +75,27 @@ class Alignment:
     """(c,) gain of the image relative to the render, by channel"""
 
 
-@dataclass(frozen=True, eq=False)
-class Target:
-    """The image at one stage, at its textured pixels."""
-
-    stage: Stage
-    camera: Camera
-    """size and intrinsics of the stage"""
-    rows: np.ndarray
-    """(n,) indices of the pixels in the flat image"""
-    values: np.ndarray
-    """(c, n)"""
-    slopes: np.ndarray
-    """(2, c, n) derivatives by x and y"""
-
-    @cached_property
-    def motions(self) -> tuple[np.ndarray, np.ndarray]:
-        """(2, 3, n) derivatives of pixel coordinates x and y by a rotation of the camera axes, and by a
-        translation of points at depth 1."""
-        camera, rays = self.camera, self.camera.rays(_centres(self.rows, self.camera.width))
-        if camera.lens is None:
-            by_point = np.zeros((len(rays), 2, 3))
-            by_point[:, [0, 1], [0, 1]], by_point[:, :, 2] = 1, -rays[:, :2]
-        else:
-            by_point = camera.lens.derivative(rays)
-        by_point = by_point * np.array([camera.fx, camera.fy])[:, None]
-        turning = np.cross(rays[:, None], by_point)  # g . (w x ray) = w . (ray x g)
-        by_turn, by_move = (
-            np.ascontiguousarray(np.moveaxis(a, 0, 2), np.float32) for a in (turning, by_point)
-        )
-        return by_turn, by_move
-
-    @cached_property
-    def blocks(self) -> np.ndarray:
-        """(n,) block numbers of the pixels."""
-        width, height = self.camera.width, self.camera.height
+def stages_of(camera: Camera) -> list[tuple[AlignmentStage, int]]:
+    """Stages from coarse to fine for a camera, with maximum numbers of steps. The first is blurred more, for
+    a larger basin of convergence; the last is not blurred, so that its noise is that of the image."""
+    short = min(camera.width, camera.height)
+    shrinks = [2**k for k in range(MAX_LEVELS) if k == 0 or short >> k >= MIN_SIDE]
+    middle = [(shrink, 0.7, 8 if shrink > 2 else 5) for shrink in reversed(shrinks[1:-1])]
+    found = []
+    for shrink, blur, steps in [(shrinks[-1], 2.0, 10), (shrinks[-1], 1.0, 6), *middle, (1, 0.0, 5)]:
+        width, height = camera.width // shrink, camera.height // shrink
         side = max(MIN_BLOCK, min(width, height) // BLOCKS)
-        y, x = np.divmod(self.rows, width)
-        return np.unique(y // side * width + x // side, return_inverse=True)[1]
-
-
-def target_of(image: np.ndarray, mask: np.ndarray | None, camera: Camera, stage: Stage) -> Target:
-    """The stage's pixels of an image (h, w, c) float32. mask: (h, w) bool, False for ignored pixels."""
-    width, height = camera.width // stage.shrink, camera.height // stage.shrink
-    small = camera.resampled(width, height)
-    values = smoothed(resized(image, width, height), stage.blur)
-    inner = np.zeros((height, width), bool)
-    inner[1:-1, 1:-1] = True
-    ignored = np.zeros((height, width), np.float32) if mask is None else resized(~mask, width, height)
-    if camera.lens is not None:  # the border of the field of view does not move with the camera
-        rays = small.rays(_centres(np.arange(width * height), width))
-        ignored[np.isnan(rays).any(axis=1).reshape(height, width)] = 1
-    if ignored.any():
-        # pixels whose blur and gradient contain no ignored pixel
-        inner &= smoothed(ignored[:, :, None], max(stage.blur, 0.7))[:, :, 0] < 1e-3
-    rows = np.flatnonzero(inner)
-    if not len(rows):
-        raise InputError(
-            "localisation must have pixels away from the border and from ignored pixels, got none at "
-            f"{width} x {height}; give a larger image or a mask that ignores less"
-        )
-    if len(rows) > MAX_PIXELS:
-        across, down = values[1:-1, 2:] - values[1:-1, :-2], values[2:, 1:-1] - values[:-2, 1:-1]
-        energy = np.einsum("hwc,hwc->hw", across, across) + np.einsum("hwc,hwc->hw", down, down)
-        energy = energy[inner[1:-1, 1:-1]]
-        rows = rows[np.sort(np.argpartition(energy, -MAX_PIXELS)[-MAX_PIXELS:])]
-    return Target(stage, small, rows, _at(values, rows), _slopes(values, rows))
-
-
-class Residuals:
-    """Residuals of a target against the render of a camera, with robust weights."""
-
-    def __init__(self, target: Target, camera: Camera, render: Render) -> None:
-        self.target, self.camera = target, camera
-        rgb, depth = render(target.camera.with_pose(camera.world_to_camera))
-        if len(target.values) == 1:
-            rgb = rgb.mean(axis=2, keepdims=True)
-        image = smoothed(np.ascontiguousarray(rgb), target.stage.blur)
-        self.values = _at(image, target.rows)
-        self.slopes = _slopes(image, target.rows)
-        self.inverse_depth = _nearest(depth, target.rows)
-        self.noise = 0.0
-
-    def weigh(self, robust: str, noise: float | None = None, weights: np.ndarray | None = None) -> Residuals:
-        """Fit gain and offset, and compute residuals, weights and cost.
-
-        Args:
-            robust: "huber" or "tukey".
-            noise: standard deviation of a channel; None: from the residuals.
-            weights: (n,) weights of the first fit, e.g. of a pose nearby; None: gain and offset of the first
-                fit are those between medians and percentiles.
-        """
-        x, y = self.values, self.target.values
-        for _ in range(2):
-            if weights is None:
-                (low_x, middle_x, high_x), (low_y, middle_y, high_y) = _percentiles(x), _percentiles(y)
-                gain = (high_y - low_y) / np.maximum(high_x - low_x, 1e-6)
-                dx, dy = x - middle_x[:, None], y - middle_y[:, None]
-            else:
-                total = max(float(weights.sum()), 1e-6)
-                dx, dy = x - (x @ weights / total)[:, None], y - (y @ weights / total)[:, None]
-                square = np.maximum((dx * dx) @ weights, 1e-12)
-                if robust == "huber":  # misalignment does not attenuate it
-                    gain = np.sqrt(np.maximum((dy * dy) @ weights, 1e-12) / square)
-                else:
-                    gain = np.maximum((dx * dy) @ weights, 1e-12) / square
-            self.gain = np.clip(gain, *GAINS).astype(np.float32)[:, None]
-            self.residuals = dy / self.gain - dx
-            error = np.sqrt((self.residuals**2).mean(axis=0))
-            if noise is None:
-                self.noise = max(_median_of(error) * (len(x) / _MEDIAN[len(x)]) ** 0.5, MIN_NOISE)
-            else:
-                self.noise = noise
-            if robust == "huber":
-                share = error / np.float32(HUBER * self.noise)
-                weights = 1 / np.maximum(share, 1)
-                cost = np.where(share < 1, share**2 / 2, share - 0.5)
-            else:
-                share = error / np.float32(TUKEY * min(self.noise, MAX_NOISE))
-                inner = np.maximum(1 - share**2, 0)
-                weights, cost = inner**2, 1 - inner**3
-        self.weights, self.cost, self.share = weights, float(cost.mean()), share
-        return self
-
-    @cached_property
-    def motions(self) -> tuple[np.ndarray, np.ndarray]:
-        """(6, n) derivatives of pixel coordinates x and y of the points by a motion of the camera axes."""
-        turning, shifting = self.target.motions
-        across, down = np.concatenate([turning, shifting * self.inverse_depth], axis=1)
-        return across, down
-
-    def moved_by(self, motion: np.ndarray) -> float:
-        """Root mean square displacement of the pixels by a motion (6,) of the camera axes."""
-        across, down = self.motions
-        squares = (motion.astype(np.float32) @ across) ** 2 + (motion.astype(np.float32) @ down) ** 2
-        return float(np.sqrt(squares.mean()))
-
-    def normal_equations(self, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Matrix (6, 6) and right side (6,) of the weighted least squares for the pose, without gain and
-        offset. slopes: (2, c, n) image gradients of the Jacobian."""
-        (across, down), (gx, gy), w = self.motions, slopes, self.weights
-        xx, xy, yy = (w * (a * b).sum(axis=0) for a, b in ((gx, gx), (gx, gy), (gy, gy)))
-        rx, ry = w * (gx * self.residuals).sum(axis=0), w * (gy * self.residuals).sum(axis=0)
-        matrix = (across @ (xx * across + xy * down).T + down @ (xy * across + yy * down).T).astype(float)
-        right = -(across @ rx + down @ ry).astype(float)
-        for channel, (by_gain, inverse) in enumerate(self._by_gains(across, down, slopes)):
-            matrix -= by_gain @ inverse @ by_gain.T
-            basis = self._basis(channel) * self.weights
-            right -= by_gain @ inverse @ (basis @ self.residuals[channel]).astype(float)
-        return matrix, right
-
-    def covariance(self) -> np.ndarray:
-        """(6, 6) covariance of the pose: a sandwich estimate from the scores of blocks. Infinite if the
-        pixels do not determine the pose."""
-        across, down = self.motions
-        (gx, gy), w, channels = self.slopes, self.weights, len(self.residuals)
-        scores = -(across * (w * (gx * self.residuals).sum(0)) + down * (w * (gy * self.residuals).sum(0)))
-        for channel, (by_gain, inverse) in enumerate(self._by_gains(across, down, self.slopes)):
-            basis = self._basis(channel) * (self.weights * self.residuals[channel])
-            scores = scores - (by_gain @ inverse).astype(np.float32) @ basis
-        blocks = self.target.blocks
-        sums = np.array([np.bincount(blocks, weights=row) for row in scores])
-        count = sums.shape[1]
-        # the derivative of the weighted residual, averaged over directions among the channels
-        inner, weights = np.maximum(1 - self.share**2, 0), self.weights
-        self.weights = np.maximum(inner**2 - 4 * self.share**2 * inner / channels, 0).astype(np.float32)
-        matrix = self.normal_equations(self.slopes)[0]
-        self.weights = weights
-        deviations = np.sqrt(np.maximum(np.diag(matrix), 1e-30))
-        scaled = matrix / np.outer(deviations, deviations)
-        if np.linalg.matrix_rank(scaled, MIN_INFORMATION, hermitian=True) < 6:
-            return np.diag(np.full(6, np.inf))
-        inverse = np.linalg.inv(scaled) / np.outer(deviations, deviations)
-        return inverse @ (sums @ sums.T) @ inverse * count / max(count - 6 - 2 * channels, 1)
-
-    def _basis(self, channel: int) -> np.ndarray:
-        """(2, n) derivatives of the model by gain and offset of a channel."""
-        return np.stack([self.values[channel], np.ones_like(self.weights)])
-
-    def _by_gains(
-        self, across: np.ndarray, down: np.ndarray, slopes: np.ndarray
-    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """For each channel the blocks of the normal equations that eliminate gain and offset: the mixed block
-        (6, 2) of pose and (gain, offset), and the inverse (2, 2) of the block of (gain, offset)."""
-        gx, gy = slopes
-        for channel in range(len(gx)):
-            basis = self._basis(channel)
-            weighted = basis * self.weights
-            mixed = -(across @ (weighted * gx[channel]).T + down @ (weighted * gy[channel]).T)
-            own = (weighted @ basis.T).astype(float)
-            yield mixed.astype(float), np.linalg.inv(own + 1e-9 * (1 + np.trace(own)) * np.eye(2))
+        found.append((AlignmentStage(camera.resampled(width, height), blur, side), steps))
+    return found
 
 
 def align(
-    image: np.ndarray, mask: np.ndarray | None, start: Camera, render: Render, coarse: bool = False
+    image: np.ndarray,
+    mask: np.ndarray | None,
+    start: Camera,
+    render: Render,
+    kernels: AlignmentKernels,
+    coarse: bool = False,
 ) -> Alignment:
     """Align a render of the scene with an image.
 
@@ -290,82 +104,203 @@ def align(
         mask: (h, w) bool, False for ignored pixels.
         start: camera of the image at its assumed pose.
         render: renders the scene.
+        kernels: sums over pixels.
         coarse: the stages of the coarsest level only, without a covariance.
     """
-    camera, stages = start, stages_of(start.width, start.height)
-    residuals = None
-    for stage in stages[:COARSE] if coarse else stages:
-        residuals = Residuals(target_of(image, mask, start, stage), camera, render).weigh("huber")
-        residuals = _minimise(residuals, render, "huber", stage.steps)
-        camera = residuals.camera
-    assert residuals is not None
+    stages = stages_of(start)[: COARSE if coarse else None]
+    ignored = _ignored(mask, start)
+    counts = kernels.load(image, ignored, [stage for stage, _ in stages], MAX_PIXELS)
+    if not all(counts):
+        camera = stages[counts.index(0)][0].camera
+        raise InputError(
+            "localisation must have pixels away from the border and from ignored pixels, got none at "
+            f"{camera.width} x {camera.height}; give a larger image or a mask that ignores less"
+        )
+    channels = image.shape[2]
+    at = _State(start, AlignmentFit(np.ones(channels), np.zeros(channels), huber=True))
+    for number, (stage, steps) in enumerate(stages):
+        settled = _SETTLED if stage.blur else _SETTLED_FINE
+        at = _minimise(at, _Stage(number, stage.camera, render, kernels), steps, settled)
     if coarse:
-        return Alignment(camera, np.full((6, 6), np.nan), 0.0, residuals.noise, residuals.gain)
-    residuals = _minimise(residuals.weigh("tukey"), render, "tukey", stages[-1].steps)
-    # an image without the scene's contrast fits a render whose contrast the smallest gain removes
-    contrast = bool((residuals.gain > GAINS[0]).any())
-    inliers = float((residuals.share < 1).mean()) if contrast else 0.0
-    return Alignment(residuals.camera, residuals.covariance(), inliers, residuals.noise, residuals.gain)
+        return Alignment(at.camera, np.full((6, 6), np.nan), 0.0, at.noise, at.fit.gain)
+    return _finish(at, _Stage(len(stages) - 1, start, render, kernels))
 
 
-def _minimise(found: Residuals, render: Render, robust: str, steps: int) -> Residuals:
-    """Levenberg-Marquardt at one stage."""
-    damping = _DAMPING
-    for _ in range(steps):
-        slopes = found.slopes
-        if robust == "huber":
-            slopes = (slopes + found.target.slopes / found.gain) / 2
-        matrix, right = found.normal_equations(slopes)
-        diagonal = np.diag(matrix) + 1e-9 * max(float(np.trace(matrix)), 1e-9)
-        motion = np.linalg.solve(matrix + damping * np.diag(diagonal), right)
-        tried = Residuals(found.target, offset_camera(found.camera, motion), render)
-        tried.weigh(robust, found.noise, found.weights)
-        if tried.cost <= found.cost:
-            noise = min(found.noise, tried.weigh(robust, None, tried.weights).noise)
-            found = tried.weigh(robust, noise, tried.weights)
-            damping = max(damping / 10, 1e-6)
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Estimate of pose and exposure."""
+
+    camera: Camera
+    fit: AlignmentFit
+    noise: float = 0.0
+
+    def moved(self, sums: AlignmentSums, step: np.ndarray) -> _State:
+        """The estimate after a step (6 + 2 c,) of pose and exposure."""
+        gains, offsets = (1 + step[6::2], step[7::2]) if not self.fit.huber else _exposure_of(sums)
+        fit = self.fit._replace(
+            gain=np.clip(self.fit.gain * gains, *GAINS), offset=self.fit.offset + self.fit.gain * offsets
+        )
+        return _State(offset_camera(self.camera, step[:6]), fit, sums.noise)
+
+
+@dataclass(frozen=True, eq=False)
+class _Stage:
+    number: int
+    camera: Camera
+    render: Render
+    kernels: AlignmentKernels
+
+    def frame(self, camera: Camera) -> Any:
+        """The scene at the pose of a camera."""
+        return self.render(self.camera.with_pose(camera.world_to_camera))
+
+    def sums(self, frame: Any, at: _State, noise: float = 0.0, **options: Any) -> AlignmentSums:
+        """Sums over the pixels of the stage."""
+        return self.kernels.sums(self.number, frame, at.fit._replace(noise=noise), **options)
+
+    def pixels(self, motion: np.ndarray, sums: AlignmentSums) -> float:
+        """Motion of the pixels by a motion (6,) of the camera, approximately."""
+        turn, shift = motion[:3] @ motion[:3], motion[3:] @ motion[3:]
+        return max(self.camera.fx, self.camera.fy) * math.sqrt(turn + shift * sums.inverse_depth)
+
+
+def _minimise(at: _State, stage: _Stage, steps: int, settled: float) -> _State:
+    """Levenberg-Marquardt at one stage. The last step is not checked by a render."""
+    damping, frame = _DAMPING, stage.frame(at.camera)
+    if not at.noise:  # the exposure is unknown: its first estimates weigh all pixels alike
+        for _ in range(3):
+            sums = stage.sums(frame, at, noise=0.0)
+            at = at.moved(sums, np.zeros(6))
+    sums = stage.sums(frame, at)
+    for number in range(steps):
+        step = _solved(sums, damping)
+        tried, size = at.moved(sums, step), stage.pixels(step[:6], sums)
+        if size < settled or number == steps - 1:
+            return tried
+        found = stage.sums(stage.frame(tried.camera), tried, sums.noise)
+        if found.cost_before <= sums.cost:
+            at, sums, damping = tried, found, max(damping / 10, 1e-6)
         else:
             damping *= 10
-        if found.moved_by(motion) < _SETTLED[robust]:
+    return at
+
+
+def _finish(at: _State, stage: _Stage) -> Alignment:
+    """Newton's method for Tukey's loss, and the covariance. The derivative of the score is that of the first
+    step. Infinite covariance if the pixels do not determine the pose."""
+    at, before, inverse = _State(at.camera, at.fit._replace(huber=False)), None, None
+    for _ in range(_LAST_STEPS):
+        frame = stage.frame(at.camera)
+        sums = stage.sums(frame, at, 0.0 if before is None else before[1].noise, blocks=True)
+        if before is not None and sums.cost_before > before[1].cost:
+            at, sums = before
             break
-    return found
+        inverse = _inverse(sums, _bread(at, sums, stage, frame)) if inverse is None else inverse
+        if inverse is None:
+            break
+        covariance, step = _covariance(sums, inverse), inverse @ _right(sums)
+        before, at = (at, sums), at.moved(sums, step)
+        square = step[:6] @ np.linalg.lstsq(covariance, step[:6], rcond=None)[0]
+        if square < _REPEATED**2 and stage.pixels(step[:6], sums) < _REPEATED_PIXELS:
+            break
+    # an image without the scene's contrast fits a render whose contrast the smallest gain removes
+    inliers = sums.inliers if (at.fit.gain > GAINS[0]).any() else 0.0
+    found = np.diag(np.full(6, np.inf)) if inverse is None else _covariance(sums, inverse)
+    return Alignment(at.camera, found, inliers, sums.noise, at.fit.gain)
 
 
-def _centres(rows: np.ndarray, width: int) -> np.ndarray:
-    """(n, 2) coordinates x and y of the centres of pixels of the flat image."""
-    return np.stack([rows % width, rows // width], axis=1) + 0.5
+def _bread(at: _State, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.ndarray:
+    """Derivative of the score by pose and exposure, by differences of renders.
+
+    A motion along the ray of a pixel and a rotation about it do not change the pixel, so that the derivatives
+    by z follow from those by x and y behind a pinhole.
+    """
+    channels = len(sums.matrix)
+    columns = np.concatenate([np.zeros((channels, 8, 6)), sums.matrix[:, :, 6:]], axis=2)
+    turn = _DIFFERENCE / max(stage.camera.fx, stage.camera.fy)
+    pinhole = stage.camera.lens is None
+    for axis in (0, 1, 3, 4) if pinhole else range(6):
+        motion = np.zeros(6)
+        motion[axis] = size = turn if axis < 3 else turn / max(math.sqrt(sums.inverse_depth), 1e-3)
+        other = stage.frame(offset_camera(at.camera, motion))
+        right = stage.sums(frame, at, sums.noise, moved=(other, size, axis % 3)).right
+        columns[:, :, axis] = right[:, :, 0]
+        if pinhole:
+            columns[:, :, axis // 3 * 3 + 2] += right[:, :, 1]
+    return _assembled(columns)
 
 
-def _at(image: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(c, n) values of an image (h, w, c) at some pixels."""
-    return np.ascontiguousarray(image.reshape(-1, image.shape[2]).take(rows, axis=0).T)
+def _inverse(sums: AlignmentSums, bread: np.ndarray) -> np.ndarray | None:
+    """The inverse of the derivative of the score; None if the pixels do not determine the pose."""
+    deviations = np.sqrt(np.maximum(np.diag(_assembled(sums.matrix)), 1e-15))
+    scaled = bread / np.outer(deviations, deviations)
+    if np.linalg.matrix_rank(scaled, MIN_INFORMATION) < len(bread):
+        return None
+    return np.linalg.inv(scaled) / np.outer(deviations, deviations)
 
 
-def _slopes(image: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(2, c, n) central differences by x and y of an image (h, w, c) at pixels that are not on its border."""
-    width = image.shape[1]
-    differences = [_at(image, rows + step) - _at(image, rows - step) for step in (1, width)]
-    return np.stack(differences) / 2
+def _covariance(sums: AlignmentSums, inverse: np.ndarray) -> np.ndarray:
+    """(6, 6) sandwich estimate from the scores of blocks."""
+    count, channels = sums.scores.shape[:2]
+    scores = np.zeros((count, len(inverse)))
+    for channel in range(channels):
+        scores[:, _parameters(channel)] += sums.scores[:, channel]
+    errors = scores @ inverse[:6].T
+    return errors.T @ errors * count / max(count - len(inverse), 1)
 
 
-def _nearest(depth: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(n,) inverse depths, the largest of a pixel and its neighbours: at an edge the gradient is that of the
-    surface in front. 0 for the background."""
-    flat, width = depth.reshape(-1), depth.shape[1]
-    inverse = np.zeros_like(flat)
-    np.divide(1, flat, out=inverse, where=flat > 0)
-    near = inverse[rows]
-    for shift in (-1, 1, -width, width):
-        near = np.maximum(near, inverse[rows + shift])
-    return near
+def _solved(sums: AlignmentSums, damping: float) -> np.ndarray:
+    """Step (6 + 2 c,) of Levenberg-Marquardt, with damped pose."""
+    matrix = _assembled(sums.matrix)
+    diagonal = np.diag(matrix)[:6]
+    matrix[range(6), range(6)] += damping * diagonal + 1e-9 * max(float(diagonal.sum()), 1e-9)
+    return np.linalg.solve(matrix, _right(sums))
 
 
-def _percentiles(values: np.ndarray) -> np.ndarray:
-    """16th, 50th and 84th percentiles of rows (c, n), as (3, c)."""
-    at = [int(share * (values.shape[1] - 1)) for share in (0.16, 0.5, 0.84)]
-    return np.partition(values, at, axis=1)[:, at].T
+def _right(sums: AlignmentSums) -> np.ndarray:
+    """The score (6 + 2 c,): right side of the normal equations."""
+    right = np.zeros(6 + 2 * len(sums.matrix))
+    for channel, column in enumerate(sums.right[:, :, 0]):
+        right[_parameters(channel)] += column
+    return right
 
 
-def _median_of(values: np.ndarray) -> float:
-    """Median without a sort of all values; 0 for none."""
-    return float(np.partition(values, len(values) // 2)[len(values) // 2]) if len(values) else 0.0
+def _assembled(matrices: np.ndarray) -> np.ndarray:
+    """The matrix (6 + 2 c, 6 + 2 c) of pose, and of gain and offset of each channel, from those (c, 8, 8) of
+    the channels."""
+    total = np.zeros((6 + 2 * len(matrices),) * 2)
+    for channel, matrix in enumerate(matrices):
+        own = _parameters(channel)
+        total[np.ix_(own, own)] += matrix
+        total[own[6:], own[6:]] += 1e-9 * (1 + matrix[6, 6] + matrix[7, 7])
+    return total
+
+
+def _parameters(channel: int) -> list[int]:
+    """Indices of the pose, and of gain and offset of a channel."""
+    return [*range(6), 6 + 2 * channel, 7 + 2 * channel]
+
+
+def _exposure_of(sums: AlignmentSums) -> tuple[np.ndarray, np.ndarray]:
+    """Changes (c,) of gains and offsets, to equal means and standard deviations: misalignment attenuates the
+    gain of a regression."""
+    total = sums.matrix[:, 7, 7]
+    values, residuals = sums.matrix[:, 6, 7] / total, sums.right[:, 7, 0] / total
+    variance = np.maximum(sums.matrix[:, 6, 6] / total - values**2, 1e-12)
+    mixed = sums.right[:, 6, 0] / total - values * residuals
+    image = variance + 2 * mixed + sums.square / total - residuals**2
+    gains = np.sqrt(np.maximum(image, 1e-12) / variance)
+    return gains, values + residuals - gains * values
+
+
+def _ignored(mask: np.ndarray | None, camera: Camera) -> np.ndarray | None:
+    """(h, w) float32, 1 for ignored pixels and outside the field of view, whose border does not move with the
+    camera; None for none."""
+    if mask is None and camera.lens is None:
+        return None
+    ignored = np.zeros((camera.height, camera.width), np.float32) if mask is None else np.float32(~mask)
+    if camera.lens is not None:
+        y, x = np.mgrid[: camera.height, : camera.width]
+        rays = camera.rays(np.stack([x.ravel(), y.ravel()], axis=1) + 0.5)
+        ignored[np.isnan(rays).any(axis=1).reshape(ignored.shape)] = 1
+    return ignored

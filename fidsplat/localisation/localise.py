@@ -15,6 +15,8 @@ from fidsplat.capture.sensor import Sensor
 from fidsplat.images.files import pixels_of
 from fidsplat.localisation.direct_alignment import MIN_INLIERS, align
 from fidsplat.localisation.initial_pose import most_similar, pose_of_markers
+from fidsplat.localisation.normal_equations import HostAlignment
+from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.scenes import Scene
@@ -147,9 +149,10 @@ def localise(
         else scene
     )
 
-    def render(at: Camera) -> tuple[np.ndarray, np.ndarray]:
-        frame = renderer.render(uploaded, capture.with_(camera=at))
-        return frame["rgb"], frame["depth"]
+    def render(at: Camera) -> Frame:
+        return renderer.render(uploaded, capture.with_(camera=at))
+
+    kernels = HostAlignment()
 
     source, starts = "start", []
     if start is not None:
@@ -171,9 +174,9 @@ def localise(
             ]
 
         best = most_similar(pixels, camera, candidates, render_all, TRIED)
-        tried = [align(pixels, mask, one, render, coarse=True) for one in best]
+        tried = [align(pixels, mask, one, render, kernels, coarse=True) for one in best]
         starts = [min(tried, key=lambda one: one.noise).camera]
-    found = align(pixels, mask, starts[0], render)
+    found = align(pixels, mask, starts[0], render, kernels)
     return Localisation(found.camera, found.covariance, found.inliers, found.noise, source)
 
 

@@ -182,6 +182,13 @@ class TrainSettings:
                 if not 0 <= as_float(value) < math.inf:
                     raise InputError(f"training: {field.name} must be a number of at least 0, got {value!r}")
                 _put(self, field.name, float(value))
+        for switch, rate in (("refine_poses", "pose_rate"), ("fit_exposures", "exposure_rate")):
+            for name in (rate, f"{rate}_end"):
+                if not getattr(self, switch) and getattr(self, name) != getattr(TrainSettings, name):
+                    raise InputError(
+                        f"training: {switch} must be on for a {name}, got {name} = {getattr(self, name):g} "
+                        f"without; add --{switch.replace('_', '-')}, or {switch}=True"
+                    )
         if not self.dssim_weight <= 1:
             raise InputError(f"training: dssim_weight must be from 0 to 1, got {self.dssim_weight!r}")
         for name in ("beta1", "beta2"):

@@ -23,6 +23,7 @@ from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import with_distortion
 from fidsplat.formats import save_ply
 from fidsplat.formats.collect import Progress
+from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.splats.cloud import SplatCloud
@@ -288,12 +289,13 @@ class Trainer:
         """The capture of a view at the pose at which the splats match its image; unchanged if none does."""
         # here, since it imports detectors, which other trainings do not need
         from fidsplat.localisation.direct_alignment import MIN_INLIERS, align
+        from fidsplat.localisation.normal_equations import HostAlignment
 
-        def render(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-            frame = self.renderer.render(resident, capture.with_(camera=camera, outputs=("rgb", "depth")))
-            return frame["rgb"], frame["depth"]
+        def render(camera: Camera) -> Frame:
+            return self.renderer.render(resident, capture.with_(camera=camera, outputs=("rgb", "depth")))
 
-        found = align(view.image.astype(np.float32) / 255, view.mask, view.camera, render)
+        image = view.image.astype(np.float32) / 255
+        found = align(image, view.mask, view.camera, render, HostAlignment())
         return capture.with_(camera=found.camera) if found.inliers >= MIN_INLIERS else capture
 
     def _advance(self, late: bool) -> None:

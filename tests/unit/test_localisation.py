@@ -187,6 +187,10 @@ def test_errors_of_localisation(renderer, room, tmp_path, capsys):
     words = ["localise", str(tmp_path / "photo.png"), "--scene", str(tmp_path / "scene.toml")]
     assert main([*words, "--start", "1,2,3"]) == 2
     assert "--start must be 7 numbers X,Y,Z,QW,QX,QY,QZ" in capsys.readouterr().err
+    assert main([*words, "-o", "poses.xyz"]) == 2
+    assert "suffix of a trajectory must be one of .tum and .txt" in capsys.readouterr().err
+    assert main([*words[:3], str(tmp_path / "city.fss")]) == 2
+    assert "must be a scene file (.toml) with the camera of the photographs" in capsys.readouterr().err
     assert main(words) == 2
     assert capsys.readouterr().err.count("\n") == 1
 

@@ -208,3 +208,10 @@ def test_masks_of_a_folder_and_of_alpha(given, tmp_path):
         load_dataset(tmp_path / "set", masks=tmp_path / "empty", alpha_masks=True)
     with pytest.raises(fs.InputError, match="refine_poses must be True or False, got 'yes'"):
         Trainer(given, refine_poses="yes")
+
+
+def test_rates_need_their_switches():
+    assert TrainSettings(refine_poses=True, pose_rate=1e-3).pose_rate == 1e-3
+    for rate in ("pose_rate", "exposure_rate_end"):
+        with pytest.raises(fs.InputError, match=rf"must be on for a {rate}, got {rate} = 0.1 without; add"):
+            TrainSettings(**{rate: 0.1})

@@ -1,0 +1,125 @@
+"""Interface of direct image alignment: sums over pixels for the normal equations of a camera pose."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+
+BINS, SHIFT, LOWEST = 256, 19, 113 << 4
+"""histograms of positive float32 by their upper bits: 16 bins per octave from 2^-14 to 4"""
+
+
+class AlignmentStage(NamedTuple):
+    """One level of the image pyramid with one blur."""
+
+    camera: Camera
+    """size, intrinsics and lens of the level"""
+    blur: float
+    """standard deviation in pixels of the level"""
+    side: int
+    """side in pixels of the blocks of `AlignmentSums.scores`"""
+
+
+class AlignmentFit(NamedTuple):
+    """Robust loss, and exposure of the image: image = gain * render + offset in each channel."""
+
+    gain: np.ndarray
+    """(c,)"""
+    offset: np.ndarray
+    """(c,)"""
+    huber: bool
+    """Huber's loss with slopes averaged between render and image; else Tukey's with slopes of the render"""
+    noise: float = 0.0
+    """standard deviation of the residuals at the pose before; 0: from the median of the residuals"""
+
+
+@dataclass(frozen=True, eq=False)
+class AlignmentSums:
+    """Weighted sums over the textured pixels of c channels.
+
+    The model of a residual is J m + a x + b: J its derivative by the motion m (6,) of the camera, x the
+    rendered value, a and b changes of gain and offset. A row (8,) is (J, x, 1).
+    """
+
+    matrix: np.ndarray
+    """(c, 8, 8) row times row, with the weights of the second derivative of the loss"""
+    right: np.ndarray
+    """(c, 8, 2) row times residual, twice. With a moved frame instead: row times the derivative of the
+    rendered value by its motion, and by that times minus one component of the ray"""
+    square: np.ndarray
+    """(c,) squared residuals"""
+    scores: np.ndarray
+    """(blocks, c, 8) row times residual in each block; empty unless requested"""
+    cost: float
+    """mean loss"""
+    cost_before: float
+    """mean loss with `AlignmentFit.noise`"""
+    inliers: float
+    """share of the pixels below the robust threshold"""
+    inverse_depth: float
+    """mean squared inverse depth [1 / m^2]"""
+    noise: float
+    """standard deviation of the residuals of a channel"""
+
+
+HUBER, TUKEY = 1.5, 4.685
+"""robust thresholds in standard deviations of the noise"""
+MIN_NOISE, MAX_NOISE = 1e-3, 0.03
+"""limits of the noise, display values; residuals above TUKEY * MAX_NOISE never fit"""
+_MEDIAN = {1: 0.4549, 3: 2.3660}
+"""median of the sum of squares of so many normal numbers"""
+
+
+def noise_factor(channels: int) -> float:
+    """Standard deviation of the residuals divided by the median of their root mean squares."""
+    return (channels / _MEDIAN[channels]) ** 0.5
+
+
+class AlignmentKernels(ABC):
+    """Residuals of an image against rendered frames, and their sums."""
+
+    @abstractmethod
+    def load(
+        self, image: np.ndarray, ignored: np.ndarray | None, stages: list[AlignmentStage], most: int
+    ) -> list[int]:
+        """Prepare an image for its stages; returns the numbers of their pixels.
+
+        Args:
+            image: (h, w, 3) or (h, w, 1) float32 display values.
+            ignored: (h, w) float32, above 0 for ignored pixels; None: none.
+            most: maximum number of pixels of a stage; those of the largest gradients are used.
+        """
+
+    @abstractmethod
+    def sums(
+        self,
+        stage: int,
+        frame: Any,
+        fit: AlignmentFit,
+        moved: tuple[Any, float, int] | None = None,
+        blocks: bool = False,
+    ) -> AlignmentSums:
+        """Sums of a stage for a Frame with rgb and depth.
+
+        Args:
+            moved: Frame after a motion of the camera, the size of the motion, and the component of the ray in
+                `AlignmentSums.right`.
+            blocks: whether to return `scores`.
+        """
+
+
+def bins_of(values: np.ndarray) -> np.ndarray:
+    """Bins of positive values, 1 to 255; 0 is for pixels that are not used."""
+    upper = np.ascontiguousarray(values, np.float32).view(np.uint32) >> SHIFT
+    return np.clip(upper.astype(np.int64) - LOWEST, 1, BINS - 1)
+
+
+def least_bin(counts: np.ndarray, most: int) -> int:
+    """The bin from which on there are about `most` values, or all if there are fewer."""
+    above = np.cumsum(counts[:0:-1])[::-1]
+    return 1 + int(np.flatnonzero(above >= min(most, above[0]))[-1])

@@ -1,0 +1,179 @@
+"""Sums of direct image alignment in NumPy, for devices without kernels for them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.alignment import (
+    BINS,
+    HUBER,
+    LOWEST,
+    MAX_NOISE,
+    MIN_NOISE,
+    SHIFT,
+    TUKEY,
+    AlignmentFit,
+    AlignmentKernels,
+    AlignmentStage,
+    AlignmentSums,
+    bins_of,
+    least_bin,
+    noise_factor,
+)
+from fidsplat.vision.pyramid import resized, smoothed
+
+
+class HostAlignment(AlignmentKernels):
+    """Sums on the host over the textured pixels of a stage, which are rows."""
+
+    def load(
+        self, image: np.ndarray, ignored: np.ndarray | None, stages: list[AlignmentStage], most: int
+    ) -> list[int]:
+        """Prepare the image for its stages."""
+        self._targets = [_Target(image, ignored, stage, most) for stage in stages]
+        self._rendered: tuple[Any, ...] = ()
+        return [len(target.rows) for target in self._targets]
+
+    def sums(
+        self,
+        stage: int,
+        frame: Any,
+        fit: AlignmentFit,
+        moved: tuple[Any, float, int] | None = None,
+        blocks: bool = False,
+    ) -> AlignmentSums:
+        """Sums over the pixels of a stage."""
+        target = self._targets[stage]
+        values, slopes, inverse_depth = self._features(target, frame)
+        gain, offset = fit.gain[:, None].astype(np.float32), fit.offset[:, None].astype(np.float32)
+        residuals = (target.values - offset) / gain - values
+        if fit.huber:
+            slopes = (slopes + target.slopes / gain) / 2
+        error = np.sqrt((residuals**2).mean(axis=0))
+        noise = max(noise_factor(len(values)) * _median(error), MIN_NOISE)
+        noise = min(noise, fit.noise) if fit.noise else noise
+        share, weights, cost = _robust(error, noise, fit.huber)
+        matrix_weights = weights
+        if not fit.huber:  # the derivative of the weighted residual, averaged over directions among channels
+            inner = np.maximum(1 - share**2, 0)
+            matrix_weights = np.maximum(inner**2 - 4 * share**2 * inner / len(values), 0)
+        across, down = np.concatenate([target.turning, target.shifting * inverse_depth], axis=1)
+        columns, column_weights = np.stack([residuals, residuals]), weights
+        if moved is not None:
+            other, step, axis = moved
+            change = (_at(target.blurred(other), target.rows) - values) / np.float32(step)
+            columns, column_weights = np.stack([change, -target.rays[axis] * change]), matrix_weights
+        matrix, right, scores = [], [], []
+        for channel, (gx, gy) in enumerate(zip(*slopes, strict=True)):
+            row = np.stack([*-(gx * across + gy * down), values[channel], np.ones_like(gx)]).astype(float)
+            weighted = row * column_weights
+            matrix.append((row * matrix_weights) @ row.T)
+            right.append(weighted @ columns[:, channel].T)
+            if blocks:
+                each = weighted * columns[0, channel]
+                scores.append([np.bincount(target.blocks, weights=one) for one in each])
+        return AlignmentSums(
+            np.array(matrix),
+            np.array(right),
+            (residuals**2 * weights).sum(axis=1, dtype=float),
+            np.moveaxis(np.array(scores), 2, 0) if blocks else np.empty((0, len(values), 8)),
+            float(cost.mean()),
+            float(_robust(error, fit.noise or noise, fit.huber)[2].mean()),
+            float((share < 1).mean()),
+            float((inverse_depth**2).mean()),
+            noise,
+        )
+
+    def _features(self, target: _Target, frame: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Values, slopes and inverse depths of a frame; those of the last frame are cached."""
+        if not self._rendered or self._rendered[0] is not target or self._rendered[1] is not frame:
+            image, rows = target.blurred(frame), target.rows
+            found = _at(image, rows), _slopes(image, rows), _nearest(frame["depth"], rows)
+            self._rendered = target, frame, found
+        return self._rendered[2]
+
+
+class _Target:
+    """The image at one stage, at its textured pixels."""
+
+    def __init__(
+        self, image: np.ndarray, ignored: np.ndarray | None, stage: AlignmentStage, most: int
+    ) -> None:
+        camera, self.blur = stage.camera, stage.blur
+        width, height = camera.width, camera.height
+        values = smoothed(resized(image, width, height), stage.blur)
+        bins = np.zeros((height, width), np.int64)
+        across, down = values[1:-1, 2:] - values[1:-1, :-2], values[2:, 1:-1] - values[:-2, 1:-1]
+        bins[1:-1, 1:-1] = bins_of(np.sqrt((across * across + down * down).sum(axis=2)) / 2)
+        if ignored is not None:  # its blur has the radius of the image's blur and gradient
+            hidden = smoothed(resized(ignored, width, height)[:, :, None], max(stage.blur, 0.7))
+            bins[hidden[:, :, 0] > 1e-3] = 0
+        self.rows = rows = np.flatnonzero(bins >= least_bin(np.bincount(bins.ravel(), minlength=BINS), most))
+        self.values, self.slopes = _at(values, rows), _slopes(values, rows)
+        y, x = np.divmod(rows, width)
+        self.blocks = np.unique(y // stage.side * width + x // stage.side, return_inverse=True)[1]
+        rays = camera.rays(np.stack([x, y], axis=1) + 0.5)
+        if camera.lens is None:
+            by_point = np.zeros((len(rays), 2, 3))
+            by_point[:, [0, 1], [0, 1]], by_point[:, :, 2] = 1, -rays[:, :2]
+        else:
+            by_point = camera.lens.derivative(rays)
+        by_point = by_point * np.array([camera.fx, camera.fy])[:, None]
+        turning = np.cross(rays[:, None], by_point)  # g . (w x ray) = w . (ray x g)
+        self.turning, self.shifting = (
+            np.ascontiguousarray(np.moveaxis(a, 0, 2), np.float32) for a in (turning, by_point)
+        )
+        """(2, 3, n) derivatives of pixel coordinates x and y by a rotation of the camera axes, and by a
+        translation of points at depth 1"""
+        self.rays = rays.T.astype(np.float32)
+
+    def blurred(self, frame: Any) -> np.ndarray:
+        """(h, w, c) colours of a frame with the blur and the channels of the image."""
+        rgb = frame["rgb"]
+        rgb = rgb.mean(axis=2, keepdims=True) if len(self.values) == 1 else rgb
+        return smoothed(np.ascontiguousarray(rgb), self.blur)
+
+
+def _robust(error: np.ndarray, noise: float, huber: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Errors relative to the robust threshold, weights and losses."""
+    if huber:
+        share = error / np.float32(HUBER * noise)
+        return share, 1 / np.maximum(share, 1), np.where(share < 1, share**2 / 2, share - 0.5)
+    share = error / np.float32(TUKEY * min(noise, MAX_NOISE))
+    inner = np.maximum(1 - share**2, 0)
+    return share, inner**2, 1 - inner**3
+
+
+def _median(values: np.ndarray) -> float:
+    """Median from a histogram, linear within its bin."""
+    counts = np.bincount(bins_of(values), minlength=BINS)
+    before = np.cumsum(counts) - counts
+    at = int(np.flatnonzero(before <= len(values) / 2)[-1])
+    low, high = (np.array([LOWEST + at, LOWEST + at + 1], np.uint32) << SHIFT).view(np.float32).tolist()
+    return low + (high - low) * (len(values) / 2 - before[at]) / max(int(counts[at]), 1)
+
+
+def _at(image: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """(c, n) values of an image (h, w, c) at some pixels."""
+    return np.ascontiguousarray(image.reshape(-1, image.shape[2]).take(rows, axis=0).T)
+
+
+def _slopes(image: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """(2, c, n) central differences by x and y of an image (h, w, c) at pixels that are not on its border."""
+    width = image.shape[1]
+    differences = [_at(image, rows + step) - _at(image, rows - step) for step in (1, width)]
+    return np.stack(differences) / 2
+
+
+def _nearest(depth: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """(n,) inverse depths, the largest of a pixel and its neighbours: at an edge the gradient is that of the
+    surface in front. 0 for the background."""
+    flat, width = depth.reshape(-1), depth.shape[1]
+    inverse = np.zeros_like(flat)
+    np.divide(1, flat, out=inverse, where=flat > 0)
+    near = inverse[rows]
+    for shift in (-1, 1, -width, width):
+        near = np.maximum(near, inverse[rows + shift])
+    return near

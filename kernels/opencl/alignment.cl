@@ -1,0 +1,248 @@
+// Direct image alignment: residuals of an image against a render, and the sums of the normal equations of the camera pose. NumPy
+// version: fidsplat/localisation/normal_equations.py.
+// ITEMS   work-items of a group: 1 on CPUs
+// SUMS    numbers of a group (`AlignmentSums` of fidsplat/backends/alignment.py, packed by fidsplat/backends/opencl/alignment.py)
+#define ROW_ITEMS (ITEMS < 16 ? ITEMS : 16)
+#define BINS 256
+#define CHANNEL_SUMS 53
+#define OTHER_SUMS (3 * CHANNEL_SUMS)
+
+// Bin of a positive number: 16 bins per octave from 2^-14 on.
+static inline uint bin_of(float value) {
+    return (uint)clamp((int)(as_uint(value) >> 19) - LOWEST, 1, BINS - 1);
+}
+
+// A channel of a pixel; of a grey image the mean of the rendered channels.
+static inline float value_of(global const float *image, int i, int channel, int channels) {
+    global const float *at = image + 3 * (size_t)i;
+    return channels == 1 ? (at[0] + at[1] + at[2]) / 3.0f : at[channel];
+}
+
+// Index space: (columns, rows) of the level. Reads: the image. Writes: means over the pixels of the level.
+kernel void align_shrink(
+//@@ arguments align_shrink
+) {
+    int x = get_global_id(0), y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    float left = x * ratio_x, right = left + ratio_x, top = y * ratio_y, bottom = top + ratio_y;
+    int end_x = min((int)ceil(right - 1e-3f), full_width), end_y = min((int)ceil(bottom - 1e-3f), full_height);
+    for (int c = 0; c < channels; c++) {
+        float sum = 0.0f;
+        for (int row = (int)top; row < end_y; row++) {
+            float across = 0.0f;
+            for (int column = (int)left; column < end_x; column++)
+                across += (fmin(right, column + 1.0f) - fmax(left, (float)column))
+                    * image[(row * (size_t)full_width + column) * channels + c];
+            sum += (fmin(bottom, row + 1.0f) - fmax(top, (float)row)) * across;
+        }
+        made[(y * (size_t)width + x) * channels + c] = sum / (ratio_x * ratio_y);
+    }
+}
+
+// Index space: (columns, rows). Reads: an image. Writes: its convolution along x or y with symmetric taps; the border is repeated.
+kernel void align_blur(
+//@@ arguments align_blur
+) {
+    int x = get_global_id(0), y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    int at = vertical ? y : x, last = (vertical ? height : width) - 1, stride = vertical ? width : 1;
+    int start = y * width + x - at * stride;
+    for (int c = 0; c < channels; c++) {
+        float sum = taps[0] * image[(size_t)(start + at * stride) * channels + c];
+        for (int k = 1; k <= radius; k++) {
+            int low = start + max(at - k, 0) * stride, high = start + min(at + k, last) * stride;
+            sum += taps[k] * (image[(size_t)low * channels + c] + image[(size_t)high * channels + c]);
+        }
+        made[(y * (size_t)width + x) * channels + c] = sum;
+    }
+}
+
+// Add a work-group's histogram to that of all groups.
+static inline void add_bins(local uint *own, global uint *counts) {
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint k = get_local_id(0); k < BINS; k += ITEMS)
+        if (own[k]) atomic_add(&counts[k], own[k]);
+}
+
+#if ITEMS == 1
+#define COUNT(own, bin) (own)[bin]++
+#else
+#define COUNT(own, bin) atomic_inc(&(own)[bin])
+#endif
+
+// Index space: any number of work-groups of ITEMS, by rows. Reads: the image of a level. Writes: the bin of each pixel's gradient, 0
+// on the border and for ignored pixels, and adds the numbers of pixels.
+kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_texture(
+//@@ arguments align_texture
+) {
+    local uint own[BINS];
+    for (uint k = get_local_id(0); k < BINS; k += ITEMS) own[k] = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int y = get_group_id(0); y < height; y += get_num_groups(0))
+        for (int x = get_local_id(0); x < width; x += ITEMS) {
+            int i = y * width + x;
+            uint bin = 0;
+            if (x > 0 && y > 0 && x + 1 < width && y + 1 < height && !(masked && mask[i])) {
+                float energy = 0.0f;
+                for (int c = 0; c < channels; c++) {
+                    float across = image[(i + 1) * channels + c] - image[(i - 1) * channels + c];
+                    float down = image[(i + width) * channels + c] - image[(i - width) * channels + c];
+                    energy += across * across + down * down;
+                }
+                bin = bin_of(sqrt(energy) / 2.0f);
+            }
+            bins[i] = (uchar)bin;
+            COUNT(own, bin);
+        }
+    add_bins(own, counts);
+}
+
+// Residuals of a pixel: image, without gain and offset, minus render. Returns their root mean square.
+static inline float residuals_of(
+    int i, int channels, global const float *image, global const float *rgb, const float *gain, const float *offset, float *residual
+) {
+    float square = 0.0f;
+    for (int c = 0; c < channels; c++) {
+        residual[c] = (image[(size_t)i * channels + c] - offset[c]) / gain[c] - value_of(rgb, i, c, channels);
+        square += residual[c] * residual[c];
+    }
+    return sqrt(square / channels);
+}
+
+#define EXPOSURE const float gain[3] = {gain_red, gain_green, gain_blue}, offset[3] = {offset_red, offset_green, offset_blue}
+
+// Index space: any number of work-groups of ITEMS, by rows. Adds the numbers of textured pixels by their error.
+kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_errors(
+//@@ arguments align_errors
+) {
+    local uint own[BINS];
+    EXPOSURE;
+    for (uint k = get_local_id(0); k < BINS; k += ITEMS) own[k] = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int y = get_group_id(0); y < height; y += get_num_groups(0))
+        for (int i = y * width + get_local_id(0); i < (y + 1) * width; i += ITEMS) {
+            float residual[3];
+            if (bins[i] < least) continue;
+            COUNT(own, bin_of(residuals_of(i, channels, image, rgb, gain, offset, residual)));
+        }
+    add_bins(own, counts);
+}
+
+// Median of a histogram, linear within its bin.
+static inline float median_of(global const uint *counts) {
+    uint total = 0, before = 0, k = 1;
+    for (uint other = 1; other < BINS; other++) total += counts[other];
+    while (k < BINS - 1 && 2 * (before + counts[k]) < total) before += counts[k++];
+    float low = as_float((LOWEST + k) << 19), high = as_float((LOWEST + k + 1) << 19);
+    return low + (high - low) * (0.5f * total - before) / fmax((float)counts[k], 1.0f);
+}
+
+// Error relative to the robust threshold; sets weight, the weight of the second derivative, and the loss.
+static inline float robust(float error, float noise, int huber, int channels, float *weight, float *curved, float *cost) {
+    float share = error / (huber ? HUBER * noise : TUKEY * fmin(noise, MAX_NOISE));
+    if (huber) {
+        *weight = *curved = 1.0f / fmax(share, 1.0f);
+        *cost = share < 1.0f ? 0.5f * share * share : share - 0.5f;
+        return share;
+    }
+    float inner = fmax(1.0f - share * share, 0.0f);
+    *weight = inner * inner;
+    *curved = fmax(inner * inner - 4.0f * share * share * inner / channels, 0.0f);
+    *cost = 1.0f - inner * inner * inner;
+    return share;
+}
+
+// Inverse depth, the largest of a pixel and its neighbours; 0 for the background.
+static inline float nearest(global const float *depth, int i, int width) {
+    float depths[5] = {depth[i], depth[i - 1], depth[i + 1], depth[i - width], depth[i + width]}, largest = 0.0f;
+    for (int k = 0; k < 5; k++)
+        if (depths[k] > 0.0f) largest = fmax(largest, 1.0f / depths[k]);
+    return largest;
+}
+
+// Index space: work-groups of ITEMS; group g has the blocks g, g + groups, ... of side x side pixels. Reads: image, render, depth,
+// the rays of a lens, counts of `align_errors`, the render after a motion. Writes: the sums of each group, in a fixed order.
+kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
+//@@ arguments align_sums
+) {
+    local float partial[ITEMS][SUMS];
+    local float shared_noise;
+    EXPOSURE;
+    uint item = get_local_id(0);
+    if (item == 0) {
+        float own = fmax(noise_factor * median_of(counts), MIN_NOISE);
+        shared_noise = noise_before > 0.0f ? fmin(own, noise_before) : own;
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    float noise = shared_noise, sums[SUMS];
+    for (int k = 0; k < SUMS; k++) sums[k] = 0.0f;
+    int across_blocks = (width + side - 1) / side, blocks = across_blocks * ((height + side - 1) / side);
+    for (int block = get_group_id(0); block < blocks; block += get_num_groups(0)) {
+        int left = block % across_blocks * side, top = block / across_blocks * side;
+        int right = min(left + side, width), bottom = min(top + side, height);
+        for (int y = top + item / ROW_ITEMS; y < bottom; y += ITEMS / ROW_ITEMS)
+            for (int x = left + item % ROW_ITEMS; x < right; x += ROW_ITEMS) {
+                int i = y * width + x;
+                if (bins[i] < least) continue;
+                float residual[3], weight, curved, cost, before, unused_weight, unused_curved;
+                float error = residuals_of(i, channels, image, rgb, gain, offset, residual);
+                robust(error, noise_before > 0.0f ? noise_before : noise, huber, channels, &unused_weight, &unused_curved, &before);
+                float share = robust(error, noise, huber, channels, &weight, &curved, &cost);
+                float inverse = nearest(depth, i, width);
+                float3 ray = {(x + 0.5f - center_x) / focal_x, (y + 0.5f - center_y) / focal_y, 1.0f};
+                float3 by_x = {1.0f / focal_x, 0.0f, 0.0f}, by_y = {0.0f, 1.0f / focal_y, 0.0f};
+                if (lens) {
+                    ray = vload3(i, rays);
+                    by_x = (vload3(i + 1, rays) - vload3(i - 1, rays)) / 2.0f;
+                    by_y = (vload3(i + width, rays) - vload3(i - width, rays)) / 2.0f;
+                }
+                // derivatives of pixel coordinates by the point: the dual basis of the rays' derivatives
+                float3 across = cross(by_y, ray), down = cross(ray, by_x);
+                across /= dot(by_x, across);
+                down /= dot(by_y, down);
+                float3 turn_x = cross(ray, across), turn_y = cross(ray, down);
+                float motion_x[6] = {turn_x.x, turn_x.y, turn_x.z, across.x * inverse, across.y * inverse, across.z * inverse};
+                float motion_y[6] = {turn_y.x, turn_y.y, turn_y.z, down.x * inverse, down.y * inverse, down.z * inverse};
+                float scale = axis == 0 ? -ray.x : axis == 1 ? -ray.y : -ray.z, of_column = moves ? curved : weight;
+                for (int c = 0; c < channels; c++) {
+                    float gx = (value_of(rgb, i + 1, c, channels) - value_of(rgb, i - 1, c, channels)) / 2.0f;
+                    float gy = (value_of(rgb, i + width, c, channels) - value_of(rgb, i - width, c, channels)) / 2.0f;
+                    if (huber) {
+                        gx = (gx + (image[(i + 1) * channels + c] - image[(i - 1) * channels + c]) / 2.0f / gain[c]) / 2.0f;
+                        gy = (gy + (image[(i + width) * channels + c] - image[(i - width) * channels + c]) / 2.0f / gain[c]) / 2.0f;
+                    }
+                    float row[8], value = value_of(rgb, i, c, channels), column = residual[c];
+                    if (moves) column = (value_of(moved, i, c, channels) - value) / step;
+                    for (int k = 0; k < 6; k++) row[k] = -(gx * motion_x[k] + gy * motion_y[k]);
+                    row[6] = value;
+                    row[7] = 1.0f;
+                    float *sum = sums + c * CHANNEL_SUMS;
+                    for (int k = 0; k < 8; k++) {
+                        float weighted = curved * row[k], entry = of_column * row[k] * column;
+                        for (int other = k; other < 8; other++) *sum++ += weighted * row[other];
+                        *sum++ += entry;
+                        *sum++ += entry * scale;
+                    }
+                    *sum += weight * residual[c] * residual[c];
+                }
+                sums[OTHER_SUMS] += 1.0f;
+                sums[OTHER_SUMS + 1] += cost;
+                sums[OTHER_SUMS + 2] += before;
+                sums[OTHER_SUMS + 3] += share < 1.0f;
+                sums[OTHER_SUMS + 4] += inverse * inverse;
+            }
+    }
+    sums[OTHER_SUMS + 5] = noise;
+    size_t into = get_group_id(0) * (size_t)SUMS;
+    if (ITEMS == 1) {
+        for (int k = 0; k < SUMS; k++) made[into + k] = sums[k];
+        return;
+    }
+    for (int k = 0; k < SUMS; k++) partial[item][k] = sums[k];
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int k = item; k < SUMS; k += ITEMS) {
+        float sum = 0.0f;
+        for (int other = 0; other < ITEMS; other++) sum += partial[other][k];
+        made[into + k] = sum;
+    }
+}
