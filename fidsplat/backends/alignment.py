@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -19,8 +20,10 @@ class AlignmentStage(NamedTuple):
 
     camera: Camera
     """size, intrinsics and lens of the level"""
-    blur: float
-    """standard deviation in pixels of the level"""
+    ignored: np.ndarray | None
+    """(h, w) bool, True for ignored pixels of the level; None: none"""
+    taps: np.ndarray
+    """(r + 1,) float32: the upper half of the symmetric taps of the blur; one for none"""
     side: int
     """side in pixels of the blocks of `AlignmentSums.scores`"""
 
@@ -83,15 +86,16 @@ def noise_factor(channels: int) -> float:
 class AlignmentKernels(ABC):
     """Residuals of an image against rendered frames, and their sums."""
 
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        """held from `load` to the last `sums` of an image"""
+
     @abstractmethod
-    def load(
-        self, image: np.ndarray, ignored: np.ndarray | None, stages: list[AlignmentStage], most: int
-    ) -> list[int]:
+    def load(self, image: np.ndarray, stages: list[AlignmentStage], most: int) -> list[int]:
         """Prepare an image for its stages; returns the numbers of their pixels.
 
         Args:
             image: (h, w, 3) or (h, w, 1) float32 display values.
-            ignored: (h, w) float32, above 0 for ignored pixels; None: none.
             most: maximum number of pixels of a stage; those of the largest gradients are used.
         """
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.alignment import AlignmentKernels
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.probing import Probe
 from fidsplat.backends.termination_depth import TerminationDepths
@@ -56,6 +57,8 @@ class DeviceTraits:
     """`Backend.differentiate`"""
     trains: bool = False
     """`Backend.training`"""
+    aligns: bool = False
+    """`Backend.alignment`"""
     measures_rates: bool = False
     """`Backend.rates`, `memory_bytes` and `release_scratch`, and kernels for the effect `overdraw`"""
     probed: bool = False
@@ -525,6 +528,11 @@ class Backend(ABC):
     def training(self) -> TrainingKernels:
         """Compiled training kernels, without splats. Raises DeviceError if the compiler fails."""
         raise DeviceError(self.lacks("have kernels for training", "train in NumPy"))
+
+    def alignment(self) -> AlignmentKernels:
+        """Compiled kernels of direct image alignment, shared by all callers. Raises DeviceError if the
+        compiler fails."""
+        raise DeviceError(self.lacks("have kernels for image alignment", "align in NumPy"))
 
     def release_scratch(self) -> None:
         """Release the scratch buffers, so that the next frame allocates only what it needs."""

@@ -28,6 +28,7 @@ from fidsplat.backends.alignment import (
 from fidsplat.cameras import Camera
 from fidsplat.cameras.pose_offset import offset_camera
 from fidsplat.util.errors import InputError
+from fidsplat.vision.pyramid import resized, smoothed, taps_of
 
 Render = Callable[[Camera], Any]
 """a Frame with rgb and depth of a camera"""
@@ -75,17 +76,22 @@ class Alignment:
     """(c,) gain of the image relative to the render, by channel"""
 
 
-def stages_of(camera: Camera) -> list[tuple[AlignmentStage, int]]:
+def stages_of(camera: Camera, mask: np.ndarray | None = None) -> list[tuple[AlignmentStage, int]]:
     """Stages from coarse to fine for a camera, with maximum numbers of steps. The first is blurred more, for
     a larger basin of convergence; the last is not blurred, so that its noise is that of the image."""
-    short = min(camera.width, camera.height)
+    short, ignored = min(camera.width, camera.height), _ignored(mask, camera)
     shrinks = [2**k for k in range(MAX_LEVELS) if k == 0 or short >> k >= MIN_SIDE]
     middle = [(shrink, 0.7, 8 if shrink > 2 else 5) for shrink in reversed(shrinks[1:-1])]
     found = []
     for shrink, blur, steps in [(shrinks[-1], 2.0, 10), (shrinks[-1], 1.0, 6), *middle, (1, 0.0, 5)]:
         width, height = camera.width // shrink, camera.height // shrink
         side = max(MIN_BLOCK, min(width, height) // BLOCKS)
-        found.append((AlignmentStage(camera.resampled(width, height), blur, side), steps))
+        hidden = None
+        if ignored is not None:  # pixels whose blur or gradient contains an ignored pixel
+            shares = smoothed(resized(ignored, width, height)[:, :, None], max(blur, 0.7))
+            hidden = shares[:, :, 0] > 1e-3
+        stage = AlignmentStage(camera.resampled(width, height), hidden, taps_of(blur), side)
+        found.append((stage, steps))
     return found
 
 
@@ -107,9 +113,20 @@ def align(
         kernels: sums over pixels.
         coarse: the stages of the coarsest level only, without a covariance.
     """
-    stages = stages_of(start)[: COARSE if coarse else None]
-    ignored = _ignored(mask, start)
-    counts = kernels.load(image, ignored, [stage for stage, _ in stages], MAX_PIXELS)
+    stages = stages_of(start, mask)[: COARSE if coarse else None]
+    with kernels.lock:
+        return _align(image, start, render, kernels, stages, coarse)
+
+
+def _align(
+    image: np.ndarray,
+    start: Camera,
+    render: Render,
+    kernels: AlignmentKernels,
+    stages: list[tuple[AlignmentStage, int]],
+    coarse: bool,
+) -> Alignment:
+    counts = kernels.load(image, [stage for stage, _ in stages], MAX_PIXELS)
     if not all(counts):
         camera = stages[counts.index(0)][0].camera
         raise InputError(
@@ -119,11 +136,10 @@ def align(
     channels = image.shape[2]
     at = _State(start, AlignmentFit(np.ones(channels), np.zeros(channels), huber=True))
     for number, (stage, steps) in enumerate(stages):
-        settled = _SETTLED if stage.blur else _SETTLED_FINE
-        at = _minimise(at, _Stage(number, stage.camera, render, kernels), steps, settled)
+        at = _minimise(at, _Stage(number, stage.camera, len(stage.taps) > 1, render, kernels), steps)
     if coarse:
         return Alignment(at.camera, np.full((6, 6), np.nan), 0.0, at.noise, at.fit.gain)
-    return _finish(at, _Stage(len(stages) - 1, start, render, kernels))
+    return _finish(at, _Stage(len(stages) - 1, start, False, render, kernels))
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,9 +150,9 @@ class _State:
     fit: AlignmentFit
     noise: float = 0.0
 
-    def moved(self, sums: AlignmentSums, step: np.ndarray) -> _State:
-        """The estimate after a step (6 + 2 c,) of pose and exposure."""
-        gains, offsets = (1 + step[6::2], step[7::2]) if not self.fit.huber else _exposure_of(sums)
+    def moved(self, sums: AlignmentSums, step: np.ndarray, blurred: bool = False) -> _State:
+        """The estimate after a step (6 + 2 c,) of pose and exposure. blurred: whether noise is negligible."""
+        gains, offsets = _exposure_of(sums) if blurred else (1 + step[6::2], step[7::2])
         fit = self.fit._replace(
             gain=np.clip(self.fit.gain * gains, *GAINS), offset=self.fit.offset + self.fit.gain * offsets
         )
@@ -147,6 +163,7 @@ class _State:
 class _Stage:
     number: int
     camera: Camera
+    blurred: bool
     render: Render
     kernels: AlignmentKernels
 
@@ -164,18 +181,18 @@ class _Stage:
         return max(self.camera.fx, self.camera.fy) * math.sqrt(turn + shift * sums.inverse_depth)
 
 
-def _minimise(at: _State, stage: _Stage, steps: int, settled: float) -> _State:
+def _minimise(at: _State, stage: _Stage, steps: int) -> _State:
     """Levenberg-Marquardt at one stage. The last step is not checked by a render."""
     damping, frame = _DAMPING, stage.frame(at.camera)
     if not at.noise:  # the exposure is unknown: its first estimates weigh all pixels alike
         for _ in range(3):
             sums = stage.sums(frame, at, noise=0.0)
-            at = at.moved(sums, np.zeros(6))
+            at = at.moved(sums, np.zeros(6), blurred=True)
     sums = stage.sums(frame, at)
     for number in range(steps):
         step = _solved(sums, damping)
-        tried, size = at.moved(sums, step), stage.pixels(step[:6], sums)
-        if size < settled or number == steps - 1:
+        tried, size = at.moved(sums, step, stage.blurred), stage.pixels(step[:6], sums)
+        if size < (_SETTLED if stage.blurred else _SETTLED_FINE) or number == steps - 1:
             return tried
         found = stage.sums(stage.frame(tried.camera), tried, sums.noise)
         if found.cost_before <= sums.cost:
@@ -188,25 +205,22 @@ def _minimise(at: _State, stage: _Stage, steps: int, settled: float) -> _State:
 def _finish(at: _State, stage: _Stage) -> Alignment:
     """Newton's method for Tukey's loss, and the covariance. The derivative of the score is that of the first
     step. Infinite covariance if the pixels do not determine the pose."""
-    at, before, inverse = _State(at.camera, at.fit._replace(huber=False)), None, None
+    at, noise, inverse = _State(at.camera, at.fit._replace(huber=False)), 0.0, None
+    covariance = np.diag(np.full(6, np.inf))
     for _ in range(_LAST_STEPS):
         frame = stage.frame(at.camera)
-        sums = stage.sums(frame, at, 0.0 if before is None else before[1].noise, blocks=True)
-        if before is not None and sums.cost_before > before[1].cost:
-            at, sums = before
-            break
+        sums = stage.sums(frame, at, noise, blocks=True)
         inverse = _inverse(sums, _bread(at, sums, stage, frame)) if inverse is None else inverse
         if inverse is None:
             break
         covariance, step = _covariance(sums, inverse), inverse @ _right(sums)
-        before, at = (at, sums), at.moved(sums, step)
+        at, noise = at.moved(sums, step), sums.noise
         square = step[:6] @ np.linalg.lstsq(covariance, step[:6], rcond=None)[0]
         if square < _REPEATED**2 and stage.pixels(step[:6], sums) < _REPEATED_PIXELS:
             break
     # an image without the scene's contrast fits a render whose contrast the smallest gain removes
     inliers = sums.inliers if (at.fit.gain > GAINS[0]).any() else 0.0
-    found = np.diag(np.full(6, np.inf)) if inverse is None else _covariance(sums, inverse)
-    return Alignment(at.camera, found, inliers, sums.noise, at.fit.gain)
+    return Alignment(at.camera, covariance, inliers, sums.noise, at.fit.gain)
 
 
 def _bread(at: _State, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.ndarray:

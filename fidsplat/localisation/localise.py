@@ -15,7 +15,7 @@ from fidsplat.capture.sensor import Sensor
 from fidsplat.images.files import pixels_of
 from fidsplat.localisation.direct_alignment import MIN_INLIERS, align
 from fidsplat.localisation.initial_pose import most_similar, pose_of_markers
-from fidsplat.localisation.normal_equations import HostAlignment
+from fidsplat.localisation.normal_equations import alignment_kernels
 from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
@@ -152,7 +152,7 @@ def localise(
     def render(at: Camera) -> Frame:
         return renderer.render(uploaded, capture.with_(camera=at))
 
-    kernels = HostAlignment()
+    kernels = alignment_kernels(renderer, uploaded)
 
     source, starts = "start", []
     if start is not None:

@@ -22,17 +22,25 @@ from fidsplat.backends.alignment import (
     least_bin,
     noise_factor,
 )
-from fidsplat.vision.pyramid import resized, smoothed
+from fidsplat.render.renderer import Renderer
+from fidsplat.render.resident import ResidentCloud
+from fidsplat.streaming.residency import Residency
+from fidsplat.vision.pyramid import convolved, resized
+
+
+def alignment_kernels(renderer: Renderer, resident: ResidentCloud) -> AlignmentKernels:
+    """Kernels of the device if it has them, else NumPy; also for stores, whose frames may be on the host."""
+    if renderer.backend.traits.aligns and not isinstance(resident.data, Residency):
+        return renderer.backend.alignment()
+    return HostAlignment()
 
 
 class HostAlignment(AlignmentKernels):
     """Sums on the host over the textured pixels of a stage, which are rows."""
 
-    def load(
-        self, image: np.ndarray, ignored: np.ndarray | None, stages: list[AlignmentStage], most: int
-    ) -> list[int]:
+    def load(self, image: np.ndarray, stages: list[AlignmentStage], most: int) -> list[int]:
         """Prepare the image for its stages."""
-        self._targets = [_Target(image, ignored, stage, most) for stage in stages]
+        self._targets = [_Target(image, stage, most) for stage in stages]
         self._rendered: tuple[Any, ...] = ()
         return [len(target.rows) for target in self._targets]
 
@@ -98,18 +106,15 @@ class HostAlignment(AlignmentKernels):
 class _Target:
     """The image at one stage, at its textured pixels."""
 
-    def __init__(
-        self, image: np.ndarray, ignored: np.ndarray | None, stage: AlignmentStage, most: int
-    ) -> None:
-        camera, self.blur = stage.camera, stage.blur
+    def __init__(self, image: np.ndarray, stage: AlignmentStage, most: int) -> None:
+        camera, self.taps = stage.camera, stage.taps
         width, height = camera.width, camera.height
-        values = smoothed(resized(image, width, height), stage.blur)
+        values = convolved(resized(image, width, height), stage.taps)
         bins = np.zeros((height, width), np.int64)
         across, down = values[1:-1, 2:] - values[1:-1, :-2], values[2:, 1:-1] - values[:-2, 1:-1]
         bins[1:-1, 1:-1] = bins_of(np.sqrt((across * across + down * down).sum(axis=2)) / 2)
-        if ignored is not None:  # its blur has the radius of the image's blur and gradient
-            hidden = smoothed(resized(ignored, width, height)[:, :, None], max(stage.blur, 0.7))
-            bins[hidden[:, :, 0] > 1e-3] = 0
+        if stage.ignored is not None:
+            bins[stage.ignored] = 0
         self.rows = rows = np.flatnonzero(bins >= least_bin(np.bincount(bins.ravel(), minlength=BINS), most))
         self.values, self.slopes = _at(values, rows), _slopes(values, rows)
         y, x = np.divmod(rows, width)
@@ -133,7 +138,7 @@ class _Target:
         """(h, w, c) colours of a frame with the blur and the channels of the image."""
         rgb = frame["rgb"]
         rgb = rgb.mean(axis=2, keepdims=True) if len(self.values) == 1 else rgb
-        return smoothed(np.ascontiguousarray(rgb), self.blur)
+        return convolved(np.ascontiguousarray(rgb), self.taps)
 
 
 def _robust(error: np.ndarray, noise: float, huber: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -92,6 +92,11 @@ class Frame(ArrayExport):
             )
         return self._images.device_array(name, self._index)
 
+    @property
+    def images(self) -> Images:
+        """The backend's images, of which this frame is the first, for kernels of the backend."""
+        return self._images
+
     def to_uint8(self) -> np.ndarray:
         """`rgb` as 8-bit colours, (h, w, 3) uint8: clamped to [0, 1], times 255, rounded to the nearest; NaN
         becomes 0. It is converted on the device if possible, so that a quarter of the bytes is copied, and is

@@ -289,13 +289,13 @@ class Trainer:
         """The capture of a view at the pose at which the splats match its image; unchanged if none does."""
         # here, since it imports detectors, which other trainings do not need
         from fidsplat.localisation.direct_alignment import MIN_INLIERS, align
-        from fidsplat.localisation.normal_equations import HostAlignment
+        from fidsplat.localisation.normal_equations import alignment_kernels
 
         def render(camera: Camera) -> Frame:
             return self.renderer.render(resident, capture.with_(camera=camera, outputs=("rgb", "depth")))
 
         image = view.image.astype(np.float32) / 255
-        found = align(image, view.mask, view.camera, render, HostAlignment())
+        found = align(image, view.mask, view.camera, render, alignment_kernels(self.renderer, resident))
         return capture.with_(camera=found.camera) if found.inliers >= MIN_INLIERS else capture
 
     def _advance(self, late: bool) -> None:

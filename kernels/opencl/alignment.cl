@@ -1,10 +1,11 @@
 // Direct image alignment: residuals of an image against a render, and the sums of the normal equations of the camera pose. NumPy
 // version: fidsplat/localisation/normal_equations.py.
 // ITEMS   work-items of a group: 1 on CPUs
-// SUMS    numbers of a group (`AlignmentSums` of fidsplat/backends/alignment.py, packed by fidsplat/backends/opencl/alignment.py)
+// SUMS    numbers of a group, CHANNEL_SUMS of each of three channels: `_unpacked` of fidsplat/backends/opencl/alignment.py
+// LOWEST  number of the first bin in the upper bits of a float
+#pragma OPENCL FP_CONTRACT OFF
 #define ROW_ITEMS (ITEMS < 16 ? ITEMS : 16)
 #define BINS 256
-#define CHANNEL_SUMS 53
 #define OTHER_SUMS (3 * CHANNEL_SUMS)
 
 // Bin of a positive number: 16 bins per octave from 2^-14 on.
@@ -94,7 +95,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_texture(
             bins[i] = (uchar)bin;
             COUNT(own, bin);
         }
-    add_bins(own, counts);
+    add_bins(own, counts + row * BINS);
 }
 
 // Residuals of a pixel: image, without gain and offset, minus render. Returns their root mean square.
@@ -232,7 +233,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                 sums[OTHER_SUMS + 4] += inverse * inverse;
             }
     }
-    sums[OTHER_SUMS + 5] = noise;
+    sums[OTHER_SUMS + 5] = item == 0 ? noise : 0.0f;
     size_t into = get_group_id(0) * (size_t)SUMS;
     if (ITEMS == 1) {
         for (int k = 0; k < SUMS; k++) made[into + k] = sums[k];

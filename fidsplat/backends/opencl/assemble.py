@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fidsplat.backends import alignment
 from fidsplat.backends.opencl.declare import (
     Argument,
     Layout,
@@ -68,6 +69,8 @@ _STEP = (
     *("train/activation_functions", "train/adam", "project_step"),
 )
 _TRAINING = ("surface", "exposure", "activation_functions", "activate", "gather_rows", "position_noise")
+CHANNEL_SUMS, ALL_SUMS = 53, 165
+"""numbers of a channel and of all sums of direct image alignment (kernels/opencl/alignment.cl)"""
 _HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")
 _HOOKS = re.compile(r"^[ \t]*//@@ (\w+)(?: \w+)?[ \t]*$", re.MULTILINE)
 _COMMENT = re.compile(r"[ \t]*//.*")
@@ -276,6 +279,17 @@ def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> Source:
     return Assembler((), declared, numbers).source({"training": stages})
 
 
+@cache
+def assemble_alignment(items: int) -> Source:
+    """Source of the kernels of direct image alignment, for work-groups of so many items."""
+    numbers: dict[str, int | str] = {"CHANNEL_SUMS": CHANNEL_SUMS, "ITEMS": items, "SUMS": ALL_SUMS}
+    numbers |= {"LOWEST": alignment.LOWEST}
+    for name in ("HUBER", "TUKEY", "MIN_NOISE", "MAX_NOISE"):
+        numbers[name] = f"{getattr(alignment, name)}f"
+    declared = Declarations(Scalars("float", "float"))
+    return Assembler((), declared, numbers).source({"alignment": ("alignment",)})
+
+
 def assemble_check(file: str, shape: DeviceShape, float64: bool, effects: Iterable[str] = ()) -> str:
     """The text of a test kernel file below kernels/opencl/, preceded by prelude.cl and math.cl.
 
@@ -338,7 +352,9 @@ def numbers_of(features: FeatureSet, shape: DeviceShape) -> dict[str, int]:
 class Assembler:
     """Assembles programs from stage files; effects' files and declarations fill their hooks."""
 
-    def __init__(self, files: Iterable[str], declared: Declarations, defines: Mapping[str, int]) -> None:
+    def __init__(
+        self, files: Iterable[str], declared: Declarations, defines: Mapping[str, int | str]
+    ) -> None:
         """files: effect files below kernels/opencl/, in the order in which they fill a hook."""
         self._sections = {file: sections_of(file) for file in files if file}
         self._declared, self._defines = declared, defines

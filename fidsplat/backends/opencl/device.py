@@ -11,6 +11,7 @@ import pyopencl as cl
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.checked_cache import check_once
 from fidsplat.backends.interface import Backend, ChunkedScene, DeviceInfo, DeviceTraits, Rates
+from fidsplat.backends.opencl.alignment import OpenCLAlignment
 from fidsplat.backends.opencl.assemble import Source, assemble
 from fidsplat.backends.opencl.background_compiler import BackgroundCompiler
 from fidsplat.backends.opencl.chunk_cache import OpenCLChunkCache
@@ -98,6 +99,7 @@ class OpenCLBackend(Workspace, Backend):
         termination_depths=True,
         differentiates=True,
         trains=True,
+        aligns=True,
         measures_rates=True,
         probed=True,
     )
@@ -114,6 +116,7 @@ class OpenCLBackend(Workspace, Backend):
         self.compiler_options = build_options(device)
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
         self._gradients: dict[OpenCLPipeline, OpenCLGradients] = {}
+        self._alignment: OpenCLAlignment | None = None
         self._background = BackgroundCompiler()
         self._requested: tuple[DeviceShape, dict[tuple[FeatureSet, DeviceShape | None], OpenCLPipeline]] = (
             self.shape,
@@ -197,6 +200,13 @@ class OpenCLBackend(Workspace, Backend):
     def training(self) -> OpenCLTraining:
         """Compiled training kernels, without splats."""
         return OpenCLTraining(self)
+
+    def alignment(self) -> OpenCLAlignment:
+        """Compiled kernels of direct image alignment."""
+        with self.lock:
+            if self._alignment is None:
+                self._alignment = OpenCLAlignment(self)
+            return self._alignment
 
     def _key(self, features: FeatureSet, shape: DeviceShape | None) -> tuple[FeatureSet, DeviceShape]:
         if not self.info.float64 and features.setup_precision != "float32":

@@ -116,7 +116,7 @@ class OpenCLImages(Images):
         with self._workspace.failing(f"rendering {name}"):
             after = self._done()
             # on another queue than frames, where the copy would wait for the next frame
-            queue, image = self._workspace.read_queue, self._buffer(name)
+            queue, image = self._workspace.read_queue, self.buffer(name)
             cl.enqueue_copy(queue, into, image, src_offset=offset, wait_for=after)
 
     def _shape(self, name: str) -> tuple[int, ...]:
@@ -124,7 +124,7 @@ class OpenCLImages(Images):
         channels = self._outputs[name].channels
         return self._size if channels == 1 else (*self._size, channels)
 
-    def _buffer(self, name: str) -> cl.Buffer:
+    def buffer(self, name: str) -> cl.Buffer:
         """The images of all views."""
         return self.complete()[0].buffer(f"{name}_out") if self._batch is None else self._batch[name][1]
 
@@ -137,7 +137,7 @@ class OpenCLImages(Images):
     def read_uint8(self, name: str, index: int = 0) -> np.ndarray:
         """Copy an image converted to 8 bits. Raises DeviceError if the device has failed."""
         with self._workspace.failing(f"rendering {name}"):
-            return read_uint8(self._workspace, self._buffer(name), index, self._shape(name), self._done())
+            return read_uint8(self._workspace, self.buffer(name), index, self._shape(name), self._done())
 
     def device_array(self, name: str, index: int | None = None) -> Any:
         """The images as a pyopencl.array.Array (views, h, w) or (views, h, w, channels); no copy."""
@@ -146,7 +146,7 @@ class OpenCLImages(Images):
         from pyopencl.array import Array
 
         shape, dtype = (self.views, *self._shape(name)), np.dtype(self._outputs[name].dtype)
-        buffer: Any = cl.MemoryObject.from_int_ptr(self._buffer(name).int_ptr)
+        buffer: Any = cl.MemoryObject.from_int_ptr(self.buffer(name).int_ptr)
         # the array and its views keep these images alive, so that the pool does not reuse their buffers
         buffer.images = self
         return Array(self._workspace.queue, shape, dtype, data=buffer)
@@ -203,7 +203,7 @@ class OpenCLImages(Images):
             for output in self._outputs.values():
                 width = 4 * output.channels  # bytes of a pixel
                 row_bytes = self._size[1] * width
-                source, target = other._buffer(output.name), self._buffer(output.name)
+                source, target = other.buffer(output.name), self.buffer(output.name)
                 for top, bottom, left, right in self._rectangles(tiles):
                     region, corner = ((right - left) * width, bottom - top, 1), (left * width, top, 0)
                     pitches = (row_bytes, row_bytes * self._size[0])

@@ -121,6 +121,10 @@ _LOSS_SIZE = takes(
     "uint image_stride  // floats of an image",
 )
 _MASK = takes("int masked", "in uchar mask  // (rows, pixels), where `masked`")
+_ALIGNED = takes(
+    *("int width height channels", "uint least  // the lowest bin of textured pixels"),
+    *(_EXPOSURE, "in uchar bins", "in float image rgb"),
+)
 _IMAGES = takes("out float images")
 _SURFACE = takes(
     _IMAGE_SIZE,
@@ -253,6 +257,29 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "add_up": takes(
         *("uint tiles groups", "in real tile_sums group_sums  // (tiles, 3), (groups, 10)"),
         "out float background pose intrinsics",
+    ),
+    # direct image alignment
+    "align_shrink": takes(
+        *("int width height channels full_width full_height", "float ratio_x ratio_y"),
+        *("in float image", "out float made"),
+    ),
+    "align_blur": takes(
+        "int width height channels vertical radius",
+        "in float taps  // (radius + 1)",
+        *("in float image", "out float made"),
+    ),
+    "align_texture": takes(
+        *("int width height channels row", _MASK, "in float image", "out uchar bins"),
+        "out uint counts  // (stages, BINS); row: the stage",
+    ),
+    "align_errors": takes(_ALIGNED, "out uint counts  // (BINS)"),
+    "align_sums": takes(
+        _ALIGNED,
+        "in uint counts",
+        "int side huber moves axis lens  // moves: whether there is a moved render",
+        "float focal_x focal_y center_x center_y noise_factor noise_before step",
+        "in float depth rays moved",
+        "out float made  // (work-groups, SUMS)",
     ),
     # training
     "loss_take": takes(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK, _IMAGES),

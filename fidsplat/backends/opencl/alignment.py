@@ -1,0 +1,190 @@
+"""Direct image alignment on an OpenCL device (kernels/opencl/alignment.cl)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.alignment import (
+    BINS,
+    AlignmentFit,
+    AlignmentKernels,
+    AlignmentStage,
+    AlignmentSums,
+    least_bin,
+    noise_factor,
+)
+from fidsplat.backends.opencl.assemble import ALL_SUMS, CHANNEL_SUMS, assemble_alignment
+from fidsplat.backends.opencl.command_list import CommandList
+from fidsplat.backends.opencl.program import Program
+from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.cameras.raster import raster_of
+
+_GROUPS = 128
+"""maximum number of work-groups of a sum"""
+_UPPER = np.triu_indices(8)
+
+
+class OpenCLAlignment(AlignmentKernels):
+    """Kernels of direct image alignment on an OpenCL device."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__()
+        self._workspace = workspace
+        self._items = 1 if workspace.shape.schedule == "lanes" else 32
+        self._program = Program(workspace, assemble_alignment(self._items))
+        self._commands = CommandList(self._program)
+        self._stages: list[dict[str, Any]] = []
+        """arguments of the kernels by stage"""
+
+    def load(self, image: np.ndarray, stages: list[AlignmentStage], most: int) -> list[int]:
+        """Prepare the image for its stages."""
+        with self._workspace.lock, self._workspace.failing("localising"):
+            full = self._put("image", image)
+            self._stages = []
+            counted = self._scratch("textures", 4 * BINS * len(stages))
+            cl.enqueue_fill_buffer(self._queue, counted, np.zeros(1, np.uint32), 0, 4 * BINS * len(stages))
+            for number, stage in enumerate(stages):
+                self._stages.append(self._prepared(number, stage, full, image.shape, counted))
+            counts = np.empty((len(stages), BINS), np.uint32)
+            cl.enqueue_copy(self._queue, counts, counted)
+        found = []
+        for given, own in zip(self._stages, counts.astype(np.int64), strict=True):
+            given["least"] = least = least_bin(own, most)
+            found.append(int(own[least:].sum()))
+        return found
+
+    def _prepared(
+        self, number: int, stage: AlignmentStage, full: cl.Buffer, shape: tuple[int, ...], counted: cl.Buffer
+    ) -> dict[str, Any]:
+        """Arguments of the kernels for a stage; its image and its textures are computed."""
+        camera, (full_height, full_width, channels) = stage.camera, shape
+        width, height, size = camera.width, camera.height, 4 * camera.width * camera.height
+        given = {
+            **{"width": width, "height": height, "channels": channels, "side": stage.side},
+            **{"full_width": full_width, "full_height": full_height},
+            **{"ratio_x": full_width / width, "ratio_y": full_height / height},
+            **{"focal_x": camera.fx, "focal_y": camera.fy, "center_x": camera.cx, "center_y": camera.cy},
+            **{"lens": int(camera.lens is not None), "rays": full, "taps": full, "mask": full},
+            **{"masked": int(stage.ignored is not None), "radius": len(stage.taps) - 1, "row": number},
+            "bins": self._scratch(f"bins {number}", size // 4),
+            "counts": counted,
+        }
+        if camera.lens is not None:
+            raster = raster_of(camera.lens, width, height, camera.fx, camera.fy, camera.cx, camera.cy)
+            given["rays"] = self._put(f"rays {number}", raster.rays)
+        if stage.ignored is not None:
+            given["mask"] = self._put(f"mask {number}", stage.ignored.astype(np.uint8))
+        if given["radius"]:
+            given["taps"] = self._put(f"taps {number}", stage.taps)
+        made = self._scratch(f"image {number}", channels * size)
+        self._over_pixels("align_shrink", {**given, "image": full, "made": made})
+        given["image"] = self._blurred(made, given, f"image {number}", channels)
+        self._by_groups("align_texture", self._rows(height), given)
+        return given
+
+    def sums(
+        self,
+        stage: int,
+        frame: Any,
+        fit: AlignmentFit,
+        moved: tuple[Any, float, int] | None = None,
+        blocks: bool = False,
+    ) -> AlignmentSums:
+        """Sums over the pixels of a stage."""
+        given, channels = self._stages[stage], len(fit.gain)
+        height, width, side = given["height"], given["width"], given["side"]
+        count = -(-height // side) * -(-width // side)
+        groups = count if blocks else min(count, _GROUPS)
+        rgb, depth = (frame.images.buffer(name) for name in ("rgb", "depth"))
+        other, step, axis = (frame, 1.0, 0) if moved is None else moved
+        moved_rgb = rgb if moved is None else other.images.buffer("rgb")
+        with self._workspace.lock, self._workspace.failing("localising"):
+            values = self._blurred(rgb, given, "render", 3)
+            if moved is not None:
+                moved_rgb = self._blurred(moved_rgb, given, "moved render", 3)
+            counts = self._scratch("errors", 4 * BINS)
+            cl.enqueue_fill_buffer(self._queue, counts, np.zeros(1, np.uint32), 0, 4 * BINS)
+            made = self._scratch("sums", 4 * groups * ALL_SUMS)
+            exposure = np.ones((2, 3))
+            exposure[:, :channels] = fit.gain, fit.offset
+            names = (f"{kind}_{name}" for kind in ("gain", "offset") for name in ("red", "green", "blue"))
+            given = given | dict(zip(names, exposure.ravel().tolist(), strict=True))
+            given |= {"rgb": values, "depth": depth, "counts": counts, "row": 0, "made": made}
+            given |= {"moved": moved_rgb, "moves": int(moved is not None), "step": step, "axis": axis}
+            given |= {"huber": int(fit.huber), "noise_before": fit.noise}
+            given["noise_factor"] = noise_factor(channels)
+            self._by_groups("align_errors", self._rows(height), given)
+            self._by_groups("align_sums", groups, given)
+            packed = np.empty((groups, ALL_SUMS), np.float32)
+            cl.enqueue_copy(self._queue, packed, made)
+        return _unpacked(packed, channels, blocks)
+
+    @property
+    def _queue(self) -> cl.CommandQueue:
+        return self._workspace.switch_to(self._workspace.queue)
+
+    def _rows(self, height: int) -> int:
+        return min(height, _GROUPS)
+
+    def _blurred(self, image: cl.Buffer, given: dict[str, Any], name: str, channels: int) -> cl.Buffer:
+        """An image convolved with the taps of a stage; the image itself without blur."""
+        if not given["radius"]:
+            return image
+        for vertical in (0, 1):
+            size = 4 * channels * given["width"] * given["height"]
+            made = self._scratch(f"blurred {vertical} {name}", size)
+            own = {"image": image, "made": made, "vertical": vertical, "channels": channels}
+            self._over_pixels("align_blur", given | own)
+            image = made
+        return image
+
+    def _over_pixels(self, kernel: str, given: dict[str, Any]) -> None:
+        size = -(-given["width"] // 64) * 64, given["height"]
+        self._launch(kernel, size, (64, 1), given)
+
+    def _by_groups(self, kernel: str, groups: int, given: dict[str, Any]) -> None:
+        self._launch(kernel, (groups * self._items,), (self._items,), given)
+
+    def _launch(
+        self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: dict[str, Any]
+    ) -> None:
+        values = [given[one.name] for one in self._program.source.arguments[kernel]]
+        self._commands.clear()
+        self._commands.launch(self._queue, kernel, size, group, values)
+
+    def _scratch(self, name: str, size: int) -> cl.Buffer:
+        return self._workspace.pool.scratch(f"alignment: {name}", size)
+
+    def _put(self, name: str, array: np.ndarray) -> cl.Buffer:
+        """A copy of an array; a read-only array is not copied again."""
+        name, array = f"alignment: {name}", np.ascontiguousarray(array)
+        buffer, event = self._workspace.pool.put(self._queue, name, array)
+        if event is not None:
+            event.wait()
+        return buffer
+
+
+def _unpacked(packed: np.ndarray, channels: int, blocks: bool) -> AlignmentSums:
+    """Sums of the work-groups: for each channel, row by row of the upper triangle, the matrix and two right
+    sides; the weighted squares; then the other sums."""
+    parts = packed[:, : channels * CHANNEL_SUMS].reshape(len(packed), channels, CHANNEL_SUMS)
+    total, others = parts.sum(axis=0, dtype=float), packed[:, 3 * CHANNEL_SUMS :].astype(float)
+    matrix, ends = np.zeros((channels, 8, 8)), np.cumsum(np.arange(10, 2, -1))
+    upper = np.setdiff1d(np.arange(ends[-1]), [ends - 2, ends - 1])
+    matrix[:, _UPPER[0], _UPPER[1]] = matrix[:, _UPPER[1], _UPPER[0]] = total[:, upper]
+    sums = others.sum(axis=0)
+    _, cost, before, inliers, inverse_depth, _ = (sums / max(sums[0], 1)).tolist()
+    return AlignmentSums(
+        matrix,
+        np.stack([total[:, ends - 2], total[:, ends - 1]], axis=2),
+        total[:, -1],
+        parts[others[:, 0] > 0][:, :, ends - 2].astype(float) if blocks else np.empty((0, channels, 8)),
+        cost,
+        before,
+        inliers,
+        inverse_depth,
+        float(others[0, 5]),
+    )
