@@ -115,8 +115,7 @@ def save_trajectory(
     elif suffix == ".kitti":
         text = _rows(trajectory.poses[:, :3, :].reshape(-1, 12))
     else:
-        text = json.dumps(_transforms_json(trajectory, _camera(camera, file), names), indent=2) + "
-"
+        text = json.dumps(_transforms_json(trajectory, _camera(camera, file), names), indent=2) + "\n"
     write_file(file, text)
 
 

@@ -24,13 +24,12 @@ from fidsplat.backends.alignment import (
 )
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
-from fidsplat.streaming.residency import Residency
 from fidsplat.vision.pyramid import convolved, resized
 
 
 def alignment_kernels(renderer: Renderer, resident: ResidentCloud) -> AlignmentKernels:
     """Kernels of the device if it has them, else NumPy; also for stores, whose frames may be on the host."""
-    if renderer.backend.traits.aligns and not isinstance(resident.data, Residency):
+    if renderer.backend.traits.aligns and resident.data is resident.complete:
         return renderer.backend.alignment()
     return HostAlignment()
 
