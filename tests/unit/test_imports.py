@@ -192,6 +192,7 @@ def within_any(names, package) -> bool:
 
 # modules of the package that every backend may import
 SHARED = (
+    "alignment",
     "interface",
     "batched_views",
     "blank",
