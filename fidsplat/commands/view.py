@@ -117,7 +117,7 @@ class Target:
     training: Training | None = None
 
     def scene(self, quality: str | None, progress: Progress, pose: StartPose = OWN_POSE) -> Scene:
-        """The scene, at a quality and from a pose that replace its own if they are given."""
+        """The scene, with a given quality and pose instead of those of its file."""
         from fidsplat.scenes.sources import load_source
         from fidsplat.worlds.yard import demo_scene
 

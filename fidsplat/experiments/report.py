@@ -287,7 +287,7 @@ def _panels(
 TRAINING_SECONDS = {3: 423.0, 5: 392.0, 9: 386.0, 17: 371.0}
 """table 2: mean training time of 2DGS by number of views"""
 CONSTRUCTION_SECONDS = 1.04
-"""table 2: its own method, over all categories"""
+"""table 2: mean of the paper's method over all categories"""
 
 ANGLES = {
     "small": {"ours": (80.0, 80.0), 3: (73.8, 60.0), 5: (79.4, 68.2), 9: (81.6, 75.4), 17: (81.0, 79.0)},

@@ -157,7 +157,7 @@ class View:
 
     @property
     def complete_scene(self) -> Scene:
-        """The scene with the marker, its lights and what covers it."""
+        """The scene with the marker, its lights and the object that covers it."""
         light = self.placed.light
         camera = self.camera if isinstance(light, Lighting) and light.view == "camera" else None
         return _assembled(self.scene, self.placed, self.cover, self.lights, camera)

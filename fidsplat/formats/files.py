@@ -92,7 +92,7 @@ def load_splats(path: str | os.PathLike[str], progress: Progress | None = None) 
 
 
 def save_splats(cloud: SplatCloud, path: str | os.PathLike[str]) -> None:
-    """Write splats in the format of the file's suffix; `losses` lists what that format cannot store.
+    """Write splats in the format of the file's suffix; `losses` lists the data that this format cannot store.
 
     Raises InputError for an unknown or read-only suffix, boxes, or a file that cannot be written.
     """
@@ -115,7 +115,7 @@ def check_writable(path: str | os.PathLike[str]) -> Format:
 
 
 def losses(cloud: SplatCloud, path: str | os.PathLike[str]) -> list[str]:
-    """Descriptions of what a file's format loses of a cloud; empty if the round trip is lossless."""
+    """Descriptions of the data of a cloud that a file's format loses; empty if the round trip is lossless."""
     known, found = format_of(path), []
     if cloud.sh_degree > 0 and not known.harmonics:
         found.append(f"SH of degree {cloud.sh_degree}: colours do not change with the view")

@@ -352,7 +352,7 @@ def _decode(data: bytes, name: str | os.PathLike[str], flags: int) -> np.ndarray
 
 @contextlib.contextmanager
 def _silent_opencv() -> Iterator[None]:
-    """Discard what OpenCV, libpng and FFmpeg write to stderr about a damaged file; our error reports it."""
+    """Discard messages of OpenCV, libpng and FFmpeg on stderr about a damaged file; our error reports it."""
     if hasattr(cv2, "setLogLevel"):  # OpenCV 4
         read, write = cv2.getLogLevel, cv2.setLogLevel  # type: ignore[attr-defined]
     else:

@@ -59,7 +59,7 @@ class RobotLog:
         self._file: LogFile = log_file(path, self._store, overwrite, source)
 
     def _begin(self, world: str, up: Any) -> None:
-        """Set what does not depend on where the messages go."""
+        """Set the fields that do not depend on the destination of the messages."""
         self.world_from_scene: Any = None if up is None else _upright(up)
         """rotation (4, 4) of the scene in the world; None without `up`"""
         self._store, self.world = typestore(), world

@@ -15,7 +15,7 @@ Item = TypeVar("Item", bound=Hashable)
 
 
 class WorkerLost(Exception):
-    """The process of an item died; the text states what is known."""
+    """The process of an item died; the text is the known cause."""
 
 
 class Engine(Protocol):

@@ -1,4 +1,4 @@
-"""Off-the-shelf detectors with their defaults, for experiments that compare what they detect and decode.
+"""Off-the-shelf detectors with their defaults, for experiments that compare their detections.
 
 `detect` combines detectors and refines corners.
 """

@@ -22,7 +22,7 @@ BASE = TIMED.with_(marker=MarkerQuality("fitted"))
 """baseline of all comparisons: the cut-off and stop of other renderers with our rules; independent of presets
 and defaults"""
 EXACT = Quality(alpha_cutoff=1e-6, transmittance_stop=0.0, arithmetic="precise", marker=BASE.marker)
-"""reference quality in float32; a constant changed only here shows its own error"""
+"""reference quality in float32; one constant changed in it shows the error of this constant"""
 SHARP = {"lowpass": "none", "samples": 3}
 """quality of markers: exact splats, the mean of 3 x 3 samples"""
 
