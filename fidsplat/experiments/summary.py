@@ -1,15 +1,13 @@
 """Results as small CSV tables, preceded by lines with facts of the runs.
 
 A summary has a row for each result, with the `amount` of measurements in it and the number of its `run`.
-Lines that begin with "# " hold the facts of the runs, notes, and two lists of columns: `empty` columns, and
-`repeated` columns, where an empty cell has the text of the cell above.
+Lines that begin with "# " hold the facts of the runs, and notes.
 """
 
 from __future__ import annotations
 
 import io
 import json
-import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -46,15 +44,9 @@ class Summary:
 
         Raises InputError when the file cannot be written.
         """
-        empty = [name for name in self.rows if len(self.rows) and self.rows[name].isna().all()]
-        rows = self.rows.drop(columns=empty)
-        repeated = [name for name in rows if _has_text(rows[name])]
         lines = [{"run": run} for run in self.runs] + [{"note": note} for note in self.notes]
-        lines += [{name: names} for name, names in (("empty", empty), ("repeated", repeated)) if names]
-        for name in repeated:
-            rows[name] = rows[name].mask(rows[name].eq(rows[name].shift()), "")
         text = "".join(f"{_MARK}{json.dumps(line)}\n" for line in lines)
-        text += rows.to_csv(index=False, float_format="%.4g", lineterminator="\n")
+        text += self.rows.to_csv(index=False, float_format="%.4g", lineterminator="\n")
         write_file(file, text)
         return read_summary(file)
 
@@ -83,28 +75,19 @@ def read_summary(file: Path) -> Summary:
         facts = [from_json(line.removeprefix(_MARK)) for line in lines if line.startswith(_MARK)]
         if not all(isinstance(one, dict) for one in facts):
             raise ValueError("the lines before its table must be facts")
-        repeated = [name for one in facts for name in one.get("repeated", ())]
-        # only empty cells are missing values: "None" is text, and a column of texts may contain numbers
-        rows = pd.read_csv(
-            io.StringIO("\n".join(lines[len(facts) :])),
-            dtype=dict.fromkeys(repeated, str),
-            keep_default_na=False,
-            na_values=[""],
-        )
+        if any("repeated" in one for one in facts):
+            raise ValueError(
+                "its format is of an earlier version; make the report again from the .jsonl files"
+            )
+        # only empty cells are missing values: "None" is text
+        table = io.StringIO("\n".join(lines[len(facts) :]))
+        rows = pd.read_csv(table, keep_default_na=False, na_values=[""])
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read {file}: {error}") from error
     runs = [one["run"] for one in facts if "run" in one]
     if "run" not in rows or not runs:
         raise InputError(f"{file} holds no summary of results of fidsplat; give another folder")
-    for name in (name for one in facts for name in one.get("empty", ())):
-        rows[name] = math.nan
-    rows[repeated] = rows[repeated].ffill()
     return Summary(rows, runs, [one["note"] for one in facts if "note" in one])
-
-
-def _has_text(column: Frame) -> bool:
-    """Whether a column has a text in every row."""
-    return pd.api.types.is_string_dtype(column) and bool(column.notna().all() and (column != "").all())
 
 
 def join(summaries: Sequence[Summary], keys: Sequence[str]) -> Summary:
