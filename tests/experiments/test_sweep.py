@@ -224,23 +224,3 @@ def test_missing_shards_are_named():
     files = [Path(f"a/angles-{i}-of-4.jsonl") for i in (1, 4)] + [Path("b/angles-2-of-2.jsonl")]
     assert missing_shards([*files, Path("angles.jsonl")]) == ["1/2", "2/4", "3/4"]
     assert missing_shards(files[:2] + [Path(f"b/angles-{i}-of-4.jsonl") for i in (2, 3)]) == []
-
-
-@pytest.mark.parametrize(
-    ("column", "words"),
-    [
-        (["a", "b"], True),
-        (["a", ""], False),
-        (["", "b"], False),
-        (["a", None], False),
-        ([None, None], False),
-        ([1.0, 2.0], False),
-    ],
-)
-def test_columns_of_words_have_one_in_every_row(column, words):
-    """Only these repeat the row above where a summary leaves them out."""
-    import pandas as pd
-
-    from fidsplat.experiments.summary import _has_text
-
-    assert _has_text(pd.Series(column)) is words
