@@ -76,11 +76,13 @@ class Variant:
     """scan with a LiDAR at the times of the images"""
     without: str = ""
     """sensor that the filter does not use: wheels, gyroscope, tags or lidar"""
+    spacing: float = 0.0
+    """metres between the used tags of a side of a bench, at least"""
 
     @property
     def rendering(self) -> Variant:
         """The variant with the same measurements and default values of all other settings."""
-        return replace(self, ideal=False, reach=math.inf, without="")
+        return replace(self, ideal=False, reach=math.inf, without="", spacing=0.0)
 
 
 VARIANTS = {
@@ -104,6 +106,8 @@ VARIANTS = {
     "no gyroscope": Variant(lidar=True, without="gyroscope"),
     "no tags": Variant(lidar=True, without="tags"),
     "no LiDAR": Variant(lidar=True, without="lidar"),
+    "sparse tags": Variant(lidar=True, spacing=3.0),
+    "sparse tags, no LiDAR": Variant(lidar=True, spacing=3.0, without="lidar"),
 }
 """variants by name: odometry only, ideal corners, mixtures, effects, speeds and tag distances of `exact`, and
 a LiDAR with each sensor left out"""
@@ -219,19 +223,19 @@ class Drive:
         detections: list[list[Detection]] | None,
         camera: Camera,
         noise: float = 0.5,
-        reach: float = math.inf,
         scans: list[np.ndarray] | None = None,
-        without: str = "",
+        variant: Variant | None = None,
     ) -> tuple[Trajectory, dict[str, Any]]:
         """Estimated poses and their errors.
 
         Args:
             detections: detected tags of each image; None: no camera.
             noise: standard deviation of corners in pixels.
-            reach: maximum distance of tags in metres.
             scans: points (n, 3) of each scan; None: no LiDAR.
-            without: sensor that is not used.
+            variant: its reach, spacing of tags, and sensor that is not used.
         """
+        variant = variant or Variant()
+        without, tags = variant.without, self._spaced(variant.spacing)
         first = run.poses[0]
         localiser = Localiser(
             np.array([*first[:2, 3], math.atan2(first[1, 0], first[0, 0])]),
@@ -245,10 +249,8 @@ class Drive:
         if scans and without != "lidar":
             from fidsplat.sim.scan_matching import ScanMatcher  # here, since it needs another package
 
-            clouds, matcher = (
-                dict(zip(self.image_indices(run), scans, strict=True)),
-                ScanMatcher(robot.LIDAR_AT[2]),
-            )
+            matcher = ScanMatcher(robot.LIDAR_AT[2])
+            clouds = dict(zip(self.image_indices(run), scans, strict=True))
         poses, used, matched, speed, last = [first], 0, 0, 0.0, 0
         for k in range(1, len(run.times)):
             seconds = float(run.times[k] - run.times[k - 1])
@@ -257,7 +259,7 @@ class Drive:
             localiser.move(wheels, turned if without == "gyroscope" else float(run.gyro[k]), seconds)
             for code, tag in by_pose.get(k, []):
                 pose = marker_pose(code.corners, tag.marker.size, camera)
-                if np.linalg.norm(pose[:3, 3]) <= reach:
+                if np.linalg.norm(pose[:3, 3]) <= variant.reach and code.id in tags:
                     used += localiser.correct(code.corners, tag.corners, partial(camera_at, camera))
             if k in clouds:
                 matched += matcher.correct(localiser, clouds[k])
@@ -268,6 +270,16 @@ class Drive:
         facts = errors_of(run, np.array(poses))
         facts |= {"tags": used, "scans": matched, "refused": localiser.rejected}
         return Trajectory(run.times, np.array(poses)), facts
+
+    def _spaced(self, spacing: float) -> set[int]:
+        """Ids of tags at least that far apart on each side of a bench."""
+        ids, last = set(), {}
+        for number, tag in sorted(self.tags.items(), key=lambda each: each[1].pose[0, 3]):
+            x, side = tag.pose[0, 3], round(tag.pose[1, 3], 3)
+            if x >= last.get(side, -math.inf) + spacing:
+                ids.add(number)
+                last[side] = x
+        return ids
 
     def _known(
         self, run: Run, detections: list[list[Detection]]

@@ -101,9 +101,8 @@ def _estimate(file: Path, drive: Drive, variant: Variant, truth: Run, log: Path)
         detections or None,
         camera,
         0.05 if variant.ideal else 0.5,
-        variant.reach,
         scans or None,
-        variant.without,
+        variant,
     )
     if detections:
         facts["corners"] = drive.corner_errors(run, detections, camera)

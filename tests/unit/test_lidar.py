@@ -2,9 +2,12 @@
 
 import json
 import math
+import runpy
 import struct
+import sys
 from dataclasses import replace
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -340,3 +343,16 @@ def test_messages_have_the_points(device, tmp_path):
 def test_refusals(make, text):
     with pytest.raises(fs.InputError, match=text):
         make()
+
+
+def test_the_example_maps_benches_and_floor(tmp_path, monkeypatch):
+    """Against the walls of the greenhouse, from a sensor that moves during the scan."""
+    example = Path(__file__).resolve().parents[2] / "examples" / "lidar.py"
+    monkeypatch.setattr(sys, "argv", [str(example), "--scans", "1", "-o", str(tmp_path / "map.npy")])
+    runpy.run_path(str(example), run_name="__main__")
+    x, y, z = (np.load(tmp_path / "map.npy")[axis] for axis in "xyz")
+    bench = y[(np.abs(y - 0.2) < 0.15) & (z > 0.1) & (z < 0.45) & (x > 0.1) & (x < 2.3)]
+    floor = z[z < 0.1]
+    assert min(len(bench), len(floor)) > 100
+    assert abs(np.median(bench) - 0.2) < 0.01
+    assert abs(np.median(floor)) < 0.01

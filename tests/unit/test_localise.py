@@ -17,6 +17,7 @@ mujoco = pytest.importorskip("mujoco", reason="pip install 'fidsplat[sim]'")
 from fidsplat.experiments.localise import (  # noqa: E402 (needs MuJoCo)
     VARIANTS,
     Drive,
+    Variant,
     errors_of,
     record,
     recorded,
@@ -358,8 +359,11 @@ def test_with_ideal_corners_it_knows_its_way():
     assert seeing["tags"] > 5
     assert seeing["refused"] == 0
     assert seeing["ate_m"] < 0.01 < blind["ate_m"]
-    _, near = requested.localise(moved, sightings, requested.camera, 0.05, reach=1.0)
+    _, near = requested.localise(moved, sightings, requested.camera, 0.05, variant=Variant(reach=1.0))
     assert 0 < near["tags"] < seeing["tags"]
+    assert Drive(1, 6)._spaced(3.0) == {0, 1, 2, 3}  # of two each at 0.9 and 2.7 m, and the ends
+    blind_too = requested.localise(moved, sightings, requested.camera, variant=Variant(without="tags"))[1]
+    assert blind_too["ate_m"] == blind["ate_m"]
     aside = np.array([0.6, 0.8])
     off = [[replace(tag, corners=tag.corners + aside) for tag in tags] for tags in sightings]
     bins = requested.corner_errors(moved, off, requested.camera)
