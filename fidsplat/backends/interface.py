@@ -17,7 +17,6 @@ from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.probing import Probe
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
-from fidsplat.cameras import Camera
 from fidsplat.effects import FeatureSet, declared_output
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import DeviceError, InputError
@@ -47,7 +46,7 @@ class DeviceInfo:
 
 @dataclass(frozen=True)
 class DeviceTraits:
-    """Optional capabilities of a device, with the methods of Backend that need them."""
+    """Optional capabilities of a device, with the methods that need them."""
 
     caches_chunks: bool = False
     """`Backend.chunk_cache`"""
@@ -61,6 +60,8 @@ class DeviceTraits:
     """`Backend.alignment`"""
     measures_rates: bool = False
     """`Backend.rates`, `memory_bytes` and `release_scratch`, and kernels for the effect `overdraw`"""
+    renders_pixels: bool = False
+    """`Pipeline.render_every`"""
     probed: bool = False
     """`Backend.probe`, `shapes` and `pieces`, for tests"""
 
@@ -280,6 +281,14 @@ class Pipeline(ABC):
         rendered = {index: self.render_view(resident, views.one(number)) for number, index in each}
         return SeparateImages(rendered, views, resident.count)
 
+    def render_every(
+        self, resident: Any, view: View, step: int, progress: Callable[[float], object] | None = None
+    ) -> Images:
+        """Render every step-th pixel in both directions, starting with the first: images of
+        (ceil(h / step), ceil(w / step)), bit-identical to those pixels of a complete frame. progress: called
+        with the completed share, 0 to 1."""
+        raise NotImplementedError
+
     def fits(self, resident: Any, view: View) -> bool:
         """Whether the frame fits the memory budget without dividing the cloud into chunks."""
         return True
@@ -337,107 +346,9 @@ class GradientPipeline(ABC):
         """
 
     def backward_to_tiles(self, images: Any, gradients: Mapping[str, Any]) -> Any:
-        """Gradients in the form that `TrainingKernels.step` of the device accepts; by default the result of
+        """Gradients in the form that `Backend.training().step` accepts; by default the result of
         `backward`."""
         return self.backward(images, gradients)
-
-
-class TrainingKernels(ABC):
-    """Device kernels of a training step other than rendering: loss, optimiser, densification, noise.
-
-    The state is n splats before their activation functions, float32: `means` (n, 3), `log_scales` (n, 2) of
-    disks or (n, 3) of 3D Gaussians, `quats` (n, 4), `logits` (n,), `sh` (n, k, 3); Adam's moments of each as
-    `first_NAME` and `second_NAME`; `gradient_sums` (n,) and `visible_counts` (n,), the statistics of
-    densification.
-    """
-
-    max_pending_losses: int
-    """number of later frames after which a loss may still be read"""
-
-    @abstractmethod
-    def load_views(self, views: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> None:
-        """Copy the ground truth to the device: images (h, w, 3) uint8, each with a mask (h, w) bool or
-        None."""
-
-    @abstractmethod
-    def load(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Set arrays of the state by their names; others are unchanged."""
-
-    @abstractmethod
-    def read(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """Copy arrays of the state to the host; all by default."""
-
-    @abstractmethod
-    def gather_rows(self, rows: np.ndarray, remaining: int) -> None:
-        """Keep or duplicate splats: row i of the new state is row `rows[i]` (m,) uint32 of the old one.
-        Moments are zeroed from row `remaining` on."""
-
-    @abstractmethod
-    def write(self, arrays: Mapping[str, np.ndarray], first: int) -> None:
-        """Overwrite arrays of the state from row `first` to their end."""
-
-    @abstractmethod
-    def clear(self, names: Sequence[str]) -> None:
-        """Fill arrays of the state with zeros."""
-
-    @abstractmethod
-    def resident(self, degree: int, origin: np.ndarray) -> ResidentData:
-        """The splats as a cloud to render, with SH up to `degree`; it shares the state, so that steps change
-        it."""
-
-    @abstractmethod
-    def loss(
-        self, images: Any, view: int, dssim_weight: float, exposure: np.ndarray | None = None
-    ) -> tuple[Callable[[], tuple[Any, ...]], Any]:
-        """Compare a frame with the ground truth of view number `view`.
-
-        exposure: (2, 3) logarithms of gains, and offsets, applied to the frame first; None: as rendered.
-
-        Returns:
-            A function that waits for the loss, the mean squared difference and, with an exposure, the
-            gradient (2, 3) by it, and returns them, to be called before `max_pending_losses` more frames; and
-            the gradient of the loss (h, w, 3), a device array that is valid until the next call.
-        """
-
-    @abstractmethod
-    def normal_loss_gradients(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:
-        """Gradients of `fidsplat.train.losses.normal_loss` with respect to `depth` and `normal`, times the
-        weight, as device arrays that are valid until the next call."""
-
-    @abstractmethod
-    def accumulate_statistics(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
-        """Add the frame's screen gradients and visibility to `gradient_sums` and `visible_counts`. taken: the
-        result of `backward_to_tiles`."""
-
-    @abstractmethod
-    def step(
-        self,
-        taken: Any,
-        sizes: Mapping[str, float],
-        numbers: Mapping[str, float],
-        camera: Camera | None,
-        origin: np.ndarray,
-        by_camera: bool = False,
-    ) -> Callable[[], np.ndarray] | None:
-        """Apply a step of Adam.
-
-        Args:
-            taken: the result of `GradientPipeline.backward_to_tiles`.
-            sizes: learning rates of `means`, `scales`, `quats`, `logits`, `sh` (degree 0) and `rest` (higher
-                degrees).
-            numbers: `beta1`, `beta2`, `epsilon`, `root` (square root of 1 - beta2^step); `scale_penalty` and
-                `opacity_penalty`, added to the gradients; `sparse`: 1 where splats on which the frame does
-                not depend are left unchanged.
-            camera: if given, statistics are accumulated first, as by `accumulate_statistics`.
-            by_camera: whether to return a function that waits for the gradient (10,) of the loss with
-                respect to the camera: pose and intrinsics.
-        """
-
-    @abstractmethod
-    def add_noise(self, size: float, slope: float, threshold: float, words: Sequence[int]) -> None:
-        """Add MCMC noise to the means: random steps in the plane of each disk with `size` times its variance,
-        reduced by a sigmoid of this `slope` for opacities above `threshold`. words: low and high word of the
-        seed, iteration, purpose of the random numbers."""
 
 
 class Backend(ABC):
@@ -472,19 +383,6 @@ class Backend(ABC):
     def frame_shape(self, view: View, count: int = 1) -> Any:
         """The `shape` of `pipeline` that renders `count` views of this size fastest, with the same bits."""
         return None
-
-    def render_every(
-        self,
-        pipeline: Any,
-        resident: Any,
-        view: View,
-        step: int,
-        progress: Callable[[float], object] | None = None,
-    ) -> Images:
-        """Render every step-th pixel in both directions, starting with the first: images of
-        (ceil(h / step), ceil(w / step)), bit-identical to those pixels of a complete frame. progress: called
-        with the completed share, 0 to 1."""
-        raise InputError(self.lacks("render subsets of pixels", "use device='reference', or render"))
 
     def unsupported(self, features: FeatureSet) -> str:
         """Error message naming the features that the device cannot render; empty if it renders all."""
@@ -525,8 +423,9 @@ class Backend(ABC):
         """Start to compile the derivatives of these features in the background, if the device supports it.
         `differentiate` waits for the compiler and raises its errors."""
 
-    def training(self) -> TrainingKernels:
-        """Compiled training kernels, without splats. Raises DeviceError if the compiler fails."""
+    def training(self) -> Any:
+        """The compiled kernels of a training step other than rendering, without splats
+        (`opencl.training.OpenCLTraining`). Raises DeviceError if the compiler fails."""
         raise DeviceError(self.lacks("have kernels for training", "train in NumPy"))
 
     def alignment(self) -> AlignmentKernels:

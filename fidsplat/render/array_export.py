@@ -1,33 +1,112 @@
-"""Export of images to NumPy, torch, JAX, CuPy and Warp by the array protocols."""
+"""Images by name: copies on the host, and export to torch, JAX, CuPy and Warp by the array protocols."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import os
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Protocol, Self
 
 import numpy as np
 
-from fidsplat.util.errors import InputError
+from fidsplat.backends.interface import Images
+from fidsplat.util.errors import InputError, MissingOutputError
+
+SceneIds = Callable[[], np.ndarray] | None
+"""Function that returns, for each splat on the device, its index in the scene, (n,) int32; None if both
+indices are equal."""
 
 
-class ArrayExport(Mapping[str, np.ndarray]):
-    """Images by name that other array libraries can read: `__array__`, `__dlpack__`, `to_torch`."""
+class ComputedImage(Protocol):
+    """An output image that the host computes from other images on first use."""
 
-    outputs: tuple[str, ...]
+    def read(self) -> np.ndarray:
+        """Compute the image; a new array."""
+        ...
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds on the device by stage, for this image only."""
+        ...
+
+
+class ImageMapping(Mapping[str, np.ndarray]):
+    """Output images by name, as read-only NumPy arrays that are copied from the device on first use.
+
+    Other array libraries read them by `__array__`, `__dlpack__` and `to_torch`.
+    """
+
     _noun: str
     """name of the class in messages"""
+    _error: ComputedImage | None = None
+    """the output `error`, if it is requested"""
+
+    def __init__(
+        self, images: Images, outputs: tuple[str, ...], ids: SceneIds, index: int | None = None
+    ) -> None:
+        """ids: scene indices of the splats on the device, for `splat_id`. index: position of the view in
+        `images`; None: all views."""
+        self._images, self._process, self._ids, self._index = images, os.getpid(), ids, index
+        self._arrays: dict[str, np.ndarray] = {}
+        self.outputs = outputs
+        """Names of the images, in the requested order."""
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        self._check(name)
+        if name not in self._arrays:
+            check_process(self._process, self._noun)
+            computed = self._error if name == "error" else None
+            image = self._images.read(name, self._index) if computed is None else computed.read()
+            self._arrays[name] = image = with_scene_ids(name, image, self._ids)
+            image.flags.writeable = False  # cached
+        return self._arrays[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.outputs)
+
+    def __len__(self) -> int:
+        return len(self.outputs)
 
     def device_array(self, name: str) -> Any:
-        """The images on their device, without a copy."""
-        raise NotImplementedError
+        """The image on its device, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3); of a
+        batch also a pyopencl.array.Array, (views, h, w) or (views, h, w, 3).
+
+        The frame or batch owns the array; the next one has a new array. `wp.to_torch`, DLPack and
+        `__cuda_array_interface__` convert it to a tensor on the same device.
+
+        Raises:
+            InputError: an output that was not requested, or the backend shares no arrays.
+        """
+        self._check(name)
+        check_process(self._process, self._noun)
+        if self._is_computed(name):
+            what = "splat_id of a store" if name == "splat_id" else f"the output {name!r}"
+            raise InputError(f"{what} must be read on the host, got device_array; use {self._noun}[{name!r}]")
+        return self._images.device_array(name, self._index)
+
+    def wait(self) -> Self:
+        """Wait until the device has rendered the images; nothing is copied.
+
+        Raises:
+            DeviceError: the device has failed during rendering.
+        """
+        self._images.wait()
+        return self
 
     def _check(self, name: str) -> None:
         """Raise MissingOutputError for an output that was not requested."""
-        raise NotImplementedError
+        if not isinstance(name, str) or name not in self.outputs:
+            raise MissingOutputError(
+                f"an output of this {self._noun} must be one of {', '.join(self.outputs)}, got {name!r}; add "
+                "it to `outputs` when you render"
+            )
+
+    def _is_computed(self, name: str) -> bool:
+        """Whether the host computes an image, so that the device has no array of it."""
+        return name == "error" or (name == "splat_id" and self._ids is not None)
 
     def _is_shared(self, name: str) -> bool:
-        """Whether the device shares an array of these images."""
-        raise NotImplementedError
+        """Whether the device shares an array of an image."""
+        return self._images.shares_arrays and not self._is_computed(name)
 
     def to_torch(self, name: str = "rgb") -> Any:
         """The images as a torch tensor: on their device without a copy if the backend shares arrays
@@ -83,6 +162,22 @@ class ArrayExport(Mapping[str, np.ndarray]):
                 f" take one by its name, for example {self._noun}['rgb']"
             )
         return self.outputs[0]
+
+
+def with_scene_ids(name: str, image: np.ndarray, ids: SceneIds) -> np.ndarray:
+    """An output image; `splat_id` with device indices replaced by scene indices. -1 is unchanged."""
+    if name != "splat_id" or ids is None:
+        return image
+    return np.append(ids(), np.int32(-1))[image]
+
+
+def check_process(opened_by: int, what: str) -> None:
+    """Raise InputError if this process is a fork of `opened_by`, since drivers do not work after a fork."""
+    if opened_by != os.getpid():
+        raise InputError(
+            f"this {what} must be used in the process that opened it ({opened_by}), got a fork of it; open a "
+            "Renderer in each process, and read frames before the fork"
+        )
 
 
 def host_array(what: str, value: Any) -> Any:

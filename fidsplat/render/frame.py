@@ -2,37 +2,18 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, Protocol, TypeVar
+from collections.abc import Callable, Iterable, Mapping
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from fidsplat.backends.interface import HostImages, Images
 from fidsplat.capture.capture import Capture
-from fidsplat.render.array_export import ArrayExport
+from fidsplat.render.array_export import ComputedImage, ImageMapping, SceneIds, check_process, with_scene_ids
 from fidsplat.util.arguments import invalid, whole_number
-from fidsplat.util.errors import InputError, MissingOutputError
-
-SceneIds = Callable[[], np.ndarray] | None
-"""Function that returns, for each splat on the device, its index in the scene, (n,) int32; None if both
-indices are equal."""
 
 
-class ComputedImage(Protocol):
-    """An output image that the host computes from other images on first use."""
-
-    def read(self) -> np.ndarray:
-        """Compute the image; a new array."""
-        ...
-
-    @property
-    def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device by stage, for this image only."""
-        ...
-
-
-class Frame(ArrayExport):
+class Frame(ImageMapping):
     """A rendered frame: a mapping from output names to read-only NumPy arrays, which are copied from the
     device on first use.
 
@@ -44,6 +25,8 @@ class Frame(ArrayExport):
     `Quality.first_hit`) `label` and `splat_id` are -1, and depths, distances and normals are 0.
     """
 
+    _noun = "frame"
+
     def __init__(
         self,
         images: Images,
@@ -52,45 +35,10 @@ class Frame(ArrayExport):
         error: ComputedImage | None = None,
         index: int = 0,
     ) -> None:
-        """ids: scene indices of the splats on the device, for `splat_id`. error: the output `error`, if it is
-        requested. index: position of the view in `images`."""
-        self._error, self._index = error, index
-        self._images, self._process, self._ids = images, os.getpid(), ids
-        self._arrays: dict[str, np.ndarray] = {}
-        self.capture = capture
+        """Arguments are those of `ImageMapping`; error: the output `error`, if it is requested."""
+        super().__init__(images, capture.outputs, ids, index)
+        self._error, self.capture = error, capture
         """The capture of this frame. `read_back` and `truth_of` use its camera, shutter and motion."""
-        self.outputs = capture.outputs
-        """Names of the images, in the requested order."""
-
-    _noun = "frame"
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        self._check(name)
-        if name not in self._arrays:
-            check_process(self._process, "frame")
-            computed = self._error if name == "error" else None
-            image = self._images.read(name, self._index) if computed is None else computed.read()
-            self._arrays[name] = image = with_scene_ids(name, image, self._ids)
-            image.flags.writeable = False  # cached
-        return self._arrays[name]
-
-    def device_array(self, name: str) -> Any:
-        """The image on its device, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3).
-
-        The frame owns the array; the next frame has a new one. `wp.to_torch`, DLPack and
-        `__cuda_array_interface__` convert it to a tensor on the same device.
-
-        Raises:
-            InputError: an output that was not requested, or the backend shares no arrays.
-        """
-        self._check(name)
-        check_process(self._process, "frame")
-        refuse_scene_ids(name, self._ids)
-        if name == "error":
-            raise InputError(
-                "the output 'error' must be read on the host, got device_array; use frame['error']"
-            )
-        return self._images.device_array(name, self._index)
 
     @property
     def images(self) -> Images:
@@ -108,17 +56,12 @@ class Frame(ArrayExport):
         self._check("rgb")
         if "rgb" not in self._arrays:
             check_process(self._process, "frame")
-            converted = self._images.read_uint8("rgb", self._index)
+            converted = self._images.read_uint8("rgb", self._index or 0)
             if converted is not None:
                 return converted
         from fidsplat.images.files import to_uint8  # here, since it imports OpenCV
 
         return to_uint8(self["rgb"])
-
-    def _is_shared(self, name: str) -> bool:
-        """Whether the device shares an array of this image."""
-        on_host = name == "error" or (name == "splat_id" and self._ids is not None)
-        return self._images.shares_arrays and not on_host
 
     def __repr__(self) -> str:
         took = sum(self.timings.values())
@@ -133,31 +76,9 @@ class Frame(ArrayExport):
         name = "rgb" if "rgb" in self.outputs else self.outputs[0]
         return encode_png(visualisation_of(name, self[name]))
 
-    def _check(self, name: str) -> None:
-        if not isinstance(name, str) or name not in self.outputs:
-            raise MissingOutputError(
-                f"an output of this frame must be one of {', '.join(self.outputs)}, got {name!r}; add it to "
-                "`outputs` when you render"
-            )
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.outputs)
-
-    def __len__(self) -> int:
-        return len(self.outputs)
-
     def __reduce__(self):
         """Pickled and copied as NumPy arrays: arrays of `device_array` are not included."""
         return _host_frame, (dict(self), dict(self.timings), dict(self.stats), self.capture.picklable())
-
-    def wait(self) -> Frame:
-        """Wait until the device has rendered this frame; nothing is copied.
-
-        Raises:
-            DeviceError: the device has failed during rendering.
-        """
-        self._images.wait()
-        return self
 
     def read_rows(self, name: str, first: int, end: int, into: np.ndarray | None = None) -> np.ndarray:
         """Copy rows of pixels [first, end) of an output into `into`, or into a new array of the complete
@@ -167,7 +88,7 @@ class Frame(ArrayExport):
             InputError: rows outside the frame, or an array of another shape or type.
         """
         self._check(name)
-        images, index = self._images, self._index
+        images, index = self._images, self._index or 0
         if name == "error":
             images, index = HostImages({name: self[name][None]}, {}, {}), 0
         complete = images.empty(name)
@@ -257,27 +178,3 @@ def stack_bands(bands: Iterable[P], render: Callable[[P], Frame]) -> Frame:
     finish(last[0])
     copy_rows(*last)
     return _host_frame(arrays, timings, stats, last[0].capture)
-
-
-def with_scene_ids(name: str, image: np.ndarray, ids: SceneIds) -> np.ndarray:
-    """An output image; `splat_id` with device indices replaced by scene indices. -1 is unchanged."""
-    if name != "splat_id" or ids is None:
-        return image
-    return np.append(ids(), np.int32(-1))[image]
-
-
-def refuse_scene_ids(name: str, ids: SceneIds) -> None:
-    """Raise InputError for `splat_id` on a device if its indices must be converted on the host."""
-    if name == "splat_id" and ids is not None:
-        raise InputError(
-            "splat_id of a store must be read on the host, got device_array; use frame['splat_id']"
-        )
-
-
-def check_process(opened_by: int, what: str) -> None:
-    """Raise InputError if this process is a fork of `opened_by`, since drivers do not work after a fork."""
-    if opened_by != os.getpid():
-        raise InputError(
-            f"this {what} must be used in the process that opened it ({opened_by}), got a fork of it; open a "
-            "Renderer in each process, and read frames before the fork"
-        )

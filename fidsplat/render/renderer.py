@@ -22,10 +22,11 @@ from fidsplat.capture.quality import Quality
 from fidsplat.capture.sensor import Sensor
 from fidsplat.capture.views import Views, views_of
 from fidsplat.effects.differentiable import check_gradients, with_distortion
+from fidsplat.render.array_export import check_process
 from fidsplat.render.batch import FrameBatch
 from fidsplat.render.certified_error import ErrorImage, ideal_of
 from fidsplat.render.differentiable_frame import DifferentiableFrame
-from fidsplat.render.frame import Frame, check_process, stack_bands
+from fidsplat.render.frame import Frame, stack_bands
 from fidsplat.render.lighting import lit_scene
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.scenes import Scene
@@ -41,10 +42,6 @@ from fidsplat.util.errors import InputError, unknown
 _DEFAULT_CAPTURE = Capture()
 METERED = 96
 """width in pixels of the small frame in which light is measured for a sensor"""
-
-
-def _render_view(pipeline: Pipeline, data: Any, view: View) -> Images:
-    return pipeline.render_view(data, view)
 
 
 def default_device() -> str:
@@ -252,11 +249,12 @@ class Renderer:
         """
         whole_number("step", step, 1, 2**31 - 1)
         requested = _capture_of(scene, capture, outputs=outputs, quality=quality)
-
-        def render_pixels(pipeline: Pipeline, data: Any, view: View) -> Images:
-            return self.backend.render_every(pipeline, data, view, step, progress)
-
-        return self._render(self._resident(scene), requested, render_pixels)
+        resident = self._resident(scene)
+        if not self.backend.traits.renders_pixels:
+            raise InputError(
+                self.backend.lacks("render subsets of pixels", "use device='reference', or render")
+            )
+        return self._render(resident, requested, every=(step, progress))
 
     def render_band(
         self,
@@ -419,9 +417,10 @@ class Renderer:
         self,
         resident: ResidentCloud,
         capture: Capture,
-        render: Callable[[Pipeline, Any, View], Images] = _render_view,
         band: tuple[int, int] | None = None,
+        every: tuple[int, Callable[[float], object] | None] | None = None,
     ) -> Frame:
+        """Render one frame. band: rows of pixels; None: all. every: arguments of `Pipeline.render_every`."""
         interrupts.check()
         capture = self._metered(resident, capture)
         features, view = prepare(resident.complete, capture)
@@ -432,18 +431,25 @@ class Renderer:
             shape, data = self.backend.frame_shape(view), resident.data
             pipeline = self.backend.pipeline(features, shape)
             if not isinstance(data, Residency):
-                error, images = None, render(pipeline, data, view)
-                if ideal is not None:
-                    ideal_view = ideal.view if band is None else _banded(ideal.view, band)
-                    ideal_images = render(self.backend.pipeline(ideal.features, shape), data, ideal_view)
-                    error = ErrorImage(images, ideal_images, ideal)
-                return Frame(images, capture, error=error)
+                images = _rendered(pipeline, data, view, every)
+                if ideal is None:
+                    return Frame(images, capture)
+                ideal_view = ideal.view if band is None else _banded(ideal.view, band)
+                ideal_images = _rendered(self.backend.pipeline(ideal.features, shape), data, ideal_view, every)
+                return Frame(images, capture, error=ErrorImage(images, ideal_images, ideal))
 
             def render_band(band: BandData) -> Frame:
-                images = band.images or render(pipeline, band.data, band.view)
+                images = band.images or _rendered(pipeline, band.data, band.view, every)
                 return Frame(images, capture, band.ids)
 
             return stack_bands(data.bands(view, features, capture.quality, pipeline), render_band)
+
+
+def _rendered(
+    pipeline: Pipeline, data: Any, view: View, every: tuple[int, Callable[[float], object] | None] | None
+) -> Images:
+    """Images of all pixels of a view, or of every n-th."""
+    return pipeline.render_view(data, view) if every is None else pipeline.render_every(data, view, *every)
 
 
 def _banded(view: View, band: tuple[int, int]) -> View:

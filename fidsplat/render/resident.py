@@ -13,7 +13,7 @@ from fidsplat.backends.view import View
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
 from fidsplat.effects import FeatureSet
-from fidsplat.render.frame import SceneIds
+from fidsplat.render.array_export import SceneIds
 from fidsplat.streaming.residency import Residency
 from fidsplat.util.errors import InputError
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.interface import Images, ResidentData, TrainingKernels
+from fidsplat.backends.interface import Images, ResidentData
 from fidsplat.cameras import Camera
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.densify import Densification, limited_logits
@@ -26,9 +26,8 @@ _STATISTICS = ("gradient_sums", "visible_counts")
 class DeviceModel:
     """Splats in training in device memory, with the images of the data set."""
 
-    def __init__(
-        self, kernels: TrainingKernels, views: Sequence[TrainingView], settings: TrainSettings
-    ) -> None:
+    def __init__(self, kernels: Any, views: Sequence[TrainingView], settings: TrainSettings) -> None:
+        """kernels: the result of `Backend.training`."""
         self._kernels, self._settings = kernels, settings
         self.max_pending_losses = kernels.max_pending_losses
         kernels.load_views([(view.image, view.mask) for view in views])

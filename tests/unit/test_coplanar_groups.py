@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fidsplat.backends.coplanar_groups import group_index
+from fidsplat.backends.cloud_arrays import group_index
 from fidsplat.selftest.clouds import splats
 
 

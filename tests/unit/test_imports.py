@@ -201,7 +201,7 @@ SHARED = (
     "view",
     "prepare",
     "registry",
-    "coplanar_groups",
+    "cloud_arrays",
     "bands",
     "gradients",
     "chunk_cache",

@@ -11,7 +11,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.backends.opencl import buffers
-from fidsplat.backends.opencl.pages import large_pages
+from fidsplat.backends.opencl.buffers import large_pages
 
 
 @pytest.mark.skipif(not hasattr(mmap, "MADV_HUGEPAGE"), reason="the system has no such advice")

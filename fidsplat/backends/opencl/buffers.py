@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
+import mmap
 import weakref
 from collections.abc import Collection, Hashable
 from typing import Any
@@ -12,7 +14,6 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
-from fidsplat.backends.opencl.pages import large_pages
 from fidsplat.cameras.raster import RayRaster
 from fidsplat.util.errors import DeviceError, bytes_words
 
@@ -233,3 +234,20 @@ class RayBuffers:
         buffer = self._pool.fresh(name, array.nbytes)
         cl.enqueue_copy(self._queue, buffer, array)
         return buffer
+
+
+def large_pages(address: int, size: int) -> bool:
+    """Advise the system to use large pages for a range of memory from its first use on.
+
+    Args:
+        address, size: in bytes; rounded inwards to complete pages.
+
+    Returns:
+        Whether the system accepted. Memory contents are unchanged.
+    """
+    advice = getattr(mmap, "MADV_HUGEPAGE", None)  # only on Linux
+    first = -(-address // mmap.PAGESIZE) * mmap.PAGESIZE
+    end = (address + size) // mmap.PAGESIZE * mmap.PAGESIZE
+    if advice is None or end <= first:
+        return False
+    return ctypes.CDLL(None).madvise(ctypes.c_void_p(first), ctypes.c_size_t(end - first), advice) == 0

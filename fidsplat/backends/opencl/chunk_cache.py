@@ -89,7 +89,6 @@ class OpenCLChunkCache(ChunkCache):
         return GatheredChunks(self, chunks, first_id)
 
     def prefetch(self, chunks: Sequence[Chunk]) -> None:
-        """Prefetch chunks of the next frame, as far as capacity allows."""
         requested = {chunk.key for chunk in chunks}  # requested chunks must not evict each other
         for chunk in chunks:
             with self._lock:

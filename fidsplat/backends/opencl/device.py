@@ -13,14 +13,13 @@ from fidsplat.backends.checked_cache import check_once
 from fidsplat.backends.interface import Backend, ChunkedScene, DeviceInfo, DeviceTraits, Rates
 from fidsplat.backends.opencl.alignment import OpenCLAlignment
 from fidsplat.backends.opencl.assemble import Source, assemble
-from fidsplat.backends.opencl.background_compiler import BackgroundCompiler
 from fidsplat.backends.opencl.chunk_cache import OpenCLChunkCache
 from fidsplat.backends.opencl.gradients import OpenCLGradients
 from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.pocl_workarounds import is_pocl, kernel_cache, linker, target_patch
 from fidsplat.backends.opencl.probe import OpenCLProbe
-from fidsplat.backends.opencl.program import build_options
+from fidsplat.backends.opencl.program import BackgroundCompiler, build_options
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.roofline import measure_rates
 from fidsplat.backends.opencl.shapes import (
@@ -129,19 +128,15 @@ class OpenCLBackend(Workspace, Backend):
         return Resident(self, cloud)
 
     def chunk_cache(self, scene: ChunkedScene, rows: int) -> OpenCLChunkCache:
-        """A cache of a scene's chunks, each of at most `rows` splats."""
         return OpenCLChunkCache(self, scene, rows)
 
     def termination_depths(self, images: OpenCLImages) -> TerminationDepths:
-        """Termination depth per tile of a frame with the effect `termination_depths`."""
         return images.termination_depths()
 
     def copy_tiles(self, images: OpenCLImages, other: OpenCLImages, tiles: np.ndarray) -> None:
-        """Copy tiles of another frame of the same view into a frame."""
         images.copy_tiles(other, tiles)
 
     def unsupported(self, features: FeatureSet) -> str:
-        """Error message if the features need float64 and the device has none; else empty."""
         if self.info.float64 or "blend_double" not in features.slots:
             return ""
         return (
@@ -150,12 +145,6 @@ class OpenCLBackend(Workspace, Backend):
         )
 
     def pipeline(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLPipeline:
-        """The stages for these features, compiled on first use; `shape` replaces the device's own build
-        constants (tests).
-
-        Raises:
-            DeviceError: the device does not support a feature.
-        """
         if self._requested[0] is not self.shape:
             self._requested = self.shape, {}
         known = self._requested[1].get((features, shape))
@@ -184,7 +173,6 @@ class OpenCLBackend(Workspace, Backend):
         return small_frame_shape(self.shape) if few else None
 
     def differentiate(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLGradients:
-        """The pipeline with derivatives; `shape` replaces the device's own build constants (tests)."""
         check_differentiable(features)
         self._background.wait(features)
         pipeline = self.pipeline(features, shape)
@@ -193,12 +181,10 @@ class OpenCLBackend(Workspace, Backend):
         return self._gradients[pipeline]
 
     def compile_in_background(self, features: FeatureSet) -> None:
-        """Start to compile `differentiate` in the background."""
         if self._requested[1].get((features, None)) not in self._gradients:
             self._background.begin(features, lambda: self.differentiate(features).compile_step())
 
     def training(self) -> OpenCLTraining:
-        """Compiled training kernels, without splats."""
         return OpenCLTraining(self)
 
     def alignment(self) -> OpenCLAlignment:
@@ -223,23 +209,18 @@ class OpenCLBackend(Workspace, Backend):
         return self.pool.memory_bytes
 
     def release_scratch(self) -> None:
-        """Release the scratch buffers; the next frame allocates new ones."""
         self.pool.clear()
 
     def rates(self) -> Rates:
-        """Measure the device's peak rates, for the roofline of `fidsplat bench`."""
         return measure_rates(self)
 
     def probe(self) -> OpenCLProbe:
-        """Access to intermediate buffers and device arithmetic, for tests."""
         return OpenCLProbe(self)
 
     def shapes(self, kind: str) -> dict[str, DeviceShape]:
-        """Alternative build constants by name, for tests."""
         return other_shapes(self.shape, kind)
 
     def pieces(self, shape: DeviceShape) -> int:
-        """Number of pieces into which the counting sorts divide their input."""
         return shape.chunks
 
 

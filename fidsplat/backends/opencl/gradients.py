@@ -143,12 +143,10 @@ class OpenCLGradients(GradientPipeline):
             return OpenCLDifferentiable(frame, pipeline.images_of(frame))
 
     def backward(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
-        """Gradients as pyopencl arrays."""
         with images.frame.workspace.lock:
             return self.backward_to_tiles(images, gradients).gradients()
 
     def backward_to_tiles(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> TileGradients:
-        """The first part of `backward`, up to the sums over tiles."""
         check_gradients(self._pipeline.features, gradients)
         if not images.last:
             raise InputError(NOT_THE_LAST)

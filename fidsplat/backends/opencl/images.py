@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import math
 import weakref
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import Images, summed
+from fidsplat.backends.opencl.assemble import kernel_text
 from fidsplat.backends.opencl.device_frame import Rendered
+from fidsplat.backends.opencl.program import build, load_invoker
 from fidsplat.backends.opencl.recorded_frame import Replay
-from fidsplat.backends.opencl.shapes import DeviceShape
-from fidsplat.backends.opencl.uint8 import read_uint8
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.effects.catalogue import Output
 from fidsplat.util.errors import DeviceError, bytes_words
+
+_UINT8_GROUP = 64
+_KERNELS: WeakKeyDictionary[Workspace, tuple[cl.Kernel, int]] = WeakKeyDictionary()
+"""kernel of uint8.cl, compiled on first use, and values per work-item"""
 
 
 def lease_images(
@@ -62,38 +68,35 @@ class OpenCLImages(Images):
 
     def __init__(
         self,
-        workspace: Workspace,
-        outputs: Mapping[str, Output],
+        pipeline: Any,
         views: ViewBatch | View,
-        shape: DeviceShape,
         rendered: list[Rendered],
         splats: int,
         leased: list[tuple[str, cl.Buffer]] | None = None,
         replay: Replay | None = None,
     ) -> None:
-        """leased: image buffers of a batch; None if the images belong to the single frame in `rendered`."""
-        self._workspace, self._splats, self._outputs = workspace, splats, outputs
+        """
+        Args:
+            pipeline: the OpenCLPipeline that rendered them.
+            leased: image buffers of a batch; None if the images belong to the single frame in `rendered`.
+        """
+        self._workspace, self._splats, self._outputs = pipeline.workspace, splats, pipeline.outputs
         self._view = view = views if isinstance(views, View) else views.view
         if isinstance(views, ViewBatch):
             self.views = views.total
         self._size = view.height // view.samples, view.width // view.samples
         self._rendered, self._replay = rendered, replay
-        self._tile = shape.tile_height, shape.tile_width
-        self._batch = None if leased is None else dict(zip(outputs, leased, strict=True))
+        self._tile = pipeline.shape.tile_height, pipeline.shape.tile_width
+        self._batch = None if leased is None else dict(zip(self._outputs, leased, strict=True))
         self._timings: dict[str, float] = {}
         self._copied: list[Rendered] = []
         """frames from which tiles were copied; without their buffers"""
         self._leased = [*(leased or ())]
         for one in rendered:
             self._leased += one.leased
-        weakref.finalize(self, workspace.pool.give_back, self._leased)
+        weakref.finalize(self, self._workspace.pool.give_back, self._leased)
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
-        """Copy images to the host; waits for the device.
-
-        Raises:
-            DeviceError: the device has failed, now or while it was rendering.
-        """
         if index is not None:
             images = self.empty(name)
             self._copy(name, images, index * images.nbytes)
@@ -104,11 +107,9 @@ class OpenCLImages(Images):
         return images
 
     def empty(self, name: str) -> np.ndarray:
-        """A host array for the image of one view, in page-locked memory if possible."""
         return self._workspace.host_memory.empty(self._shape(name), self._outputs[name].dtype)
 
     def read_rows(self, name: str, first: int, end: int, into: np.ndarray, index: int = 0) -> None:
-        """Copy only pixel rows [first, end). Raises DeviceError if the device has failed."""
         if first < end:
             self._copy(name, into[first:end], (index * len(into) + first) * into[:1].nbytes)
 
@@ -135,12 +136,10 @@ class OpenCLImages(Images):
         return [event for one in self.complete() for event in one.done()]
 
     def read_uint8(self, name: str, index: int = 0) -> np.ndarray:
-        """Copy an image converted to 8 bits. Raises DeviceError if the device has failed."""
         with self._workspace.failing(f"rendering {name}"):
             return read_uint8(self._workspace, self.buffer(name), index, self._shape(name), self._done())
 
     def device_array(self, name: str, index: int | None = None) -> Any:
-        """The images as a pyopencl.array.Array (views, h, w) or (views, h, w, channels); no copy."""
         if index is not None:
             return super().device_array(name, index)
         from pyopencl.array import Array
@@ -152,7 +151,6 @@ class OpenCLImages(Images):
         return Array(self._workspace.queue, shape, dtype, data=buffer)
 
     def wait(self) -> None:
-        """Wait until the device has rendered the images. Raises DeviceError if it has failed."""
         with self._workspace.failing("rendering"):
             for one in self.complete():
                 one.queue.finish()
@@ -225,3 +223,37 @@ class OpenCLImages(Images):
             sides = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))
             for first, end in sides.reshape(-1, 2).tolist():
                 yield row * height, min((row + 1) * height, rows), first * width, min(end * width, columns)
+
+
+def read_uint8(
+    workspace: Workspace, image: cl.Buffer, index: int, shape: tuple[int, ...], after: list[cl.Event]
+) -> np.ndarray:
+    """An image of floats as an array of uint8 on the host; waits for the device.
+
+    index: number of the image in the buffer. after: events to wait for.
+
+    Raises:
+        DeviceError: no memory, or the compiler refuses.
+    """
+    into, count = workspace.host_memory.empty(shape, np.uint8), math.prod(shape)
+    queue, name = workspace.read_queue, "8 bits of an image"
+    with workspace.lock:  # the kernel's arguments are shared by all images
+        kernel, values = _kernel(workspace)
+        made = workspace.pool.lease(name, count)
+        items = -(-count // (values * _UINT8_GROUP)) * _UINT8_GROUP
+        numbers = np.uint64(count), np.uint64(index * count)
+        converted = kernel(queue, (items,), (_UINT8_GROUP,), *numbers, image, made, wait_for=after)
+    try:
+        cl.enqueue_copy(queue, into, made, wait_for=[converted])
+    finally:
+        workspace.pool.give_back([(name, made)])
+    return into
+
+
+def _kernel(workspace: Workspace) -> tuple[cl.Kernel, int]:
+    if workspace not in _KERNELS:
+        load_invoker()
+        values = 16 if workspace.shape.schedule == "lanes" else 4
+        program = build(workspace, kernel_text("uint8.cl"), f"-DVALUES={values}")
+        _KERNELS[workspace] = program.to_uint8, values
+    return _KERNELS[workspace]

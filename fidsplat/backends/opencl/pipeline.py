@@ -99,10 +99,9 @@ class OpenCLPipeline(Pipeline):
             complete = not (plan.chunk or frame.in_bands or view.sub_frames or view.band)
             if complete and resident.count and not resident.streamed:
                 self._cache(resident, key, frame)
-            return self._images(view, [frame.rendered()], resident)
+            return OpenCLImages(self, view, [frame.rendered()], resident.count)
 
     def render(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
-        """Render views, as many at once as memory allows. Raises DeviceError if the device fails."""
         if views.is_single:
             return self.render_view(resident, views.one(0))
         if self._vectorises_too_few(resident):
@@ -121,10 +120,9 @@ class OpenCLPipeline(Pipeline):
                 frame.bind_images(images)
                 render(frame)
                 rendered.append(frame.rendered())
-            return self._images(views, rendered, resident, leased)
+            return OpenCLImages(self, views, rendered, resident.count, leased)
 
     def fits(self, resident: Resident, view: View) -> bool:
-        """Whether the frame is rendered without dividing the cloud into chunks."""
         try:
             return not self._planner.frame(resident, view).chunk
         except DeviceError:  # too little memory even for a divided frame
@@ -180,7 +178,7 @@ class OpenCLPipeline(Pipeline):
 
     def images_of(self, frame: DeviceFrame) -> OpenCLImages:
         """The output images of a frame."""
-        return self._images(frame.view, [frame.rendered()], frame.resident)
+        return OpenCLImages(self, frame.view, [frame.rendered()], frame.resident.count)
 
     def render_again(self, resident: Resident, view: View) -> Rendered:
         """Render a frame whose replay exceeded its capacity again, with larger buffers."""
@@ -210,10 +208,10 @@ class OpenCLPipeline(Pipeline):
             if not frame.in_bands:
                 cached.recorded = recorded = RecordedFrame(frame)
         if waits:
-            return self._images(view, [rendered], resident)
+            return OpenCLImages(self, view, [rendered], resident.count)
         assert recorded is not None  # the lists of a recorded frame are not divided on a GPU
         replay = Replay(recorded, resident, view, self.render_again)
-        images = self._images(view, [rendered], resident, replay=replay)
+        images = OpenCLImages(self, view, [rendered], resident.count, replay=replay)
         if not resident.immutable:
             images.complete()
         return images
@@ -268,18 +266,6 @@ class OpenCLPipeline(Pipeline):
         """Key of frames that differ only in numeric arguments."""
         labels, budgets = tuple(dict(view.groups)), (self.workspace.memory_budget, self.workspace.pair_budget)
         return self, view.width, view.height, view.raster, labels, budgets
-
-    def _images(
-        self,
-        views: ViewBatch | View,
-        rendered: list[Rendered],
-        resident: Resident,
-        leased: list[tuple[str, cl.Buffer]] | None = None,
-        replay: Replay | None = None,
-    ) -> OpenCLImages:
-        return OpenCLImages(
-            self.workspace, self.outputs, views, self.shape, rendered, resident.count, leased, replay
-        )
 
     def _listing(self, lists: str) -> OpenCLPipeline:
         """The pipeline with another tile-binning strategy."""

@@ -109,20 +109,16 @@ class OpenCLProbe(Probe):
         return self._workspace.shape.fast_fma
 
     def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
-        """Evaluate a b - a b; a b + a; (a/3)(b/3) - (a/3)(b/3) in the set-up's precision; fma(a, b, -(a b)):
-        each (n,), from a, b (n,) float32."""
         real = np.float64 if self._workspace.info.float64 else np.float32
         types = (np.float32, np.float32, real, np.float32)
         return evaluate(self._workspace, CONTRACTION, (a, b, a), types)
 
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
-        """NaN tests of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
         return evaluate(self._workspace, NOT_A_NUMBER, (x,), (np.int32,) * 4)
 
     def arithmetic(
         self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Run the kernels of check/arithmetic.cl."""
         workspace, n = self._workspace, len(exponents)
         kernels = check_kernels(workspace, "check/arithmetic.cl", effects=("slot/arithmetic_fast.cl",))
 
@@ -150,12 +146,9 @@ class OpenCLProbe(Probe):
         return results
 
     def options(self) -> list[str]:
-        """Compiler options of every program."""
         return self._workspace.compiler_options
 
     def scan(self, pipeline: OpenCLPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
-        """Prefix sums of list lengths (n,) uint32: the start of each list (n + 1,) uint32, and the total in
-        64 bits."""
         workspace, items = pipeline.workspace, (pipeline.shape.scan_items,)
         starts = buffer_of(workspace, np.empty(len(lengths) + 1, np.uint32))
         sums = buffer_of(workspace, np.zeros(8, np.uint32))
@@ -182,13 +175,10 @@ class OpenCLProbe(Probe):
         return places, int(words[place]) | int(words[place + 1]) << 32
 
     def boxes(self, pipeline: OpenCLPipeline, trace: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Bounding boxes of the splats in a result of `pipeline.trace`, in samples: (n, 4) int, columns
-        [x0, x1) and rows [y0, y1); undefined for culled splats."""
         return np.stack([trace["records"][name].astype(int) for name in ("x0", "x1", "y0", "y1")], 1)
 
     @contextmanager
     def poisoned(self) -> Iterator[None]:
-        """Fill every buffer of a frame with 0xFF before its use: NaN, or the integer -1."""
         pool = self._workspace.pool
         self._workspace.pool = _PoisonedPool(self._workspace)
         try:

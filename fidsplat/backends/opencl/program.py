@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib
 import threading
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Hashable, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -15,12 +15,11 @@ import pyopencl as cl
 
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.opencl.assemble import Source, assemble_check
-from fidsplat.backends.opencl.pocl_workarounds import is_pocl
-from fidsplat.backends.opencl.pocl_workarounds.shared_programs import shared_program
+from fidsplat.backends.opencl.pocl_workarounds import is_pocl, shared_program
 from fidsplat.backends.opencl.pocl_workarounds.target_patch import correct_target, needs_correction
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.util import interrupts
-from fidsplat.util.errors import DeviceError
+from fidsplat.util.errors import DeviceError, FidsplatError
 
 in_background = threading.local()
 """`on` in compile threads: the parent thread has set the warning filters, which all threads share"""
@@ -137,3 +136,39 @@ def check_kernels(
     built = build(workspace, assemble_check(file, shape, workspace.info.float64, effects) + text)
     load_invoker()
     return {kernel.function_name: kernel for kernel in built.all_kernels()}
+
+
+class BackgroundCompiler:
+    """Compiles programs one after another in background threads; drivers release the GIL while compiling.
+
+    Each thread compiles one program: a process that exits meanwhile, after Ctrl-C for example, waits for it.
+    """
+
+    def __init__(self) -> None:
+        self._threads: dict[Hashable, threading.Thread] = {}
+
+    def begin(self, key: Hashable, compile: Callable[[], object]) -> None:
+        """Start to compile. Errors are ignored here: the program is compiled again when it is needed, and the
+        error is raised then."""
+        if key in self._threads:
+            return
+        # not in the thread: `build` changes the filters of all threads
+        warnings.filterwarnings("ignore", category=cl.CompilerWarning)
+        before = list(self._threads.values())
+
+        def work() -> None:
+            in_background.on = True
+            for other in before:
+                other.join()
+            with suppress(FidsplatError, cl.Error):
+                compile()
+
+        self._threads[key] = thread = threading.Thread(target=work, name="fidsplat compiles", daemon=False)
+        thread.start()
+
+    def wait(self, key: Hashable) -> None:
+        """Wait until the compilation of a key has ended, if it has begun."""
+        thread = self._threads.get(key)
+        if thread is not None and thread is not threading.current_thread():
+            thread.join()
+            self._threads.pop(key, None)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.coplanar_groups import group_index
+from fidsplat.backends.cloud_arrays import kernel_arrays
 from fidsplat.backends.interface import ResidentData
 from fidsplat.backends.opencl.buffers import DeviceBuffer
 from fidsplat.backends.opencl.workspace import Workspace
@@ -39,24 +39,7 @@ class Resident(ResidentData):
         self.sh_degree = cloud.sh_degree
         self.has_coplanar_groups = cloud.coplanar_groups is not None
         self.footprint, self.ellipsoids = cloud.footprint, cloud.ellipsoids
-        self._arrays = {
-            "means": cloud.means,
-            "quats": cloud.quats,
-            "scales": cloud.scales,
-            "opacities": cloud.opacities,
-            "labels": cloud.labels,
-        }
-        if self.has_coplanar_groups:
-            self._arrays["coplanar_groups"] = group_index(cloud)
-        if cloud.boxes is not None:
-            self._arrays["boxes"] = cloud.boxes.astype(np.int32)
-        if cloud.thickness is not None:
-            self._arrays["thickness"] = cloud.thickness
-        plain = cloud.plain_colors
-        if plain is not None:
-            self._arrays["colors"] = plain
-        elif cloud.sh is not None:  # always true: a cloud has colours or SH
-            self._arrays["sh"] = cloud.sh
+        self._arrays = kernel_arrays(cloud)
         self._buffers: dict[str, cl.Buffer] = {}
         self.cached_frames: dict[Hashable, Any] = {}
         """cached frames for replay, by their kind"""
@@ -109,7 +92,6 @@ class Resident(ResidentData):
         return 0 if self._shared else sum(buffer.size for buffer in self._buffers.values())
 
     def color_range(self) -> tuple[float, float]:
-        """Lower and upper bound of every channel, from any direction."""
         return color_range(self._arrays.get("colors"), self._arrays.get("sh"))
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:

@@ -11,10 +11,9 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
-from fidsplat.backends.interface import ResidentData, TrainingKernels
+from fidsplat.backends.interface import ResidentData
 from fidsplat.backends.opencl.assemble import assemble_training
 from fidsplat.backends.opencl.command_list import CommandList
-from fidsplat.backends.opencl.loss_readback import SLOTS, LossReadback
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.cameras import Camera
@@ -33,6 +32,8 @@ _EACH_ROWS = 4
 """rows per work-item of the vertical passes (EACH_ROWS of kernels/opencl/train/loss.cl)"""
 _MOMENTS = ("first_", "second_")
 """name prefixes of Adam's moments"""
+SLOTS = 16
+"""maximum number of unread losses"""
 _STEP_NUMBERS = (
     *("beta1", "beta2", "rest1", "rest2", "root", "epsilon", "scale_penalty", "opacity_penalty"),
     *(f"size_{name}" for name in ("means", "scales", "quats", "logits", "sh", "rest")),
@@ -87,10 +88,53 @@ class ResidentArrays(ResidentData):
         return complete.get_sub_region(first * row, (end - first) * row)
 
 
-class OpenCLTraining(TrainingKernels):
-    """Training kernels of an OpenCL device."""
+class LossReadback:
+    """Ring buffer for the sums of the last losses, so that the host need not read each before the next."""
+
+    def __init__(self, workspace: Workspace, groups: int) -> None:
+        """groups: number of work-groups, each with three sums."""
+        self._workspace, self._groups = workspace, groups
+        align = max(1, workspace.device.mem_base_addr_align // 8)
+        size = -(-12 * groups // align) * align
+        self._buffer = workspace.pool.fresh("losses", SLOTS * size)
+        self._slots = [self._buffer.get_sub_region(k * size, 12 * groups) for k in range(SLOTS)]
+        self._words = np.empty((SLOTS, size // 4), np.float32)
+        self._next = 0
+        self._last: cl.Event | None = None
+        """event of the last loss's sums; the queue is in order, so earlier losses are complete too"""
+        self._unread: set[int] = set()
+
+    def take(self) -> tuple[int, cl.Buffer]:
+        """The next slot and its buffer; slots are reused after `SLOTS` losses."""
+        self._next = (self._next + 1) % SLOTS
+        return self._next, self._slots[self._next]
+
+    def submitted(self, slot: int, event: cl.Event) -> None:
+        """Mark a slot as unread. event: of the kernel that writes its sums."""
+        self._last = event
+        self._unread.add(slot)
+
+    def read(self, slot: int) -> np.ndarray:
+        """Read the three sums (3,) float64 of a slot; all unread slots are copied together."""
+        if slot in self._unread:
+            after = None if self._last is None else [self._last]
+            cl.enqueue_copy(self._workspace.side_queue, self._words, self._buffer, wait_for=after)
+            self._unread.clear()
+        sums = self._words[slot, : 3 * self._groups].reshape(self._groups, 3)
+        return sums.sum(axis=0, dtype=np.float64)
+
+
+class OpenCLTraining:
+    """Device kernels of a training step other than rendering: loss, optimiser, densification, noise.
+
+    The state is n splats before their activation functions, float32: `means` (n, 3), `log_scales` (n, 2) of
+    disks or (n, 3) of 3D Gaussians, `quats` (n, 4), `logits` (n,), `sh` (n, k, 3); Adam's moments of each as
+    `first_NAME` and `second_NAME`; `gradient_sums` (n,) and `visible_counts` (n,), the statistics of
+    densification.
+    """
 
     max_pending_losses = SLOTS // 2 - 1  # a frame that exceeds its capacity uses two slots
+    """number of later frames after which a loss may still be read"""
 
     def __init__(self, workspace: Workspace, lanes: int = 0) -> None:
         """lanes: vector width; 0 for the device's own."""
@@ -119,7 +163,8 @@ class OpenCLTraining(TrainingKernels):
         """origin and arguments of the kernel `count_visible` by camera"""
 
     def load_views(self, views: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> None:
-        """Copy images and masks to the device."""
+        """Copy the ground truth to the device: images (h, w, 3) uint8, each with a mask (h, w) bool or
+        None."""
         for image, mask in views:
             weights = np.zeros(1, np.uint8) if mask is None else mask.astype(np.uint8)
             values = image.size if mask is None else max(1, 3 * int(weights.sum()))
@@ -127,17 +172,15 @@ class OpenCLTraining(TrainingKernels):
             self._targets.append(_Target(*buffers, mask is not None, values))
 
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Set arrays of the splats."""
+        """Set arrays of the state by their names; others are unchanged."""
         for name, array in arrays.items():
             self._bound[name] = self._put(f"the splats' {name}", array)
             self._shapes[name] = array.shape
         self._splats_changed()
 
     def gather_rows(self, rows: np.ndarray, remaining: int) -> None:
-        """Replace the splats by these rows of their arrays, in this order.
-
-        remaining: number of first rows that keep their moments of Adam; other rows have moments of 0.
-        """
+        """Keep or duplicate splats: row i of the new state is row `rows[i]` (m,) uint32 of the old one.
+        Moments are zeroed from row `remaining` on."""
         self._bound["rows"], self._count = self._put("rows", rows), len(rows)
         for name, shape in self._shapes.items():
             made = len(rows), *shape[1:]
@@ -153,14 +196,14 @@ class OpenCLTraining(TrainingKernels):
         self._splats_changed()
 
     def write(self, arrays: Mapping[str, np.ndarray], first: int) -> None:
-        """Overwrite the last rows of arrays."""
+        """Overwrite arrays of the state from row `first` to their end."""
         for name, array in arrays.items():
             above = first * 4 * math.prod(self._shapes[name][1:])
             if array.nbytes:
                 cl.enqueue_copy(self._queue, self._bound[name], np.ascontiguousarray(array), dst_offset=above)
 
     def clear(self, names: Sequence[str]) -> None:
-        """Fill arrays with zeros."""
+        """Fill arrays of the state with zeros."""
         for name in names:
             if size := 4 * math.prod(self._shapes[name]):
                 cl.enqueue_fill_buffer(self._queue, self._bound[name], np.zeros(1, np.float32), 0, size)
@@ -176,7 +219,7 @@ class OpenCLTraining(TrainingKernels):
             )
 
     def read(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """Copy arrays to the host."""
+        """Copy arrays of the state to the host; all by default."""
         found = {}
         for name in self._shapes if names is None else names:
             found[name] = np.empty(self._shapes[name], np.float32)
@@ -184,7 +227,8 @@ class OpenCLTraining(TrainingKernels):
         return found
 
     def resident(self, degree: int, origin: np.ndarray) -> ResidentArrays:
-        """The splats as a cloud to render."""
+        """The splats as a cloud to render, with SH up to `degree`; it shares the state, so that steps change
+        it."""
         if self._resident is None or self._resident[0] != degree:
             count, rendered, every = self._count, (degree + 1) ** 2, self._shapes["sh"][1]
             shared = degree > 0 and rendered == every  # the coefficients are rendered as they are
@@ -212,7 +256,15 @@ class OpenCLTraining(TrainingKernels):
     def loss(
         self, images: Any, view: int, dssim_weight: float, exposure: np.ndarray | None = None
     ) -> tuple[Callable[[], tuple[Any, ...]], Any]:
-        """Compare a frame with the image of a view."""
+        """Compare a frame with the ground truth of view number `view`.
+
+        exposure: (2, 3) logarithms of gains, and offsets, applied to the frame first; None: as rendered.
+
+        Returns:
+            A function that waits for the loss, the mean squared difference and, with an exposure, the
+            gradient (2, 3) by it, and returns them, to be called before `max_pending_losses` more frames; and
+            the gradient of the loss (h, w, 3), a device array that is valid until the next call.
+        """
         rgb, (height, columns, _) = images.device_buffer("rgb")
         rendered, shown = rgb, _exposure_arguments(exposure)
         if shown:
@@ -282,7 +334,8 @@ class OpenCLTraining(TrainingKernels):
         return read
 
     def normal_loss_gradients(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:
-        """Gradients of the normal loss."""
+        """Gradients of `fidsplat.train.losses.normal_loss` with respect to `depth` and `normal`, times the
+        weight, as device arrays that are valid until the next call."""
         depth, target = images.device_array("depth"), self._targets[view]
         height, width = depth.shape
         shapes = {"depth": (height, width), "normal": (height, width, 3)}
@@ -301,7 +354,8 @@ class OpenCLTraining(TrainingKernels):
         return found
 
     def accumulate_statistics(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
-        """Add screen gradients and visibility to the statistics."""
+        """Add the frame's screen gradients and visibility to `gradient_sums` and `visible_counts`. taken: the
+        result of `backward_to_tiles`."""
         self._step(taken, dict.fromkeys(_STEP_NUMBERS, 0.0) | {"move": 0, "sparse": 0}, camera, origin)
 
     def step(
@@ -313,7 +367,19 @@ class OpenCLTraining(TrainingKernels):
         origin: np.ndarray,
         by_camera: bool = False,
     ) -> Callable[[], np.ndarray] | None:
-        """Apply a step of Adam."""
+        """Apply a step of Adam.
+
+        Args:
+            taken: the result of `GradientPipeline.backward_to_tiles`.
+            sizes: learning rates of `means`, `scales`, `quats`, `logits`, `sh` (degree 0) and `rest` (higher
+                degrees).
+            numbers: `beta1`, `beta2`, `epsilon`, `root` (square root of 1 - beta2^step); `scale_penalty` and
+                `opacity_penalty`, added to the gradients; `sparse`: 1 where splats on which the frame does
+                not depend are left unchanged.
+            camera: if given, statistics are accumulated first, as by `accumulate_statistics`.
+            pose: whether to return a function that waits for the gradient (6,) of the loss with respect to
+                the camera pose.
+        """
         given = {f"size_{name}": size for name, size in sizes.items()} | dict(numbers)
         given |= {"rest1": 1 - numbers["beta1"], "rest2": 1 - numbers["beta2"]}
         return self._step(
@@ -342,7 +408,9 @@ class OpenCLTraining(TrainingKernels):
         self._replay("count", (), given, lambda: [self._items("count_visible", self._count, given)])
 
     def add_noise(self, size: float, slope: float, threshold: float, words: Sequence[int]) -> None:
-        """Add MCMC noise to the means."""
+        """Add MCMC noise to the means: random steps in the plane of each disk with `size` times its variance,
+        reduced by a sigmoid of this `slope` for opacities above `threshold`. words: low and high word of the
+        seed, iteration, purpose of the random numbers."""
         names = ("seed_low", "seed_high", "iteration", "purpose")
         given = {"size": size, "slope": slope, "threshold": threshold, **dict(zip(names, words, strict=True))}
         self._launch("add_position_noise", self._count, given)

@@ -11,8 +11,7 @@ import pyopencl as cl
 from fidsplat.backends.interface import DeviceInfo
 from fidsplat.backends.opencl.buffers import BufferPool, RayBuffers
 from fidsplat.backends.opencl.host_memory import HostMemory
-from fidsplat.backends.opencl.pocl_workarounds import is_pocl
-from fidsplat.backends.opencl.pocl_workarounds.shared_programs import shared_context
+from fidsplat.backends.opencl.pocl_workarounds import is_pocl, shared_context
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.util.errors import DeviceError
 

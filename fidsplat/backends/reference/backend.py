@@ -70,43 +70,24 @@ def open_device(selector: str = "") -> ReferenceBackend:
 class ReferenceBackend(Backend):
     """The reference device: NumPy in float64."""
 
-    traits = DeviceTraits(differentiates=True)
+    traits = DeviceTraits(differentiates=True, renders_pixels=True)
 
     def __init__(self) -> None:
         self.info = devices()[0]
 
     def upload(self, cloud: SplatCloud) -> ReferenceCloud:
-        """Wrap the cloud; nothing is copied."""
         return ReferenceCloud(cloud)
 
     def unsupported(self, features: FeatureSet) -> str:
-        """Error message naming extensions of other packages; empty if there are none."""
         lacking = ", ".join(sorted(EXTENSIONS.keys() & features.names))
         return f"reference has no {lacking}; use an OpenCL device for it" if lacking else ""
 
     def pipeline(self, features: FeatureSet, shape: None = None) -> ReferencePipeline:
-        """The pipeline for these features; nothing is compiled.
-
-        Raises:
-            DeviceError: the features are `unsupported`.
-        """
         if why := self.unsupported(features):
             raise DeviceError(why)
         return ReferencePipeline(features)
 
-    def render_every(
-        self,
-        pipeline: ReferencePipeline,
-        resident: ReferenceCloud,
-        view: View,
-        step: int,
-        progress: Callable[[float], object] | None = None,
-    ) -> HostImages:
-        """Render every step-th pixel in both directions."""
-        return pipeline.render_every(resident, view, step, progress)
-
     def differentiate(self, features: FeatureSet, shape: None = None) -> ReferenceGradients:
-        """The pipeline with derivatives."""
         check_differentiable(features)
         return ReferenceGradients(self.pipeline(features), features)
 
@@ -124,7 +105,6 @@ class ReferenceCloud(ResidentData):
         self.footprint, self.ellipsoids = cloud.footprint, cloud.ellipsoids
 
     def color_range(self) -> tuple[float, float]:
-        """Lower and upper bound of every channel, from any direction."""
         return color_range(self.cloud.plain_colors, self.cloud.sh)
 
 
@@ -135,7 +115,6 @@ class ReferencePipeline(Pipeline):
         self.features, self._progress = features, _Progress()
 
     def render_view(self, resident: ReferenceCloud, view: View) -> HostImages:
-        """Render every pixel, in float64."""
         return self.render_every(resident, view, 1)
 
     def render_every(
@@ -145,7 +124,6 @@ class ReferencePipeline(Pipeline):
         step: int,
         progress: Callable[[float], object] | None = None,
     ) -> HostImages:
-        """Render every step-th pixel in both directions."""
         rows, columns = np.mgrid[
             0 : view.height // view.samples : step, 0 : view.width // view.samples : step
         ]

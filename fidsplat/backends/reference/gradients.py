@@ -28,13 +28,11 @@ class ReferenceGradients(GradientPipeline):
         self._last: tuple[Images, FrozenFrame] | None = None
 
     def forward(self, resident: Any, view: View, waits: bool = True) -> Images:
-        """Render one view."""
         images = self._pipeline.render_view(resident, view)
         self._last = images, FrozenFrame(resident.cloud, view, self._features)
         return images
 
     def backward(self, images: Any, gradients: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Gradients as NumPy arrays in float64."""
         check_gradients(self._features, gradients)
         if self._last is None or self._last[0] is not images:
             raise InputError(NOT_THE_LAST)

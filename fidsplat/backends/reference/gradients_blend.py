@@ -9,8 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.reference.blend import INVERSE_DEPTH, SPREAD_NEAR, inverse_depth, transmittance
-from fidsplat.backends.reference.coverage import MIN_ALPHA
+from fidsplat.backends.reference.blend import (
+    INVERSE_DEPTH,
+    MIN_ALPHA,
+    SPREAD_NEAR,
+    inverse_depth,
+    transmittance,
+)
 from fidsplat.backends.reference.fragments import HALF_RHO_OF_RANGE, bulged, fragments_of
 from fidsplat.backends.reference.gradients_scene import Placed
 from fidsplat.backends.reference.gradients_shapes import shapes_of

@@ -7,7 +7,7 @@ from copy import copy
 
 import numpy as np
 
-from fidsplat.backends.coplanar_groups import group_index
+from fidsplat.backends.cloud_arrays import group_index
 from fidsplat.backends.reference import ellipsoids, optics
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet

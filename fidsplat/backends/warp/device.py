@@ -80,23 +80,15 @@ class WarpBackend(Workspace, Backend):
         self.memory_budget = budget
 
     def upload(self, cloud: SplatCloud) -> Resident:
-        """Copy a cloud to the device."""
         return Resident.of(cloud, self.pool)
 
     def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> Resident:
-        """Make a cloud of arrays that are already on the device, without a copy."""
         return Resident.around(arrays, origin, self.pool)
 
     def unsupported(self, features: FeatureSet) -> str:
-        """Error message naming requested effects that have no Warp kernels; empty if there are none."""
         return unsupported(features, self.info.name)
 
     def pipeline(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpPipeline:
-        """The stages compiled for these features; `shape` replaces the device's own tiles (tests).
-
-        Raises:
-            DeviceError: an effect is not supported, or the compiler fails.
-        """
         key = (features, shape or self.shape)
         if key not in self._pipelines:
             program = Program(self.device, self.info.name, *key)
@@ -104,7 +96,6 @@ class WarpBackend(Workspace, Backend):
         return self._pipelines[key]
 
     def differentiate(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpGradients:
-        """The pipeline with derivatives; `shape` replaces the device's own tiles (tests)."""
         check_differentiable(features)
         if any(name.startswith("ellipsoid") for name in features.slots):
             raise DeviceError(
@@ -116,11 +107,9 @@ class WarpBackend(Workspace, Backend):
         return self._gradients[key]
 
     def probe(self) -> WarpProbe:
-        """Access to the device for tests."""
         return WarpProbe(self)
 
     def shapes(self, kind: str) -> dict[str, WarpShape]:
-        """Alternative build constants by name, for tests."""
         return other_shapes(self.shape, kind)
 
 

@@ -62,7 +62,6 @@ class WarpGradients(GradientPipeline):
         return WarpDifferentiable(frame, images)
 
     def backward(self, images: WarpDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
-        """Gradients as wp.arrays."""
         frame = images.frame
         check_gradients(frame.program.features, gradients)
         if not images.last:

@@ -90,8 +90,6 @@ class WarpImages(Images):
             self.arrays[name].fill_(output.blank)
 
     def device_array(self, name: str, index: int | None = None) -> Any:
-        """The images as a wp.array (views, h, w) or (views, h, w, 3), or of one view (h, w) or (h, w, 3), on
-        the device, without a copy."""
         for part in self.rendered:
             part.settle()
         output, array = self._outputs[name], self.arrays[name]
@@ -104,12 +102,10 @@ class WarpImages(Images):
         return array.reshape(shape)
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
-        """Copy the images of all views, or of one, to the host."""
         # copied, as on the CPU numpy() shares the memory of `device_array`
         return np.array(self.device_array(name, index).numpy())
 
     def read_uint8(self, name: str, index: int = 0) -> np.ndarray:
-        """Copy an image to the host in 8 bits, converted on the device."""
         image = self.device_array(name, index)
         made = load().empty(image.size, dtype=load().uint8, device=image.device)
         given = [image.flatten(), made]
@@ -121,7 +117,6 @@ class WarpImages(Images):
         return made.numpy().reshape(image.shape)
 
     def wait(self) -> None:
-        """Wait until the device has rendered all views."""
         for part in self.rendered:
             part.settle().launcher.finish()
 

@@ -26,11 +26,6 @@ class WarpPipeline(Pipeline):
         self._renderer = FrameRenderer(program, workspace, launches)
 
     def render_view(self, resident: Resident, view: View) -> WarpImages:
-        """Render one view.
-
-        Raises:
-            DeviceError: the device runs out of memory or fails.
-        """
         with self.workspace.working("while rendering"):
             images, into = self._new_images(resident, view)
             views = ViewBatch.single(view)
@@ -38,7 +33,6 @@ class WarpPipeline(Pipeline):
             return images
 
     def render(self, resident: Resident, views: ViewBatch) -> WarpImages:
-        """Render views, as many at once as memory allows. Raises DeviceError if the device fails."""
         wp, device = load(), self.workspace.device
         with self.workspace.working("while rendering"):
             images = WarpImages(self.workspace, self.outputs, views.size, views.total, resident.count)

@@ -25,21 +25,17 @@ class WarpProbe(Probe):
     """always true: Warp fuses multiply-adds where requested"""
 
     def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
-        """Evaluate a b - a b; a b + a; (a/3)(b/3) - (a/3)(b/3) in float64; fma(a, b, -(a b)): each (n,), from
-        a, b (n,) float32."""
         n = len(a)
         types = (np.float32, np.float32, np.float64, np.float32)
         return run(self._workspace, "contraction", n, (a, b, a), [np.zeros(n, each) for each in types])
 
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
-        """NaN tests of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
         (found,) = run(self._workspace, "not_a_number", len(x), (x,), [np.zeros((4, len(x)), np.int32)])
         return list(found)
 
     def arithmetic(
         self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Run the kernels of check.py."""
         workspace, n = self._workspace, len(exponents)
         single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
         (found,) = run(workspace, "arithmetic", n, single, [np.zeros((8, n), np.float32)])
@@ -52,13 +48,9 @@ class WarpProbe(Probe):
         return results
 
     def options(self) -> list[str]:
-        """Enabled compiler options, the same for every kernel."""
         return [name for name, value in kernels("common").STRICT.items() if value is True]
 
     def scan(self, pipeline: Any, lengths: np.ndarray) -> tuple[np.ndarray, int]:
-        """Prefix sums of list lengths (n,) uint32, modulo 2^32, (n + 1,) uint32; and the total in
-        64 bits. All pipelines use the same kernel.
-        """
         wp, device = load(), self._workspace.device
         with wp.ScopedDevice(device):
             given = wp.array(lengths.astype(np.int64), dtype=wp.int64, device=device)
@@ -68,15 +60,12 @@ class WarpProbe(Probe):
         return places.astype(np.uint32), int(places[-1])
 
     def boxes(self, pipeline: WarpPipeline, trace: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Bounding boxes of the splats in a result of `pipeline.trace`, in samples: (n, 4) int, columns
-        [x0, x1) and rows [y0, y1); undefined for culled splats."""
         words = [pipeline.program.layout.word(name) for name in ("columns", "rows")]
         spans = trace["records"].view(np.uint32)[:, words].astype(int)
         return np.stack([spans & 0xFFFF, spans >> 16], 2).reshape(-1, 4)
 
     @contextmanager
     def poisoned(self) -> Iterator[None]:
-        """A context in which new arrays are filled with bytes 0xFF: NaN as floats, -1 as integers."""
         pool = self._workspace.pool
         self._workspace.pool = PoisonedPool(self._workspace.device)
         try:

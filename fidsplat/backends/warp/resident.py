@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.coplanar_groups import group_index
+from fidsplat.backends.cloud_arrays import kernel_arrays
 from fidsplat.backends.interface import ResidentData
 from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import ArrayPool, nbytes
@@ -46,23 +46,11 @@ class Resident(ResidentData):
     @classmethod
     def of(cls, cloud: SplatCloud, pool: ArrayPool) -> Resident:
         """Upload a cloud."""
-        colors = cloud.plain_colors
-        if colors is None and cloud.sh is not None:
-            colors = cloud.sh.reshape(-1, 3)
-        arrays = {
-            "means": cloud.means,
-            "quats": cloud.quats,
-            "scales": cloud.scales,
-            "opacities": cloud.opacities,
-            "colors": colors,
-            "labels": cloud.labels,
-        }
-        if cloud.coplanar_groups is not None:
-            arrays["coplanar_groups"] = group_index(cloud)
-        if cloud.footprint == "mixed" and cloud.boxes is not None:
-            arrays["boxes"] = cloud.boxes.astype(np.int32)
-        if cloud.thickness is not None:
-            arrays["thickness"] = cloud.thickness
+        arrays = kernel_arrays(cloud)
+        if "sh" in arrays:
+            arrays["colors"] = arrays.pop("sh").reshape(-1, 3)
+        if cloud.footprint != "mixed":
+            arrays.pop("boxes", None)
         device = {name: _uploaded(name, array, pool) for name, array in arrays.items()}
         kinds = cloud.footprint, cloud.ellipsoids
         return cls(device, len(cloud), cloud.origin, cloud.sh_degree, *kinds)

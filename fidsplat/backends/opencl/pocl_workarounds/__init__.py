@@ -1,8 +1,26 @@
 """Workarounds for faults of PoCL; README.md says which versions need which."""
 
+from functools import cache
+
 import pyopencl as cl
 
 
 def is_pocl(device: cl.Device) -> bool:
     """Whether PoCL drives a device."""
     return "Portable Computing Language" in device.platform.name
+
+
+# PoCL does not free a program that has run: each renderer would leak 3 MB. The renderers of a process share
+# programs and their context; each has its own kernels, queues and buffers.
+
+
+@cache
+def shared_context(device: cl.Device) -> cl.Context:
+    """The context of a device."""
+    return cl.Context([device])
+
+
+@cache
+def shared_program(context: cl.Context, text: str, options: tuple[str, ...]) -> cl.Program:
+    """The program of a text compiled with these options, in this call or an earlier one."""
+    return cl.Program(context, text).build(options=list(options))
