@@ -16,6 +16,7 @@ from fidsplat.backends.opencl.effect_layouts import LAYOUTS
 from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
 from fidsplat.capture.quality import ELLIPSOID
 from fidsplat.effects import OUTPUTS, select
+from fidsplat.util.files import kernels_folder
 
 BACKEND = "opencl"
 
@@ -50,7 +51,8 @@ def record_bytes(features):
 def test_base_text_names_no_other_effect():
     text = assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE).text
     assert "//" not in text
-    absent = set(LAYOUTS) - {
+    parts = {path.stem for path in (kernels_folder() / "opencl/part").glob("*.cl")}
+    absent = (parts | set(LAYOUTS)) - {
         "camera_pinhole",
         "conic",
         "perspective",

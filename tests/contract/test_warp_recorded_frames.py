@@ -12,7 +12,7 @@ import fidsplat as fs
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.warp import memory_plan, runtime
 from fidsplat.backends.warp.frame import DeviceFrame
-from fidsplat.backends.warp.recorded_frame import RecordedFrame
+from fidsplat.backends.warp.pipeline import RecordedFrame
 from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.capture.views import views_of
 

@@ -177,41 +177,40 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     # blend and resolve are fused if a pixel has one sample and one pose, and no other pass adds to it
     separate = {"rays", "shutter_exposure", "shutter_rows"}
     fused = features.samples == 1 and "background_constant" in layouts and separate.isdisjoint(layouts)
-    half = "blend_half" in layouts
     files = [layout.file for layout in layouts.values() if layout.file]
-    files += [*_dialect(shape, _scalars(features), features.slots), LAYOUTS["resolve_pixel"].file]
-    if not half:
-        files.append(LAYOUTS["blend_float"].file)
+    files += [*_dialect(shape, _scalars(features), features.slots), "part/resolve_pixel.cl"]
+    if "blend_half" not in layouts:
+        files.append("part/blend_float.cl")
     if shape.batch > 1 and "camera_pinhole" in layouts:
         # not for mixtures of disks and 3D Gaussians, whose bounds are computed in another way
         if "lowpass_screen" in layouts and "thickness" not in layouts:
-            files.append(LAYOUTS["cull_frustum"].file)
+            files.append("part/cull_frustum.cl")
         if "lowpass_pixel" in layouts and "thickness" not in layouts:
-            files.append(LAYOUTS["cull_frustum_pixel"].file)
+            files.append("part/cull_frustum_pixel.cl")
         if "ellipsoids_only" in layouts:
-            files.append(LAYOUTS["cull_frustum_ewa"].file)
+            files.append("part/cull_frustum_ewa.cl")
     if fused:
-        files.append(LAYOUTS["resolve_fused"].file)
+        files.append("part/resolve_fused.cl")
     if shape.lists == "tiled":
         files.append("list/tiled.cl")
     # other cameras have no bounds by tile
     keys_by_tile = {"compose_pixel", "camera_pinhole"} <= layouts.keys() and shape.lists != "ordered"
     if keys_by_tile:
         layouts["tile_keys"] = LAYOUTS["tile_keys"]
-        files.append(LAYOUTS["tile_keys"].file)
+        files.append("part/tile_keys.cl")
     if "compose_pixel" in layouts:
-        files.append(LAYOUTS[f"k_buffer_{shape.schedule}"].file)
+        files.append(f"part/k_buffer_{shape.schedule}.cl")
     elif shape.schedule == "lanes":
-        files.append(LAYOUTS["tile_loop_lanes"].file)
+        files.append("part/tile_loop_lanes.cl")
     if not layouts.keys().isdisjoint({"compose_pixel", "coplanar_layers"}):
-        files += [LAYOUTS["passes"].file, LAYOUTS[f"passes_{shape.schedule}"].file]
-        files.append(LAYOUTS["blocks_nearest" if shape.schedule == "lanes" else "tile_nearest"].file)
+        files += ["part/passes.cl", f"part/passes_{shape.schedule}.cl"]
+        files.append("part/blocks_nearest.cl" if shape.schedule == "lanes" else "part/tile_nearest.cl")
     if "termination_depths" in layouts:  # after all passes through a list
         way = "_pixel" if "compose_pixel" in layouts else ""
-        files += [LAYOUTS["termination_depth_pixel"].file] if way else []
-        files.append(LAYOUTS[f"termination_depth{way}_{shape.schedule}"].file)
+        files += ["part/termination_depth_pixel.cl"] if way else []
+        files.append(f"part/termination_depth{way}_{shape.schedule}.cl")
     if "external_depth" in layouts:  # after all passes
-        files.append(LAYOUTS["external_depth_end"].file)
+        files.append("part/external_depth_end.cl")
     stages = {
         "lists": ("prelude", "math", *(("splat",) if keys_by_tile else ()), "bounds", *_LISTS[shape.lists]),
         "frame": [
@@ -507,6 +506,7 @@ def _refuse_unknown_hooks(files: list[str]) -> None:
     stages = [stage.format(schedule) for stage in _DRAWN for schedule in ("lanes", "group")]
     everywhere = {f"{stage}.cl" for stage in chain(stages, *_LISTS.values())}
     everywhere |= {layout.file for layout in LAYOUTS.values() if layout.file}
+    everywhere |= {f"part/{path.name}" for path in (kernels_folder() / "opencl/part").glob("*.cl")}
     known = set(chain.from_iterable(map(_hooks, everywhere)))
     for file in files:
         if unknown := set(sections_of(file)) - known:

@@ -23,9 +23,9 @@ from fidsplat.backends.view import View
 from fidsplat.effects.catalogue import Output
 
 
-@dataclass(init=False)
 class FrameBuffers:
-    """Buffers of a frame, named like the kernel arguments; None until their stage has allocated them.
+    """Buffers of every frame, named like the kernel arguments; a buffer is an attribute once its stage has
+    allocated it.
 
     v views, n splats, t tiles of all views, s samples of all views.
     """
@@ -34,7 +34,6 @@ class FrameBuffers:
     """records `View` (groups + 1, v)"""
     moving: cl.Buffer
     """number of moving groups, then their labels"""
-    """sort keys of the coplanar groups (groups, v)"""
     splats: cl.Buffer
     """records `Splat` (v, n)"""
     keys: cl.Buffer
@@ -112,7 +111,6 @@ class DeviceFrame:
         resident: Resident,
         views: ViewBatch,
         plan: MemoryPlan,
-        *,
         replay_queue: cl.CommandQueue | None = None,
         pair_limit: int = 0,
     ) -> None:
@@ -147,8 +145,8 @@ class DeviceFrame:
             self.first_tile = view.band[0] // shape.tile_height * self.tiles_x
             self.end_tile = -(-view.band[1] // shape.tile_height) * self.tiles_x
         self.buffers = FrameBuffers()
-        self.named: dict[str, cl.Buffer] = {}
-        """buffers that depend on effects and outputs, by the names of the kernel arguments"""
+        self.named: dict[str, cl.Buffer] = vars(self.buffers)
+        """these buffers and those of effects and outputs, by the names of the kernel arguments"""
         self.numbers: dict[str, Any] = numbers_of(view, self.source)
         """numbers by the names of the kernel arguments"""
         self.numbers |= {"width": view.width, "height": view.height, "stride": self.stride}
@@ -181,11 +179,6 @@ class DeviceFrame:
         frame = DeviceFrame(self.workspace, self.commands, self.shape, self.resident, views, self.plan)
         frame.is_sub_frame = True
         return frame
-
-    @property
-    def bound(self) -> dict[str, cl.Buffer]:
-        """All buffers by the names of the kernel arguments."""
-        return vars(self.buffers) | self.named
 
     @property
     def capacity(self) -> Capacity:
@@ -236,7 +229,7 @@ class DeviceFrame:
     def value(self, argument: Argument) -> Any:
         """The value of a kernel argument, from the frame or its view."""
         name = argument.name
-        for values in (vars(self.buffers), self.named, self.numbers):
+        for values in (self.named, self.numbers):
             if name in values:
                 return values[name]
         if argument.source == "uniform":  # of derivatives
@@ -264,21 +257,14 @@ class DeviceFrame:
 
     def bind(self, name: str, buffer: cl.Buffer) -> cl.Buffer:
         """Use a buffer as the kernel argument of this name."""
-        if name in FrameBuffers.__annotations__:
-            setattr(self.buffers, name, buffer)
-        else:
-            self.named[name] = buffer
+        self.named[name] = buffer
         return buffer
-
-    def buffer(self, name: str) -> cl.Buffer:
-        """The buffer that is bound to the kernel argument of this name."""
-        return getattr(self.buffers, name) if name in FrameBuffers.__annotations__ else self.named[name]
 
     def read(self, name: str, dtype: Any, shape: tuple[int, ...]) -> np.ndarray:
         """The contents of a buffer; waits for the device."""
         array = np.empty(shape, dtype)
         if array.size:
-            cl.enqueue_copy(self.queue, array, self.buffer(name))
+            cl.enqueue_copy(self.queue, array, self.named[name])
         return array
 
     def lease_images(self, outputs: tuple[Output, ...]) -> None:

@@ -155,9 +155,6 @@ LAYOUTS: dict[str, Layout] = {
         )
     ),
     # parts that several effects share
-    "cull_frustum": Layout("part/cull_frustum.cl"),
-    "cull_frustum_ewa": Layout("part/cull_frustum_ewa.cl"),
-    "cull_frustum_pixel": Layout("part/cull_frustum_pixel.cl"),
     "chord": Layout("part/chord.cl"),
     "conic": Layout("part/conic.cl", behind=(("ellipsoids_only", "conic_facing"),)),
     "conic_facing": Layout("part/conic_facing.cl"),
@@ -220,31 +217,7 @@ LAYOUTS: dict[str, Layout] = {
         splat=(member("int group", "coplanar group, -1: none"),),
         project=takes("cloud int coplanar_groups  // (n) index of the splat's group; -1: none"),
     ),
-    # colours and transmittance of a pixel, unless blend_half
-    "blend_float": Layout("part/blend_float.cl"),
-    # resolving samples to pixels
-    "resolve_pixel": Layout("part/resolve_pixel.cl"),
-    "resolve_fused": Layout("part/resolve_fused.cl"),
-    # loop through a tile's list on CPUs, without a k-buffer
-    "tile_loop_lanes": Layout("part/tile_loop_lanes.cl"),
-    # termination depths of tiles, by the schedule
-    "termination_depth_lanes": Layout("part/termination_depth_lanes.cl"),
-    "termination_depth_group": Layout("part/termination_depth_group.cl"),
-    "termination_depth_pixel": Layout("part/termination_depth_pixel.cl"),
-    "termination_depth_pixel_lanes": Layout("part/termination_depth_pixel_lanes.cl"),
-    "termination_depth_pixel_group": Layout("part/termination_depth_pixel_group.cl"),
-    # fragments sorted by depth at each pixel, by the schedule
-    "k_buffer_lanes": Layout("part/k_buffer_lanes.cl"),
-    "k_buffer_group": Layout("part/k_buffer_group.cl"),
-    # minimum depths of splats in blocks of pixels and in tiles, by the schedule
-    "blocks_nearest": Layout("part/blocks_nearest.cl"),
-    "tile_nearest": Layout("part/tile_nearest.cl"),
     "tile_keys": Layout("part/tile_keys.cl", emit=takes("in Splat splats")),
-    # several passes through a tile's list, by the schedule
-    "passes": Layout("part/passes.cl"),
-    "passes_lanes": Layout("part/passes_lanes.cl"),
-    "passes_group": Layout("part/passes_group.cl"),
-    "external_depth_end": Layout("part/external_depth_end.cl"),
     "coverage": Layout("part/coverage.cl"),
     "ray": Layout(resolve=RAY_UNIFORMS),
     "row_rotation": Layout("part/row_rotation.cl", resolve=takes("array float row_rotations  // (h, 3, 3)")),

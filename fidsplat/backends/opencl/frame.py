@@ -202,7 +202,7 @@ def accumulate(frame: DeviceFrame, part: DeviceFrame, sub_frame: SubFrame) -> No
     for one in frame.samples:
         if not (one.averaged or sub_frame.middle):
             continue
-        buffers = {"raw": part.buffer(one.name), "exposed": frame.buffer(one.name), "channels": one.channels}
+        buffers = {"raw": part.named[one.name], "exposed": frame.named[one.name], "channels": one.channels}
         weights = {"weight": sub_frame.weight, "first": sub_frame.first} if one.averaged else {}
         kernel = "expose" if one.averaged else "expose_middle"
         _launch_grid(frame, "expose", kernel, *size, **given, **buffers, **weights)

@@ -173,7 +173,7 @@ class OpenCLGradients(GradientPipeline):
         commands, key = self._tile_commands, self._key(frame)
         if key is not None and commands.key == key:
             leased = {name: buffer for name, buffer in frame.leased}
-            given = {f"by_{name}": frame.buffer(f"by_{name}") for name in self._by_outputs}
+            given = {f"by_{name}": frame.named[f"by_{name}"] for name in self._by_outputs}
             commands.set({**scalars_of(frame.view), "log_ceiling": ceiling, **leased, **given})
             frame.events += commands.submit(frame.queue)
             frame.stages += commands.stages

@@ -160,7 +160,10 @@ class OpenCLPipeline(Pipeline):
             cached, queue = resident.cached_frames.get(key), workspace.switch_to(workspace.queue)
             recorded = None if cached is None else cached.recorded
             if cached is not None and recorded is not None and recorded.set_view(view, queue):
-                frame = self._frame(resident, view, cached.plan, recorded.commands, queue, pair_limit)
+                frame = DeviceFrame(
+                    *(workspace, recorded.commands, self.shape, resident),
+                    *(ViewBatch.single(view), cached.plan, queue, pair_limit),
+                )
                 recorded.render(frame)
                 return frame
             plan = self._planner.frame(resident, view)
@@ -170,9 +173,7 @@ class OpenCLPipeline(Pipeline):
                 return self.render_complete(resident, view)
             resident.cached_frames.pop(key, None)  # after an interrupt the recording may be incomplete
             commands = CommandList(self.program) if recorded is None else recorded.commands
-            frame = self._frame(resident, view, plan, commands, queue, pair_limit)
-            frame.lease_images(self.features.images)
-            render(frame)
+            frame = self._render_frame(resident, view, plan, commands, queue, pair_limit)
             resident.cached_frames[key] = CachedFrame(plan, kind, None, RecordedFrame(frame))
             return frame
 
@@ -201,9 +202,7 @@ class OpenCLPipeline(Pipeline):
         else:
             commands = CommandList(self.program) if recorded is None else recorded.commands
             cached.recorded = None  # after an interrupt the recording may be incomplete
-            frame = self._frame(resident, view, cached.plan, commands, queue)
-            frame.lease_images(self.features.images)
-            render(frame)
+            frame = self._render_frame(resident, view, cached.plan, commands, queue)
             rendered = frame.rendered()
             if not frame.in_bands:
                 cached.recorded = recorded = RecordedFrame(frame)
@@ -216,34 +215,29 @@ class OpenCLPipeline(Pipeline):
             images.complete()
         return images
 
-    def _frame(
+    def _render_frame(
         self,
         resident: Resident,
         view: View,
         plan: MemoryPlan,
-        commands: CommandList,
+        commands: CommandList | None = None,
         replay_queue: cl.CommandQueue | None = None,
         pair_limit: int = 0,
     ) -> DeviceFrame:
-        return DeviceFrame(
-            *(self.workspace, commands, self.shape, resident, ViewBatch.single(view), plan),
-            **{"replay_queue": replay_queue, "pair_limit": pair_limit},
+        frame = DeviceFrame(
+            *(self.workspace, commands or self._commands, self.shape),
+            *(resident, ViewBatch.single(view), plan, replay_queue, pair_limit),
         )
+        frame.lease_images(self.features.images)
+        render(frame)
+        return frame
 
-    def _render_planned(
-        self,
-        resident: Resident,
-        view: View,
-        plan: MemoryPlan,
-    ) -> DeviceFrame:
+    def _render_planned(self, resident: Resident, view: View, plan: MemoryPlan) -> DeviceFrame:
         """Render a frame according to its memory plan."""
         # release the buffers of other kinds of frames; buffers of this kind are part of the plan
         free = self.workspace.memory_budget - plan.total
         self.workspace.pool.make_way(self._buffer_kind(resident, view, plan), free, resident.capacity)
-        frame = self._frame(resident, view, plan, self._commands)
-        frame.lease_images(self.features.images)
-        render(frame)
-        return frame
+        return self._render_frame(resident, view, plan)
 
     def _buffer_kind(self, resident: Resident, view: View, plan: MemoryPlan) -> tuple[Any, ...]:
         """Key of frames that have buffers of the same sizes."""
@@ -297,10 +291,7 @@ class OpenCLPipeline(Pipeline):
         transmittance of the padded sample grid; and the output images by name.
         """
         with self.workspace.rendering():
-            plan = MemoryPlan(0, resident.count, 0)
-            frame = self._frame(resident, view, plan, self._commands)
-            frame.lease_images(self.features.images)
-            render(frame)
+            frame = self._render_frame(resident, view, MemoryPlan(0, resident.count, 0))
         images = self.images_of(frame)
         return {
             "keys": frame.read("keys", np.uint32, (resident.count,)),

@@ -58,7 +58,7 @@ class RecordedFrame:
         """bytes of these arrays"""
         self._uploads: deque[cl.Event] = deque(frame.uploads, maxlen=_UPLOADS)
         self._leases = [(name, buffer.size) for name, buffer in frame.leased]
-        self._scratch = [name for name in frame.bound if name not in dict(frame.leased)]
+        self._scratch = [name for name in frame.named if name not in dict(frame.leased)]
 
     def set_view(self, view: View, queue: cl.CommandQueue) -> bool:
         """Bind the uniforms of a view. Returns False if a scratch buffer was replaced, so that the command

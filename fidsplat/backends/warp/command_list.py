@@ -6,6 +6,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -150,45 +151,27 @@ class Launcher:
         return timings
 
 
-class CommandList:
-    """Command list: a CUDA graph that is captured once and replayed; on the CPU (in tests) Warp's own
-    list."""
-
-    def __init__(self, graph: Any) -> None:
-        self._graph = graph
-
-    @staticmethod
-    def record(workspace: Workspace, launch: Callable[[], object]) -> CommandList | None:
-        """Capture the launches that `launch` submits, without running them. Returns None after a warning if
-        the device cannot capture; later frames are then not captured either."""
-        wp, device = load(), workspace.device
-        try:
-            # a separate stream, as the caller's current stream may not support capture
-            with wp.ScopedStream(workspace.capture_stream, sync_enter=False):
-                wp.capture_begin(device=device)
-                try:
-                    launch()
-                except BaseException:
-                    _abort_capture(wp, device)
-                    raise
-                return CommandList(wp.capture_end(device=device))
-        except RuntimeError as error:
-            workspace.replays = False
-            warnings.warn(
-                f"{workspace.name} captures no graphs ({str(error).strip()}); each frame's kernels are "
-                "launched one by one, with bit-identical images",
-                stacklevel=2,
-            )
-            return None
-
-    def submit(self) -> None:
-        """Replay the launches."""
-        load().capture_launch(self._graph)
-
-
-def _abort_capture(wp: Any, device: Any) -> None:
-    """End a capture that failed."""
+def capture(workspace: Workspace, launch: Callable[[], object]) -> Any:
+    """Capture the launches that `launch` submits as a CUDA graph, without running them; on the CPU (in tests)
+    as a list of Warp. Returns None after a warning if the device cannot capture; later frames are then not
+    captured either."""
+    wp, device = load(), workspace.device
     try:
-        wp.capture_end(device=device)
-    except RuntimeError:
-        return
+        # a separate stream, as the caller's current stream may not support capture
+        with wp.ScopedStream(workspace.capture_stream, sync_enter=False):
+            wp.capture_begin(device=device)
+            try:
+                launch()
+            except BaseException:
+                with suppress(RuntimeError):
+                    wp.capture_end(device=device)
+                raise
+            return wp.capture_end(device=device)
+    except RuntimeError as error:
+        workspace.replays = False
+        warnings.warn(
+            f"{workspace.name} captures no graphs ({str(error).strip()}); each frame's kernels are "
+            "launched one by one, with bit-identical images",
+            stacklevel=2,
+        )
+        return None

@@ -7,7 +7,7 @@ bit-identically.
 
 A frame of a kind that was rendered before does not wait for these numbers: its lists have the `Capacity` of
 earlier frames, and `totals` on the device holds the true numbers. If they exceed the capacity, the lists are
-empty, and recorded_frame.py renders the frame again.
+empty, and pipeline.py renders the frame again.
 """
 
 from __future__ import annotations
@@ -44,6 +44,8 @@ class ImageArrays:
     """by the names of the outputs"""
     indices: Any
     """(views) int32 on the device: batch index of each view in these arrays"""
+    reserved: int
+    """size in bytes of the images of all views of the batch"""
 
 
 @dataclass(frozen=True)

@@ -1,35 +1,86 @@
-"""The stages compiled for one FeatureSet on one Warp device."""
+"""The stages compiled for one FeatureSet on one Warp device, and the replay of frames.
+
+A frame of a kind that was rendered before is rendered without waiting for its counts: its lists have the
+largest capacity that earlier frames of the same cloud, size and number of views needed, plus an eighth. A
+frame that exceeds this capacity is rendered again when it is read. From the third frame of a kind on, all
+stages except resolve are one captured CUDA graph. The arguments of its launches are constant: values that
+differ between views are in input arrays, which the host fills before the replay.
+"""
 
 from __future__ import annotations
+
+import weakref
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import Pipeline
 from fidsplat.backends.view import View
-from fidsplat.backends.warp.command_list import LaunchCache
-from fidsplat.backends.warp.frame import DeviceFrame, ImageArrays
-from fidsplat.backends.warp.images import WarpImages
+from fidsplat.backends.warp.command_list import LaunchCache, Launcher, capture
+from fidsplat.backends.warp.frame import Capacity, DeviceFrame, ImageArrays
+from fidsplat.backends.warp.images import Rendered, WarpImages
+from fidsplat.backends.warp.memory_plan import MemoryPlanner
 from fidsplat.backends.warp.program import Program
-from fidsplat.backends.warp.recorded_frame import FrameRenderer
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import load
-from fidsplat.backends.warp.workspace import Workspace
+from fidsplat.backends.warp.workspace import ArrayPool, Workspace
+
+_SPARE = 256
+"""constant added to a capacity, in addition to an eighth"""
+_MAX_KINDS = 8
+"""maximum number of kinds of frames that are cached for a cloud"""
+
+
+@dataclass(frozen=True)
+class RecordedFrame:
+    """A frame and the CUDA graph of its stages except resolve."""
+
+    frame: DeviceFrame
+    graph: Any
+
+    def replay(self, views: ViewBatch) -> None:
+        """Replay the stages for other views."""
+        if len(views) > 1 or views.view is not self.frame.view:
+            self.frame.set_views(views)
+        load().capture_launch(self.graph)
+
+
+@dataclass(eq=False)
+class _CachedFrame:
+    """Cache entry: a kind of frame of a cloud, with one image size and number of views."""
+
+    inputs: ArrayPool
+    """pool of the input arrays that the host fills for the views"""
+    capacity: Capacity
+    token: tuple[Any, ...] = ()
+    """result of `_token` for the last frame"""
+    recorded: RecordedFrame | None = None
+
+    def release_arrays(self) -> None:
+        """Release the arrays of the recorded frame."""
+        self.recorded = None
 
 
 class WarpPipeline(Pipeline):
-    """Compiled stages."""
+    """Compiled stages, with cached capacities and recorded frames of each cloud."""
 
     def __init__(self, program: Program, workspace: Workspace, launches: LaunchCache) -> None:
-        self.program, self.workspace = program, workspace
+        self.program, self.workspace, self._launches = program, workspace, launches
         self.outputs = {output.name: output for output in program.images}
-        self._renderer = FrameRenderer(program, workspace, launches)
+        self._planner = MemoryPlanner(program, workspace)
+        workspace.pool.holders.add(launches)
+        self._cached: WeakKeyDictionary[Resident, dict[tuple[int, int, int], _CachedFrame]] = (
+            WeakKeyDictionary()
+        )
 
     def render_view(self, resident: Resident, view: View) -> WarpImages:
         with self.workspace.working("while rendering"):
             images, into = self._new_images(resident, view)
-            views = ViewBatch.single(view)
-            images.rendered.append(self._renderer.render(resident, views, into, images.nbytes))
+            images.rendered.append(self._render(resident, ViewBatch.single(view), into))
             return images
 
     def render(self, resident: Resident, views: ViewBatch) -> WarpImages:
@@ -38,11 +89,11 @@ class WarpPipeline(Pipeline):
             images = WarpImages(self.workspace, self.outputs, views.size, views.total, resident.count)
             if len(views) < views.total:
                 images.blank()
-            for first, end in self._renderer.planner.parts(resident, views, images.nbytes):
+            for first, end in self._planner.parts(resident, views, images.nbytes):
                 indices = views.batch_indices[first:end].astype(np.int32)
-                into = ImageArrays(images.arrays, wp.array(indices, dtype=wp.int32, device=device))
-                part = views.part(first, end)
-                images.rendered.append(self._renderer.render(resident, part, into, images.nbytes))
+                indices = wp.array(indices, dtype=wp.int32, device=device)
+                into = ImageArrays(images.arrays, indices, images.nbytes)
+                images.rendered.append(self._render(resident, views.part(first, end), into))
             return images
 
     def render_counted(self, resident: Resident, view: View) -> tuple[DeviceFrame, WarpImages]:
@@ -54,15 +105,14 @@ class WarpPipeline(Pipeline):
         """
         with self.workspace.working("while rendering"):
             images, into = self._new_images(resident, view)
-            views = ViewBatch.single(view)
-            frame, rendered = self._renderer.render_counted(resident, views, into, images.nbytes)
+            frame, rendered = self._render_counted(resident, ViewBatch.single(view), into)
             images.rendered.append(rendered)
             return frame, images
 
     def _new_images(self, resident: Resident, view: View) -> tuple[WarpImages, ImageArrays]:
         size = view.height // view.samples, view.width // view.samples
         images = WarpImages(self.workspace, self.outputs, size, splats=resident.count)
-        return images, ImageArrays(images.arrays, self.workspace.first_index)
+        return images, ImageArrays(images.arrays, self.workspace.first_index, images.nbytes)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Render one view and return the data between the stages.
@@ -85,3 +135,123 @@ class WarpPipeline(Pipeline):
             "raw": raw.reshape(rows, stride, 4).transpose(2, 0, 1).copy(),
             **{output.name: images.read(output.name, 0) for output in self.program.images},
         }
+
+    def _render_counted(
+        self, resident: Resident, views: ViewBatch, into: ImageArrays
+    ) -> tuple[DeviceFrame, Rendered]:
+        """Render views and wait for their counts."""
+        launcher = Launcher(self._launches)
+        frame = DeviceFrame(self.program, self._planner, resident, views, launcher, into.reserved)
+        self.workspace.frames += 1
+        frame.render()
+        if not views.view.sub_frames:
+            self._update_capacity(resident, views, frame.stats["visible"], frame.stats["pairs"])
+        frame.resolve(into, launcher)
+        return frame, Rendered(launcher, frame.stats)
+
+    def _render(self, resident: Resident, views: ViewBatch, into: ImageArrays) -> Rendered:
+        """Render views; without waiting if a frame of their kind was rendered before."""
+        workspace, view = self.workspace, views.view
+        # adopted arrays may change before a frame is rendered again, so these frames must wait
+        if not workspace.asynchronous or view.sub_frames or resident.adopted or not resident.count:
+            return self._render_counted(resident, views, into)[1]
+        cached = self._cached.get(resident, {}).get((view.width, view.height, len(views)))
+        if cached is None:
+            return self._render_counted(resident, views, into)[1]
+        # after a failure or another kind of frame the inputs are undefined
+        capacity, recorded, cached.recorded = cached.capacity, cached.recorded, None
+        if recorded is not None and cached.token == self._token(cached, view, into.reserved):
+            recorded.replay(views)
+            cached.recorded = recorded
+            workspace.frames += 1
+            launcher = Launcher(self._launches, timed=False)
+            return self._pending(resident, views, capacity, recorded.frame, launcher, into)
+        launcher = Launcher(self._launches)
+        given = into.reserved, capacity, cached.inputs
+        frame = DeviceFrame(self.program, self._planner, resident, views, launcher, *given)
+        if not frame.fits(capacity):
+            return self._render_counted(resident, views, into)[1]
+        workspace.frames += 1
+        frame.render()
+        rendered = self._pending(resident, views, capacity, frame, launcher, into)
+        self._record(cached, frame, into.reserved)
+        return rendered
+
+    def _pending(
+        self,
+        resident: Resident,
+        views: ViewBatch,
+        capacity: Capacity,
+        frame: DeviceFrame,
+        launcher: Launcher,
+        into: ImageArrays,
+    ) -> Rendered:
+        """A submitted frame whose numbers of splats and pairs are compared with the capacities later."""
+        workspace, pool = self.workspace, frame.pool
+        counts = pool.lend("totals", 2, load().int64)
+        load().copy(counts, frame.named["totals"])
+        frame.resolve(into, launcher)
+        rendered = Rendered(launcher, {"splats": resident.count, "visible": 0, "pairs": 0})
+        # give the array back; a later frame may then use it
+        weakref.finalize(rendered, pool.give_back, "totals", counts)
+        stats = rendered.counts  # capture only the counts, so that the object can be released
+
+        def complete() -> Rendered | None:
+            with workspace.failing("while rendering"):
+                launcher.finish()
+            with workspace.working("while rendering"):
+                visible, pairs = counts.numpy().tolist()
+                stats.update(visible=visible, pairs=pairs)
+                self._update_capacity(resident, views, visible, pairs)
+                if visible > capacity.visible or pairs > capacity.pairs:
+                    return self._render_counted(resident, views, into)[1]
+            return None
+
+        def profile() -> Mapping[str, float]:
+            """Measure the stages by rendering into other arrays, or into those of a batch."""
+            with workspace.working("while rendering"):
+                own = into
+                if len(views) == 1:
+                    arrays = {name: load().empty_like(array) for name, array in into.arrays.items()}
+                    own = replace(into, arrays=arrays)
+                return self._render_counted(resident, views, own)[1].timings()
+
+        rendered.complete = complete
+        if not launcher.timed:
+            rendered.profile = profile
+        return rendered
+
+    def _record(self, cached: _CachedFrame, frame: DeviceFrame, reserved: int) -> None:
+        """Record a frame if its launches equal those of the previous frame of its kind."""
+        token, before = self._token(cached, frame.view, reserved), frame.launcher
+        if self.workspace.replays and token == cached.token:
+            frame.launcher = Launcher(self._launches, timed=False, divided=False)
+            graph = capture(self.workspace, frame.render)
+            frame.launcher = before
+            # the cloud caches its recorded frames, so they must not keep it alive
+            frame.resident = weakref.proxy(frame.resident)
+            cached.recorded = None if graph is None else RecordedFrame(frame, graph)
+            self.workspace.pool.holders.add(cached)
+        cached.token = token
+
+    def _token(self, cached: _CachedFrame, view: View, reserved: int) -> tuple[Any, ...]:
+        """Everything on which the launches depend, except the numbers of the views."""
+        workspace, labels = self.workspace, tuple(label for label, _ in view.groups)
+        budgets = workspace.memory_budget, workspace.pair_budget, reserved
+        states = workspace.pool.state, cached.inputs.state
+        external = view.external_depth and view.external_depth.depth.shape
+        return cached.capacity, budgets, states, view.raster, view.surroundings, labels, external
+
+    def _update_capacity(self, resident: Resident, views: ViewBatch, visible: int, pairs: int) -> None:
+        kinds, kind = self._cached.setdefault(resident, {}), (views.view.width, views.view.height, len(views))
+        cached = kinds.get(kind)
+        if cached is None:
+            if len(kinds) >= _MAX_KINDS:
+                kinds.clear()
+            cached = kinds[kind] = _CachedFrame(ArrayPool(self.workspace.device), Capacity(-1, -1))
+        before = cached.capacity
+        if visible > before.visible or pairs > before.pairs:
+            cached.capacity = Capacity(
+                min(max(visible + visible // 8 + _SPARE, before.visible), len(views) * resident.count),
+                max(pairs + pairs // 8 + _SPARE, before.pairs),
+            )
