@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from fidsplat.splats.cloud import SplatCloud
 
 
-def kernel_arrays(cloud: SplatCloud) -> dict[str, np.ndarray]:
+def kernel_arrays(cloud: SplatCloud) -> dict[str, Any]:
     """Arrays of a cloud by name, with colours instead of SH of degree 0, and int32 for groups and boxes."""
     arrays = {name: getattr(cloud, name) for name in ("means", "quats", "scales", "opacities", "labels")}
     if cloud.coplanar_groups is not None:
