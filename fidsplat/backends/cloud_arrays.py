@@ -6,20 +6,21 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.splats.arrays import present_arrays
 from fidsplat.splats.cloud import SplatCloud
 
 
 def kernel_arrays(cloud: SplatCloud) -> dict[str, Any]:
     """Arrays of a cloud by name, with colours instead of SH of degree 0, and int32 for groups and boxes."""
-    arrays = {name: getattr(cloud, name) for name in ("means", "quats", "scales", "opacities", "labels")}
+    arrays = present_arrays(cloud)
     if cloud.coplanar_groups is not None:
         arrays["coplanar_groups"] = group_index(cloud)
     if cloud.boxes is not None:
         arrays["boxes"] = cloud.boxes.astype(np.int32)
-    if cloud.thickness is not None:
-        arrays["thickness"] = cloud.thickness
-    colors = cloud.plain_colors
-    return arrays | ({"sh": cloud.sh} if colors is None else {"colors": colors})
+    if cloud.sh is not None and (colors := cloud.plain_colors) is not None:
+        del arrays["sh"]
+        arrays["colors"] = colors
+    return arrays
 
 
 def group_index(cloud: SplatCloud) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -13,26 +12,16 @@ from fidsplat.backends.view import FAR_EYE, SubFrame, View, rotated
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.views import Views
 from fidsplat.effects import FeatureSet, select
-from fidsplat.effects.select import CloudTraits
 from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.traits import PlacedTraits
 from fidsplat.util.errors import InputError
 
-
-class Origined(CloudTraits, Protocol):
-    """A cloud with the properties that select kernels, and an origin."""
-
-    @property
-    def origin(self) -> np.ndarray:
-        """(3,) float64 metres: world position of the means' zero."""
-        ...
-
-
 _Prepared = tuple[FeatureSet, View]
-_prepared: WeakKeyDictionary[Capture, WeakKeyDictionary[Origined, _Prepared]] = WeakKeyDictionary()
+_prepared: WeakKeyDictionary[Capture, WeakKeyDictionary[PlacedTraits, _Prepared]] = WeakKeyDictionary()
 """cached for static captures only: the functions of a motion may return other poses next time"""
 
 
-def prepare(cloud: Origined, capture: Capture) -> _Prepared:
+def prepare(cloud: PlacedTraits, capture: Capture) -> _Prepared:
     """Return the features that a capture of a cloud requires, and its view; cached for resident clouds.
 
     Raises:
@@ -49,7 +38,7 @@ def prepare(cloud: Origined, capture: Capture) -> _Prepared:
     return cached[cloud]
 
 
-def prepare_batch(cloud: Origined, views: Views) -> tuple[FeatureSet, ViewBatch]:
+def prepare_batch(cloud: PlacedTraits, views: Views) -> tuple[FeatureSet, ViewBatch]:
     """Return the features that the views of a batch require, and the batch of rendered views.
 
     Raises:

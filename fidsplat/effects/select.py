@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 from fidsplat.cameras import Orthographic
 from fidsplat.cameras.lenses import Lens, camera_effect
@@ -13,6 +12,7 @@ from fidsplat.capture.environment import Gradient, Panorama
 from fidsplat.capture.quality import Quality
 from fidsplat.effects.catalogue import CATALOGUE, COMPOSED, OUTPUTS, RGB, Output
 from fidsplat.effects.extensions import EXTENSIONS, load_extensions
+from fidsplat.splats.traits import CloudTraits
 from fidsplat.util.errors import InputError, unknown
 
 _KINDS = {Gradient: "gradient", Panorama: "panorama"}
@@ -54,30 +54,6 @@ class FeatureSet:
             if output is not None and output not in images:
                 images.append(output)
         return tuple(images)
-
-
-class CloudTraits(Protocol):
-    """Properties of a cloud that select kernels."""
-
-    @property
-    def sh_degree(self) -> int:
-        """Degree of the spherical harmonics; -1 for RGB colours."""
-        ...
-
-    @property
-    def has_coplanar_groups(self) -> bool:
-        """Whether some splats belong to coplanar groups."""
-        ...
-
-    @property
-    def footprint(self) -> str:
-        """`gaussian`, `box`, or `mixed` for both kinds."""
-        ...
-
-    @property
-    def ellipsoids(self) -> str:
-        """Which splats are 3D Gaussians: `none`, `some` or `all`."""
-        ...
 
 
 def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:

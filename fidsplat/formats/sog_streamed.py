@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.formats.sog import load_sog_folder, neighbour, save_sog_folder
+from fidsplat.splats.arrays import all_scales
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, read_input, writable_folder, write_json
@@ -71,12 +72,8 @@ class StreamedSog:
             )
         rows = slice(span.first, span.first + span.count)
         assert whole.sh is not None
-        scales = whole.scales[rows]
-        if whole.thickness is not None:
-            scales = np.column_stack([scales, whole.thickness[rows]])
-        return SplatCloud(
-            whole.means[rows], whole.quats[rows], scales, whole.opacities[rows], sh=whole.sh[rows]
-        )
+        shapes = whole.means[rows], whole.quats[rows], all_scales(whole)[rows]
+        return SplatCloud(*shapes, whole.opacities[rows], sh=whole.sh[rows])
 
 
 def read_streamed(path: Path) -> StreamedSog:

@@ -84,8 +84,7 @@ def scene_mesh(
 
 def _cosine(normal: np.ndarray, camera: Camera) -> np.ndarray:
     """Cosine (h, w) float32 of the angle between the rays and the normals (h, w, 3), at least 0.1."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    pixels = np.stack([x.ravel(), y.ravel()], 1)
+    pixels = camera.pixel_centres.reshape(-1, 2)
     ends = camera.unproject(pixels, np.ones(len(pixels))) - camera.unproject(pixels, np.zeros(len(pixels)))
     rays = (ends @ camera.world_to_camera[:3, :3].T).reshape(normal.shape)
     cosine = -(normal * rays).sum(2) / np.linalg.norm(rays, axis=2)

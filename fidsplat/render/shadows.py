@@ -141,8 +141,7 @@ def _depth_image(camera: Camera, points: np.ndarray) -> np.ndarray:
     pixels, value = pixels[inside], value[inside]
     plane = np.linalg.lstsq(_affine(pixels), value, rcond=None)[0]
     height, width = camera.height, camera.width
-    grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
-    image = (_affine(grid) @ plane).reshape(height, width)
+    image = (_affine(camera.pixel_centres.reshape(-1, 2)) @ plane).reshape(height, width)
     off = value - _affine(pixels) @ plane
     if len(off) and np.abs(off).max() > 1e-6 * np.abs(value).max():  # a curved surface
         column, row = np.clip(pixels.astype(int), 0, (width - 1, height - 1)).T

@@ -184,10 +184,9 @@ def _radius(camera: Camera, pixel: tuple[float, float], pixels: float, depth: fl
 def _fitted(
     depth: np.ndarray, camera: Camera, pixel: tuple[float, float], pixels: float, metres: float
 ) -> Surface:
-    h, w = depth.shape
-    x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
-    within = (x - pixel[0]) ** 2 + (y - pixel[1]) ** 2 <= max(pixels, 1.0) ** 2
+    centres = camera.pixel_centres
+    within = ((centres - pixel) ** 2).sum(2) <= max(pixels, 1.0) ** 2
     depths = depth[within].astype(np.float64)
-    points = camera.unproject(np.stack([x[within], y[within]], 1), np.where(depths > 0, depths, np.nan))
+    points = camera.unproject(centres[within], np.where(depths > 0, depths, np.nan))
     origin, ahead = camera.unproject(np.array([pixel, pixel]), np.array([0.0, 1.0]))
     return fit_surface(points, origin, ahead - origin, metres)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fidsplat.cameras import Camera
+from fidsplat.splats.arrays import all_scales
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrix_to_quaternion
 
@@ -52,10 +53,9 @@ def splats(
 
 def subset_of(cloud: SplatCloud, index) -> SplatCloud:
     """The splats at an index array, in that order."""
-    names = ("means", "quats", "scales", "opacities", "colors", "sh", "labels")
+    names = ("means", "quats", "opacities", "colors", "sh", "labels")
     arrays = {name: array[index] for name in names if (array := getattr(cloud, name)) is not None}
-    if cloud.thickness is not None:
-        arrays["scales"] = np.column_stack([arrays["scales"], cloud.thickness[index]])
+    arrays["scales"] = all_scales(cloud)[index]
     chosen = SplatCloud(**arrays, origin=cloud.origin)
     return (
         chosen if cloud.coplanar_groups is None else chosen.with_coplanar_groups(cloud.coplanar_groups[index])

@@ -10,6 +10,19 @@ from fidsplat.util.arguments import LARGEST
 from fidsplat.util.errors import InputError
 
 F32 = np.dtype(np.float32)
+OPTIONAL = ("colors", "sh", "coplanar_groups", "boxes", "thickness")
+"""names of the arrays that may be None"""
+
+
+def present_arrays(cloud: Any) -> dict[str, np.ndarray]:
+    """The arrays of a cloud by their names, without those that are None."""
+    names = ("means", "quats", "scales", "opacities", "labels", *OPTIONAL)
+    return {name: array for name in names if (array := getattr(cloud, name)) is not None}
+
+
+def all_scales(cloud: Any) -> np.ndarray:
+    """Scales (n, 2) of a cloud of disks, or scales and thickness (n, 3) if some splats are 3D Gaussians."""
+    return cloud.scales if cloud.thickness is None else np.column_stack([cloud.scales, cloud.thickness])
 
 
 def rows_beyond(array: np.ndarray, limit: float) -> np.ndarray | None:

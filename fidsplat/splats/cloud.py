@@ -9,6 +9,7 @@ import numpy as np
 
 from fidsplat.splats.arrays import (
     F32,
+    OPTIONAL,
     as_single,
     check_one_footprint,
     check_origin,
@@ -19,13 +20,14 @@ from fidsplat.splats.arrays import (
     find_defects,
     joined_arrays,
     joined_groups,
+    present_arrays,
     real_numbers,
     rows_beyond,
     unit_quaternions,
     whole_numbers,
     with_thinnest_last,
 )
-from fidsplat.splats.harmonics import C0, MAX_DEGREE, rotation_of_coefficients, sh_basis
+from fidsplat.splats.harmonics import MAX_DEGREE, colors_of_degree, rotation_of_coefficients, sh_basis
 from fidsplat.splats.rotations import (
     check_similarity,
     matrix_to_quaternion,
@@ -166,19 +168,7 @@ class SplatCloud(PickledByFields, Summarised):
             new_origin = check_origin(origin)
         else:  # after dropping, so dropped splats do not affect it
             single["means"], new_origin = choose_origin(given, single["means"], single["scales"])
-        self._set(
-            **{
-                "colors": None,
-                "sh": None,
-                "coplanar_groups": None,
-                "boxes": None,
-                "thickness": None,
-                **single,
-            },
-            labels=labels,
-            origin=new_origin,
-            dropped=dropped,
-        )
+        self._set(**dict.fromkeys(OPTIONAL) | single, labels=labels, origin=new_origin, dropped=dropped)
 
     def _set(self, **values) -> None:
         for name, value in values.items():
@@ -221,7 +211,7 @@ class SplatCloud(PickledByFields, Summarised):
         degree."""
         if self.sh is None or self.sh_degree > 0:
             return self.colors
-        return np.maximum(np.float32(C0) * self.sh[:, 0, :] + np.float32(0.5), np.float32(0))
+        return colors_of_degree({"sh": self.sh}, -1)["colors"]
 
     @property
     def has_coplanar_groups(self) -> bool:
@@ -400,16 +390,8 @@ class SplatCloud(PickledByFields, Summarised):
         if degree < 0:
             colors, sh = np.concatenate([cloud.colors for cloud in filled if cloud.colors is not None]), None
         else:
-            colors, sh = None, np.concatenate([_sh_of_degree(cloud, degree) for cloud in filled])
+            sh = [colors_of_degree(present_arrays(cloud), degree)["sh"] for cloud in filled]
+            colors, sh = None, np.concatenate(sh)
         joined |= {"coplanar_groups": joined_groups(filled), "boxes": joined_arrays(filled, "boxes", bool)}
         joined["thickness"] = joined_arrays(filled, "thickness", F32)
         return first._replaced(**joined, colors=colors, sh=sh, dropped=dropped)
-
-
-def _sh_of_degree(cloud: SplatCloud, degree: int) -> np.ndarray:
-    sh = np.zeros((len(cloud), (degree + 1) ** 2, 3), F32)
-    if cloud.colors is not None:
-        sh[:, 0] = (cloud.colors.astype(np.float64) - 0.5) / C0
-    elif cloud.sh is not None:
-        sh[:, : cloud.sh.shape[1]] = cloud.sh
-    return sh

@@ -1,5 +1,7 @@
 """Real spherical harmonics of degree 0 to 3, with the signs, order and constants of 3DGS, gsplat and 2DGS."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from fidsplat.util.errors import InputError
@@ -52,6 +54,28 @@ def sh_basis(degree: int, dirs: np.ndarray) -> np.ndarray:
             _C3[6] * x * (xx - 3 * yy),
         ]
     return np.stack(columns, axis=1)
+
+
+def colors_of_degree(given: Mapping[str, np.ndarray], sh_degree: int) -> dict[str, np.ndarray]:
+    """`colors` or `sh` converted to an SH degree, with 0 for missing bands.
+
+    given: also `means`. Degree -1: plain colours; `sh` must then have degree 0.
+    """
+    if sh_degree < 0:
+        if "colors" in given:
+            return {"colors": given["colors"]}
+        return {"colors": np.maximum(np.float32(C0) * given["sh"][:, 0] + np.float32(0.5), np.float32(0))}
+    terms = (sh_degree + 1) ** 2
+    if "sh" in given and given["sh"].shape[1] == terms:
+        return {"sh": given["sh"]}
+    sh = np.zeros((len(given["means"]), terms, 3), np.float32)
+    if "sh" in given:
+        common = min(terms, given["sh"].shape[1])
+        sh[:, :common] = given["sh"][:, :common]
+    else:
+        with np.errstate(over="ignore"):  # colours of a damaged store
+            sh[:, 0] = (given["colors"].astype(np.float64) - 0.5) / C0
+    return {"sh": sh}
 
 
 def color_range(colors: np.ndarray | None, sh: np.ndarray | None) -> tuple[float, float]:

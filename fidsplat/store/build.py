@@ -21,7 +21,7 @@ import numpy as np
 
 from fidsplat.formats.collect import Progress
 from fidsplat.store.build_plan import ON_PLANE, BuildPlan, BuildSettings, plan_build
-from fidsplat.store.columns import ColumnFiles, node_record
+from fidsplat.store.columns import ColumnFiles, enclose, node_record
 from fidsplat.store.layout import NODE, Header, npy_header, write_nodes
 from fidsplat.store.merge import REDUCTION, merged
 from fidsplat.store.sources import Source, open_sources, splats_of
@@ -262,7 +262,7 @@ class _Build:
             for number, (parent, size) in enumerate(work, done + 1):
                 node = node_record(parent, rows)
                 node["level"], node["size"] = level + 1, size
-                _enclose(node, nodes[groups[number - 1]])
+                enclose(node, nodes[groups[number - 1]])
                 self.columns.write(rows, parent)
                 rows += len(parent["means"])
                 self._add_nodes(node)
@@ -315,16 +315,6 @@ def _groups(nodes: np.ndarray, level: int, pinned: int) -> list[np.ndarray]:
     are never merged."""
     below = np.flatnonzero((nodes["level"] == level) & ((level > 0) | (nodes["first"] < pinned)))
     return np.array_split(below, -(-len(below) // REDUCTION)) if len(below) else []
-
-
-def _enclose(node: np.ndarray, children: np.ndarray) -> None:
-    """Extend a node's box and sizes to include its children, so that culling a node also culls them."""
-    node["size"] = max(float(node["size"][0]), float(children["size"].max()))
-    for name in ("low", "far_low"):
-        node[name] = np.minimum(node[name], children[name].min(axis=0))
-    for name in ("high", "far_high"):
-        node[name] = np.maximum(node[name], children[name].max(axis=0))
-    node["reach"] = max(float(node["reach"][0]), float(children["reach"].max()))
 
 
 def _is_root(nodes: np.ndarray, level: int) -> bool:

@@ -15,10 +15,11 @@ from functools import cached_property
 import numpy as np
 
 from fidsplat.capture.quality import Quality
-from fidsplat.splats.arrays import group_offsets
+from fidsplat.splats.arrays import group_offsets, present_arrays
 from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.harmonics import colors_of_degree
 from fidsplat.store.layout import MAX_SPLATS
-from fidsplat.store.partial_cloud import PartialCloud, colors_of_degree, concatenated
+from fidsplat.store.partial_cloud import PartialCloud, concatenated
 from fidsplat.store.store import Store
 from fidsplat.store.subchunks import Subchunks, SubchunkTable
 from fidsplat.util.errors import InputError
@@ -211,12 +212,7 @@ class ChunkedSplats:
     @cached_property
     def in_memory_arrays(self) -> dict[str, np.ndarray]:
         """Arrays of the cloud in memory, in the columns and relative to the origin of this scene."""
-        cloud = self.in_memory
-        arrays = {name: getattr(cloud, name) for name in ("means", "quats", "scales", "opacities", "labels")}
-        arrays = self._relative(arrays, cloud.origin)
-        optional = {"sh": cloud.sh, "colors": cloud.colors, "coplanar_groups": cloud.coplanar_groups}
-        optional |= {"thickness": cloud.thickness, "boxes": cloud.boxes}
-        arrays |= {name: array for name, array in optional.items() if array is not None}
+        arrays = self._relative(present_arrays(self.in_memory), self.in_memory.origin)
         return self._with_columns(arrays, self._first_groups[-1])
 
     @cached_property

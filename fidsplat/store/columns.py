@@ -75,3 +75,13 @@ def node_record(splats: dict[str, np.ndarray], first: int) -> np.ndarray:
     node["far_low"] = np.nextafter(below, np.float32(-np.inf))
     node["far_high"] = np.nextafter(above, np.float32(np.inf))
     return node
+
+
+def enclose(node: np.ndarray, children: np.ndarray) -> None:
+    """Extend a node's box and sizes to include its children, so that culling a node also culls them."""
+    node["size"] = max(float(node["size"][0]), float(children["size"].max()))
+    for name in ("low", "far_low"):
+        node[name] = np.minimum(node[name], children[name].min(axis=0))
+    for name in ("high", "far_high"):
+        node[name] = np.maximum(node[name], children[name].max(axis=0))
+    node["reach"] = max(float(node["reach"][0]), float(children["reach"].max()))

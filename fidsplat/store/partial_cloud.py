@@ -5,53 +5,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
+from fidsplat.splats.arrays import OPTIONAL
 from fidsplat.splats.cloud import SplatCloud
-from fidsplat.splats.harmonics import C0, rotation_of_coefficients
+from fidsplat.splats.harmonics import rotation_of_coefficients
 from fidsplat.splats.rotations import matrix_to_quaternion
-
-
-class SceneTraits(Protocol):
-    """Traits of a complete scene, which select the kernels, so that a part renders bit-identically."""
-
-    @property
-    def sh_degree(self) -> int: ...
-
-    @property
-    def has_coplanar_groups(self) -> bool: ...
-
-    @property
-    def footprint(self) -> str: ...
-
-    @property
-    def ellipsoids(self) -> str: ...
-
-    @property
-    def origin(self) -> np.ndarray: ...
+from fidsplat.splats.traits import PlacedTraits
 
 
 class PartialCloud(SplatCloud):
     """Some splats of a scene, in its order, rendered with the traits of the complete scene."""
 
-    _scene: SceneTraits
+    _scene: PlacedTraits
 
     @classmethod
     def of(
-        cls, arrays: Mapping[str, np.ndarray], scene: SceneTraits, dropped: Mapping[str, int] | None = None
+        cls, arrays: Mapping[str, np.ndarray], scene: PlacedTraits, dropped: Mapping[str, int] | None = None
     ) -> PartialCloud:
         """A cloud of valid arrays, without a copy. dropped: number of omitted splats by the reason."""
         part = object.__new__(cls)
-        given: dict[str, Any] = {
-            "colors": None,
-            "sh": None,
-            "coplanar_groups": None,
-            "boxes": None,
-            "thickness": None,
-        }
-        part._set(**given | dict(arrays), origin=scene.origin, dropped=dict(dropped or {}))
+        part._set(**dict.fromkeys(OPTIONAL) | dict(arrays), origin=scene.origin, dropped=dict(dropped or {}))
         object.__setattr__(part, "_scene", scene)
         return part
 
@@ -86,28 +62,6 @@ def concatenated(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndar
     if len(parts) == 1:
         return dict(parts[0])
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
-def colors_of_degree(given: Mapping[str, np.ndarray], sh_degree: int) -> dict[str, np.ndarray]:
-    """`colors` or `sh` converted to an SH degree, with 0 for missing bands.
-
-    Degree -1: plain colours, bit-identical to `SplatCloud.plain_colors`.
-    """
-    if sh_degree < 0:
-        if "colors" in given:
-            return {"colors": given["colors"]}
-        return {"colors": np.maximum(np.float32(C0) * given["sh"][:, 0] + np.float32(0.5), np.float32(0))}
-    terms = (sh_degree + 1) ** 2
-    if "sh" in given and given["sh"].shape[1] == terms:
-        return {"sh": given["sh"]}
-    sh = np.zeros((len(given["means"]), terms, 3), np.float32)
-    if "sh" in given:
-        common = min(terms, given["sh"].shape[1])
-        sh[:, :common] = given["sh"][:, :common]
-    else:
-        with np.errstate(over="ignore"):  # colours of a damaged store
-            sh[:, 0] = (given["colors"].astype(np.float64) - 0.5) / C0
-    return {"sh": sh}
 
 
 def transformed(

@@ -12,9 +12,9 @@ import numpy as np
 from fidsplat.formats.collect import WINDOW, Rows, window
 from fidsplat.formats.files import format_of, load_splats
 from fidsplat.formats.ply import ply_rows
-from fidsplat.splats.arrays import choose_origin, group_offsets, unit_quaternions
+from fidsplat.splats.arrays import all_scales, choose_origin, group_offsets, present_arrays, unit_quaternions
 from fidsplat.splats.cloud import SplatCloud
-from fidsplat.store.partial_cloud import colors_of_degree
+from fidsplat.splats.harmonics import colors_of_degree
 from fidsplat.util.arguments import invalid
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
@@ -63,13 +63,8 @@ def source_of(cloud: SplatCloud, name: Path, stamp: str) -> Source:
     """A cloud in memory as a source."""
     if cloud.boxes is not None:
         raise InputError("a store cannot contain box footprints; put markers into a scene file next to it")
-    arrays = {"means": cloud.means, "quats": cloud.quats, "opacities": cloud.opacities}
-    scales = cloud.scales
-    if cloud.thickness is not None:
-        scales = np.column_stack([scales, cloud.thickness])
-    arrays |= {"scales": scales, "labels": cloud.labels}
-    some = {"colors": cloud.colors, "sh": cloud.sh, "coplanar_groups": cloud.coplanar_groups}
-    arrays |= {key: array for key, array in some.items() if array is not None}
+    arrays = present_arrays(cloud) | {"scales": all_scales(cloud)}
+    arrays.pop("thickness", None)
     columns = {name: (array.shape[1:], array.dtype.type) for name, array in arrays.items()}
 
     def fill(first: int, into: dict[str, np.ndarray]) -> None:

@@ -12,10 +12,10 @@ import numpy as np
 from fidsplat.formats.collect import Progress
 from fidsplat.formats.sog_streamed import META, read_streamed, save_streamed
 from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.harmonics import colors_of_degree
 from fidsplat.store.build_plan import MAX_CHUNK
-from fidsplat.store.columns import ColumnFiles, node_record
+from fidsplat.store.columns import ColumnFiles, enclose, node_record
 from fidsplat.store.layout import Header, npy_header, shapes_of, write_nodes
-from fidsplat.store.partial_cloud import colors_of_degree
 from fidsplat.store.staging import staged
 from fidsplat.store.store import Store
 from fidsplat.util import interrupts
@@ -24,8 +24,6 @@ from fidsplat.util.files import path_of
 
 _LEAF = 2**18
 """maximum splats of a leaf of streamed SOG, unless a chunk has more"""
-_ENCLOSE = dict.fromkeys(("high", "far_high", "size", "reach"), np.maximum)
-_ENCLOSE |= dict.fromkeys(("low", "far_low"), np.minimum)
 _GRID = 64
 """number of grid cells along the largest extent, for estimating the area of a scene"""
 
@@ -78,10 +76,9 @@ def import_streamed(path: Path, folder: Path, progress: Progress) -> None:
         place = {(number, level): k for k, (number, level) in enumerate(of_node)}
         for k, (number, level) in enumerate(of_node):
             records["parent"][k] = place.get((number, level + 1), -1)
-        for k in np.argsort(records["level"], kind="stable"):  # a node encloses its children
+        for k in np.argsort(records["level"], kind="stable"):
             if (above := records["parent"][k]) >= 0:
-                for name, most in _ENCLOSE.items():
-                    records[name][above] = most(records[name][above], records[name][k])
+                enclose(records[above : above + 1], records[k : k + 1])
         for name, kind in columns.items():
             files.finish(name, npy_header(kind, (rows, *shapes_of(degree)[name])), rows)
         chunks = records["level"] == 0

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.formats import load_ply
+from fidsplat.splats.arrays import all_scales
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrices_to_quaternions
 from fidsplat.util.errors import InputError
@@ -187,9 +188,9 @@ def _plain(cloud: SplatCloud) -> SplatCloud:
     colors = cloud.plain_colors
     if cloud.sh is None or colors is None:
         return cloud
-    thick = () if cloud.thickness is None else (cloud.thickness,)
-    scales = np.column_stack([cloud.scales, *thick])
-    return SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, colors, origin=cloud.origin)
+    return SplatCloud(
+        cloud.means, cloud.quats, all_scales(cloud), cloud.opacities, colors, origin=cloud.origin
+    )
 
 
 def _shade(rng: np.random.Generator, colour: Sequence[float], spread: float = 0.2) -> np.ndarray:

@@ -21,6 +21,7 @@ from fidsplat.markers import marker
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.captured import captured_scenes, fetch_scene
 from fidsplat.scenes.random_clouds import SCENES, load_scene, log_uniform, random_cloud, standard_camera
+from fidsplat.splats.arrays import all_scales
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import C0
 from fidsplat.splats.rotations import rigid_matrix
@@ -60,7 +61,7 @@ class Views:
         cloud, camera = self.cloud, self.camera
         arrays = {name: getattr(cloud, name) for name in ARRAYS}
         arrays["means"] = cloud.means + cloud.origin.astype(np.float32)
-        arrays["scales"] = _scales(cloud)
+        arrays["scales"] = all_scales(cloud)
         given = {name: array for name, array in arrays.items() if array is not None}
         size = (camera.width, camera.height)
         np.savez(file, poses=self.poses, matrix=camera.matrix, size=size, near=camera.near, **given)
@@ -89,15 +90,10 @@ def _single(cloud: SplatCloud, camera: Camera, scene: Scene | None = None) -> Vi
     return Views(cloud, camera, camera.world_to_camera[None], scene)
 
 
-def _scales(cloud: SplatCloud) -> np.ndarray:
-    """All scales: (n, 2) of disks, (n, 3) of ellipsoids."""
-    return cloud.scales if cloud.thickness is None else np.column_stack([cloud.scales, cloud.thickness])
-
-
 def _changed(cloud: SplatCloud, **arrays: np.ndarray) -> SplatCloud:
     """The cloud with some arrays replaced."""
     given = {name: getattr(cloud, name) for name in ("means", "quats", "opacities", "colors")}
-    return SplatCloud(**{**given, "scales": _scales(cloud), **arrays})
+    return SplatCloud(**{**given, "scales": all_scales(cloud), **arrays})
 
 
 def huge(thick: bool) -> Views:
@@ -106,7 +102,7 @@ def huge(thick: bool) -> Views:
     factor = np.ones((_COUNT, 1))
     factor[:: _COUNT // 1000] = log_uniform(generator, 15.0, 100.0, (1000, 1))
     return _single(
-        _changed(cloud, scales=(_scales(cloud) * factor).astype(np.float32)), standard_camera(1280, 720)
+        _changed(cloud, scales=(all_scales(cloud) * factor).astype(np.float32)), standard_camera(1280, 720)
     )
 
 
@@ -124,7 +120,7 @@ def needles(thick: bool) -> Views:
     cloud = random_cloud(_COUNT, _SCALE, thick=thick)
     factor = np.array([6.0, 0.15, 0.15][: 3 if thick else 2])
     return _single(
-        _changed(cloud, scales=(_scales(cloud) * factor).astype(np.float32)), standard_camera(1280, 720)
+        _changed(cloud, scales=(all_scales(cloud) * factor).astype(np.float32)), standard_camera(1280, 720)
     )
 
 

@@ -1,0 +1,40 @@
+"""Properties of a cloud that select the kernels of its frames."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+
+class CloudTraits(Protocol):
+    """Properties of a cloud that select kernels."""
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics; -1 for RGB colours."""
+        ...
+
+    @property
+    def has_coplanar_groups(self) -> bool:
+        """Whether some splats belong to coplanar groups."""
+        ...
+
+    @property
+    def footprint(self) -> str:
+        """`gaussian`, `box`, or `mixed` for both kinds."""
+        ...
+
+    @property
+    def ellipsoids(self) -> str:
+        """Which splats are 3D Gaussians: `none`, `some` or `all`."""
+        ...
+
+
+class PlacedTraits(CloudTraits, Protocol):
+    """These properties and the origin of a cloud."""
+
+    @property
+    def origin(self) -> np.ndarray:
+        """(3,) float64 metres: world position of the means' zero."""
+        ...
