@@ -377,8 +377,8 @@ class OpenCLTraining:
                 `opacity_penalty`, added to the gradients; `sparse`: 1 where splats on which the frame does
                 not depend are left unchanged.
             camera: if given, statistics are accumulated first, as by `accumulate_statistics`.
-            pose: whether to return a function that waits for the gradient (6,) of the loss with respect to
-                the camera pose.
+            by_camera: whether to return a function that waits for the gradient (10,) of the loss with
+                respect to the camera: pose and intrinsics.
         """
         given = {f"size_{name}": size for name, size in sizes.items()} | dict(numbers)
         given |= {"rest1": 1 - numbers["beta1"], "rest2": 1 - numbers["beta2"]}
