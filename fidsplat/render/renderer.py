@@ -435,7 +435,9 @@ class Renderer:
                 if ideal is None:
                     return Frame(images, capture)
                 ideal_view = ideal.view if band is None else _banded(ideal.view, band)
-                ideal_images = _rendered(self.backend.pipeline(ideal.features, shape), data, ideal_view, every)
+                ideal_images = _rendered(
+                    self.backend.pipeline(ideal.features, shape), data, ideal_view, every
+                )
                 return Frame(images, capture, error=ErrorImage(images, ideal_images, ideal))
 
             def render_band(band: BandData) -> Frame:

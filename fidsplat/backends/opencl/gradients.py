@@ -287,7 +287,7 @@ class OpenCLGradients(GradientPipeline):
         self._add_up(frame, arrays, groups)
         found = np.empty(_CAMERA, np.float32)
         copied = [
-            cl.enqueue_copy(frame.queue, part, arrays[name].data, is_blocking=False)
+            cl.enqueue_copy(frame.queue, part, arrays[name].data, is_blocking=False)  # pyright: ignore
             for name, part in (("pose", found[:6]), ("intrinsics", found[6:]))
         ]
         frame.queue.flush()
