@@ -51,13 +51,14 @@ class Demo:
     """Make markers, render them in a scene and detect them, with images and a table.
 
     Makes an AprilTag, an ArUco tag and a QR code of splats, places them in a yard of ten thousand splats,
-    renders three views with colour, depth, normals and labels, and detects the markers in them. The exit
-    status is 1 if a completely visible marker is not located within 1 % of its distance.
+    renders three views with colour, depth, normals and labels, and detects the markers in them. Then it does
+    so in a captured scene: biker (PlayCanvas, MIT, 2.5 MB), if its download ends while the other views are
+    rendered. The exit status is 1 if a completely visible marker is not located within 1 % of its distance.
 
     Examples:
       fidsplat demo
       fidsplat demo --mixture fitted --out soft
-      fidsplat demo --captured playbot                  and markers in a captured scene
+      fidsplat demo --captured playbot                  another captured scene, in its own light
       fidsplat demo --out images --json
       fidsplat demo views -o yard                       the scene as a data set for training
     """
@@ -69,8 +70,7 @@ class Demo:
     mixture: str = "exact"
     """NAME: mixture of the markers: exact, fitted, facets or paper"""
     captured: str | None = None
-    """NAME: also render markers in a captured scene of `fidsplat fetch`, downloaded on first use: biker or
-    playbot"""
+    """NAME: captured scene of `fidsplat fetch`: biker or playbot, whose download is waited for, or none"""
     json: Json = False
 
     def run(self) -> int:
@@ -95,6 +95,7 @@ class Demo:
                 where,
                 f"{result.background_splats:,} background and {markers:,} marker splats; "
                 f"{result.seconds:.1f} s in total; images in {self.out}/contact-sheet.png",
+                f"captured scene: {result.captured}",
             )
         if not result.passed:
             missed = [

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.captured import captured_scenes, fetch_scene
 from fidsplat.scenes.lights import Lighting
 from fidsplat.splats.rotations import rigid_matrix
+from fidsplat.util.errors import InputError
 from fidsplat.util.files import writable_folder, write_json
 from fidsplat.vision.readback import Reading, read_back
 from fidsplat.worlds.yard import OUTPUTS, demo_scene, demo_views, sunlit
@@ -40,6 +42,8 @@ COMPLETE = 0.98
 """minimum visible share of a completely visible marker; the rest is the soft edge of its quiet zone"""
 MAX_POSITION_ERROR = 0.01
 """maximum position error relative to the distance"""
+_WAIT = 0.5
+"""seconds to wait for a download after the other views"""
 _FRAMES = 3
 """timed frames after the one that compiles kernels"""
 
@@ -74,6 +78,8 @@ class DemoResult:
     """by view: device time of a frame with all outputs, in milliseconds"""
     visible_splats: dict[str, int]
     """by view: number of splats after culling"""
+    captured: str
+    """title, author and licence of the captured scene, or why there is none"""
     seconds: float
     """duration of the run in seconds"""
     files: list[Path]
@@ -107,16 +113,21 @@ def run_demo(
         progress: called with the name of each step.
         mixture: mixture of the markers; scene.ply has `fitted` instead of `exact`, since PLY files have no
             boxes.
-        captured: name of a captured scene that is rendered with markers too, see `fetch_scene`.
+        captured: name of a captured scene that is rendered with markers too, see `fetch_scene`, or "none". By
+            default biker, if its download ends while the other views are rendered.
 
     Raises InputError when the folder cannot be written or for an unknown mixture, DeviceError when the device
     cannot be used.
     """
     begun = time.perf_counter()
     folder = writable_folder(out)
-    if captured is not None:
+    default = captured is None
+    captured = "biker" if captured is None else captured
+    missing = _fetched_meanwhile(captured) if default else lambda: "not requested"
+    if captured != "none" and not default:
         progress(f"fetching the captured scene {captured}")
         fetch_scene(captured)  # first, since it may fail
+        missing = lambda: ""  # noqa: E731
     progress("making three markers and their scene")
     scene = sunlit(demo_scene(mixture=mixture))
     progress("opening the device")
@@ -141,8 +152,10 @@ def run_demo(
         files.append(write_png(f"{stem}-detection.png", view.outlined))
     files.append(write_png(folder / "contact-sheet.png", _sheet(views)))
     marker_splats = {placed.marker.spec: len(placed.marker.cloud) for placed in scene.markers}
-    if captured is not None:
-        shown, splats = run_captured(captured, renderer, progress)
+    reason = missing()
+    if not reason:
+        # light by panoramas takes 3 s on the first run
+        shown, splats = run_captured(captured, renderer, "lights" if default else "scene", progress)
         views += shown
         marker_splats = splats | marker_splats
         row = [(view.name, view.outlined) for view in shown]
@@ -156,11 +169,33 @@ def run_demo(
         unexpected=[name for view in views for name in view.others],
         frame_ms={view.name: view.frame_ms for view in views},
         visible_splats={view.name: view.visible for view in views},
+        captured=reason or captured_scenes()[captured].credit,
         seconds=time.perf_counter() - begun,
         files=[*files, folder / "demo.json"],
     )
     write_json(folder / "demo.json", result.as_dict(), indent=2)
     return result
+
+
+def _fetched_meanwhile(name: str) -> Callable[[], str]:
+    """Download a captured scene in a thread. Returns a function that returns why it is missing, or ""."""
+    found: list[str] = []
+
+    def fetch() -> None:
+        try:
+            fetch_scene(name)
+            found.append("")
+        except InputError as error:
+            found.append(str(error))
+
+    thread = Thread(target=fetch, daemon=True)  # the command ends although a download hangs
+    thread.start()
+
+    def missing() -> str:
+        thread.join(_WAIT)
+        return found[0] if found else f"the download of {name} takes longer than the other views"
+
+    return missing
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,15 +293,16 @@ _LAYOUTS = {
 }
 
 
-def captured_scene(name: str, progress: Callable[[str, float], None] = lambda *_: None) -> Scene:
-    """A captured scene with an AprilTag and a QR code. Raises InputError as `fetch_scene`."""
-    path, layout = fetch_scene(name, progress), _LAYOUTS[name]
+def captured_scene(name: str, light: str) -> Scene:
+    """A captured scene with an AprilTag and a QR code. light: see `Lighting.source`. Raises InputError as
+    `fetch_scene`."""
+    path, layout = fetch_scene(name), _LAYOUTS[name]
     specs = (("apriltag:36h11:5", layout.tag), ("qr:fidsplat", layout.code))
     placed = tuple(
         PlacedMarker(
             marker(spec, size=layout.size),
             rigid_matrix(place),
-            light=Lighting(ambient=layout.ambient, rows=16, panoramas=2),
+            light=Lighting(light, ambient=layout.ambient, rows=16, panoramas=2),
         )
         for spec, place in specs
     )
@@ -285,11 +321,11 @@ def captured_views(name: str) -> dict[str, Camera]:
 
 
 def run_captured(
-    name: str, renderer: Renderer, progress: Callable[[str], None] = lambda _: None
+    name: str, renderer: Renderer, light: str, progress: Callable[[str], None] = lambda _: None
 ) -> tuple[list[DemoView], dict[str, int]]:
     """Render and detect the markers of a captured scene; returns its views, and the splats of each marker."""
     progress(f"reading the captured scene {name}")
-    scene, title, views = captured_scene(name), captured_scenes()[name].title, []
+    scene, title, views = captured_scene(name, light), captured_scenes()[name].title, []
     resident = renderer.upload(scene)
     for view, camera in captured_views(name).items():
         progress(f"rendering and detecting: {name}, {view}")

@@ -41,7 +41,15 @@ def drawn_once(pictures, monkeypatch):
     monkeypatch.setattr(demo, "_render", kept)
 
 
-def test_the_demo_passes_and_writes_what_it_made(tmp_path, capsys):
+@pytest.fixture
+def blob(tmp_path, monkeypatch):
+    """A single splat stands for a capture, which would be downloaded."""
+    cloud = fs.SplatCloud([[0, -1.6, 0]], [[1, 0, 0, 0]], [[0.1, 0.1]], [0.9], colors=[[1, 0, 0]])
+    fs.save_splats(cloud, tmp_path / "blob.ply")
+    monkeypatch.setattr(demo, "fetch_scene", lambda *_: tmp_path / "blob.ply")
+
+
+def test_the_demo_passes_and_writes_what_it_made(tmp_path, capsys, blob):
     folder = tmp_path / "made" / "demo"
     assert main(["demo", "--out", str(folder), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
@@ -50,8 +58,9 @@ def test_the_demo_passes_and_writes_what_it_made(tmp_path, capsys):
     assert result == json.loads((folder / "demo.json").read_text())
 
     whole = [s for s in result["sightings"] if s["passed"] is not None]
-    assert len(result["sightings"]) == 9
-    assert len(whole) == 8
+    assert len(result["sightings"]) == 9 + 4
+    assert len(whole) == 8 + 4
+    assert result["captured"].startswith("Biker by PlayCanvas, MIT")
     for sighting in whole:
         assert sighting["found"]
         assert sighting["position_error_mm"] < 10 * sighting["distance_m"]
@@ -69,7 +78,7 @@ def test_the_demo_passes_and_writes_what_it_made(tmp_path, capsys):
     # a PLY file has no boxes: the markers' stand there as Gaussians
     more = sum(len(p.marker.gaussians) - len(p.marker.cloud) for p in loaded.markers)
     assert len(loaded.cloud()) + more == len(fs.load_ply(folder / "scene.ply"))
-    assert [p.marker.spec for p in loaded.markers] == list(result["marker_splats"])
+    assert {p.marker.spec for p in loaded.markers} | {"qr:fidsplat"} == set(result["marker_splats"])
     # the scene file gives the image that the demo saved
     assert main(["render", str(folder / "scene.toml"), "-o", str(folder / "again.png")]) == 0
     assert np.array_equal(read_image(folder / "again.png"), read_image(folder / "frontal-rgb.png"))
@@ -78,9 +87,12 @@ def test_the_demo_passes_and_writes_what_it_made(tmp_path, capsys):
 
 def test_a_marker_that_is_missed_fails_the_demo(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("fidsplat.vision.readback.detect", lambda image, families: [])
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("FIDSPLAT_SCENES", str(tmp_path / "offline"))
     assert main(["demo", "--out", str(tmp_path)]) == 1
     out = capsys.readouterr().out
     assert "failed: " in out
+    assert "captured scene: cannot download" in out
     assert "apriltag:36h11:5 in 'frontal'" in out
     assert "aruco:4x4_50:7 in 'hidden'" not in out
 
@@ -108,13 +120,8 @@ def test_the_demo_has_disks_boxes_and_3d_gaussians(scene):
     assert 0.05 < np.mean(cloud.thickness[cloud.labels == 0] > 0) < 0.2
 
 
-def test_the_demo_has_markers_in_a_captured_scene(tmp_path, monkeypatch):
-    """A single splat stands for the capture, which would be downloaded."""
-    blob = fs.SplatCloud([[0, -1.6, 0]], [[1, 0, 0, 0]], [[0.1, 0.1]], [0.9], colors=[[1, 0, 0]])
-    fs.save_splats(blob, tmp_path / "blob.ply")
-    monkeypatch.setattr("fidsplat.experiments.demo.fetch_scene", lambda *_: tmp_path / "blob.ply")
-    for name in ("biker", "playbot"):
-        views, splats = run_captured(name, fs.Renderer("opencl"))
-        assert set(splats) == {"apriltag:36h11:5", "qr:fidsplat"}
-        assert all(Sighting(view.name, reading).passed for view in views for reading in view.readings)
-        assert not any(view.others for view in views)
+def test_the_markers_in_a_captured_scene_are_lit_by_it(blob):
+    views, splats = run_captured("playbot", fs.Renderer("opencl"), "scene")
+    assert set(splats) == {"apriltag:36h11:5", "qr:fidsplat"}
+    assert all(Sighting(view.name, reading).passed for view in views for reading in view.readings)
+    assert not any(view.others for view in views)
