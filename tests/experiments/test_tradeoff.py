@@ -9,7 +9,7 @@ from ewa_error import linear_error
 
 import fidsplat as fs
 from fidsplat.capture.quality import ELLIPSOID, PRESETS, MarkerQuality
-from fidsplat.experiments.tradeoff import compare, run
+from fidsplat.experiments.tradeoff import compare, run, scenes
 from fidsplat.experiments.tradeoff import session as session_module
 from fidsplat.experiments.tradeoff.points import (
     ABLATION,
@@ -28,6 +28,14 @@ from fidsplat.selftest.hard_scene import CELLS, cell_window, hard_scene
 
 pytestmark = pytest.mark.usefixtures("optimised")
 FACING = (1.0, 0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_images():
+    """Of markers: 400 x 400 pixels instead of 800 x 800."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenes, "PROTOCOL", dataclasses.replace(scenes.PROTOCOL, pixels=400))
+        yield
 
 
 @pytest.fixture(scope="module")
