@@ -35,6 +35,7 @@ def main(job: dict) -> None:
             add_light(light)
         if "mesh" in one:
             diffuse_mesh(one["mesh"])
+            scene.cycles.denoising_prefilter = scene.cycles.denoising_quality = "FAST"
         for each in one.get("sheets", [one]):
             sheet(each)
         for image in one["images"]:

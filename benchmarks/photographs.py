@@ -178,7 +178,7 @@ def take_by_cycles(folder: Path, count: int, size: tuple[int, int], seed: int, s
     room |= {"sheets": [sheet_of(tag) for tag in tags], "images": images}
     worker = Path(__file__).with_name("blender_room.py")
     job = {"samples": samples, "denoise": True}
-    list(run_worker(ready("raw", default_environment()), worker, [room], job, 1))
+    list(run_worker(ready("raw", default_environment()), worker, [room], job))
     y, x = np.mgrid[0 : size[1], 0 : size[0]] + 0.5
     for i, (camera, image) in enumerate(zip(given, images, strict=True)):
         rays = camera.rays(np.stack([x, y], -1).reshape(-1, 2))
@@ -267,7 +267,7 @@ def train_all(options: argparse.Namespace, truth: dict) -> None:
     renderer, captured = fs.Renderer(), load_dataset(options.o / "scene", hold_out=8)
     true = true_dataset(options, truth, captured)
     poses, both = {"refine_poses": True}, {"refine_poses": True, "refine_intrinsics": True}
-    print("| poses | PSNR, dB | SSIM | scale_percent | drift_percent | ate_mm | angle_deg |")
+    print("| poses | PSNR, dB | SSIM | scale, % | drift, % | ATE, mm | angle, ° | focal, % | middle, px |")
     for name, dataset, refine in (
         *(("true", true, {}), ("of the capture", captured, {})),
         *(("refined", captured, poses), ("and intrinsics", captured, both)),
@@ -283,6 +283,8 @@ def train_all(options: argparse.Namespace, truth: dict) -> None:
         if refine:  # of the refined cameras as they are optimised
             drift = 1 / np.cbrt(np.linalg.det(trainer._refinement.to_given()[:3, :3])) - 1
         row += [facts["scale_percent"], 100 * drift, facts["ate_mm"], facts["angle_deg"]]
+        one, exact = trainer.views[0].camera, true.views[0].camera
+        row += [100 * (one.fx / exact.fx - 1), math.hypot(one.cx - exact.cx, one.cy - exact.cy)]
         print(f"| {name} | " + " | ".join(f"{value:.4g}" for value in row) + " |", flush=True)
         cloud, views = trainer.cloud(), trainer.views
         shown = renderer.render(cloud, dataset.held_out[0].camera, background=dataset.background)["rgb"]

@@ -6,6 +6,7 @@ import pytest
 from command_line import fails, prints_json
 
 import fidsplat as fs
+from fidsplat.cli import main
 from fidsplat.images.files import read_image
 from fidsplat.train import load_dataset
 
@@ -173,3 +174,17 @@ def test_too_few_or_unrelated_photographs_are_one_clear_line(photos, captured, t
     assert (status, "of the same photographs" in message) == (2, True)
     status, message = fails(capsys, "capture", photos, "-o", tmp_path / "c", "--up", "qr:a")
     assert (status, "--up must be a tag of --tag" in message) == (2, True)
+
+
+def test_a_rolling_shutter_and_a_still_video_are_one_clear_line(captured, tmp_path, monkeypatch, capsys):
+    words = captured[1]
+    monkeypatch.setattr("fidsplat.photographs.steps.readout_motion", lambda model: (0.1, 0.5))
+    assert main(["capture", *map(str, words)]) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert "(rolling shutter), or the lens is not opencv: 0.50 px remain in the errors" in words
+    video = cv2.VideoWriter(str(tmp_path / "still.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (160, 120))
+    for _ in range(8):
+        video.write(cv2.resize(walls()[0][0], (160, 120)))
+    video.release()
+    status, message = fails(capsys, "capture", tmp_path / "still.avi", "-o", tmp_path / "still")
+    assert (status, "from different positions, got 1 different of 8 frames" in message) == (2, True)
