@@ -264,7 +264,7 @@ def true_dataset(options: argparse.Namespace, truth: dict, captured: Dataset) ->
 
 def train_all(options: argparse.Namespace, truth: dict) -> None:
     """PSNR of held-out views by poses, drift of the scale by refinement, and errors of localisation."""
-    renderer, captured = fs.Renderer(), load_dataset(options.o / "scene", hold_out=8)
+    renderer, captured = fs.Renderer(), load_dataset(options.o / "scene", hold_out=4)
     true = true_dataset(options, truth, captured)
     poses, both = {"refine_poses": True}, {"refine_poses": True, "refine_intrinsics": True}
     print("| poses | PSNR, dB | SSIM | scale, % | drift, % | ATE, mm | angle, ° | focal, % | middle, px |")
