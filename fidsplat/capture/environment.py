@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -162,8 +161,8 @@ class ExternalDepth(PickledByFields):
         return 20 * math.prod(self.depth.shape)
 
     def part(self, views: int | slice | np.ndarray) -> ExternalDepth:
-        """The images of one view of a batch, or of some."""
-        part = copy.copy(self)
+        """The images of one view of a batch, or of some; those of an array of numbers are on the host."""
+        part = object.__new__(type(self))  # they are checked
         for name in ("rgb", "depth", "label"):
             array = getattr(self, name)
             if isinstance(views, np.ndarray) and not isinstance(array, np.ndarray):
@@ -182,6 +181,9 @@ class DeviceExternalDepth(ExternalDepth):
 
     def __post_init__(self) -> None:
         pass
+
+    def __reduce__(self):
+        return ExternalDepth, tuple(array.numpy() for array in (self.rgb, self.depth, self.label))
 
 
 Background = tuple[float, float, float] | Gradient | Panorama

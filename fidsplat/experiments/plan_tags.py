@@ -248,8 +248,8 @@ class Survey:
         if not self._settings.planar:
             return seen
         return [
-            Sightings(poses, planar_information(information, self.path[poses], self.up))
-            for poses, information in seen
+            Sightings(one.poses, planar_information(one.information, self.path[one.poses], self.up))
+            for one in seen
         ]
 
     def with_tags(self, tags: Sequence[PlacedMarker]) -> np.ndarray:

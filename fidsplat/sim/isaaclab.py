@@ -13,11 +13,11 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.sim.poses import IDENTITY, OPENGL, OPTICAL, compose, inverse, pose_of
-from fidsplat.sim.rig import Rig
-from fidsplat.util.arguments import instance, invalid, whole_number
-from fidsplat.util.errors import InputError, unknown
+from fidsplat.sim.rig import Rig, _known
+from fidsplat.util.arguments import instance, whole_number
+from fidsplat.util.errors import InputError
 
-_FROM_ROS = {"ros": IDENTITY, "opengl": OPENGL, "world": OPTICAL}
+_FROM_ROS = {"world": OPTICAL, "ros": IDENTITY, "opengl": OPENGL}
 """(7,) axes of the convention from OpenCV axes"""
 _OUTPUTS = {
     "rgb": "rgb",
@@ -32,22 +32,20 @@ _OUTPUTS = {
 
 @dataclass
 class CameraData:
-    """Data of the cameras of all environments as torch tensors, by the names of Isaac Lab."""
+    """Data of the cameras of all environments as torch tensors, by the names of Isaac Lab.
+
+    Poses (N, 3) and (N, 4) are in the world of the simulation, with axes x forward, z up (world), z forward,
+    y down (ros) or -z forward, y up (opengl). `output` has images (N, h, w, channels) by data type: rgb
+    uint8, semantic_segmentation int32, else float32.
+    """
 
     image_shape: tuple[int, int]
-    """height and width"""
     intrinsic_matrices: Any
-    """(N, 3, 3)"""
     pos_w: Any
-    """(N, 3) metres in the world of the simulation"""
-    quat_w_ros: Any
-    """(N, 4) OpenCV axes"""
     quat_w_world: Any
-    """(N, 4) x forward, z up"""
+    quat_w_ros: Any
     quat_w_opengl: Any
-    """(N, 4) -z forward, y up"""
     output: dict[str, Any]
-    """(N, h, w, channels) by data type: rgb uint8, semantic_segmentation int32, else float32"""
 
 
 class TiledCamera:
@@ -86,20 +84,16 @@ class TiledCamera:
             raise InputError(f"the rig of a TiledCamera must have one camera, got {', '.join(rig.cameras)}")
         if rig.bodies and bodies is None:
             raise InputError(f"bodies must return the poses of {', '.join(rig.bodies)}, got None")
+        _known("order of quaternions", quaternions, ("xyzw", "wxyz"))
         for name in data_types:
-            if name not in _OUTPUTS:
-                raise InputError(unknown("data type", name, _OUTPUTS))
-        if quaternions not in ("xyzw", "wxyz"):
-            raise InputError(unknown("order of quaternions", quaternions, ("xyzw", "wxyz")))
+            _known("data type", name, _OUTPUTS)
         self.num_instances = whole_number("num_instances", num_instances, 1, 2**31 - 1)
-        self._rig, self._types, self._bodies = rig, tuple(data_types), bodies
+        self._rig, self._types, self._bodies, self._period = rig, tuple(data_types), bodies, update_period
         (self._name,) = rig.cameras
-        self._outputs = tuple(_OUTPUTS[name] for name in data_types)
         origins = np.zeros((num_instances, 3)) if origins is None else _host(origins)
         self._origins = np.concatenate([origins, np.tile(IDENTITY[3:], (len(origins), 1))], -1)
         self._to_wxyz = [0, 1, 2, 3] if quaternions == "wxyz" else [3, 0, 1, 2]
         self._from_wxyz = [0, 1, 2, 3] if quaternions == "wxyz" else [1, 2, 3, 0]
-        self._period = update_period
         self._poses: np.ndarray | None = None
         """(N, 7) poses in the world of the simulation that `set_world_poses` has set"""
         self._tensors: dict[str, Any] = {}
@@ -107,15 +101,8 @@ class TiledCamera:
         """number of images of each environment since its reset"""
         self._times, self._taken = np.zeros((2, num_instances))
         self._outdated = np.ones(num_instances, bool)
-
-    @property
-    def image_shape(self) -> tuple[int, int]:
-        """Height and width."""
-        return self._camera.height, self._camera.width
-
-    @property
-    def _camera(self) -> Camera:
-        return self._rig.cameras[self._name].camera
+        self._camera = rig.cameras[self._name].camera
+        self.image_shape = self._camera.height, self._camera.width
 
     @property
     def data(self) -> CameraData:
@@ -125,15 +112,12 @@ class TiledCamera:
             self._render(bodies, self._world_poses(bodies))
         poses, camera = self._world_poses(bodies), self._camera
         tensor = next(iter(self._tensors.values())).new_empty(0).float().new_tensor  # on their device
-        quats = {
-            name: tensor(compose(poses, inverse(axes))[:, 3:][:, self._from_wxyz])
-            for name, axes in _FROM_ROS.items()
-        }
+        order = 3 + np.array(self._from_wxyz)
+        quats = [tensor(compose(poses, inverse(axes))[:, order]) for axes in _FROM_ROS.values()]
         matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
         return CameraData(
-            self.image_shape, tensor([matrix] * len(poses)), tensor(poses[:, :3]),
-            quats["ros"], quats["world"], quats["opengl"], dict(self._tensors),
-        )  # fmt: skip
+            self.image_shape, tensor([matrix] * len(poses)), tensor(poses[:, :3]), *quats, dict(self._tensors)
+        )
 
     def update(self, dt: float, force_recompute: bool = False) -> None:
         """Advance the time; images of environments whose period has passed are rendered when `data` is read,
@@ -165,8 +149,7 @@ class TiledCamera:
             env_ids: environments; None: all.
             convention: opengl (-z forward, y up), ros (z forward, y down) or world (x forward, z up).
         """
-        if convention not in _FROM_ROS:
-            raise InputError(unknown("convention", convention, _FROM_ROS))
+        _known("convention", convention, _FROM_ROS)
         which, poses = self._which(env_ids), self._world_poses(self._body_poses())
         if positions is not None:
             poses[which, :3] = _host(positions)
@@ -192,8 +175,6 @@ class TiledCamera:
     def _body_poses(self) -> dict[str, np.ndarray]:
         """Poses (N, 7) of the bodies in the world of the simulation."""
         given = {} if self._bodies is None else self._bodies()
-        if not isinstance(given, Mapping):
-            raise invalid("the result of bodies", "{name of a body: poses (N, 7)}", given)
         order = [0, 1, 2, *(3 + k for k in self._to_wxyz)]
         return {name: _host(poses)[:, order] for name, poses in given.items()}
 
@@ -207,16 +188,17 @@ class TiledCamera:
 
     def _render(self, bodies: Mapping[str, np.ndarray], poses: np.ndarray) -> None:
         mask, back = self._outdated.copy(), inverse(self._origins)
-        images = self._rig.render(
+        images = Rig.render(
+            self._rig,
             {name: compose(back, each) for name, each in bodies.items()},
             {self._name: compose(back, poses)},
-            outputs=self._outputs,
+            outputs=[_OUTPUTS[name] for name in self._types],
             mask=mask,
         ).of(self._name)
-        made = {name: self._tensor(name, images) for name in self._types}
-        for name, tensor in made.items():
-            if self._tensors and not mask.all():
-                which = np.flatnonzero(mask).tolist()
+        which = np.flatnonzero(mask).tolist()
+        for name in self._types:
+            tensor = self._tensor(name, images)
+            if name in self._tensors and not mask.all():
                 self._tensors[name][which] = tensor[which]
             else:
                 self._tensors[name] = tensor

@@ -14,7 +14,7 @@ from fidsplat.render.device_surface import device_surface
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.sim.poses import OPENGL
-from fidsplat.sim.rig import Rig, RigCamera, RigImages
+from fidsplat.sim.rig import MESH_OFFSET, RigCamera, SimulatorRig
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrices_to_quaternions, quaternion_multiply
 from fidsplat.util.arguments import instance, whole_number
@@ -29,8 +29,6 @@ mujoco: Any = _mujoco  # type checkers do not know its names
 
 MESH = -2
 """label of geom 0 among `meshes`; geom i has MESH - i"""
-MESH_OFFSET = 2e-3
-"""metres by which meshes are moved away from the camera"""
 _OUTPUTS = {
     "mjCAMOUT_RGB": "rgb",
     "mjCAMOUT_DEPTH": "depth",
@@ -41,7 +39,7 @@ _OUTPUTS = {
 """output name of each MuJoCo camera output"""
 
 
-class MujocoRig(Rig):
+class MujocoRig(SimulatorRig):
     """A rig with the cameras of a MuJoCo model and splats attached to its bodies.
 
     Resolution, fovy, focal length, principal point and outputs are the model's; the near plane is at
@@ -53,6 +51,11 @@ class MujocoRig(Rig):
         bodies: {label: name of the body in the model}.
         cameras: names of the requested cameras; default all cameras that have a name.
         renderer, rest, outputs: as in `Rig`; by default a camera has the outputs of its `output` attribute.
+
+    The state that `render` reads is an MjData, a list of MjData, one for each environment, or mujoco_warp's
+    Data; after `mj_forward` or `mj_step`, which compute the poses of bodies and cameras. Its `meshes` may be
+    geom groups, by default 0, 1 and 2, rendered by MuJoCo (with OpenGL, for pinhole cameras) or mujoco_warp.
+    Geom i has the label `MESH` - i.
 
     Raises:
         InputError: as `Rig`; a body or camera that the model does not have, a camera without a name.
@@ -104,45 +107,12 @@ class MujocoRig(Rig):
         cameras = np.concatenate([at, camera_rotation], -1)[:, self._camera_ids]
         return bodies, cameras
 
-    def render(  # type: ignore[override]
-        self,
-        data: Any,
-        *,
-        outputs: Iterable[str] | None = None,
-        external_depths: Mapping[str, Sequence[ExternalDepth] | ExternalDepth] | None = None,
-        mask: Any = None,
-        meshes: bool | Iterable[int] = False,
-    ) -> RigImages:
-        """Render the images of all cameras.
-
-        Args:
-            data: an MjData, a list of MjData, one for each environment, or mujoco_warp's Data; after
-                `mj_forward` or `mj_step`, which compute the poses of bodies and cameras.
-            outputs, external_depths, mask: as in `Rig.render`.
-            meshes: whether the model's geoms, rendered by MuJoCo or mujoco_warp, are composited with the
-                splats by depth; or their geom groups, by default 0, 1 and 2. They have the label `MESH` - id
-                of the geom. They are moved 2 mm away from the camera, so that markers on their surfaces are
-                visible.
-
-        Raises:
-            InputError: as `Rig.render`; data without poses; meshes with external_depths; without mujoco_warp:
-                meshes with an orthographic camera, or without OpenGL.
-        """
-        bodies, cameras = self.poses(data)
-        if meshes is not False:
-            if external_depths is not None:
-                raise InputError("meshes and external_depths exclude each other; give one of them")
-            ours = self._world_meshes if hasattr(data, "nworld") else self._meshes
-            external_depths = ours(data, self._groups_of(meshes))
-        return super().render(bodies, cameras, outputs=outputs, external_depths=external_depths, mask=mask)
-
-    @staticmethod
-    def _groups_of(meshes: Any) -> list[int]:
-        """The geom groups to render."""
-        if meshes is True:
-            return [0, 1, 2]
-        groups = meshes if isinstance(meshes, Iterable) else [meshes]
-        return [whole_number("a geom group of meshes", group, 0, mujoco.mjNGROUP - 1) for group in groups]
+    def _geometry(self, data: Any, poses: Mapping[str, np.ndarray], meshes: Any) -> Mapping[str, Any]:
+        groups = [0, 1, 2] if meshes is True else meshes if isinstance(meshes, Iterable) else [meshes]
+        groups = [whole_number("a geom group of meshes", group, 0, mujoco.mjNGROUP - 1) for group in groups]
+        if hasattr(data, "nworld"):
+            return self._world_meshes(data, groups)
+        return self._meshes(data if isinstance(data, list | tuple) else [data], groups)
 
     def _world_meshes(self, data: Any, groups: list[int]) -> dict[str, ExternalDepth]:
         """Images of the model's geoms for each camera and all worlds, by mujoco_warp's ray caster."""
@@ -177,17 +147,11 @@ class MujocoRig(Rig):
                 )
         return found
 
-    def _meshes(self, data: Any, groups: list[int]) -> dict[str, list[ExternalDepth]]:
+    def _meshes(self, data: Sequence[Any], groups: list[int]) -> dict[str, list[ExternalDepth]]:
         """Images of the model's geoms for each camera and environment, by MuJoCo."""
-        data = data if isinstance(data, list | tuple) else [data]
         for one in data:
             instance("data with meshes", one, mujoco.MjData, "a mujoco.MjData")
-        for name, camera in self.cameras.items():
-            if camera.camera.lens is not None:
-                raise InputError(
-                    f"a camera with meshes must be a pinhole, got {name!r} with the lens "
-                    f"{camera.camera.lens.kind}; leave it out by cameras="
-                )
+        self._pinholes()
         option = mujoco.MjvOption()
         option.geomgroup[:] = 0
         option.geomgroup[groups] = 1

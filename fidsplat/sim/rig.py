@@ -22,6 +22,9 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.arguments import instance, invalid, whole_number
 from fidsplat.util.errors import InputError, MissingOutputError, unknown
 
+MESH_OFFSET = 2e-3
+"""metres by which the geometry of simulators is moved away from the camera"""
+
 
 @dataclass(frozen=True, eq=False)
 class RigCamera:
@@ -249,6 +252,60 @@ class Rig:
     ) -> FrameBatch:
         taken = captures[0] if len(captures) == 1 else captures
         return self.renderer.render_batch(self._cloud, taken, poses=poses, groups=groups, mask=mask)
+
+
+class SimulatorRig(Rig):
+    """A rig that reads poses, and images of the geometry, from the state of a simulator."""
+
+    def poses(self, state: Any) -> tuple[Any, Any]:
+        """Poses of bodies and of cameras as for `Rig.render`; None: the cameras' mounts."""
+        raise NotImplementedError
+
+    def _geometry(self, state: Any, poses: Mapping[str, np.ndarray], meshes: Any) -> Mapping[str, Any]:
+        """External depth images of the simulator's geometry, for poses (env, 7) of the cameras."""
+        raise NotImplementedError
+
+    def render(  # type: ignore[override]
+        self,
+        state: Any,
+        cameras: Mapping[str, Any] | None = None,
+        *,
+        outputs: Iterable[str] | None = None,
+        external_depths: Mapping[str, Sequence[ExternalDepth] | ExternalDepth] | None = None,
+        mask: Any = None,
+        meshes: Any = False,
+    ) -> RigImages:
+        """Render the images of all cameras.
+
+        Args:
+            state: state of the simulator, for the class.
+            cameras, outputs, external_depths, mask: as in `Rig.render`.
+            meshes: whether the simulator's geometry is composited with the splats by depth; or what of it,
+                for the class. It is moved 2 mm away from the camera, so that markers on its surfaces are
+                visible.
+
+        Raises:
+            InputError: as `Rig.render`; a state without poses; meshes with external_depths.
+        """
+        bodies, own = self.poses(state)
+        given = _by_name("body", bodies, self.bodies)
+        mounts = {name: self._mounted_pose(name, given, len(bodies)) for name in self.cameras}
+        views = mounts | _by_name("camera", own, tuple(self.cameras))
+        views |= _by_name("camera", cameras, tuple(self.cameras))
+        if meshes is not False:
+            if external_depths is not None:
+                raise InputError("meshes and external_depths exclude each other; give one of them")
+            external_depths = self._geometry(state, views, meshes)
+        return super().render(given, views, outputs=outputs, external_depths=external_depths, mask=mask)
+
+    def _pinholes(self) -> None:
+        """Raise InputError for a camera with a lens."""
+        for name, camera in self.cameras.items():
+            if camera.camera.lens is not None:
+                raise InputError(
+                    f"a camera with meshes must be a pinhole, got {name!r} with the lens "
+                    f"{camera.camera.lens.kind}; leave it out by cameras="
+                )
 
 
 class RigImages(Mapping):

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
@@ -24,7 +25,8 @@ _MORE = 1e-9
 """smallest relative improvement of the objective"""
 
 
-class Sightings(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Sightings:
     """Images of one tag along a trajectory."""
 
     poses: np.ndarray
@@ -32,12 +34,12 @@ class Sightings(NamedTuple):
     information: np.ndarray
     """(k, 6, 6) Fisher information about each pose"""
 
-    @property
+    @cached_property
     def rows(self) -> np.ndarray:
         """Rows (6 k,) of the poses in the covariance of the trajectory."""
         return (6 * self.poses[:, None] + np.arange(6)).ravel()
 
-    @property
+    @cached_property
     def roots(self) -> np.ndarray:
         """(k, 6, 6) L with L L^T the information."""
         values, vectors = np.linalg.eigh(self.information)
@@ -137,20 +139,19 @@ def error_gain(covariance: np.ndarray, sightings: Sightings) -> float:
     k = len(sightings.poses)
     if not k:
         return 0.0
-    positions = covariance.reshape(-1, 6, covariance.shape[1])[:, :3].reshape(-1, covariance.shape[1])
-    seen = np.einsum("nka,kai->nki", positions[:, sightings.rows].reshape(-1, k, 6), sightings.roots)
-    seen = seen.reshape(-1, 6 * k)
+    positions = covariance[:, sightings.rows].reshape(-1, 6, k, 6)[:, :3].reshape(-1, k, 6)
+    seen = np.einsum("nka,kai->nki", positions, sightings.roots).reshape(-1, 6 * k)
     return float((seen * np.linalg.solve(_spread(covariance, sightings), seen.T).T).sum() / (len(seen) / 3))
 
 
-def updated(covariance: np.ndarray, sightings: Sightings) -> np.ndarray:
-    """The covariance of the trajectory with the sightings of a tag."""
+def updated(covariance: np.ndarray, sightings: Sightings, sign: float = 1.0) -> np.ndarray:
+    """The covariance of the trajectory with the sightings of a tag, or without them by sign -1."""
     k = len(sightings.poses)
     if not k:
         return covariance
     columns = covariance[:, sightings.rows].reshape(-1, k, 6)
     seen = np.einsum("nka,kai->nki", columns, sightings.roots).reshape(-1, 6 * k)
-    result = covariance - seen @ np.linalg.solve(_spread(covariance, sightings), seen.T)
+    result = covariance - sign * seen @ np.linalg.solve(_spread(covariance, sightings, sign), seen.T)
     return (result + result.T) / 2
 
 
@@ -209,13 +210,11 @@ def local_search(
     limits = np.array([objective(covariance, one) for one in candidates])
     order = np.argsort(-limits, kind="stable")
     for _ in range(PASSES):
-        before = value
+        before, after = value, _with(covariance, candidates, chosen)
         for place in range(len(chosen)):
             interrupts.check()
             others = chosen[:place] + chosen[place + 1 :]
-            without = covariance
-            for k in others:
-                without = updated(without, candidates[k])
+            without = updated(after, candidates[chosen[place]], -1.0)
             own = objective(without, candidates[chosen[place]])
             best, most = chosen[place], own * (1 + _MORE)
             for k in order:
@@ -229,13 +228,18 @@ def local_search(
             if best != chosen[place]:
                 chosen[place] = best
                 value += most - own
+                after = updated(without, candidates[best])
         if value <= before * (1 + _MORE):
             break
-    after = covariance
-    for k in chosen:
-        after = updated(after, candidates[k])
+    after = _with(covariance, candidates, chosen)
     bound = min(selection.bound, _bound(after, candidates, chosen, value, objective))
     return Selection(tuple(chosen), value, bound)
+
+
+def _with(covariance: np.ndarray, candidates: Sequence[Sightings], chosen: Sequence[int]) -> np.ndarray:
+    for k in chosen:
+        covariance = updated(covariance, candidates[k])
+    return covariance
 
 
 def _bound(
@@ -254,12 +258,12 @@ def _bound(
     return value + sum(sorted((gain(covariance, one) for one in candidates), reverse=True)[: len(chosen)])
 
 
-def _spread(covariance: np.ndarray, sightings: Sightings) -> np.ndarray:
+def _spread(covariance: np.ndarray, sightings: Sightings, sign: float = 1.0) -> np.ndarray:
     """I + L^T S L (6 k, 6 k), S being the covariance of the poses of the sightings."""
     k, rows, roots = len(sightings.poses), sightings.rows, sightings.roots
     own = covariance[np.ix_(rows, rows)].reshape(k, 6, k, 6)
     half = np.einsum("kai,kalb->kilb", roots, own)
-    return np.eye(6 * k) + np.einsum("kilb,lbj->kilj", half, roots).reshape(6 * k, 6 * k)
+    return np.eye(6 * k) + sign * np.einsum("kilb,lbj->kilj", half, roots).reshape(6 * k, 6 * k)
 
 
 def _cross(v: np.ndarray) -> np.ndarray:
