@@ -1,5 +1,3 @@
 // Factors of the three channels.
 //@ resolve_end
-    rgb_out[3 * out] *= red;
-    rgb_out[3 * out + 1] *= green;
-    rgb_out[3 * out + 2] *= blue;
+    vstore3(vload3(out, rgb_out) * (float3)(red, green, blue), out, rgb_out);
