@@ -1,6 +1,7 @@
 """PyTorch bridge: differentiable rendering as an autograd function, for your own optimisation.
 
-Arrays are copied through host memory. docs/gradients.md describes the gradients.
+Images and gradients are copied from the device to the host once, and tensors on the CPU share that memory.
+docs/gradients.md describes the gradients.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class _Rendered(torch.autograd.Function):
         ctx.thick = arrays["scales"].shape[1:] == (3,)
         ctx.like = [None if tensor is None else (tensor.device, tensor.dtype) for tensor in tensors]
         ctx.set_materialize_grads(False)
-        return tuple(torch.from_numpy(np.array(image)).to(tensors[0].device) for image in frame.values())
+        return tuple(_tensor(image).to(tensors[0].device) for image in frame.values())
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -112,9 +113,15 @@ class _Rendered(torch.autograd.Function):
                 gradients.append(None)
                 continue
             device, dtype = like
-            array = np.array(found[name])
+            array = found[name]
             if name not in ("background", "pose") and len(ctx.rows) < ctx.count:
                 array = np.zeros((ctx.count, *array.shape[1:]), array.dtype)
                 array[ctx.rows] = found[name]
-            gradients.append(torch.from_numpy(array).to(device=device, dtype=dtype))
+            gradients.append(_tensor(array).to(device=device, dtype=dtype))
         return tuple(gradients)
+
+
+def _tensor(array: np.ndarray) -> Any:
+    """A tensor on the memory of an array that nobody else reads."""
+    array.flags.writeable = True
+    return torch.from_numpy(array)
