@@ -212,6 +212,8 @@ class _Clock:
             if wait > 0:
                 time.sleep(wait)
             yield step, step / self._rate
+            if not self.sent:  # the first frame compiles kernels
+                start = time.monotonic()
             self.sent += 1
             self.seconds = time.monotonic() - start
             due = max(step + 1, int(self.seconds * self._rate))

@@ -106,8 +106,7 @@ VARIANTS = {
     "no gyroscope": Variant(lidar=True, without="gyroscope"),
     "no tags": Variant(lidar=True, without="tags"),
     "no LiDAR": Variant(lidar=True, without="lidar"),
-    "sparse tags": Variant(lidar=True, spacing=3.0),
-    "sparse tags, no LiDAR": Variant(lidar=True, spacing=3.0, without="lidar"),
+    "sparse tags, no wheels": Variant(lidar=True, without="wheels", spacing=3.0),
 }
 """variants by name: odometry only, ideal corners, mixtures, effects, speeds and tag distances of `exact`, and
 a LiDAR with each sensor left out"""

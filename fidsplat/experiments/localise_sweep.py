@@ -30,7 +30,7 @@ Found = Mapping[str, Mapping[str, Any]]
 """results by variant"""
 Progress = Callable[[str, float], object]
 """called with the name of a variant and the completed share of its images"""
-_PLOTTED = ("odometry", "paper", "exact")
+_PLOTTED = ("odometry", "paper", "exact", "no tags", "no wheels")
 """variants with a plotted trajectory"""
 _SPANS = (
     f"to {DISTANCES[0]:g} m",
