@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.alignment import (
+    MIN_NOISE,
     AlignmentFit,
     AlignmentKernels,
     AlignmentStage,
@@ -50,11 +51,12 @@ MIN_INFORMATION = 1e-9
 """smallest eigenvalue of the scaled information matrix of a determined pose"""
 _DAMPING = 1e-3
 """initial damping of Levenberg-Marquardt, relative to the diagonal"""
-_SETTLED, _SETTLED_FINE = 0.3, 0.04
-"""motion in pixels of a step that ends a stage, and the last stage"""
-_REPEATED, _REPEATED_PIXELS = 4.0, 0.02
-"""standard deviations, and pixels, of a last step above which it is repeated at its result"""
-_LAST_STEPS = 4
+_SETTLED = 0.3
+"""motion in pixels of a step that ends a stage"""
+_REPEATED, _REPEATED_PIXELS = 4.0, 0.01
+"""standard deviations of a last step above which it is repeated at its result; pixels, for an image without
+noise"""
+_LAST_STEPS = 5
 """maximum number of last steps"""
 _DIFFERENCE = 0.01
 """motion in pixels of the finite differences"""
@@ -77,13 +79,15 @@ class Alignment:
 
 
 def stages_of(camera: Camera, mask: np.ndarray | None = None) -> list[tuple[AlignmentStage, int]]:
-    """Stages from coarse to fine for a camera, with maximum numbers of steps. The first is blurred more, for
-    a larger basin of convergence; the last is not blurred, so that its noise is that of the image."""
+    """Stages from coarse to fine for a camera, with maximum numbers of steps of `_minimise`. The first is
+    blurred more, for a larger basin of convergence; the last is not blurred, so that its noise is that of the
+    image."""
     short, ignored = min(camera.width, camera.height), _ignored(mask, camera)
     shrinks = [2**k for k in range(MAX_LEVELS) if k == 0 or short >> k >= MIN_SIDE]
-    middle = [(shrink, 0.7, 8 if shrink > 2 else 5) for shrink in reversed(shrinks[1:-1])]
+    coarsest = shrinks[-1]
+    finer = [(shrink, 0.7, 8 if shrink > 2 else 5) for shrink in reversed(shrinks[1:-1] or [1])]
     found = []
-    for shrink, blur, steps in [(shrinks[-1], 2.0, 10), (shrinks[-1], 1.0, 6), *middle, (1, 0.0, 5)]:
+    for shrink, blur, steps in [(coarsest, 2.0, 10), (coarsest, 1.0, 6), *finer, (1, 0.0, 0)]:
         width, height = camera.width // shrink, camera.height // shrink
         side = max(MIN_BLOCK, min(width, height) // BLOCKS)
         hidden = None
@@ -136,10 +140,11 @@ def _align(
     channels = image.shape[2]
     at = _State(start, AlignmentFit(np.ones(channels), np.zeros(channels), huber=True))
     for number, (stage, steps) in enumerate(stages):
-        at = _minimise(at, _Stage(number, stage.camera, len(stage.taps) > 1, render, kernels), steps)
+        if steps:
+            at = _minimise(at, _Stage(number, stage.camera, render, kernels), steps)
     if coarse:
         return Alignment(at.camera, np.full((6, 6), np.nan), 0.0, at.noise, at.fit.gain)
-    return _finish(at, _Stage(len(stages) - 1, start, False, render, kernels))
+    return _finish(at, _Stage(len(stages) - 1, start, render, kernels))
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,9 +155,9 @@ class _State:
     fit: AlignmentFit
     noise: float = 0.0
 
-    def moved(self, sums: AlignmentSums, step: np.ndarray, blurred: bool = False) -> _State:
-        """The estimate after a step (6 + 2 c,) of pose and exposure. blurred: whether noise is negligible."""
-        gains, offsets = _exposure_of(sums) if blurred else (1 + step[6::2], step[7::2])
+    def moved(self, sums: AlignmentSums, step: np.ndarray) -> _State:
+        """The estimate after a step (6 + 2 c,) of pose and exposure."""
+        gains, offsets = _exposure_of(sums) if self.fit.huber else (1 + step[6::2], step[7::2])
         fit = self.fit._replace(
             gain=np.clip(self.fit.gain * gains, *GAINS), offset=self.fit.offset + self.fit.gain * offsets
         )
@@ -163,7 +168,6 @@ class _State:
 class _Stage:
     number: int
     camera: Camera
-    blurred: bool
     render: Render
     kernels: AlignmentKernels
 
@@ -187,12 +191,12 @@ def _minimise(at: _State, stage: _Stage, steps: int) -> _State:
     if not at.noise:  # the exposure is unknown: its first estimates weigh all pixels alike
         for _ in range(3):
             sums = stage.sums(frame, at, noise=0.0)
-            at = at.moved(sums, np.zeros(6), blurred=True)
+            at = at.moved(sums, np.zeros(6))
     sums = stage.sums(frame, at)
     for number in range(steps):
         step = _solved(sums, damping)
-        tried, size = at.moved(sums, step, stage.blurred), stage.pixels(step[:6], sums)
-        if size < (_SETTLED if stage.blurred else _SETTLED_FINE) or number == steps - 1:
+        tried, size = at.moved(sums, step), stage.pixels(step[:6], sums)
+        if size < _SETTLED or number == steps - 1:
             return tried
         found = stage.sums(stage.frame(tried.camera), tried, sums.noise)
         if found.cost_before <= sums.cost:
@@ -216,7 +220,8 @@ def _finish(at: _State, stage: _Stage) -> Alignment:
         covariance, step = _covariance(sums, inverse), inverse @ _right(sums)
         at, noise = at.moved(sums, step), sums.noise
         square = step[:6] @ np.linalg.lstsq(covariance, step[:6], rcond=None)[0]
-        if square < _REPEATED**2 and stage.pixels(step[:6], sums) < _REPEATED_PIXELS:
+        exact = sums.noise > 1.001 * MIN_NOISE or stage.pixels(step[:6], sums) < _REPEATED_PIXELS
+        if square < _REPEATED**2 and exact:
             break
     # an image without the scene's contrast fits a render whose contrast the smallest gain removes
     inliers = sums.inliers if (at.fit.gain > GAINS[0]).any() else 0.0
@@ -296,8 +301,8 @@ def _parameters(channel: int) -> list[int]:
 
 
 def _exposure_of(sums: AlignmentSums) -> tuple[np.ndarray, np.ndarray]:
-    """Changes (c,) of gains and offsets, to equal means and standard deviations: misalignment attenuates the
-    gain of a regression."""
+    """Changes (c,) of gains and offsets, to equal means and standard deviations of blurred images:
+    misalignment attenuates the gain of a regression."""
     total = sums.matrix[:, 7, 7]
     values, residuals = sums.matrix[:, 6, 7] / total, sums.right[:, 7, 0] / total
     variance = np.maximum(sums.matrix[:, 6, 6] / total - values**2, 1e-12)

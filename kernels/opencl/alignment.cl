@@ -1,12 +1,12 @@
 // Direct image alignment: residuals of an image against a render, and the sums of the normal equations of the camera pose. NumPy
 // version: fidsplat/localisation/normal_equations.py.
 // ITEMS   work-items of a group: 1 on CPUs
-// SUMS    numbers of a group, CHANNEL_SUMS of each of three channels: `_unpacked` of fidsplat/backends/opencl/alignment.py
 // LOWEST  number of the first bin in the upper bits of a float
 #pragma OPENCL FP_CONTRACT OFF
 #define ROW_ITEMS (ITEMS < 16 ? ITEMS : 16)
 #define BINS 256
-#define OTHER_SUMS (3 * CHANNEL_SUMS)
+#define CHANNEL_ROWS 10   // rows of 8 sums of a channel: the matrix, two right sides
+#define SUMS (8 * (3 * CHANNEL_ROWS + 1))
 
 // Bin of a positive number: 16 bins per octave from 2^-14 on.
 static inline uint bin_of(float value) {
@@ -19,42 +19,43 @@ static inline float value_of(global const float *image, int i, int channel, int 
     return channels == 1 ? (at[0] + at[1] + at[2]) / 3.0f : at[channel];
 }
 
-// Index space: (columns, rows) of the level. Reads: the image. Writes: means over the pixels of the level.
+// Index space: (columns, rows) of the level. Reads: a larger image. Writes: means over the pixels of the level.
 kernel void align_shrink(
 //@@ arguments align_shrink
 ) {
     int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
-    float left = x * ratio_x, right = left + ratio_x, top = y * ratio_y, bottom = top + ratio_y;
+    float left = x * ratio_x, right = left + ratio_x, top = y * ratio_y, bottom = top + ratio_y, sum[3] = {0.0f, 0.0f, 0.0f};
     int end_x = min((int)ceil(right - 1e-3f), full_width), end_y = min((int)ceil(bottom - 1e-3f), full_height);
-    for (int c = 0; c < channels; c++) {
-        float sum = 0.0f;
-        for (int row = (int)top; row < end_y; row++) {
-            float across = 0.0f;
-            for (int column = (int)left; column < end_x; column++)
-                across += (fmin(right, column + 1.0f) - fmax(left, (float)column))
-                    * image[(row * (size_t)full_width + column) * channels + c];
-            sum += (fmin(bottom, row + 1.0f) - fmax(top, (float)row)) * across;
+    for (int row = (int)top; row < end_y; row++)
+        for (int column = (int)left; column < end_x; column++) {
+            global const float *at = image + (row * (size_t)full_width + column) * channels;
+            float share = fmin(right, column + 1.0f) - fmax(left, (float)column);
+            share *= fmin(bottom, row + 1.0f) - fmax(top, (float)row);
+            for (int c = 0; c < channels; c++) sum[c] += share * at[c];
         }
-        made[(y * (size_t)width + x) * channels + c] = sum / (ratio_x * ratio_y);
-    }
+    for (int c = 0; c < channels; c++) made[(y * (size_t)width + x) * channels + c] = sum[c] / (ratio_x * ratio_y);
 }
 
-// Index space: (columns, rows). Reads: an image. Writes: its convolution along x or y with symmetric taps; the border is repeated.
+// Index space: (any number, rows). Reads: an image. Writes: its convolution along x or y with symmetric taps; the border is repeated.
 kernel void align_blur(
 //@@ arguments align_blur
 ) {
-    int x = get_global_id(0), y = get_global_id(1);
-    if (x >= width || y >= height) return;
-    int at = vertical ? y : x, last = (vertical ? height : width) - 1, stride = vertical ? width : 1;
-    int start = y * width + x - at * stride;
-    for (int c = 0; c < channels; c++) {
-        float sum = taps[0] * image[(size_t)(start + at * stride) * channels + c];
-        for (int k = 1; k <= radius; k++) {
-            int low = start + max(at - k, 0) * stride, high = start + min(at + k, last) * stride;
-            sum += taps[k] * (image[(size_t)low * channels + c] + image[(size_t)high * channels + c]);
+    int y = get_global_id(1), first = get_global_id(0), count = width * channels, step = get_global_size(0);
+    global const float *own = image + y * (size_t)count;
+    global float *into = made + y * (size_t)count;
+    for (int i = first; i < count; i += step) into[i] = taps[0] * own[i];
+    for (int k = 1; k <= radius; k++) {
+        if (vertical) {
+            global const float *low = image + max(y - k, 0) * (size_t)count, *high = image + min(y + k, height - 1) * (size_t)count;
+            for (int i = first; i < count; i += step) into[i] += taps[k] * (low[i] + high[i]);
+            continue;
         }
-        made[(y * (size_t)width + x) * channels + c] = sum;
+        int shift = k * channels;
+        for (int i = first; i < count; i += step) {
+            int low = i >= shift ? i - shift : i % channels, high = i + shift < count ? i + shift : count - channels + i % channels;
+            into[i] += taps[k] * (own[low] + own[high]);
+        }
     }
 }
 
@@ -175,8 +176,9 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
         shared_noise = noise_before > 0.0f ? fmin(own, noise_before) : own;
     }
     barrier(CLK_LOCAL_MEM_FENCE);
-    float noise = shared_noise, sums[SUMS];
-    for (int k = 0; k < SUMS; k++) sums[k] = 0.0f;
+    float noise = shared_noise;
+    float8 totals[CHANNEL_ROWS * 3], others = 0.0f;    // others: squares of three channels, pixels, losses, inliers, squared inverse depths
+    for (int k = 0; k < CHANNEL_ROWS * 3; k++) totals[k] = 0.0f;
     int across_blocks = (width + side - 1) / side, blocks = across_blocks * ((height + side - 1) / side);
     for (int block = get_group_id(0); block < blocks; block += get_num_groups(0)) {
         int left = block % across_blocks * side, top = block / across_blocks * side;
@@ -202,9 +204,9 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                 across /= dot(by_x, across);
                 down /= dot(by_y, down);
                 float3 turn_x = cross(ray, across), turn_y = cross(ray, down);
-                float motion_x[6] = {turn_x.x, turn_x.y, turn_x.z, across.x * inverse, across.y * inverse, across.z * inverse};
-                float motion_y[6] = {turn_y.x, turn_y.y, turn_y.z, down.x * inverse, down.y * inverse, down.z * inverse};
-                float scale = axis == 0 ? -ray.x : axis == 1 ? -ray.y : -ray.z, of_column = moves ? curved : weight;
+                float8 motion_x = (float8)(turn_x, across * inverse, 0.0f, 0.0f), motion_y = (float8)(turn_y, down * inverse, 0.0f, 0.0f);
+                float scale = moves ? axis == 0 ? -ray.x : axis == 1 ? -ray.y : -ray.z : 1.0f, of_column = moves ? curved : weight;
+                float squares[3] = {0.0f, 0.0f, 0.0f};
                 for (int c = 0; c < channels; c++) {
                     float gx = (value_of(rgb, i + 1, c, channels) - value_of(rgb, i - 1, c, channels)) / 2.0f;
                     float gy = (value_of(rgb, i + width, c, channels) - value_of(rgb, i - width, c, channels)) / 2.0f;
@@ -212,38 +214,36 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                         gx = (gx + (image[(i + 1) * channels + c] - image[(i - 1) * channels + c]) / 2.0f / gain[c]) / 2.0f;
                         gy = (gy + (image[(i + width) * channels + c] - image[(i - width) * channels + c]) / 2.0f / gain[c]) / 2.0f;
                     }
-                    float row[8], value = value_of(rgb, i, c, channels), column = residual[c];
+                    float value = value_of(rgb, i, c, channels), column = residual[c];
                     if (moves) column = (value_of(moved, i, c, channels) - value) / step;
-                    for (int k = 0; k < 6; k++) row[k] = -(gx * motion_x[k] + gy * motion_y[k]);
-                    row[6] = value;
-                    row[7] = 1.0f;
-                    float *sum = sums + c * CHANNEL_SUMS;
-                    for (int k = 0; k < 8; k++) {
-                        float weighted = curved * row[k], entry = of_column * row[k] * column;
-                        for (int other = k; other < 8; other++) *sum++ += weighted * row[other];
-                        *sum++ += entry;
-                        *sum++ += entry * scale;
-                    }
-                    *sum += weight * residual[c] * residual[c];
+                    float8 row = -(gx * motion_x + gy * motion_y), entry;
+                    row.s67 = (float2)(value, 1.0f);
+                    float8 weighted = curved * row, *total = totals + c * CHANNEL_ROWS;
+                    total[0] += weighted.s0 * row;
+                    total[1] += weighted.s1 * row;
+                    total[2] += weighted.s2 * row;
+                    total[3] += weighted.s3 * row;
+                    total[4] += weighted.s4 * row;
+                    total[5] += weighted.s5 * row;
+                    total[6] += weighted.s6 * row;
+                    total[7] += weighted.s7 * row;
+                    entry = of_column * column * row;
+                    total[8] += entry;
+                    total[9] += scale * entry;
+                    squares[c] = weight * residual[c] * residual[c];
                 }
-                sums[OTHER_SUMS] += 1.0f;
-                sums[OTHER_SUMS + 1] += cost;
-                sums[OTHER_SUMS + 2] += before;
-                sums[OTHER_SUMS + 3] += share < 1.0f;
-                sums[OTHER_SUMS + 4] += inverse * inverse;
+                others += (float8)(squares[0], squares[1], squares[2], 1.0f, cost, before, share < 1.0f, inverse * inverse);
             }
     }
-    sums[OTHER_SUMS + 5] = item == 0 ? noise : 0.0f;
-    size_t into = get_group_id(0) * (size_t)SUMS;
-    if (ITEMS == 1) {
-        for (int k = 0; k < SUMS; k++) made[into + k] = sums[k];
-        return;
-    }
-    for (int k = 0; k < SUMS; k++) partial[item][k] = sums[k];
+    local float *sums = partial[item];
+    for (int k = 0; k < CHANNEL_ROWS * 3; k++) vstore8(totals[k], k, sums);
+    vstore8(others, CHANNEL_ROWS * 3, sums);
     barrier(CLK_LOCAL_MEM_FENCE);
+    size_t into = get_group_id(0) * (size_t)(SUMS + 1);
     for (int k = item; k < SUMS; k += ITEMS) {
         float sum = 0.0f;
         for (int other = 0; other < ITEMS; other++) sum += partial[other][k];
         made[into + k] = sum;
     }
+    if (item == 0) made[into + SUMS] = noise;
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyopencl as cl
@@ -16,7 +16,7 @@ from fidsplat.backends.alignment import (
     least_bin,
     noise_factor,
 )
-from fidsplat.backends.opencl.assemble import ALL_SUMS, CHANNEL_SUMS, assemble_alignment
+from fidsplat.backends.opencl.assemble import assemble_alignment
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.workspace import Workspace
@@ -24,7 +24,10 @@ from fidsplat.cameras.raster import raster_of
 
 _GROUPS = 128
 """maximum number of work-groups of a sum"""
-_UPPER = np.triu_indices(8)
+_SUMS = 249
+"""numbers of a work-group"""
+_Image: TypeAlias = tuple[cl.Buffer, tuple[int, ...]]
+"""an image with its shape"""
 
 
 class OpenCLAlignment(AlignmentKernels):
@@ -42,12 +45,13 @@ class OpenCLAlignment(AlignmentKernels):
     def load(self, image: np.ndarray, stages: list[AlignmentStage], most: int) -> list[int]:
         """Prepare the image for its stages."""
         with self._workspace.lock, self._workspace.failing("localising"):
-            full = self._put("image", image)
             self._stages = []
             counted = self._scratch("textures", 4 * BINS * len(stages))
             cl.enqueue_fill_buffer(self._queue, counted, np.zeros(1, np.uint32), 0, 4 * BINS * len(stages))
-            for number, stage in enumerate(stages):
-                self._stages.append(self._prepared(number, stage, full, image.shape, counted))
+            source = complete = self._put("image", image), image.shape
+            for number, stage in reversed([*enumerate(stages)]):  # each level from the next finer one
+                given, source = self._prepared(number, stage, source, complete, counted)
+                self._stages.insert(0, given)
             counts = np.empty((len(stages), BINS), np.uint32)
             cl.enqueue_copy(self._queue, counts, counted)
         found = []
@@ -57,17 +61,21 @@ class OpenCLAlignment(AlignmentKernels):
         return found
 
     def _prepared(
-        self, number: int, stage: AlignmentStage, full: cl.Buffer, shape: tuple[int, ...], counted: cl.Buffer
-    ) -> dict[str, Any]:
-        """Arguments of the kernels for a stage; its image and its textures are computed."""
-        camera, (full_height, full_width, channels) = stage.camera, shape
+        self, number: int, stage: AlignmentStage, source: _Image, full: _Image, counted: cl.Buffer
+    ) -> tuple[dict[str, Any], _Image]:
+        """Arguments of the kernels for a stage, and its image before the blur. source: the next finer level,
+        which is used if its size is a multiple."""
+        camera = stage.camera
+        finer, (full_height, full_width, channels) = source
+        if full_width % camera.width or full_height % camera.height:
+            finer, (full_height, full_width, _) = full
         width, height, size = camera.width, camera.height, 4 * camera.width * camera.height
         given = {
             **{"width": width, "height": height, "channels": channels, "side": stage.side},
             **{"full_width": full_width, "full_height": full_height},
             **{"ratio_x": full_width / width, "ratio_y": full_height / height},
             **{"focal_x": camera.fx, "focal_y": camera.fy, "center_x": camera.cx, "center_y": camera.cy},
-            **{"lens": int(camera.lens is not None), "rays": full, "taps": full, "mask": full},
+            **{"lens": int(camera.lens is not None), "rays": finer, "taps": finer, "mask": finer},
             **{"masked": int(stage.ignored is not None), "radius": len(stage.taps) - 1, "row": number},
             "bins": self._scratch(f"bins {number}", size // 4),
             "counts": counted,
@@ -79,11 +87,14 @@ class OpenCLAlignment(AlignmentKernels):
             given["mask"] = self._put(f"mask {number}", stage.ignored.astype(np.uint8))
         if given["radius"]:
             given["taps"] = self._put(f"taps {number}", stage.taps)
-        made = self._scratch(f"image {number}", channels * size)
-        self._over_pixels("align_shrink", {**given, "image": full, "made": made})
+        made = finer
+        if (width, height) != (full_width, full_height):
+            made = self._scratch(f"image {number}", channels * size)
+            grid = -(-width // 64) * 64, height
+            self._launch("align_shrink", grid, (64, 1), {**given, "image": finer, "made": made})
         given["image"] = self._blurred(made, given, f"image {number}", channels)
         self._by_groups("align_texture", self._rows(height), given)
-        return given
+        return given, (made, (height, width, channels))
 
     def sums(
         self,
@@ -107,7 +118,7 @@ class OpenCLAlignment(AlignmentKernels):
                 moved_rgb = self._blurred(moved_rgb, given, "moved render", 3)
             counts = self._scratch("errors", 4 * BINS)
             cl.enqueue_fill_buffer(self._queue, counts, np.zeros(1, np.uint32), 0, 4 * BINS)
-            made = self._scratch("sums", 4 * groups * ALL_SUMS)
+            made = self._scratch("sums", 4 * groups * _SUMS)
             exposure = np.ones((2, 3))
             exposure[:, :channels] = fit.gain, fit.offset
             names = (f"{kind}_{name}" for kind in ("gain", "offset") for name in ("red", "green", "blue"))
@@ -118,7 +129,7 @@ class OpenCLAlignment(AlignmentKernels):
             given["noise_factor"] = noise_factor(channels)
             self._by_groups("align_errors", self._rows(height), given)
             self._by_groups("align_sums", groups, given)
-            packed = np.empty((groups, ALL_SUMS), np.float32)
+            packed = np.empty((groups, _SUMS), np.float32)
             cl.enqueue_copy(self._queue, packed, made)
         return _unpacked(packed, channels, blocks)
 
@@ -137,13 +148,10 @@ class OpenCLAlignment(AlignmentKernels):
             size = 4 * channels * given["width"] * given["height"]
             made = self._scratch(f"blurred {vertical} {name}", size)
             own = {"image": image, "made": made, "vertical": vertical, "channels": channels}
-            self._over_pixels("align_blur", given | own)
+            across = 1 if self._items == 1 else 64
+            self._launch("align_blur", (across, given["height"]), (across, 1), given | own)
             image = made
         return image
-
-    def _over_pixels(self, kernel: str, given: dict[str, Any]) -> None:
-        size = -(-given["width"] // 64) * 64, given["height"]
-        self._launch(kernel, size, (64, 1), given)
 
     def _by_groups(self, kernel: str, groups: int, given: dict[str, Any]) -> None:
         self._launch(kernel, (groups * self._items,), (self._items,), given)
@@ -168,23 +176,13 @@ class OpenCLAlignment(AlignmentKernels):
 
 
 def _unpacked(packed: np.ndarray, channels: int, blocks: bool) -> AlignmentSums:
-    """Sums of the work-groups: for each channel, row by row of the upper triangle, the matrix and two right
-    sides; the weighted squares; then the other sums."""
-    parts = packed[:, : channels * CHANNEL_SUMS].reshape(len(packed), channels, CHANNEL_SUMS)
-    total, others = parts.sum(axis=0, dtype=float), packed[:, 3 * CHANNEL_SUMS :].astype(float)
-    matrix, ends = np.zeros((channels, 8, 8)), np.cumsum(np.arange(10, 2, -1))
-    upper = np.setdiff1d(np.arange(ends[-1]), [ends - 2, ends - 1])
-    matrix[:, _UPPER[0], _UPPER[1]] = matrix[:, _UPPER[1], _UPPER[0]] = total[:, upper]
-    sums = others.sum(axis=0)
-    _, cost, before, inliers, inverse_depth, _ = (sums / max(sums[0], 1)).tolist()
+    """Sums of the work-groups: for each of three channels 8 rows of the matrix and two right sides; squares
+    of the channels, number of pixels, losses, inliers and squared inverse depths; the noise."""
+    rows = packed[:, :240].reshape(len(packed), 3, 10, 8)[:, :channels]
+    total, others = rows.sum(axis=0, dtype=float), packed[:, 240:248].sum(axis=0, dtype=float)
+    cost, before, inliers, inverse_depth = (others[4:] / max(others[3], 1)).tolist()
+    scores = rows[packed[:, 243] > 0][:, :, 8] if blocks else rows[:0, :, 8]
     return AlignmentSums(
-        matrix,
-        np.stack([total[:, ends - 2], total[:, ends - 1]], axis=2),
-        total[:, -1],
-        parts[others[:, 0] > 0][:, :, ends - 2].astype(float) if blocks else np.empty((0, channels, 8)),
-        cost,
-        before,
-        inliers,
-        inverse_depth,
-        float(others[0, 5]),
+        *(total[:, :8], np.moveaxis(total[:, 8:], 1, 2), others[:channels], scores.astype(float)),
+        *(cost, before, inliers, inverse_depth, float(packed[0, 248])),
     )

@@ -69,8 +69,6 @@ _STEP = (
     *("train/activation_functions", "train/adam", "project_step"),
 )
 _TRAINING = ("surface", "exposure", "activation_functions", "activate", "gather_rows", "position_noise")
-CHANNEL_SUMS, ALL_SUMS = 53, 165
-"""numbers of a channel and of all sums of direct image alignment (kernels/opencl/alignment.cl)"""
 _HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")
 _HOOKS = re.compile(r"^[ \t]*//@@ (\w+)(?: \w+)?[ \t]*$", re.MULTILINE)
 _COMMENT = re.compile(r"[ \t]*//.*")
@@ -281,8 +279,7 @@ def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> Source:
 @cache
 def assemble_alignment(items: int) -> Source:
     """Source of the kernels of direct image alignment, for work-groups of so many items."""
-    numbers: dict[str, int | str] = {"CHANNEL_SUMS": CHANNEL_SUMS, "ITEMS": items, "SUMS": ALL_SUMS}
-    numbers |= {"LOWEST": alignment.LOWEST}
+    numbers: dict[str, int | str] = {"ITEMS": items, "LOWEST": alignment.LOWEST}
     for name in ("HUBER", "TUKEY", "MIN_NOISE", "MAX_NOISE"):
         numbers[name] = f"{getattr(alignment, name)}f"
     declared = Declarations(Scalars("float", "float"))

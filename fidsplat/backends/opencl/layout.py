@@ -279,7 +279,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "int side huber moves axis lens  // moves: whether there is a moved render",
         "float focal_x focal_y center_x center_y noise_factor noise_before step",
         "in float depth rays moved",
-        "out float made  // (work-groups, SUMS)",
+        "out float made  // (work-groups, SUMS + 1)",
     ),
     # training
     "loss_take": takes(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK, _IMAGES),
