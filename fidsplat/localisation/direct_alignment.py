@@ -188,7 +188,7 @@ class _Stage:
 def _minimise(at: _State, stage: _Stage, steps: int) -> _State:
     """Levenberg-Marquardt at one stage. The last step is not checked by a render."""
     damping, frame = _DAMPING, stage.frame(at.camera)
-    if not at.noise:  # the exposure is unknown: its first estimates weigh all pixels alike
+    if not at.noise:  # the exposure is unknown
         for _ in range(3):
             sums = stage.sums(frame, at, noise=0.0)
             at = at.moved(sums, np.zeros(6))

@@ -177,7 +177,8 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     float noise = shared_noise;
-    float8 totals[CHANNEL_ROWS * 3], others = 0.0f;    // others: squares of three channels, pixels, losses, inliers, squared inverse depths
+    // others: squares of three channels, number of pixels, two losses, inliers, squared inverse depths
+    float8 totals[CHANNEL_ROWS * 3], others = 0.0f;
     for (int k = 0; k < CHANNEL_ROWS * 3; k++) totals[k] = 0.0f;
     int across_blocks = (width + side - 1) / side, blocks = across_blocks * ((height + side - 1) / side);
     for (int block = get_group_id(0); block < blocks; block += get_num_groups(0)) {
@@ -187,11 +188,10 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
             for (int x = left + item % ROW_ITEMS; x < right; x += ROW_ITEMS) {
                 int i = y * width + x;
                 if (bins[i] < least) continue;
-                float residual[3], weight, curved, cost, before, unused_weight, unused_curved;
-                float error = residuals_of(i, channels, image, rgb, gain, offset, residual);
-                robust(error, noise_before > 0.0f ? noise_before : noise, huber, channels, &unused_weight, &unused_curved, &before);
+                float residual[3], weight, curved, cost, before;
+                float error = residuals_of(i, channels, image, rgb, gain, offset, residual), inverse = nearest(depth, i, width);
+                robust(error, noise_before > 0.0f ? noise_before : noise, huber, channels, &weight, &curved, &before);
                 float share = robust(error, noise, huber, channels, &weight, &curved, &cost);
-                float inverse = nearest(depth, i, width);
                 float3 ray = {(x + 0.5f - center_x) / focal_x, (y + 0.5f - center_y) / focal_y, 1.0f};
                 float3 by_x = {1.0f / focal_x, 0.0f, 0.0f}, by_y = {0.0f, 1.0f / focal_y, 0.0f};
                 if (lens) {
@@ -216,18 +216,10 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                     }
                     float value = value_of(rgb, i, c, channels), column = residual[c];
                     if (moves) column = (value_of(moved, i, c, channels) - value) / step;
-                    float8 row = -(gx * motion_x + gy * motion_y), entry;
+                    float8 row = -(gx * motion_x + gy * motion_y), *total = totals + c * CHANNEL_ROWS;
                     row.s67 = (float2)(value, 1.0f);
-                    float8 weighted = curved * row, *total = totals + c * CHANNEL_ROWS;
-                    total[0] += weighted.s0 * row;
-                    total[1] += weighted.s1 * row;
-                    total[2] += weighted.s2 * row;
-                    total[3] += weighted.s3 * row;
-                    total[4] += weighted.s4 * row;
-                    total[5] += weighted.s5 * row;
-                    total[6] += weighted.s6 * row;
-                    total[7] += weighted.s7 * row;
-                    entry = of_column * column * row;
+                    float8 weighted = curved * row, entry = of_column * column * row;
+                    for (int k = 0; k < 8; k++) total[k] += ((const float *)&weighted)[k] * row;
                     total[8] += entry;
                     total[9] += scale * entry;
                     squares[c] = weight * residual[c] * residual[c];

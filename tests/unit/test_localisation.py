@@ -3,15 +3,19 @@
 import json
 import math
 import runpy
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.backends.alignment import AlignmentFit
 from fidsplat.cameras.pose_offset import offset_camera
 from fidsplat.cli import main
 from fidsplat.images.files import write_png
+from fidsplat.localisation.direct_alignment import stages_of
+from fidsplat.localisation.normal_equations import HostAlignment
 from fidsplat.vision.pose import pose_error
 
 START = np.array([0.03, -0.04, 0.03, 0.02, -0.015, 0.03])
@@ -119,6 +123,34 @@ def test_a_lens_and_a_grey_image(renderer, name):
     assert off(found.camera, camera)[0] < 0.5
     assert off(found.camera, camera)[0] < 4e3 * found.position_deviation
     assert found.camera.lens == camera.lens
+
+
+@pytest.mark.parametrize("lens", [None, fs.BrownConrady(k1=-0.1)], ids=["pinhole", "lens"])
+def test_sums_of_the_device_agree_with_numpy(renderer, room, lens):
+    scene, resident, image = room
+    camera = fs.Camera.pinhole(64, 48, 62.0, 66.0, 33.0, 23.0, scene.camera.world_to_camera, lens=lens)
+    mask = np.ones((48, 64), bool)
+    mask[10:20, 30:40] = False
+    stages = [stage for stage, _ in stages_of(camera, mask)]
+    stages.append(stages[0]._replace(camera=camera.resampled(27, 19), ignored=None, side=5))
+    moved = offset_camera(camera, np.array([0, 0, 0, 0, 1e-3, 0]))
+    both = HostAlignment(), renderer.backend.alignment()
+    noisy = image + np.random.default_rng(1).normal(0, 0.01, image.shape).astype(np.float32)
+    host, device = [kernels.load(noisy, stages, 1500) for kernels in both]
+    assert host == device
+    assert min(host) > 300
+    assert host[0] < 1700
+    fit = AlignmentFit(np.array([0.9, 1.0, 1.2]), np.array([0.02, 0.0, -0.01]), huber=True)
+    for number, fitted, change in ((0, fit, False), (4, fit, False), (3, fit._replace(huber=False), True)):
+        render = partial(renderer.render, resident, outputs=("rgb", "depth"))
+        frame = render(stages[number].camera)
+        options = {"moved": (render(moved), 1e-3, 1)} if change else {"blocks": True}
+        fitted = fitted._replace(noise=0.02 if change else 0.0)
+        one, other = (vars(kernels.sums(number, frame, fitted, **options)) for kernels in both)
+        for name, value in one.items():
+            tolerance = 3e-3 if lens else 2e-5  # the device differentiates the rays by differences
+            scale = np.abs(value).max(initial=1e-9)
+            assert other[name] == pytest.approx(value, abs=tolerance * scale), name
 
 
 def test_a_tag_gives_the_initial_pose(renderer, tmp_path, capsys):

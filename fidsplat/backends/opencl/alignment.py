@@ -22,7 +22,7 @@ from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.cameras.raster import raster_of
 
-_GROUPS = 128
+_GROUPS = 256
 """maximum number of work-groups of a sum"""
 _SUMS = 249
 """numbers of a work-group"""
