@@ -29,7 +29,11 @@ from fidsplat.vision.metrics import psnr
 THIN = 1e-4
 """metres: third scale of splats of the others"""
 TRUTH = "standard,lowpass=none,order=pixel,alpha_cutoff=1e-8,transmittance_stop=0"
-QUALITIES = {"order by pixel": "standard,order=pixel", "order by centre": "standard,order=centre"}
+QUALITIES = {
+    "order by pixel": "standard,order=pixel",
+    "fast, by pixel": "fast,order=pixel",
+    "order by centre": "standard,order=centre",
+}
 COLOR = 0.28209479177387814
 """spherical harmonic of degree 0"""
 

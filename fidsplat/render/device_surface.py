@@ -8,33 +8,22 @@ from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.capture.environment import DeviceExternalDepth, ExternalDepth
 from fidsplat.render.renderer import Renderer
 
+MESH = -2
+"""label of surface 0 of a simulator; surface i has MESH - i"""
+MESH_OFFSET = 2e-3
+"""metres by which surfaces of simulators are moved away from the camera"""
+
 
 def device_surface(
-    renderer: Renderer,
-    packed: Any,
-    depths: Any,
-    ids: Any,
-    size: tuple[int, int],
-    *,
-    red: int,
-    label: int,
-    offset: float,
+    renderer: Renderer, packed: Any, depths: Any, ids: Any, size: tuple[int, int], red: int
 ) -> ExternalDepth:
-    """External depth images of all views, from arrays of a Warp device; on a Warp renderer of this device
-    without a copy to the host.
-
-    Args:
-        packed: wp.array (views, pixels) uint32, colours of 8 bits.
-        depths: wp.array (views, pixels) float32, metres along z.
-        ids: wp.array (views, pixels) int32, id of the surface, negative for none.
-        size: rows and columns of pixels.
-        red: shift of red in `packed`, 0 or 16.
-        label: label of id 0; id i has label - i.
-        offset: metres by which surfaces are moved away from the camera.
+    """External depth images of all views from wp.arrays (views, pixels): colours packed in uint32 with red at
+    the bit `red`, depths along z, and int32 ids of surfaces, negative for none. They stay on the device if it
+    is the renderer's.
     """
     wp, device = load(), packed.device
     made = [wp.empty(packed.shape, dtype=dtype, device=device) for dtype in (wp.vec3, wp.float32, wp.int32)]
-    given = [packed, depths, ids, red, label, offset]
+    given = [packed, depths, ids, red, MESH, MESH_OFFSET]
     with quiet():
         kernel = kernels("surfaces").unpack_surfaces
         wp.launch(kernel, packed.shape, given, made, device=device, record_tape=False)

@@ -93,7 +93,7 @@ class TiledCamera:
         origins = np.zeros((num_instances, 3)) if origins is None else _host(origins)
         self._origins = np.concatenate([origins, np.tile(IDENTITY[3:], (len(origins), 1))], -1)
         self._to_wxyz = [0, 1, 2, 3] if quaternions == "wxyz" else [3, 0, 1, 2]
-        self._from_wxyz = [0, 1, 2, 3] if quaternions == "wxyz" else [1, 2, 3, 0]
+        self._from_wxyz = np.argsort(self._to_wxyz)
         self._poses: np.ndarray | None = None
         """(N, 7) poses in the world of the simulation that `set_world_poses` has set"""
         self._tensors: dict[str, Any] = {}
@@ -112,7 +112,7 @@ class TiledCamera:
             self._render(bodies, self._world_poses(bodies))
         poses, camera = self._world_poses(bodies), self._camera
         tensor = next(iter(self._tensors.values())).new_empty(0).float().new_tensor  # on their device
-        order = 3 + np.array(self._from_wxyz)
+        order = 3 + self._from_wxyz
         quats = [tensor(compose(poses, inverse(axes))[:, order]) for axes in _FROM_ROS.values()]
         matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
         return CameraData(
@@ -141,14 +141,8 @@ class TiledCamera:
         env_ids: Any = None,
         convention: Literal["opengl", "ros", "world"] = "ros",
     ) -> None:
-        """Set poses in the world of the simulation, instead of those of the camera's mount.
-
-        Args:
-            positions: (n, 3) metres; None: unchanged.
-            orientations: (n, 4) quaternions, axes of the convention; None: unchanged.
-            env_ids: environments; None: all.
-            convention: opengl (-z forward, y up), ros (z forward, y down) or world (x forward, z up).
-        """
+        """Set positions (n, 3) and orientations (n, 4) in the world of the simulation, instead of those of
+        the camera's mount; None: unchanged. convention: axes of the orientations, as in `CameraData`."""
         _known("convention", convention, _FROM_ROS)
         which, poses = self._which(env_ids), self._world_poses(self._body_poses())
         if positions is not None:

@@ -10,11 +10,11 @@ import numpy as np
 
 from fidsplat.cameras import Camera, Orthographic
 from fidsplat.capture.environment import ExternalDepth
-from fidsplat.render.device_surface import device_surface
+from fidsplat.render.device_surface import MESH, MESH_OFFSET, device_surface
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.sim.poses import OPENGL
-from fidsplat.sim.rig import MESH_OFFSET, RigCamera, SimulatorRig
+from fidsplat.sim.rig import RigCamera, SimulatorRig
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrices_to_quaternions, quaternion_multiply
 from fidsplat.util.arguments import instance, whole_number
@@ -27,8 +27,6 @@ except ImportError as error:
 
 mujoco: Any = _mujoco  # type checkers do not know its names
 
-MESH = -2
-"""label of geom 0 among `meshes`; geom i has MESH - i"""
 _OUTPUTS = {
     "mjCAMOUT_RGB": "rgb",
     "mjCAMOUT_DEPTH": "depth",
@@ -142,9 +140,7 @@ class MujocoRig(SimulatorRig):
                 size = each.camera.height, each.camera.width
                 own = slice(first, first := first + size[0] * size[1])
                 arrays = context.rgb_data[:, own], context.depth_data[:, own], ids[:, own]
-                found[name] = device_surface(
-                    self.renderer, *arrays, size, red=16, label=MESH, offset=MESH_OFFSET
-                )
+                found[name] = device_surface(self.renderer, *arrays, size, red=16)
         return found
 
     def _meshes(self, data: Sequence[Any], groups: list[int]) -> dict[str, list[ExternalDepth]]:

@@ -12,7 +12,7 @@ from fidsplat.render.device_surface import device_surface
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.sim.poses import OPENGL, compose
-from fidsplat.sim.rig import MESH_OFFSET, RigCamera, SimulatorRig
+from fidsplat.sim.rig import RigCamera, SimulatorRig
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.arguments import instance
 from fidsplat.util.errors import InputError, unknown
@@ -25,8 +25,6 @@ except ImportError as error:
 
 newton: Any = _newton  # type checkers do not know their names
 wp: Any = _warp
-SHAPE = -2
-"""label of shape 0 among `meshes`; shape i of the model has SHAPE - i"""
 _TO_XYZW, _TO_WXYZ = [0, 1, 2, 4, 5, 6, 3], [0, 1, 2, 6, 3, 4, 5]
 
 
@@ -40,7 +38,7 @@ class NewtonRig(SimulatorRig):
         cameras, renderer, rest, outputs: as in `Rig`.
 
     The state that `render` reads is a newton.State. Its `meshes` may be the newton.sensors.SensorCamera that
-    renders the shapes, with its lights; for pinhole cameras. Shape i of the model has the label `SHAPE` - i.
+    renders the shapes, with its lights; for pinhole cameras. Shape i of the model has the label -2 - i.
 
     Raises:
         InputError: as `Rig`; a body that the model does not have, worlds with different bodies.
@@ -103,8 +101,6 @@ class NewtonRig(SimulatorRig):
             transforms = wp.array(places, dtype=wp.transformf, device=device)
             meshes.update(state, transforms, self._rays[name], **images)
             colors, depths, ids = (array.reshape((len(places), -1)) for array in images.values())
-            found[name] = device_surface(
-                self.renderer, colors, depths, ids.view(wp.int32), size[::-1],
-                red=0, label=SHAPE, offset=MESH_OFFSET,
-            )  # fmt: skip
+            ids = ids.view(wp.int32)
+            found[name] = device_surface(self.renderer, colors, depths, ids, size[::-1], red=0)
         return found

@@ -22,9 +22,6 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.arguments import instance, invalid, whole_number
 from fidsplat.util.errors import InputError, MissingOutputError, unknown
 
-MESH_OFFSET = 2e-3
-"""metres by which the geometry of simulators is moved away from the camera"""
-
 
 @dataclass(frozen=True, eq=False)
 class RigCamera:
