@@ -48,13 +48,14 @@ def take_turns(items: Sequence[pytest.Item], devices: Sequence[str], turn: int =
 
     A file's tests of several of these devices run on one of them, which then compiles a feature set for the
     complete file. Of `SWEEP` or more cases of a test of kernels, or with the mark `sweep`, every other one
-    runs.
+    runs; with the mark and fewer cases the test runs in every other run.
     """
     found: dict[str, dict[str, list[pytest.Item]]] = {}
     for item in items:
         params = getattr(getattr(item, "callspec", None), "params", {})
         device = params.get("renderer", params.get("device"))
-        if params and not item.get_closest_marker("exhaustive"):
+        marked = item.get_closest_marker("sweep")
+        if (params or marked) and not item.get_closest_marker("exhaustive"):
             test = item.nodeid.partition("[")[0]
             found.setdefault(test, {}).setdefault(device if device in devices else "", []).append(item)
     for test, by_device in found.items():
@@ -62,8 +63,10 @@ def take_turns(items: Sequence[pytest.Item], devices: Sequence[str], turn: int =
         own = devices[(crc32(test.partition("::")[0].encode()) + turn) % len(devices)] if devices else ""
         for device, cases in by_device.items():
             elsewhere = own in by_device and device not in ("", own)
-            sweep = not test.startswith(WITHOUT_KERNELS) or cases[0].get_closest_marker("sweep")
+            marked, long = cases[0].get_closest_marker("sweep"), len(cases) >= SWEEP
+            sweep = marked or (long and not test.startswith(WITHOUT_KERNELS))
+            place = turn // 4 + (0 if long else crc32(test.encode()))
             for number, item in enumerate(cases):
                 # the parity of the number's bits: of two short axes, no run has one value of one axis only
-                if elsewhere or (sweep and len(cases) >= SWEEP and (number.bit_count() + turn // 4) % 2):
+                if elsewhere or (sweep and (long * number.bit_count() + place) % 2):
                     item.add_marker(pytest.mark.exhaustive)

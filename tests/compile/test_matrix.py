@@ -47,6 +47,7 @@ def test_texts_of_each_effect():
         assert_well_formed(names)
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("first", [0, pytest.param(1, marks=pytest.mark.exhaustive)])
 def test_texts_of_every_pair(first):
     """Schedules alternate."""

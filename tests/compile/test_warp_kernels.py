@@ -147,6 +147,7 @@ def test_the_kernels_compile_for_cuda(kernel, tmp_path):
     assert "wp::launch_bounds_t" in compiled(kernel(), tmp_path)
 
 
+@pytest.mark.sweep
 def test_the_base_has_nothing_of_absent_effects_and_takes_no_more_of_a_gpu(tmp_path):
     text, blend = measured(blending(outputs=()), tmp_path, 128)
     absent = (*OF_SAMPLES, *OF_BOXES, *OF_LAYERS, "finished", "disc_x", "cross_ray", "origin")

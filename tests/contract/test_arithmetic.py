@@ -62,6 +62,7 @@ def test_the_bits_are_the_same_on_every_device():
         assert np.array_equal(logarithm, found[0][1])
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
 def test_images_move_by_the_rounding_of_opacities(renderer, cloud):
     for quality in (FAST, PRECISE):

@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 import shapely
 from agreement import ALL_OUTPUTS
 
@@ -12,6 +13,7 @@ import fidsplat as fs
 SIGN = Path(__file__).parents[2] / "examples" / "data" / "sign.svg"
 
 
+@pytest.mark.sweep
 def test_a_drawing_is_as_smooth_as_its_outlines(renderer):
     """At 8 px a stroke (16 x 16 places in each pixel): 40 dB, where modules alone have 21; nothing behind it
     shows through."""

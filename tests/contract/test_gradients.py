@@ -155,6 +155,7 @@ def long_lists():
     return faint, capture
 
 
+@pytest.mark.sweep
 def test_long_lists_are_taken_back_in_chunks(backend):
     found = assert_same(backend, *long_lists())
     for shape in backend.shapes("tape").values():

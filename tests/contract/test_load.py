@@ -8,6 +8,7 @@ import pytest
 import fidsplat as fs
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("device", ["opencl", "warp:cpu"])
 def test_threads_share_a_renderer_or_have_their_own(device):
     seeds = range(6)
@@ -18,6 +19,7 @@ def test_threads_share_a_renderer_or_have_their_own(device):
         assert list(pool.map(lambda seed: load.digest_of_views(fs.Renderer(device), seed), seeds)) == truth
 
 
+@pytest.mark.sweep
 def test_processes_share_an_empty_kernel_cache(monkeypatch):
     monkeypatch.setattr(load, "PROCESSES", 3)
     assert load.processes("opencl") == {"wrong of 3 processes": 0}

@@ -147,6 +147,7 @@ def test_half_precision_changes_a_pixel_by_at_most_its_roundings(opencl, name):
     assert np.array_equal(halves, halves.astype(np.float16))
 
 
+@pytest.mark.sweep
 def test_half_precision_has_the_same_bits_in_both_schedules_and_words(opencl, monkeypatch, tmp_path):
     """Two halves in a word, as dialects with packed instructions hold them, have the bits of two floats."""
     file = tmp_path / "words.cl"

@@ -104,6 +104,7 @@ def test_a_quick_run_has_few_tilts_and_distances(tmp_path):
             assert (tuple(point["distances"]), tuple(point["tilts"])) == (distances, tilts)
 
 
+@pytest.mark.sweep
 def test_everything_quick_and_its_report(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(angles, "QUICK_TILTS", "0:40:40")
     monkeypatch.setattr(localisation, "QUICK", ((1.0,), (0.0, 40.0)))

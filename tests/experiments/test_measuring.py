@@ -67,6 +67,7 @@ def test_scans_of_the_ideal_texture_find_its_ceiling(pool):
         )
 
 
+@pytest.mark.sweep
 def test_scans_do_not_hang_on_the_number_of_threads(renderer):
     markers = MarkerRenderer(renderer)
     for method in (IDEAL, "fitted/best"):
@@ -79,6 +80,7 @@ def test_scans_do_not_hang_on_the_number_of_threads(renderer):
         assert "1" in results[0]["readers"]["pupil"]["read"]
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize(
     ("category", "tilts"), [("small", "0:44:22"), ("apriltag", "72:84:6"), ("medium", "0:40:20")]
 )

@@ -75,6 +75,7 @@ def test_places_that_were_found_are_those_of_the_untouched_image():
     ).found
 
 
+@pytest.mark.sweep
 def test_a_code_that_is_only_read_enlarged_is_found_where_it_is():
     """Modules of less than two pixels: read in an image twice as large."""
     image, target = ideal("small", 10.0)

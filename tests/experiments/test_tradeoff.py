@@ -123,6 +123,7 @@ def test_the_hard_scene_is_the_same_each_time_and_fills_its_cells(session):
     assert np.abs(dropped - image)[cell_window(CELLS.index("opaque"))].max() > 0.5
 
 
+@pytest.mark.sweep
 def test_3d_gaussians_are_compared_with_the_gaussians_themselves(monkeypatch):
     """What EWA widens and what its linear image is wrong by are errors. A few of the scene's splats."""
     small = dataclasses.replace(SCENES["r100k_720p_3d"], count=3_000, width=160, height=90)
@@ -214,6 +215,7 @@ def test_a_definition_has_a_truth_of_its_own(session):
     assert np.abs(session.reference("apriltag@0", BASE) - session.reference("apriltag@0", centre)).max() > 0.1
 
 
+@pytest.mark.sweep
 def test_omissions_of_standard_are_invisible(session):
     """The error is within half an 8-bit level on the scenes that constants change most."""
     standard = PRESETS["standard"]

@@ -18,6 +18,7 @@ from fidsplat.scenes.random_clouds import random_cloud
 WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--settings", "opacity_ceiling")
 
 
+@pytest.mark.sweep
 def test_an_interrupted_run_continues(capsys, tmp_path, monkeypatch):
     words = [*WORDS, "-o", str(tmp_path), "--json"]
     real, begun = run._begin, []

@@ -169,6 +169,7 @@ def test_on_a_gpu_what_delays_both_frames_makes_nothing_cheaper():
         assert found.cost(found.at("hard", "alpha_cutoff", "1/1024")) == pytest.approx(expected)
 
 
+@pytest.mark.sweep
 def test_the_report_says_what_the_numbers_say(capsys, tmp_path):
     parts = plain_records("hard"), plain_records("r100k_720p"), marker_records(), thick_records()
     write(tmp_path / "cpu", [each for part in parts for each in part])

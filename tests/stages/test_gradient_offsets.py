@@ -3,6 +3,7 @@ without being written."""
 
 import numpy as np
 import pyopencl as cl
+import pytest
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
@@ -19,6 +20,7 @@ WIDE = fs.SplatCloud(
 )
 
 
+@pytest.mark.sweep
 def test_splats_have_an_offset_for_each_tile_that_lists_them(renderer):
     backend = renderer.backend
     random = random_splats(300, 0, scale=(0.02, 0.6), depth=(1.5, 4.0), sh_degree=None)

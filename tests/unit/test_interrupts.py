@@ -69,6 +69,7 @@ def trial(tmp_path_factory):
     return interrupt.Trial(interrupt.COMMANDS["render"], tmp_path_factory.mktemp("interrupted"))
 
 
+@pytest.mark.sweep
 def test_an_interrupted_command_loses_nothing(trial):
     found = [interrupt.disturb(trial, how, how, 0.8) for how in interrupt.SIGNALS]
     assert [row["lost"] for row in found] == [[]] * 3

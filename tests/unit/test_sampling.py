@@ -54,6 +54,8 @@ def test_a_sweep_of_kernels_runs_every_other_case():
         name: kept(0, files=[f"tests/unit/{name}.py"], devices=("one",), cases=8) for name in ("a", "swept")
     }
     assert [len(run) for run in others.values()] == [8, 4]
+    runs = [kept(turn, files=["swept"], devices=("one",), cases=1) for turn in (0, 4)]
+    assert sorted(map(len, runs)) == [0, 1]
 
 
 def test_all_turns_have_every_case_on_every_device():

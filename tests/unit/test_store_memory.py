@@ -115,6 +115,7 @@ def facing_the_wall(x=0.0):
     return fs.Camera.look_at(120, 90, 1.4, (x, 0, -1), (x, 0, 3))
 
 
+@pytest.mark.sweep
 def test_views_that_do_not_fit_are_rendered_in_bands(stores, monkeypatch):
     store, rendered, most = stores["wall"], [], 5500
     cloud, plain, limited = store.cloud(), fs.Renderer("opencl"), fs.Renderer("opencl")
@@ -165,6 +166,7 @@ def test_a_memory_budget_makes_bands(stores):
     assert len(resident.data._splitter._cuts[0, 90]) > 2
 
 
+@pytest.mark.sweep
 def test_frames_and_cached_chunks_keep_the_budget(stores, monkeypatch):
     live, peak, store = weakref.WeakSet(), [0], stores["wall"]
 

@@ -204,6 +204,7 @@ def test_transparent_splats_occlude_nothing(tmp_path, culling, monkeypatch):
     assert all(count > 0.6 * of for count, of in culling)  # pieces next to the image are left out
 
 
+@pytest.mark.sweep
 def test_levels_of_detail_and_instances_are_culled(town, tmp_path, culling, monkeypatch):
     poses = [np.eye(4), rigid_matrix((1, 0, 16)), rigid_matrix((-2, 0, 30))]
     places = fs.Store(fs.place_store(town.stores[1], tmp_path / "places.fss", poses))
