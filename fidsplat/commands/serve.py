@@ -112,10 +112,7 @@ class Serve(RenderInput):
             except KeyboardInterrupt:
                 pass
         facts = {"frames": clock.sent, "dropped": clock.dropped, "seconds": clock.seconds, "port": log.port}
-        facts["dropped_messages"] = log.dropped
         rows = [("frames", f"{clock.sent:,}"), ("dropped", f"{clock.dropped:,}")]
-        if self.ros2:
-            rows.append(("dropped messages", f"{log.dropped:,}"))
         return report(self.json, facts, table=(f"{self.source} on {renderer.device.title}", ("", ""), rows))
 
 

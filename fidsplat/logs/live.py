@@ -56,11 +56,6 @@ class LiveLog(RobotLog):
             """port on which the server listens"""
             self._file.append(server)
 
-    @property
-    def dropped(self) -> int:
-        """Number of messages that slow ROS 2 subscribers did not accept."""
-        return 0 if self._topics is None else self._topics.dropped
-
     def received(self, topic: str, kind: str) -> list[Any]:
         """Messages of a ROS 2 topic since the last call, oldest first; the first call subscribes to it.
 

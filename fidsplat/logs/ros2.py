@@ -22,10 +22,10 @@ except ImportError as error:
     raise InputError(f"ROS 2 topics need another package ({error}); pip install 'fidsplat[live]'") from None
 
 DEPTHS = {"/tf": 100, "/clock": 1}
-"""messages that are kept for a slow subscriber, by topic; the oldest are dropped"""
+"""history by topic: number of messages that wait for a slow subscriber; the oldest are dropped"""
 DEPTH = 10
 BLOCKING = duration(milliseconds=100)
-"""longest wait for a slow subscriber; then a message is dropped and counted"""
+"""longest wait for a subscriber; then a message is dropped"""
 _LOCAL = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="{host}"/></Interfaces>
 <AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>
 <MaxAutoParticipantIndex>32</MaxAutoParticipantIndex><Peers><Peer address="{host}"/></Peers></Discovery>
@@ -54,8 +54,6 @@ class Ros2Topics:
         self._types: dict[str, Any] = {}
         self._writers: dict[str, Any] = {}
         self._readers: dict[str, Any] = {}
-        self.dropped = 0
-        """messages that a slow subscriber did not accept"""
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         if not (domain.isdecimal() and int(domain) <= 232):
             raise InputError(f"ROS_DOMAIN_ID must be a number from 0 to 232, got {domain!r}")
@@ -80,9 +78,8 @@ class Ros2Topics:
         try:
             self._writers[topic].write(sample, time)
         except DDSException as error:
-            if error.code != DDSException.DDS_RETCODE_TIMEOUT:
+            if error.code != DDSException.DDS_RETCODE_TIMEOUT:  # of a subscriber that does not respond
                 raise OSError(str(error)) from error
-            self.dropped += 1
 
     def received(self, topic: str, kind: str) -> list[Any]:
         """Messages of a topic since the last call, oldest first; the first call subscribes to it."""
