@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 
 from fidsplat.images.family_names import foreign_family
-from fidsplat.markers import boards, codes, svg
+from fidsplat.markers import boards, codes, stag, svg
 from fidsplat.markers.spec import Detector, Kind, Spec
 from fidsplat.util.arguments import instance, invalid
 from fidsplat.util.errors import InputError, did_you_mean
 from fidsplat.util.plugins import load_plugins
 
-_kinds = {kind.name: kind for module in (codes, svg, boards) for kind in module.KINDS}
+_kinds = {kind.name: kind for module in (codes, stag, svg, boards) for kind in module.KINDS}
 
 
 def register(kind: Kind) -> None:
@@ -32,10 +32,15 @@ def register(kind: Kind) -> None:
     _kinds[kind.name] = kind
 
 
-def detectors() -> dict[str, Detector]:
-    """Detectors of registered kinds and of those of installed packages, by kind."""
+def detectors(default: bool = False) -> dict[str, Detector]:
+    """Detectors of registered kinds and of those of installed packages, by kind. default: only those that
+    `detect` includes without families."""
     load_plugins("fidsplat.markers", register)
-    return {name: kind.detect for name, kind in _kinds.items() if kind.detect is not None}
+    return {
+        name: kind.detect
+        for name, kind in _kinds.items()
+        if kind.detect is not None and (kind.default or not default)
+    }
 
 
 def kind_of(spec: Spec) -> Kind:
@@ -45,7 +50,7 @@ def kind_of(spec: Spec) -> Kind:
 
 def parse_spec(text: str) -> Spec:
     """Parse a marker spec: apriltag:36h11:5 or tag36h11:5, aruco:4x4_50:7 or DICT_4X4_50:7, qr:TEXT,
-    qr-v22-L:TEXT, image:FILE.png, svg:FILE.svg, charuco:7x5:4x4_50, gridboard:5x7:4x4_50,
+    qr-v22-L:TEXT, image:FILE.png, svg:FILE.svg, stag:hd21:0, charuco:7x5:4x4_50, gridboard:5x7:4x4_50,
     aprilgrid:6x6:36h11.
 
     A QR spec may omit the version (default the smallest for the text) or the level (L).

@@ -60,3 +60,5 @@ class Kind:
     """whether the part after the colon is a file name, relative to the scene file"""
     detect: Detector | None = None
     """detector of such markers, for `fidsplat.vision.detect`; None: there is none"""
+    default: bool = True
+    """whether `detect` without families includes them"""

@@ -82,7 +82,7 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
     if not isinstance(qr, bool | np.bool_ | int):
         raise InputError(f"qr must be True or False, got a {type(qr).__name__}")
     hooks = detectors()
-    names = (*DEFAULT_FAMILIES, *hooks) if families is None else families
+    names = (*DEFAULT_FAMILIES, *detectors(default=True)) if families is None else families
     requested = [parse_family(name) for name in names if name not in hooks]
     if min(pixels.shape[:2]) < MIN_SIDE:
         return []
