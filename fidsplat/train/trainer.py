@@ -286,7 +286,8 @@ class Trainer:
         return scores
 
     def _localised(self, view: TrainingView, capture: Capture, resident: ResidentCloud) -> Capture:
-        """The capture of a view at the pose at which the splats match its image; unchanged if none does."""
+        """The capture of a view at the pose at which the splats match its image; unchanged if they match it
+        better at its own pose."""
         # here, since it imports detectors, which other trainings do not need
         from fidsplat.localisation.direct_alignment import MIN_INLIERS, align
         from fidsplat.localisation.normal_equations import alignment_kernels
@@ -296,7 +297,12 @@ class Trainer:
 
         image = view.image.astype(np.float32) / 255
         found = align(image, view.mask, view.camera, render, alignment_kernels(self.renderer, resident))
-        return capture.with_(camera=found.camera) if found.inliers >= MIN_INLIERS else capture
+        if found.inliers < MIN_INLIERS:
+            return capture
+        both = capture, capture.with_(camera=found.camera)
+        frames = self.renderer.render_views(resident, both)
+        psnr = [score_view(view, with_exposure_of(frame["rgb"], view)).psnr for frame in frames]
+        return both[psnr[1] > psnr[0]]
 
     def _advance(self, late: bool) -> None:
         """Run one iteration. late: its loss may be read after later iterations."""

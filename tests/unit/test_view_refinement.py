@@ -1,6 +1,7 @@
 """Refinement of training views: poses, exposures, and masks."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -113,6 +114,20 @@ def test_intrinsics_return_to_the_truth(renderer, cloud, given):
         np.testing.assert_array_equal(camera.world_to_camera, true.world_to_camera)
     assert before < 28
     assert trainer.evaluate()[0].psnr > 35
+
+
+def test_a_localisation_that_matches_worse_is_not_used(renderer, cloud, given, monkeypatch):
+    """Scores are those at the held-out view's own pose."""
+    from fidsplat.localisation import direct_alignment
+
+    dataset = replace(given, views=given.views[1:], held_out=given.views[:1])
+    trainer = Trainer(dataset, renderer, start=cloud, iterations=1, refine_poses=True, **FIXED)
+    expected = trainer.evaluate()[0].psnr
+    wrong = replace(given.views[0].camera, cx=given.views[0].camera.cx + 4)
+    found = SimpleNamespace(camera=wrong, inliers=0.9)
+    monkeypatch.setattr(direct_alignment, "align", lambda *given: found)
+    assert trainer.evaluate()[0].psnr == pytest.approx(expected, abs=0.5)
+    assert expected > 40
 
 
 def test_refinement_does_not_drift_by_a_similarity(given):
