@@ -13,9 +13,14 @@ _SMALL_ANGLE = 1e-3
 
 def offset_camera(camera: Camera, offset: np.ndarray) -> Camera:
     """The camera after a motion (6,) in its own axes: rotation vector [rad], then translation [m]."""
+    return camera.with_pose(offset_pose(camera.world_to_camera, offset))
+
+
+def offset_pose(world_to_camera: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """The pose (4, 4) of a camera after a motion (6,), as in `offset_camera`."""
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = _rotation(offset[:3]), offset[3:]
-    return camera.with_pose(motion @ camera.world_to_camera)
+    return motion @ world_to_camera
 
 
 def offset_gradient(by_pose: np.ndarray, offset: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ from fidsplat.backends.alignment import (
     AlignmentSums,
 )
 from fidsplat.cameras import Camera
-from fidsplat.cameras.pose_offset import offset_camera
+from fidsplat.cameras.pose_offset import offset_pose
 from fidsplat.util.errors import InputError
 from fidsplat.vision.pyramid import resized, smoothed, taps_of
 
@@ -138,12 +138,12 @@ def _align(
             f"{camera.width} x {camera.height}; give a larger image or a mask that ignores less"
         )
     channels = image.shape[2]
-    at = _State(start, AlignmentFit(np.ones(channels), np.zeros(channels), huber=True))
+    at = _State(start.world_to_camera, AlignmentFit(np.ones(channels), np.zeros(channels), huber=True))
     for number, (stage, steps) in enumerate(stages):
         if steps:
             at = _minimise(at, _Stage(number, stage.camera, render, kernels), steps)
     if coarse:
-        return Alignment(at.camera, np.full((6, 6), np.nan), 0.0, at.noise, at.fit.gain)
+        return Alignment(start.with_pose(at.pose), np.full((6, 6), np.nan), 0.0, at.noise, at.fit.gain)
     return _finish(at, _Stage(len(stages) - 1, start, render, kernels))
 
 
@@ -151,7 +151,8 @@ def _align(
 class _State:
     """Estimate of pose and exposure."""
 
-    camera: Camera
+    pose: np.ndarray
+    """(4, 4) world_to_camera"""
     fit: AlignmentFit
     noise: float = 0.0
 
@@ -161,7 +162,7 @@ class _State:
         fit = self.fit._replace(
             gain=np.clip(self.fit.gain * gains, *GAINS), offset=self.fit.offset + self.fit.gain * offsets
         )
-        return _State(offset_camera(self.camera, step[:6]), fit, sums.noise)
+        return _State(offset_pose(self.pose, step[:6]), fit, sums.noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,9 +172,9 @@ class _Stage:
     render: Render
     kernels: AlignmentKernels
 
-    def frame(self, camera: Camera) -> Any:
-        """The scene at the pose of a camera."""
-        return self.render(self.camera.with_pose(camera.world_to_camera))
+    def frame(self, pose: np.ndarray) -> Any:
+        """The scene at a pose (4, 4)."""
+        return self.render(self.camera.with_pose(pose))
 
     def sums(self, frame: Any, at: _State, noise: float = 0.0, **options: Any) -> AlignmentSums:
         """Sums over the pixels of the stage."""
@@ -187,7 +188,7 @@ class _Stage:
 
 def _minimise(at: _State, stage: _Stage, steps: int) -> _State:
     """Levenberg-Marquardt at one stage. The last step is not checked by a render."""
-    damping, frame = _DAMPING, stage.frame(at.camera)
+    damping, frame = _DAMPING, stage.frame(at.pose)
     if not at.noise:  # the exposure is unknown
         for _ in range(3):
             sums = stage.sums(frame, at, noise=0.0)
@@ -198,7 +199,7 @@ def _minimise(at: _State, stage: _Stage, steps: int) -> _State:
         tried, size = at.moved(sums, step), stage.pixels(step[:6], sums)
         if size < _SETTLED or number == steps - 1:
             return tried
-        found = stage.sums(stage.frame(tried.camera), tried, sums.noise)
+        found = stage.sums(stage.frame(tried.pose), tried, sums.noise)
         if found.cost_before <= sums.cost:
             at, sums, damping = tried, found, max(damping / 10, 1e-6)
         else:
@@ -209,10 +210,10 @@ def _minimise(at: _State, stage: _Stage, steps: int) -> _State:
 def _finish(at: _State, stage: _Stage) -> Alignment:
     """Newton's method for Tukey's loss, and the covariance. The derivative of the score is that of the first
     step. Infinite covariance if the pixels do not determine the pose."""
-    at, noise, inverse = _State(at.camera, at.fit._replace(huber=False)), 0.0, None
+    at, noise, inverse = _State(at.pose, at.fit._replace(huber=False)), 0.0, None
     covariance = np.diag(np.full(6, np.inf))
     for _ in range(_LAST_STEPS):
-        frame = stage.frame(at.camera)
+        frame = stage.frame(at.pose)
         sums = stage.sums(frame, at, noise, blocks=True)
         inverse = _inverse(sums, _bread(at, sums, stage, frame)) if inverse is None else inverse
         if inverse is None:
@@ -225,7 +226,7 @@ def _finish(at: _State, stage: _Stage) -> Alignment:
             break
     # an image without the scene's contrast fits a render whose contrast the smallest gain removes
     inliers = sums.inliers if (at.fit.gain > GAINS[0]).any() else 0.0
-    return Alignment(at.camera, covariance, inliers, sums.noise, at.fit.gain)
+    return Alignment(stage.camera.with_pose(at.pose), covariance, inliers, sums.noise, at.fit.gain)
 
 
 def _bread(at: _State, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.ndarray:
@@ -241,7 +242,7 @@ def _bread(at: _State, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.nda
     for axis in (0, 1, 3, 4) if pinhole else range(6):
         motion = np.zeros(6)
         motion[axis] = size = turn if axis < 3 else turn / max(math.sqrt(sums.inverse_depth), 1e-3)
-        other = stage.frame(offset_camera(at.camera, motion))
+        other = stage.frame(offset_pose(at.pose, motion))
         right = stage.sums(frame, at, sums.noise, moved=(other, size, axis % 3)).right
         columns[:, :, axis] = right[:, :, 0]
         if pinhole:

@@ -191,7 +191,9 @@ def _pixels(image: Any) -> np.ndarray:
         )
     if pixels.dtype.kind == "u" and pixels.dtype != np.uint8:
         raise InputError(f"the image must be uint8 or floats, got {pixels.dtype}; convert it first")
-    values = pixels.astype(np.float32) / (255 if pixels.dtype == np.uint8 else 1)
+    if pixels.dtype == np.uint8:
+        return np.multiply(pixels, np.float32(1 / 255), dtype=np.float32)
+    values = pixels.astype(np.float32)
     if not np.isfinite(values).all():
         raise InputError("the image must be finite, got NaN or infinity")
     return values

@@ -22,8 +22,8 @@ from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.cameras.raster import raster_of
 
-_GROUPS = 256
-"""maximum number of work-groups of a sum"""
+_GROUPS = {1: 32, 32: 256}
+"""maximum number of work-groups of a sum, by their size"""
 _SUMS = 249
 """numbers of a work-group"""
 _Image: TypeAlias = tuple[cl.Buffer, tuple[int, ...]]
@@ -108,7 +108,7 @@ class OpenCLAlignment(AlignmentKernels):
         given, channels = self._stages[stage], len(fit.gain)
         height, width, side = given["height"], given["width"], given["side"]
         count = -(-height // side) * -(-width // side)
-        groups = count if blocks else min(count, _GROUPS)
+        groups = count if blocks else min(count, _GROUPS[self._items])
         rgb, depth = (frame.images.buffer(name) for name in ("rgb", "depth"))
         other, step, axis = (frame, 1.0, 0) if moved is None else moved
         moved_rgb = rgb if moved is None else other.images.buffer("rgb")
@@ -138,7 +138,7 @@ class OpenCLAlignment(AlignmentKernels):
         return self._workspace.switch_to(self._workspace.queue)
 
     def _rows(self, height: int) -> int:
-        return min(height, _GROUPS)
+        return min(height, _GROUPS[self._items])
 
     def _blurred(self, image: cl.Buffer, given: dict[str, Any], name: str, channels: int) -> cl.Buffer:
         """An image convolved with the taps of a stage; the image itself without blur."""
