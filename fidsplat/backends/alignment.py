@@ -58,6 +58,8 @@ class AlignmentSums:
     """(c,) squared residuals"""
     scores: np.ndarray
     """(blocks, c, 8) row times residual in each block; empty unless requested"""
+    matrices: np.ndarray
+    """(blocks, c, 8, 8) `matrix` of each block; empty unless requested"""
     cost: float
     """mean loss"""
     cost_before: float
@@ -113,7 +115,7 @@ class AlignmentKernels(ABC):
         Args:
             moved: Frame after a motion of the camera, the size of the motion, and the component of the ray in
                 `AlignmentSums.right`.
-            blocks: whether to return `scores`.
+            blocks: whether to return `scores` and `matrices`.
         """
 
 

@@ -5,7 +5,7 @@ Jacobian of a rendered pixel is its image gradient times the motion of its point
 determines; this takes one render per step (Lucas-Kanade). Gain and offset of each channel are unknowns too,
 so the result does not depend on exposure and white balance.
 
-The last step and the covariance are those of an M-estimator (Huber 1967): the sandwich of the derivative of
+The last steps and the covariance are those of an M-estimator (Huber 1967): the sandwich of the derivative of
 the score, by finite differences of renders, and of the covariance of the score. Blocks of pixels are
 independent, the pixels within a block may be correlated.
 """
@@ -260,13 +260,16 @@ def _inverse(sums: AlignmentSums, bread: np.ndarray) -> np.ndarray | None:
 
 
 def _covariance(sums: AlignmentSums, inverse: np.ndarray) -> np.ndarray:
-    """(6, 6) sandwich estimate from the scores of blocks."""
-    count, channels = sums.scores.shape[:2]
-    scores = np.zeros((count, len(inverse)))
-    for channel in range(channels):
-        scores[:, _parameters(channel)] += sums.scores[:, channel]
-    errors = scores @ inverse[:6].T
-    return errors.T @ errors * count / max(count - len(inverse), 1)
+    """(6, 6) sandwich estimate from the scores of blocks, as the jackknife that deletes one block (CR3,
+    MacKinnon and White 1985): residuals are smaller than errors where a block has leverage."""
+    count, size = len(sums.scores), len(inverse)
+    scores, matrices = np.zeros((count, size)), np.zeros((count, size, size))
+    for channel in range(sums.scores.shape[1]):
+        own = np.array(_parameters(channel))
+        scores[:, own] += sums.scores[:, channel]
+        matrices[:, own[:, None], own] += sums.matrices[:, channel]
+    errors = np.linalg.solve(1.000001 * np.eye(size) - inverse @ matrices, (scores @ inverse.T)[:, :, None])[:, :6, 0]
+    return errors.T @ errors * (count - 1) / count
 
 
 def _solved(sums: AlignmentSums, damping: float) -> np.ndarray:

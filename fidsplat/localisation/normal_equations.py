@@ -72,20 +72,21 @@ class HostAlignment(AlignmentKernels):
             other, step, axis = moved
             change = (_at(target.blurred(other), target.rows) - values) / np.float32(step)
             columns, column_weights = np.stack([change, -target.rays[axis] * change]), matrix_weights
-        matrix, right, scores = [], [], []
+        matrix, right, scores, matrices = [], [], [], []
         for channel, (gx, gy) in enumerate(zip(*slopes, strict=True)):
             row = np.stack([*-(gx * across + gy * down), values[channel], np.ones_like(gx)]).astype(float)
             weighted = row * column_weights
             matrix.append((row * matrix_weights) @ row.T)
             right.append(weighted @ columns[:, channel].T)
             if blocks:
-                each = weighted * columns[0, channel]
-                scores.append([np.bincount(target.blocks, weights=one) for one in each])
+                scores.append(target.by_block(weighted * columns[0, channel]))
+                matrices.append(target.by_block((row * matrix_weights)[:, None] * row))
         return AlignmentSums(
             np.array(matrix),
             np.array(right),
             (residuals**2 * weights).sum(axis=1, dtype=float),
-            np.moveaxis(np.array(scores), 2, 0) if blocks else np.empty((0, len(values), 8)),
+            np.stack(scores, axis=1) if blocks else np.empty((0, len(values), 8)),
+            np.stack(matrices, axis=1) if blocks else np.empty((0, len(values), 8, 8)),
             float(cost.mean()),
             float(_robust(error, fit.noise or noise, fit.huber)[2].mean()),
             float((share < 1).mean()),
@@ -117,7 +118,9 @@ class _Target:
         self.rows = rows = np.flatnonzero(bins >= least_bin(np.bincount(bins.ravel(), minlength=BINS), most))
         self.values, self.slopes = _at(values, rows), _slopes(values, rows)
         y, x = np.divmod(rows, width)
-        self.blocks = np.unique(y // stage.side * width + x // stage.side, return_inverse=True)[1]
+        blocks = y // stage.side * width + x // stage.side
+        self._order = np.argsort(blocks, kind="stable")
+        self._starts = np.unique(blocks[self._order], return_index=True)[1]
         rays = camera.rays(np.stack([x, y], axis=1) + 0.5)
         if camera.lens is None:
             by_point = np.zeros((len(rays), 2, 3))
@@ -132,6 +135,10 @@ class _Target:
         """(2, 3, n) derivatives of pixel coordinates x and y by a rotation of the camera axes, and by a
         translation of points at depth 1"""
         self.rays = rays.T.astype(np.float32)
+
+    def by_block(self, values: np.ndarray) -> np.ndarray:
+        """(blocks, ...) sums over the pixels of each block of (..., n) values."""
+        return np.moveaxis(np.add.reduceat(values[..., self._order], self._starts, axis=-1), -1, 0)
 
     def blurred(self, frame: Any) -> np.ndarray:
         """(h, w, c) colours of a frame with the blur and the channels of the image."""

@@ -181,8 +181,8 @@ def _unpacked(packed: np.ndarray, channels: int, blocks: bool) -> AlignmentSums:
     rows = packed[:, :240].reshape(len(packed), 3, 10, 8)[:, :channels]
     total, others = rows.sum(axis=0, dtype=float), packed[:, 240:248].sum(axis=0, dtype=float)
     cost, before, inliers, inverse_depth = (others[4:] / max(others[3], 1)).tolist()
-    scores = rows[packed[:, 243] > 0][:, :, 8] if blocks else rows[:0, :, 8]
+    own = rows[packed[:, 243] > 0 if blocks else slice(0)].astype(float)
     return AlignmentSums(
-        *(total[:, :8], np.moveaxis(total[:, 8:], 1, 2), others[:channels], scores.astype(float)),
+        *(total[:, :8], np.moveaxis(total[:, 8:], 1, 2), others[:channels], own[:, :, 8], own[:, :, :8]),
         *(cost, before, inliers, inverse_depth, float(packed[0, 248])),
     )
