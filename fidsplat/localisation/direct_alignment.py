@@ -268,7 +268,8 @@ def _covariance(sums: AlignmentSums, inverse: np.ndarray) -> np.ndarray:
         own = np.array(_parameters(channel))
         scores[:, own] += sums.scores[:, channel]
         matrices[:, own[:, None], own] += sums.matrices[:, channel]
-    errors = np.linalg.solve(1.000001 * np.eye(size) - inverse @ matrices, (scores @ inverse.T)[:, :, None])[:, :6, 0]
+    others = 1.000001 * np.eye(size) - inverse @ matrices  # 1.000001: one block may determine the pose alone
+    errors = np.linalg.solve(others, (scores @ inverse.T)[:, :, None])[:, :6, 0]
     return errors.T @ errors * (count - 1) / count
 
 
