@@ -322,7 +322,9 @@ def _ignored(mask: np.ndarray | None, camera: Camera) -> np.ndarray | None:
     camera; None for none."""
     if mask is None and camera.lens is None:
         return None
-    ignored = np.zeros((camera.height, camera.width), np.float32) if mask is None else np.float32(~mask)
+    ignored = np.zeros((camera.height, camera.width), np.float32)
+    if mask is not None:
+        ignored[~mask] = 1
     if camera.lens is not None:
         y, x = np.mgrid[: camera.height, : camera.width]
         rays = camera.rays(np.stack([x.ravel(), y.ravel()], axis=1) + 0.5)
