@@ -10,7 +10,7 @@ from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Device, Json, Overwrite, new_file, repeatable, require_packages
 from fidsplat.commands.output import console, json_text, print_lines, report, run_sweeps, show_progress
 from fidsplat.experiments.calibrate import CalibrationSettings
-from fidsplat.experiments.tag_settings import TagSettings
+from fidsplat.experiments.tags import TagSettings
 
 
 @dataclass

@@ -9,7 +9,7 @@ from ewa_error import linear_error
 
 import fidsplat as fs
 from fidsplat.capture.quality import ELLIPSOID, PRESETS, MarkerQuality
-from fidsplat.experiments.tradeoff import compare, run, scenes
+from fidsplat.experiments.tradeoff import run, scenes
 from fidsplat.experiments.tradeoff import session as session_module
 from fidsplat.experiments.tradeoff.points import (
     ABLATION,
@@ -147,37 +147,37 @@ def test_errors_are_those_of_the_cut_off():
     renderer, scene = fs.Renderer("opencl"), faint_rim()
     cut = fs.Quality(alpha_cutoff=0.1)
     exact = np.asarray(rendered(renderer, scene, EXACT), np.float64)
-    result = compare.compare_image(rendered(renderer, scene, cut), exact, scene, cut)
+    result = session_module.compare_image(rendered(renderer, scene, cut), exact, scene, cut)
     # just outside the radius alpha is just below the cut-off
     assert 0.09 < result["maximum"] < 0.1
     assert result["rmse"] == pytest.approx(np.sqrt(((rendered(renderer, scene, cut) - exact) ** 2).mean()))
     # no pixel's decision hangs on rounding, so certificates take nothing away
     assert result["maximum_sure"] == pytest.approx(result["maximum"], abs=1e-4)
-    assert compare.compare_image(exact.astype(np.float32), exact, scene, EXACT)["rmse"] < 1e-6
+    assert session_module.compare_image(exact.astype(np.float32), exact, scene, EXACT)["rmse"] < 1e-6
 
 
 def test_a_certified_flip_is_not_an_error():
     renderer, scene = fs.Renderer("opencl"), faint_rim()
     quality = fs.Quality(alpha_cutoff=0.1)
-    reference = compare.reference_images(
-        compare.FrameSpec(scene.cloud, scene.camera, quality, ("rgb",)),
+    reference = session_module.reference_images(
+        session_module.FrameSpec(scene.cloud, scene.camera, quality, ("rgb",)),
         tuple(part.ravel() for part in np.mgrid[0:48, 0:64]),
     )
     certificate = reference["certificate"].reshape(48, 64)
     off = np.zeros((48, 64))
     row, column = np.unravel_index(np.argmax(certificate), off.shape)
     off[row, column] = certificate[row, column]
-    assert compare.beyond_certificates(off, scene, quality) == pytest.approx(0.0, abs=1e-12)
+    assert session_module.beyond_certificates(off, scene, quality) == pytest.approx(0.0, abs=1e-12)
     # an error that nothing certifies stays
     off[24, 32] = 0.3
     assert certificate[24, 32] < 1e-3
-    assert compare.beyond_certificates(off, scene, quality) == pytest.approx(0.3, abs=1e-3)
+    assert session_module.beyond_certificates(off, scene, quality) == pytest.approx(0.3, abs=1e-3)
     assert rendered(renderer, scene, quality)[24, 32].max() > 0.9
 
 
 def test_many_splats_have_no_certificates(monkeypatch):
-    monkeypatch.setattr(compare, "_PAIRS", 5)
-    assert compare.beyond_certificates(np.zeros((48, 64)), faint_rim(), BASE) is None
+    monkeypatch.setattr(session_module, "_PAIRS", 5)
+    assert session_module.beyond_certificates(np.zeros((48, 64)), faint_rim(), BASE) is None
 
 
 def test_a_marker_is_compared_with_the_printed_texture(session):
@@ -186,7 +186,7 @@ def test_a_marker_is_compared_with_the_printed_texture(session):
         quality = BASE.with_(marker=MarkerQuality(mixture))
         scene = make_view("apriltag@60", quality.marker)
         frame, times = time_point(session, "apriltag@60", quality, QUICK)
-        result[mixture] = times | compare.compare_marker(frame["rgb"], scene)
+        result[mixture] = times | session_module.compare_marker(frame["rgb"], scene)
     assert result["exact"]["ideal_psnr"] > 50 > result["fitted"]["ideal_psnr"] > 20
     assert result["exact"]["corners_px"] < 0.1
     assert result["exact"]["splats"] == result["exact"]["rectangles"]

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from fidsplat.experiments.run import device_name
 from fidsplat.experiments.sweep import Key, Results, Sweep, TimeLimit, Work, thread_pool
-from fidsplat.experiments.tradeoff import compare, points, scenes
+from fidsplat.experiments.tradeoff import points, scenes
 from fidsplat.experiments.tradeoff.points import ABLATION, BASE, MARKER, PRESET, Point
-from fidsplat.experiments.tradeoff.session import FULL, QUICK, Effort, Session, time_point
+from fidsplat.experiments.tradeoff.session import FULL, QUICK, Effort, Session, compare_image, time_point
 from fidsplat.render.renderer import Renderer
 from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.provenance import run_facts
@@ -163,4 +163,4 @@ def _begin(session: Session, key: Key, quick: bool) -> Work:
     frame, times = time_point(session, view, quality, QUICK if quick else FULL)
     image, reference = frame["rgb"], session.reference(view, quality)
     scene = session.scene(view, quality.marker)
-    return lambda: times | compare.compare_image(image, reference, scene, quality)
+    return lambda: times | compare_image(image, reference, scene, quality)
