@@ -228,9 +228,9 @@ def late_ms(choice: Choice) -> float:
 
 
 def _much_more_accurate(candidate: Candidate, missed: Candidate, factor: float) -> bool:
-    """Whether a candidate can have `factor` times the error of one that exceeded the bound.
+    """Whether the error of a candidate is probably at most `factor` times that of `missed`.
 
-    The cut-off decides the median error over the measured scenes, the stop the maximum.
+    The median over the measured scenes depends on the cut-off, the maximum on the stop: one of them suffices.
     """
     enough = SCENE_VARIATION * factor
     by_median = candidate.error_median <= enough * missed.error_median

@@ -166,7 +166,7 @@ def _with_progress(name: str, sweeps: Sequence[Sweep], records: Iterable[Record]
 
 
 def point_label(key: Key) -> str:
-    """Names of a point, without numbers and settings."""
+    """Label of a point: the texts of its key, without numbers and settings."""
     return " ".join(value for value in key.values() if isinstance(value, str))
 
 

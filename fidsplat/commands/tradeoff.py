@@ -72,11 +72,11 @@ class Tradeoff:
     Each setting of Quality is varied separately (its values include the constants of gsplat and of the 2DGS
     authors), then several together. Frames of a setting and of the baseline are interleaved, and the image is
     compared with a float64 reference without cut-offs. Markers are also compared with the ideal printed
-    texture, and tilted until no detector reads them. Results are JSON lines, written immediately; an
-    interrupted run resumes. Several devices are measured one after the other, each into a folder of its name
-    in DIR. Keep the machine idle. --scene measures the splats of your own scene from its camera, or from
-    eight poses of --cameras, with --quick from two. The command first estimates its time; its table shows
-    what was measured, also after Ctrl-C. --quick stops after 3 minutes; the same command continues.
+    texture. Results are JSON lines, written immediately; an interrupted run resumes. Several devices are
+    measured one after the other, each into a folder of its name in DIR. Keep the machine idle. --scene
+    measures the splats of your own scene from its camera, or from eight poses of --cameras, with --quick from
+    two. The command first estimates its time; it prints a table of the measured points, also after Ctrl-C.
+    --quick stops after 3 minutes; the same command continues.
 
       r100k_720p, r1m_1080p            random splats, as in `fidsplat bench`
       r100k_720p_3d, r1m_1080p_3d      3D Gaussians, with each method of rendering them

@@ -111,7 +111,8 @@ def _accumulate(begin: np.ndarray, end: np.ndarray, jump: np.ndarray, shape: tup
 
 
 def _pieces(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pieces of segments between pixel borders: number of the segment, and parameters in [0, 1]."""
+    """Segments cut at the borders of pixels: for each piece the number of its segment, and the positions of
+    its ends along the segment, 0 to 1."""
     n = len(begin)
     owner, cut = [np.arange(n), np.arange(n)], [np.zeros(n), np.ones(n)]
     for axis in (0, 1):

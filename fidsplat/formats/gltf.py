@@ -276,7 +276,7 @@ class _Reader:
         return values.astype(np.int32)
 
     def _array(self, number: int, plain: bool = False) -> np.ndarray:
-        """Values (n, width) float32 of an accessor; plain: integers need not be normalized."""
+        """Values (n, width) float32 of an accessor. plain: accept integers that are not normalized."""
         accessor = self._document["accessors"][number]
         if "sparse" in accessor or "bufferView" not in accessor:
             raise InputError(f"{self._path}: accessor {number} must be dense, got a sparse one")

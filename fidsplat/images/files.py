@@ -60,7 +60,7 @@ def read_rgba(path: str | os.PathLike[str]) -> np.ndarray:
 
 def read_on_background(path: str | os.PathLike[str], background: Sequence[float]) -> np.ndarray:
     """Read an image as (h, w, 3) uint8 RGB, blended over a background of display values where it is
-    transparent. Pixels and errors as `read_rgba`.
+    transparent. `read_rgba` defines the accepted files and the errors.
     """
     rgba = read_rgba(path)
     if rgba[:, :, 3].min() == 255:
@@ -214,7 +214,7 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Encode an image as a PNG file's content; shapes and errors as `write_png`."""
+    """Encode an image as a PNG file's content. `write_png` defines the accepted shapes and the errors."""
     array = pixels_of(image)
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or array.size == 0:
         raise InputError(f"the image of a PNG must be (h, w) or (h, w, 3), got {array.shape}")

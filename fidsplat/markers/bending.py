@@ -191,7 +191,7 @@ def _borders(surface: SheetShape, way: np.ndarray, low: float, high: float) -> l
 
 
 def surface_frames(surface: SheetShape | None, xy: np.ndarray) -> Frames:
-    """Points and tangents of positions (n, 2) of a sheet; None: a flat one."""
+    """Points and tangents at positions (n, 2) on a sheet. surface: None for a flat sheet."""
     if surface is not None:
         return surface.frames(xy)
     along = np.zeros((2, len(xy), 3))

@@ -346,7 +346,7 @@ def _noise(sheet: Sheet, wide: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def _ranks(sheet: Sheet, values: np.ndarray) -> np.ndarray:
-    """Share of the sheet's cells with a lower value, 0 to 1; 1 without paper."""
+    """For each cell the share of the sheet's cells with a lower value, 0 to 1; 1 where there is no paper."""
     rank = np.ones(sheet.present.shape)
     order = np.argsort(values[sheet.present], kind="stable")
     own = np.empty(len(order))

@@ -105,9 +105,10 @@ def truth_of(frame: Mapping[str, np.ndarray], scene: Scene, camera: Camera | Non
 def at_shutter(
     frame: Any, scene: Scene, camera: Camera | None, shape: Sequence[int]
 ) -> tuple[Camera, list[PlacedMarker]]:
-    """Camera and markers at the shutter's time of an image: by the capture of a Frame, else of the scene.
+    """Camera and markers of a scene at the time of the shutter, which the capture of a Frame has, else the
+    scene's.
 
-    shape: shape of the image. Other arguments and errors: as `truth_of`.
+    shape: shape of the image. `truth_of` explains the other arguments and the errors.
     """
     instance("scene", scene, Scene, remedy="fs.Scene([cloud]) makes one of splats")
     if camera is not None:
