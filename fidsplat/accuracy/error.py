@@ -123,23 +123,19 @@ def reference_renderer(renderer: Renderer, capture: Capture) -> Renderer:
 
 
 def reference_image(
-    renderer: Renderer, scene: Scene | SplatCloud | ResidentCloud, capture: Capture, output: str = "rgb"
+    renderer: Renderer, scene: Scene | SplatCloud | ResidentCloud, capture: Capture
 ) -> np.ndarray:
-    """The image at full precision (`full_precision`).
+    """The image at full precision (`full_precision`), (h, w, 3) float64.
 
     Args:
         renderer: device "reference" computes float64 images; images of others are converted.
         scene: scene to render.
         capture: capture; its outputs are ignored.
-        output: name of the image.
-
-    Returns:
-        float64, of the shape of the image: (h, w, 3) for rgb.
 
     Raises:
         InputError, DeviceError: as `Renderer.render`.
     """
-    frame = renderer.render(scene, full_precision(capture.with_(outputs=output), renderer))
+    frame = renderer.render(scene, full_precision(capture.with_(outputs="rgb"), renderer))
     if renderer.device.always_float64:  # other reads round to float32
-        return frame._images.read_float64(output, 0)
-    return np.asarray(frame[output], np.float64)
+        return frame._images.read_float64("rgb", 0)
+    return np.asarray(frame["rgb"], np.float64)

@@ -49,20 +49,18 @@ def load_scene(name: str, seed: int = 0) -> tuple[SplatCloud, Camera]:
     return cloud, standard_camera(scene.width, scene.height)
 
 
-def standard_camera(width: int, height: int, fov_x: float = math.radians(60.0)) -> Camera:
-    """The scenes' camera; fov_x in radians."""
-    focal = 0.5 * width / math.tan(fov_x / 2)
+def standard_camera(width: int, height: int) -> Camera:
+    """The scenes' camera, 60 degrees wide."""
+    focal = 0.5 * width / math.tan(math.radians(30))
     return Camera.pinhole(width, height, focal, focal, width / 2, height / 2)
 
 
-def random_cloud(
-    count: int, median_scale: float, seed: int = 0, extent: float = 4.0, thick: bool = False
-) -> SplatCloud:
-    """`count` splats: centres uniform in a cube, orientations uniform, scales log-normal, opacities beta(1.2,
-    1). thick: with a third scale."""
+def random_cloud(count: int, median_scale: float, seed: int = 0, thick: bool = False) -> SplatCloud:
+    """`count` splats: centres uniform in a cube of 8 m, orientations uniform, scales log-normal, opacities
+    beta(1.2, 1). thick: with a third scale."""
     generator = np.random.default_rng(seed)
-    means = generator.uniform(-extent, extent, (count, 3)).astype(np.float32)
-    means[:, 2] += extent * 2.0
+    means = generator.uniform(-4.0, 4.0, (count, 3)).astype(np.float32)
+    means[:, 2] += 8.0
     quats = generator.normal(size=(count, 4)).astype(np.float32)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     scales = np.exp(generator.normal(np.log(median_scale), 0.6, (count, 2))).astype(np.float32)

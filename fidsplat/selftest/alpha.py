@@ -20,13 +20,11 @@ MIDDLE = (8, 12)
 PARITY = ("gsplat", "surfel")
 
 
-def stack(
-    opacities, colors=(0.0, 0.0, 0.0), first: float = 1.0, step: float = 0.1, size: float = 5.0
-) -> SplatCloud:
+def stack(opacities, colors=(0.0, 0.0, 0.0), step: float = 0.1, size: float = 5.0) -> SplatCloud:
     """Fronto-parallel layers one behind the other, each with its opacity on the axis."""
     n = len(opacities)
     means = np.zeros((n, 3))
-    means[:, 2] = first + step * np.arange(n)
+    means[:, 2] = 1.0 + step * np.arange(n)
     return splats(means, FACING, (size, size), opacities, colors)
 
 

@@ -237,13 +237,3 @@ def read_table() -> dict[int, Digest]:
             int(row["seed"]): Digest(row["sha256"], {name: row[name] for name in OUTPUTS})
             for row in csv.DictReader(stream)
         }
-
-
-def write_table(renderer: Renderer) -> None:
-    """Replace the table by the digests of a device."""
-    with TABLE.open("w", newline="") as stream:
-        table = csv.writer(stream, lineterminator="\n")
-        table.writerow(["seed", "sha256", *OUTPUTS])
-        for seed in range(COUNT):
-            digest = digest_of(renderer, seed)
-            table.writerow([seed, digest.sha256, *digest.outputs.values()])

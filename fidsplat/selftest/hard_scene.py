@@ -19,9 +19,6 @@ CELL = (WIDTH // COLUMNS, HEIGHT // ROWS)
 PLACE = np.array([5e5, 4.5e6, 300.0])
 """position of the camera in metres, far from the origin as in map (UTM) coordinates"""
 
-CELLS = ("haze", "veils", "opaque", "edge-on", "tiny", "pages", "needles", "near")
-"""Contents of the cells, row by row."""
-
 
 def hard_scene(seed: int = 0) -> tuple[SplatCloud, Camera]:
     """About 5000 splats on black in 640 x 480 pixels, 4.5 million metres from the origin; deterministic.
@@ -51,12 +48,6 @@ def hard_scene(seed: int = 0) -> tuple[SplatCloud, Camera]:
     pose[:3, 3] = -PLACE
     camera = Camera.pinhole(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, world_to_camera=pose)
     return cloud, camera
-
-
-def cell_window(number: int) -> tuple[slice, slice]:
-    """Rows and columns of the image that a cell covers."""
-    row, column = divmod(number, COLUMNS)
-    return slice(row * CELL[1], (row + 1) * CELL[1]), slice(column * CELL[0], (column + 1) * CELL[0])
 
 
 def _at(number: int, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:

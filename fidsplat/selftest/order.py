@@ -321,12 +321,12 @@ def crossing(count: int = 120) -> SplatCloud:
     return random_splats(count, seed=15, depth=(0.5, 4.0), scale=(0.2, 0.8))
 
 
-def fan(count: int = 40, seed: int = 5) -> SplatCloud:
-    """Splats 2 m wide that share a line at 3 m: each is in front of every other one somewhere."""
-    generator = np.random.default_rng(seed)
-    quats = np.array([rotation((0, 1, 0), angle) for angle in np.linspace(-75, 75, count)])
-    means = np.tile([0.0, 0.0, 3.0], (count, 1))
-    return splats(means, quats, (0.35, 0.5), generator.uniform(0.1, 0.9, count), generator.random((count, 3)))
+def fan() -> SplatCloud:
+    """40 splats 2 m wide that share a line at 3 m: each is in front of every other one somewhere."""
+    generator = np.random.default_rng(5)
+    quats = np.array([rotation((0, 1, 0), angle) for angle in np.linspace(-75, 75, 40)])
+    means = np.tile([0.0, 0.0, 3.0], (40, 1))
+    return splats(means, quats, (0.35, 0.5), generator.uniform(0.1, 0.9, 40), generator.random((40, 3)))
 
 
 def _pixel_specs() -> Iterator[FrameSpec]:

@@ -1,35 +1,15 @@
 """Undistortion: resampling images of a lens to a pinhole camera."""
 
-import math
 from functools import lru_cache
 
 import cv2
 import numpy as np
 
-from fidsplat.cameras import Camera, Lens, Orthographic, focal_length, look_at_matrix
+from fidsplat.cameras import Camera, Lens, Orthographic
 from fidsplat.util.errors import InputError
 
-MAX_FIELD = math.radians(150)
 _NOWHERE = -1e4
 """coordinate of pixels outside the lens's field of view"""
-
-
-def pinhole_towards(camera: Camera, target, width: int, height: int, fov_x: float) -> Camera:
-    """A pinhole at the camera's position that looks at `target` (3,) [m]; fov_x in radians, up to 150
-    degrees.
-
-    Raises:
-        InputError: fov_x out of range, or a target at the camera's position.
-    """
-    if not 0 < fov_x <= MAX_FIELD:
-        raise InputError(f"fov_x must be more than 0 and at most 150 degrees, got {math.degrees(fov_x):.6g}")
-    # the image's down is that of the camera, unless the target is in that direction
-    down, along = camera.world_to_camera[1, :3], np.asarray(target, np.float64) - camera.position
-    if np.linalg.norm(np.cross(down, along)) < 1e-3 * np.linalg.norm(along):
-        down = camera.world_to_camera[2, :3]
-    f = focal_length(width, fov_x)
-    pose = look_at_matrix(camera.position, target, -down)
-    return Camera.pinhole(width, height, f, f, width / 2, height / 2, pose, position=camera.position)
 
 
 def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:

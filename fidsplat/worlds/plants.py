@@ -228,13 +228,13 @@ def _placed(points: np.ndarray, at: np.ndarray, turn: float) -> np.ndarray:
     return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + at
 
 
-def _tube(line: np.ndarray, radius: float, colour: Sequence[float], sides: int = 6) -> Mesh:
-    """Tapered tube along a line (n, 3)."""
+def _tube(line: np.ndarray, radius: float, colour: Sequence[float]) -> Mesh:
+    """Tapered tube along a line (n, 3), with six sides."""
     along = np.gradient(line, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = np.cross(along, [0.35, 0.9, 0.25])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    around = np.arange(sides) * 2 * math.pi / sides
+    around = np.arange(6) * 2 * math.pi / 6
     thick = radius * np.linspace(1, 0.6, len(line))
     ring = (
         np.cos(around)[:, None] * across[:, None] + np.sin(around)[:, None] * np.cross(along, across)[:, None]
