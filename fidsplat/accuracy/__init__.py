@@ -1,1 +1,1 @@
-"""Errors of images, their prices in time, and the quality that fits a bound."""
+"""Errors of images, their cost in time, and the choice of a quality within a bound."""

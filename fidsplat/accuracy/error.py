@@ -33,7 +33,7 @@ candidates.json"""
 
 @dataclass(frozen=True)
 class Errors:
-    """Differences between two images, over all their values."""
+    """Statistics of the differences between two images, over all pixels and channels."""
 
     maximum: float
     """largest absolute difference"""

@@ -1,4 +1,4 @@
-"""Light of markers: lights in the scene, and how a marker's colours follow from light."""
+"""Lights of a scene, and the model of a marker's colours in their light."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ GRIDS = (1, 2, 3, 5, 9, 17)
 
 @dataclass(frozen=True)
 class Lighting:
-    """How the colours of a marker follow from the light that it receives.
+    """Model of the colours of a marker in the light that it receives.
 
     The reflectance of a splat of colour c is `ink` + (`paper` - `ink`) c, with c in linear light. Matte
     paper of reflectance 1 under radiance L from all sides has the radiance L. Raises InputError for a value
