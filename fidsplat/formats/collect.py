@@ -119,7 +119,7 @@ class _GrowingArrays:
         }
 
     def reserve(self, count: int, rows: int) -> dict[str, np.ndarray]:
-        """Memory for the next `count` splats, as views of the arrays. rows: number of rows that were read before."""
+        """Views of the arrays for the next `count` splats. rows: number of rows that were read before."""
         if self._count + count > self._capacity:
             # if most rows so far are valid, all others are expected to be
             mostly_valid = 2 * self._count > rows
