@@ -31,7 +31,7 @@ from fidsplat.experiments.blender import default_environment, image_job, ready, 
 from fidsplat.images.files import encode_image, read_image, to_uint8, write_png
 from fidsplat.splats.rotations import quaternion_to_matrix, rigid_matrix
 from fidsplat.train import Dataset, Trainer, TrainingView, load_dataset
-from fidsplat.train.undistorted_view import undistorted_view
+from fidsplat.train.masks import undistorted_view
 from fidsplat.train.view_refinement import alignment, moved
 from fidsplat.util.response import to_colors, to_light
 from fidsplat.vision.pose import pose_error

@@ -158,16 +158,16 @@ class Camera(PickledByFields, Summarised):
             raise InputError(f"a fisheye must have 4 coefficients, k1 to k4, got {len(factors)}")
         lens, width, height = Fisheye(*factors), _size("width", width), _size("height", height)
         f = fisheye_focal_length(width, fov_x, lens)
-        pose = np.eye(4) if world_to_camera is None else world_to_camera
-        return Camera(width, height, f, f, width / 2, height / 2, pose, near, far, lens=lens)
+        place = width / 2, height / 2, world_to_camera, near, far
+        return Camera.pinhole(width, height, f, f, *place, lens=lens)
 
     @staticmethod
     def equirectangular(width, height, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
         """A panorama of the sphere: z in the middle, -z at the left and right edges, -y at the top."""
         width, height = _size("width", width), _size("height", height)
-        pose = np.eye(4) if world_to_camera is None else world_to_camera
         fx, fy = width / (2 * math.pi), height / math.pi
-        return Camera(width, height, fx, fy, width / 2, height / 2, pose, near, far, lens=Equirectangular())
+        place = width / 2, height / 2, world_to_camera, near, far
+        return Camera.pinhole(width, height, fx, fy, *place, lens=Equirectangular())
 
     @staticmethod
     def orthographic(width, height, metres_wide, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
@@ -176,9 +176,9 @@ class Camera(PickledByFields, Summarised):
         across = _number("metres_wide", metres_wide)
         if not 0 < across < math.inf:
             raise InputError(f"camera metres_wide must be above 0 and finite, got {metres_wide!r}")
-        pose = np.eye(4) if world_to_camera is None else world_to_camera
         f = width / across
-        return Camera(width, height, f, f, width / 2, height / 2, pose, near, far, lens=Orthographic())
+        place = width / 2, height / 2, world_to_camera, near, far
+        return Camera.pinhole(width, height, f, f, *place, lens=Orthographic())
 
     @staticmethod
     def look_at(

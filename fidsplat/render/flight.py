@@ -133,7 +133,8 @@ class FlightFolder:
             writable_folder(self.folder / name)
         if overwrite:
             self._clear()
-        self._write(RECORD, self._record())
+        with atomic_write(self.folder / RECORD) as stream:
+            stream.write((json.dumps(self._record(), indent=2) + "\n").encode())
         self._save_poses()
 
     def remaining(self) -> list[int]:
@@ -214,10 +215,6 @@ class FlightFolder:
             "outputs": list(self.flight.capture.outputs),
             "times": np.asarray(path.times).tolist(),
         }
-
-    def _write(self, name: str, facts: dict[str, Any]) -> None:
-        with atomic_write(self.folder / name) as stream:
-            stream.write((json.dumps(facts, indent=2) + "\n").encode())
 
     def _save_poses(self) -> None:
         save_trajectory(self.flight.path, self.folder / POSES)

@@ -134,7 +134,11 @@ class ChunkedSplats:
     @cached_property
     def pinned(self) -> NodeMasks:
         """Chunks with coplanar groups, which are part of every frame."""
-        return tuple(_pinned(store) for store in self.stores)
+        each = ((store, store.nodes) for store in self.stores)
+        return tuple(
+            np.tile((nodes["level"] == 0) & (nodes["first"] >= store.header.pinned), store.instances)
+            for store, nodes in each
+        )
 
     def boxes(self, number: int, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
         """Corners (instances * nodes, 3) [m] of boxes around a store's nodes, from the origin."""
@@ -242,8 +246,3 @@ class ChunkedSplats:
         if self.footprint != "gaussian":
             columns["boxes"] = arrays.get("boxes", np.zeros(count, bool))
         return columns
-
-
-def _pinned(store: Store) -> np.ndarray:
-    nodes = store.nodes
-    return np.tile((nodes["level"] == 0) & (nodes["first"] >= store.header.pinned), store.instances)

@@ -9,7 +9,6 @@ import numpy as np
 
 from fidsplat.backends.interface import Chunk, ChunkedScene
 from fidsplat.store.chunked_splats import ChunkedSplats, Selection
-from fidsplat.store.partial_cloud import PartialCloud
 from fidsplat.store.store import Store
 
 
@@ -56,13 +55,9 @@ class DeviceChunks(ChunkedScene):
         return sum(each) + -(-len(self.scene.in_memory) // self.largest_chunk)
 
     @cached_property
-    def _pinned_part(self) -> PartialCloud:
-        """The chunks that are part of every frame, and the splats in memory."""
-        return self.scene.part(Selection.of(self.scene.pinned))
-
-    @cached_property
     def _group_ids(self) -> np.ndarray:
-        ids = self._pinned_part.coplanar_groups
+        """Sorted ids of all coplanar groups, whose chunks are part of every frame."""
+        ids = self.scene.part(Selection.of(self.scene.pinned)).coplanar_groups
         assert ids is not None
         return np.unique(ids[ids >= 0])
 

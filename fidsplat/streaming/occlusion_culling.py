@@ -101,7 +101,9 @@ class OcclusionCulling:
             if few and not subchunks:
                 self._pause = _PAUSE if bands[0].count > _MAX_VISIBLE * full.count else 0
                 return bands, images
-            if few and _pixels_within_tiles(full.view, termination):
+            if few and not any(
+                side % full.view.samples for side in termination.tile
+            ):  # no pixel in two tiles
                 tiles = band.contributing_tiles(subchunks, here)
                 patch = full.with_rows(*_rows(tiles, full, termination)).without_occluded(
                     termination.within(tiles)
@@ -127,11 +129,6 @@ def _rows(tiles: np.ndarray, full: Band, termination: TerminationDepths) -> tupl
     """Rows of pixels [first, end) of a view that contain the selected tiles."""
     rows, height = np.flatnonzero(tiles.any(axis=1)), termination.tile[0] // full.view.samples
     return max(int(rows[0]) * height, full.rows[0]), min((int(rows[-1]) + 1) * height, full.rows[1])
-
-
-def _pixels_within_tiles(view: View, termination: TerminationDepths) -> bool:
-    """Whether all samples of each pixel are in one tile."""
-    return not any(side % view.samples for side in termination.tile)
 
 
 def _without(nodes: NodeMasks, others: NodeMasks) -> NodeMasks:

@@ -106,13 +106,12 @@ class Residency:
     def _data(self, selection: Selection, first_id: int = 0) -> ResidentData:
         if self._current is None or self._current[:2] != (selection, first_id):
             self._current = None  # released before the upload, so that the device need not hold both
-            self._current = selection, first_id, self._uploaded(selection, first_id)
+            if self._cache is None:
+                data = self._backend.upload(self.scene.part(selection))
+            else:
+                data = self._cache.gather(self.chunks.of(selection, self._cache.applies_poses), first_id)
+            self._current = selection, first_id, data
         return self._current[-1]
-
-    def _uploaded(self, selection: Selection, first_id: int) -> ResidentData:
-        if self._cache is None:
-            return self._backend.upload(self.scene.part(selection))
-        return self._cache.gather(self.chunks.of(selection, self._cache.applies_poses), first_id)
 
     def _can_cull(self, view: View, features: FeatureSet) -> bool:
         """Whether occlusion culling is supported."""

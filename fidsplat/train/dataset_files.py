@@ -12,9 +12,8 @@ from fidsplat.formats.colmap import has_colmap, load_colmap
 from fidsplat.images.files import read_on_background
 from fidsplat.train.boxes import MarkerBox, read_boxes, without_markers
 from fidsplat.train.dataset import MAX_POINTS, Dataset, TrainingView
-from fidsplat.train.masks import Masks, mask_file
+from fidsplat.train.masks import Masks, mask_file, undistorted_view
 from fidsplat.train.transforms import DatasetContents, check_other_image, has_transforms, load_transforms
-from fidsplat.train.undistorted_view import undistorted_view
 from fidsplat.util.arguments import callback, flag, whole_number
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, path_of, read_text

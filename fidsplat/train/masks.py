@@ -1,13 +1,16 @@
-"""Masks of training images: files of a folder, and the alpha channel of the images."""
+"""Masks of training images (files of a folder, the alpha channel, the edges of undistorted images)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from fidsplat.cameras import Camera
 from fidsplat.images.files import read_image, read_rgba
+from fidsplat.train.dataset import TrainingView
+from fidsplat.vision.undistort import undistort_masked
 
 _OPAQUE = 128
 """alpha from which a pixel counts, with `alpha`"""
@@ -45,3 +48,16 @@ def mask_file(folder: Path, name: str) -> Path | None:
     image = folder / name
     candidates = (image.with_name(f"{image.name}.png"), image.with_suffix(".png"))
     return next((one for one in candidates if one.is_file()), None)
+
+
+def undistorted_view(name: str, camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> TrainingView:
+    """Make a training view; a photograph with lens distortion is resampled to a pinhole camera of the same
+    focal length, and the mask excludes pixels outside the photograph.
+
+    Raises InputError if camera, image and mask do not match.
+    """
+    size = (camera.height, camera.width)
+    if camera.lens is not None and image.shape[:2] == size and (mask is None or mask.shape == size):
+        image, inside = undistort_masked(image, camera, np.ones(size, bool) if mask is None else mask)
+        mask, camera = None if inside.all() else inside, replace(camera, lens=None)
+    return TrainingView(name, camera, image, mask)

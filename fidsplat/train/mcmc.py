@@ -82,16 +82,12 @@ def _share_among_copies(splats: Splats, sources: np.ndarray, settings: TrainSett
     number = np.minimum(copies + 1, MAX_COPIES)
     opacity = splats.opacities[rows].astype(np.float64)
     new = 1 - (1 - opacity) ** (1 / number)
-    sums = _copy_sums(new)[np.arange(len(rows)), number - 1]
+    # integrated alpha of N equal splats along a line, for N = 1 to 51
+    integrals = np.cumsum(new[:, None] ** np.arange(1, MAX_COPIES + 1) @ _binomial_terms().T, axis=1)
+    sums = integrals[np.arange(len(rows)), number - 1]
     new = np.clip(new, settings.dead_opacity, 1 - np.finfo(np.float32).eps)
     splats.values["logits"][rows] = (np.log(new) - np.log1p(-new)).astype(np.float32)
     splats.values["log_scales"][rows] += np.log(opacity / sums).astype(np.float32)[:, None]
-
-
-def _copy_sums(opacity: np.ndarray) -> np.ndarray:
-    """Integrated alpha of N equal splats along a line, (n, 51) for N = 1 to 51."""
-    powers = opacity[:, None] ** np.arange(1, MAX_COPIES + 1)
-    return np.cumsum(powers @ _binomial_terms().T, axis=1)
 
 
 @cache

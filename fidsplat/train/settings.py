@@ -202,22 +202,15 @@ class TrainSettings:
 
     def position_rate_at(self, iteration: int) -> float:
         """Learning rate of the means at an iteration, in units of the scene extent: exponential decay."""
-        iteration = whole_number("iteration", iteration, 0, 2**63 - 1)
-        share = min(iteration / self.position_steps, 1.0)
-        return self.position_rate ** (1 - share) * self.position_rate_end**share
+        return _decayed(iteration, self.position_rate, self.position_rate_end, self.position_steps)
 
     def pose_rate_at(self, iteration: int) -> float:
         """Learning rate of poses and intrinsics at an iteration."""
-        return self._decayed(iteration, self.pose_rate, self.pose_rate_end)
+        return _decayed(iteration, self.pose_rate, self.pose_rate_end, self.iterations)
 
     def exposure_rate_at(self, iteration: int) -> float:
         """Learning rate of exposures at an iteration."""
-        return self._decayed(iteration, self.exposure_rate, self.exposure_rate_end)
-
-    def _decayed(self, iteration: int, first: float, last: float) -> float:
-        """Exponential decay over all iterations."""
-        share = min(whole_number("iteration", iteration, 0, 2**63 - 1) / self.iterations, 1.0)
-        return first ** (1 - share) * last**share
+        return _decayed(iteration, self.exposure_rate, self.exposure_rate_end, self.iterations)
 
     def degree_at(self, iteration: int) -> int:
         """SH degree at an iteration."""
@@ -267,6 +260,12 @@ class TrainSettings:
     def start_opacity(self) -> float:
         """Initial opacity of all splats."""
         return self.mcmc_opacity if self.strategy == "mcmc" else self.initial_opacity
+
+
+def _decayed(iteration: int, first: float, last: float, steps: int) -> float:
+    """Exponential decay from `first` to `last` in a number of steps."""
+    share = min(whole_number("iteration", iteration, 0, 2**63 - 1) / steps, 1.0)
+    return first ** (1 - share) * last**share
 
 
 def _put(settings: TrainSettings, name: str, value: Any) -> None:

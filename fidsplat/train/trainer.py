@@ -19,7 +19,7 @@ from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
-from fidsplat.effects import FeatureSet
+from fidsplat.effects import FeatureSet, select
 from fidsplat.effects.differentiable import with_distortion
 from fidsplat.formats import save_ply
 from fidsplat.formats.collect import Progress
@@ -34,7 +34,6 @@ from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.device_model import DeviceModel
 from fidsplat.train.host_model import HostModel
 from fidsplat.train.losses import Loss
-from fidsplat.train.next_features import next_features
 from fidsplat.train.optimiser import learning_rates
 from fidsplat.train.parameters import Splats, TrainingError, initial_splats, splats_from_cloud
 from fidsplat.train.random_numbers import Purpose, permutation
@@ -67,6 +66,15 @@ class Step(NamedTuple):
     """PSNR of the view before the step [dB]"""
     splats: int
     """number of splats after the step"""
+
+
+class _Traits(NamedTuple):
+    """`CloudTraits` of splats in training."""
+
+    sh_degree: int
+    ellipsoids: str
+    has_coplanar_groups: bool = False
+    footprint: str = "gaussian"
 
 
 class Trainer:
@@ -107,7 +115,9 @@ class Trainer:
             instance("start", start, SplatCloud, "an fs.SplatCloud or None")
         self.settings = settings_with(TrainSettings, settings, changes)
         self.renderer = Renderer() if renderer is None else renderer
-        self.checkpoint = None if checkpoint is None else _writable(checkpoint)
+        self.checkpoint = None if checkpoint is None else ordinary_file(checkpoint)
+        if self.checkpoint is not None:
+            writable_folder(self.checkpoint.parent)
         backend = self.renderer.backend
         if not backend.traits.differentiates:
             raise DeviceError(backend.lacks("have gradients", "use device='opencl', 'warp' or 'reference'"))
@@ -429,9 +439,7 @@ class Trainer:
             features = with_distortion(features)
         if features != self._features:
             self._features = features
-            upcoming = next_features(self.settings, iteration, plain, surface)
-            if upcoming is not None:
-                self.renderer.backend.compile_in_background(upcoming)
+            self._compile_next(iteration, plain, surface)
         pipeline = self._differentiate(features)
         images = pipeline.forward(resident, prepared, waits)
         fitted = self._refinement if self.settings.fit_exposures else None
@@ -445,6 +453,16 @@ class Trainer:
             mask = np.ones(view.image.shape[:2], np.float32) if view.mask is None else view.mask
             by_images["distortion"] = mask * np.float32(by_distortions / mask.size)
         return loss, self._model.backward_to_tiles(pipeline, images, by_images)
+
+    def _compile_next(self, iteration: int, plain: Capture, surface: Capture) -> None:
+        """Compile the kernels after the next change, a higher SH degree or another loss, in the
+        background."""
+        if (change := self.settings.changes_after(iteration)) is None:
+            return
+        by_normals, by_distortions = self.settings.surface_weights_at(change)
+        traits = _Traits(self.settings.degree_at(change), "all" if self.settings.axes == 3 else "none")
+        features = select(traits, surface if by_normals else plain)
+        self.renderer.backend.compile_in_background(with_distortion(features) if by_distortions else features)
 
     def _checked_splats(self) -> Splats:
         self._read_losses()
@@ -546,10 +564,3 @@ class Trainer:
         if self.checkpoint is None or not self.checkpoint.exists():
             return f"there is no checkpoint{advice}"
         return f"the last checkpoint {self.checkpoint} is complete"
-
-
-def _writable(checkpoint: str | Path) -> Path:
-    """The path of the checkpoint, if its folder is writable."""
-    file = ordinary_file(checkpoint)
-    writable_folder(file.parent)
-    return file

@@ -14,8 +14,7 @@ from fidsplat.formats.colmap import byte_colors
 from fidsplat.formats.ply_header import read_header
 from fidsplat.images.files import read_on_background
 from fidsplat.train.dataset import TrainingView
-from fidsplat.train.masks import Masks
-from fidsplat.train.undistorted_view import undistorted_view
+from fidsplat.train.masks import Masks, undistorted_view
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, path_of, read_text
 

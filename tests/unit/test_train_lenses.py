@@ -10,7 +10,7 @@ from training_scene import scene, write
 import fidsplat as fs
 from fidsplat.images.files import write_png
 from fidsplat.train import load_dataset
-from fidsplat.train.undistorted_view import undistorted_view
+from fidsplat.train.masks import undistorted_view
 
 
 @pytest.fixture

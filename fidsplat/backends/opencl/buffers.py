@@ -202,7 +202,10 @@ class RayBuffers:
         if (rows, columns) not in sizes:
             sizes[rows, columns] = {"rays": self._planar("rays", raster.rays, rows, columns)}
             if raster.lens.kind != "equirectangular":
-                sizes[rows, columns]["ray_map"] = self._map(raster.whole or raster)
+                maps = self._held.setdefault(raster.whole or raster, {}).setdefault((0, 0), {})
+                if "ray_map" not in maps:
+                    maps["ray_map"] = self._put("ray_map", raster.map[0])
+                sizes[rows, columns]["ray_map"] = maps["ray_map"]
         buffers = sizes[rows, columns]
         if slopes and "ray_slopes" not in buffers:
             flat = raster.slopes.reshape(raster.height, raster.width, 6)
@@ -223,12 +226,6 @@ class RayBuffers:
         one = next(iter(rasters))
         each = 36 if slopes else 12
         return each * rows * columns + (one.map[0].nbytes if one.lens.kind != "equirectangular" else 0)
-
-    def _map(self, raster: RayRaster) -> cl.Buffer:
-        maps = self._held.setdefault(raster, {}).setdefault((0, 0), {})
-        if "ray_map" not in maps:
-            maps["ray_map"] = self._put("ray_map", raster.map[0])
-        return maps["ray_map"]
 
     def _put(self, name: str, array: np.ndarray) -> cl.Buffer:
         buffer = self._pool.fresh(name, array.nbytes)

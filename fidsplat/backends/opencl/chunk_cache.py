@@ -85,7 +85,8 @@ class OpenCLChunkCache(ChunkCache):
         with self._lock:
             self._rendered = {chunk.key for chunk in chunks}
             if not self.widths:
-                self._set_widths(chunks[0].load())
+                for name, array in chunks[0].load().items():
+                    self.widths[name] = array.dtype.itemsize * int(np.prod(array.shape[1:], dtype=np.int64))
         return GatheredChunks(self, chunks, first_id)
 
     def prefetch(self, chunks: Sequence[Chunk]) -> None:
@@ -235,10 +236,6 @@ class OpenCLChunkCache(ChunkCache):
             self._arrays[name] = buffer
         self._free += range(size - 1, self._size - 1, -1)
         self._size = size
-
-    def _set_widths(self, arrays: Mapping[str, np.ndarray]) -> None:
-        for name, array in arrays.items():
-            self.widths[name] = array.dtype.itemsize * int(np.prod(array.shape[1:], dtype=np.int64))
 
 
 def _rounded_up(count: int) -> int:

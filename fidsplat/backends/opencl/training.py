@@ -274,7 +274,9 @@ class OpenCLTraining:
         target, size, strided = self._targets[view], 3 * height * columns, self._lanes > 1
         number, stride = target.values, self._stride(columns)
         grid = (-(-3 * columns // _PANEL), -(-height // _STRIP)) if strided else (_SUMS,)
-        sums = self._sums_of(math.prod(grid))
+        if (groups := math.prod(grid)) not in self._sums:
+            self._sums[groups] = LossReadback(self._workspace, groups)
+        sums = self._sums[groups]
         slot, buffer = sums.take()
         gradient = self._array("by_rgb", (height, columns, 3))
         given = {
@@ -478,11 +480,6 @@ class OpenCLTraining:
 
     def _array(self, name: str, shape: tuple[int, ...]) -> Array:
         return self._workspace.pool.array(self._queue, f"training: {name}", shape)
-
-    def _sums_of(self, groups: int) -> LossReadback:
-        if groups not in self._sums:
-            self._sums[groups] = LossReadback(self._workspace, groups)
-        return self._sums[groups]
 
     def _stride(self, columns: int) -> int:
         return -(-3 * columns // self._lanes) * self._lanes + 2 * _MARGIN
