@@ -97,8 +97,8 @@ class ResidentData(ABC):
     def color_range(self) -> tuple[float, float]:
         """Lower and upper bound of every channel of every splat, from any direction."""
         raise InputError(
-            "the output 'error' must be of splats whose colours are known, got a cloud without them; render "
-            "a SplatCloud, or leave the output out"
+            "the output 'error' must be of splats whose colours the host knows, got adopted arrays; render "
+            "a SplatCloud, or leave out the output 'error'"
         )
 
 

@@ -170,8 +170,8 @@ class View:
         n = quality.samples
         if max(camera.width, camera.height) * n > MAX_GRID:
             raise InputError(
-                f"{camera.width} x {camera.height} pixels with {n} x {n} samples each is too large: at most "
-                f"{MAX_GRID} samples along a side; use fewer samples or a smaller image"
+                f"a frame must have at most {MAX_GRID} samples along a side, got {camera.width} x "
+                f"{camera.height} pixels with {n} x {n} samples each; use fewer samples or a smaller image"
             )
         external = capture.external_depth
         if external is not None and external.depth.shape != (camera.height, camera.width):

@@ -20,10 +20,10 @@ FISHEYE_LIMIT = math.radians(100)
 """largest angle of a fisheye from its axis: a field of view of 200 degrees"""
 MAX_COEFFICIENT = 1e12
 """largest size of a lens coefficient: far beyond invertible ones, and products of several stay finite"""
-_STEPS = 4096  # of the tables from which Newton's iteration starts
+_STEPS = 4096  # entries of the table of start values for Newton's iteration
 _ITERATIONS = 12
-_LOWEST = math.cos(math.radians(1))  # -z is infinitely far in the chart of directions
-_NOTHING = 1e-200  # a leading coefficient that would overflow when roots are found
+_LOWEST = math.cos(math.radians(1))  # the stereographic projection maps -z to infinity
+_NOTHING = 1e-200  # smaller leading coefficients are dropped: roots would overflow
 
 
 @dataclass(frozen=True)

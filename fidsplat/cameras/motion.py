@@ -147,7 +147,7 @@ class _PoseTable:
     def __call__(self, time: float) -> np.ndarray:
         if time not in self.poses:
             given = ", ".join(f"{one:g}" for one in self.poses)
-            raise InputError(f"time must be one that this motion was sampled at ({given} s), got {time:g} s")
+            raise InputError(f"time must be a sampled time of this motion ({given} s), got {time:g} s")
         return self.poses[time]
 
 

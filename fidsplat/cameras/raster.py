@@ -63,7 +63,7 @@ class RayRaster:
             rays = self.rays[top : top + step].reshape(-1, 3).astype(np.float64)
             by_ray = self.lens.derivative(rays) * np.array([[self.focal_x], [self.focal_y]])
             if not self.lens.along_ray:
-                by_ray[:, :, 2] = 0.0  # rays have Z = 1, and so have their neighbours
+                by_ray[:, :, 2] = 0.0  # all rays have Z = 1, so their differences have Z = 0
             # the inverse among neighbouring rays: J^T (J J^T)^-1
             xx, yy, xy = ((by_ray[:, i] * by_ray[:, j]).sum(1)[:, None] for i, j in ((0, 0), (1, 1), (0, 1)))
             with np.errstate(divide="ignore", invalid="ignore"):

@@ -205,7 +205,7 @@ class Lidar:
             if kind not in RETURNS:
                 raise InputError(unknown("return of a lidar", kind, RETURNS))
         if not kinds or len(set(kinds)) < len(kinds):
-            raise invalid("lidar returns", "one or more different ones", self.returns)
+            raise invalid("lidar returns", "one or more different kinds of return", self.returns)
         object.__setattr__(self, "returns", kinds)
         for label, value in self.reflectivity.items():
             number(f"lidar reflectivity of label {label}", value, "a number of at least 0", 0.0, 1e9)
@@ -213,8 +213,8 @@ class Lidar:
             isinstance(self.pattern, Spinning) and self.pattern.rings * self.rays > MAX_SIZE
         ):
             raise InputError(
-                f"lidar rays must be at most {MAX_BEAMS:,} in a scan, got {self.pattern.beams:,} beams of "
-                f"{self.rays}"
+                f"a scan of a lidar must have at most {MAX_BEAMS:,} rays, got {self.pattern.beams:,} beams "
+                f"of {self.rays} rays each"
             )
 
     @staticmethod

@@ -159,7 +159,7 @@ class Quality:
     def __post_init__(self) -> None:
         for setting in fields(self):
             value = getattr(self, setting.name)
-            if isinstance(value, np.generic):  # like `own_scalars`, without loading another module
+            if isinstance(value, np.generic):  # not by `own_scalars`, whose module would be loaded too
                 object.__setattr__(self, setting.name, value.item())
 
         def within(name: str, low: float, high: float, low_open: bool, high_open: bool) -> None:

@@ -57,7 +57,7 @@ class Sensor:
     extra_steps: tuple[str, ...] = ()
     """steps of other packages before quantisation, NAME or NAME:NUMBER,NUMBER (docs/effects.md)"""
     decode: str = "linear"
-    """what the frame's colours are: "linear" light, or display colours ("srgb"), which are decoded"""
+    """meaning of the frame's colours: "linear" light, or display colours ("srgb"), which are decoded"""
     veiling_glare: float = 0.0
     """share of the light, 0 to below 1, that the lens scatters evenly over the image"""
     glare_light: tuple[float, ...] = ()
@@ -139,7 +139,7 @@ class Sensor:
         elif self.response == "srgb":
             found.append(("response_srgb", True))
         elif isinstance(self.response, tuple):
-            # a line from 0 to 1 only clamps, which every output does as well
+            # a table from 0 to 1 only clamps, as every output does
             line = np.linspace(0, 1, len(self.response))
             found.append(("response_table", not np.array_equal(self.response, line)))
         found += [(name, True) for name in self.extra]
@@ -153,12 +153,13 @@ class Sensor:
         return glare or self.auto_exposure > 0 or self.white_balance == "grey"
 
     def metered(self, colors: np.ndarray) -> Sensor:
-        """The sensor with numbers instead of what is measured, by an image (h, w, 3) without a sensor."""
+        """The sensor with fixed exposure, white balance and glare, measured in an image (h, w, 3) without a
+        sensor."""
         if not self.meters:
             return self
         mean = to_light(colors, self.decode).reshape(-1, 3).mean(axis=0)
         glare = self.glare_light or tuple(mean.tolist())
-        # scattering changes the mean if glare_light is not the image's
+        # scattering changes the mean if glare_light is given
         mean = (1 - self.veiling_glare) * mean + self.veiling_glare * np.array(glare)
         luminance = max(float(mean @ LUMINANCE), 1 / LARGEST)
         exposure = self.exposure * (self.auto_exposure / luminance if self.auto_exposure > 0 else 1.0)

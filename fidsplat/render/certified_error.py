@@ -176,7 +176,7 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
         return prepare(data, plain)
     if not info.float64:
         raise InputError(
-            f"the output 'error' must have a device with float64, got {info.name} without; use another device"
+            f"the device of the output 'error' must have float64, got {info.name}; use another device"
         )
     bounded = quality.with_(blend_precision="float32")
     if bounded.arithmetic == "approximate":

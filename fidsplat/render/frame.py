@@ -172,7 +172,7 @@ def stack_bands(bands: Iterable[P], render: Callable[[P], Frame]) -> Frame:
         if last is not None:
             copy_rows(*last)
         last = frame, band.rows
-    assert last is not None  # a frame has rows
+    assert last is not None  # there is at least one band
     if not arrays:
         return last[0]
     finish(last[0])

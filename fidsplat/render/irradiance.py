@@ -77,7 +77,8 @@ class LightField:
                 _difference(found[::2, 1::2], (halved[:, 1:] + halved[:, :-1]) / 2),
                 _difference(found[1::2, ::2], (halved[1:] + halved[:-1]) / 2),
             )
-            if error <= 2 * step * found.max():  # that of a coarser grid: halved spacing halves it at least
+            # the error of a grid of twice the spacing, which is at least twice as large
+            if error <= 2 * step * found.max():
                 break
         return field
 

@@ -66,7 +66,7 @@ def lit_scene(scene: Scene, renderer: Any) -> Scene:
 
 
 class _Surroundings:
-    """What is around the lit markers: splats, background and lights, and panoramas of them."""
+    """Surroundings of the lit markers: splats, background and lights, and panoramas of them."""
 
     def __init__(self, scene: Scene, renderer: Any) -> None:
         self.renderer, self.lights, self.camera = renderer, scene.lights, scene.camera
@@ -218,7 +218,7 @@ def _points(placed: PlacedMarker, light: Lighting) -> _Points:
     local = cloud.world_means()[owner]
     for axis in (0, 1):
         local = local + offset[:, axis] * turns[owner, :, axis]
-    # a marker is visible from its -z
+    # the front of a marker faces its -z
     normals = -turns[owner, :, 2] @ pose[:3, :3].T
     clearance = placed.marker.size / 20 if light.clearance is None else light.clearance
     surface = ReceiverPoints(local @ pose[:3, :3].T + pose[:3, 3], normals, pitch, clearance)
@@ -253,7 +253,7 @@ def _field(placed: PlacedMarker, light: Lighting, points: _Points, around: _Surr
     def radiance_at(wanted: np.ndarray) -> np.ndarray:
         nearest = np.array([np.argmin(((places - place) ** 2).sum(axis=1)) for place in wanted])
         local = points.local[nearest].copy()
-        local[:, :2] = wanted  # on the sheet between its splats, too
+        local[:, :2] = wanted  # places between splats are on the sheet too
         at = local @ placed.pose[:3, :3].T + placed.pose[:3, 3]
         at = at + max(surface.clearance, 1e-6) * surface.normals[nearest]
         parts: dict[str, Any] = {"outputs": ("rgb", "alpha")}
@@ -277,7 +277,7 @@ def _field(placed: PlacedMarker, light: Lighting, points: _Points, around: _Surr
     if light.ambient is None and field.radiance.max() < _DARK:
         raise InputError(
             f"the panorama at marker {placed.label}, {placed.marker.spec}, must show something, got black; "
-            "add splats or a background, name ambient light (ambient = [0.5, 0.5, 0.5]), or use light = "
+            "add splats or a background, set ambient light (ambient = [0.5, 0.5, 0.5]), or use light = "
             "'lights'"
         )
     return field
@@ -415,7 +415,7 @@ def _rgb(cloud: SplatCloud) -> np.ndarray:
     colors = cloud.plain_colors
     if colors is None:
         raise InputError(
-            f"a marker with light must have plain colours, got harmonics of degree {cloud.sh_degree}; leave "
+            f"a lit marker must have plain colours, got harmonics of degree {cloud.sh_degree}; leave "
             "out its light"
         )
     return colors

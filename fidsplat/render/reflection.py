@@ -53,7 +53,9 @@ def gloss(
     half = (view + light) / length
     distribution = square / (np.pi * (half**2 * (square - 1) + 1) ** 2)
     masking = 0.5 / (light * _slope(view, square) + view * _slope(light, square))
-    factor = fresnel((1 + along) / length, surface.reflectance)  # by viewer and half vector
+    factor = fresnel(
+        (1 + along) / length, surface.reflectance
+    )  # the cosine is between viewer and half vector
     return np.where(above, distribution * masking * factor * light, 0.0)
 
 
@@ -124,7 +126,7 @@ def fit_harmonics(to_viewer: np.ndarray, colors: np.ndarray) -> np.ndarray:
 
     Directions on the hemisphere alone leave the other one free; the smallest coefficients are chosen.
     """
-    basis = sh_basis(MAX_DEGREE, -to_viewer)  # of the direction from the camera to the splat
+    basis = sh_basis(MAX_DEGREE, -to_viewer)  # harmonics have the direction from camera to splat
     base = colors.mean(axis=1, keepdims=True)
     fitted = np.einsum("kv,nvc->nkc", np.linalg.pinv(basis, rcond=1e-3), colors - base)
     fitted[:, 0] += (base[:, 0] - 0.5) / C0

@@ -107,7 +107,7 @@ class Renderer:
         if isinstance(cloud, ChunkedSplats):
             return ResidentCloud(self.backend, Residency(cloud, self.backend), capture)
         if not isinstance(cloud, SplatCloud):
-            raise InputError(f"cannot render a {type(scene).__name__}; give a Scene, a SplatCloud or a Store")
+            raise InputError(f"scene must be a Scene, a SplatCloud or a Store, got {type(scene).__name__}")
         with self._lock:
             return ResidentCloud(self.backend, self.backend.upload(cloud), capture, cloud.labels)
 
@@ -150,7 +150,7 @@ class Renderer:
         """
         check_process(self._process, "Renderer")
         if (colors is None) == (sh is None):
-            raise InputError("give exactly one of colors (n, 3) and sh (n, k, 3)")
+            raise InputError("exactly one of colors (n, 3) and sh (n, k, 3) must be given, got both or none")
         arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
         arrays |= {"colors": colors} if sh is None else {"sh": sh}
         arrays |= {} if labels is None else {"labels": labels}
@@ -402,7 +402,7 @@ class Renderer:
         return resident
 
     def _metered(self, resident: ResidentCloud, capture: Capture) -> Capture:
-        """The capture with a sensor of numbers only: what it measures is measured in a small frame."""
+        """The capture with the sensor settings that are measured, from a small frame."""
         camera = capture.camera
         if not capture.sensor.meters or camera is None:
             return capture

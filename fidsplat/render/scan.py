@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 LINK_FROM_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 """the lidar's axes (x forward, y left, z up) from those of a camera (z forward, y down)"""
-_REFERENCE = 0.1  # reflectivity of `Lidar.detection_range`
-_ODDS = 9  # of a probability of 90 %
-_SHARPNESS = 4  # power of the signal in the odds of detection: from 90 % to 10 % by a factor of 3
+_REFERENCE = 0.1  # reflectivity for which `Lidar.detection_range` is stated
+_ODDS = 9  # odds of a detection at that range: a probability of 90 %
+_SHARPNESS = 4  # power of the signal in the odds: a third of the signal is detected with 10 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,7 +311,7 @@ def _returns(rays: dict[str, np.ndarray], lidar: Lidar) -> dict[str, np.ndarray]
     ranges, hit = sorted_["range"], sorted_["range"] > 0
     starts = np.diff(np.where(hit, ranges, 0.0), axis=1, prepend=-np.inf) > lidar.separation
     group = np.clip(np.cumsum(starts & hit, axis=1) - 1, 0, count - 1)
-    # dark surfaces return something too, so that a group without signal has a range
+    # 1e-9: a group of black surfaces has a range too
     signal = np.where(hit, (sorted_["intensity"] + 1e-9) / np.where(hit, ranges, 1.0) ** 2, 0.0)
     beams = np.arange(len(ranges))[:, None]
 
@@ -347,7 +347,7 @@ def _measure(found: dict[str, np.ndarray], lidar: Lidar, random: np.random.Gener
     ranges = found["range"]
     kept = (ranges >= lidar.near) & (ranges <= lidar.far)
     if math.isfinite(lidar.detection_range):
-        signal = found["intensity"] * lidar.detection_range**2 / _REFERENCE  # times the square of the range
+        signal = found["intensity"] * lidar.detection_range**2 / _REFERENCE  # signal times the squared range
         signal, lost = _ODDS * signal**_SHARPNESS, ranges ** (2 * _SHARPNESS)
         kept &= random.random(ranges.shape) * (signal + lost) < signal
     if lidar.dropouts:

@@ -37,7 +37,7 @@ class ReceiverPoints(NamedTuple):
 
 
 class LightPoint(NamedTuple):
-    """One of the points of a light from which its shadows are rendered."""
+    """A point of a light, from which a shadow map is rendered."""
 
     light: Light
     place: np.ndarray
@@ -166,7 +166,7 @@ def _affine(pixels: np.ndarray) -> np.ndarray:
 def _bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Values of an image (h, w) at pixel coordinates (m, 2); 1 outside."""
     height, width = image.shape
-    inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)  # False for NaN
+    inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)  # NaN is outside
     x, y = np.clip(np.where(inside.reshape(-1, 1), pixels, 0) - 0.5, 0, (width - 1, height - 1)).T
     left, top = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
     right, below = x - left, y - top

@@ -39,7 +39,7 @@ class DistanceField:
         self.voxel, self.origin = voxel, np.asarray(origin, np.float64)
         self.keys = np.empty(0, np.int64)
         """sorted keys of the blocks"""
-        self._sums = np.empty((0, SIDE**3, 6), np.float32)  # weight, distance, colour, its weight
+        self._sums = np.empty((0, SIDE**3, 6), np.float32)  # weight, distance, colour, weight of the colour
 
     def allocate(self, depth: np.ndarray, camera: Camera) -> None:
         """Add the blocks around the surface of a depth image (h, w), 0 where empty."""

@@ -26,7 +26,8 @@ def all_scales(cloud: Any) -> np.ndarray:
 
 
 def rows_beyond(array: np.ndarray, limit: float) -> np.ndarray | None:
-    """Which rows hold a value that is not finite or beyond +-limit; None, at no cost in memory, if none."""
+    """Mask of the rows with a value that is not finite or beyond +-limit; None, without a copy, if there is
+    none."""
     with np.errstate(invalid="ignore"):
         if not array.size or (array.min() >= -limit and array.max() <= limit):  # false where there is a NaN
             return None
@@ -62,7 +63,7 @@ def find_defects(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, dict
 
 
 def drop_report(dropped: dict[str, int], n: int, source) -> str:
-    """What a warning says about splats that are left out."""
+    """Text of the warning about splats that are left out."""
     parts = ", ".join(f"{reason}: {count}" for reason, count in dropped.items())
     start = "" if source is None else f"{source}: "
     total = sum(dropped.values())
@@ -74,7 +75,8 @@ _STORED = {
     "scale not above 0": "scales are standard deviations in metres: take exp() of logarithms",
     "opacity outside [0, 1]": "opacities are from 0 to 1: take the sigmoid of logits",
 }
-"""what trainers keep instead, as files do: said where more than a quarter of all are left out for it"""
+"""hints for a reason by which more than a quarter of all splats are left out: often the raw parameters of
+trainers were given"""
 
 
 def square_of(quats: np.ndarray) -> np.ndarray:

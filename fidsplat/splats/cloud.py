@@ -102,7 +102,7 @@ class SplatCloud(PickledByFields, Summarised):
         shapes: dict[str, tuple[int, ...]] = {"quats": (n, 4), "opacities": (n,)}
         shapes["scales"] = (n, 3) if thick else (n, 2)
         if (colors is None) == (sh is None):
-            raise InputError("give exactly one of colors (n, 3) and sh (n, k, 3)")
+            raise InputError("exactly one of colors (n, 3) and sh (n, k, 3) must be given, got both or none")
         if colors is not None:
             arrays["colors"] = check_scale(real_numbers("colors", colors))
             shapes["colors"] = (n, 3)
@@ -249,7 +249,7 @@ class SplatCloud(PickledByFields, Summarised):
         Raises InputError for an empty cloud.
         """
         if not len(self):
-            raise InputError("an empty cloud has no bounds")
+            raise InputError("bounds must be of at least one splat, got an empty cloud")
         reach = self.reach(3.0)
         return (self.means - reach).min(axis=0) + self.origin, (self.means + reach).max(axis=0) + self.origin
 
@@ -353,7 +353,7 @@ class SplatCloud(PickledByFields, Summarised):
         mask = np.full(len(self), mask) if mask.ndim == 0 else mask.copy()
         check_one_footprint(self.coplanar_groups, mask)
         if self.thickness is not None and (self.thickness[np.flatnonzero(mask)] > 0).any():
-            raise InputError("a box has no thickness, but some of these splats are 3D Gaussians")
+            raise InputError("boxes must have a thickness of 0, got 3D Gaussians among them")
         return self._replaced(boxes=mask if mask.any() else None)
 
     @staticmethod
@@ -370,7 +370,7 @@ class SplatCloud(PickledByFields, Summarised):
             clouds = [None]  # type: ignore[list-item]
         for cloud in clouds:
             if not isinstance(cloud, SplatCloud):
-                raise InputError(f"concatenate takes a list of SplatCloud, not of {type(cloud).__name__}")
+                raise InputError(f"clouds must be a list of SplatCloud, got {type(cloud).__name__}")
         dropped = dict(sum((Counter(cloud.dropped) for cloud in clouds), Counter[str]()))
         filled = [cloud for cloud in clouds if len(cloud)]
         if not filled:

@@ -81,7 +81,7 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
     if m.shape != (4, 4):
         raise InputError(f"{name} must be a 4x4 matrix, got shape {m.shape}")
     if not (np.isfinite(m).all() and (np.abs(m[:3, 3]) <= LARGEST).all()):
-        raise InputError(f"{name} holds a value that is not finite, or moves by more than {LARGEST:g} metres")
+        raise InputError(f"{name} must be finite, and move by at most {LARGEST:g} metres, got other values")
     if not np.array_equal(m[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(f"{name} must have the last row (0, 0, 0, 1), got {tuple(m[3].tolist())}")
     linear = m[:3, :3]
@@ -99,9 +99,7 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
         )
     (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
     if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:  # the determinant
-        raise InputError(
-            f"{name} holds a reflection (its determinant is negative); only rotations are possible"
-        )
+        raise InputError(f"{name} must be a rotation, got a reflection (its determinant is negative)")
     if rigid:
         if abs(scale - 1.0) > 1e-6:
             raise InputError(f"{name} must be rigid (rotation and translation), got scale {scale:g}")

@@ -96,7 +96,7 @@ class ChunkedSplats:
         """Axis-aligned box (min (3,), max (3,)) float64, world, around all splats."""
         boxes = [part.bounds() for part in (*self.stores, self.in_memory) if len(part)]
         if not boxes:
-            raise InputError("a scene without splats has no bounds")
+            raise InputError("bounds must be of at least one splat, got an empty scene")
         low, high = zip(*boxes, strict=True)
         return np.min(low, axis=0), np.max(high, axis=0)
 

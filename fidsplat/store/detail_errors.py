@@ -39,7 +39,7 @@ class DetailSettings:
         if isinstance(self.views, bool) or not isinstance(self.views, int) or not 1 <= self.views <= 10_000:
             raise InputError(f"views must be a whole number from 1 to 10,000, got {self.views!r}")
         if unknown := set(self.lowpass) - set(LOWPASS):
-            raise InputError(f"lowpass must be among {', '.join(LOWPASS)}, got {min(unknown)!r}")
+            raise InputError(f"lowpass must be one or more of {', '.join(LOWPASS)}, got {min(unknown)!r}")
 
 
 @dataclass(frozen=True)

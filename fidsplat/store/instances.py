@@ -58,7 +58,10 @@ def place_store(
     """
     source = store if isinstance(store, Store) else Store(store)
     if source.poses is not None:
-        raise InputError(f"{source.path} is instanced itself; place {source.header.store} instead")
+        raise InputError(
+            f"{source.path} must not have instances itself, got an instanced store; place "
+            f"{source.header.store} instead"
+        )
     if source.has_coplanar_groups:
         raise InputError(
             f"{source.path} has coplanar groups, which cannot be instanced; put markers into a scene file"

@@ -83,7 +83,7 @@ def _cells(codes: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
     # number of levels at which neighbouring splats in Morton order differ
     _, exponents = np.frexp((ordered[1:] ^ ordered[:-1]).astype(np.float64))
     differing = np.bincount((exponents + 2) // 3, minlength=BITS + 2)
-    cells = 1 + np.cumsum(differing[::-1])[::-1]  # [s + 1]: number of cells that combine s levels
+    cells = 1 + np.cumsum(differing[::-1])[::-1]  # cells[s + 1]: number of cells that combine s levels
     shift = int(np.argmax(np.append(cells[1:], 0) <= target))
     while True:
         keys = (codes >> np.uint64(3 * min(shift, BITS))) * np.uint64(_CLASSES) + classes

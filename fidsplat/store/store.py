@@ -123,7 +123,7 @@ class Store(Summarised):
             facts["levels"].append({"level": level, **row, "cell_m": float(np.median(own["size"]))})
         return facts | {"bounds": list(self.bounds()) if len(self) else None}
 
-    # traits, like those of a cloud
+    # properties that select kernels (`CloudTraits`)
 
     @property
     def sh_degree(self) -> int:
@@ -186,7 +186,7 @@ class Store(Summarised):
         low, high = self.boxes(sigmas)
         leaves = np.tile(self.nodes["level"] == 0, self.instances)
         if not leaves.any():
-            raise InputError("an empty store has no bounds")
+            raise InputError("bounds must be of at least one splat, got an empty store")
         return low[leaves].min(axis=0) + self.origin, high[leaves].max(axis=0) + self.origin
 
     @cached_property

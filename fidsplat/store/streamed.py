@@ -127,7 +127,7 @@ def export_streamed(store: Store, path: Path) -> None:
     if store.poses is not None:
         raise InputError(
             f"a store written as streamed SOG must have no instances, got {len(store.poses):,}; write the "
-            "one it places"
+            "store of which they are instances"
         )
     nodes, origin = store.nodes, np.array(store.origin)
     level, parent = nodes["level"], nodes["parent"]

@@ -101,9 +101,7 @@ class OcclusionCulling:
             if few and not subchunks:
                 self._pause = _PAUSE if bands[0].count > _MAX_VISIBLE * full.count else 0
                 return bands, images
-            if few and not any(
-                side % full.view.samples for side in termination.tile
-            ):  # no pixel in two tiles
+            if few and not any(side % full.view.samples for side in termination.tile):  # no pixel spans tiles
                 tiles = band.contributing_tiles(subchunks, here)
                 patch = full.with_rows(*_rows(tiles, full, termination)).without_occluded(
                     termination.within(tiles)

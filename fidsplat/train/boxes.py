@@ -54,7 +54,7 @@ def read_boxes(file: Path, given: Any) -> tuple[MarkerBox, ...]:
 
 
 def outside_boxes(points: np.ndarray, matrices: Sequence[np.ndarray]) -> np.ndarray:
-    """Which points (n, 3) are outside all boxes, (n,) bool."""
+    """Mask (n,) of the points (n, 3) that are outside all boxes."""
     outside = np.ones(len(points), bool)
     for box in matrices:
         local = np.linalg.solve(box[:3, :3], (points - box[:3, 3]).T)

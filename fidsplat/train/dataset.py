@@ -48,8 +48,8 @@ class TrainingView:
         if self.image.dtype != np.uint8 or shape != (camera.height, camera.width, 3):
             size = f"{shape[1]} x {shape[0]}" if len(shape) >= 2 else f"the shape {shape}"
             raise InputError(
-                f"the image {self.name} must be {camera.width} x {camera.height} pixels of uint8, as its "
-                f"camera, got {size}; give images of the size for which their cameras were found"
+                f"the image {self.name} must be {camera.width} x {camera.height} pixels of uint8, the "
+                f"size of its camera, got {size}; give images of the size for which their cameras were found"
             )
         mask = self.mask
         if mask is not None and not (isinstance(mask, np.ndarray) and mask.dtype == bool and mask.ndim == 2):
@@ -113,8 +113,8 @@ class Dataset:
             )
         if not self.extent > _MIN_EXTENT * max(np.abs(view.camera.position).max() for view in self.views):
             raise InputError(
-                f"the {len(self.views)} cameras of {self.name} must be at different positions, got one, "
-                "which determines no depth; give views from different positions"
+                f"the {len(self.views)} cameras of {self.name} must be at different positions, got one "
+                "position, from which depths cannot be determined; give views from different positions"
             )
         if wrong := np.count_nonzero(~np.isfinite(self.points).all(axis=-1)):
             raise InputError(

@@ -24,7 +24,7 @@ _SHRINK = 0.8 * COPIES
 
 
 class Densification(NamedTuple):
-    """One round of cloning, splitting and pruning, as indices into the splats before it."""
+    """A round of cloning, splitting and pruning, as indices into the earlier splats."""
 
     rows: np.ndarray
     """(m,) uint32: source of each splat: first the remaining ones in their order, then clones, then splits"""

@@ -38,8 +38,7 @@ class Splats:
 
     values: Arrays
     """means (n, 3) metres relative to the origin, log_scales (n, 2) of disks or (n, 3) of 3D Gaussians, quats
-    (n, 4) of any length, logits (n,)
-    of the opacities, sh (n, k, 3)"""
+    (n, 4) of any length, logits (n,) of the opacities, sh (n, k, 3)"""
     first: Arrays
     """Adam's first moments, in the same shapes"""
     second: Arrays

@@ -1,1 +1,1 @@
-"""Files, errors, interrupts, limits and timing: what every package may import."""
+"""Files, errors, interrupts, limits and timing, for all packages."""

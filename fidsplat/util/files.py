@@ -33,7 +33,7 @@ def path_of(path: str | os.PathLike[str]) -> Path:
         len(os.fsencode(part)) > MAX_NAME for part in Path(name).parts
     ):
         raise InputError(
-            f"a file name must have at most {MAX_NAME} bytes and a path {MAX_PATH}, got {name!r}"
+            f"a file name must have at most {MAX_NAME} bytes, and a path {MAX_PATH} bytes, got {name!r}"
         )
     try:
         os.stat(name)
@@ -88,7 +88,7 @@ def regular_file(path: str | os.PathLike[str]) -> Path:
 
 
 def kind_of(path: Path) -> str:
-    """What a path is, for messages: a file, a folder, a pipe, nothing and so on."""
+    """Kind of a path for messages: a file, a folder, a pipe, nothing and so on."""
     try:
         return _KINDS.get(stat.S_IFMT(path.stat().st_mode), "something else")
     except OSError:

@@ -1,8 +1,10 @@
 """Interleaved timing: compared functions run alternately, so that disturbances affect all of them.
 
+```python
 ours, theirs = Timer(render_ours), Timer(render_theirs)
 time_interleaved([ours, theirs], rounds=20)
 ours.median, theirs.quartiles, ratios(ours, theirs)
+```
 """
 
 from __future__ import annotations
@@ -45,9 +47,11 @@ class Timer:
         Args:
             work: function that returns when the work is complete. It may return milliseconds of its parts by
                 name.
-            clock: time in seconds. parts: converts the result of `work` to milliseconds by name, such as
-            `frame.timings`; not timed. catch_errors: store a FidsplatError of `work` in `error` and stop
-            timing it, instead of raising it.
+            clock: time in seconds.
+            catch_errors: store a FidsplatError of `work` in `error` and stop timing it, instead of raising
+                it.
+            parts: function that converts the result of `work` to milliseconds by name, such as
+                `frame.timings`; not timed.
         """
         self._work, self._clock, self._catch_errors, self._parts = work, clock, catch_errors, parts
         self.ms: list[float] = []

@@ -205,7 +205,7 @@ def test_a_pickled_frame_is_regenerated_by_its_capture(renderer):
     frame = renderer.render(scene, motion=moved, shutter=fs.Shutter(0.1, exposure_time=0.1, readout=0.2))
     again = pickle.loads(pickle.dumps(frame))
     assert np.array_equal(renderer.render(scene, again.capture)["rgb"], frame["rgb"])
-    with pytest.raises(fs.InputError, match="time must be one that this motion was sampled at"):
+    with pytest.raises(fs.InputError, match="time must be a sampled time of this motion"):
         again.capture.motion.camera_at(7.0)
 
 

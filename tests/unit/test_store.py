@@ -297,7 +297,7 @@ def test_an_instanced_store_repeats_the_splats(store, files, tmp_path):
         if flat.nodes["level"][one] == 0:
             first = int(street.first_of(np.array([number]))[0])
             assert np.array_equal(cloud.means[first : first + len(part["means"])], part["means"])
-    with pytest.raises(fs.InputError, match="is instanced itself"):
+    with pytest.raises(fs.InputError, match="got an instanced store"):
         fs.place_store(street, tmp_path / "q.fss", poses)
     with pytest.raises(fs.InputError, match="pose 1 must be rigid"):
         fs.place_store(flat, tmp_path / "q.fss", [np.eye(4), np.diag([2.0, 2, 2, 1])])

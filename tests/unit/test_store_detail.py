@@ -245,7 +245,7 @@ def test_stores_without_detail_are_refused(store, renderer, tmp_path):
         measure_detail(placed, renderer)
     with pytest.raises(fs.InputError, match=r"views must be .* got 0"):
         measure_detail(store, renderer, views=0)
-    with pytest.raises(fs.InputError, match="among screen, pixel, none"):
+    with pytest.raises(fs.InputError, match="one or more of screen, pixel, none"):
         measure_detail(store, renderer, lowpass=("box",))
     flat = fs.Store(fs.build_store([City(300).source], tmp_path / "flat.fss", levels=False))
     with pytest.raises(fs.InputError, match="no levels of detail"):

@@ -117,7 +117,7 @@ class Source:
 
     @property
     def text(self) -> str:
-        """The text of all programs as it is compiled."""
+        """The compiled text of all programs, without comments."""
         return "".join(program.compiled for program in self.programs.values())
 
     @property

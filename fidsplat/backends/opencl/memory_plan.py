@@ -45,7 +45,7 @@ _OF_CAMERAS = {"ray", "vignette_center"}
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """How one frame, or a part of a batch, is divided, and the bytes of its buffers."""
+    """Division of a frame, or of a part of a batch, and the bytes of its buffers."""
 
     chunk: int
     """splats that are projected at once; 0: all, without packing the visible ones"""

@@ -279,7 +279,7 @@ class OpenCLPipeline(Pipeline):
         if self.shape.lists != "tiled":
             return self
         if plan.chunk:
-            return self._listing("ordered")  # as for single views in chunks
+            return self._listing("ordered")  # the only strategy of frames in chunks
         few = len(views) > 1 and self._planner.tiles(views.view) <= tiling.LOCAL_TILES
         return self._listing("local") if few or resident.coherent else self
 

@@ -235,7 +235,7 @@ class WarpPipeline(Pipeline):
         cached.token = token
 
     def _token(self, cached: _CachedFrame, view: View, reserved: int) -> tuple[Any, ...]:
-        """Everything on which the launches depend, except the numbers of the views."""
+        """Key of the launches of a frame: all their arguments except the numbers of the views."""
         workspace, labels = self.workspace, tuple(label for label, _ in view.groups)
         budgets = workspace.memory_budget, workspace.pair_budget, reserved
         states = workspace.pool.state, cached.inputs.state

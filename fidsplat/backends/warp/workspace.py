@@ -102,8 +102,8 @@ class ArrayPool:
             return wp.empty(max(size, 1), dtype=dtype, device=self.device)
         except (RuntimeError, MemoryError, ValueError) as error:  # ValueError: 2^31 elements and more
             raise DeviceError(
-                f"{name} needs {bytes_words(size * wp.types.type_size_in_bytes(dtype))}, which "
-                f"more than {self.device} has; use fewer splats or a smaller image"
+                f"{name} needs {bytes_words(size * wp.types.type_size_in_bytes(dtype))}, more "
+                f"than {self.device} has; use fewer splats or a smaller image"
             ) from error
 
 
