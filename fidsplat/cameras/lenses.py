@@ -19,7 +19,7 @@ from fidsplat.util.errors import InputError
 FISHEYE_LIMIT = math.radians(100)
 """largest angle of a fisheye from its axis: a field of view of 200 degrees"""
 MAX_COEFFICIENT = 1e12
-"""largest size of a lens coefficient: far beyond invertible ones, and products of several stay finite"""
+"""largest size of a lens coefficient: beyond those of invertible lenses, but products of several stay finite"""
 _STEPS = 4096  # entries of the table of start values for Newton's iteration
 _ITERATIONS = 12
 _LOWEST = math.cos(math.radians(1))  # the stereographic projection maps -z to infinity
@@ -149,8 +149,7 @@ class BrownConrady:
         return np.where(visible[:, None], np.stack([x, y, np.ones_like(x)], 1), np.nan)
 
     def _undistorted(self, distance: np.ndarray) -> np.ndarray:
-        """tan of the angles at which the radial part, without the others, has these distances from the
-        centre."""
+        """tan of the angles whose images have these distances from the centre, by the radial part alone."""
         symmetric = BrownConrady(self.k1, self.k2, self.k3, self.k4, self.k5, self.k6)
 
         def radial(tangent: np.ndarray) -> np.ndarray:
@@ -334,7 +333,7 @@ class RayTable:
     along_ray: ClassVar[bool] = True
     does_nothing: ClassVar[bool] = False
     uniforms: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0, 0.0, -1.0)
-    """of a fisheye whose field of view is empty, so that no centre has an image"""
+    """uniforms of a fisheye with an empty field of view, so that no splat's centre has an image"""
 
     def __post_init__(self) -> None:
         given = real_array("directions", self.directions)
@@ -415,6 +414,6 @@ def _first_root(polynomial: np.polynomial.Polynomial) -> float:
 
 
 def _scaled(a: np.ndarray, b: np.ndarray, length: np.ndarray, target: np.ndarray):
-    """(a, b) with another length; 0 stays 0."""
+    """Vectors (a, b) scaled to another length; 0 stays 0."""
     factor = target / np.where(length > 0, length, 1.0)
     return a * factor, b * factor

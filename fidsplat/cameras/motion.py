@@ -36,7 +36,7 @@ class Shutter:
     exposure_time: float = 0.0
     """seconds that each row is exposed; the image is the mean of `sub_poses` sub-frames"""
     sub_poses: int = 8
-    """n: one pose in the middle of each n-th of the exposure time"""
+    """number n of poses of an exposure, one in the middle of each n-th of the exposure time"""
     readout: float = 0.0
     """seconds from the first row's exposure to the last's (rolling shutter)"""
     rows_per_band: int = 8

@@ -1,4 +1,4 @@
-"""Rays of an image's samples and their inverse, the tables of a lens that devices read."""
+"""Tables of a lens for devices: the ray of each sample, and the samples in each cell of directions."""
 
 from __future__ import annotations
 

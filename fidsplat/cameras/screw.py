@@ -8,13 +8,13 @@ from fidsplat.splats.rotations import matrix_to_quaternion
 
 
 def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
-    """The rigid pose (4, 4) that share of the way along the screw motion from one to another."""
+    """The rigid pose (4, 4) at a share of the screw motion from one pose to another."""
     return start @ exponential(twist(start, end) * share)
 
 
 def twist(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Axis times angle, and velocity (6,), in the axes of start, of the screw motion that takes time 1 from
-    one rigid pose (4, 4) to another."""
+    """The twist (6,) of the screw motion that moves one rigid pose (4, 4) to another in time 1: axis times
+    angle, and velocity, in the axes of `start`."""
     turn = start[:3, :3].T @ end[:3, :3]
     move = start[:3, :3].T @ (end[:3, 3] - start[:3, 3])
     axis = _rotation_vector(turn)

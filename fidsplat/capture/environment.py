@@ -70,7 +70,7 @@ class Panorama(PickledByFields):
     image: np.ndarray
     """(h, w, 3) float32 RGB, read-only; uint8 is divided by 255, uint16 by 65535"""
     file: str | None = None
-    """its file"""
+    """file of the image"""
 
     def __post_init__(self) -> None:
         given = array_of("background: a panorama", self.image, "(h, w, 3) numbers", "fiu")
@@ -152,7 +152,7 @@ class ExternalDepth(PickledByFields):
 
     @property
     def stacked(self) -> bool:
-        """Whether it has the images of all views of a batch."""
+        """Whether these are the images of all views of a batch."""
         return len(self.depth.shape) > 2
 
     @property

@@ -174,9 +174,9 @@ class Lidar:
     """poses of a scan while something moves; a beam is up to duration / (2 bands) away from the time of its
     pose. At most the number of columns"""
     seed: int = 0
-    """of noise and detection, 0 to 2^32 - 1"""
+    """seed of noise and detection, 0 to 2^32 - 1"""
     source: str = ""
-    """where the values of a preset come from"""
+    """source of the values of a preset"""
 
     def __post_init__(self) -> None:
         own_scalars(self)

@@ -95,7 +95,8 @@ def cutoff_of(splats: int) -> float:
 
 
 def ideal_quality(quality: Quality, cutoff: float) -> Quality:
-    """The quality with this cut-off, no transmittance stop, no opacity ceiling and a float64 set-up."""
+    """The quality of the second rendering: a smaller cut-off, no transmittance stop, no opacity ceiling and a
+    float64 set-up."""
     return quality.with_(
         alpha_cutoff=cutoff,
         detail_error=0.0,
@@ -108,7 +109,7 @@ def ideal_quality(quality: Quality, cutoff: float) -> Quality:
 
 @dataclass(frozen=True)
 class Ideal:
-    """Features and view of the ideal's rendering, and its error bound."""
+    """Features and view of the second rendering, which approximates the ideal image, and its error bound."""
 
     features: FeatureSet
     view: View

@@ -34,9 +34,9 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.response import to_light
 
 FINEST = 8
-"""parts per module along a side of a box, the smallest that light is measured on"""
+"""number of the smallest parts of a box per module, each with its own measurement of light"""
 MOST = 256
-"""measured points along a side of a square marker, at most"""
+"""maximum number of measured points along a side of a square marker"""
 SMOOTHEST = 0.5
 """smallest roughness whose reflections harmonics of degree 3 represent (docs/effects.md)"""
 MEASURING = "fast,lowpass=none,samples=2"
@@ -47,7 +47,7 @@ _CHUNK = 256
 _SAME = 0.03
 """radians between normals of a bent marker that share the reflection of a panorama"""
 _WALL = 0.1
-"""metres around a light in which splats on all sides mean that it is inside of something"""
+"""metres: a light with splats on all sides within this distance is inside an object"""
 
 
 def lit_scene(scene: Scene, renderer: Any) -> Scene:
@@ -89,7 +89,7 @@ class _Surroundings:
 
     @cached_property
     def black(self) -> tuple[Any, np.ndarray, np.ndarray]:
-        """The splats on the device without colour, and their bounding box."""
+        """The splats on the device in black, for shadow maps, and their bounding box."""
         cloud = self.scene.cloud()
         black = _rebuilt(cloud, colors=np.zeros((len(cloud), 3), np.float32))
         low, high = cloud.bounds() if len(cloud) else (np.zeros(3), np.zeros(3))

@@ -20,7 +20,7 @@ from fidsplat.util.arguments import items, number
 from fidsplat.util.errors import InputError
 
 VIEWS, SIDE, FOV = 64, 512, math.radians(50.0)
-"""number, pixels per side and field of view of the views around a scene"""
+"""views around a scene: their number, pixels per side and field of view"""
 RESOLUTION = 200
 """voxels along the longest side of a scene"""
 _TINY = 1e-300

@@ -198,7 +198,7 @@ def _resident(scene: Any, renderer: Renderer | None) -> tuple[Renderer, Any]:
 
 @dataclass(frozen=True)
 class _Request:
-    """A scan that is requested, except the pose."""
+    """Arguments of a scan, except the pose."""
 
     lidar: Lidar
     base: Capture
@@ -219,7 +219,7 @@ class _Request:
 
     @property
     def moving(self) -> bool:
-        """Whether something moves during the scan."""
+        """Whether the lidar or a group of splats moves during the scan."""
         return not self.motion.is_still
 
     def capture(self, pose: Any) -> Capture:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 MAX_PIXELS = 512
 """pixels of a shadow map along a side"""
 _MARGIN = 4
-"""pixels around the marker"""
+"""width of the border around the marker [pixels]"""
 _WIDEST = np.tan(np.radians(80))
 """tangent of the largest half field of view of a shadow map; beyond it there are no shadows"""
 
@@ -43,7 +43,7 @@ class LightPoint(NamedTuple):
     place: np.ndarray
     """(3,) its position; of a sun the direction of its light"""
     share: float
-    """of the light's intensity"""
+    """share of the light's intensity"""
 
     def arriving(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Unit directions (m, 3) towards the light, and irradiance (m, 3) of facing surfaces without

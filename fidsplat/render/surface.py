@@ -158,7 +158,8 @@ def _ray_camera(ray) -> Camera:
 
 
 def _patch(camera: Camera, pixel: tuple[float, float], radius: float) -> Camera:
-    """The camera of the square of this half side around a pixel, in `SAMPLES` samples per side."""
+    """A camera that images only the square of half side `radius` around a pixel, in `SAMPLES` samples per
+    side."""
     zoom = SAMPLES / (2 * radius)
     cx = (camera.cx - pixel[0] + radius) * zoom
     cy = (camera.cy - pixel[1] + radius) * zoom

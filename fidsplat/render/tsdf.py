@@ -18,7 +18,7 @@ SIDE = 8
 TRUNCATION = 2.0
 """voxels"""
 GRAZING = 0.2
-"""smallest cosine of a pixel that is used: depths at silhouettes are those of neither side"""
+"""smallest cosine between ray and normal of a pixel that is used: at silhouettes depths are of no surface"""
 EMPTY = 0.05
 """weight of an observation in front of the truncation band"""
 CHUNK = 1024

@@ -37,7 +37,8 @@ def rows_beyond(array: np.ndarray, limit: float) -> np.ndarray | None:
 
 
 def find_defects(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, dict[str, int]]:
-    """(mask of the rows to keep, or None for all; reason -> count), each row under its first reason."""
+    """Mask of the rows to keep, or None for all; and the number of other rows by reason, each under its
+    first."""
     bad: np.ndarray | None = None
     dropped: dict[str, int] = {}
     s, o = arrays["scales"], arrays["opacities"]
@@ -146,7 +147,7 @@ def _is_frozen(array) -> bool:
 
 
 def as_single(array: np.ndarray) -> np.ndarray:
-    """C-ordered, unshared float32 array; an overflow becomes inf."""
+    """A C-ordered float32 array that nobody else can change; an overflow becomes inf."""
     if array.dtype == F32 and array.flags.c_contiguous and _is_frozen(array):
         return array
     with np.errstate(over="ignore"):
@@ -175,8 +176,8 @@ def choose_origin(means: np.ndarray, single: np.ndarray, scales: np.ndarray) -> 
 
 
 def unit_quaternions(quats: np.ndarray) -> np.ndarray:
-    """Normalised quaternions. Those already normalised to float32 rounding are unchanged, so it is
-    idempotent."""
+    """Normalised quaternions. Quaternions that are normalised up to float32 rounding stay unchanged, so
+    normalising twice has no effect."""
     unit = quats  # only arrays of the cloud are writable
     for start in range(0, len(quats), 4096):  # bounds the float64 copy
         part = slice(start, start + 4096)

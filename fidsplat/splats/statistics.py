@@ -17,7 +17,7 @@ GROUND, FRONTAL = 0.2, 0.95
 """shares of the area: level areas of at least GROUND define the up axis; above FRONTAL, facing z, they are a
 marker"""
 SAMPLE = 100_000
-"""largest number of splats that the up axis is guessed from"""
+"""maximum number of splats from which the up axis is guessed"""
 
 
 class Up(NamedTuple):
@@ -27,7 +27,7 @@ class Up(NamedTuple):
     """for example `-y`"""
     reason: str
     ground: bool
-    """whether it follows from level areas"""
+    """whether the guess follows from level areas"""
 
     @property
     def direction(self) -> np.ndarray:

@@ -32,7 +32,7 @@ class CloudTraits(Protocol):
 
 
 class PlacedTraits(CloudTraits, Protocol):
-    """These properties and the origin of a cloud."""
+    """`CloudTraits` and the origin of a cloud."""
 
     @property
     def origin(self) -> np.ndarray:

@@ -51,7 +51,7 @@ class DetailErrors:
     level: int
     """highest level of the rendered nodes"""
     sizes: tuple[float, ...]
-    """samples, rising: cells below this size on the image are merged"""
+    """increasing sizes [samples]: cells that are smaller on the image are merged"""
     errors: tuple[float | None, ...]
     """for each size the largest rgb error over all views; None if no view had cells of about this size"""
     views: int

@@ -82,7 +82,7 @@ class Header:
     chunk: int
     """maximum number of splats of a chunk"""
     origin: tuple[float, float, float]
-    """metres: the world's position of the means' zero"""
+    """metres: world position of the means' zero"""
     sh_degree: int
     """-1: plain colours"""
     columns: dict[str, str]

@@ -266,7 +266,7 @@ class Store(Summarised):
         return self.nodes["count"][self._checked(numbers) % max(len(self.nodes), 1)]
 
     def _checked(self, numbers: np.ndarray) -> np.ndarray:
-        """Validate numbers of nodes (k,)."""
+        """Numbers of nodes (k,) as int64. Raises InputError if one does not exist."""
         given, count = real_array("numbers", numbers), self.instances * len(self.nodes)
         if not ((given == np.rint(given)) & (given >= 0) & (given < count)).all():
             raise invalid("numbers", f"whole numbers of nodes, 0 to {count - 1}", numbers)

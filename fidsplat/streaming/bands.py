@@ -27,8 +27,8 @@ from fidsplat.streaming.occlusion_test import contributing_tiles, node_keys, occ
 _MIN_ROWS = 16
 """pixels"""
 _MAX_OVERLAP = 1.6
-"""a band is not split if its halves together need more than this times its splats; with a fisheye each half
-may need all"""
+"""a band is split if its halves together have at most this many times its splats; with a fisheye each half may
+need all"""
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Band:
 
     @property
     def missing(self) -> NodeMasks:
-        """Visible nodes from which it is not rendered."""
+        """Visible nodes from which the band is not rendered."""
         return tuple(each & ~own for each, own in zip(self.visible, self.nodes, strict=True))
 
     def occluded(self, termination: TerminationDepths) -> NodeMasks:
@@ -150,14 +150,14 @@ class Band:
 
     @cached_property
     def selection(self) -> Selection:
-        """Chunks, or rows of chunks, from which it is rendered."""
+        """Chunks, or rows of chunks, from which the band is rendered."""
         if self.subchunks is None:
             return Selection.of(self.nodes)
         return Selection.of_subchunks([each.only(used) for each, used in self.subchunks])
 
     @cached_property
     def count(self) -> int:
-        """Number of splats from which it is rendered."""
+        """Number of splats from which the band is rendered."""
         if self.subchunks is None:
             return self.count_of(self.nodes) + len(self.scene.in_memory)
         return sum(int(each.rows[used].sum()) for each, used in self.subchunks) + len(self.scene.in_memory)
@@ -168,7 +168,7 @@ class Band:
 
     @property
     def halves(self) -> list[Band]:
-        """The two halves of its rows; empty if splitting does not help."""
+        """Bands of the upper and the lower half of the rows; empty if splitting does not help."""
         first, end = self.rows
         middle = (first + end) // 2
         if end - first < 2 * _MIN_ROWS or self.full_view.sub_frames:

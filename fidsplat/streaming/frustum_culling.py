@@ -25,7 +25,7 @@ Boxes = Callable[[float], tuple[np.ndarray, np.ndarray]]
 around the splats to that extent"""
 
 PADDING = 1.01
-"""factor on the extent of splats, for rounding"""
+"""factor by which the extent of splats is enlarged, for rounding errors"""
 _ACROSS, _ALONG = 0.5, 1 / 8
 """standard deviations of the filter of the low-pass `pixel`: across the ray in samples, and along it as a
 share of the depth (kernels/opencl/slot/lowpass_pixel.cl)"""

@@ -28,7 +28,7 @@ _INITIAL_SPLATS = 1_500_000
 _MAX_GROWTH = 2.0
 """limit on the growth of a guess per pass: nodes that are added first may occlude the rest"""
 _MAX_VISIBLE = 0.7
-"""share of a view's splats that are not occluded above which all are rendered"""
+"""share of splats that are not occluded above which all splats of a view are rendered"""
 _PROBE_SHARE, _PROBE_SPLATS = 4, 4_000_000
 """occlusion culling is always tried with a guess of at most 1 / _PROBE_SHARE of the splats, or
 _PROBE_SPLATS"""

@@ -18,7 +18,7 @@ from fidsplat.train.random_numbers import Purpose, normal
 from fidsplat.train.settings import TrainSettings
 
 COPIES = 2
-"""splats that replace a split one"""
+"""number of splats that replace a split splat"""
 _SHRINK = 0.8 * COPIES
 """divisor of the scales of split splats"""
 
@@ -104,7 +104,7 @@ def with_statistics_reset(splats: Splats) -> Splats:
 
 
 def _largest_scales(scales: np.ndarray) -> np.ndarray:
-    """Row maxima; max(axis=1) is ten times as slow."""
+    """Largest scale of each splat; max(axis=1) would take ten times as long."""
     return functools.reduce(np.maximum, scales.T)
 
 

@@ -37,7 +37,7 @@ def mean_square_distances(points: np.ndarray) -> np.ndarray:
 
 
 def _boxes(points: np.ndarray) -> list[np.ndarray]:
-    """Indices of the points of each box, halved along the longest side until it is small."""
+    """Indices of the points of each box. Boxes are halved along their longest side until they are small."""
     todo, done = [np.arange(len(points))], []
     while todo:
         box = todo.pop()
