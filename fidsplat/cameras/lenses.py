@@ -19,7 +19,7 @@ from fidsplat.util.errors import InputError
 FISHEYE_LIMIT = math.radians(100)
 """largest angle of a fisheye from its axis: a field of view of 200 degrees"""
 MAX_COEFFICIENT = 1e12
-"""largest size of a lens coefficient: beyond those of invertible lenses, but products of several stay finite"""
+"""largest size of a lens coefficient: beyond those of invertible lenses, and small enough for products"""
 _STEPS = 4096  # entries of the table of start values for Newton's iteration
 _ITERATIONS = 12
 _LOWEST = math.cos(math.radians(1))  # the stereographic projection maps -z to infinity

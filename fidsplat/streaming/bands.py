@@ -27,8 +27,8 @@ from fidsplat.streaming.occlusion_test import contributing_tiles, node_keys, occ
 _MIN_ROWS = 16
 """pixels"""
 _MAX_OVERLAP = 1.6
-"""a band is split if its halves together have at most this many times its splats; with a fisheye each half may
-need all"""
+"""a band is split if its halves together have at most this many times its splats; with a fisheye each half
+may need all"""
 
 
 @dataclass(frozen=True)
