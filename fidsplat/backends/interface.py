@@ -19,7 +19,7 @@ from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet, declared_output
 from fidsplat.splats.cloud import SplatCloud
-from fidsplat.util.errors import DeviceError, InputError
+from fidsplat.util.errors import DeviceError, InputError, bytes_words
 
 
 @dataclass(frozen=True)
@@ -255,8 +255,21 @@ class SeparateImages(Images):
 
     @property
     def stats(self) -> Mapping[str, int]:
-        none = {"splats": 0, "visible": 0, "pairs": 0}
-        return summed([none, *(images.stats for images in self._images.values())]) | {"splats": self._splats}
+        return batch_stats((images.stats for images in self._images.values()), self._splats)
+
+
+def check_batch_memory(views: int, size: int, budget: int) -> None:
+    """Raise DeviceError if the images of a batch exceed the memory budget."""
+    if size > budget:
+        raise DeviceError(
+            f"the images of {views} views must be at most {bytes_words(budget)}, the memory budget, got "
+            f"{bytes_words(size)}; render fewer views or outputs at once"
+        )
+
+
+def batch_stats(each: Iterable[Mapping[str, int]], splats: int) -> dict[str, int]:
+    """Number of splats in the cloud, and of visible splats and pairs, summed over views."""
+    return summed([{"visible": 0, "pairs": 0}, *each]) | {"splats": splats}
 
 
 def summed(counts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,9 @@ import numpy as np
 class Probe(ABC):
     """Access for tests: small kernels compiled like the stages, stages on artificial input, poisoned
     memory."""
+
+    def __init__(self, workspace: Any) -> None:
+        self._workspace = workspace
 
     fuses: bool
     """whether the device fuses multiply-adds where requested"""
@@ -65,6 +68,16 @@ class Probe(ABC):
         """Bounding boxes of the splats of a `Pipeline.trace` in samples, (n, 4) int, columns [x0, x1) and
         rows [y0, y1); undefined for culled splats."""
 
-    @abstractmethod
-    def poisoned(self) -> AbstractContextManager[None]:
+    @contextmanager
+    def poisoned(self) -> Iterator[None]:
         """A context in which the memory that a frame allocates is first filled with 0xFF (NaN, or -1)."""
+        pool = self._workspace.pool
+        self._workspace.pool = self._poisoned_pool()
+        try:
+            yield
+        finally:
+            self._workspace.pool = pool
+
+    @abstractmethod
+    def _poisoned_pool(self) -> Any:
+        """A memory pool whose memory is first filled with 0xFF."""

@@ -104,7 +104,7 @@ def test_an_ellipsoid_is_not_a_box_and_has_no_coplanar_group():
     first = np.arange(6) == 0
     assert cloud.with_boxes(first).boxes.tolist() == first.tolist()
     assert cloud.with_coplanar_groups(np.where(first, 0, -1)).has_coplanar_groups
-    with pytest.raises(fs.InputError, match="no thickness"):
+    with pytest.raises(fs.InputError, match="boxes must have a thickness of 0"):
         cloud.with_boxes()
     with pytest.raises(fs.InputError, match="must have a thickness of 0"):
         cloud.with_coplanar_groups(0)

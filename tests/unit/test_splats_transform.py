@@ -145,7 +145,7 @@ def test_a_cloud_moved_far_away_gets_an_origin():
         (np.diag([1.0, 1, 2, 1]), "uniform scale"),
         (np.diag([0.0, 0, 0, 1]), "positive scale"),
         (np.eye(3), r"4x4 matrix.*\(3, 3\)"),
-        (np.full((4, 4), np.nan), "not finite"),
+        (np.full((4, 4), np.nan), "must be finite"),
         (np.eye(4) + np.eye(4, k=-3), "last row"),
         (np.eye(4) + 0.01 * np.eye(4, k=1), "uniform scale"),
         ("x", "4x4 matrix of numbers"),

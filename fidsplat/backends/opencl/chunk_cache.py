@@ -19,6 +19,7 @@ import pyopencl as cl
 
 from fidsplat.backends.interface import Chunk, ChunkCache, ChunkedScene, ResidentData
 from fidsplat.backends.opencl.assemble import kernel_text
+from fidsplat.backends.opencl.host_memory import rounded_up
 from fidsplat.backends.opencl.program import build
 from fidsplat.backends.opencl.workspace import Workspace
 
@@ -238,12 +239,6 @@ class OpenCLChunkCache(ChunkCache):
         self._size = size
 
 
-def _rounded_up(count: int) -> int:
-    """At least `count`, and at most an eighth more: one of a few numbers, so that buffers are reused."""
-    step = 1 << max(count.bit_length() - 4, 0)
-    return -(-count // step) * step
-
-
 class GatheredChunks(ResidentData):
     """A cloud of cached chunks. An array is copied out of the slots when a frame first reads it; a cloud that
     exceeds its share of the memory budget is copied in parts for every frame (`streamed`)."""
@@ -254,7 +249,7 @@ class GatheredChunks(ResidentData):
         self._first_id = first_id
         self._ends = np.cumsum([chunk.count for chunk in chunks], dtype=np.int64)
         self.count = int(self._ends[-1])
-        self.capacity = _rounded_up(self.count)
+        self.capacity = rounded_up(self.count, 4)
         """splats for which frames have buffers; rounded up, so that the next view reuses the buffers"""
         self.origin, self.sh_degree, self.footprint = whole.origin, whole.sh_degree, whole.footprint
         self.has_coplanar_groups = whole.has_coplanar_groups

@@ -62,7 +62,7 @@ class HostMemory:
         size = math.prod(shape) * np.dtype(dtype).itemsize
         if not self.locks or size < _MINIMUM:
             return np.empty(shape, dtype)
-        capacity = _capacity(size)
+        capacity = rounded_up(size, 3)
         with self._lock:
             memory = self._acquire(capacity)
         if memory is None:
@@ -99,8 +99,8 @@ class HostMemory:
         return _LockedBuffer(buffer, mapped)
 
 
-def _capacity(size: int) -> int:
-    """Capacity in bytes of an array's buffer: rounded up by at most a quarter, so that images of varying
-    size, as in a viewer, reuse buffers."""
-    step = 1 << max(size.bit_length() - 3, 0)
-    return -(-size // step) * step
+def rounded_up(count: int, bits: int) -> int:
+    """`count` rounded up to a number of `bits` binary digits and zeros, so that frames of varying sizes reuse
+    buffers."""
+    step = 1 << max(count.bit_length() - bits, 0)
+    return -(-count // step) * step

@@ -14,7 +14,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewBatch
-from fidsplat.backends.interface import Images, summed
+from fidsplat.backends.interface import Images, check_batch_memory, summed
 from fidsplat.backends.opencl.assemble import kernel_text
 from fidsplat.backends.opencl.device_frame import Rendered
 from fidsplat.backends.opencl.program import build, load_invoker
@@ -47,11 +47,7 @@ def lease_images(
             f"{largest} of {views.total} views must be at most {bytes_words(workspace.largest_buffer)}, the "
             f"largest buffer of the device, got {bytes_words(bytes_of[largest])}; render fewer views at once"
         )
-    if sum(bytes_of.values()) > workspace.memory_budget:
-        raise DeviceError(
-            f"the images of {views.total} views must be at most {bytes_words(workspace.memory_budget)}, the "
-            f"memory budget, got {bytes_words(sum(bytes_of.values()))}; render fewer views or outputs at once"
-        )
+    check_batch_memory(views.total, sum(bytes_of.values()), workspace.memory_budget)
     leased = []
     for output in outputs:
         name = f"{output.name} of views"  # another pool name, as single frames must not reuse batch buffers

@@ -4,8 +4,7 @@ stages on artificial input, and buffers that are filled with NaN before their us
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -100,9 +99,6 @@ kernel void probe(global const float *x, global int *unequal, global int *named,
 class OpenCLProbe(Probe):
     """Access to an open OpenCL device for tests."""
 
-    def __init__(self, workspace: Workspace) -> None:
-        self._workspace = workspace
-
     @property
     def fuses(self) -> bool:
         """Whether the device fuses multiply-adds where requested."""
@@ -177,11 +173,5 @@ class OpenCLProbe(Probe):
     def boxes(self, pipeline: OpenCLPipeline, trace: Mapping[str, np.ndarray]) -> np.ndarray:
         return np.stack([trace["records"][name].astype(int) for name in ("x0", "x1", "y0", "y1")], 1)
 
-    @contextmanager
-    def poisoned(self) -> Iterator[None]:
-        pool = self._workspace.pool
-        self._workspace.pool = _PoisonedPool(self._workspace)
-        try:
-            yield
-        finally:
-            self._workspace.pool = pool
+    def _poisoned_pool(self) -> BufferPool:
+        return _PoisonedPool(self._workspace)

@@ -12,17 +12,15 @@ from fidsplat.backends.reference import ellipsoids, optics
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.splats.cloud import SplatCloud, sh_basis
+from fidsplat.splats.rotations import quaternion_to_matrix
 
 
 class Setup:
     """Camera-space splats that are not culled; float64 arrays (n, ...) in depth order."""
 
     def __init__(self, cloud: SplatCloud, view: View, features: FeatureSet) -> None:
-        q = cloud.quats.astype(np.float64)
-        q /= np.linalg.norm(q, axis=1, keepdims=True)
-        w, x, y, z = q.T
-        tangent_u = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1)
-        tangent_v = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], 1)
+        turns = quaternion_to_matrix(cloud.quats)
+        tangent_u, tangent_v = (np.ascontiguousarray(turns[:, :, axis]) for axis in (0, 1))
         mean, scale = cloud.means.astype(np.float64), cloud.scales.astype(np.float64)
         scale = np.maximum(scale, np.float32(1e-20))  # MIN_SCALE of the kernels
         unit_a, unit_b, p, outward = _posed(view, tangent_u, tangent_v, mean)
@@ -153,9 +151,9 @@ _PLANE_RADIUS = 64.0
 """the same for splats of a coplanar group (boxes: in half sides); larger than any cut-off and low-pass, so
 that culling a splat does not move the layer"""
 _OF_SPLATS = (
-    *("order", "log_opacity", "half_r2", "z_low", "z_high", "labels", "pz", "z_numerator"),
-    *("inverse_m2", "turned"),
+    *("order", "log_opacity", "half_r2", "z_low", "z_high", "labels", "pz", "z_numerator", "inverse_m2"),
     *(
+        "turned",
         "box",
         "disc",
         "center_x",

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.interface import Images, summed
+from fidsplat.backends.interface import Images, batch_stats, check_batch_memory, summed
 from fidsplat.backends.warp.command_list import Launcher
 from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import Output
-from fidsplat.util.errors import DeviceError, bytes_words
 
 _CONVERTING = threading.Lock()
 
@@ -71,14 +70,8 @@ class WarpImages(Images):
         """arrays by the names of the outputs; possibly not complete yet"""
         for name, output in outputs.items():
             self.nbytes += 4 * pixels * output.channels
-            if (
-                views > 1 and self.nbytes > workspace.memory_budget
-            ):  # single frames include images in their plan
-                raise DeviceError(
-                    f"the images of {views} views must be at most {bytes_words(workspace.memory_budget)}, "
-                    f"the memory budget, got {bytes_words(self.nbytes)}; render fewer views or outputs at "
-                    "once"
-                )
+            if views > 1:  # single frames include images in their plan
+                check_batch_memory(views, self.nbytes, workspace.memory_budget)
             dtype = getattr(load(), output.dtype)
             self.arrays[name] = workspace.pool.fresh(name, pixels * output.channels, dtype)
         self.rendered: list[Rendered] = []
@@ -127,6 +120,4 @@ class WarpImages(Images):
 
     @property
     def stats(self) -> Mapping[str, int]:
-        """Number of splats in the cloud, and of visible splats and pairs, summed over all views."""
-        none = {"splats": 0, "visible": 0, "pairs": 0}
-        return summed([none, *(part.settle().counts for part in self.rendered)]) | {"splats": self._splats}
+        return batch_stats((part.settle().counts for part in self.rendered), self._splats)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,9 +16,6 @@ from fidsplat.util.errors import DeviceError
 
 class WarpProbe(Probe):
     """Access to a Warp device for tests."""
-
-    def __init__(self, workspace: Workspace) -> None:
-        self._workspace = workspace
 
     fuses = True
     """always true: Warp fuses multiply-adds where requested"""
@@ -64,14 +60,8 @@ class WarpProbe(Probe):
         spans = trace["records"].view(np.uint32)[:, words].astype(int)
         return np.stack([spans & 0xFFFF, spans >> 16], 2).reshape(-1, 4)
 
-    @contextmanager
-    def poisoned(self) -> Iterator[None]:
-        pool = self._workspace.pool
-        self._workspace.pool = PoisonedPool(self._workspace.device)
-        try:
-            yield
-        finally:
-            self._workspace.pool = pool
+    def _poisoned_pool(self) -> ArrayPool:
+        return PoisonedPool(self._workspace.device)
 
 
 class PoisonedPool(ArrayPool):
