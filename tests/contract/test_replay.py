@@ -32,7 +32,7 @@ def test_kernels_see_new_buffers_at_old_addresses(opencl):
 
 def test_a_frame_is_replayed_for_each_view(opencl):
     """Of its kind, on a GPU: other poses, groups, colours and sizes come between, and frames are kept."""
-    machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
+    machine, own = as_on_a_gpu(opencl), as_on_a_gpu(opencl)
     some = (
         random_splats(300, seed=4)
         .with_labels(np.arange(300) % 2)
@@ -112,7 +112,7 @@ def test_a_frame_that_exceeds_the_last_is_rendered_again(opencl, scale):
 def test_threads_share_cached_launches(opencl):
     """Sixteen draw images of two kinds with a GPU's kernels, of a cloud that outgrows its room at times,
     and read them, their times and their counts while others draw."""
-    machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
+    machine, own = as_on_a_gpu(opencl), as_on_a_gpu(opencl)
     some = random_splats(500, seed=4, scale=(1e-2, 0.3), depth=(2.0, 6.0))
     captures = [
         fs.Capture(fs.Camera.look_at(width, 40, 1.0, (0.0, 0.0, z), (0.0, 0.0, 30.0)))
