@@ -13,8 +13,9 @@ import argparse
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -115,13 +116,32 @@ def camera_at(rng: np.random.Generator, width: int, height: int, edges: tuple[fl
     return fs.Camera.look_at(width, height, math.radians(45), position, target, (math.sin(roll), -1.0, 0.0))
 
 
+def inside(camera: fs.Camera) -> bool:
+    """Whether a camera is in the room."""
+    x, y, z = camera.position
+    return abs(x) < 1 and abs(y) < 0.8 and -2 < z < 0
+
+
+def resized(camera: fs.Camera, factor: float) -> fs.Camera:
+    """The camera with an image of another size."""
+    size = (round(camera.width * factor), round(camera.height * factor))
+    numbers = (factor * value for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    return fs.Camera.pinhole(*size, *numbers, camera.world_to_camera)
+
+
+def reduced(light: np.ndarray, factor: int) -> np.ndarray:
+    """A smaller image: means of linear light."""
+    size = (light.shape[1] // factor, light.shape[0] // factor)
+    return cv2.resize(light.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+
+
 def cases(poses: int) -> list[Case]:
     """All cases; the last one has views for detection rates."""
     rng = np.random.default_rng(0)
     three = tuple(camera_at(rng, 320, 240, (3.0, 4.0)) for _ in range(3))
     sun = fs.Sun(direction=(0.25, 0.8, 0.75), intensity=4.0, angle=math.radians(2), samples=64)
     lamp = fs.PointLight(position=(0.4, 0.1, -0.5), intensity=0.25, radius=0.05, samples=64)
-    small = tuple(camera_at(rng, 160, 120, (3.0, 12.0)) for _ in range(poses))
+    small = tuple(islice(filter(inside, (camera_at(rng, 160, 120, (3.0, 12.0)) for _ in count())), poses))
     return [
         Case("room", cameras=three),
         Case("room and sun", lights=(sun,), cameras=three),
@@ -159,7 +179,11 @@ def ours(case: Case, renderer: fs.Renderer) -> Iterator[np.ndarray]:
     for camera in case.cameras:
         if scene is None or case.roughness is not None:  # gloss depends on the camera
             scene = scene_of(case, camera)
-        yield renderer.render(scene, camera, quality=quality)["rgb"]
+        if case.name == "poses":  # pixels are means of light, as Blender's
+            rgb = renderer.render(scene, resized(camera, 4))["rgb"]
+            yield to_colors(reduced(to_light(rgb, "srgb"), 4), "srgb")
+        else:
+            yield renderer.render(scene, camera, quality=quality)["rgb"]
 
 
 def job_of(case: Case, folder: Path) -> dict:
@@ -346,42 +370,33 @@ def main() -> int:
     return 0
 
 
+def detection(case: Case, light: dict[str, list[np.ndarray]], factor: int) -> dict[str, Any]:
+    """Detections in images reduced by a factor: numbers, intervals of their shares, equal results, and median
+    errors of corners."""
+    small = replace(case, cameras=tuple(resized(camera, 1 / factor) for camera in case.cameras))
+    errors = {
+        name: read_all(
+            small, (np.asarray(to_colors(reduced(image, factor), "srgb"), np.float32) for image in images)
+        )
+        for name, images in light.items()
+    }
+    found: dict[str, Any] = {}
+    for detector in errors["ours"]:
+        each = {name: np.array(own[detector], float) for name, own in errors.items()}
+        read = {name: np.isfinite(own) for name, own in each.items()}
+        found[detector] = {
+            name: [int(own.sum()), *wilson(int(own.sum()), len(own)), float(np.nanmedian(each[name]))]
+            for name, own in read.items()
+        } | {"equal": float((read["ours"] == read["Cycles"]).mean())}
+    return found
+
+
 def compare(case: Case, own: list[np.ndarray], truth: list[np.ndarray]) -> dict[str, Any]:
     """Figures of a case: our images in display values, Blender's in linear light."""
     shown = [np.asarray(to_colors(image, case.response), np.float32) for image in truth]
     if case.name == "poses":
-        errors = {name: read_all(case, iter(images)) for name, images in (("ours", own), ("Cycles", shown))}
-        return {
-            "views": len(own),
-            "read": {
-                detector: {
-                    name: [
-                        sum(e is not None for e in each[detector]),
-                        *wilson(sum(e is not None for e in each[detector]), len(own)),
-                    ]
-                    for name, each in errors.items()
-                }
-                for detector in errors["ours"]
-            },
-            "equal": {
-                detector: float(
-                    np.mean(
-                        [
-                            (a is None) == (b is None)
-                            for a, b in zip(errors["ours"][detector], errors["Cycles"][detector], strict=True)
-                        ]
-                    )
-                )
-                for detector in errors["ours"]
-            },
-            "median_corner_px": {
-                detector: {
-                    name: float(np.median([e for e in each[detector] if e is not None] or [math.nan]))
-                    for name, each in errors.items()
-                }
-                for detector in errors["ours"]
-            },
-        }
+        light = {"ours": [to_light(image, "srgb") for image in own], "Cycles": truth}
+        return {"views": len(own)} | {f"1/{k}": detection(case, light, k) for k in (1, 2, 3)}
     if case.shape is not None and not case.emits:
         return smooth_errors([(to_light(a, "srgb"), b) for a, b in zip(own, truth, strict=True)])
     if case.shape is not None:
