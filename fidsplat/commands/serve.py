@@ -16,6 +16,7 @@ from fidsplat.commands.options import Json, require_packages
 from fidsplat.commands.output import console, report
 from fidsplat.commands.scenes import RenderInput, Size
 from fidsplat.splats.rotations import rigid_matrix
+from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
@@ -207,7 +208,7 @@ class _Clock:
         while self._duration is None or step / self._rate < self._duration:
             wait = start + step / self._rate - time.monotonic()
             if wait > 0:
-                time.sleep(wait)
+                interrupts.sleep(wait)
             yield step, step / self._rate
             if not self.sent:  # the first frame compiles kernels
                 start = time.monotonic()

@@ -65,7 +65,8 @@ class TiledCamera:
         quaternions: order of all quaternions: xyzw (Isaac Lab 3.0) or wxyz (2.x).
 
     Raises:
-        InputError: a rig with several cameras, bodies without `bodies`, or an unknown data type.
+        InputError: a rig with several cameras, bodies without `bodies`, no or an unknown data type, or
+            origins of another number.
     """
 
     def __init__(
@@ -85,12 +86,14 @@ class TiledCamera:
         if rig.bodies and bodies is None:
             raise InputError(f"bodies must return the poses of {', '.join(rig.bodies)}, got None")
         _known("order of quaternions", quaternions, ("xyzw", "wxyz"))
-        for name in data_types:
+        for name in data_types or (None,):
             _known("data type", name, _OUTPUTS)
         self.num_instances = whole_number("num_instances", num_instances, 1, 2**31 - 1)
         self._rig, self._types, self._bodies, self._period = rig, tuple(data_types), bodies, update_period
         (self._name,) = rig.cameras
         origins = np.zeros((num_instances, 3)) if origins is None else _host(origins)
+        if origins.shape != (num_instances, 3):
+            raise InputError(f"origins must have the shape ({num_instances}, 3), got {origins.shape}")
         self._origins = np.concatenate([origins, np.tile(IDENTITY[3:], (len(origins), 1))], -1)
         self._to_wxyz = [0, 1, 2, 3] if quaternions == "wxyz" else [3, 0, 1, 2]
         self._from_wxyz = np.argsort(self._to_wxyz)
@@ -164,7 +167,11 @@ class TiledCamera:
         self.set_world_poses(eyes, np.array(poses)[:, 3:][:, self._from_wxyz], env_ids)
 
     def _which(self, env_ids: Any) -> Any:
-        return slice(None) if env_ids is None else _host(env_ids).astype(int)
+        """Index of environments: all for None; a mask is not converted to numbers."""
+        if env_ids is None or isinstance(env_ids, slice):
+            return slice(None) if env_ids is None else env_ids
+        which = _host(env_ids, None)
+        return which if which.dtype == bool else which.astype(int)
 
     def _body_poses(self) -> dict[str, np.ndarray]:
         """Poses (N, 7) of the bodies in the world of the simulation."""
@@ -189,13 +196,12 @@ class TiledCamera:
             outputs=[_OUTPUTS[name] for name in self._types],
             mask=mask,
         ).of(self._name)
-        which = np.flatnonzero(mask).tolist()
+        rest = np.flatnonzero(~mask).tolist()
         for name in self._types:
             tensor = self._tensor(name, images)
-            if name in self._tensors and not mask.all():
-                self._tensors[name][which] = tensor[which]
-            else:
-                self._tensors[name] = tensor
+            if rest:  # the first images are those of all environments
+                tensor[rest] = self._tensors[name][rest]
+            self._tensors[name] = tensor  # tensors that were returned before keep their images
         self.frame[mask] += 1
         self._taken[mask] = self._times[mask]
         self._outdated[:] = False
@@ -210,9 +216,9 @@ class TiledCamera:
         return image if image.ndim == 4 else image.unsqueeze(-1)
 
 
-def _host(value: Any) -> np.ndarray:
+def _host(value: Any, dtype: Any = np.float64) -> np.ndarray:
     """An array of torch, Warp or Isaac Lab's `ProxyArray` as NumPy array on the host."""
     value = getattr(value, "torch", value) if not isinstance(value, np.ndarray) else value
     if hasattr(value, "detach"):
         value = value.detach().cpu()
-    return np.array(value.numpy() if hasattr(value, "numpy") else value, np.float64)
+    return np.array(value.numpy() if hasattr(value, "numpy") else value, dtype)

@@ -117,6 +117,15 @@ class MujocoRig(SimulatorRig):
         import mujoco_warp as mjw  # type: ignore[import-not-found]
         import warp as wp  # type: ignore[import-not-found]
 
+        for name, number in zip(self.cameras, self._camera_ids, strict=True):
+            width, height = self._model.cam_resolution[number]
+            wide, high = self._model.cam_sensorsize[number]
+            if high and abs(wide * height - high * width) > 1e-4 * high * width:
+                raise InputError(
+                    f"the sensorsize of a camera with meshes by mujoco_warp, which crops sensors, must have "
+                    f"the aspect ratio of its resolution {width} x {height}, got {wide:g} x {high:g} for "
+                    f"{name!r}"
+                )
         if not (np.isin(self._model.geom_group, groups).any() or self._model.nflex):
             return {}  # mujoco_warp 4.0 crashes without geoms
         kind = data.nworld, tuple(groups)

@@ -19,6 +19,8 @@ KEY_DISTANCE, KEY_TURN = 1.0, 0.5
 """metres and radians from a reference scan to the next"""
 VOXEL = 0.08
 """metres: points are averaged over cubes of this edge"""
+MINIMUM = 20
+"""smallest number of averaged points of a scan; small_gicp crashes without points"""
 REACH = 0.3
 """metres: longest distance between corresponding points"""
 SPREAD = 0.6
@@ -40,8 +42,11 @@ class ScanMatcher:
 
     def correct(self, localiser: Localiser, points: np.ndarray) -> bool:
         """Correct a localiser by the points (n, 3) of a scan in the axes of the robot; returns whether they
-        matched the reference scan."""
-        scan, matched = small_gicp.preprocess_points(np.asarray(points, np.float64), VOXEL, 10), False
+        matched the reference scan. Scans of fewer points than `MINIMUM` have no effect."""
+        points, matched = np.asarray(points, np.float64), False
+        scan = small_gicp.preprocess_points(points[np.isfinite(points).all(1)], VOXEL, 10)
+        if scan[0].size() < MINIMUM:
+            return False
         if self._reference is not None:
             found = self._match(scan[0], localiser.relative)
             matched = found is not None and localiser.match(*found)

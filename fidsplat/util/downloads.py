@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import http.client
 import urllib.error
 import urllib.request
 from collections.abc import Callable
@@ -43,7 +44,7 @@ def download(
                     f"{url} must have {size:,} bytes and the SHA-256 {sha256}, got {received:,} and "
                     f"{found.hexdigest()}; the file has changed or a proxy has replaced it"
                 )
-    except (OSError, ValueError) as error:  # urllib's errors are OSErrors
+    except (OSError, ValueError, http.client.HTTPException) as error:  # urllib's errors are OSErrors
         reason = getattr(error, "reason", None) or error
         raise InputError(f"cannot download {url}: {reason}; is the network reachable?") from None
     return target

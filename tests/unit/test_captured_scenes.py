@@ -1,6 +1,8 @@
 """Captured scenes by name: downloads with checksums, from a folder instead of the network."""
 
 import hashlib
+import socket
+import threading
 
 import pytest
 
@@ -55,6 +57,19 @@ def test_fetch_reports_what_failed(mirror, monkeypatch):
     monkeypatch.delenv("FIDSPLAT_SCENES")
     with pytest.raises(fs.InputError, match=r"cannot download http://0.0.0.0:1/one.ply"):
         captured.fetch_scene("some")
+
+
+def test_fetch_reports_a_server_that_ends_early(mirror, monkeypatch):
+    def respond(server):
+        with server.accept()[0] as client:
+            client.recv(4096)
+            client.sendall(b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nab")
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=respond, args=(server,)).start()
+        monkeypatch.setenv("FIDSPLAT_SCENES", f"http://127.0.0.1:{server.getsockname()[1]}")
+        with pytest.raises(fs.InputError, match=r"cannot download http://127.0.0.1:\d+/one.ply: Incomplete"):
+            captured.fetch_scene("some")
 
 
 def test_every_scene_names_author_and_licence(capsys):

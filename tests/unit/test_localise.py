@@ -210,6 +210,8 @@ def test_scans_of_a_room_give_the_motion():
         return (room - pose[:3, 3]) @ pose[:3, :3] + rng.normal(0, 0.005, room.shape)
 
     filtered, matcher = Localiser(np.zeros(3), drift=0.1), matching.ScanMatcher(0.7)
+    for few in (room[:0], room[:1], np.full((30, 3), np.nan)):  # as in an empty hall
+        assert not matcher.correct(filtered, few)
     assert not matcher.correct(filtered, seen(np.eye(4)))  # the reference
     filtered.move(np.full(2, 0.15), 0.41, 0.25)
     assert matcher.correct(filtered, seen(headed(0.1, 0.2, 0.05)))

@@ -307,7 +307,7 @@ def test_late_steps_are_dropped_and_counted(monkeypatch):
     def sleep(seconds: float) -> None:
         now[0] += seconds
 
-    monkeypatch.setattr("fidsplat.commands.serve.time.sleep", sleep)
+    monkeypatch.setattr("fidsplat.commands.serve.interrupts.sleep", sleep)
     clock = _Clock(10.0, 1.0)
     steps = []
     for step, elapsed in clock:

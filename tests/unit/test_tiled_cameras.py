@@ -87,6 +87,9 @@ def test_mujoco_warps_geoms_are_composited_in_all_worlds(states, scene):
     rig = MujocoRig(model, scene, {1: "box"}, renderer=fs.Renderer("reference"), outputs=OUTPUTS)
     check(rig.render(worlds, meshes=True), states, lambda label: MESH - label)
     assert set(np.unique(rig.render(worlds, meshes=3)["label"])) == {-1, 1}
+    square = mujoco.MjModel.from_xml_string(MODEL.replace('sensorsize="1 0.75"', 'sensorsize="1 1"'))
+    with pytest.raises(fs.InputError, match="aspect ratio of its resolution 32 x 24, got 1 x 1 for 'eye'"):
+        MujocoRig(square, scene, {1: "box"}, renderer=rig.renderer).render(worlds, meshes=True)
 
 
 def test_newtons_shapes_are_composited_in_all_worlds(states, scene):
@@ -141,7 +144,8 @@ def test_isaac_labs_cameras(scene):
     np.testing.assert_allclose(data.pos_w, origins + torch.tensor([0, 0, 0.5]))
     np.testing.assert_allclose(data.quat_w_world, upright, atol=1e-12)
     np.testing.assert_allclose(data.quat_w_ros, [[-0.5, 0.5, -0.5, 0.5]] * 2, atol=1e-12)
-    before = data.output["rgb"].clone()
+    shared = data.output["rgb"]
+    before = shared.clone()
     tiled.update(0.05)
     assert tiled.data.output["rgb"].equal(before)
     assert tiled.frame.tolist() == [1, 1]
@@ -149,11 +153,17 @@ def test_isaac_labs_cameras(scene):
     data = tiled.data
     assert data.output["depth"][:, *middle, 0].tolist() == pytest.approx([1.1, 1.4], abs=1e-5)
     assert data.output["rgb"][1].equal(before[1])
+    assert not data.output["rgb"][0].equal(before[0])
+    assert shared.equal(before)  # tensors keep their images
     assert tiled.frame.tolist() == [2, 1]
     tiled.set_world_poses_from_view([[0.2, 0, 0.5]], [[1.0, 0, 0.5]], torch.tensor([0]))
     assert tiled.data.output["depth"][0, *middle, 0].item() == pytest.approx(1.2, abs=1e-5)
-    tiled.reset([1])
+    tiled.reset(torch.tensor([False, True]))
     assert tiled.frame.tolist() == [3, 0]
+    with pytest.raises(fs.InputError, match=r"origins must have the shape \(2, 3\), got \(1, 3\)"):
+        TiledCamera(rig, 2, bodies=lambda: poses, origins=origins[:1])
+    with pytest.raises(fs.InputError, match="unknown data type None"):
+        TiledCamera(rig, 2, (), bodies=lambda: poses)
     with pytest.raises(fs.InputError, match="unknown data type 'rbg'"):
         TiledCamera(rig, 2, ["rbg"], bodies=lambda: poses)
     with pytest.raises(fs.InputError, match="bodies must return the poses of box, eye"):
