@@ -209,7 +209,7 @@ def _minimise(at: _State, stage: _Stage, steps: int) -> _State:
 
 def _finish(at: _State, stage: _Stage) -> Alignment:
     """Newton's method for Tukey's loss, and the covariance. The derivative of the score is that of the first
-    step. Infinite covariance if the pixels do not determine the pose."""
+    step. Infinite covariance if the pixels do not determine the pose and its covariance."""
     at, noise, inverse = _State(at.pose, at.fit._replace(huber=False)), 0.0, None
     covariance = np.diag(np.full(6, np.inf))
     for _ in range(_LAST_STEPS):
@@ -251,7 +251,10 @@ def _bread(at: _State, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.nda
 
 
 def _inverse(sums: AlignmentSums, bread: np.ndarray) -> np.ndarray | None:
-    """The inverse of the derivative of the score; None if the pixels do not determine the pose."""
+    """The inverse of the derivative of the score; None if the pixels do not determine the pose, or if there
+    are too few blocks of pixels for a covariance."""
+    if len(sums.scores) <= len(bread):
+        return None
     deviations = np.sqrt(np.maximum(np.diag(_assembled(sums.matrix)), 1e-15))
     scaled = bread / np.outer(deviations, deviations)
     if np.linalg.matrix_rank(scaled, MIN_INFORMATION) < len(bread):

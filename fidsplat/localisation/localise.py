@@ -25,6 +25,8 @@ from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.util.arguments import instance, invalid
 from fidsplat.util.errors import InputError
 
+MAX_VALUE = 1e4
+"""maximum display value of an image: sums of squares are float32"""
 TRIED = 3
 """number of candidates that are aligned coarsely"""
 
@@ -194,6 +196,10 @@ def _pixels(image: Any) -> np.ndarray:
     if pixels.dtype == np.uint8:
         return np.multiply(pixels, np.float32(1 / 255), dtype=np.float32)
     values = pixels.astype(np.float32)
-    if not np.isfinite(values).all():
-        raise InputError("the image must be finite, got NaN or infinity")
+    largest = float(np.abs(values).max())
+    if not largest <= MAX_VALUE:
+        raise InputError(
+            f"display values of the image must be finite and at most {MAX_VALUE:g}, got {largest:g}; give "
+            "uint8, or divide floats so that white is 1"
+        )
     return values

@@ -182,12 +182,15 @@ class TrainSettings:
                 if not 0 <= as_float(value) < math.inf:
                     raise InputError(f"training: {field.name} must be a number of at least 0, got {value!r}")
                 _put(self, field.name, float(value))
-        for switch, rate in (("refine_poses", "pose_rate"), ("fit_exposures", "exposure_rate")):
+        cameras, exposures = ("refine_poses", "refine_intrinsics"), ("fit_exposures",)
+        for switches, rate in ((cameras, "pose_rate"), (exposures, "exposure_rate")):
             for name in (rate, f"{rate}_end"):
-                if not getattr(self, switch) and getattr(self, name) != getattr(TrainSettings, name):
+                off = not any(getattr(self, switch) for switch in switches)
+                if off and getattr(self, name) != getattr(TrainSettings, name):
                     raise InputError(
-                        f"training: {switch} must be on for a {name}, got {name} = {getattr(self, name):g} "
-                        f"without; add --{switch.replace('_', '-')}, or {switch}=True"
+                        f"training: {' or '.join(switches)} must be on for a {name}, got {name} = "
+                        f"{getattr(self, name):g} without; add --{switches[0].replace('_', '-')}, or "
+                        f"{switches[0]}=True"
                     )
         if not self.dssim_weight <= 1:
             raise InputError(f"training: dssim_weight must be from 0 to 1, got {self.dssim_weight!r}")

@@ -201,6 +201,16 @@ def test_an_image_without_contrast_is_not_found(renderer, room):
     assert found.position_deviation == math.inf  # no splat is visible
 
 
+def test_few_pixels_do_not_determine_a_covariance(renderer, room):
+    """Of 4 x 4 pixels each, the blocks within the mask are fewer than the 12 parameters."""
+    scene, resident, image = room
+    mask = np.zeros((48, 64), bool)
+    mask[20:32, 28:40] = True
+    found = fs.localise(image, scene, scene.camera, mask=mask, renderer=renderer, resident=resident)
+    assert found.position_deviation == math.inf
+    assert not found.found
+
+
 def test_errors_of_localisation(renderer, room, tmp_path, capsys):
     scene, resident, image = room
     with pytest.raises(fs.InputError, match="initial pose, got no start, no marker of the scene"):
@@ -209,8 +219,9 @@ def test_errors_of_localisation(renderer, room, tmp_path, capsys):
         fs.localise(image[:, :60], scene, scene.camera, renderer=renderer, resident=resident)
     with pytest.raises(fs.InputError, match="the image must have a camera, got none"):
         fs.localise(image, scene.clouds[0], np.eye(4), renderer=renderer)
-    with pytest.raises(fs.InputError, match="must be finite, got NaN"):
-        fs.localise(image * np.nan, scene, scene.camera, renderer=renderer, resident=resident)
+    for value, got in ((np.nan, "nan"), (np.inf, "inf"), (1e30, "1e"), (-1e6, "[0-9]")):
+        with pytest.raises(fs.InputError, match=f"must be finite and at most 10000, got {got}"):
+            fs.localise(np.full((48, 64), value), scene, scene.camera, renderer=renderer)
     ignored = np.zeros((48, 64), bool)
     with pytest.raises(fs.InputError, match="pixels away from the border and from ignored pixels, got none"):
         fs.localise(image, scene, scene.camera, mask=ignored, renderer=renderer, resident=resident)

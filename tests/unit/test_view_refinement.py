@@ -226,7 +226,8 @@ def test_masks_of_a_folder_and_of_alpha(given, tmp_path):
 
 
 def test_rates_need_their_switches():
-    assert TrainSettings(refine_poses=True, pose_rate=1e-3).pose_rate == 1e-3
+    for switch in ("refine_poses", "refine_intrinsics"):
+        assert TrainSettings(pose_rate=1e-3, **{switch: True}).pose_rate == 1e-3
     for rate in ("pose_rate", "exposure_rate_end"):
         with pytest.raises(fs.InputError, match=rf"must be on for a {rate}, got {rate} = 0.1 without; add"):
             TrainSettings(**{rate: 0.1})
