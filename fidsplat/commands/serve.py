@@ -28,6 +28,8 @@ CAMERA, LIDAR = "camera", "lidar"
 """names of frames and topics"""
 TIMEOUT = 0.5
 """seconds after which the robot stops without a new /cmd_vel"""
+FAR = 1e9
+"""metres: largest coordinate of the robot; farther poses of other programs are ignored"""
 
 
 @dataclass
@@ -177,18 +179,21 @@ class _Driver:
 
     def base_at(self, time: float) -> np.ndarray:
         """Pose of base_link in the world (4, 4) at a time, which must not decrease."""
-        moved = self._base @ exponential(self._twist * max(0.0, min(time, self._until) - self._time))
-        if np.isfinite(moved).all():
-            self._base = moved
+        self._place(self._base @ exponential(self._twist * max(0.0, min(time, self._until) - self._time)))
         self._time = time
         for stamped in self._log.received("/pose", "geometry_msgs/msg/PoseStamped"):
             at, turn = stamped.pose.position, stamped.pose.orientation
             with suppress(InputError):  # an invalid pose of another program must not end the server
-                self._base = rigid_matrix((at.x, at.y, at.z), (turn.w, turn.x, turn.y, turn.z))
+                self._place(rigid_matrix((at.x, at.y, at.z), (turn.w, turn.x, turn.y, turn.z)))
         for twist in self._log.received("/cmd_vel", "geometry_msgs/msg/Twist"):
             parts = [getattr(part, axis) for part in (twist.angular, twist.linear) for axis in "xyz"]
             self._twist, self._until = np.array(parts), time + TIMEOUT
         return self._base
+
+    def _place(self, pose: np.ndarray) -> None:
+        """Move base_link to a pose, unless it is not finite or farther away than `FAR`."""
+        if (np.abs(pose) <= FAR).all():
+            self._base = pose
 
     def camera(self, camera: Camera) -> Camera:
         """The camera at the current pose of the robot."""

@@ -286,7 +286,8 @@ def test_a_ros2_node_receives_and_drives(served):
     expected = fs.Renderer().render(fs.Scene.load(file), camera.with_pose(camera_to_world=nearer))["rgb"]
     np.testing.assert_allclose(pixels / 255, np.clip(expected, 0, 1), atol=0.5 / 255 + 1e-5)
 
-    place.write(PoseStamped(stamped.header, Pose(Point(np.nan, 0.0, 0.0), Quaternion(*turn))))  # ignored
+    for invalid in (np.nan, 1e30):  # ignored
+        place.write(PoseStamped(stamped.header, Pose(Point(invalid, 0.0, 0.0), Quaternion(*turn))))
     drive.write(Twist(Vector3(0.4, 0.0, 0.0), Vector3(0.0, 0.0, 0.2)))
     # it drives for half a second, since no other command follows: 0.2 m along an arc to the left
     arc = 0.1
