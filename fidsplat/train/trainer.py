@@ -306,7 +306,11 @@ class Trainer:
             return self.renderer.render(resident, capture.with_(camera=camera, outputs=("rgb", "depth")))
 
         image = view.image.astype(np.float32) / 255
-        found = align(image, view.mask, view.camera, render, alignment_kernels(self.renderer, resident))
+        kernels = alignment_kernels(self.renderer, resident)
+        try:
+            found = align(image, view.mask, view.camera, render, kernels)
+        except InputError:  # the mask leaves no pixels at the coarsest level
+            return capture
         if found.inliers < MIN_INLIERS:
             return capture
         both = capture, capture.with_(camera=found.camera)

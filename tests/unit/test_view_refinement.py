@@ -116,6 +116,14 @@ def test_intrinsics_return_to_the_truth(renderer, cloud, given):
     assert trainer.evaluate()[0].psnr > 35
 
 
+def test_a_held_out_view_with_too_sparse_a_mask_is_evaluated(renderer, cloud, given):
+    """Localisation has no pixel whose neighbours are not ignored."""
+    mask = np.indices((24, 32)).sum(axis=0) % 2 == 0
+    dataset = replace(given, views=given.views[1:], held_out=(replace(given.views[0], mask=mask),))
+    trainer = Trainer(dataset, renderer, start=cloud, iterations=1, refine_poses=True, **FIXED)
+    assert trainer.evaluate()[0].psnr > 40
+
+
 def test_a_localisation_that_matches_worse_is_not_used(renderer, cloud, given, monkeypatch):
     """Scores are those at the held-out view's own pose."""
     from fidsplat.localisation import direct_alignment
