@@ -27,12 +27,12 @@ def main() -> None:
     parser.add_argument("--max-splats", type=int, default=20000)
     parser.add_argument("--degrees", type=float, default=0.3, help="standard deviation of rotations")
     parser.add_argument("--share", type=float, default=0.01, help="of positions, relative to the depth")
-    parser.add_argument("--rate", type=float, help="learning rate of poses")
+    parser.add_argument("--rate", type=float, default=5e-3, help="learning rate of poses")
     parser.add_argument("--refined-only", action="store_true", help="only the last of the three")
     words = parser.parse_args()
     renderer, given = fs.Renderer(words.device), load_dataset(words.dataset)
     off = disturbed(given, math.radians(words.degrees), words.share)
-    changes = {} if words.rate is None else {"pose_rate": words.rate}
+    changes = {"pose_rate": words.rate, "pose_rate_end": words.rate / 100}
     rows = {}
     for name, dataset, refine in (
         ("true poses", given, False),

@@ -103,10 +103,10 @@ class TrainSettings:
     refine_intrinsics: bool = False
     """refine fx, fy, cx and cy of each camera; views and held-out views with equal intrinsics share them.
     Distortion is not refined"""
-    pose_rate: float = 5e-3
+    pose_rate: float = 1e-4
     """initial learning rate of poses and intrinsics: radians, metres per metre of depth, and pixels per pixel
     of focal length"""
-    pose_rate_end: float = 5e-5
+    pose_rate_end: float = 1e-6
     """learning rate of poses and intrinsics at the last iteration"""
     fit_exposures: bool = False
     """fit a gain and an offset of each channel for each training view: exposure and white balance; those of

@@ -173,12 +173,16 @@ def test_sizes_that_share_a_side_are_replayed_alternately(renderer, replayed, si
     assert_drawn(renderer, frames, cameras)
 
 
-def test_what_another_kind_reallocated_is_not_replayed(renderer, replayed):
+def test_what_another_kind_reallocated_is_not_replayed(renderer, ahead, replayed, monkeypatch):
     """Arrays that a larger image has replaced are not those of the graph."""
     resident, large = (
         renderer.upload(CLOUD),
         fs.Camera.look_at(200, 160, 1.1, (0.0, 0.0, 0.0), (0.0, 0.0, 3.0)),
     )
+    # earlier tests may have left larger arrays
+    monkeypatch.setattr(ahead.pool, "_arrays", {})
+    monkeypatch.setattr(ahead.pool, "_parts", {})
+    monkeypatch.setattr(ahead.pool, "state", object())
     small = [renderer.render(resident, CAPTURE) for _ in range(4)]
     renderer.render(resident, CAPTURE.with_(camera=large))
     small += [renderer.render(resident, CAPTURE) for _ in range(2)]
