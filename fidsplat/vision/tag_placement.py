@@ -206,17 +206,17 @@ def local_search(
 ) -> Selection:
     """Exchange one selected candidate at a time for a better one, until no exchange improves the
     objective."""
-    chosen, value = list(selection.chosen), selection.value
+    chosen = list(selection.chosen)
+    value, after = _with(covariance, candidates, chosen, objective)
     limits = np.array([objective(covariance, one) for one in candidates])
     order = np.argsort(-limits, kind="stable")
     for _ in range(PASSES):
-        before, after = value, _with(covariance, candidates, chosen)
+        before = value
         for place in range(len(chosen)):
             interrupts.check()
             others = chosen[:place] + chosen[place + 1 :]
             without = updated(after, candidates[chosen[place]], -1.0)
-            own = objective(without, candidates[chosen[place]])
-            best, most = chosen[place], own * (1 + _MORE)
+            best, most = chosen[place], objective(without, candidates[chosen[place]]) * (1 + _MORE)
             for k in order:
                 if objective is gain and limits[k] <= most:
                     break
@@ -225,21 +225,28 @@ def local_search(
                 found = objective(without, candidates[k])
                 if found > most:
                     best, most = int(k), found
-            if best != chosen[place]:
-                chosen[place] = best
-                value += most - own
-                after = updated(without, candidates[best])
+            if best == chosen[place]:
+                continue
+            # a downdate loses digits that precise tags have gained
+            tried = [*chosen[:place], best, *chosen[place + 1 :]]
+            exact, moved = _with(covariance, candidates, tried, objective)
+            if exact > value:
+                chosen, value, after = tried, exact, moved
         if value <= before * (1 + _MORE):
             break
-    after = _with(covariance, candidates, chosen)
     bound = min(selection.bound, _bound(after, candidates, chosen, value, objective))
     return Selection(tuple(chosen), value, bound)
 
 
-def _with(covariance: np.ndarray, candidates: Sequence[Sightings], chosen: Sequence[int]) -> np.ndarray:
+def _with(
+    covariance: np.ndarray, candidates: Sequence[Sightings], chosen: Sequence[int], objective: Objective
+) -> tuple[float, np.ndarray]:
+    """The objective of selected candidates, and the covariance with them."""
+    value = 0.0
     for k in chosen:
+        value += objective(covariance, candidates[k])
         covariance = updated(covariance, candidates[k])
-    return covariance
+    return value, covariance
 
 
 def _bound(

@@ -223,6 +223,22 @@ def test_the_predicted_error_can_be_minimised():
     assert short < 6
 
 
+def test_exchanges_of_precise_tags_lose_no_digits():
+    """After much drift, tags of high information determine nearly everything."""
+    rng, path = np.random.default_rng(1), np.tile(np.eye(4), (30, 1, 1))
+    path[:, 0, 3] = np.arange(30) / 2
+    covariance, candidates = odometry_covariance(path, 1.0, 0.5, start=(1.0, 1.0)), []
+    for _ in range(40):
+        roots = 1e4 * rng.normal(size=(5, 6, 8))
+        seen = np.sort(rng.choice(30, 5, replace=False))
+        candidates.append(Sightings(seen, roots @ roots.transpose(0, 2, 1)))
+    found = greedy(covariance, candidates, 6, objective=error_gain)
+    searched = local_search(covariance, candidates, found, objective=error_gain)
+    left = error_of(covariance, candidates, searched.chosen)
+    assert position_error(covariance) ** 2 - searched.value == pytest.approx(left**2, rel=1e-3)
+    assert left <= error_of(covariance, candidates, found.chosen)
+
+
 def test_conflicts_and_targets_are_respected():
     covariance, candidates = problem(1)
     free = greedy(covariance, candidates, 3).chosen
