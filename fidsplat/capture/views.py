@@ -35,8 +35,9 @@ class Views:
         counts = {"captures": len(self.captures)} if len(self.captures) != 1 else {}
         counts |= {} if self.poses is None else {"poses": len(self.poses)}
         counts |= {f"groups[{label}]": len(each) for label, each in (self.groups or {}).items()}
-        external = self.captures[0].external_depth if len(self.captures) == 1 else None
-        counts |= {"external_depth": len(external.depth)} if external and external.stacked else {}
+        for external in (capture.external_depth for capture in self.captures):
+            if external and external.stacked:
+                counts["external_depth"] = len(external.depth)
         if not counts:
             counts = {"captures": 1}
         counts |= {} if self.mask is None else {"mask": len(self.mask)}

@@ -143,6 +143,8 @@ def test_views_of_a_batch_have_images_of_their_own(renderer):
             np.testing.assert_array_equal(same[name][::2], batch[name][::2], err_msg=name)
     with pytest.raises(fs.InputError, match="external_depth has 3, mask has 2"):
         renderer.render_batch(cloud, capture, mask=np.array([True, True]))
+    with pytest.raises(fs.InputError, match="captures has 2, external_depth has 3"):
+        renderer.render_batch(cloud, [capture, capture])
 
 
 def test_an_empty_surface_changes_no_bit(renderer):
