@@ -208,25 +208,34 @@ def _minimise(at: _State, stage: _Stage, steps: int) -> _State:
 
 
 def _finish(at: _State, stage: _Stage) -> Alignment:
-    """Newton's method for Tukey's loss, and the covariance. The derivative of the score is that of the first
-    step. Infinite covariance if the pixels do not determine the pose and its covariance."""
+    """The last steps, and if they do not converge, again after steps with Huber's loss: Tukey's ignores edges
+    that are more than a fraction of a pixel away."""
+    found, settled = _last_steps(at, stage)
+    return found if settled else _last_steps(_minimise(at, stage, _LAST_STEPS), stage)[0]
+
+
+def _last_steps(at: _State, stage: _Stage) -> tuple[Alignment, bool]:
+    """Newton's method for Tukey's loss, and the covariance; and whether the steps converged. The derivative
+    of the score is that of the first step. Infinite covariance if the pixels do not determine the pose and
+    its covariance."""
     at, noise, inverse = _State(at.pose, at.fit._replace(huber=False)), 0.0, None
-    covariance = np.diag(np.full(6, np.inf))
+    covariance, settled = np.diag(np.full(6, np.inf)), False
     for _ in range(_LAST_STEPS):
         frame = stage.frame(at.pose)
         sums = stage.sums(frame, at, noise, blocks=True)
         inverse = _inverse(sums, _bread(at, sums, stage, frame)) if inverse is None else inverse
-        if inverse is None:
+        if settled := inverse is None:
             break
         covariance, step = _covariance(sums, inverse), inverse @ _right(sums)
         at, noise = at.moved(sums, step), sums.noise
         square = step[:6] @ np.linalg.lstsq(covariance, step[:6], rcond=None)[0]
         exact = sums.noise > 1.001 * MIN_NOISE or stage.pixels(step[:6], sums) < _REPEATED_PIXELS
-        if square < _REPEATED**2 and exact:
+        if settled := square < _REPEATED**2 and exact:
             break
     # an image without the scene's contrast fits a render whose contrast the smallest gain removes
     inliers = sums.inliers if (at.fit.gain > GAINS[0]).any() else 0.0
-    return Alignment(stage.camera.with_pose(at.pose), covariance, inliers, sums.noise, at.fit.gain)
+    camera = stage.camera.with_pose(at.pose)
+    return Alignment(camera, covariance, inliers, sums.noise, at.fit.gain), bool(settled)
 
 
 def _bread(at: _State, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.ndarray:

@@ -72,6 +72,14 @@ def test_the_pose_of_a_noisy_image_is_recovered(renderer, room):
     assert found.camera.fx == 62.0
 
 
+def test_small_splats_are_aligned_to_a_fraction_of_a_pixel(renderer):
+    """Edges that Tukey's loss ignores after the stages at lower resolution."""
+    scene = scene_with(2000)
+    start = offset_camera(scene.camera, START / 2)
+    found = fs.localise(renderer.render(scene)["rgb"], scene, start, renderer=renderer)
+    assert off(found.camera, scene.camera)[0] < 0.2
+
+
 def test_exposure_and_white_balance_do_not_matter(renderer, room):
     scene, resident, image = room
     start = offset_camera(scene.camera, START)
