@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -30,10 +29,9 @@ from fidsplat.markers import marker
 from fidsplat.render.output_files import save_output
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import PlacedMarker, Scene
-from fidsplat.scenes.captured import captured_scenes, fetch_scene
+from fidsplat.scenes.captured import captured_scenes, fetch_meanwhile, fetch_scene
 from fidsplat.scenes.lights import Lighting
 from fidsplat.splats.rotations import rigid_matrix
-from fidsplat.util.errors import InputError
 from fidsplat.util.files import writable_folder, write_json
 from fidsplat.vision.readback import Reading, read_back
 from fidsplat.worlds.yard import OUTPUTS, demo_scene, demo_views, sunlit
@@ -42,8 +40,6 @@ COMPLETE = 0.98
 """minimum visible share of a completely visible marker; the rest is the soft edge of its quiet zone"""
 MAX_POSITION_ERROR = 0.01
 """maximum position error relative to the distance"""
-_WAIT = 0.5
-"""seconds to wait for a download after the other views"""
 _FRAMES = 3
 """timed frames after the one that compiles kernels"""
 
@@ -123,7 +119,7 @@ def run_demo(
     folder = writable_folder(out)
     default = captured is None
     captured = "biker" if captured is None else captured
-    missing = _fetched_meanwhile(captured) if default else lambda: "not requested"
+    missing = fetch_meanwhile(captured) if default else lambda: "not requested"
     if captured != "none" and not default:
         progress(f"fetching the captured scene {captured}")
         fetch_scene(captured)  # first, since it may fail
@@ -175,27 +171,6 @@ def run_demo(
     )
     write_json(folder / "demo.json", result.as_dict(), indent=2)
     return result
-
-
-def _fetched_meanwhile(name: str) -> Callable[[], str]:
-    """Download a captured scene in a thread. Returns a function that returns why it is missing, or ""."""
-    found: list[str] = []
-
-    def fetch() -> None:
-        try:
-            fetch_scene(name)
-            found.append("")
-        except InputError as error:
-            found.append(str(error))
-
-    thread = Thread(target=fetch, daemon=True)  # the command ends although a download hangs
-    thread.start()
-
-    def missing() -> str:
-        thread.join(_WAIT)
-        return found[0] if found else f"the download of {name} takes longer than the other views"
-
-    return missing
 
 
 @dataclass(frozen=True, eq=False)

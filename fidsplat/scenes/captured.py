@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from threading import Thread
 
 from fidsplat.util.downloads import download
 from fidsplat.util.errors import InputError, unknown
@@ -14,6 +15,8 @@ from fidsplat.util.files import from_json, user_cache
 
 MIRROR = "FIDSPLAT_SCENES"
 """environment variable with a folder or URL that replaces the address of the files"""
+_WAIT = 0.5
+"""seconds to wait for a download that runs meanwhile"""
 
 
 @dataclass(frozen=True)
@@ -74,3 +77,28 @@ def fetch_scene(name: str, progress: Callable[[str, float], None] = lambda *_: N
     for file, (size, sha256) in scene.files.items():
         download(f"{url.rstrip('/')}/{file}", folder / file, size, sha256, add)
     return folder / scene.open
+
+
+def fetch_meanwhile(name: str) -> Callable[[], str]:
+    """Download a captured scene in a thread. Returns a function that returns why it is missing, or "".
+
+    A thread that hangs at the end of the process keeps the globals of its functions alive; those of this
+    module hold no objects of zxing-cpp, which would report them as leaks.
+    """
+    found: list[str] = []
+
+    def fetch() -> None:
+        try:
+            fetch_scene(name)
+            found.append("")
+        except InputError as error:
+            found.append(str(error))
+
+    thread = Thread(target=fetch, daemon=True)  # the command ends although a download hangs
+    thread.start()
+
+    def missing() -> str:
+        thread.join(_WAIT)
+        return found[0] if found else f"the download of {name} takes longer than the other views"
+
+    return missing

@@ -1,7 +1,10 @@
 """Captured scenes by name: downloads with checksums, from a folder instead of the network."""
 
 import hashlib
+import os
 import socket
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -70,6 +73,19 @@ def test_fetch_reports_a_server_that_ends_early(mirror, monkeypatch):
         monkeypatch.setenv("FIDSPLAT_SCENES", f"http://127.0.0.1:{server.getsockname()[1]}")
         with pytest.raises(fs.InputError, match=r"cannot download http://127.0.0.1:\d+/one.ply: Incomplete"):
             captured.fetch_scene("some")
+
+
+def test_a_download_that_hangs_ends_with_the_process(tmp_path):
+    code = """import fidsplat.experiments.demo as demo
+print(demo.fetch_meanwhile("biker")())"""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"http://127.0.0.1:{server.getsockname()[1]}"
+        changed = {"FIDSPLAT_SCENES": url, "XDG_CACHE_HOME": str(tmp_path)}
+        run = subprocess.run(
+            [sys.executable, "-c", code], env=os.environ | changed, capture_output=True, text=True, timeout=60
+        )
+    assert run.stdout == "the download of biker takes longer than the other views\n"
+    assert run.stderr == ""
 
 
 def test_every_scene_names_author_and_licence(capsys):
