@@ -161,6 +161,17 @@ def test_sums_of_the_device_agree_with_numpy(renderer, room, lens):
             assert other[name] == pytest.approx(value, abs=tolerance * scale), name
 
 
+def test_a_store_is_localised_in(renderer, room, tmp_path):
+    """Frames of a store are on the host, and so are the sums."""
+    scene, _, _ = room
+    fs.save_ply(scene.clouds[0], str(tmp_path / "room.ply"))
+    store = fs.Store(fs.build_store([str(tmp_path / "room.ply")], str(tmp_path / "room.fss")))
+    image, resident = renderer.render(store, scene.camera)["rgb"], renderer.upload(store)
+    found = fs.localise(image, resident, offset_camera(scene.camera, START), renderer=renderer)
+    assert found.found
+    assert off(found.camera, scene.camera)[0] < 0.1
+
+
 def test_a_tag_gives_the_initial_pose(renderer, tmp_path, capsys):
     made = fs.marker("apriltag:36h11:5", size=0.5)
     pose = np.eye(4)
