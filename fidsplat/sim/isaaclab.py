@@ -116,11 +116,10 @@ class TiledCamera:
         poses, camera = self._world_poses(bodies), self._camera
         tensor = next(iter(self._tensors.values())).new_empty(0).float().new_tensor  # on their device
         order = 3 + self._from_wxyz
-        quats = [tensor(compose(poses, inverse(axes))[:, order]) for axes in _FROM_ROS.values()]
+        world, ros, opengl = (tensor(compose(poses, inverse(axes))[:, order]) for axes in _FROM_ROS.values())
         matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
-        return CameraData(
-            self.image_shape, tensor([matrix] * len(poses)), tensor(poses[:, :3]), *quats, dict(self._tensors)
-        )
+        intrinsics, images = tensor([matrix] * len(poses)), dict(self._tensors)
+        return CameraData(self.image_shape, intrinsics, tensor(poses[:, :3]), world, ros, opengl, images)
 
     def update(self, dt: float, force_recompute: bool = False) -> None:
         """Advance the time; images of environments whose period has passed are rendered when `data` is read,
