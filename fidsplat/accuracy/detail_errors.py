@@ -49,7 +49,9 @@ def measure_detail(
     if store.poses is not None:
         raise InputError(f"{store.path} is instanced; measure {store.header.store} instead")
     if not len(store) or not store.nodes["level"].any():
-        raise InputError(f"{store.path} has no levels of detail; build it with them, from more splats")
+        raise InputError(
+            f"{store.path} must have levels of detail, got none; build it again with levels, from more splats"
+        )
     measured, levels, views = [], range(1, store.levels + 1), settings.views
     for number, one in enumerate(settings.lowpass):
         worst: dict[int, list[float | None]] = {level: [None] * len(SIZES) for level in levels}

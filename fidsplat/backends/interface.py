@@ -49,19 +49,20 @@ class DeviceTraits:
     """Optional capabilities of a device, with the methods that need them."""
 
     caches_chunks: bool = False
-    """`Backend.chunk_cache`"""
+    """caches chunks of stores on the device: `Backend.chunk_cache`"""
     termination_depths: bool = False
-    """`Backend.termination_depths` and `copy_tiles`, and kernels for the effect `termination_depths`"""
+    """reports the depth at which each tile terminates, for occlusion culling: `Backend.termination_depths`
+    and `copy_tiles`, and kernels for the effect `termination_depths`"""
     differentiates: bool = False
-    """`Backend.differentiate`"""
+    """computes gradients of frames: `Backend.differentiate`"""
     trains: bool = False
-    """`Backend.training`"""
+    """trains splats on the device: `Backend.training`"""
     aligns: bool = False
-    """`Backend.alignment`"""
+    """aligns images on the device: `Backend.alignment`"""
     measures_rates: bool = False
     """`Backend.rates`, `memory_bytes` and `release_scratch`, and kernels for the effect `overdraw`"""
     renders_pixels: bool = False
-    """`Pipeline.render_every`"""
+    """renders a subset of the pixels: `Pipeline.render_every`"""
     probed: bool = False
     """`Backend.probe`, `shapes` and `pieces`, for tests"""
 
@@ -97,7 +98,7 @@ class ResidentData(ABC):
     def color_range(self) -> tuple[float, float]:
         """Lower and upper bound of every channel of every splat, from any direction."""
         raise InputError(
-            "the output 'error' must be of splats whose colours the host knows, got adopted arrays; render "
+            "the output 'error' needs splat colours in host memory, got adopted device arrays; render "
             "a SplatCloud, or leave out the output 'error'"
         )
 
@@ -386,8 +387,8 @@ class Backend(ABC):
 
     @abstractmethod
     def pipeline(self, features: FeatureSet, shape: Any = None) -> Pipeline:
-        """The pipeline for these features, compiled on first use. shape: one of `shapes` instead of the
-        device's own.
+        """The pipeline for these features, compiled on first use. shape: build constants of the kernels, one
+        of `shapes`; None: those in `Backend.shape`.
 
         Raises:
             DeviceError: the device does not support a feature, or the compiler fails.

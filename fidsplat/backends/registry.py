@@ -58,7 +58,7 @@ class Devices(list[DeviceInfo]):
 
 
 def devices() -> Devices:
-    """List all devices: those that can be opened, and those that cannot, with the reason.
+    """List all devices: usable ones, and unusable ones with the reason.
 
     Raises:
         DeviceError: a fork has made a driver unusable, or a limit of the process is too low for drivers.

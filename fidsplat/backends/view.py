@@ -204,7 +204,7 @@ class View:
             center_y=cy,
             rotation=rotation,
             translation=rotated(-rotation, eye),
-            # view-dependent colours of parallel rays are those of a distant eye
+            # evaluate view-dependent colours of parallel rays from a distant eye
             eye=eye - FAR_EYE * rotation[2] if parallel else eye,
             near=camera.near,
             far=camera.far,

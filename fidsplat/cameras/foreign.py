@@ -172,7 +172,7 @@ def ros_parts(info: Any, world_to_camera: Any, rectified: bool) -> Parts:
             f"camera_matrix and so on, got {type(info).__name__}"
         ) from None
     if reduced:
-        raise InputError("info must be of the complete image, got binning or a region of interest")
+        raise InputError("info must describe the complete image, got binning or a region of interest")
     if model not in _ROS:
         raise InputError(unknown("distortion_model of CameraInfo", model, tuple(filter(None, _ROS))))
     kind, names = _ROS[model]

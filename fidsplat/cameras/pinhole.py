@@ -122,9 +122,9 @@ class Camera(PickledByFields, Summarised):
                 values = [(each.name, getattr(lens, each.name)) for each in fields(lens)]
                 given = ", ".join(f"{name} = {value:g}" for name, value in values if value)
                 raise InputError(
-                    f"camera distortion must be invertible in half of the image, got {given}, which folds "
-                    f"back in {100 * (1 - covered):.0f} % of it; check the coefficients and the focal length "
-                    f"({self.fx:g} pixels)"
+                    f"camera distortion must be invertible in half of the image, got {given}, which is not "
+                    f"invertible in {100 * (1 - covered):.0f} % of it; check the coefficients and the focal "
+                    f"length ({self.fx:g} pixels)"
                 )
             if covered == 0:
                 raise InputError(

@@ -38,7 +38,7 @@ class Trajectory(PickledByFields):
     """(k, 4, 4) rigid; or given as pairs of a position and a unit quaternion w, x, y, z, or as (k, 7)"""
     smooth: bool = False
     """continuous velocity: a cubic Bezier curve of screw motions between keyframes. The velocity at a
-    keyframe is that of the parabola through it and its neighbours, limited where rotations are fast.
+    keyframe is the slope of the parabola through it and its neighbours, limited where rotations are fast.
     Keyframes must be less than half a rotation apart"""
 
     def __post_init__(self) -> None:
@@ -159,7 +159,7 @@ def _of_vector(k: int, vector) -> np.ndarray:
 
 
 def _shown(given, times: np.ndarray) -> str:
-    """The times for a message; those that do not increase, if that is the problem."""
+    """The times for an error message; if times do not increase, only these times."""
     if times.ndim == 1 and len(times) > 1 and np.isfinite(times).all():
         k = int(np.argmax(np.diff(times) <= 0))
         return f"{times[k]:.15g} and then {times[k + 1]:.15g} (number {k + 1}, counted from 0)"

@@ -17,7 +17,7 @@ from fidsplat.commands.output import delayed_progress, report
 class Info:
     """Describe a splat file: number, kind and bounds of its splats.
 
-    Bounds are those of all splats, and of the middle 99 % of their centres along each axis, as captures have
+    Bounds enclose all splats, and the middle 99 % of their centres along each axis, as captures have
     strays far away. The up axis is a guess: away from the level areas, or along a side that is by far the
     longest. The command suggests size and pose of a first marker that faces the camera of `fidsplat render
     FILE.ply`.

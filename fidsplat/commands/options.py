@@ -59,7 +59,7 @@ def check_request(outputs: tuple[str, ...] | None, quality: str | None) -> None:
 def check_workers(ray: str | None, workers: int | None) -> None:
     """Raise InputError for an impossible number of workers, before anything is read."""
     if workers is not None and (ray is None or workers < 1):
-        raise InputError(f"--workers must be at least 1, with --ray ADDRESS, got {workers}")
+        raise InputError(f"--workers must be at least 1 and needs --ray ADDRESS, got {workers}")
 
 
 def writable_file(path: str | Path) -> Path:

@@ -66,7 +66,7 @@ class Build:
 class Place:
     """Place instances of a store: the new store holds only poses and the path of the other.
 
-    Poses come from a file (camera to world, as for `fidsplat fly`) or form a grid whose first pose is that of
+    Poses come from a file (camera to world, as for `fidsplat fly`) or form a grid that starts at the pose of
     the store itself.
 
     Examples:

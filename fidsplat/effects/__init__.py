@@ -1,4 +1,4 @@
-"""Effects and outputs as data, and the selection of those that a frame requires."""
+"""Declarations of effects and outputs, and the selection of what a frame requires."""
 
 from fidsplat.effects.catalogue import CATALOGUE, IMAGES, OUTPUTS, Effect, Output, declared_output
 from fidsplat.effects.extensions import Extension, load_extensions, register

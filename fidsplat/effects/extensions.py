@@ -17,7 +17,7 @@ class Extension:
 
     name: str
     opencl: Path
-    """absolute path of its OpenCL sections, as those of kernels/opencl/output and post"""
+    """absolute path of its OpenCL sections, in the format of the files in kernels/opencl/output and post"""
     output: Output | None = None
     """declaration of the image; None: a step of a sensor, requested by `Sensor.extra_steps`"""
     parts: tuple[str, ...] = ()
@@ -25,7 +25,7 @@ class Extension:
     samples: tuple[str, ...] = ()
     """its sample buffers of floats"""
     uniforms: tuple[str, ...] = ()
-    """names of a step's float arguments, whose values are those of `Sensor.extra_steps`"""
+    """names of a step's float arguments; `Sensor.extra_steps` has their values"""
     warp: Path | None = None
     """absolute path of a folder with NAME.py for Warp; None: not supported"""
 

@@ -44,7 +44,7 @@ class FeatureSet:
 
     @cached_property
     def images(self) -> tuple[Output, ...]:
-        """Output images: rgb, those that other outputs need, the others."""
+        """Output images: first rgb, then inputs of other outputs, then the others."""
         needed: set[str] = set()
         for name in self.outputs:
             needed.update(CATALOGUE[name].needs)
@@ -58,7 +58,7 @@ class FeatureSet:
 
 def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
     """Select the features that a capture of a cloud requires. Values without effect select nothing. A capture
-    without a camera is that of a pinhole.
+    without a camera counts as a pinhole.
 
     Raises:
         InputError: an unknown output, or two effects that exclude each other.

@@ -22,7 +22,7 @@ def tag_depth_image(tags: Iterable[PlacedMarker], camera: Camera, behind: np.nda
     A partly covered pixel is mixed with the frame, at the depth of the tag.
 
     Args:
-        tags: black and white markers; those that face away or reach behind the camera are skipped.
+        tags: black and white markers; tags that face away or reach behind the camera are skipped.
         camera: a pinhole.
         behind: (h, w, 3) frame without the tags.
     """

@@ -107,7 +107,7 @@ def check(options: TagSettings) -> None:
 
 
 def points_of(options: TagSettings) -> list[Key]:
-    """Points of the shard of a run: first those without a cause, then cause by cause.
+    """Points of the shard of a run: first without a cause, then cause by cause.
 
     Raises InputError for detectors that cannot be used.
     """

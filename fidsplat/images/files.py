@@ -40,7 +40,9 @@ def read_image(path: str | os.PathLike[str], deep: bool = False) -> np.ndarray:
     """
     image = _read(path, cv2.IMREAD_COLOR | (cv2.IMREAD_ANYDEPTH if deep else 0))
     if image.dtype not in (np.uint8, np.uint16, np.float32):
-        raise InputError(f"the pixels of {path} must be of 8 or 16 bits, or floats of 32, got {image.dtype}")
+        raise InputError(
+            f"the pixels of {path} must be integers of 8 or 16 bits or 32-bit floats, got {image.dtype}"
+        )
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
@@ -52,7 +54,7 @@ def read_rgba(path: str | os.PathLike[str]) -> np.ndarray:
     """
     image = _read(path, cv2.IMREAD_UNCHANGED)
     if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"the pixels of {path} must be of 8 or 16 bits, got {image.dtype}")
+        raise InputError(f"the pixels of {path} must be integers of 8 or 16 bits, got {image.dtype}")
     if image.dtype == np.uint16:
         image = (image >> 8).astype(np.uint8)
     return _to_rgba(image, path)

@@ -5,7 +5,7 @@ Jacobian of a rendered pixel is its image gradient times the motion of its point
 determines; this takes one render per step (Lucas-Kanade). Gain and offset of each channel are unknowns too,
 so the result does not depend on exposure and white balance.
 
-The last steps and the covariance are those of an M-estimator (Huber 1967): the sandwich of the derivative of
+The last steps and the covariance follow an M-estimator (Huber 1967): the sandwich of the derivative of
 the score, by finite differences of renders, and of the covariance of the score. Blocks of pixels are
 independent, the pixels within a block may be correlated.
 """
@@ -80,7 +80,7 @@ class Alignment:
 
 def stages_of(camera: Camera, mask: np.ndarray | None = None) -> list[tuple[AlignmentStage, int]]:
     """Stages from coarse to fine for a camera, with maximum numbers of steps of `_minimise`. The first is
-    blurred more, for a larger basin of convergence; the last is not blurred, so that its noise is that of the
+    blurred more, for a larger basin of convergence; the last is not blurred, so that it has the noise of the
     image."""
     short, ignored = min(camera.width, camera.height), _ignored(mask, camera)
     shrinks = [2**k for k in range(MAX_LEVELS) if k == 0 or short >> k >= MIN_SIDE]
@@ -216,8 +216,8 @@ def _finish(at: _State, stage: _Stage) -> Alignment:
 
 def _last_steps(at: _State, stage: _Stage) -> tuple[Alignment, bool]:
     """Newton's method for Tukey's loss, and the covariance; and whether the steps converged. The derivative
-    of the score is that of the first step. Infinite covariance if the pixels do not determine the pose and
-    its covariance."""
+    of the score is computed at the first step only. Infinite covariance if the pixels do not determine the
+    pose and its covariance."""
     at, noise, inverse = _State(at.pose, at.fit._replace(huber=False)), 0.0, None
     covariance, settled = np.diag(np.full(6, np.inf)), False
     for _ in range(_LAST_STEPS):

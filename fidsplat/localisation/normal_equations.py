@@ -179,7 +179,7 @@ def _slopes(image: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _nearest(depth: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(n,) inverse depths, the largest of a pixel and its neighbours: at an edge the gradient is that of the
+    """(n,) inverse depths, the largest of a pixel and its neighbours: at an edge the gradient belongs to the
     surface in front. 0 for the background."""
     flat, width = depth.reshape(-1), depth.shape[1]
     inverse = np.zeros_like(flat)

@@ -137,7 +137,7 @@ class Marker(PickledByFields):
     shape: SheetShape | None = None
     """surface that the sheet is bent to; None: flat"""
     wear: Wear | None = None
-    """print defects and wear of the splats; grid and rectangles are those of the new marker; None: none"""
+    """print defects and wear of the splats; grid and rectangles describe the new marker; None: none"""
 
     def __repr__(self) -> str:
         return (

@@ -152,7 +152,7 @@ def ideal_of(data: Any, capture: Capture, backend: Backend) -> Ideal:
     _refuse_unbounded(capture)
     if not isinstance(data, ResidentData):
         raise InputError(
-            "the output 'error' must be of splats in memory, got a store; render store.cloud() if it fits "
+            "the output 'error' needs splats in memory, got a store; render store.cloud() if it fits "
             "into memory, or leave out the output 'error'"
         )
     quality = ideal_quality(capture.quality, cutoff_of(data.count))

@@ -35,7 +35,7 @@ class Frame(ImageMapping):
         error: ComputedImage | None = None,
         index: int = 0,
     ) -> None:
-        """Arguments are those of `ImageMapping`; error: the output `error`, if it is requested."""
+        """Accepts the arguments of `ImageMapping`. error: the output `error`, if it is requested."""
         super().__init__(images, capture.outputs, ids, index)
         self._error, self.capture = error, capture
         """The capture of this frame. `read_back` and `truth_of` use its camera, shutter and motion."""

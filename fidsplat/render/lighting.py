@@ -196,7 +196,7 @@ def _check_gloss(light: Lighting, around: _Surroundings) -> None:
             f"cannot represent sharper reflections, got {light.roughness:g}; use view='camera'"
         )
     if light.view == "camera" and around.camera is None:
-        raise InputError("light: view='camera' must have a scene with a camera, got none; add a camera")
+        raise InputError("light: the scene must have a camera for view='camera', got none; add a camera")
 
 
 def _points(placed: PlacedMarker, light: Lighting) -> _Points:

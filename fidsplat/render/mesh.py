@@ -64,7 +64,9 @@ def scene_mesh(
         else items("cameras", cameras, Camera, "a list of Camera")
     )
     if not views:
-        raise InputError("a mesh must have at least one camera, got none")
+        raise InputError(
+            "cameras must have at least one camera, got none; leave them out for views around the scene"
+        )
     renderer = Renderer(scene.device) if renderer is None else renderer
     report: Callable[[str, float], object] = progress or (lambda step, share: None)
     still = median_depth(scene.capture, "rgb", "normal")
@@ -114,7 +116,7 @@ def _bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Box of the middle 99 % of the centres along each axis."""
     cloud = scene.cloud()
     if not len(cloud):
-        raise InputError("a mesh must have a scene with splats, got none")
+        raise InputError("the scene of a mesh must have at least one splat, got none")
     low, high = np.percentile(cloud.means.astype(np.float64), (0.5, 99.5), axis=0) + cloud.origin
     reach = np.percentile(cloud.scales, 90)
     return low - reach, high + reach

@@ -81,8 +81,8 @@ class SeveralDevices:
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
     ) -> Frame:
-        """Render one frame. scene: as `Renderer.render`, or the result of `upload`. Other arguments and
-        errors are those of `Renderer.render`."""
+        """Render one frame. scene: as `Renderer.render`, or the result of `upload`. The other
+        arguments and errors are the same as in `Renderer.render`."""
         if capture is not None and not isinstance(capture, Capture | Camera):
             raise invalid("capture", "a Capture or a Camera", capture)
         resident = self._uploaded(scene)

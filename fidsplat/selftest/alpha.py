@@ -62,7 +62,7 @@ def d1(renderer: Renderer) -> Found:
     for n in (1, 2, 3, 4):
         yield Finding(f"light of the background through {n} opaque layers", light(n, None), 1e-4)
     for preset in PARITY:
-        # their second opaque layer is dropped, as in those renderers
+        # these presets drop the second opaque layer, as their renderers do: any number transmits 1 %
         worst = max(abs(light(n, preset) - 0.01) for n in (1, 2, 3))
         yield Finding(f"{preset}: difference from the 1 % that its renderer transmits", worst, 1e-5)
 

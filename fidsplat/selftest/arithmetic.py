@@ -236,7 +236,7 @@ def f6(renderer: Renderer) -> Found:
                 unsorted += not np.array_equal(visible, np.flatnonzero(depths > 0))
                 unlisted += not _lists_are_complete(trace, len(expected))
                 tried += 1
-    yield Finding(f"of {tried} depth orders, those that are not stable", unsorted, 0)
+    yield Finding(f"unstable depth orders, of {tried}", unsorted, 0)
     yield Finding("tile lists that lack a splat or have a wrong start", unlisted, 0)
 
 

@@ -104,8 +104,8 @@ def e1(renderer: Renderer) -> Found:
         counted = sum(bad.dropped.values()) == 1 and len(bad) == len(without)
         miscounted += not (counted and frame.stats == expected.stats)
         tried += 1
-    yield Finding(f"of {tried} broken values, those that change the image", different, 0)
-    yield Finding("those that are not counted as one dropped splat", miscounted, 0)
+    yield Finding(f"invalid values that change the image, of {tried}", different, 0)
+    yield Finding("invalid values that are not counted as one dropped splat", miscounted, 0)
 
 
 @case(

@@ -82,8 +82,10 @@ def camera_path(
 
 
 def tag_and_large_splat(where: str) -> tuple[SplatCloud, SplatCloud]:
-    """A tag, and a large slanted splat in front of (`before`), `behind` or `through` it, whose centre is on
-    the other side.
+    """A tag, and a large slanted splat that passes in front of it (`before`), `behind` it or `through` it.
+
+    `before` and `behind`: the centre of the splat is on the other side of the tag's plane, so that sorting by
+    centres is wrong.
     """
     middle, slide = {"before": (-0.75, -1.3), "behind": (0.75, 1.3), "through": (0.0, 0.7)}[where]
     along = np.array([math.cos(math.radians(50)), 0, -math.sin(math.radians(50))])

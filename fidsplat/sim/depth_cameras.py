@@ -259,7 +259,7 @@ class StructuredLight(DepthCamera):
         moved = np.rint(rng.normal(0, self.lateral, (2, h, w))).astype(int)
         rows = np.clip(np.arange(h)[:, None] + moved[0], 0, h - 1)
         columns = np.clip(np.arange(w) + moved[1], 0, w - 1)
-        # the neighbour decides which surface is matched; its depth is that of the same plane at this pixel
+        # the neighbour decides which surface is matched; use the depth of that surface's plane at this pixel
         other, own = view.depth[rows, columns], view.depth
         same = np.abs(other - own) < 0.05 * own
         depth, valid = np.where(same, own, other), np.where(same, valid, valid[rows, columns])

@@ -198,7 +198,7 @@ class TiledCamera:
         rest = np.flatnonzero(~mask).tolist()
         for name in self._types:
             tensor = self._tensor(name, images)
-            if rest:  # the first images are those of all environments
+            if rest:  # the first images contain all environments
                 tensor[rest] = self._tensors[name][rest]
             self._tensors[name] = tensor  # tensors that were returned before keep their images
         self.frame[mask] += 1

@@ -25,9 +25,9 @@ class Localiser:
     State: x, y [m] and heading [rad] of the robot, bias of the gyroscope [rad/s], common scale of the wheels.
 
     Wheels measure the distance, the gyroscope the rotation; corners of tags in an image and matches of scans
-    correct the pose. The covariance is that of the error state; a correction is added to the state at once. A
-    scan is matched to an earlier one, the reference, whose pose is a part of the error state (stochastic
-    cloning), since the errors of both poses are correlated.
+    correct the pose. The filter stores the covariance of the error state; a correction is added to the state
+    at once. A scan is matched to an earlier one, the reference, whose pose is a part of the error state
+    (stochastic cloning), since the errors of both poses are correlated.
 
     Args:
         start: x, y, heading.

@@ -45,7 +45,7 @@ class MujocoRig(SimulatorRig):
 
     Args:
         model: mujoco.MjModel.
-        scene: splats and markers; those with a label in `bodies` in the frame of their body.
+        scene: splats and markers; splats with a label in `bodies` are in the frame of their body.
         bodies: {label: name of the body in the model}.
         cameras: names of the requested cameras; default all cameras that have a name.
         renderer, rest, outputs: as in `Rig`; by default a camera has the outputs of its `output` attribute.

@@ -33,7 +33,7 @@ class NewtonRig(SimulatorRig):
 
     Args:
         model: newton.Model whose worlds have the same bodies.
-        scene: splats and markers; those with a label in `bodies` in the frame of their body.
+        scene: splats and markers; splats with a label in `bodies` are in the frame of their body.
         bodies: {label of splats: label of the body in the first world, or of a global body}.
         cameras, renderer, rest, outputs: as in `Rig`.
 

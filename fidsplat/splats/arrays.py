@@ -15,7 +15,7 @@ OPTIONAL = ("colors", "sh", "coplanar_groups", "boxes", "thickness")
 
 
 def present_arrays(cloud: Any) -> dict[str, np.ndarray]:
-    """The arrays of a cloud by their names, without those that are None."""
+    """The arrays of a cloud by their names; arrays that are None are left out."""
     names = ("means", "quats", "scales", "opacities", "labels", *OPTIONAL)
     return {name: array for name in names if (array := getattr(cloud, name)) is not None}
 
@@ -147,7 +147,7 @@ def _is_frozen(array) -> bool:
 
 
 def as_single(array: np.ndarray) -> np.ndarray:
-    """A C-ordered float32 array that nobody else can change; an overflow becomes inf."""
+    """A C-ordered float32 array that no other code can change; an overflow becomes inf."""
     if array.dtype == F32 and array.flags.c_contiguous and _is_frozen(array):
         return array
     with np.errstate(over="ignore"):

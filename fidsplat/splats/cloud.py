@@ -249,7 +249,7 @@ class SplatCloud(PickledByFields, Summarised):
         Raises InputError for an empty cloud.
         """
         if not len(self):
-            raise InputError("bounds must be of at least one splat, got an empty cloud")
+            raise InputError("the cloud must have at least one splat to have bounds, got none")
         reach = self.reach(3.0)
         return (self.means - reach).min(axis=0) + self.origin, (self.means + reach).max(axis=0) + self.origin
 

@@ -96,7 +96,7 @@ class ChunkedSplats:
         """Axis-aligned box (min (3,), max (3,)) float64, world, around all splats."""
         boxes = [part.bounds() for part in (*self.stores, self.in_memory) if len(part)]
         if not boxes:
-            raise InputError("bounds must be of at least one splat, got an empty scene")
+            raise InputError("the scene must have at least one splat to have bounds, got none")
         low, high = zip(*boxes, strict=True)
         return np.min(low, axis=0), np.max(high, axis=0)
 
@@ -234,7 +234,8 @@ class ChunkedSplats:
         return arrays | {"means": (arrays["means"] + offset).astype(np.float32)}
 
     def _with_columns(self, arrays: dict[str, np.ndarray], first_group: int) -> dict[str, np.ndarray]:
-        """Arrays in the columns of this scene, with defaults for absent ones."""
+        """Convert the arrays of a chunk to the columns of this scene; absent columns have default values.
+        first_group: offset of the coplanar group ids."""
         count = len(arrays["means"])
         columns = {name: arrays[name] for name in ("means", "quats", "scales", "opacities", "labels")}
         columns |= colors_of_degree(arrays, self.sh_degree)

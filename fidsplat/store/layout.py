@@ -291,7 +291,7 @@ def _misfit(nodes: np.ndarray, header: Header) -> str:
         return "splats of coplanar groups must begin with a chunk"
     above = np.flatnonzero(parent != -1)
     if not ((parent >= -1) & (parent < len(nodes))).all() or (level[parent[above]] != level[above] + 1).any():
-        return "a node's parent must be of the level above"
+        return "a node's parent must be in the level above"
     if (parent[chunk & (first >= header.pinned)] != -1).any():
         return "splats of coplanar groups must have no parent"
     lengths = ("size", "reach", "low", "high", "far_low", "far_high")

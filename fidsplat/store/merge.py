@@ -32,7 +32,7 @@ def merged(splats: dict[str, np.ndarray], grid: Grid) -> tuple[dict[str, np.ndar
     """Merge splats to about a quarter of their number; returns the merged splats and the edge [m] of the
     cells.
 
-    The label of a merged splat is that of the splat with the largest weight. splats: arrays of a store's
+    A merged splat has the label of the splat with the largest weight. splats: arrays of a store's
     columns.
     """
     u, v, normal = _frames(splats["quats"])

@@ -104,7 +104,7 @@ def degree_of(source: Source) -> int:
 def sample(sources: Sequence[Source]) -> tuple[np.ndarray, np.ndarray]:
     """Sampled centres (n, 3) float32 [m] of all sources, relative to the returned origin (3,) float64.
 
-    The origin is that of all sources if they agree, else a point near the splats.
+    The origin: the common origin of all sources, or else a point near the splats.
     """
     means, single, scales = [], [], []
     for source in sources:

@@ -186,7 +186,7 @@ class Store(Summarised):
         low, high = self.boxes(sigmas)
         leaves = np.tile(self.nodes["level"] == 0, self.instances)
         if not leaves.any():
-            raise InputError("bounds must be of at least one splat, got an empty store")
+            raise InputError("the store must have at least one splat to have bounds, got none")
         return low[leaves].min(axis=0) + self.origin, high[leaves].max(axis=0) + self.origin
 
     @cached_property

@@ -131,8 +131,8 @@ def load_checkpoint(
         ) from error
     if made is None:
         raise InputError(
-            f"checkpoint {file} must be of the same run, got another {' and another '.join(differ)}; give "
-            "another name with -o, or --overwrite to start again"
+            f"checkpoint {file} must belong to the same run, got another {' and another '.join(differ)}; "
+            "give another name with -o, or --overwrite to start again"
         )
     now = zip(_made_by(device).items(), before, strict=True)
     return made, [f"another {name} ({was}, not {here})" for (name, here), was in now if was != here]

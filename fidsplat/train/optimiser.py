@@ -30,7 +30,7 @@ def learning_rates(settings: TrainSettings, iteration: int, extent: float) -> di
 def parameter_gradients(
     splats: Splats, gradients: Mapping[str, np.ndarray], settings: TrainSettings
 ) -> Arrays:
-    """Gradients with respect to the raw parameters, from those with respect to the activated values.
+    """Gradients with respect to the raw parameters, from gradients with respect to the activated values.
 
     Args:
         gradients: the result of a gradient pipeline: `means`, `quats`, `scales`, `opacities`, and `colors`
@@ -65,7 +65,7 @@ def parameter_gradients(
 
 
 def contributing(gradients: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Mask (n,) of the splats that contribute to a frame: those with a gradient."""
+    """Mask (n,) of the splats that contribute to a frame, which have a gradient."""
     color = gradients["sh"][:, 0] if "sh" in gradients else gradients["colors"]
     return (gradients["opacities"] != 0) | gradients["means"].any(axis=1) | color.any(axis=1)
 

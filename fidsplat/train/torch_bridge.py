@@ -122,6 +122,6 @@ class _Rendered(torch.autograd.Function):
 
 
 def _tensor(array: np.ndarray) -> Any:
-    """A tensor on the memory of an array that nobody else reads."""
+    """A tensor that shares the memory of an array without other readers."""
     array.flags.writeable = True
     return torch.from_numpy(array)

@@ -61,7 +61,7 @@ def render(
     wp, backend = load(), renderer.backend
     if not isinstance(backend, WarpBackend):
         raise DeviceError(
-            f"renderer must be of a Warp device, got {renderer.device.name}; use 'warp:cpu' or 'warp:cuda'"
+            f"renderer must use a Warp device, got {renderer.device.name}; use 'warp:cpu' or 'warp:cuda'"
         )
     given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     given |= {name: array for name, array in (("colors", colors), ("sh", sh)) if array is not None}

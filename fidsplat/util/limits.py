@@ -67,9 +67,9 @@ def check_expansion(path: Path | str, need: float, what: str, size: int | None =
         size = min(status.st_size, 512 * status.st_blocks)
     if need > (limit := input_limit(size)):
         raise InputError(
-            f"{path} must expand to at most {bytes_words(limit)}, the limit for a size of "
-            f"{bytes_words(size)}, got {what}, {bytes_words(need)}; "
-            f"if you trust the file, set {VARIABLE}={int(need) + 1}"
+            f"{path} must expand to at most {bytes_words(limit)} for its size of {bytes_words(size)}, "
+            f"got {what} ({bytes_words(need)} expanded); if you trust the file, set "
+            f"{VARIABLE}={int(need) + 1}"
         )
 
 

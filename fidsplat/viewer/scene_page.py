@@ -45,7 +45,7 @@ def save_page(scene: Scene, path: str | os.PathLike[str], title: str = "fidsplat
     """Write a scene as one HTML file that renders it offline, with WebGL 2, from its camera.
 
     The scene's lens, shutter, sensor, fog and light on markers are left out, and markers and boxes are
-    Gaussians; motions are those of time 0.
+    Gaussians; moving objects have their pose at time 0.
 
     Raises InputError for a scene without camera or splats, if the engine cannot be obtained, or for a file
     that cannot be written.

@@ -63,7 +63,7 @@ class Viewpoint:
     def __post_init__(self) -> None:
         numbers = (*self.position, *self.quaternion, self.fov_y, self.distance)
         if not all(math.isfinite(number) for number in numbers) or not any(self.quaternion):
-            raise InputError(f"the page's camera must be of finite numbers, got {numbers}; reload the page")
+            raise InputError(f"the page's camera must have finite numbers, got {numbers}; reload the page")
         if not 1e-3 <= self.fov_y <= math.pi - 1e-3:
             raise InputError(
                 f"the page's field of view must be 0.001 to 3.14 radians, got {self.fov_y}; reload the page"

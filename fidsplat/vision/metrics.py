@@ -121,7 +121,7 @@ def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
                 )
             if wrong := np.count_nonzero(~np.isfinite(weights[name])):
                 raise InputError(
-                    f"the array {name} of {file} must be finite, got {wrong:,} other numbers; see "
+                    f"the array {name} of {file} must be finite, got {wrong:,} NaN or infinite values; see "
                     "docs/experiments.md"
                 )
 

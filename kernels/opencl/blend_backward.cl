@@ -74,7 +74,7 @@ typedef struct {            // sums over the fragments of a lane
 typedef struct {
     vfloat nu, nv, inverse_d;
     vfloat half_rho;        // valid where `on_plane`
-    vint on_plane;          // the weight is that of the plane intersection, not of the low-pass disc
+    vint on_plane;          // the weight comes from the plane intersection, not from the low-pass disc
 //@@ geometry
 } Geometry;
 

@@ -91,7 +91,7 @@ INLINE TileSpan tile_span(const Bounds *b, int tile_row, int width, int height) 
 #endif
 
 // Tiles that the bounds overlap, as bits of a window of WINDOW_W x WINDOW_H tiles with its corner at tile
-// (*corner & 0xFFFF, *corner >> 16); 0 if they do not fit a window. Columns [x0, x1) and rows [y0, y1) enclose them.
+// (*corner & 0xFFFF, *corner >> 16); 0 if they do not fit into a window. Columns [x0, x1) and rows [y0, y1) enclose the bounds.
 INLINE uint tile_window(const Bounds *b, int x0, int x1, int y0, int y1, int width, int height, uint *corner) {
     int left = x0 / TILE_W, columns = (x1 - 1) / TILE_W - left + 1;
     int top = y0 / TILE_H, rows = (y1 - 1) / TILE_H - top + 1;

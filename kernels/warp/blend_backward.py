@@ -139,12 +139,12 @@ def make_blend_backward(
 
     @wp.func_native(with_numbers(_ANY_OF_BLOCK, numbers))
     def any_of_block(open: bool) -> bool:
-        """Whether any thread of the block says so; all wait for each other."""
+        """Whether `open` is true in any thread of the block; a barrier for all threads."""
         ...
 
     @wp.func_native(with_numbers(_ANY_OF_WARP, numbers))
     def any_of_warp(open: bool) -> bool:
-        """Whether any thread of the warp says so."""
+        """Whether `open` is true in any thread of the warp."""
         ...
 
     @wp.func_native(with_numbers(_POOL, numbers))

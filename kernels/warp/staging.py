@@ -1,5 +1,5 @@
 """A batch of splats in a GPU block's shared memory: their records, and for each cell of the tile the list of
-those that can touch it (cells.py says which).
+those that can touch it (selected by cells.py).
 
 Warp's own tiles have no 16-byte reads, shuffles or bytes in shared memory, so these few functions are CUDA.
 On the CPU, where a block is one thread, they read the records where they lie, and a cell's list is the batch.

@@ -56,7 +56,7 @@ def test_a_panorama_of_floats_keeps_what_is_brighter_than_white(tmp_path):
 
 def test_a_panorama_of_other_numbers_is_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "sky.tiff"), np.zeros((6, 8, 3)))
-    with pytest.raises(InputError, match="must be of 8 or 16 bits, or floats of 32, got float64"):
+    with pytest.raises(InputError, match="must be integers of 8 or 16 bits or 32-bit floats, got float64"):
         Panorama.load(tmp_path / "sky.tiff")
 
 

@@ -387,7 +387,7 @@ def test_errors_of_light_that_cannot_be_computed():
     assert light.max() == pytest.approx(0.85 * 0.5, rel=1e-4)
     with pytest.raises(fs.InputError, match=r"at least 0\.5 with view='any'"):
         lit(of_lights(SUN, roughness=0.3))
-    with pytest.raises(fs.InputError, match="must have a scene with a camera"):
+    with pytest.raises(fs.InputError, match="the scene must have a camera"):
         lit(of_lights(SUN, roughness=0.3, view="camera"))
 
 

@@ -248,7 +248,7 @@ def test_stores_without_detail_are_refused(store, renderer, tmp_path):
     with pytest.raises(fs.InputError, match="one or more of screen, pixel, none"):
         measure_detail(store, renderer, lowpass=("box",))
     flat = fs.Store(fs.build_store([City(300).source], tmp_path / "flat.fss", levels=False))
-    with pytest.raises(fs.InputError, match="no levels of detail"):
+    with pytest.raises(fs.InputError, match="must have levels of detail"):
         measure_detail(flat, renderer)
     assert flat.cell_sizes(QUALITY.with_(detail_error=0.1)) == (0.0,)  # beside others it stays exact
     with pytest.raises(fs.InputError, match=r"detail_error must .* got 1"):

@@ -90,7 +90,7 @@ def test_a_tape_has_the_gradients_of_pose_and_background(renderer, render):
 def test_what_a_tape_cannot_record_is_an_error(renderer, render):
     cloud, capture = picture()
     arrays, tape = on_device(cloud), wp.Tape()
-    with pytest.raises(fs.DeviceError, match="must be of a Warp device, got reference"):
+    with pytest.raises(fs.DeviceError, match="must use a Warp device, got reference"):
         render(tape, fs.Renderer("reference"), capture, **arrays)
     with pytest.raises(fs.InputError, match="exactly one of colors"):
         render(tape, renderer, capture, **arrays, sh=arrays["colors"])

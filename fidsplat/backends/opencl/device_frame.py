@@ -276,7 +276,7 @@ class DeviceFrame:
         self.put("batch_indices", self.batch.batch_indices)
 
     def bind_images(self, images: dict[str, cl.Buffer]) -> None:
-        """Bind the output images of the batch of which these views are a part."""
+        """Bind the output images of the complete batch; these views render into their part of them."""
         self.named |= images
         self.put("batch_indices", self.batch.batch_indices)
 

@@ -112,7 +112,7 @@ class OpenCLImages(Images):
     def _copy(self, name: str, into: np.ndarray, offset: int) -> None:
         with self._workspace.failing(f"rendering {name}"):
             after = self._done()
-            # on another queue than frames, where the copy would wait for the next frame
+            # a separate queue: on the queue of the frames, the copy would wait for the next frame
             queue, image = self._workspace.read_queue, self.buffer(name)
             cl.enqueue_copy(queue, into, image, src_offset=offset, wait_for=after)
 

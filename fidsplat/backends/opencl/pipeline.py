@@ -266,7 +266,7 @@ class OpenCLPipeline(Pipeline):
         return self._other(self.features, replace(self.shape, lists=lists))
 
     def _vectorises_too_few(self, resident: Resident) -> bool:
-        """Whether a frame of the cloud saves less by vectorised set-up than that takes to compile."""
+        """Whether the cloud is so small that vectorised set-up saves less time than its compilation takes."""
         return self.shape.batch > 1 and resident.count < MIN_BATCHED
 
     @cached_property

@@ -129,7 +129,7 @@ class ReferencePipeline(Pipeline):
         ]
         start = time.perf_counter()
         self._progress = _Progress(progress, rows.size * view.samples**2)
-        # tiles are those of the complete frame, so that sums have the same order
+        # the tiles of the complete frame, so that sums have the same order
         flat = self.pixels(resident, view, rows.ravel(), columns.ravel(), widest=_TILE)
         images = {name: image.reshape(1, *rows.shape, *image.shape[1:]) for name, image in flat.items()}
         took = (time.perf_counter() - start) * 1e3

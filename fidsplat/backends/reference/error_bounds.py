@@ -130,8 +130,8 @@ _Pair = tuple[np.ndarray, np.ndarray]
 
 
 def _of_mirrored_depth(s: Setup, d: _Pair, q: _Pair, dz: _Pair, circle: _Pair) -> _Pair:
-    """Interval of mirrored depths pz + circle (dz - pz d) 2 d / q (k, n), from the intervals of the factors.
-    circle: half of the rho at which depths are mirrored."""
+    """Bounds (k, n) of the depths of fragments outside the circle rho = C (docs/correctness.md, "The depth of
+    a fragment"): pz + circle (dz - pz d) 2 d / q, from bounds of the factors. circle: C / 2."""
     d = np.maximum(d[0], 0.0), np.maximum(d[1], 0.0)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         beyond = dz[0] - np.maximum(s.pz * d[0], s.pz * d[1]), dz[1] - np.minimum(s.pz * d[0], s.pz * d[1])
@@ -222,10 +222,11 @@ def first_column(mask: np.ndarray, start: int) -> np.ndarray:
 
 
 def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
-    """Bounds over all depth orders that rounding allows, of fragments or layers (k, m) sorted by depth.
+    """Bounds for fragments or layers (k, m) sorted by depth, over all depth orders that rounding allows.
 
-    Returns the span with bounds of the transmittances in front, and the largest change of colour by a change
-    of order (k,), per unit of colour. lift (k, m): share of its depth by which each counts as nearer.
+    Returns the span with bounds of the transmittance in front of each fragment, and (k,) the largest change
+    of a pixel's colour by another order, if all colours are in [0, 1]. lift (k, m): length that is subtracted
+    from the depth of each before sorting.
 
     A swap of two neighbours changes a colour by at most the product of their opacities and the transmittance
     in front of them. Every possible order results from swaps of pairs whose depth intervals overlap. Exactly

@@ -37,7 +37,7 @@ class Decisions:
     clamped: np.ndarray
     """clamped to the maximum alpha"""
     missed: np.ndarray
-    """the ray does not meet the plane beyond `near`, so the depth is that of the centre"""
+    """the ray does not meet the plane beyond `near`: the fragment has the depth of the centre"""
     mirrored: np.ndarray
     """the depth is mirrored at a circle"""
     wide: np.ndarray
@@ -141,7 +141,7 @@ class Blend:
         )
 
     def backward(self, by: Samples) -> Placed:
-        """Derivatives of a loss with respect to the placed splats, from those with respect to the samples."""
+        """Derivatives of a loss by the placed splats, from its derivatives by the samples."""
         made = self._made
         by_inverse = by.inverse[:, None] + 2 * by.squares[:, None] * self._inverse
         by_inverse = np.where(self._z > SPREAD_NEAR, by_inverse, 0.0)
@@ -154,7 +154,7 @@ class Blend:
         share = np.where(met, self._share, 0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             by_share = np.where(mirrored, by_z * (self._z_plane - self._pz), 0.0)
-            # derivative with respect to rho / 2, where rho / 2 is that of the intersection with the plane
+            # derivative with respect to rho / 2 of the ray-plane intersection
             by_plane = np.where(mirrored, -by_share * share / self._plane, 0.0)
             by_plane -= np.where(on_plane, by_log, 0.0)
             by_disc = np.where(made.contributes & made.by_disc, by_log, 0.0)

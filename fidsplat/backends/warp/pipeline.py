@@ -208,7 +208,7 @@ class WarpPipeline(Pipeline):
             return None
 
         def profile() -> Mapping[str, float]:
-            """Measure the stages by rendering into other arrays, or into those of a batch."""
+            """Measure the stages by rendering again: one view into new arrays, a batch into its own."""
             with workspace.working("while rendering"):
                 own = into
                 if len(views) == 1:

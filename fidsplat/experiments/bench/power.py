@@ -16,7 +16,7 @@ def energy_meter(kind: str) -> Callable[[], float] | None:
     """Function that returns the joules used so far by a device of a kind, `gpu` or `cpu`; None if the machine
     does not report them.
 
-    A GPU's is that of the first GPU, a processor's that of all packages.
+    GPU: the power of the first GPU. Processor: the power of all packages.
     """
     return _nvml() or _nvidia_smi() if kind == "gpu" else _rapl()
 

@@ -5,9 +5,9 @@
 typedef struct {                        // an ellipse, relative to the splat's anchor
     bool valid;                            // false: no ellipse, or the horizon is near, or the splat is edge-on to rows or columns
     float middle, slope;                // midpoints of chords: middle + slope y
-    float y, half_height;
-    float square, bend;                 // squares of half chords: square - bend (height above y)^2
-    float tip;                          // height above y of the rightmost point
+    float y, half_height;               // row of the centre; the ellipse covers y - half_height to y + half_height
+    float square, bend;                 // squared half chord of a row: square - bend (row - y)^2
+    float tip;                          // row of the rightmost point minus y
     float pad;
 } Conic;
 

@@ -5,7 +5,8 @@
 //
 // Splats of groups are the first ones of a tile's list, group after group. A pass through the list finds at each pixel the nearest layer
 // (`next`) behind that of the previous pass (`from`), composites the fragments of other splats between the two, in centre order or by
-// fragment depth, then the layer. Where there was a layer another pass follows. Tiles without groups have none of this.
+// fragment depth, then the layer. A pass that finds a layer is followed by another pass.
+// Tiles without groups have a single pass without layers.
 //@ project
     record.group = coplanar_groups[i];
 //@ functions
@@ -14,8 +15,8 @@
 #endif
 #define COPLANAR_RADIUS REAL(64.0)       // in standard deviations; for boxes in half sides
 //@ coplanar_depth_reach
-    // depth range of the plane out to a fixed radius, beyond the reach of every alpha cut-off and low-pass: then the order of
-    // layers does not depend on the cut-off, nor on boxes much smaller than a pixel
+    // depth range of the plane within a fixed radius, which is larger than that of any alpha cut-off and low-pass filter, also
+    // for boxes much smaller than a pixel: the order of layers then does not depend on the cut-off
     if (coplanar_groups[i] >= 0) depth_reach = reach * (BOX_HERE ? COPLANAR_RADIUS : COPLANAR_RADIUS / radius);
 //@ coplanar_nearest
     if (coplanar_groups[i] >= 0) record.nearest = -0x1p126f;

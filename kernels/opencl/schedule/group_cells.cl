@@ -6,7 +6,7 @@
 #define CELL_W (TILE_W / CELLS_X)
 #define CELL_H (ITEMS / CELL_W * ROWS)
 #define CELLS_Y (TILE_H / CELL_H)
-#define BLOCK_X (CELLS_X / CELL_W)           // cells in a row of the 8 cells of a warp, which are 8 pixels wide
+#define BLOCK_X (CELLS_X / CELL_W)           // cells in a row of a warp's block: 8 cells, together 8 pixels wide
 #define STAGED 128
 #define SHARE (STAGED / ITEMS)               // staged splats per work-item of a cell: 32
 #define CELLS_STRIDE (STAGED + 4)             // bytes; padded against bank conflicts

@@ -1,7 +1,7 @@
 // Orthographic camera, parallel rays along z: x = fx X + cx, so the last row of the projection is (0, 0, 1). D is constant, and depth
 // times D is another affine form of the pixel.
 //@ crossing
-    vfloat z;               // depth times d
+    vfloat z;               // depth times D, at the ray-plane intersection
 //@ camera
 static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ z_row) {
     real3_ row = {focal * axis_row.x + offset * z_row.x, focal * axis_row.y + offset * z_row.y,

@@ -1,4 +1,4 @@
-// Training loss for GPUs, image by image (loss_values.cl). A work-item computes LANES values of a row.
+// Training loss for GPUs (loss_values.cl): each kernel is a pass over all pixels. A work-item computes LANES values of a row.
 
 // Rows per work-item in the passes over columns; the rows share their reads.
 #define EACH_ROWS 4

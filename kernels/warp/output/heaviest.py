@@ -78,7 +78,9 @@ def heaviest_of(grid: PixelGrid, samples: Any) -> int:
 
 
 OUTPUT = Output(
-    attributes={"heaviest": wp.int32},  # among all views' splats; a layer's is that of greatest optical depth
+    attributes={
+        "heaviest": wp.int32
+    },  # splat index among all views; for a layer, the splat of largest optical depth
     read_attributes=read_attributes,
     layer={"thickest": wp.float32},
     accumulate=accumulate,

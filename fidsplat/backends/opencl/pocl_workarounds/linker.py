@@ -51,6 +51,6 @@ def _system_linker() -> str | None:
 
 
 def _path() -> str:
-    """The PATH without the folder of bin/ld."""
+    """The PATH of this process without the folder of the script bin/ld, if `provide_linker` has added it."""
     folders = os.environ.get("PATH", os.defpath).split(os.pathsep)
     return os.pathsep.join(folder for folder in folders if folder != str(_FOLDER))
