@@ -139,12 +139,12 @@ def make_blend_backward(
 
     @wp.func_native(with_numbers(_ANY_OF_BLOCK, numbers))
     def any_of_block(open: bool) -> bool:
-        """Whether `open` is true in any thread of the block; a barrier for all threads."""
+        """Whether any thread of the block says so; all wait for each other."""
         ...
 
     @wp.func_native(with_numbers(_ANY_OF_WARP, numbers))
     def any_of_warp(open: bool) -> bool:
-        """Whether `open` is true in any thread of the warp."""
+        """Whether any thread of the warp says so."""
         ...
 
     @wp.func_native(with_numbers(_POOL, numbers))

@@ -153,7 +153,7 @@ def make_bounds(screen: bool) -> SimpleNamespace:
         if columns <= WINDOW_W and height <= WINDOW_H:
             for row in range(height):
                 first, end = left, left + columns
-                if height > 1:  # else the row covers all columns
+                if height > 1:  # else the columns are those of the row
                     first, end = tile_span(b, top + row, view)
                     # a chord between two rows of samples may be wider than those at the rows
                     first, end = wp.max(first, left), wp.min(end, left + columns)

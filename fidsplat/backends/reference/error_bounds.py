@@ -248,8 +248,8 @@ def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
 
 
 def of_layers(span: Span, lift: np.ndarray, place: np.ndarray) -> tuple[Span, np.ndarray]:
-    """Bounds as of `of_order`, for fragments in the order of the splats' centres between layers sorted by
-    depth.
+    """Bounds over all orders that rounding allows, for fragments in the order of the splats' centres between
+    layers sorted by depth. Returns the same as `of_order`.
 
     Two fragments may also swap where rounding decides whether a layer is between them. place (k, m): position
     in the order of centres; negative for layers.
