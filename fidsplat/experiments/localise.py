@@ -208,7 +208,7 @@ class Drive:
         return (codes for _, codes in self.frames(variant, run, renderer))
 
     def scans(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[np.ndarray]:
-        """Points of a VLP-16 at 20 scans per second (900 columns), as of `Scan.cloud`, at the images."""
+        """Point cloud (`Scan.cloud`) of a VLP-16 at 20 scans per second (900 columns), for each image."""
         lidar = Lidar.preset("vlp-16", rate=20.0, seed=self.seed)
         lidar = replace(lidar, pattern=replace(lidar.pattern, columns=900))
         resident = renderer.upload(self.scene(variant.mixture))

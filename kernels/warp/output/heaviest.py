@@ -78,9 +78,8 @@ def heaviest_of(grid: PixelGrid, samples: Any) -> int:
 
 
 OUTPUT = Output(
-    attributes={
-        "heaviest": wp.int32
-    },  # splat index among all views; for a layer, the splat of largest optical depth
+    # splat index among all views; for a layer, the splat of largest optical depth
+    attributes={"heaviest": wp.int32},
     read_attributes=read_attributes,
     layer={"thickest": wp.float32},
     accumulate=accumulate,
