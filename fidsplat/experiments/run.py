@@ -88,8 +88,9 @@ def _points(name: str, options: Any) -> list[Key]:
         spans = {"distances": list(distances), "tilts": list(tilts)}
         return [{**one, "method": m, **spans} for one, m in product(located, options.methods)]
     tilts = options.tilts or (angles.QUICK_TILTS if options.quick else angles.FULL_TILTS)
-    scans = product(options.protocol or PROTOCOLS, _markers(categories, count), options.methods)
-    return [{"protocol": p, **one, "method": m, "tilts": tilts} for p, one, m in scans]
+    scans = product(_markers(categories, count), options.methods)
+    own = [{**one, "method": m, "tilts": tilts} for one, m in scans]
+    return [{"protocol": p, **one} for p in options.protocol or PROTOCOLS for one in own]
 
 
 def _markers(categories: Iterable[Category], count: int) -> list[Key]:

@@ -102,5 +102,7 @@ class NewtonRig(SimulatorRig):
             meshes.update(state, transforms, self._rays[name], **images)
             colors, depths, ids = (array.reshape((len(places), -1)) for array in images.values())
             ids = ids.view(wp.int32)
-            found[name] = device_surface(self.renderer, colors, depths, ids, size[::-1], red=0)
+            found[name] = device_surface(
+                self.renderer, colors, depths, ids, (camera.height, camera.width), red=0
+            )
         return found
