@@ -52,18 +52,14 @@ def test_a_tag_in_front_of_a_wall_does_not_jump(renderer):
         assert after < 10 * SMOOTH
 
 
-@pytest.mark.parametrize("name", ["crossing", "fan"])
-def test_intersecting_splats_equal_their_composited_images(renderer, name):
+@pytest.mark.parametrize("cloud", [order.crossing(30), order.fan()], ids=["crossing", "fan"])
+def test_intersecting_splats_equal_their_composited_images(renderer, cloud):
     """Images of single splats, composited by depth at each pixel, equal the image of all."""
-    cloud = getattr(order, name)(30)
     view = Camera.pinhole(40, 30, 40.0, 40.0, 20.0, 15.0)
-    got, expected = composited_parts(
-        renderer, [subset_of(cloud, np.array([k])) for k in range(30)], view, "pixel"
-    )
+    single = [subset_of(cloud, np.array([k])) for k in range(len(cloud))]
+    got, expected = composited_parts(renderer, single, view, "pixel")
     assert np.abs(got - expected).max() < 1e-5
-    centre = composited_parts(renderer, [subset_of(cloud, np.array([k])) for k in range(30)], view, "centre")[
-        0
-    ]
+    centre = composited_parts(renderer, single, view, "centre")[0]
     assert np.abs(centre - expected).max() > 0.1
 
 
