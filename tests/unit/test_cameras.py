@@ -190,7 +190,7 @@ GOOD = {"width": 64, "height": 48, "fx": 50.0, "fy": 50.0, "cx": 32.0, "cy": 24.
         ({"world_to_camera": np.diag([2, 2, 2, 1])}, "world_to_camera must be rigid.*got scale 2"),
         ({"world_to_camera": np.diag([1, 1, -1, 1])}, "reflection"),
         ({"world_to_camera": np.diag([1, 2, 1, 1])}, "world_to_camera must be a rotation"),
-        ({"world_to_camera": np.full((4, 4), np.nan)}, "not finite"),
+        ({"world_to_camera": np.full((4, 4), np.nan)}, "world_to_camera must be finite"),
         ({"world_to_camera": "here"}, "4x4 matrix of numbers"),
     ],
 )

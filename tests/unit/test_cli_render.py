@@ -49,7 +49,7 @@ def names(folder) -> set[str]:
 
 
 def test_a_budget_is_measured_and_reported(scene, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("fidsplat.accuracy.quality_within.folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr("fidsplat.accuracy.quality_within.cache_folder", lambda: tmp_path / "cache")
     words = ["render", scene, "--max-error", "1e-3", "--max-ms", "60000"]
     assert main([*words, "--json"]) == 0
     chosen = said(capsys)["chosen"]
@@ -79,7 +79,7 @@ def test_a_budget_is_measured_and_reported(scene, tmp_path, capsys, monkeypatch)
     ],
 )
 def test_impossible_bounds(scene, tmp_path, capsys, monkeypatch, words, message):
-    monkeypatch.setattr("fidsplat.accuracy.quality_within.folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr("fidsplat.accuracy.quality_within.cache_folder", lambda: tmp_path / "cache")
     assert main(["render", scene, *words]) == 2
     assert message in capsys.readouterr().err
 
