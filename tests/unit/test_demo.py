@@ -10,6 +10,7 @@ from fidsplat.cli import main
 from fidsplat.experiments import demo
 from fidsplat.experiments.demo import Sighting, run_captured
 from fidsplat.images.files import read_image
+from fidsplat.scenes import captured
 from fidsplat.worlds.yard import demo_scene
 
 pytestmark = pytest.mark.usefixtures("optimised")
@@ -46,7 +47,8 @@ def blob(tmp_path, monkeypatch):
     """A single splat stands for a capture, which would be downloaded."""
     cloud = fs.SplatCloud([[0, -1.6, 0]], [[1, 0, 0, 0]], [[0.1, 0.1]], [0.9], colors=[[1, 0, 0]])
     fs.save_splats(cloud, tmp_path / "blob.ply")
-    monkeypatch.setattr(demo, "fetch_scene", lambda *_: tmp_path / "blob.ply")
+    for module in (demo, captured):
+        monkeypatch.setattr(module, "fetch_scene", lambda *_: tmp_path / "blob.ply")
 
 
 def test_the_demo_passes_and_writes_what_it_made(tmp_path, capsys, blob):

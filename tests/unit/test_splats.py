@@ -246,7 +246,7 @@ def test_empty():
     for cloud in (fs.SplatCloud.empty(), fs.SplatCloud(**parts(0)), fs.SplatCloud(**sh_parts(0))):
         assert len(cloud) == 0
         assert len(cloud.transformed(np.eye(4))) == 0
-        with pytest.raises(fs.InputError, match="empty"):
+        with pytest.raises(fs.InputError, match="at least one splat"):
             cloud.bounds()
 
 
