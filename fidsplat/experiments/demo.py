@@ -117,13 +117,11 @@ def run_demo(
     """
     begun = time.perf_counter()
     folder = writable_folder(out)
-    default = captured is None
-    captured = "biker" if captured is None else captured
-    missing = fetch_meanwhile(captured) if default else lambda: "not requested"
-    if captured != "none" and not default:
+    name = "biker" if captured is None else captured
+    missing = fetch_meanwhile(name) if captured is None else None
+    if captured not in (None, "none"):
         progress(f"fetching the captured scene {captured}")
         fetch_scene(captured)  # first, since it may fail
-        missing = lambda: ""  # noqa: E731
     progress("making three markers and their scene")
     scene = sunlit(demo_scene(mixture=mixture))
     progress("opening the device")
@@ -138,24 +136,24 @@ def run_demo(
     resident = renderer.upload(scene)
 
     views = []
-    for name, camera in demo_views().items():
-        progress(f"rendering and detecting: {name}")
-        view = render_view(renderer, resident, scene, name, camera)
+    for title, camera in demo_views().items():
+        progress(f"rendering and detecting: {title}")
+        view = render_view(renderer, resident, scene, title, camera)
         views.append(view)
-        stem = folder / name.replace(" ", "-")
+        stem = folder / title.replace(" ", "-")
         for output, image in view.images.items():
             files += save_output(output, image, lambda kind, end, stem=stem: Path(f"{stem}-{kind}{end}"))
         files.append(write_png(f"{stem}-detection.png", view.outlined))
     files.append(write_png(folder / "contact-sheet.png", _sheet(views)))
     marker_splats = {placed.marker.spec: len(placed.marker.cloud) for placed in scene.markers}
-    reason = missing()
+    reason = missing() if missing else "not requested" if captured == "none" else ""
     if not reason:
         # light by panoramas takes 3 s on the first run
-        shown, splats = run_captured(captured, renderer, "lights" if default else "scene", progress)
+        shown, splats = run_captured(name, renderer, "lights" if captured is None else "scene", progress)
         views += shown
         marker_splats = splats | marker_splats
         row = [(view.name, view.outlined) for view in shown]
-        files.append(write_png(folder / f"{captured}.png", contact_sheet([row], width=_WIDTH)))
+        files.append(write_png(folder / f"{name}.png", contact_sheet([row], width=_WIDTH)))
 
     result = DemoResult(
         device=renderer.device.title,
@@ -165,7 +163,7 @@ def run_demo(
         unexpected=[name for view in views for name in view.others],
         frame_ms={view.name: view.frame_ms for view in views},
         visible_splats={view.name: view.visible for view in views},
-        captured=reason or captured_scenes()[captured].credit,
+        captured=reason or captured_scenes()[name].credit,
         seconds=time.perf_counter() - begun,
         files=[*files, folder / "demo.json"],
     )

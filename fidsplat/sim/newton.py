@@ -85,7 +85,8 @@ class NewtonRig(SimulatorRig):
         instance("meshes", meshes, newton.sensors.SensorCamera, "True or a newton.sensors.SensorCamera")
         self._model.bvh_refit_shapes(state)
         device, found = self._model.device, {}
-        for name, camera in ((name, each.camera) for name, each in self.cameras.items()):
+        for name, each in self.cameras.items():
+            camera = each.camera
             size = camera.width, camera.height
             intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
             if name not in self._rays:
