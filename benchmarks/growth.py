@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from measuring import PROGRESS, keep, options, show
 from rich.progress import Progress, TextColumn
+from tables import exponent
 
 import fidsplat as fs
 from fidsplat.backends.interface import Rates
@@ -120,17 +121,6 @@ def run(series: dict[str, list[Point]], device: str, repeats: int, longest: floa
 def abscissa(record: dict) -> float:
     """Abscissa of a record: x, but for the series `overdraw` the layers per pixel."""
     return record.get("layers_per_pixel", record["x"])
-
-
-def exponent(x: Sequence[float], y: Sequence[float]) -> float | None:
-    """Exponent p of a least-squares fit y = c x^p to the upper half of the points, where constant costs are
-    negligible (to all of them if there are at most three); None for fewer than two."""
-    pairs = [(a, b) for a, b in zip(x, y, strict=True) if a > 0 and b > 0]
-    upper = pairs[len(pairs) // 2 :] if len(pairs) > 3 else pairs
-    if len(upper) < 2:
-        return None
-    logs = np.log(np.array(upper, dtype=np.float64))
-    return float(np.polyfit(logs[:, 0], logs[:, 1], 1)[0])
 
 
 def exponents(records: Sequence[dict]) -> Iterator[tuple[str, str, dict[str, float | None]]]:

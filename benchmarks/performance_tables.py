@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 
-import pandas as pd
 from growth import exponents
+from tables import insert, markdown, ms
 
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES
 from fidsplat.experiments.sweep import read_records
@@ -50,15 +49,6 @@ def load(files: Iterable[Path]) -> dict[str, list[dict]]:
     for kind in ("frames", "backends", "peers"):  # group the devices of a scene
         found[kind].sort(key=lambda record: scenes.index(record["scene"]))
     return found
-
-
-def markdown(rows: Iterable[dict[str, str]]) -> str:
-    """Markdown table of rows {column: cell}; a dash for a missing cell."""
-    frame = pd.DataFrame(list(rows)).fillna("-")
-    if frame.empty:
-        return ""
-    lines = ["| " + " | ".join(row) + " |" for row in (frame.columns, *frame.to_numpy())]
-    return "\n".join([lines[0], "|" + "---|" * len(frame.columns), *lines[1:]])
 
 
 def rates(record: dict) -> dict[str, str]:
@@ -234,17 +224,6 @@ TABLES = (
     *("counts", "rates", "frames", "backends", "stages", "peers", "first", "batches"),
     *("peer_batches", "growth"),
 )
-
-
-def insert(page: str, name: str, text: str) -> str:
-    """Replace the text between the marks of a name, if the page has them."""
-    marks = re.compile(rf"(<!-- begin {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
-    return marks.sub(lambda match: f"{match[1]}{text}\n{match[2]}", page)
-
-
-def ms(value: float) -> str:
-    """Milliseconds with three digits."""
-    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
 
 
 def times(record: dict, name: str) -> str:

@@ -21,9 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
-from growth import exponent
 from markupsafe import Markup, escape
-from performance_tables import insert, markdown, ms
+from tables import exponent, insert, markdown, ms
 
 from fidsplat.util.files import atomic_write, writable_folder
 
@@ -246,19 +245,16 @@ def first_setting(device: Device) -> list[dict[str, Any]]:
     return list(seen.values())
 
 
-def write_site(files: Sequence[Path], folder: Path) -> Path:
-    """Write index.html and copies of the results; returns the page."""
-    folder = writable_folder(folder)
+def page(files: Sequence[Path]) -> str:
+    """HTML of the page."""
     devices = load(files)
     groups = groups_of(devices)
-    for file in files:
-        shutil.copyfile(file, folder / file.name)
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
     )
-    page = environment.get_template("splatmark.html.j2").render(
+    return environment.get_template("splatmark.html.j2").render(
         devices=devices,
         rows=dict.fromkeys((group.regime, group.kind) for group in groups),
         group_of={(group.regime, group.kind, group.device.name): group for group in groups},
@@ -272,8 +268,15 @@ def write_site(files: Sequence[Path], folder: Path) -> Path:
         files=[(file.name, json.loads(file.read_text("utf-8"))) for file in files],
         markup=Markup,
     )
+
+
+def write_site(files: Sequence[Path], folder: Path) -> Path:
+    """Write index.html and copies of the results; returns the page."""
+    folder = writable_folder(folder)
+    for file in files:
+        shutil.copyfile(file, folder / file.name)
     with atomic_write(folder / "index.html") as stream:
-        stream.write(page.encode())
+        stream.write(page(files).encode())
     return folder / "index.html"
 
 

@@ -1,11 +1,15 @@
-"""mkdocs hook: publish the notebooks of examples/ as pages, and devlog/ outside the navigation."""
+"""mkdocs hook: publish the notebooks of examples/ as pages; devlog/ and Splatmark outside the navigation."""
 
 import json
+import sys
 from pathlib import Path
 
 from mkdocs.structure.files import File
 
 TREE = Path(__file__).parents[1]
+sys.path[:0] = [str(TREE), str(TREE / "benchmarks")]
+
+import splatmark  # noqa: E402
 
 
 def notebook_page(path):
@@ -16,7 +20,11 @@ def notebook_page(path):
 
 
 def on_files(files, config):
-    """Add every file of devlog/ and a page per notebook."""
+    """Add every file of devlog/, a page per notebook, and Splatmark with its results."""
+    results = sorted((TREE / "benchmarks" / "results").glob("suite-*.json"))
+    files.append(File.generated(config, "splatmark/index.html", content=splatmark.page(results)))
+    for path in results:
+        files.append(File.generated(config, f"splatmark/{path.name}", abs_src_path=str(path)))
     for path in sorted((TREE / "devlog").rglob("*.*")):
         files.append(File.generated(config, path.relative_to(TREE).as_posix(), abs_src_path=str(path)))
     for path in sorted((TREE / "examples" / "notebooks").glob("*.ipynb")):
@@ -25,7 +33,9 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Convert links between docs/ and devlog/ in the tree to links of the site."""
+    """Convert links from docs/ to devlog/ and results in the tree, and back, to links of the site."""
     if page.file.src_uri.startswith("devlog/"):
         return markdown.replace("](../docs/", "](../")
-    return markdown.replace("](../devlog/", "](devlog/")
+    return markdown.replace("](../devlog/", "](devlog/").replace(
+        "](../benchmarks/results)", "](splatmark/index.html)"
+    )

@@ -3,7 +3,8 @@
 import dataclasses
 
 import pytest
-from growth import exponent, exponents, points
+from growth import exponents, points
+from tables import exponent
 
 from fidsplat.backends.interface import Rates
 from fidsplat.experiments.bench.model import FRAGMENT_FMA, RECORD, Counts, Work, roofline_ms, roofline_work
