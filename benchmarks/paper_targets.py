@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from fidsplat.experiments import angles, counts, trained, views
+from fidsplat.experiments import angles, counts, views
 from fidsplat.experiments.methods import IDEAL
 from fidsplat.experiments.report import ANGLES, VIEWS, load
 from fidsplat.experiments.summary import Frame
@@ -33,8 +33,6 @@ FITTED_GAIN = 3.0
 FITTED_SHARE = 0.25
 """largest share of the number of Gaussians of the paper's mixture"""
 HUGE_SECONDS = 0.15
-TRAINED_LOSS = 0.5
-"""dB below the paper's figure of 2DGS"""
 _SLACK = 1e-6
 
 
@@ -59,8 +57,6 @@ def targets(folders: Sequence[Path]) -> Frame:
         found += _views(rows[views.NAME])
     if counts.NAME in rows:
         found += _counts(rows[counts.NAME])
-    if trained.NAME in rows:
-        found += _trained(rows[trained.NAME])
     return pd.DataFrame(found, columns=Target._fields).astype({"reached": bool})
 
 
@@ -211,18 +207,6 @@ def _views(rows: Frame) -> Iterator[Target]:
                     f"{fitted - theirs:+.2f} dB ({fitted:.2f} and {theirs:.2f}){note}",
                     fitted - theirs >= FITTED_GAIN,
                 )
-
-
-def _trained(rows: Frame) -> Iterator[Target]:
-    for (category, number), psnr in rows.groupby(["category", "views"], sort=False)["psnr"].mean().items():
-        theirs = VIEWS[category][number][0]
-        yield Target(
-            "PSNR of trained 2DGS, the paper's less 0.5 dB",
-            f"2dgs-{number}, {category}, PSNR of novel views",
-            f">= {theirs - TRAINED_LOSS:.2f} dB (the paper's {theirs:.2f})",
-            f"{psnr:.2f} dB",
-            bool(psnr >= theirs - TRAINED_LOSS),
-        )
 
 
 def _counts(rows: Frame) -> Iterator[Target]:

@@ -7,7 +7,6 @@ from typing import ClassVar
 
 from fidsplat.commands.calibrate import Calibrate, Tags
 from fidsplat.commands.experiment_data import (
-    Baseline,
     Blender,
     Dataset,
     Merge,
@@ -16,10 +15,9 @@ from fidsplat.commands.experiment_data import (
     write_report,
 )
 from fidsplat.commands.experiment_localise import Localise
-from fidsplat.commands.options import Json, RayAddress, repeatable, require_packages
+from fidsplat.commands.options import Json, repeatable, require_packages
 from fidsplat.commands.output import (
     console,
-    measure_on_cluster,
     print_lines,
     report,
     run_sweeps,
@@ -44,29 +42,19 @@ class Command(MarkerSettings):
     json: Json = False
 
 
-@dataclass(frozen=True)
-class RayCommand(Command):
-    """Options of an experiment that a Ray cluster can measure."""
-
-    ray: RayAddress = None
-
-
-def measure(names: tuple[str, ...], options: MeasureSettings, as_json: bool, ray: str | None = None) -> int:
-    """Run experiments and report the files of their results. A cluster measures everything but times."""
-    from fidsplat.experiments import counts
+def measure(names: tuple[str, ...], options: MeasureSettings, as_json: bool) -> int:
+    """Run experiments and report the files of their results."""
     from fidsplat.experiments.run import prepared
 
-    away = tuple(name for name in names if ray is not None and name != counts.NAME)
-    files = measure_on_cluster(ray, away, options) if ray and isinstance(options, ImageSettings) else {}
-    with prepared([name for name in names if name not in away], options) as sweeps:
+    with prepared(names, options) as sweeps:
         run_sweeps(sweeps)
-        files |= {sweep.name: str(sweep.results.file) for sweep in sweeps if sweep.points}
+        files = {sweep.name: str(sweep.results.file) for sweep in sweeps if sweep.points}
     return report(as_json, {"files": files}, *files.values())
 
 
 @repeatable
 @dataclass(frozen=True)
-class Angles(RayCommand, AngleSettings):
+class Angles(Command, AngleSettings):
     """The largest tilt at which each detector finds and reads each marker (table 3).
 
     Every tilt from 0 to 89.8 degrees in steps of 0.2 is rendered and read by every detector: for tags
@@ -82,12 +70,12 @@ class Angles(RayCommand, AngleSettings):
     """
 
     def run(self) -> int:
-        return measure(("angles",), self, self.json, self.ray)
+        return measure(("angles",), self, self.json)
 
 
 @repeatable
 @dataclass(frozen=True)
-class Views(RayCommand, ViewSettings):
+class Views(Command, ViewSettings):
     """PSNR, SSIM, FLIP and LPIPS of 20 random views of each marker (table 4).
 
     Ground truth: the exact renderer (a pixel is the mean over its square), the same in linear light, and
@@ -101,7 +89,7 @@ class Views(RayCommand, ViewSettings):
     """
 
     def run(self) -> int:
-        return measure(("views",), self, self.json, self.ray)
+        return measure(("views",), self, self.json)
 
 
 @repeatable
@@ -123,7 +111,7 @@ class Counts(Command, MeasureSettings):
 
 @repeatable
 @dataclass(frozen=True)
-class Localisation(RayCommand, ImageSettings):
+class Localisation(Command, ImageSettings):
     """Pose errors of AprilTags and small QR codes by distance and tilt.
 
     Codes of 0.16 m in images of 1280 x 720, 60 degrees wide, at 0.5 to 4 m and 0 to 70 degrees; corners of
@@ -139,7 +127,7 @@ class Localisation(RayCommand, ImageSettings):
 
         if self.category and not set(self.category) & set(LOCATED):
             raise InputError(f"--category must be {' or '.join(LOCATED)}, got {', '.join(self.category)}")
-        return measure(("localisation",), self, self.json, self.ray)
+        return measure(("localisation",), self, self.json)
 
 
 @repeatable
@@ -175,7 +163,7 @@ def render_sheets(options: RenderSettings) -> list[str]:
 
 @repeatable
 @dataclass(frozen=True)
-class All(RayCommand, ExperimentSettings):
+class All(Command, ExperimentSettings):
     """Run counts, localisation, views and angles, and write the report.
 
     --quick takes under five minutes on two cores. An interrupted run resumes. Several machines share the work
@@ -185,7 +173,6 @@ class All(RayCommand, ExperimentSettings):
       fidsplat experiment all --quick
       fidsplat experiment all -o results --device opencl:nvidia
       fidsplat experiment all --shard 2/8 -o shards
-      fidsplat experiment all --ray ray://HOST:10001
     """
 
     def run(self) -> int:
@@ -194,7 +181,7 @@ class All(RayCommand, ExperimentSettings):
         self.check()
         if self.shard is None:
             require_packages()
-        status = measure(NAMES, self, self.json, self.ray)
+        status = measure(NAMES, self, self.json)
         if self.shard is not None:
             return status
         render_sheets(self)
@@ -226,7 +213,6 @@ class Experiment:
         "tags": Tags,
         "pictures": Pictures,
         "dataset": Dataset,
-        "baseline": Baseline,
         "blender": Blender,
         "plants": Plants,
         "merge": Merge,

@@ -1,5 +1,4 @@
-"""`fidsplat experiment`: data sets, training of the baseline, Blender's images, results of shards,
-reports."""
+"""`fidsplat experiment`: data sets, Blender's images, results of shards, reports."""
 
 from __future__ import annotations
 
@@ -22,13 +21,11 @@ from fidsplat.commands.output import (
     console,
     delayed_progress,
     report,
-    run_interleaved,
     show_progress,
     steps_shown,
 )
 from fidsplat.experiments.plants import PlantSettings
 from fidsplat.experiments.settings import BlenderSettings, DatasetSettings
-from fidsplat.experiments.trained import BaselineSettings
 from fidsplat.util.errors import InputError
 
 
@@ -58,36 +55,6 @@ class Dataset(DatasetSettings):
         scenes = (write_scene(part, folder, self.seed, self.truth, self.blender) for part in parts)
         names = [scene.name for scene in show_progress("scenes", scenes, len(parts))]
         return report(self.json, {"folder": str(folder), "scenes": names}, f"{len(names)} scenes in {folder}")
-
-
-@repeatable
-@dataclass(frozen=True)
-class Baseline(BaselineSettings):
-    """Train the paper's baseline: 2DGS on 3, 5, 9 and 17 views of each marker, 7,000 iterations.
-
-    Writes missing scenes of the data set, the splats (2dgs-17/small-0.ply and so on), and trained.jsonl with
-    seconds, splats, PSNR and SSIM. Each result is immediately measured like `experiment views` and `angles`
-    (views.jsonl, angles.jsonl). One marker of each category comes first. An interrupted run resumes.
-
-    Examples:
-      fidsplat experiment baseline --device opencl:nvidia
-      fidsplat experiment baseline --shard 2/8 --seeds 3            several processes on one GPU, then `merge`
-      fidsplat experiment baseline --category small --markers 1 --views 17 --iterations 1000 -o rough
-      fidsplat experiment report fidsplat-experiments fidsplat-baseline
-    """
-
-    device: Device = None
-    json: Json = False
-
-    def run(self) -> int:
-        from fidsplat.experiments.trained import baseline_sweeps
-        from fidsplat.render.renderer import Renderer
-
-        self.check()
-        with baseline_sweeps(self, Renderer(self.device)) as sweeps:
-            run_interleaved("baseline", sweeps)
-            files = {sweep.name: str(sweep.results.file) for sweep in sweeps}
-        return report(self.json, {"files": files}, *files.values())
 
 
 @repeatable
@@ -181,12 +148,12 @@ class Merge:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.experiments import tags, trained
+        from fidsplat.experiments import tags
         from fidsplat.experiments.run import NAMES
         from fidsplat.experiments.sweep import merge, missing_shards, result_files
 
         result, lines = {}, []
-        for name in (*NAMES, trained.NAME, tags.NAME):
+        for name in (*NAMES, tags.NAME):
             if not (files := result_files([Path(folder) for folder in self.folders], name)):
                 continue
             target = Path(self.out) / f"{name}.jsonl"

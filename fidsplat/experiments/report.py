@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from fidsplat.experiments import angles, counts, localisation, trained, views
+from fidsplat.experiments import angles, counts, localisation, views
 from fidsplat.experiments.charts import bars, chart, legend_above
 from fidsplat.experiments.methods import FILTERS, IDEAL, mixtures, with_linear_light
 from fidsplat.experiments.pages import NOTHING, fixed, number, page_and_folder, write_page
@@ -49,7 +49,6 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
         angles.NAME: _angles,
         views.NAME: _views,
         localisation.NAME: lambda own, _: _localisation(own),
-        trained.NAME: lambda own, _: _trained(own, rows.get(angles.NAME)),
     }
     context: dict[str, Any] = {
         name: section(rows[name], folder) if name in rows else None for name, section in sections.items()
@@ -58,10 +57,9 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
     for sheet in sheets:
         if sheet.parent.resolve() != folder.resolve():
             write_file(folder / sheet.name, read_input(sheet))
-    commands = {name: "baseline" if name == trained.NAME else name for name in summaries}
     context |= {
         "sheets": [sheet.name for sheet in sheets],
-        "runs": provenance({f"`{commands[name]}`": summary for name, summary in summaries.items()}),
+        "runs": provenance({f"`{name}`": summary for name, summary in summaries.items()}),
         "training_seconds": TRAINING_SECONDS,
         "notes": list(dict.fromkeys(note for summary in summaries.values() for note in summary.notes)),
     }
@@ -194,34 +192,6 @@ def _views(rows: Frame, folder: Path) -> dict:
     _panels(folder / "psnr.svg", categories, series, "PSNR, dB")
     count = {name: int(rows[name].notna().sum()) for name in ("flip", "lpips")}
     return {"tables": tables, "views": int(rows["amount"].max()), "rows": len(rows), "measured": count}
-
-
-def _trained(rows: Frame, scans: Frame | None) -> dict:
-    """Baseline by category and number of views: the paper's figures, and ours of the first seed."""
-    first, read = rows[rows["seed"] == 0], {}
-    if scans is not None:
-        plane = _best_reader(scans[scans["protocol"] == "fixed-plane"])
-        read = {key: _angle(own["read"]) for key, own in plane.groupby(["category", "method"])}
-    table = []
-    for category in category_order(first["category"]):
-        for count, own in first[first["category"] == category].groupby("views"):
-            psnr, ssim, _ = VIEWS[category][count]
-            theirs = ANGLES.get(category, {}).get(count)
-            table.append(
-                {
-                    "marker, views": f"{CATEGORIES[category].title}, {count}",
-                    "markers": own["marker"].nunique(),
-                    "PSNR/SSIM, paper": f"{psnr:.1f}/{ssim:.2f}",
-                    "ours": f"{own['psnr'].mean():.1f}/{own['ssim'].mean():.3f}",
-                    "read to, paper": NOTHING if theirs is None else f"{theirs[1]:.1f}",
-                    "read to, ours": read.get((category, f"2dgs-{count}"), NOTHING),
-                    "read to, training-free": read.get((category, "exact/best"), NOTHING),
-                    "splats": fixed(own["splats"].mean(), 0),
-                    "seconds, paper": f"{TRAINING_SECONDS[count]:.0f}",
-                    "seconds, several at once": fixed(own["seconds"].median()),
-                }
-            )
-    return {"rows": pd.DataFrame(table), "trainings": len(rows), "iterations": int(rows["amount"].max())}
 
 
 def _localisation(rows: Frame) -> Frame:
@@ -411,15 +381,6 @@ def _localisation_rows(record: Record) -> Rows:
         yield row
 
 
-def _trained_rows(record: Record) -> Rows:
-    """Row of a training; a resumed one has no total time."""
-    key, found = record.key, record.result
-    row = {name: key[name] for name in ("category", "views", "seed")} | {"marker": key["index"]}
-    row |= {name: found[name] for name in ("psnr", "ssim", "splats")}
-    complete = found["iterations"] == key["iterations"]
-    yield row | {"amount": key["iterations"], "seconds": found["seconds"] if complete else None}
-
-
 KINDS = {
     counts.NAME: Kind(
         ("category", "marker", "mixture"),
@@ -443,7 +404,5 @@ KINDS = {
         ("read", "position_mm", "angle_deg", "corners_px"),
         _localisation_rows,
     ),
-    trained.NAME: Kind(
-        ("category", "views", "marker", "seed"), ("psnr", "ssim", "splats", "seconds"), _trained_rows
-    ),
+
 }  # fmt: skip

@@ -17,7 +17,7 @@ from fidsplat.experiments.sweep import Key, Results, Sweep, shard, thread_pool
 from fidsplat.render.renderer import Renderer
 from fidsplat.util.files import writable_folder
 from fidsplat.util.provenance import run_facts
-from fidsplat.vision.metrics import load_lpips, metric_versions, weights_name
+from fidsplat.vision.metrics import load_lpips, metric_versions
 from fidsplat.vision.readers import reader_versions
 
 NAMES = (counts.NAME, localisation.NAME, views.NAME, angles.NAME)
@@ -80,8 +80,8 @@ def _points(name: str, options: Any) -> list[Key]:
         return [{**one, "repeats": repeats} for one in _markers(categories, count)]
     if name == views.NAME:
         number = QUICK_VIEWS if options.quick else TEST_VIEWS
-        weights = None if options.lpips is None else weights_name(options.lpips)
-        return views.views_points(categories, options.methods, options.blender_folder, count, number, weights)
+        folder = options.blender_folder
+        return views.views_points(categories, options.methods, folder, count, number, options.lpips)
     if name == localisation.NAME:
         distances, tilts = localisation.QUICK if options.quick else localisation.FULL
         located = _markers((c for c in categories if c.name in localisation.LOCATED), count)
@@ -104,9 +104,6 @@ def _measure(name: str, options: Any, markers: MarkerRenderer, pool: Executor) -
     if name == localisation.NAME:
         return partial(localisation.measure_localisation, **common)
     if name == views.NAME:
-        lpips = None if options.lpips is None else load_lpips(options.lpips)
-        cache = views.ImageCache()
-        return partial(
-            views.measure_views, blender=options.blender_folder, lpips=lpips, cache=cache, **common
-        )
+        lpips = load_lpips() if options.lpips else None
+        return partial(views.measure_views, blender=options.blender_folder, lpips=lpips, **common)
     return partial(angles.measure_angles, workers=options.workers, **common)

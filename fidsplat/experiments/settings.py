@@ -132,12 +132,7 @@ class BlenderSettings(CountedSettings):
 
 
 @dataclass(frozen=True)
-class SweepSettings(ShardSettings, CountedSettings):
-    """Part of a sweep over markers that one machine measures."""
-
-
-@dataclass(frozen=True)
-class MeasureSettings(SweepSettings):
+class MeasureSettings(ShardSettings, CountedSettings):
     """Settings of every experiment that measures."""
 
     quick: bool = False
@@ -183,7 +178,7 @@ class RenderSettings(MarkerSettings):
         if not models:
             raise InputError(
                 f"--trained must have at least one of the folders 2dgs-3, 2dgs-5, 2dgs-9 and 2dgs-17, "
-                f"got {folder}; train models by `fidsplat experiment baseline`"
+                f"got {folder}; train models by benchmarks/baseline.py"
             )
         for model, category, index in product(
             models, chosen_categories(self.category), range(self.marker_count)
@@ -236,8 +231,8 @@ class ViewSettings(ImageSettings):
 
     blender: Path | None = None
     """Folder with Blender's images. By default the folder `blender` in the folder for results."""
-    lpips: Path | None = None
-    """File with LPIPS weights (.npz); docs/experiments.md says how to make it."""
+    lpips: bool = False
+    """Also measure LPIPS, with the packages lpips and torch."""
 
     @property
     def blender_folder(self) -> Path:

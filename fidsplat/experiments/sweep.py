@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from itertools import groupby, zip_longest
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,9 +22,9 @@ from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.files import atomic_write, from_json, ordinary_file, read_text, writable_folder
 
 Key = dict[str, Any]
-"""key of a point: plain data"""
+"""parameters of a point of a sweep: names and plain values"""
 Work = Callable[[], dict[str, Any]]
-"""host work of a point, which returns its result"""
+"""function that evaluates the images of a point and returns its result"""
 
 
 class Record(NamedTuple):
@@ -127,19 +127,19 @@ class TimeLimit:
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Points with their measurement."""
+    """A parameter sweep: its points, their measurement, and the file of the results."""
 
     name: str
     results: Results
     points: list[Key]
     begin: Callable[[Key], Work]
-    """runs the device work of a point and returns its host work"""
+    """renders the images of a point on the device, and returns the function that evaluates them"""
     batch: int = 1
-    """number of points whose device work runs before their host work, so that neither disturbs timings"""
+    """number of points that are rendered before they are evaluated, so that evaluation disturbs no timing"""
     pool: Executor | None = None
-    """runs the host work of a batch in parallel"""
+    """evaluates the points of a batch in parallel"""
     record_errors: bool = False
-    """store a FidsplatError of the device work as the result `error`"""
+    """whether a FidsplatError of `begin` becomes the result of the point, as `error`"""
     limit: TimeLimit | None = None
     """limit of a run, which leaves the other points to the next run"""
     estimate: Callable[[], float] | None = None
@@ -156,19 +156,20 @@ class Sweep:
         return self.results.left(self.points)
 
     def run(self) -> Iterator[Record]:
-        """Measure the missing points; yields each record when it is in the file."""
-        return run_interleaved([self])
+        """Measure the missing points; yields each record when it is in the file.
 
-    def run_batch(self, keys: Sequence[Key]) -> Iterator[Record]:
-        """Measure the missing points of a batch."""
-        keys = self.results.left(keys)
-        if not keys or (self.limit is not None and not self.limit.allows()):
-            return
-        with nullcontext() if self.limit is None else self.limit.batch():
-            work = [self._begin(key) for key in keys]
-            results = map(_call, work) if self.pool is None else self.pool.map(_call, work)
-            for key, result in zip(keys, results, strict=True):
-                yield self.results.append(key, result)
+        An interrupt loses at most one batch.
+        """
+        left = self.left
+        for first in range(0, len(left), self.batch):
+            if self.limit is not None and not self.limit.allows():
+                return
+            keys = left[first : first + self.batch]
+            with nullcontext() if self.limit is None else self.limit.batch():
+                work = [self._begin(key) for key in keys]
+                results = map(_call, work) if self.pool is None else self.pool.map(_call, work)
+                for key, result in zip(keys, results, strict=True):
+                    yield self.results.append(key, result)
 
     def _begin(self, key: Key) -> Work:
         try:
@@ -180,23 +181,9 @@ class Sweep:
             return lambda: result
 
 
-def run_interleaved(sweeps: Sequence[Sweep]) -> Iterator[Record]:
-    """Measure the missing points of sweeps, one batch of each in turn; yields each record.
-
-    Each record is written to its file before it is yielded, so an interrupt loses at most one batch.
-    """
-    batches = [
-        [sweep.points[first : first + sweep.batch] for first in range(0, len(sweep.points), sweep.batch)]
-        for sweep in sweeps
-    ]
-    for rounds in zip_longest(*batches, fillvalue=()):
-        for sweep, keys in zip(sweeps, rounds, strict=True):
-            yield from sweep.run_batch(keys)
-
-
 @contextmanager
 def thread_pool(workers: int) -> Iterator[ThreadPoolExecutor]:
-    """Threads for the host work of sweeps; an interrupt cancels pending work."""
+    """Threads that evaluate points of sweeps; an interrupt cancels pending calls."""
     pool = ThreadPoolExecutor(workers)
     try:
         yield pool

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
-from threading import Lock
 
 import numpy as np
 
@@ -45,14 +44,14 @@ def views_points(
     blender: Path,
     markers: int = 5,
     views: int = TEST_VIEWS,
-    lpips: str | None = None,
+    lpips: bool = False,
 ) -> list[dict]:
     """Points of the experiment: a marker, a method and a ground truth.
 
     Args:
         blender: folder of `fidsplat experiment blender`; used for markers with all images.
         views: number of views, at most 20.
-        lpips: digest of the LPIPS weights, if measured.
+        lpips: whether LPIPS is measured.
     """
     points = []
     for category, index in product(categories, range(markers)):
@@ -62,7 +61,7 @@ def views_points(
             if all(file.is_file() for file in files):
                 truths.append(f"blender-{view}")
         common = {"category": category.name, "index": index}
-        metrics = {"views": views, "flip": has_flip(), "lpips": lpips}
+        metrics = {"views": views, "flip": has_flip(), "lpips": lpips or None}
         points += [
             {**common, "method": method, "truth": truth, **metrics}
             for method, truth in product(with_linear_light(methods), truths)
@@ -72,22 +71,21 @@ def views_points(
     return points
 
 
-class ImageCache:
-    """Cache of 8-bit images for the following points."""
+@lru_cache(1)  # points with the same method follow each other
+def _images_of(
+    markers: MarkerRenderer, method: str, category: str, index: int, seed: int, count: int
+) -> list[np.ndarray]:
+    """8-bit images (h, w) of the first views of a marker by a method."""
+    spec = CATEGORIES[category].spec(index, seed)
+    module = PROTOCOLS["fixed-plane"].module(marker(spec).grid.shape[0])
+    render = markers.prepare(method, f"{category}-{index}", spec, module)
+    return [to_uint8(render(camera)) for camera in novel_cameras(CATEGORIES[category], index, seed)[:count]]
 
-    def __init__(self) -> None:
-        self._images: dict[str, tuple[tuple, dict[int, np.ndarray]]] = {}
-        self._lock = Lock()  # evaluation threads make the ground truths
 
-    def get(self, kind: str, subject: tuple, number: int, make: Callable[[], np.ndarray]) -> np.ndarray:
-        """Return image `number` of a subject; make it if it is missing. One subject per kind is cached."""
-        with self._lock:
-            if kind not in self._images or self._images[kind][0] != subject:
-                self._images[kind] = subject, {}
-            images = self._images[kind][1]
-        if number not in images:
-            images[number] = to_uint8(make())
-        return images[number]
+@lru_cache(2 * TEST_VIEWS)  # the exact images of a marker, for all methods
+def _exact_image(category: str, index: int, seed: int, number: int, linear: bool) -> np.ndarray:
+    camera = novel_cameras(CATEGORIES[category], index, seed)[number]
+    return to_uint8(exact_view(CATEGORIES[category].spec(index, seed), camera, linear))
 
 
 def measure_views(
@@ -97,34 +95,20 @@ def measure_views(
     blender: Path,
     pool: Executor,
     lpips: Perceptual | None = None,
-    cache: ImageCache | None = None,
 ) -> dict:
     """Compare the 8-bit images of a marker with the ground truth.
-
-    Args:
-        cache: cache of the run: images of a method are rendered once for all ground truths, and the exact
-            ground truth of a marker once for all methods.
 
     Returns `psnr` (dB), `ssim`, `flip` and `lpips`: a number for each view; None for an unavailable
     metric, and for the PSNR of equal images.
     """
-    category, truth, cache = CATEGORIES[point["category"]], point["truth"], cache or ImageCache()
-    spec = category.spec(point["index"], seed)
-    module = PROTOCOLS["fixed-plane"].module(marker(spec).grid.shape[0])
-    subject = (point["category"], point["index"], seed)
-    method = (*subject, point["method"])
-    # prepared lazily: splats are uploaded only if an image is missing
-    prepared = lru_cache(1)(
-        lambda: markers.prepare(point["method"], f"{category.name}-{point['index']}", spec, module)
-    )
+    category, index, truth = point["category"], point["index"], point["truth"]
 
-    def compare(number: int, camera: Camera, image: np.ndarray) -> dict[str, float | None]:
+    def compare(number: int, image: np.ndarray) -> dict[str, float | None]:
         if truth.startswith("exact"):
-            render = partial(exact_view, spec, camera, truth == "exact-linear")
-            reference = cache.get(truth, subject, number, render)
+            reference = _exact_image(category, index, seed, number, truth == "exact-linear")
         else:
             view = truth.removeprefix("blender-")
-            file = image_file(blender, view, category.name, point["index"], TEST, number)
+            file = image_file(blender, view, category, index, TEST, number)
             reference = to_uint8(read_image(file)[:, :, 0])
         if reference.shape != image.shape:
             raise InputError(f"the Blender images in {blender} have another size; render them again")
@@ -137,10 +121,8 @@ def measure_views(
             found["lpips"] = lpips(ours, theirs)
         return found
 
-    pending = []
-    for i, camera in enumerate(novel_cameras(category, point["index"], seed)[: point["views"]]):
-        image = cache.get("method", method, i, lambda camera=camera: prepared()(camera))
-        pending.append(pool.submit(compare, i, camera, image))
+    images = _images_of(markers, point["method"], category, index, seed, point["views"])
+    pending = [pool.submit(compare, number, image) for number, image in enumerate(images)]
     measured = [interrupts.result_of(future) for future in pending]
     names = ("psnr", "ssim", "flip", "lpips")
     return {name: [one[name] for one in measured] if name in measured[0] else None for name in names}

@@ -1,25 +1,16 @@
-"""Image metrics PSNR, SSIM, FLIP and LPIPS of display values in [0, 1].
-
-LPIPS (Zhang et al. 2018) uses AlexNet in NumPy with weights that the user provides. `load_lpips` reads a
-NumPy file with the five convolutions of torchvision's AlexNet and the five linear layers of LPIPS version
-0.1; docs/experiments.md has the conversion by PyTorch and the package lpips.
-"""
+"""Image metrics PSNR, SSIM, FLIP and LPIPS of display values in [0, 1]."""
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable
 from importlib.metadata import version
 from importlib.util import find_spec
-from pathlib import Path
 
 import cv2
 import numpy as np
 
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import read_input
-from fidsplat.util.npy import load_npz
 
 _SIGMA, _RADIUS = 1.5, 5  # pixels: Wang et al. 2004, as in the 3DGS and 2DGS papers
 _C1, _C2 = 0.01**2, 0.03**2
@@ -77,81 +68,22 @@ def flip(image: np.ndarray, truth: np.ndarray) -> float:
     return float(mean)
 
 
-# stride and padding of each convolution, and whether a 3 x 3 pooling with stride 2 comes before it
-_LAYERS = ((4, 2, False), (1, 2, True), (1, 1, True), (1, 1, False), (1, 1, False))
-_CHANNELS = ((64, 3, 11), (192, 64, 5), (384, 192, 3), (256, 384, 3), (256, 256, 3))
-# input normalization, LPIPS's scaling layer
-_SHIFT = np.array([-0.030, -0.088, -0.188]).reshape(3, 1, 1)
-_SCALE = np.array([0.458, 0.448, 0.450]).reshape(3, 1, 1)
-_EPSILON = 1e-10
+def load_lpips() -> Callable[[np.ndarray, np.ndarray], float]:
+    """LPIPS (Zhang et al. 2018, AlexNet) of two (h, w) images of display values in [0, 1].
 
-
-def weights_name(file: Path) -> str:
-    """Name of LPIPS weights in results: the first digits of the file's hash. Raises InputError for an
-    unreadable file."""
-    try:
-        return hashlib.sha256(read_input(file)).hexdigest()[:12]
-    except InputError as error:
-        raise InputError(f"cannot read the LPIPS weights: {error}") from error
-
-
-def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
-    """Load LPIPS from weights in a .npz file: a function of two (h, w) images of display values in [0, 1].
-
-    Raises InputError for a file that cannot be read, a missing array, or one of another shape.
+    Raises InputError without the packages lpips and torch, or if the weights of AlexNet cannot be downloaded.
     """
     try:
-        arrays = load_npz(file)
-        weights = {name: arrays[name].astype(np.float64) for name in sorted(arrays)}
-    except InputError:
-        raise
-    except (ValueError, TypeError) as error:
-        raise InputError(f"cannot read {file} as LPIPS weights (.npz): {error}") from error
-    for k, (out, into, size) in enumerate(_CHANNELS):
-        shapes = {
-            f"conv{k + 1}.weight": (out, into, size, size),
-            f"conv{k + 1}.bias": (out,),
-            f"lin{k}": (out,),
-        }
-        for name, shape in shapes.items():
-            if name not in weights or weights[name].shape != shape:
-                got = f"shape {weights[name].shape}" if name in weights else "none"
-                raise InputError(
-                    f"{file} must have an array {name} of shape {shape}, got {got}; see docs/experiments.md"
-                )
-            if wrong := np.count_nonzero(~np.isfinite(weights[name])):
-                raise InputError(
-                    f"the array {name} of {file} must be finite, got {wrong:,} NaN or infinite values; see "
-                    "docs/experiments.md"
-                )
+        import lpips  # type: ignore[import-not-found]
+        import torch  # type: ignore[import-not-found]
+
+        net = lpips.LPIPS(net="alex", verbose=False).eval()
+    except (ImportError, OSError) as error:
+        raise InputError(f"LPIPS needs the packages lpips and torch: {error}; pip install lpips") from error
 
     def measure(image: np.ndarray, truth: np.ndarray) -> float:
-        total = 0.0
-        for k, (a, b) in enumerate(zip(_features(image, weights), _features(truth, weights), strict=True)):
-            difference = (_unit(a) - _unit(b)) ** 2
-            total += float(np.tensordot(weights[f"lin{k}"], difference, 1).mean())
-        return total
+        pair = (torch.tensor(2 * np.repeat(grey[None, None], 3, 1) - 1).float() for grey in (image, truth))
+        with torch.no_grad():
+            return float(net(*pair))
 
     return measure
-
-
-def _features(grey: np.ndarray, weights: dict[str, np.ndarray]) -> list[np.ndarray]:
-    x = (np.repeat(np.asarray(grey, np.float64)[None] * 2 - 1, 3, axis=0) - _SHIFT) / _SCALE
-    found = []
-    for k, (stride, padding, pooled) in enumerate(_LAYERS, 1):
-        if pooled:
-            x = np.lib.stride_tricks.sliding_window_view(x, (3, 3), (1, 2))[:, ::2, ::2].max((3, 4))
-        x = np.maximum(_convolve(x, weights[f"conv{k}.weight"], weights[f"conv{k}.bias"], stride, padding), 0)
-        found.append(x)
-    return found
-
-
-def _convolve(x: np.ndarray, kernel: np.ndarray, bias: np.ndarray, stride: int, padding: int) -> np.ndarray:
-    """Convolution of (channels, h, w) with (out, channels, k, k), equal to PyTorch's Conv2d."""
-    padded = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
-    windows = np.lib.stride_tricks.sliding_window_view(padded, kernel.shape[2:], (1, 2))
-    return np.tensordot(kernel, windows[:, ::stride, ::stride], ((1, 2, 3), (0, 3, 4))) + bias[:, None, None]
-
-
-def _unit(x: np.ndarray) -> np.ndarray:
-    return x / (np.sqrt((x**2).sum(0, keepdims=True)) + _EPSILON)

@@ -87,16 +87,6 @@ COUNTS = [
 ]  # fmt: skip
 
 
-def training(index, seed, psnr, seconds, done=7000) -> tuple[dict, dict]:
-    key = {"category": "small", "index": index, "views": 9, "iterations": 7000, "seed": seed}
-    found = {"splats": 5000 + index, "seconds": seconds, "iterations": done}
-    return key, found | {"psnr": psnr, "ssim": 0.99}
-
-
-# the paper has 33.82 dB; the last was stopped, so that its seconds are those of a part
-TRAININGS = [training(0, 0, 33.0, 6.0), training(1, 0, 34.0, 8.0), training(0, 1, 33.5, 1.0, 1000)]
-
-
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("results")
@@ -104,7 +94,6 @@ def results(tmp_path_factory):
     write(folder, "views", VIEWS)
     write(folder, "localisation", [place(0, SEEN), place(1, LOST)])
     write(folder, "counts", COUNTS)
-    write(folder, "trained", TRAININGS)
     write_png(folder / "sheet-small.png", np.zeros((4, 4), np.uint8))
     return folder
 
@@ -128,8 +117,6 @@ def test_the_report_says_what_was_measured(reported):
         "FLIP was measured in 5 of 5\ncases.",
         "| QR Small, 1 m | 0.5 (1/2) |",
         "`angles`, 8 | a device |",
-        "3 trainings of 7000 iterations",
-        "| QR Small, 9 | 2 | 33.8/0.99 | 33.5/0.990 | 75.4 | 80.0 | 82.0 | 5000 | 386 | 7.0 |",
     ):
         assert words in text, words
 
@@ -260,7 +247,6 @@ def test_a_report_that_is_regenerated_has_the_same_tables(tmp_path):
 
 def test_complete_inputs_of_detectors_are_not_listed(tmp_path):
     write(tmp_path, "angles", SCANS)
-    write(tmp_path, "trained", TRAININGS[:1])
     assert "Tilts of some markers" not in make_report([tmp_path], tmp_path / "page.md")[0].read_text()
 
 

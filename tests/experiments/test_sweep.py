@@ -13,7 +13,6 @@ from fidsplat.experiments.sweep import (
     merge,
     missing_shards,
     read_records,
-    run_interleaved,
     shard,
 )
 from fidsplat.util.provenance import run_facts
@@ -85,21 +84,6 @@ def test_a_point_that_was_refused_is_tried_again(tmp_path):
     assert read_records(file) == [record]
     list(sweep(file, lambda key: {"value": 1}, POINTS[:1]).run())
     assert [record.result for record in read_records(file)] == [{"value": 1}]
-
-
-def test_interleaved_sweeps_alternate_by_point(tmp_path):
-    """Existing results are not measured again."""
-    order = []
-
-    def measured(name, points):
-        return sweep(tmp_path / f"{name}.jsonl", lambda key: order.append((name, key["index"])) or {}, points)
-
-    list(measured("b", POINTS[:1]).run())
-    order.clear()
-    found = list(run_interleaved([measured("a", POINTS[:3]), measured("b", POINTS[:2])]))
-    assert order == [("a", 0), ("a", 1), ("b", 1), ("a", 2)]
-    assert [record.key["index"] for record in found] == [0, 1, 1, 2]
-    assert [record.key for record in read_records(tmp_path / "b.jsonl")] == POINTS[:2]
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,6 @@ from fidsplat.train.dataset_files import load_dataset
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, writable_folder
 from fidsplat.util.npy import load_npy
-from fidsplat.vision.metrics import load_lpips
 
 
 def test_a_file_takes_the_place_of_the_old_one_only_when_it_is_whole(tmp_path):
@@ -201,7 +200,6 @@ INPUTS = {
         f"store {name}": lambda folder, pipe, name=name: put_store(folder, pipe, name)
         for name in ("store.json", "nodes.npy", "means.npy")
     },
-    "weights": lambda folder, pipe: load_lpips(pipe),
     "summary": lambda folder, pipe: read_summary(pipe),
     "records": lambda folder, pipe: read_records(pipe),
 }

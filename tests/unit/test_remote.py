@@ -128,18 +128,6 @@ def test_replies_that_are_no_files_of_the_image(tmp_path, reply):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("reply", [None, [1], {"a": float("nan")}, {"a": object()}, {"a": b"bytes"}])
-def test_replies_that_are_no_results(tmp_path, reply):
-    from fidsplat.experiments.sweep import Results
-    from fidsplat.remote.experiments import measure
-
-    points = {"views": [{"category": "aruco", "index": 0}]}
-    results = Results(tmp_path / "views.jsonl", {"device": None})
-    with pytest.raises(fs.FidsplatError, match="must be a result of views that JSON can hold"):
-        list(measure(points, {"views": results}, Here(lambda _: reply), 2))
-    assert not results.file.exists()
-
-
 def test_workers_read_stores_at_the_same_path(tmp_path):
     cloud = fs.marker("aruco:4x4_50:7", size=0.4, mixture="fitted").cloud
     fs.save_ply(cloud, tmp_path / "a.ply")

@@ -5,7 +5,6 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.experiments.sweep import read_records
 from fidsplat.remote import ray_engine as module
 from fidsplat.remote.flights import FlightWork, render_flight
 from fidsplat.remote.queue import WorkerLost
@@ -86,27 +85,6 @@ def test_the_command_renders_by_workers(tmp_path, monkeypatch, capsys):
         assert (tmp_path / "many" / name).read_bytes() == (tmp_path / "one" / name).read_bytes()
     assert main([*words, "-o", "many"]) == 0  # the same flight, whatever renders it
     assert "4 were there already" in capsys.readouterr().out
-
-
-def test_an_experiment_by_workers_finds_what_one_process_does(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    words = ["experiment", "angles", "--ideal", "--category", "small", "--markers", "2"]
-    words += ["--tilts", "0:60:60", "--protocol", "fixed-plane"]
-    assert main([*words, "-o", "one"]) == 0
-    assert main([*words, "-o", "many", "--ray", "local"]) == 0
-    one, many = (
-        {record.name: record.result for record in read_records(tmp_path / folder / "angles.jsonl")}
-        for folder in ("one", "many")
-    )
-    assert many == one
-    assert len(many) > 1
-    before = (tmp_path / "many" / "angles.jsonl").read_bytes()
-    assert main([*words, "-o", "many", "--ray", "local"]) == 0
-    assert (tmp_path / "many" / "angles.jsonl").read_bytes() == before
-    (tmp_path / "pictures").mkdir()
-    capsys.readouterr()
-    assert main(["experiment", "views", "--ray", "local", "--blender", "pictures", "-o", "v"]) == 2
-    assert "pictures is on the disk of this machine" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

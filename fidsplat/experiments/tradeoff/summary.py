@@ -91,23 +91,14 @@ def load(folders: Iterable[Path]) -> list[DeviceResults]:
 
 
 class DeviceResults:
-    """Results of a device.
-
-    Results of a preset that has changed since are replaced by those of its current quality under another
-    name, or left out.
-    """
+    """Results of a device. Those of a preset whose settings have changed since are left out."""
 
     def __init__(self, summary: Summary) -> None:
         run, rows = summary.runs[0], summary.rows
         self.summary, self.name = summary, run["device"]
         self.title, self.kind = run.get("title", self.name), run.get("kind", "device")
-        presets = rows["knob"] == PRESET
-        stale = presets & (rows["quality"] != rows["value"].map(_current_quality))
+        stale = (rows["knob"] == PRESET) & (rows["quality"] != rows["value"].map(_current_quality))
         points: Frame = rows[rows["error"].isna() & ~stale]
-        for name in rows.loc[presets, "value"].unique():
-            same = points[points["quality"] == _current_quality(name)].drop_duplicates("scene")
-            named = same.assign(knob=PRESET, value=name)
-            points = pd.concat([points, named]).drop_duplicates(["scene", "knob", "value"])
         names = pd.MultiIndex.from_frame(points[["scene", "knob", "value"]], names=[None] * 3)
         self.points = points.set_index(names)
         known = [view for name in NAMES for view in views_of(name)]
