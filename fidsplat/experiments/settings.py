@@ -232,7 +232,7 @@ class ViewSettings(ImageSettings):
     blender: Path | None = None
     """Folder with Blender's images. By default the folder `blender` in the folder for results."""
     lpips: bool = False
-    """Also measure LPIPS, with the packages lpips and torch."""
+    """Also measure LPIPS, by the package lpips."""
 
     @property
     def blender_folder(self) -> Path:

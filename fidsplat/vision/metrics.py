@@ -71,19 +71,17 @@ def flip(image: np.ndarray, truth: np.ndarray) -> float:
 def load_lpips() -> Callable[[np.ndarray, np.ndarray], float]:
     """LPIPS (Zhang et al. 2018, AlexNet) of two (h, w) images of display values in [0, 1].
 
-    Raises InputError without the packages lpips and torch, or if the weights of AlexNet cannot be downloaded.
+    Raises InputError without the package lpips, or if the weights of AlexNet cannot be downloaded.
     """
     try:
         import lpips  # type: ignore[import-not-found]
-        import torch  # type: ignore[import-not-found]
 
-        net = lpips.LPIPS(net="alex", verbose=False).eval()
+        net = lpips.LPIPS(net="alex", verbose=False).eval().requires_grad_(False)
     except (ImportError, OSError) as error:
-        raise InputError(f"LPIPS needs the packages lpips and torch: {error}; pip install lpips") from error
+        raise InputError(f"--lpips needs the package lpips: {error}; pip install lpips") from error
 
     def measure(image: np.ndarray, truth: np.ndarray) -> float:
-        pair = (torch.tensor(2 * np.repeat(grey[None, None], 3, 1) - 1).float() for grey in (image, truth))
-        with torch.no_grad():
-            return float(net(*pair))
+        pair = (np.repeat(255 * grey[:, :, None], 3, axis=2) for grey in (image, truth))
+        return float(net(*map(lpips.im2tensor, pair)))
 
     return measure

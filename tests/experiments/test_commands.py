@@ -200,7 +200,7 @@ def test_what_is_wrong_with_the_last_experiment_is_shown_before_the_first(capsys
     assert "angles.jsonl holds results of another versions and code" in err
     status, _, err = run(capsys, *words, "--lpips", "--overwrite")
     assert status == 2
-    assert "LPIPS needs the packages lpips and torch" in err
+    assert "--lpips needs the package lpips" in err
     assert read_records(tmp_path / "counts.jsonl") == []
     assert (tmp_path / "angles.jsonl").read_text() == old  # --overwrite drops nothing for it
 
