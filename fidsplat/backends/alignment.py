@@ -41,19 +41,30 @@ class AlignmentFit(NamedTuple):
     """standard deviation of the residuals at the pose before; 0: from the median of the residuals"""
 
 
+class MovedFrame(NamedTuple):
+    """A second frame of the same scene after a motion of the camera, for derivatives by differences."""
+
+    frame: Any
+    size: float
+    """size of the motion [rad or m]"""
+    axis: int
+    """index of the ray's component by which the second column of `AlignmentSums.right` is multiplied"""
+
+
 @dataclass(frozen=True, eq=False)
 class AlignmentSums:
-    """Weighted sums over the textured pixels of c channels.
+    """Weighted sums over the textured pixels of c channels, for the normal equations.
 
-    The model of a residual is J m + a x + b: J its derivative by the motion m (6,) of the camera, x the
-    rendered value, a and b changes of gain and offset. A row (8,) is (J, x, 1).
+    The model of a residual (image minus rendered value) is J m + a x + b: m (6,) is the motion of the camera,
+    J (6,) the derivative of the residual with respect to it, x the rendered value, a and b the changes of
+    gain and offset. A row (8,) of the design matrix is (J, x, 1).
     """
 
     matrix: np.ndarray
-    """(c, 8, 8) row times row, with the weights of the second derivative of the loss"""
+    """(c, 8, 8) outer product of a row with itself, weighted by the second derivative of the loss"""
     right: np.ndarray
-    """(c, 8, 2) row times residual, twice. With a moved frame instead: row times the derivative of the
-    rendered value by its motion, and by that times minus one component of the ray"""
+    """(c, 8, 2) row times residual, in both columns. With a MovedFrame: row times d, and row times -d times
+    a component of the ray, with d the derivative of the rendered value by the motion"""
     square: np.ndarray
     """(c,) squared residuals"""
     scores: np.ndarray
@@ -107,16 +118,11 @@ class AlignmentKernels(ABC):
         stage: int,
         frame: Any,
         fit: AlignmentFit,
-        moved: tuple[Any, float, int] | None = None,
+        moved: MovedFrame | None = None,
         blocks: bool = False,
     ) -> AlignmentSums:
-        """Sums of a stage for a Frame with rgb and depth.
-
-        Args:
-            moved: Frame after a motion of the camera, the size of the motion, and the component of the ray in
-                `AlignmentSums.right`.
-            blocks: whether to return `scores` and `matrices`.
-        """
+        """Sums of a stage for a Frame with rgb and depth. blocks: whether to return `scores` and
+        `matrices`."""
 
 
 def bins_of(values: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet, declared_output
 from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.traits import PlacedTraits
 from fidsplat.util.errors import DeviceError, InputError, bytes_words
 
 
@@ -64,7 +65,7 @@ class DeviceTraits:
     renders_pixels: bool = False
     """renders a subset of the pixels: `Pipeline.render_every`"""
     probed: bool = False
-    """`Backend.probe`, `shapes` and `pieces`, for tests"""
+    """`Backend.probe` and `shapes`, for tests"""
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ class Rates:
 
 
 class ResidentData(ABC):
-    """A cloud on a device, with the properties (`CloudTraits`) that select its kernels."""
+    """A cloud on a device, with the properties that select its kernels (splats/traits.py)."""
 
     count: int
     """number of splats"""
@@ -94,6 +95,11 @@ class ResidentData(ABC):
     has_coplanar_groups: bool
     footprint: str
     ellipsoids: str
+
+    def take_traits(self, cloud: PlacedTraits) -> None:
+        """Copy the origin and the properties that select kernels from another cloud."""
+        for name in ("origin", "sh_degree", "has_coplanar_groups", "footprint", "ellipsoids"):
+            setattr(self, name, getattr(cloud, name))
 
     def color_range(self) -> tuple[float, float]:
         """Lower and upper bound of every channel of every splat, from any direction."""
@@ -118,40 +124,6 @@ class Chunk:
     [m], and the rotation as a quaternion; None: not moved"""
     first: int = 0
     """first row of the chunk's `count` splats in these arrays"""
-
-
-class ChunkedScene(ABC):
-    """A scene divided into chunks, with the `CloudTraits` of the complete scene."""
-
-    origin: np.ndarray
-    """(3,) float64 metres: world position of the means' zero"""
-    sh_degree: int
-    has_coplanar_groups: bool
-    footprint: str
-    ellipsoids: str
-
-    @abstractmethod
-    def distinct(self, applies_poses: bool) -> int:
-        """Number of different chunk keys. applies_poses: whether the device applies `Chunk.pose`."""
-
-
-class ChunkCache(ABC):
-    """Device cache of a scene's chunks, bounded by the memory budget; the least recently used are evicted."""
-
-    applies_poses: bool
-    """whether the device applies `Chunk.pose`; else it must be None"""
-    memory_bytes: int
-    """device memory of the cache"""
-
-    @abstractmethod
-    def gather(self, chunks: Sequence[Chunk], first_id: int = 0) -> ResidentData:
-        """Concatenate chunks into one cloud on the device; load chunks that are not cached. first_id:
-        `splat_id` of the first splat."""
-
-    @abstractmethod
-    def prefetch(self, chunks: Sequence[Chunk]) -> None:
-        """Prefetch chunks of the next frame while one is rendered, as far as capacity allows. Called from
-        another thread."""
 
 
 class Images(ABC):
@@ -411,8 +383,9 @@ class Backend(ABC):
         Raises InputError for arrays that cannot be used."""
         raise InputError(self.lacks("adopt arrays", "use a Warp device, or a SplatCloud"))
 
-    def chunk_cache(self, scene: ChunkedScene, rows: int) -> ChunkCache:
-        """A cache of a scene's chunks, each of at most `rows` splats."""
+    def chunk_cache(self, scene: Any) -> Any:
+        """A device cache of the chunks of a `streaming.device_chunks.DeviceChunks`
+        (`opencl.chunk_cache.OpenCLChunkCache`)."""
         raise DeviceError(self.lacks("cache chunks of a scene", "upload the scene"))
 
     def termination_depths(self, images: Any) -> TerminationDepths:
@@ -474,7 +447,3 @@ class Backend(ABC):
             `tape`: the number of fragments stored for the backward pass; gradients are bit-identical.
         """
         return {}
-
-    def pieces(self, shape: Any) -> int:
-        """Number of pieces into which the counting sorts divide their input."""
-        return 1

@@ -25,6 +25,7 @@ from fidsplat.backends.alignment import (
     AlignmentKernels,
     AlignmentStage,
     AlignmentSums,
+    MovedFrame,
 )
 from fidsplat.cameras import Camera
 from fidsplat.cameras.pose_offset import offset_pose
@@ -252,7 +253,7 @@ def _bread(at: _State, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.nda
         motion = np.zeros(6)
         motion[axis] = size = turn if axis < 3 else turn / max(math.sqrt(sums.inverse_depth), 1e-3)
         other = stage.frame(offset_pose(at.pose, motion))
-        right = stage.sums(frame, at, sums.noise, moved=(other, size, axis % 3)).right
+        right = stage.sums(frame, at, sums.noise, moved=MovedFrame(other, size, axis % 3)).right
         columns[:, :, axis] = right[:, :, 0]
         if pinhole:
             columns[:, :, axis // 3 * 3 + 2] += right[:, :, 1]

@@ -18,6 +18,7 @@ from fidsplat.backends.alignment import (
     AlignmentKernels,
     AlignmentStage,
     AlignmentSums,
+    MovedFrame,
     bins_of,
     least_bin,
     noise_factor,
@@ -48,10 +49,9 @@ class HostAlignment(AlignmentKernels):
         stage: int,
         frame: Any,
         fit: AlignmentFit,
-        moved: tuple[Any, float, int] | None = None,
+        moved: MovedFrame | None = None,
         blocks: bool = False,
     ) -> AlignmentSums:
-        """Sums over the pixels of a stage."""
         target = self._targets[stage]
         values, slopes, inverse_depth = self._features(target, frame)
         gain, offset = fit.gain[:, None].astype(np.float32), fit.offset[:, None].astype(np.float32)
@@ -69,9 +69,8 @@ class HostAlignment(AlignmentKernels):
         across, down = np.concatenate([target.turning, target.shifting * inverse_depth], axis=1)
         columns, column_weights = np.stack([residuals, residuals]), weights
         if moved is not None:
-            other, step, axis = moved
-            change = (_at(target.blurred(other), target.rows) - values) / np.float32(step)
-            columns, column_weights = np.stack([change, -target.rays[axis] * change]), matrix_weights
+            change = (_at(target.blurred(moved.frame), target.rows) - values) / np.float32(moved.size)
+            columns, column_weights = np.stack([change, -target.rays[moved.axis] * change]), matrix_weights
         matrix, right, scores, matrices = [], [], [], []
         for channel, (gx, gy) in enumerate(zip(*slopes, strict=True)):
             row = np.stack([*-(gx * across + gy * down), values[channel], np.ones_like(gx)]).astype(float)

@@ -216,7 +216,7 @@ def f6(renderer: Renderer) -> Found:
     unsorted = unlisted = tried = 0
     for shape in backend.shapes("sorting").values():
         pipeline = backend.pipeline(features, shape)
-        c = backend.pieces(shape)
+        c = shape.chunks
         for n in sorted({1, 2, 3, c - 1, c, c + 1, 2 * c + 1, 255, 256, 257, 1000, 4097} - {0}):
             for kind in ("random", "few values", "one value", "descending", "half culled"):
                 depths = generator.uniform(1.0, 9.0, n)

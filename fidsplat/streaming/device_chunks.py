@@ -7,18 +7,16 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from fidsplat.backends.interface import Chunk, ChunkedScene
+from fidsplat.backends.interface import Chunk
 from fidsplat.store.chunked_splats import ChunkedSplats, Selection
 from fidsplat.store.store import Store
 
 
-class DeviceChunks(ChunkedScene):
-    """Chunks of a scene for a device's chunk cache, and the properties of the complete scene."""
+class DeviceChunks:
+    """Chunks of a scene for a device's chunk cache."""
 
     def __init__(self, scene: ChunkedSplats) -> None:
-        self.scene, self.origin = scene, scene.origin
-        self.sh_degree, self.has_coplanar_groups = scene.sh_degree, scene.has_coplanar_groups
-        self.footprint, self.ellipsoids = scene.footprint, scene.ellipsoids
+        self.scene = scene
         self._chunks: dict[tuple[int, bool], dict[int, Chunk]] = {}
         """(number of the store, posed by the device) -> chunks, by node"""
 
@@ -64,8 +62,8 @@ class DeviceChunks(ChunkedScene):
     def _can_pose(self, store: Store) -> bool:
         """Whether a device may apply a store's poses: SH would have to be rotated too, and means of another
         origin would be rounded twice."""
-        offset = store.origin - self.origin
-        return store.poses is not None and self.sh_degree < 0 and not offset.any()
+        offset = store.origin - self.scene.origin
+        return store.poses is not None and self.scene.sh_degree < 0 and not offset.any()
 
     def _chunk_of(self, number: int, node: int, posed: bool) -> Chunk:
         store = self.scene.stores[number]

@@ -31,11 +31,7 @@ class Residency:
 
     def __init__(self, scene: ChunkedSplats, backend: Backend) -> None:
         self.scene, self._backend, self.chunks = scene, backend, DeviceChunks(scene)
-        self._cache = (
-            backend.chunk_cache(self.chunks, self.chunks.largest_chunk)
-            if backend.traits.caches_chunks
-            else None
-        )
+        self._cache = backend.chunk_cache(self.chunks) if backend.traits.caches_chunks else None
         self._current: tuple[Selection, int, ResidentData] | None = None
         self._splitter, self._occlusion = BandSplitter(), OcclusionCulling()
         self._prefetch_thread: threading.Thread | None = None

@@ -46,9 +46,7 @@ def test_chunks_are_sent_to_a_device_once(stores, tmp_path, monkeypatch):
 def test_gathered_parts_can_begin_within_a_chunk(stores):
     backend, scene = fs.Renderer("opencl").backend, ChunkedSplats([stores["disks"]])
     device_chunks = DeviceChunks(scene)
-    gathered = backend.chunk_cache(device_chunks, device_chunks.largest_chunk).gather(
-        device_chunks.of(scene.all_chunks(), True)
-    )
+    gathered = backend.chunk_cache(device_chunks).gather(device_chunks.of(scene.all_chunks(), True))
     gathered.streamed = True
     found = np.empty(130, np.float32)
     cl.enqueue_copy(backend.queue, found, gathered.part("opacities", 70, 200))
@@ -186,7 +184,7 @@ def test_frames_and_cached_chunks_keep_the_budget(stores, monkeypatch):
         cache = resident.data._cache
         assert 0 < cache.memory_bytes <= cache.reserved_bytes <= budget // 4
         # room is left for all that the cache may come to take, whatever it holds yet
-        empty = limited.backend.chunk_cache(resident.data.chunks, cache._rows)
+        empty = limited.backend.chunk_cache(resident.data.chunks)
         gathered = empty.gather(resident.data.chunks.of(resident.data.scene.all_chunks(), True))
         assert gathered.bytes_for(["means"])[0] == cache.reserved_bytes + 12 * gathered.capacity
         assert len(store) <= gathered.capacity <= 9 / 8 * len(store)

@@ -31,9 +31,8 @@ class Cloud(interface.ResidentData):
     memory_bytes = 0
 
     def __init__(self, cloud):
-        self.count, self.origin, self.sh_degree = len(cloud), cloud.origin, cloud.sh_degree
-        self.has_coplanar_groups, self.footprint = cloud.has_coplanar_groups, cloud.footprint
-        self.ellipsoids = cloud.ellipsoids
+        self.count = len(cloud)
+        self.take_traits(cloud)
 
 
 class Backend(interface.Backend):

@@ -13,6 +13,7 @@ from fidsplat.backends.alignment import (
     AlignmentKernels,
     AlignmentStage,
     AlignmentSums,
+    MovedFrame,
     least_bin,
     noise_factor,
 )
@@ -31,8 +32,6 @@ _Image: TypeAlias = tuple[cl.Buffer, tuple[int, ...]]
 
 
 class OpenCLAlignment(AlignmentKernels):
-    """Kernels of direct image alignment on an OpenCL device."""
-
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()
         self._workspace = workspace
@@ -43,7 +42,6 @@ class OpenCLAlignment(AlignmentKernels):
         """arguments of the kernels by stage"""
 
     def load(self, image: np.ndarray, stages: list[AlignmentStage], most: int) -> list[int]:
-        """Prepare the image for its stages."""
         with self._workspace.lock, self._workspace.failing("localising"):
             self._stages = []
             counted = self._scratch("textures", 4 * BINS * len(stages))
@@ -101,16 +99,15 @@ class OpenCLAlignment(AlignmentKernels):
         stage: int,
         frame: Any,
         fit: AlignmentFit,
-        moved: tuple[Any, float, int] | None = None,
+        moved: MovedFrame | None = None,
         blocks: bool = False,
     ) -> AlignmentSums:
-        """Sums over the pixels of a stage."""
         given, channels = self._stages[stage], len(fit.gain)
         height, width, side = given["height"], given["width"], given["side"]
         count = -(-height // side) * -(-width // side)
         groups = count if blocks else min(count, _GROUPS[self._items])
         rgb, depth = (frame.images.buffer(name) for name in ("rgb", "depth"))
-        other, step, axis = (frame, 1.0, 0) if moved is None else moved
+        other, step, axis = moved or (frame, 1.0, 0)
         moved_rgb = rgb if moved is None else other.images.buffer("rgb")
         with self._workspace.lock, self._workspace.failing("localising"):
             values = self._blurred(rgb, given, "render", 3)

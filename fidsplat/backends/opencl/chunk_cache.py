@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.interface import Chunk, ChunkCache, ChunkedScene, ResidentData
+from fidsplat.backends.interface import Chunk
 from fidsplat.backends.opencl.assemble import kernel_text
 from fidsplat.backends.opencl.host_memory import rounded_up
 from fidsplat.backends.opencl.program import build
+from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.workspace import Workspace
 
 _SHARE = 4
@@ -48,12 +49,14 @@ class Copies:
     """number of evictions before these parameters were made; later ones make them stale"""
 
 
-class OpenCLChunkCache(ChunkCache):
-    """Chunk cache in the slots of device buffers."""
+class OpenCLChunkCache:
+    """Device cache of a scene's chunks, bounded by the memory budget; the least recently used are evicted."""
 
-    def __init__(self, workspace: Workspace, whole: ChunkedScene, rows: int) -> None:
-        self.workspace, self.whole, self._rows = workspace, whole, max(rows, 1)
+    def __init__(self, workspace: Workspace, scene: Any) -> None:
+        """scene: a `streaming.device_chunks.DeviceChunks`."""
+        self.workspace, self.scene, self._rows = workspace, scene, max(scene.largest_chunk, 1)
         self.applies_poses = workspace.info.float64
+        """whether the device applies `Chunk.pose`; else it must be None"""
         self.widths: dict[str, int] = {}
         """bytes of a splat in each array"""
         self._arrays: dict[str, cl.Buffer] = {}
@@ -82,7 +85,8 @@ class OpenCLChunkCache(ChunkCache):
         return self._size * self._rows * sum(self.widths.values())
 
     def gather(self, chunks: Sequence[Chunk], first_id: int = 0) -> GatheredChunks:
-        """Concatenate chunks on the device, lazily: an array is copied when a frame first reads it."""
+        """Concatenate chunks into one cloud on the device, lazily: an array is copied when a frame first
+        reads it. first_id: `splat_id` of the first splat."""
         with self._lock:
             self._rendered = {chunk.key for chunk in chunks}
             if not self.widths:
@@ -91,6 +95,8 @@ class OpenCLChunkCache(ChunkCache):
         return GatheredChunks(self, chunks, first_id)
 
     def prefetch(self, chunks: Sequence[Chunk]) -> None:
+        """Load chunks of the next frame while one is rendered, as far as capacity allows. Called from another
+        thread."""
         requested = {chunk.key for chunk in chunks}  # requested chunks must not evict each other
         for chunk in chunks:
             with self._lock:
@@ -223,7 +229,7 @@ class OpenCLChunkCache(ChunkCache):
         """Maximum number of slots."""
         share = self.workspace.memory_budget // _SHARE // self._slot_bytes
         widest = self.workspace.device.max_mem_alloc_size // (self._rows * max(self.widths.values()))
-        return max(1, self._size, min(share, widest, self.whole.distinct(self.applies_poses)))
+        return max(1, self._size, min(share, widest, self.scene.distinct(self.applies_poses)))
 
     def _grow(self, size: int) -> None:
         if self._last is not None:
@@ -239,27 +245,20 @@ class OpenCLChunkCache(ChunkCache):
         self._size = size
 
 
-class GatheredChunks(ResidentData):
+class GatheredChunks(Resident):
     """A cloud of cached chunks. An array is copied out of the slots when a frame first reads it; a cloud that
     exceeds its share of the memory budget is copied in parts for every frame (`streamed`)."""
 
+    coherent = True
+
     def __init__(self, cache: OpenCLChunkCache, chunks: Sequence[Chunk], first_id: int) -> None:
-        whole, workspace = cache.whole, cache.workspace
+        workspace = cache.workspace
         self._cache, self._chunks, self._workspace = cache, chunks, workspace
-        self._first_id = first_id
+        self._first_id, self.buffer_key = first_id, cache.token
         self._ends = np.cumsum([chunk.count for chunk in chunks], dtype=np.int64)
-        self.count = int(self._ends[-1])
-        self.capacity = rounded_up(self.count, 4)
-        """splats for which frames have buffers; rounded up, so that the next view reuses the buffers"""
-        self.origin, self.sh_degree, self.footprint = whole.origin, whole.sh_degree, whole.footprint
-        self.has_coplanar_groups = whole.has_coplanar_groups
-        self.ellipsoids = whole.ellipsoids
-        self.cached_frames: dict[Hashable, Any] = {}
-        """cached frames for replay, by their kind"""
-        self.immutable = True
-        self.buffer_key = cache.token
-        self.coherent = True
-        self._buffers: dict[str, cl.Buffer] = {}
+        super().__init__(int(self._ends[-1]))
+        self.take_traits(cache.scene.scene)
+        self.capacity = rounded_up(self.count, 4)  # so that the next view reuses the buffers
         self._leased: list[tuple[str, cl.Buffer]] = []
         weakref.finalize(self, workspace.pool.give_back, self._leased)
         self._copies: tuple[int, int, Copies | None] = (0, 0, None)
@@ -270,8 +269,7 @@ class GatheredChunks(ResidentData):
         )
 
     def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
-        """Bytes that stay on the device, including the full cache, and bytes per splat that each frame
-        copies."""
+        """See `Resident.bytes_for`; the bytes that stay on the device include the full cache."""
         read, stays = {*names, *self._buffers}, self._cache.reserved_bytes
         each = sum(self._width(name) for name in read)
         return (stays, each) if self.streamed else (stays + self.capacity * each, 0)
@@ -279,10 +277,9 @@ class GatheredChunks(ResidentData):
     @property
     def memory_bytes(self) -> int:
         """Bytes on the device, the cache included."""
-        return self._cache.memory_bytes + sum(buffer.size for buffer in self._buffers.values())
+        return self._cache.memory_bytes + super().memory_bytes
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
-        """The array of splats [first, end)."""
         width = self._width(name)
         if self.streamed:
             buffer = self._workspace.pool.scratch(f"chunk of {name}", (end - first) * width)
@@ -296,10 +293,7 @@ class GatheredChunks(ResidentData):
             self._fill(name, 0, self.count, whole)
             self._cache.wait()  # frames may be rendered on another queue
             self._buffers[name] = whole
-        whole = self._buffers[name]
-        return (
-            whole if end - first == self.count else whole.get_sub_region(first * width, (end - first) * width)
-        )
+        return self._region(self._buffers[name], first, end, width)
 
     def _width(self, name: str) -> int:
         return 4 if name == "splat_ids" else self._cache.widths[name]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.checked_cache import check_once
-from fidsplat.backends.interface import Backend, ChunkedScene, DeviceInfo, DeviceTraits, Rates
+from fidsplat.backends.interface import Backend, DeviceInfo, DeviceTraits, Rates
 from fidsplat.backends.opencl.alignment import OpenCLAlignment
 from fidsplat.backends.opencl.assemble import Source, assemble
 from fidsplat.backends.opencl.chunk_cache import OpenCLChunkCache
@@ -20,7 +21,7 @@ from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.pocl_workarounds import is_pocl, kernel_cache, linker, target_patch
 from fidsplat.backends.opencl.probe import OpenCLProbe
 from fidsplat.backends.opencl.program import BackgroundCompiler, build_options
-from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.resident import UploadedCloud
 from fidsplat.backends.opencl.roofline import measure_rates
 from fidsplat.backends.opencl.shapes import (
     DeviceShape,
@@ -123,12 +124,11 @@ class OpenCLBackend(Workspace, Backend):
         )
         """the device's own shape, and pipelines by the arguments of `pipeline`"""
 
-    def upload(self, cloud: SplatCloud) -> Resident:
-        """Copy a cloud to device buffers; a CPU reads the host's arrays."""
-        return Resident(self, cloud)
+    def upload(self, cloud: SplatCloud) -> UploadedCloud:
+        return UploadedCloud(self, cloud)
 
-    def chunk_cache(self, scene: ChunkedScene, rows: int) -> OpenCLChunkCache:
-        return OpenCLChunkCache(self, scene, rows)
+    def chunk_cache(self, scene: Any) -> OpenCLChunkCache:
+        return OpenCLChunkCache(self, scene)
 
     def termination_depths(self, images: OpenCLImages) -> TerminationDepths:
         return images.termination_depths()
@@ -219,9 +219,6 @@ class OpenCLBackend(Workspace, Backend):
 
     def shapes(self, kind: str) -> dict[str, DeviceShape]:
         return other_shapes(self.shape, kind)
-
-    def pieces(self, shape: DeviceShape) -> int:
-        return shape.chunks
 
 
 def _all_devices() -> Iterator[cl.Device]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from copy import copy
 from typing import Any
 
@@ -36,13 +36,14 @@ from fidsplat.backends.opencl.uniforms import scalars_of
 from fidsplat.backends.view import View
 from fidsplat.effects import IMAGES
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
-from fidsplat.util.errors import DeviceError, InputError
+from fidsplat.util.errors import InputError
 
 _GROUP = 64  # work-group size: RESERVE_ITEMS, POSE_ITEMS, SUM_ITEMS and STEP_ITEMS of the kernels
 _SUMS = {"background": 3, "pose": 6, "intrinsics": 4}
 """gradients that are sums over tiles or splats, and their numbers"""
 _CAMERA = 10
 """numbers of a camera: pose and intrinsics"""
+_DOING = "taking derivatives"
 _F32 = np.dtype(np.float32)
 _ZERO = np.zeros(1, np.uint32)  # also zeroes floats
 
@@ -63,49 +64,6 @@ class OpenCLDifferentiable(DifferentiableImages):
         return self.frame.named[f"{name}_out"], gradient_shape(name, self.frame.view)
 
 
-@contextmanager
-def _differentiating(frame: DeviceFrame) -> Iterator[None]:
-    """Use the device exclusively, and raise its failures as DeviceError."""
-    try:
-        with frame.workspace.lock:
-            yield
-    except cl.Error as error:
-        title = frame.workspace.info.title
-        raise DeviceError(f"{title} failed while taking derivatives: {error}") from error
-
-
-class TileGradients:
-    """Gradients of a frame summed per tile, until the device renders another frame."""
-
-    def __init__(self, of: OpenCLGradients, images: OpenCLDifferentiable, frame: DeviceFrame) -> None:
-        self._of, self._images, self._frame = of, images, frame
-
-    def gradients(self) -> dict[str, Any]:
-        """Sum over tiles; returns the result of `OpenCLGradients.backward`."""
-        with self._last():
-            return self._of.sum_tiles(self._frame)
-
-    def compile_step(self, by_camera: bool = False) -> None:
-        """Compile the kernel of `step`."""
-        self._of.compile_step(by_camera)
-
-    def step(self, given: Mapping[str, Any], by_camera: bool = False) -> Callable[[], np.ndarray] | None:
-        """Submit an optimiser step (kernels/opencl/project_step.cl).
-
-        Args:
-            given: arguments that are not the frame's.
-            by_camera: whether to return a function that waits for the gradient (10,) with respect to the
-                camera: pose and intrinsics.
-        """
-        with self._last():
-            return self._of.step(self._frame, given, by_camera)
-
-    def _last(self) -> AbstractContextManager[None]:
-        if not self._images.last:
-            raise InputError(NOT_THE_LAST)
-        return _differentiating(self._frame)
-
-
 class OpenCLGradients(GradientPipeline):
     """Compiled stages with their derivatives.
 
@@ -115,7 +73,7 @@ class OpenCLGradients(GradientPipeline):
     """
 
     def __init__(self, pipeline: OpenCLPipeline) -> None:
-        self._pipeline = pipeline
+        self._pipeline, self.features = pipeline, pipeline.features
         self.source = assemble_gradients(pipeline.features, pipeline.shape)
         self.program = Program(pipeline.workspace, self.source)
         arguments = self.source.arguments
@@ -125,11 +83,11 @@ class OpenCLGradients(GradientPipeline):
             if any(one.name == f"by_{name}" for one in arguments["blend_backward"])
         ]
         """outputs that have gradients"""
-        self._cloud_arrays = [one.name for one in arguments["project_backward"] if one.source == "cloud"]
+        self.cloud_arrays = [one.name for one in arguments["project_backward"] if one.source == "cloud"]
         self._pair_limit = 0
         """list capacity of frames for whose counts the host does not wait"""
-        self._tile_commands, self._sum_commands = CommandList(self.program), CommandList(self.program)
-        self._step_commands: dict[bool, CommandList] = {}
+        self._tile_commands, self.sum_commands = CommandList(self.program), CommandList(self.program)
+        self.step_commands: dict[bool, CommandList] = {}
         """command lists of a step by whether it sums the gradient of the camera"""
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
@@ -147,10 +105,10 @@ class OpenCLGradients(GradientPipeline):
             return self.backward_to_tiles(images, gradients).gradients()
 
     def backward_to_tiles(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> TileGradients:
-        check_gradients(self._pipeline.features, gradients)
+        check_gradients(self.features, gradients)
         if not images.last:
             raise InputError(NOT_THE_LAST)
-        with _differentiating(images.frame):
+        with images.frame.workspace.lock, images.frame.workspace.failing(_DOING):
             frame = self._backward_frame(images.frame)
             self._submit_to_tiles(frame, gradients)
             return TileGradients(self, images, frame)
@@ -192,7 +150,7 @@ class OpenCLGradients(GradientPipeline):
         return frame.pool.state, count, frame.capacity, size
 
     def _record_to_tiles(self, frame: DeviceFrame, log_ceiling: float) -> None:
-        features, shape = self._pipeline.features, self._pipeline.shape
+        features, shape = self.features, self._pipeline.shape
         in_groups, tile = shape.schedule == "group", shape.tile_width * shape.tile_height
         chunks = frame.pairs // backward_chunk(features, shape) + frame.tiles
         frame.take("checkpoints", (8 * tile if in_groups else 4 * (tile + shape.lanes)) * chunks)
@@ -221,83 +179,15 @@ class OpenCLGradients(GradientPipeline):
         splat of eight chunks, and one more word.
         """
         shape = self._pipeline.shape
-        chunk, vector = backward_chunk(self._pipeline.features, shape), 4 * shape.lanes
+        chunk, vector = backward_chunk(self.features, shape), 4 * shape.lanes
         words = 2 * 8 * chunk + 1
         return 8 * chunk * shape.tile_width * shape.tile_height + -(-4 * words // vector) * vector
 
-    def sum_tiles(self, frame: DeviceFrame) -> dict[str, Any]:
-        """The gradients of a frame from the sums over tiles."""
-        frame = copy(frame)
-        frame.commands = self._sum_commands
-        self._sum_commands.clear()
-        count, real = frame.resident.count, self.source.scalars.dtype("real").itemsize
-        groups = -(-count // _GROUP)  # of the sums for the camera
-        frame.take("group_sums", _CAMERA * real * groups)
-        found = self._allocate_results(frame)
-        if count:
-            arrays: dict[str, Any] = {
-                name: frame.resident.part(name, 0, count) for name in self._cloud_arrays
-            }
-            frame.launch("project backward", "project_backward", (count,), (_GROUP,), count=count, **arrays)
-        self._add_up(frame, found, groups)
-        return found
-
-    def _add_up(self, frame: DeviceFrame, found: Mapping[str, Array], groups: int) -> None:
-        """Sum the gradients of the background over tiles, and those of the camera over work-groups."""
-        given: dict[str, Any] = {name: found[name].data for name in _SUMS}
-        given |= {"tiles": frame.tiles, "groups": groups}
-        frame.launch("project backward", "add_up", (sum(_SUMS.values()) * _GROUP,), (_GROUP,), **given)
-
     def compile_step(self, by_camera: bool = False) -> None:
         """Compile the kernel of `step`, which gradients do not need."""
-        if by_camera not in self._step_commands:
-            source = assemble_step(self._pipeline.features, self._pipeline.shape, by_camera)
-            self._step_commands[by_camera] = CommandList(Program(self._pipeline.workspace, source))
-
-    def step(
-        self, frame: DeviceFrame, given: Mapping[str, Any], by_camera: bool = False
-    ) -> Callable[[], np.ndarray] | None:
-        """Submit a step of Adam from the sums over tiles; `compile_step` comes first. given: arguments that
-        are not the frame's. by_camera: whether to return a function that waits for the gradient (10,) of the
-        camera."""
-        commands, count = self._step_commands[by_camera], frame.resident.count
-        given = {**given, "count": count}
-        groups = -(-count // _GROUP)
-        if by_camera:
-            frame.take("group_sums", _CAMERA * self.source.scalars.dtype("real").itemsize * groups)
-        arguments = commands.program.source.arguments["project_step"]
-        values = {one.name: given[one.name] if one.name in given else frame.value(one) for one in arguments}
-        if commands.key != count:
-            commands.clear()
-            size = (max(1, -(-count // _GROUP)) * _GROUP,)
-            commands.record("project_step", size, (_GROUP,), list(values.values()))
-            commands.key = count
-        commands.set(values)
-        (event,) = commands.submit(frame.queue)
-        frame.events.append(event)
-        frame.stages.append("project backward")
-        return self._camera_readback(frame, groups) if by_camera else None
-
-    def _camera_readback(self, frame: DeviceFrame, groups: int) -> Callable[[], np.ndarray]:
-        """Sum the gradient of the camera over work-groups; returns a function that waits for it."""
-        frame = copy(frame)
-        frame.commands = self._sum_commands
-        self._sum_commands.clear()
-        arrays = {name: frame.pool.array(frame.queue, name, (k,)) for name, k in _SUMS.items()}
-        self._add_up(frame, arrays, groups)
-        found = np.empty(_CAMERA, np.float32)
-        copied = [
-            cl.enqueue_copy(frame.queue, part, arrays[name].data, is_blocking=False)  # pyright: ignore
-            for name, part in (("pose", found[:6]), ("intrinsics", found[6:]))
-        ]
-        frame.queue.flush()
-
-        def read() -> np.ndarray:
-            with _differentiating(frame):
-                cl.wait_for_events(copied)
-            return found
-
-        return read
+        if by_camera not in self.step_commands:
+            source = assemble_step(self.features, self._pipeline.shape, by_camera)
+            self.step_commands[by_camera] = CommandList(Program(self._pipeline.workspace, source))
 
     def _check_capacity(self, frame: DeviceFrame) -> None:
         """Raise CapacityExceeded if the lists were too small: then they are empty, and gradient buffer
@@ -327,9 +217,104 @@ class OpenCLGradients(GradientPipeline):
             else:
                 frame.put(f"by_{name}", np.ascontiguousarray(given, np.float32))
 
+
+class TileGradients:
+    """Gradients of a frame summed per tile, valid until the device renders another frame."""
+
+    def __init__(self, pipeline: OpenCLGradients, images: OpenCLDifferentiable, frame: DeviceFrame) -> None:
+        self.pipeline, self._images, self._frame = pipeline, images, frame
+
+    def gradients(self) -> dict[str, Any]:
+        """The result of `OpenCLGradients.backward`, from the sums over tiles."""
+        pipeline = self.pipeline
+        with self._last():
+            frame = copy(self._frame)
+            frame.commands = pipeline.sum_commands
+            frame.commands.clear()
+            count, groups = frame.resident.count, self._allocate_camera_sums(frame)
+            found = self._allocate_results(frame)
+            if count:
+                arrays: dict[str, Any] = {
+                    name: frame.resident.part(name, 0, count) for name in pipeline.cloud_arrays
+                }
+                frame.launch(
+                    "project backward", "project_backward", (count,), (_GROUP,), count=count, **arrays
+                )
+            self._add_up(frame, found, groups)
+            return found
+
+    def step(self, given: Mapping[str, Any], by_camera: bool = False) -> Callable[[], np.ndarray] | None:
+        """Submit an optimiser step (kernels/opencl/project_step.cl); `OpenCLGradients.compile_step` comes
+        first.
+
+        Args:
+            given: arguments that are not the frame's.
+            by_camera: whether to return a function that waits for the gradient (10,) with respect to the
+                camera: pose and intrinsics.
+        """
+        with self._last():
+            frame, commands = self._frame, self.pipeline.step_commands[by_camera]
+            given = {**given, "count": (count := frame.resident.count)}
+            groups = self._allocate_camera_sums(frame) if by_camera else 0
+            arguments = commands.program.source.arguments["project_step"]
+            values = {
+                one.name: given[one.name] if one.name in given else frame.value(one) for one in arguments
+            }
+            if commands.key != count:
+                commands.clear()
+                size = (max(1, -(-count // _GROUP)) * _GROUP,)
+                commands.record("project_step", size, (_GROUP,), list(values.values()))
+                commands.key = count
+            commands.set(values)
+            frame.events += commands.submit(frame.queue)
+            frame.stages.append("project backward")
+            return self._camera_readback(frame, groups) if by_camera else None
+
+    @contextmanager
+    def _last(self) -> Iterator[None]:
+        """A context that uses the device. Raises InputError after a later frame of the device."""
+        if not self._images.last:
+            raise InputError(NOT_THE_LAST)
+        with self._frame.workspace.lock, self._frame.workspace.failing(_DOING):
+            yield
+
+    def _allocate_camera_sums(self, frame: DeviceFrame) -> int:
+        """Allocate the sums of work-groups for the camera, and return the number of work-groups."""
+        groups = -(-frame.resident.count // _GROUP)
+        real = self.pipeline.source.scalars.dtype("real").itemsize
+        frame.take("group_sums", _CAMERA * real * groups)
+        return groups
+
+    def _add_up(self, frame: DeviceFrame, found: Mapping[str, Array], groups: int) -> None:
+        """Sum the gradients of the background over tiles, and those of the camera over work-groups."""
+        given: dict[str, Any] = {name: found[name].data for name in _SUMS}
+        given |= {"tiles": frame.tiles, "groups": groups}
+        frame.launch("project backward", "add_up", (sum(_SUMS.values()) * _GROUP,), (_GROUP,), **given)
+
+    def _camera_readback(self, frame: DeviceFrame, groups: int) -> Callable[[], np.ndarray]:
+        """Sum the gradient of the camera over work-groups; returns a function that waits for it."""
+        frame = copy(frame)
+        frame.commands = self.pipeline.sum_commands
+        frame.commands.clear()
+        arrays = {name: frame.pool.array(frame.queue, name, (k,)) for name, k in _SUMS.items()}
+        self._add_up(frame, arrays, groups)
+        found = np.empty(_CAMERA, np.float32)
+        copied = [
+            cl.enqueue_copy(frame.queue, part, arrays[name].data, is_blocking=False)  # pyright: ignore
+            for name, part in (("pose", found[:6]), ("intrinsics", found[6:]))
+        ]
+        frame.queue.flush()
+
+        def read() -> np.ndarray:
+            with frame.workspace.lock, frame.workspace.failing(_DOING):
+                cl.wait_for_events(copied)
+            return found
+
+        return read
+
     def _allocate_results(self, frame: DeviceFrame) -> dict[str, Array]:
         """Arrays for the gradients, reused by every call."""
-        count, features = frame.resident.count, self._pipeline.features
+        count, features = frame.resident.count, self.pipeline.features
         shapes: dict[str, tuple[int, ...]] = {
             **{"means": (count, 3), "quats": (count, 4), "scales": (count, 2), "opacities": (count,)},
             **{"screen": (count,)},
@@ -339,7 +324,7 @@ class OpenCLGradients(GradientPipeline):
             shapes["sh"] = (count, (features.sh_degree + 1) ** 2, 3)
         else:
             shapes["colors"] = (count, 3)
-        if "thickness" in self._cloud_arrays:
+        if "thickness" in self.pipeline.cloud_arrays:
             shapes["thickness"] = (count,)
         found = {}
         for name, shape in shapes.items():

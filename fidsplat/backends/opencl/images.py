@@ -132,8 +132,21 @@ class OpenCLImages(Images):
         return [event for one in self.complete() for event in one.done()]
 
     def read_uint8(self, name: str, index: int = 0) -> np.ndarray:
-        with self._workspace.failing(f"rendering {name}"):
-            return read_uint8(self._workspace, self.buffer(name), index, self._shape(name), self._done())
+        workspace, shape, label = self._workspace, self._shape(name), "8 bits of an image"
+        into, count = workspace.host_memory.empty(shape, np.uint8), math.prod(shape)
+        with workspace.failing(f"rendering {name}"):
+            after = self._done()
+            with workspace.lock:  # the kernel's arguments are shared by all images
+                kernel, values = _kernel(workspace)
+                made = workspace.pool.lease(label, count)
+                items = -(-count // (values * _UINT8_GROUP)) * _UINT8_GROUP
+                given = np.uint64(count), np.uint64(index * count), self.buffer(name), made
+                converted = kernel(workspace.read_queue, (items,), (_UINT8_GROUP,), *given, wait_for=after)
+            try:
+                cl.enqueue_copy(workspace.read_queue, into, made, wait_for=[converted])
+            finally:
+                workspace.pool.give_back([(label, made)])
+        return into
 
     def device_array(self, name: str, index: int | None = None) -> Any:
         if index is not None:
@@ -219,31 +232,6 @@ class OpenCLImages(Images):
             sides = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))
             for first, end in sides.reshape(-1, 2).tolist():
                 yield row * height, min((row + 1) * height, rows), first * width, min(end * width, columns)
-
-
-def read_uint8(
-    workspace: Workspace, image: cl.Buffer, index: int, shape: tuple[int, ...], after: list[cl.Event]
-) -> np.ndarray:
-    """An image of floats as an array of uint8 on the host; waits for the device.
-
-    index: number of the image in the buffer. after: events to wait for.
-
-    Raises:
-        DeviceError: no memory, or the compiler refuses.
-    """
-    into, count = workspace.host_memory.empty(shape, np.uint8), math.prod(shape)
-    queue, name = workspace.read_queue, "8 bits of an image"
-    with workspace.lock:  # the kernel's arguments are shared by all images
-        kernel, values = _kernel(workspace)
-        made = workspace.pool.lease(name, count)
-        items = -(-count // (values * _UINT8_GROUP)) * _UINT8_GROUP
-        numbers = np.uint64(count), np.uint64(index * count)
-        converted = kernel(queue, (items,), (_UINT8_GROUP,), *numbers, image, made, wait_for=after)
-    try:
-        cl.enqueue_copy(queue, into, made, wait_for=[converted])
-    finally:
-        workspace.pool.give_back([(name, made)])
-    return into
 
 
 def _kernel(workspace: Workspace) -> tuple[cl.Kernel, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import weakref
+from abc import abstractmethod
 from collections.abc import Hashable, Iterable
 from contextlib import suppress
 from typing import Any
@@ -17,69 +18,80 @@ from fidsplat.backends.opencl.buffers import DeviceBuffer
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import color_range
-from fidsplat.util.errors import DeviceError
 
 _VECTOR = 16
 """alignment in bytes of the vectors in which kernels read arrays"""
 
 
 class Resident(ResidentData):
+    """Base of the clouds on an OpenCL device."""
+
+    streamed = False
+    """whether every frame copies the cloud to the device, a chunk at a time"""
+    immutable = True
+    """whether the arrays never change, so that a frame can be rendered again later"""
+    buffer_key: object = None
+    """key of clouds whose frames may share buffers"""
+    coherent = False
+    """whether splats with neighbouring indices are close to each other, as in stores"""
+
+    def __init__(self, count: int) -> None:
+        self.count = self.capacity = count
+        """number of splats, and number of splats for which frames allocate buffers"""
+        self._buffers: dict[str, cl.Buffer] = {}
+        self.cached_frames: dict[Hashable, Any] = {}
+        """command lists of rendered frames, by the properties that a frame must share to replay them"""
+
+    @property
+    def memory_bytes(self) -> int:
+        return sum(buffer.size for buffer in self._buffers.values())
+
+    @abstractmethod
+    def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
+        """Memory of these arrays: bytes that stay on the device, and bytes per splat that each frame
+        copies."""
+
+    @abstractmethod
+    def part(self, name: str, first: int, end: int) -> cl.Buffer:
+        """The array of splats [first, end)."""
+
+    def _region(self, complete: cl.Buffer, first: int, end: int, width: int) -> cl.Buffer:
+        """Splats [first, end) of a buffer with `width` bytes per splat."""
+        if end - first == self.count:
+            return complete
+        return complete.get_sub_region(first * width, (end - first) * width)
+
+
+class UploadedCloud(Resident):
     """A SplatCloud on the device.
 
     A CPU reads the host's arrays without a copy. Other devices have copies; labels and colours are copied
-    when a frame first reads them. A cloud that exceeds half of the memory budget is `streamed`: every frame
-    copies it to the device, a chunk at a time.
+    when a frame first reads them. A cloud that exceeds half of the memory budget is `streamed`.
     """
 
     def __init__(self, workspace: Workspace, cloud: SplatCloud) -> None:
-        self._workspace = workspace
-        self.count = self.capacity = len(cloud)
-        """number of splats, and number for which frames have buffers"""
-        self.origin = cloud.origin
-        self.sh_degree = cloud.sh_degree
-        self.has_coplanar_groups = cloud.coplanar_groups is not None
-        self.footprint, self.ellipsoids = cloud.footprint, cloud.ellipsoids
-        self._arrays = kernel_arrays(cloud)
-        self._buffers: dict[str, cl.Buffer] = {}
-        self.cached_frames: dict[Hashable, Any] = {}
-        """cached frames for replay, by their kind"""
-        self.immutable = True
-        """whether the arrays never change, so that a frame can be rendered again later"""
-        self.buffer_key: object = None
-        """key of clouds that may share buffers"""
-        self.coherent = False
-        """whether consecutive splats are close to each other, as in stores"""
+        super().__init__(len(cloud))
+        self.take_traits(cloud)
+        self._workspace, self._arrays = workspace, kernel_arrays(cloud)
         total = self.count * self._bytes_of(self._arrays)
-        widest = 0
-        for array in self._arrays.values():
-            widest = max(widest, array.nbytes)
+        widest = max(array.nbytes for array in self._arrays.values())
         device = workspace.device
         self._shared = workspace.info.kind == "cpu" and bool(device.host_unified_memory)
         if self._shared:
             weakref.finalize(self, _finish, os.getpid(), workspace.queue, workspace.replay_queue)
-        self.streamed = not self._shared and (
-            total > workspace.memory_budget // 2 or widest > device.max_mem_alloc_size
-        )
-        if not self._shared and not self.streamed:
-            try:
+            return
+        self.streamed = total > workspace.memory_budget // 2 or widest > device.max_mem_alloc_size
+        if not self.streamed:
+            with workspace.failing("copying the cloud"):
                 for name in self._arrays.keys() - {"labels", "colors", "sh"}:
                     self._whole(name)
                 workspace.queue.finish()
-            except cl.Error as error:
-                raise DeviceError(
-                    f"{workspace.info.title} failed while copying the cloud: {error}"
-                ) from error
 
     def _bytes_of(self, names: Iterable[str]) -> int:
         """Bytes per splat of these arrays."""
-        size = 0
-        for name in names:
-            size += self._array(name).nbytes // max(self.count, 1)
-        return size
+        return sum([self._array(name).nbytes // max(self.count, 1) for name in names])
 
     def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
-        """Memory of these arrays: bytes that stay on the device, and bytes per splat that each frame
-        copies."""
         if self._shared:
             return 0, 0
         if self.streamed:
@@ -89,23 +101,18 @@ class Resident(ResidentData):
     @property
     def memory_bytes(self) -> int:
         """Bytes on the device; 0 where it reads the host's arrays."""
-        return 0 if self._shared else sum(buffer.size for buffer in self._buffers.values())
+        return 0 if self._shared else super().memory_bytes
 
     def color_range(self) -> tuple[float, float]:
         return color_range(self._arrays.get("colors"), self._arrays.get("sh"))
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
-        """The array of splats [first, end)."""
         if self.streamed:
             piece = np.ascontiguousarray(self._array(name)[first:end])
             buffer = self._workspace.pool.scratch(f"chunk of {name}", piece.nbytes)
             cl.enqueue_copy(self._workspace.queue, buffer, piece)
             return buffer
-        whole = self._whole(name)
-        if end - first == self.count:
-            return whole
-        row = self._array(name).nbytes // self.count
-        return whole.get_sub_region(first * row, (end - first) * row)
+        return self._region(self._whole(name), first, end, self._array(name).nbytes // max(self.count, 1))
 
     def _array(self, name: str) -> np.ndarray:
         """The array on the host; splat ids are made when a frame first reads them."""
@@ -130,8 +137,7 @@ class Resident(ResidentData):
 
 
 def _finish(process: int, *queues: cl.CommandQueue) -> None:
-    """Wait for kernels that may be reading the host's arrays, before these are released. Does nothing in a
-    fork."""
+    """Wait for kernels that may be reading the host's arrays, before these are released; not in a fork."""
     if process == os.getpid():
         for queue in queues:
             with suppress(cl.Error):

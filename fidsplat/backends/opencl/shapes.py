@@ -23,7 +23,7 @@ class DeviceShape:
     tile_width: int
     tile_height: int
     chunks: int
-    """number of pieces of the counting sorts (`ordered`)"""
+    """number of pieces into which the counting sorts divide their input (`ordered`)"""
     radix_bits: int
     """bits per pass of the depth sort (`ordered`)"""
     scan_items: int

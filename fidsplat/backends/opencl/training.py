@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 from weakref import WeakKeyDictionary
 
@@ -11,10 +11,10 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
-from fidsplat.backends.interface import ResidentData
 from fidsplat.backends.opencl.assemble import assemble_training
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.program import Program
+from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.cameras import Camera
 from fidsplat.util.errors import DeviceError
@@ -55,37 +55,24 @@ Launch: TypeAlias = tuple[str, tuple[int, ...], tuple[int, ...], list[Any]]
 """kernel, size, work-group, and values of the arguments"""
 
 
-class ResidentArrays(ResidentData):
+class ResidentArrays(Resident):
     """Splats in training as a cloud to render, without labels and coplanar groups."""
 
-    has_coplanar_groups, footprint = False, "gaussian"
-    streamed = immutable = coherent = False
+    has_coplanar_groups, footprint, immutable = False, "gaussian", False
 
     def __init__(
         self, buffers: Mapping[str, cl.Buffer], count: int, sh_degree: int, origin: np.ndarray
     ) -> None:
-        self._buffers, self.count, self.origin = dict(buffers), count, origin
+        super().__init__(count)
+        self._buffers, self.origin, self.sh_degree = dict(buffers), origin, sh_degree
         self.ellipsoids = "all" if "thickness" in buffers else "none"
-        self.capacity, self.buffer_key = count, None
-        self.sh_degree = sh_degree
-        self.cached_frames: dict[Hashable, Any] = {}
-
-    @property
-    def memory_bytes(self) -> int:
-        """Size of the arrays."""
-        return sum(buffer.size for buffer in self._buffers.values())
 
     def bytes_for(self, names: Any) -> tuple[int, int]:
-        """Bytes that stay on the device, and bytes to upload: none."""
         return self.memory_bytes, 0
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
-        """The array of splats [first, end)."""
         complete = self._buffers[name]
-        if end - first == self.count:
-            return complete
-        row = complete.size // self.count
-        return complete.get_sub_region(first * row, (end - first) * row)
+        return self._region(complete, first, end, complete.size // max(self.count, 1))
 
 
 class LossReadback:
@@ -294,11 +281,11 @@ class OpenCLTraining:
             if strided:
                 kernels = "loss_strips", "loss_strips_backward"
                 return [self._one(kernel, grid, (1, 1), every) for kernel in kernels]
-            row = [self._of_rows("loss_take", 3 * columns, height, every)]
+            made = [self._items("loss_take", 3 * columns, every, height)]
             for kernel in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
                 each = _EACH_ROWS if "columns" in kernel else 1
-                row.append(self._of_rows(kernel, 3 * columns, -(-height // each), every))
-            return [*row, self._one("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), every)]
+                made.append(self._items(kernel, 3 * columns, every, -(-height // each)))
+            return [*made, self._one("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), every)]
 
         events = self._replay("loss", (height, columns, dssim_weight), given, launches)
         sums.submitted(slot, events[0 if strided else -1])
@@ -351,8 +338,8 @@ class OpenCLTraining:
             "normal_share": weight / (width * height),
             "differences": self._scratch("differences", 24 * width * height),
         }
-        self._launch_rows("surface_normals", width, height, given)
-        self._launch_rows("surface_depths", width, height, given)
+        for kernel in ("surface_normals", "surface_depths"):
+            self._enqueue(self._items(kernel, width, given, height))
         return found
 
     def accumulate_statistics(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
@@ -397,7 +384,7 @@ class OpenCLTraining:
         by_camera: bool = False,
     ) -> Callable[[], np.ndarray] | None:
         # compiling takes seconds: it is first, so that an interrupt leaves the statistics unchanged
-        taken.compile_step(by_camera)
+        taken.pipeline.compile_step(by_camera)
         if camera is not None:
             self._count_visible(camera, origin)
         return taken.step({**self._bound, **given, "counted": int(camera is not None)}, by_camera)
@@ -425,14 +412,12 @@ class OpenCLTraining:
     def _launch(self, kernel: str, items: int, given: Mapping[str, Any] | None = None) -> None:
         self._enqueue(self._items(kernel, items, given or {}))
 
-    def _launch_rows(self, kernel: str, items: int, rows: int, given: Mapping[str, Any]) -> None:
-        self._enqueue(self._of_rows(kernel, items, rows, given))
-
-    def _items(self, kernel: str, items: int, given: Mapping[str, Any]) -> Launch:
-        return self._one(kernel, (max(_GROUP, -(-items // _GROUP) * _GROUP),), (_GROUP,), given)
-
-    def _of_rows(self, kernel: str, items: int, rows: int, given: Mapping[str, Any]) -> Launch:
-        return self._one(kernel, (max(_GROUP, -(-items // _GROUP) * _GROUP), rows), (_GROUP, 1), given)
+    def _items(self, kernel: str, items: int, given: Mapping[str, Any], rows: int = 0) -> Launch:
+        """A launch with at least `items` work-items, or that many for each of some rows."""
+        width = max(_GROUP, -(-items // _GROUP) * _GROUP)
+        return self._one(
+            kernel, (width, rows) if rows else (width,), (_GROUP, 1) if rows else (_GROUP,), given
+        )
 
     def _one(
         self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: Mapping[str, Any]

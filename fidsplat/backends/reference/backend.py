@@ -96,13 +96,9 @@ class ReferenceCloud(ResidentData):
     """A cloud in host memory."""
 
     def __init__(self, cloud: SplatCloud) -> None:
-        self.cloud = cloud
-        self.count = len(cloud)
-        self.origin = cloud.origin
+        self.cloud, self.count = cloud, len(cloud)
         self.memory_bytes = 0  # nothing is copied to a device
-        self.sh_degree = cloud.sh_degree
-        self.has_coplanar_groups = cloud.coplanar_groups is not None
-        self.footprint, self.ellipsoids = cloud.footprint, cloud.ellipsoids
+        self.take_traits(cloud)
 
     def color_range(self) -> tuple[float, float]:
         return color_range(self.cloud.plain_colors, self.cloud.sh)
