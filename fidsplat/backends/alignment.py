@@ -23,22 +23,25 @@ class AlignmentStage(NamedTuple):
     ignored: np.ndarray | None
     """(h, w) bool, True for ignored pixels of the level; None: none"""
     taps: np.ndarray
-    """(r + 1,) float32: the upper half of the symmetric taps of the blur; one for none"""
+    """(r + 1,) float32: blur weights of the offsets 0 to r, the same on both sides; (1,) without blur"""
     side: int
-    """side in pixels of the blocks of `AlignmentSums.scores`"""
+    """side in pixels of the square blocks for which `AlignmentSums.scores` has separate sums"""
 
 
 class AlignmentFit(NamedTuple):
-    """Robust loss, and exposure of the image: image = gain * render + offset in each channel."""
+    """Robust loss, and exposure of the image: image = gain * rendered value + offset, for each of c
+    channels."""
 
     gain: np.ndarray
     """(c,)"""
     offset: np.ndarray
     """(c,)"""
     huber: bool
-    """Huber's loss with slopes averaged between render and image; else Tukey's with slopes of the render"""
+    """True: Huber's loss, gradients averaged between rendered frame and image; False: Tukey's, gradients of
+    the frame"""
     noise: float = 0.0
-    """standard deviation of the residuals at the pose before; 0: from the median of the residuals"""
+    """standard deviation of the residuals at the previous pose; 0: computed from the median of the
+    residuals"""
 
 
 class MovedFrame(NamedTuple):
@@ -92,12 +95,12 @@ _MEDIAN = {1: 0.4549, 3: 2.3660}
 
 
 def noise_factor(channels: int) -> float:
-    """Standard deviation of the residuals divided by the median of their root mean squares."""
+    """Ratio of the residuals' standard deviation to the median over pixels of their root mean square."""
     return (channels / _MEDIAN[channels]) ** 0.5
 
 
 class AlignmentKernels(ABC):
-    """Residuals of an image against rendered frames, and their sums."""
+    """Computation of the residuals between an image and rendered frames, and of sums over them."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -105,12 +108,8 @@ class AlignmentKernels(ABC):
 
     @abstractmethod
     def load(self, image: np.ndarray, stages: list[AlignmentStage], most: int) -> list[int]:
-        """Prepare an image for its stages; returns the numbers of their pixels.
-
-        Args:
-            image: (h, w, 3) or (h, w, 1) float32 display values.
-            most: maximum number of pixels of a stage; those of the largest gradients are used.
-        """
+        """Prepare an image (h, w, 1 or 3), float32 display values, for all stages; returns the number of
+        pixels of each. A stage uses the `most` pixels with the largest gradients."""
 
     @abstractmethod
     def sums(
@@ -132,6 +131,6 @@ def bins_of(values: np.ndarray) -> np.ndarray:
 
 
 def least_bin(counts: np.ndarray, most: int) -> int:
-    """The bin from which on there are about `most` values, or all if there are fewer."""
+    """The bin from which on there are about `most` values, or all values if there are fewer."""
     above = np.cumsum(counts[:0:-1])[::-1]
     return 1 + int(np.flatnonzero(above >= min(most, above[0]))[-1])

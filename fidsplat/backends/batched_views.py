@@ -23,8 +23,8 @@ _FIRST.flags.writeable = False
 class ViewBatch:
     """Views of one size that are rendered together; a single view is a batch of one.
 
-    v of `total` views are rendered; the others are masked out. g groups of splats move: the splats with the
-    labels in `view.groups`. Index 0 of the poses is for all other splats.
+    v of `total` views are rendered; the others are masked out. Splats with the labels in `view.groups` have
+    their own poses, one for each of g groups. Index 0 of the pose arrays is for all other splats.
     """
 
     view: View
@@ -42,9 +42,9 @@ class ViewBatch:
     total: int = 1
     """number of views of the batch, including masked-out views"""
     views: tuple[View, ...] = ()
-    """the views, unless they differ from `view` in their poses only"""
+    """the views, if they differ from `view` in more than their poses"""
     stacked: bool = True
-    """whether views differ in poses and `numbers` only; otherwise they are rendered one by one"""
+    """whether the views differ only in poses and `numbers`; if not, they are rendered one by one"""
 
     def __len__(self) -> int:
         """Number of views that are rendered."""
@@ -97,13 +97,9 @@ class ViewBatch:
         batch_indices: np.ndarray,
         total: int,
     ) -> ViewBatch:
-        """A batch of one camera in v poses, bit-identical to a `View.of` for each pose.
-
-        Args:
-            origin: (3,) origin of the cloud.
-            poses: (v, 4, 4) camera to world; None: the pose of `view`.
-            groups: (v, 4, 4) motion of each group in world coordinates, by label.
-        """
+        """A batch of one camera in v poses, bit-identical to a `View.of` for each pose. origin: (3,) origin
+        of the cloud. poses: (v, 4, 4) camera to world; None: the pose of `view`. groups: (v, 4, 4) motion of
+        each group in world coordinates, by label."""
         count = len(batch_indices)
         if poses is None:
             rotation = np.broadcast_to(view.rotation, (count, 3, 3))

@@ -1,7 +1,5 @@
-"""Replacement folders for the kernel caches of PoCL, pyopencl and Warp, if their own cannot be written.
-
-Without a cache folder PoCL lists no device or refuses to compile, and pyopencl's caches fail.
-"""
+"""Replacement folders for the kernel caches of PoCL, pyopencl and Warp if their own are not writable: without
+one, PoCL finds no device."""
 
 from __future__ import annotations
 
@@ -32,9 +30,8 @@ def pocl_folder() -> Path:
 
 @cache
 def ensure_caches() -> None:
-    """Set a temporary folder in the environment for each cache that cannot be written, has too little free
-    space, or can be written by other users. Warns. Called before a driver is first used.
-    """
+    """Set a temporary folder, with a warning, for each cache that is not writable, is nearly full, or belongs
+    to another user. Called before the first use of a driver."""
     if "HOME" not in os.environ and "XDG_CACHE_HOME" not in os.environ:  # PoCL would use a folder in /tmp
         os.environ.setdefault("POCL_CACHE_DIR", str(user_cache() / "pocl" / "kcache"))
     where = {"POCL_CACHE_DIR": pocl_folder(), "XDG_CACHE_HOME": user_cache()}

@@ -1,9 +1,8 @@
 """Checksums of compiled kernels, which drivers cache in files and load without a check.
 
-A damaged file crashes the driver, or changes what it computes. Before a driver first loads kernels, files
-that differ from their checksum are removed, and the driver compiles them again. When the process ends, the
-checksums of new files are recorded. A file without a checksum, of a process that was killed, is checked by
-its format alone. If the record is damaged, all files are removed.
+A damaged file crashes the driver, or changes its results. Before a driver first loads kernels, files that
+differ from their checksum are removed, and the driver compiles them again. Checksums of new files are
+recorded when the process ends. If the record itself is damaged, all files are removed.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ _CHECKSUM = "crc"
 _watched: set[Path] = set()
 
 Entry = list[int]
-"""checksum, size in bytes, modification time in ns, inode; while the last three are unchanged the file is not
-read"""
+"""checksum, size [bytes], modification time [ns], inode; a file is only read if one of the last three has
+changed"""
 
 
 def check_once(folder: Path, is_loaded: Callable[[str], bool], is_whole: Callable[[Path], bool]) -> None:
@@ -43,13 +42,9 @@ def check_once(folder: Path, is_loaded: Callable[[str], bool], is_whole: Callabl
 
 
 def remove_damaged(folder: Path, is_loaded: Callable[[str], bool], is_whole: Callable[[Path], bool]) -> int:
-    """Remove files that differ from their checksum and entries that are not regular files; returns their
-    number.
-
-    Args:
-        is_loaded: whether the driver loads files of a name; others are not touched.
-        is_whole: whether a file without a checksum is complete.
-    """
+    """Remove files that differ from their checksum, and entries that are not regular files; returns their
+    number. Files that the driver does not load (`is_loaded`) are not touched. A file without a checksum is
+    removed unless `is_whole` finds it complete."""
     record, valid, removed = _read(folder), {}, 0
     known = record or {}
     for file in _loaded(folder, is_loaded):

@@ -1,4 +1,4 @@
-"""Code shared by backends with derivatives: differentiable images, and checks of gradient arrays."""
+"""Code shared by backends with gradients: differentiable images, and checks of gradient arrays."""
 
 from __future__ import annotations
 
@@ -19,12 +19,11 @@ NOT_THE_LAST = (
 
 
 class CapacityExceeded(Exception):
-    """Error: a frame that was submitted without waiting for its pair count exceeded the capacity of its
-    lists."""
+    """Error: a frame that was submitted without waiting for its counts had too many pairs for its buffers."""
 
 
 class DifferentiableImages:
-    """Output images together with their frame's data on the device, which `backward` needs."""
+    """Output images, with the frame's data on the device that `backward` needs."""
 
     frame: Any
     images: Images
@@ -49,18 +48,18 @@ class DifferentiableImages:
 
     @property
     def stats(self) -> Mapping[str, int]:
-        """Number of splats, of visible splats, and of pairs of a splat and a tile."""
+        """Number of splats, of visible splats, and of (splat, tile) pairs."""
         return self.images.stats
 
 
 def gradient_shape(name: str, view: View) -> tuple[int, ...]:
-    """The shape of the gradient with respect to an output: the shape of its image."""
+    """Shape of the gradient with respect to an output: that of its image."""
     channels = IMAGES[name].channels
     return (view.height, view.width) if channels == 1 else (view.height, view.width, channels)
 
 
 def check_shape(name: str, given: tuple[int, ...], view: View) -> None:
-    """Raise InputError unless the gradient with respect to an output has the shape of the output's image."""
+    """Raise InputError unless the gradient with respect to an output has the shape of the image."""
     if tuple(given) != gradient_shape(name, view):
         raise InputError(
             f"the gradient of {name} must have the shape {gradient_shape(name, view)}, got {tuple(given)}"

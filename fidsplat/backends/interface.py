@@ -1,7 +1,4 @@
-"""The interface of a device: base classes with defaults for optional capabilities.
-
-`Backend.traits` says what a device offers. Code outside a backend never depends on its name.
-"""
+"""The interface of a device: base classes with defaults for optional capabilities (`Backend.traits`)."""
 
 from __future__ import annotations
 
@@ -47,13 +44,13 @@ class DeviceInfo:
 
 @dataclass(frozen=True)
 class DeviceTraits:
-    """Optional capabilities of a device, with the methods that need them."""
+    """Optional capabilities of a device, with the methods that exist only then."""
 
     caches_chunks: bool = False
-    """caches chunks of stores on the device: `Backend.chunk_cache`"""
+    """has a device cache for chunks of stores: `Backend.chunk_cache`"""
     termination_depths: bool = False
-    """reports the depth at which each tile terminates, for occlusion culling: `Backend.termination_depths`
-    and `copy_tiles`, and kernels for the effect `termination_depths`"""
+    """reports the depth at which blending of each tile stopped: `Backend.termination_depths` and
+    `copy_tiles`"""
     differentiates: bool = False
     """computes gradients of frames: `Backend.differentiate`"""
     trains: bool = False
@@ -61,7 +58,7 @@ class DeviceTraits:
     aligns: bool = False
     """aligns images on the device: `Backend.alignment`"""
     measures_rates: bool = False
-    """`Backend.rates`, `memory_bytes` and `release_scratch`, and kernels for the effect `overdraw`"""
+    """`Backend.rates`, `memory_bytes` and `release_scratch`, and the output `overdraw`"""
     renders_pixels: bool = False
     """renders a subset of the pixels: `Pipeline.render_every`"""
     probed: bool = False
@@ -90,7 +87,7 @@ class ResidentData(ABC):
     origin: np.ndarray
     """(3,) float64 metres: world position of the means' zero"""
     memory_bytes: int
-    """device memory of the cloud; 0 if the device reads the host's arrays"""
+    """bytes on the device; 0 if the device reads the host's arrays"""
     sh_degree: int
     has_coplanar_groups: bool
     footprint: str
@@ -117,43 +114,39 @@ class Chunk:
     """cache key: equal for chunks with the same splats, even if their poses differ"""
     count: int
     load: Callable[[], Mapping[str, np.ndarray]]
-    """arrays of the splats, float32 or int32, named like the arrays of a SplatCloud; `coplanar_groups` holds
-    dense indices"""
+    """function that returns the splats' arrays, float32 or int32, named as in SplatCloud"""
     pose: np.ndarray | None = None
-    """(16,) float64: placement of the chunk: the rotation matrix by rows, the position of the means' zero
-    [m], and the rotation as a quaternion; None: not moved"""
+    """(16,) float64: pose of the chunk: rotation matrix by rows, translation [m], rotation as a quaternion;
+    None: identity"""
     first: int = 0
-    """first row of the chunk's `count` splats in these arrays"""
+    """first row of the chunk in the arrays of `load`"""
 
 
 class Images(ABC):
-    """Output images of one or several views, on the device until they are read.
-
-    Views that are masked out hold `Output.blank`.
-    """
+    """Output images of one or several views, on the device until they are read. Views that are masked out
+    have the value `Output.blank`."""
 
     views: int = 1
     """number of views, including masked-out views"""
     timings: Mapping[str, float]
     """milliseconds on the device by stage, in the order of the stages; summed over views"""
     stats: Mapping[str, int]
-    """number of splats of the cloud; of visible splats and of pairs of a splat and a tile, summed over
-    views"""
+    """number of splats of the cloud; of visible splats and of (splat, tile) pairs, summed over views"""
     shares_arrays: bool = False
     """whether the arrays of `device_array` support DLPack"""
 
     @abstractmethod
     def read(self, name: str, index: int | None = None) -> np.ndarray:
-        """Copy images to the host, in the type of `OUTPUTS[name]`: (views, h, w) or (views, h, w, channels);
-        with an index the image of this view, (h, w) or (h, w, channels)."""
+        """Copy images to the host, in the type of `OUTPUTS[name]`: (views, h, w) or (views, h, w, channels),
+        or one view without the first axis if `index` is given."""
 
     def read_float64(self, name: str, index: int | None = None) -> np.ndarray:
         """Copy images to the host in float64; unrounded if the device computes in float64."""
         return self.read(name, index).astype(np.float64)
 
     def read_uint8(self, name: str, index: int = 0) -> np.ndarray | None:
-        """Convert an image of floats in [0, 1] to 8 bits on the device, bit-identical to `to_uint8`
-        (fidsplat/images/files.py), and copy it to the host; None if the device does not convert."""
+        """Convert an image of floats in [0, 1] to 8 bits on the device, rounded like `images.files.to_uint8`,
+        and copy it to the host; None if the device cannot."""
         return None
 
     def empty(self, name: str) -> np.ndarray:
@@ -166,7 +159,7 @@ class Images(ABC):
             into[first:end] = self.read(name, index)[first:end]
 
     def device_array(self, name: str, index: int | None = None) -> Any:
-        """The images as a device array in the shape that `read` returns, without a copy."""
+        """The images as a device array in the shape of `read`, without a copy."""
         raise InputError(
             f"device_array({name!r}) needs a device that shares its arrays, such as a Warp device; "
             "render with device='warp:cuda' or 'warp:cpu', or take frame[name], which is copied to the host"
@@ -202,7 +195,7 @@ class SeparateImages(Images):
     """Images of views that were rendered one after another."""
 
     def __init__(self, images: Mapping[int, Images], batch: ViewBatch, splats: int) -> None:
-        """images: images of each rendered view by its position in the batch. splats: number of splats in the
+        """images: those of each rendered view, by its position in the batch. splats: number of splats of the
         cloud."""
         self._images, self.views, self._size, self._splats = images, batch.total, batch.size, splats
 
@@ -241,7 +234,7 @@ def check_batch_memory(views: int, size: int, budget: int) -> None:
 
 
 def batch_stats(each: Iterable[Mapping[str, int]], splats: int) -> dict[str, int]:
-    """Number of splats in the cloud, and of visible splats and pairs, summed over views."""
+    """Number of splats of the cloud, and of visible splats and (splat, tile) pairs, summed over views."""
     return summed([{"visible": 0, "pairs": 0}, *each]) | {"splats": splats}
 
 
@@ -270,9 +263,9 @@ class Pipeline(ABC):
     def render_every(
         self, resident: Any, view: View, step: int, progress: Callable[[float], object] | None = None
     ) -> Images:
-        """Render every step-th pixel in both directions, starting with the first: images of
-        (ceil(h / step), ceil(w / step)), bit-identical to those pixels of a complete frame. progress: called
-        with the completed share, 0 to 1."""
+        """Render every step-th pixel in both directions, from the first: (ceil(h / step), ceil(w / step))
+        images, bit-identical to those pixels of a complete frame. progress: called with the completed share,
+        0 to 1."""
         raise NotImplementedError
 
     def fits(self, resident: Any, view: View) -> bool:
@@ -280,60 +273,50 @@ class Pipeline(ABC):
         return True
 
     def trace(self, resident: Any, view: View) -> dict[str, np.ndarray]:
-        """Render one view and return the data between the stages, for tests; empty by default."""
+        """Render one view, and return the data between the stages for tests; empty by default."""
         return {}
 
 
 class GradientPipeline(ABC):
-    """The stages and their derivatives, compiled for one FeatureSet."""
+    """The stages and their gradients, compiled for one FeatureSet."""
 
     @abstractmethod
     def forward(self, resident: Any, view: View, waits: bool = True) -> Any:
-        """Render one view of an uploaded cloud, bit-identical to `Pipeline.render`, and retain what
-        `backward` needs until the device renders another frame.
+        """Render one view of an uploaded cloud, bit-identical to `Pipeline.render`, for a later `backward`.
 
-        waits: whether to wait until it is known that the buffers were large enough. Without waiting,
-        `backward` may raise CapacityExceeded; then the frame must be discarded.
-
-        Raises:
-            DeviceError: the device runs out of memory or fails; or the frame needs bands or chunks, which
-                have no gradient.
+        waits: whether to wait until the counts show that the buffers were large enough. If not, `backward`
+        may raise CapacityExceeded, and the frame must be discarded. Raises DeviceError if the frame does not
+        fit the memory budget in one piece, as bands and chunks have no gradient.
         """
 
     @abstractmethod
     def backward(self, images: Any, gradients: Mapping[str, Any]) -> dict[str, Any]:
-        """Gradients of a loss with respect to splats, background and camera, from its gradients with respect
-        to the output images.
+        """Gradients of a loss with respect to splats, background and camera.
 
-        Steps (the alpha cut-off, the transmittance stop, the near plane, the order of splats) have no
-        derivative: they are constants of the frame.
+        Alpha cut-off, transmittance stop, near plane and depth order are treated as constants.
 
         Args:
             images: the result of the last `forward` on this device.
-            gradients: float32 arrays by the names of outputs (rgb, alpha, depth, normal, distortion), in the
-                shapes of their images, as device or NumPy arrays; 0 for missing names.
+            gradients: gradients of the loss with respect to the outputs (rgb, alpha, depth, normal,
+                distortion), float32 device or NumPy arrays in the shapes of the images; missing ones are 0.
 
         Returns:
-            Device arrays in the cloud's shapes and units: `means` (n, 3), `quats` (n, 4), `scales` (n, 2),
-            `opacities` (n,), `colors` (n, 3) or `sh` (n, k, 3), with respect to the stored values
-            (quaternions need not be normalised); `screen` (n,), the norm of the gradient with respect to the
-            projected centre in units of half images (dL_dmean2D of 2DGS trainers, for densification);
-            `background` (3,); `pose` (6,): rotation vector [1 / rad] and translation [1 / m] of a motion
-            after world_to_camera, in the camera's axes; `intrinsics` (4,): fx, fy, cx, cy [1 / px].
-            Splats that are not rendered have zeros. The arrays are bit-identical on every run and valid
-            until the next call.
+            Device arrays, bit-identical on every run and valid until the next call: `means` (n, 3), `quats`
+            (n, 4), `scales` (n, 2), `opacities` (n,), `colors` (n, 3) or `sh` (n, k, 3); `screen` (n,), the
+            norm of the gradient with respect to the projected centre in units of half images (dL_dmean2D of
+            2DGS trainers); `background` (3,); `pose` (6,), rotation vector [1 / rad] and translation [1 / m]
+            of a motion after world_to_camera, in camera axes; `intrinsics` (4,): fx, fy, cx, cy [1 / px].
+            Culled splats have zeros.
 
         Raises:
             CapacityExceeded: `forward` did not wait, and the buffers were too small; the next frame has
-                larger buffers.
-            InputError: another frame has been rendered since, or a gradient names an unknown output or has
-                the wrong shape.
-            DeviceError: the device runs out of memory or fails.
+                larger ones.
+            InputError: the device has rendered another frame since, or a gradient has an unknown name or
+                another shape.
         """
 
     def backward_to_tiles(self, images: Any, gradients: Mapping[str, Any]) -> Any:
-        """Gradients in the form that `Backend.training().step` accepts; by default the result of
-        `backward`."""
+        """Gradients in the form that `Backend.training().step` accepts; by default the same as `backward`."""
         return self.backward(images, gradients)
 
 
@@ -343,11 +326,11 @@ class Backend(ABC):
     info: DeviceInfo
     traits: DeviceTraits = DeviceTraits()
     shape: Any = None
-    """build constants of the kernels, such as the tile size and the sorting method"""
+    """build constants of the kernels, such as the tile size"""
     pair_budget: int = 2**30 - 1
-    """maximum number of pairs of a splat and a tile in the tile lists at once; tests lower it"""
+    """maximum number of (splat, tile) pairs in the tile lists at once; tests lower it"""
     memory_bytes: int = 0
-    """device memory of scratch buffers; clouds and finished images are not included"""
+    """device memory of scratch buffers, without clouds and images"""
 
     def lacks(self, requirement: str, remedy: str) -> str:
         """Error message for an operation that the device does not support."""
@@ -359,15 +342,12 @@ class Backend(ABC):
 
     @abstractmethod
     def pipeline(self, features: FeatureSet, shape: Any = None) -> Pipeline:
-        """The pipeline for these features, compiled on first use. shape: build constants of the kernels, one
-        of `shapes`; None: those in `Backend.shape`.
-
-        Raises:
-            DeviceError: the device does not support a feature, or the compiler fails.
-        """
+        """The pipeline for these features, compiled on first use. shape: build constants, one of `shapes`;
+        None: those of the device. Raises DeviceError if the device lacks a feature or the compiler fails."""
 
     def frame_shape(self, view: View, count: int = 1) -> Any:
-        """The `shape` of `pipeline` that renders `count` views of this size fastest, with the same bits."""
+        """The `shape` with which `pipeline` renders `count` views of this size fastest, with bit-identical
+        images."""
         return None
 
     def unsupported(self, features: FeatureSet) -> str:
@@ -379,8 +359,7 @@ class Backend(ABC):
         raise InputError(self.lacks("have a memory budget", f"leave out memory_budget={budget}"))
 
     def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> ResidentData:
-        """Make a cloud of arrays (`means`, `quats`, ...) that are already on the device, without a copy.
-        Raises InputError for arrays that cannot be used."""
+        """Use arrays that are already on the device (`means`, `quats`, ...) as a cloud, without a copy."""
         raise InputError(self.lacks("adopt arrays", "use a Warp device, or a SplatCloud"))
 
     def chunk_cache(self, scene: Any) -> Any:
@@ -389,35 +368,30 @@ class Backend(ABC):
         raise DeviceError(self.lacks("cache chunks of a scene", "upload the scene"))
 
     def termination_depths(self, images: Any) -> TerminationDepths:
-        """Termination depth per tile of a frame with the effect `termination_depths`; waits for the frame."""
+        """Depth at which blending of each tile stopped, for a frame with the effect `termination_depths`;
+        waits for it."""
         raise DeviceError(self.lacks("report termination depths", "render without occlusion culling"))
 
     def copy_tiles(self, images: Any, other: Any, tiles: np.ndarray) -> None:
-        """Copy the tiles selected by a mask (rows, columns) bool from another frame of the same view into a
-        frame, and add its counts. All samples of a pixel must be in one tile."""
+        """Copy the tiles of a mask (rows, columns) bool from another frame of the same view into a frame, and
+        add its counts. A pixel must not span two tiles."""
         raise DeviceError(self.lacks("copy tiles", "render without occlusion culling"))
 
     def differentiate(self, features: FeatureSet, shape: Any = None) -> GradientPipeline:
-        """The pipeline for these features with its derivatives, compiled on first use.
-
-        Raises:
-            InputError: an effect has no gradient; the message names it and a remedy.
-            DeviceError: the compiler fails.
-        """
+        """The pipeline for these features with gradients, compiled on first use. Raises InputError for an
+        effect without a gradient."""
         raise DeviceError(self.lacks("have gradients", "use device='opencl', 'warp' or 'reference'"))
 
     def compile_in_background(self, features: FeatureSet) -> None:  # noqa: B027 (optional)
-        """Start to compile the derivatives of these features in the background, if the device supports it.
-        `differentiate` waits for the compiler and raises its errors."""
+        """Start to compile the gradients of these features in the background; `differentiate` waits for the
+        compiler."""
 
     def training(self) -> Any:
-        """The compiled kernels of a training step other than rendering, without splats
-        (`opencl.training.OpenCLTraining`). Raises DeviceError if the compiler fails."""
+        """The compiled kernels of a training step except rendering (`opencl.training.OpenCLTraining`)."""
         raise DeviceError(self.lacks("have kernels for training", "train in NumPy"))
 
     def alignment(self) -> AlignmentKernels:
-        """Compiled kernels of direct image alignment, shared by all callers. Raises DeviceError if the
-        compiler fails."""
+        """The compiled kernels of direct image alignment, shared by all callers."""
         raise DeviceError(self.lacks("have kernels for image alignment", "align in NumPy"))
 
     def release_scratch(self) -> None:
@@ -435,15 +409,9 @@ class Backend(ABC):
     def shapes(self, kind: str) -> dict[str, Any]:
         """Alternative build constants by name, with which tests compile the same features.
 
-        kind: what the alternatives change:
-            `tiles`: the tile size; images are bit-identical.
-            `schedule`: the assignment of work to threads as on a GPU (on a GPU: the tile size); images differ
-                by rounding.
-            `listing`: the tile-binning strategy, with the schedule of a GPU.
-            `sorting`: the method of binning and sorting.
-            `arithmetic`: the compilation of the functions of `Probe.arithmetic`: with or without fused
-                multiply-adds, with or without vectors.
-            `k_buffer`: the size of the k-buffer; images are bit-identical.
-            `tape`: the number of fragments stored for the backward pass; gradients are bit-identical.
+        kind: `tiles` or `k_buffer`: another tile or k-buffer size, with bit-identical images; `tape`: fewer
+        fragments are stored for the backward pass; `listing`, `sorting`: another method of tile binning or
+        sorting; `schedule`: work is assigned to threads as on a GPU; `arithmetic`: without fused
+        multiply-adds or vectors.
         """
         return {}

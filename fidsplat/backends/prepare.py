@@ -1,4 +1,4 @@
-"""Preparation of a frame: the features to compile and the view's uniforms, from a cloud and a capture."""
+"""Preparation of a frame from a cloud and a capture: the features to compile, and the view's uniforms."""
 
 from __future__ import annotations
 
@@ -22,12 +22,9 @@ _prepared: WeakKeyDictionary[Capture, WeakKeyDictionary[PlacedTraits, _Prepared]
 
 
 def prepare(cloud: PlacedTraits, capture: Capture) -> _Prepared:
-    """Return the features that a capture of a cloud requires, and its view; cached for resident clouds.
-
-    Raises:
-        InputError: no camera, an unknown output, effects that exclude each other, a frame that is too large,
-            or a pose that is not rigid.
-    """
+    """The features that a capture of a cloud requires, and its view; cached for uploaded clouds. Raises
+    InputError for a missing camera, an unknown output, effects that exclude each other, or a pose that is not
+    rigid."""
     if isinstance(cloud, SplatCloud) or not capture.motion.is_still:
         view = view_of(capture, cloud.origin)
         return select(cloud, capture), view
@@ -39,11 +36,8 @@ def prepare(cloud: PlacedTraits, capture: Capture) -> _Prepared:
 
 
 def prepare_batch(cloud: PlacedTraits, views: Views) -> tuple[FeatureSet, ViewBatch]:
-    """Return the features that the views of a batch require, and the batch of rendered views.
-
-    Raises:
-        InputError: as for `prepare`, or the views have different effects.
-    """
+    """The features that the views of a batch require, and the batch of rendered views. Raises InputError as
+    `prepare`, and if the views have different effects."""
     rendered = views.active
     indices = np.array(rendered, np.uint32)
     indices.flags.writeable = False
@@ -72,11 +66,8 @@ def prepare_batch(cloud: PlacedTraits, views: Views) -> tuple[FeatureSet, ViewBa
 
 
 def view_of(capture: Capture, origin: np.ndarray) -> View:
-    """The view of a capture at the time of its shutter, with `sub_frames` if the shutter needs several poses.
-
-    Raises:
-        InputError: as for `View.of`, or a pose is not rigid.
-    """
+    """The view of a capture at the time of its shutter, with `sub_frames` if the shutter needs several
+    poses."""
     camera, motion, shutter = capture.camera, capture.motion, capture.shutter
     if motion.is_still:
         return View.of(capture, origin)

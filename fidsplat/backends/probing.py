@@ -1,4 +1,4 @@
-"""Interface for tests of an open device: single functions, single stages, and poisoned memory."""
+"""Interface for tests of a device: single functions, single stages, and memory filled with NaN."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import numpy as np
 
 
 class Probe(ABC):
-    """Access for tests: small kernels compiled like the stages, stages on artificial input, poisoned
-    memory."""
+    """Access to a device for tests."""
 
     def __init__(self, workspace: Any) -> None:
         self._workspace = workspace
@@ -22,36 +21,25 @@ class Probe(ABC):
 
     @abstractmethod
     def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
-        """Evaluate expressions that a compiler may contract to fused multiply-adds, from a, b (n,) float32.
-
-        Returns:
-            Four arrays (n,): a b - a b; a b + a; (a/3)(b/3) - (a/3)(b/3) in the precision of the set-up;
-            fma(a, b, -(a b)).
-        """
+        """Four expressions that a compiler may contract to fused multiply-adds, for a, b (n,) float32: a b -
+        a b; a b + a; (a/3)(b/3) - (a/3)(b/3) in the precision of the set-up; fma(a, b, -(a b))."""
 
     @abstractmethod
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
-        """Test x (n,) float32 for NaN and infinity in four ways, each (n,) int32: x != x, isnan, every
-        comparison is false, isinf."""
+        """Four tests of x (n,) float32 for NaN or infinity, as int32: x != x; isnan; every comparison is
+        false; isinf."""
 
     @abstractmethod
     def arithmetic(
         self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Evaluate the device's mathematical functions, compiled as in the stages.
+        """The device's mathematical functions, compiled as in the stages, for arguments (n,) float64, n a
+        multiple of 16.
 
-        Args:
-            exponents, shares, above, below: (n,) float64 arguments, n a multiple of 16; rounded to float32
-                for functions in float32.
-
-        Returns:
-            (n,) float32: `exp` of exponents, `log` of shares, `division` above / below, `sqrt` of below,
-            `fma` above * below + above, `fast_exp` of exponents, `fast_log` of shares; (n,) float64 where the
-            device has it: `division64`, `sqrt64`, `log64`; `denormal` (2,) float32: half of the smallest
-            normal number, and twice that.
-
-        Raises:
-            DeviceError: the device cannot compile or run the kernels.
+        Returns (n,) float32: `exp` and `fast_exp` of exponents, `log` and `fast_log` of shares, `division`
+        above / below, `sqrt` of below, `fma` above * below + above; (n,) float64 if the device has it:
+        `division64`, `sqrt64`, `log64`; `denormal` (2,) float32: half of the smallest normal number, and
+        twice that.
         """
 
     @abstractmethod
@@ -60,13 +48,13 @@ class Probe(ABC):
 
     @abstractmethod
     def scan(self, pipeline: Any, lengths: np.ndarray) -> tuple[np.ndarray, int]:
-        """Run the prefix sum of the tile lists on lengths (n,) uint32: sums modulo 2^32, (n + 1,) uint32, and
-        the total in 64 bits."""
+        """Prefix sums of list lengths (n,) uint32, as in tile binning: sums modulo 2^32, (n + 1,) uint32, and
+        the total."""
 
     @abstractmethod
     def boxes(self, pipeline: Any, trace: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Bounding boxes of the splats of a `Pipeline.trace` in samples, (n, 4) int, columns [x0, x1) and
-        rows [y0, y1); undefined for culled splats."""
+        """Bounding boxes (n, 4) int in samples of the splats of a `Pipeline.trace`: columns [x0, x1), rows
+        [y0, y1); undefined for culled splats."""
 
     @contextmanager
     def poisoned(self) -> Iterator[None]:

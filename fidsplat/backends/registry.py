@@ -1,7 +1,5 @@
-"""Registry of devices: opens and lists them by name.
-
-A family of devices is a module with `devices()` and `open_device(selector)`, imported on first use.
-"""
+"""Registry of devices: opens and lists them by name. A family is a module with `devices` and
+`open_device`."""
 
 from __future__ import annotations
 
@@ -31,12 +29,8 @@ _STARTED_BY: dict[str, int] = {}
 
 
 def open_backend(name: str) -> Backend:
-    """Open a device by name: `auto`, a family (`opencl`, `warp`, `reference`) or `family:selector`.
-
-    Raises:
-        UnknownDeviceError: no such family, or no device of the family matches the selector.
-        DeviceError: the device exists but cannot be used, or a fork has made it unusable here.
-    """
+    """Open a device by name: `auto`, a family (`opencl`, `warp`, `reference`) or `family:selector`. Raises
+    UnknownDeviceError if no device matches, and DeviceError if it cannot be used."""
     family, _, selector = str(name).strip().partition(":")
     family = family.lower()
     if (family, selector) == (FIRST, ""):
@@ -58,19 +52,15 @@ class Devices(list[DeviceInfo]):
 
 
 def devices() -> Devices:
-    """List all devices: usable ones, and unusable ones with the reason.
-
-    Raises:
-        DeviceError: a fork has made a driver unusable, or a limit of the process is too low for drivers.
-    """
+    """List all devices, also unusable ones with the reason. Raises DeviceError in a fork of a process that
+    has used a driver."""
     for family in FAMILIES:
         _prepare(family)
     return Devices(info for module in FAMILIES.values() for info in import_module(module).devices())
 
 
 def _open_first() -> Backend:
-    """Open the best device of the first family in `ORDER` that has a usable one; warn about skipped
-    families."""
+    """Open the best device of the first family in `ORDER` that has a usable one; warn of skipped families."""
     reasons = []
     for family in ORDER:
         _prepare(family)

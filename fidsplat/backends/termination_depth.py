@@ -1,9 +1,8 @@
 """Termination depths: the depth at which blending of each tile stopped, for occlusion culling.
 
-Blending walks a tile's list of splats by sort key until all pixels of the tile are opaque. The device
-stores that key (part/termination_depth_*.cl). A splat with a larger key cannot change the tile: the list up
-to that key is the same with or without it. So a splat can be left out, with a bit-identical frame, if its key
-is larger than the termination depth of every tile that it can touch. This holds for every output and order.
+Blending walks a tile's list in depth order until all pixels of the tile are opaque. The device stores the
+depth key of the last splat (part/termination_depth_*.cl). A splat with a larger key in every tile that it can
+touch does not change the frame, so it can be left out. This holds for every output and depth order.
 """
 
 from __future__ import annotations
@@ -32,8 +31,7 @@ class TerminationDepths:
 
     @staticmethod
     def of_keys(keys: np.ndarray, tile: tuple[int, int]) -> TerminationDepths:
-        """Convert the kernels' sortable keys (rows, columns) uint32; a key with all bits set: not
-        terminated."""
+        """Convert the kernels' sortable keys (rows, columns) uint32; all bits set: the tile is not opaque."""
         bits = np.where(keys & 0x80000000, keys ^ np.uint32(0x80000000), ~keys).astype(np.uint32)
         depths = bits.view(np.float32).copy()
         depths[(keys == 0xFFFFFFFF) | np.isnan(depths)] = np.inf

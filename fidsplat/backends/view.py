@@ -17,7 +17,7 @@ from fidsplat.capture.sensor import Sensor
 from fidsplat.util.errors import InputError
 
 FAR_EYE = 1e9
-"""metres: distance of the eye that gives view-dependent colours in a parallel projection"""
+"""metres: distance of the eye from which view-dependent colours of a parallel projection are evaluated"""
 NO_CAMERA = "no camera: pass camera=fs.Camera... or give the scene a [camera] table"
 MAX_GRID = 32767
 """Largest side of the sample grid: anchors and rows are stored in 16 bits."""
@@ -25,17 +25,15 @@ _NO_SENSOR = Sensor()
 
 
 def rotated(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Multiply each matrix (..., 3, 3) with its vector (..., 3); never returns -0. Rounding is the same on
-    every processor, unlike with `@`, which depends on BLAS."""
+    """Multiply each matrix (..., 3, 3) with its vector (..., 3), without -0 and, unlike `@`, with the same
+    rounding on every processor."""
     return (matrices * vectors[..., None, :]).sum(axis=-1) + 0.0
 
 
 @dataclass(frozen=True)
 class View:
-    """The uniforms of a frame, in float64.
-
-    The sample grid is the image with `samples` x `samples` samples in each pixel.
-    """
+    """The uniforms of a frame, in float64. The sample grid is the image with `samples` x `samples` samples
+    per pixel."""
 
     width: int
     """width of the sample grid"""
@@ -54,8 +52,8 @@ class View:
     translation: np.ndarray
     """(3,) metres: the cloud's origin in the camera frame"""
     eye: np.ndarray
-    """(3,) metres: the camera's centre relative to the cloud's origin, in world axes; for parallel rays a
-    point far behind the camera"""
+    """(3,) metres: camera centre relative to the cloud's origin, in world axes; far behind the camera for
+    parallel rays"""
     near: float
     far: float
     log_cut: float
@@ -79,7 +77,8 @@ class View:
     """whether depths (also near, far, sort keys) are distances from the camera's centre; else z
     coordinates"""
     slopes: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """limits of -x, x, -y, y at z = 1: EWA clamps the point at which it linearises to them"""
+    """limits of -x, x, -y, y at z = 1, to which EWA clamps the centre of a splat before it linearises the
+    projection"""
     parallel: bool = False
     """whether all rays are parallel to z; focal_x and focal_y are samples per metre then"""
     groups: tuple[tuple[int, View], ...] = ()
@@ -87,8 +86,7 @@ class View:
     sub_frames: tuple[SubFrame, ...] = ()
     """sub-frames of an exposure; empty for a single pose"""
     band: tuple[int, int] | None = None
-    """rows of samples [first, end) that are rendered, bit-identical to those of the complete frame; None:
-    all"""
+    """rows of samples [first, end) to render, bit-identical to those of the complete frame; None: all"""
 
     @property
     def lens(self) -> Lens | None:
@@ -99,8 +97,8 @@ class View:
 
     @property
     def row_rotations(self) -> np.ndarray:
-        """(h, 3, 3) rotation from world to camera for each row of pixels: that of the sub-frame whose normals
-        the row shows."""
+        """(h, 3, 3) rotation world to camera for each row of pixels: that of the sub-frame from which its
+        normals are."""
         rotations = np.tile(self.rotation, (self.height // self.samples, 1, 1))
         for sub_frame in self.sub_frames:
             if sub_frame.middle:
@@ -157,12 +155,9 @@ class View:
 
     @classmethod
     def of(cls, capture: Capture, origin: np.ndarray, camera: Camera | None = None) -> View:
-        """The view of a capture's camera, or of `camera` instead, for a cloud whose means are relative to
-        `origin` (3,). Motions are ignored.
-
-        Raises:
-            InputError: there is no camera, or the sample grid is too large.
-        """
+        """The view of a capture's camera, or of `camera` instead, for a cloud with its means relative to
+        `origin` (3,). Motions are ignored. Raises InputError if there is no camera, or the sample grid is too
+        large."""
         camera = camera or capture.camera
         if camera is None:
             raise InputError(NO_CAMERA)
@@ -226,7 +221,7 @@ class View:
 
 @dataclass(frozen=True)
 class SubFrame:
-    """Sub-frame: one pose of a frame with a shutter."""
+    """One pose of a frame with a shutter."""
 
     view: View
     """the view at this pose, restricted to the sub-frame's rows"""
@@ -237,4 +232,4 @@ class SubFrame:
     first: bool
     """whether it is the first sub-frame of its rows"""
     middle: bool
-    """whether outputs other than rgb and alpha show this sub-frame: number n // 2 of n"""
+    """whether outputs other than rgb and alpha are from this sub-frame: number n // 2 of n"""

@@ -61,8 +61,8 @@ class OpenCLAlignment(AlignmentKernels):
     def _prepared(
         self, number: int, stage: AlignmentStage, source: _Image, full: _Image, counted: cl.Buffer
     ) -> tuple[dict[str, Any], _Image]:
-        """Arguments of the kernels for a stage, and its image before the blur. source: the next finer level,
-        which is used if its size is a multiple."""
+        """Arguments of the kernels for a stage, and its image before the blur. source: the next finer level
+        of the pyramid."""
         camera = stage.camera
         finer, (full_height, full_width, channels) = source
         if full_width % camera.width or full_height % camera.height:
@@ -173,8 +173,7 @@ class OpenCLAlignment(AlignmentKernels):
 
 
 def _unpacked(packed: np.ndarray, channels: int, blocks: bool) -> AlignmentSums:
-    """Sums of the work-groups: for each of three channels 8 rows of the matrix and two right sides; squares
-    of the channels, number of pixels, losses, inliers and squared inverse depths; the noise."""
+    """Sums of the work-groups: 8 matrix rows and 2 right sides for each of 3 channels, then scalars."""
     rows = packed[:, :240].reshape(len(packed), 3, 10, 8)[:, :channels]
     total, others = rows.sum(axis=0, dtype=float), packed[:, 240:248].sum(axis=0, dtype=float)
     cost, before, inliers, inverse_depth = (others[4:] / max(others[3], 1)).tolist()

@@ -1,13 +1,11 @@
-"""Kernel source assembly: flat program texts from a FeatureSet and the shape of a device. Needs no OpenCL.
+"""Kernel source assembly: flat program texts from a FeatureSet and a DeviceShape. Needs no OpenCL.
 
 A frame needs two programs, `lists` and `frame`: drivers cache compiled programs by their text, and most
-feature sets have the same `lists`. Derivatives (`gradients`, `step`) and `training` are separate programs,
-which a renderer without derivatives never compiles.
+feature sets have the same `lists`. Gradients (`gradients`, `step`) and `training` are separate programs.
 
-A stage's file, or a section of an effect's file, has hooks, lines `//@@ name`, which are replaced by the
-sections `//@ name` of the chosen effects, and lines `//@@ struct NAME` and `//@@ arguments KERNEL`, which are
-replaced by the declarations of layout.py. An unfilled hook becomes an empty line, so the text names no absent
-effect; `#line` directives give the file and line of each line.
+A line `//@@ name` in a stage's file is a hook: it is replaced by the sections `//@ name` of the chosen
+effects' files, or by an empty line. `//@@ struct NAME` and `//@@ arguments KERNEL` are replaced by
+declarations of layout.py. `#line` directives give the file and line of each line.
 """
 
 from __future__ import annotations
@@ -58,8 +56,7 @@ _DRAWN = (
     "schedule/{}",
     "resolve",
 )
-"""stages of the program `frame`, with the device's schedule; visible splats are packed only under the
-strategy `ordered`"""
+"""stages of the program `frame`; `{}` is the schedule; `pack` is used by the strategy `ordered` only"""
 _GRADIENTS = (
     *("prelude", "math", "splat", "bounds", "moments", "blend_backward"),
     *("schedule/{}_cells", "schedule/{}_backward", "set_up_backward", "project_backward"),
@@ -147,8 +144,7 @@ class Source:
 
 
 def layouts_of(features: FeatureSet) -> dict[str, Layout]:
-    """Layouts of all effects and of the parts that they require, in the order of their text: slots (one
-    effect of each kind), parts, outputs, post-processing steps."""
+    """Layouts of all effects and of the parts that they require, in the order of their text."""
     chosen = [*features.slots, *features.outputs, *features.posts]
     for name in EXTENSIONS.keys() & {*chosen} - LAYOUTS.keys():
         LAYOUTS[name] = extension_layout(EXTENSIONS[name])
@@ -166,11 +162,8 @@ def layouts_of(features: FeatureSet) -> dict[str, Layout]:
 
 
 def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
-    """The source text of all stages for these features on a device of this shape.
-
-    Raises:
-        DeviceError: an effect's file fills a hook that no file has.
-    """
+    """The source of all stages for these features. Raises DeviceError if an effect's file fills an unknown
+    hook."""
     layouts = layouts_of(features)
     # blend and resolve are fused if a pixel has one sample and one pose, and no other pass adds to it
     separate = {"rays", "shutter_exposure", "shutter_rows"}
@@ -223,12 +216,12 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
 
 
 def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
-    """The source of the derivatives of these features on a device of this shape."""
+    """The source of the gradients of these features."""
     return _assemble_backward("gradients", _GRADIENTS, features, shape)
 
 
 def assemble_step(features: FeatureSet, shape: DeviceShape, camera: bool = False) -> Source:
-    """The source of a training step: the last stage of the derivatives, fused with Adam. camera: also sums
+    """The source of a training step: the last stage of the backward pass, fused with Adam. camera: also sums
     the gradient with respect to the camera."""
     return _assemble_backward("step", _STEP, features, shape, ("step_camera",) if camera else ())
 
@@ -252,8 +245,8 @@ def _assemble_backward(
 
 
 def _dialect(shape: DeviceShape, scalars: Scalars, slots: Iterable[str] = ()) -> list[str]:
-    """Files with a vendor's instructions, for fragments in float32: first for all frames, then for the slots
-    that have such a file."""
+    """Files with a vendor's instructions, for fragments in float32: one for all frames, then those of
+    slots."""
     if not shape.dialect or scalars.wide != "float":
         return []
     own = {"arithmetic_approximate": "_exp", "blend_half": "_half"}
@@ -267,8 +260,7 @@ def kernels_of(shape: DeviceShape) -> Mapping[str, tuple[Argument, ...]]:
 
 @cache
 def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> Source:
-    """Source of the kernels of loss, regularisation and optimiser, for vectors of `lanes` floats. Sums are in
-    float64 if the device has it."""
+    """The source of the kernels of loss, regularisation and optimiser, for vectors of `lanes` floats."""
     files = ("loss_values", "loss" if lanes == 1 else "loss_strips", *_TRAINING)
     numbers = {"LANES": lanes, "FAST_FMA": int(fast_fma and lanes > 1), "SETUP_FP64": int(float64)}
     declared = Declarations(Scalars("double" if float64 else "float", "float"))
@@ -287,12 +279,8 @@ def assemble_alignment(items: int) -> Source:
 
 
 def assemble_check(file: str, shape: DeviceShape, float64: bool, effects: Iterable[str] = ()) -> str:
-    """The text of a test kernel file below kernels/opencl/, preceded by prelude.cl and math.cl.
-
-    Args:
-        file: empty for prelude.cl and math.cl only.
-        effects: effect files whose sections fill the hooks.
-    """
+    """The text of a test kernel file below kernels/opencl/ (empty: none), after prelude.cl and math.cl.
+    effects: files whose sections fill the hooks."""
     numbers = {"LANES": shape.lanes, "FAST_FMA": int(shape.fast_fma), "SETUP_FP64": int(float64)}
     scalars = Scalars("double" if float64 else "float", "float")
     stages = ("prelude", "math", *([file.removesuffix(".cl")] if file else ()))
@@ -301,19 +289,15 @@ def assemble_check(file: str, shape: DeviceShape, float64: bool, effects: Iterab
 
 
 def backward_items(features: FeatureSet, shape: DeviceShape) -> int:
-    """Work-group size of the backward pass over a chunk of a tile's list.
-
-    It is halved for outputs other than rgb, which need more local memory per pixel: with distortion, 256
-    work-items would exceed NVIDIA's limit of 48 KiB.
-    """
+    """Work-group size of the backward pass over a chunk of a tile's list; half for outputs other than rgb,
+    which would otherwise exceed NVIDIA's 48 KiB of local memory."""
     if shape.schedule == "lanes":
         return 1
     return min(shape.tile_width * shape.tile_height, 128 if features.outputs else 256)
 
 
 def backward_chunk(features: FeatureSet, shape: DeviceShape) -> int:
-    """Splats of a tile's list that are evaluated forward and then backward at once: on GPUs a column of a
-    splat's pixels for each work-item; on CPUs the minimum number, for splats that cover the complete tile."""
+    """Number of splats of a tile's list that the backward pass evaluates at once."""
     if shape.schedule == "lanes":
         return shape.tape
     return backward_items(features, shape) // shape.tile_width
@@ -479,8 +463,7 @@ def with_scalars(text: str, wide: str = "float") -> str:
 
 
 def with_constants(text: str, constants: Mapping[str, str]) -> str:
-    """Replace fields of `Splat` that are constant by their values in kernel text, and remove writes to
-    them."""
+    """Replace constant fields of `Splat` by their values in kernel text, and remove writes to them."""
     if not constants:
         return text
     names = "|".join(constants)
@@ -490,7 +473,7 @@ def with_constants(text: str, constants: Mapping[str, str]) -> str:
 
 def with_packed(text: str, packed: Mapping[str, str]) -> str:
     """Replace packed fields of `Splat` in kernel text: writes go to variables `unpacked_NAME`, reads use an
-    expression, in which `{}` is the record."""
+    expression of the record `{}`."""
     if not packed:
         return text
     names = "|".join(packed)

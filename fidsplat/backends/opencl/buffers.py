@@ -22,7 +22,7 @@ _LARGE = 1 << 22  # bytes from which large pages are requested
 
 
 class DeviceBuffer(cl.Buffer):
-    """A buffer with an identity token that can be compared without keeping the buffer alive."""
+    """A buffer with a token that identifies it without keeping it alive."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -30,7 +30,7 @@ class DeviceBuffer(cl.Buffer):
 
 
 def token_of(buffer: cl.Buffer) -> object:
-    """The identity token of a buffer. A sub-buffer has a new one at each call."""
+    """The token of a buffer; a new one at each call for a sub-buffer."""
     return buffer.token if type(buffer) is DeviceBuffer else object()
 
 
@@ -50,7 +50,7 @@ class BufferPool:
         self._kind: Hashable = None
         self._splats = 0
         self.state = object()
-        """identity of the set of scratch buffers: another object whenever one is replaced or released"""
+        """a new object whenever a scratch buffer is replaced or released"""
 
     def size(self, name: str) -> int:
         """Bytes of the scratch buffer of that name; 0 if there is none."""
@@ -88,8 +88,8 @@ class BufferPool:
         return size
 
     def make_way(self, kind: Hashable, size: int, splats: int = 0) -> None:
-        """Before a frame: release the buffers of other kinds of frames if they take more than `size` bytes.
-        Frames of one kind have equal buffer sizes, or smaller ones for fewer splats."""
+        """Before a frame: release all buffers if they belong to frames of another kind and exceed `size`
+        bytes. Frames of one kind have buffers of equal sizes, or smaller ones for fewer splats."""
         if kind == self._kind and splats <= self._splats:
             return
         if self.memory_bytes > size:
@@ -112,7 +112,7 @@ class BufferPool:
 
     def put(self, queue: cl.CommandQueue, name: str, array: np.ndarray) -> tuple[cl.Buffer, cl.Event | None]:
         """Copy an array to a scratch buffer without waiting; returns the buffer and the event of the copy. A
-        read-only array, such as a panorama, is not copied again if the buffer holds it already."""
+        read-only array that the buffer already contains is not copied again."""
         content = self._contents.get(name)
         if content is not None and content() is array:
             return self._buffers[name], None
@@ -135,8 +135,8 @@ class BufferPool:
         return buffer
 
     def array(self, queue: cl.CommandQueue, name: str, shape: tuple[int, ...]) -> Array:
-        """A scratch buffer as a float32 array. The array object is cached: creating one takes the host longer
-        than submitting a kernel."""
+        """A scratch buffer as a float32 array; cached, as creating one takes longer than submitting a
+        kernel."""
         buffer = self.scratch(name, 4 * math.prod(shape))
         known = self._arrays.get(name)
         if known is None or known.base_data is not buffer or known.shape != shape or known.queue is not queue:
@@ -152,11 +152,7 @@ class BufferPool:
         return self._buffers[name]
 
     def fresh(self, name: str, size: int) -> cl.Buffer:
-        """A new buffer outside the pool.
-
-        Raises:
-            DeviceError: the device cannot allocate that much at once.
-        """
+        """A new buffer outside the pool. Raises DeviceError if the device cannot allocate it."""
         limit = self._device.max_mem_alloc_size
         if size > limit:
             raise DeviceError(
@@ -197,7 +193,7 @@ class RayBuffers:
 
     def of(self, raster: RayRaster, rows: int, columns: int, slopes: bool = False) -> dict[str, cl.Buffer]:
         """Buffers by name, for a sample grid padded to rows x columns. slopes: also the derivatives of the
-        ray directions with respect to the sample position, which box primitives need."""
+        rays with respect to the sample position, for box splats."""
         sizes = self._held.setdefault(raster, {})
         if (rows, columns) not in sizes:
             sizes[rows, columns] = {"rays": self._planar("rays", raster.rays, rows, columns)}
@@ -234,14 +230,8 @@ class RayBuffers:
 
 
 def large_pages(address: int, size: int) -> bool:
-    """Advise the system to use large pages for a range of memory from its first use on.
-
-    Args:
-        address, size: in bytes; rounded inwards to complete pages.
-
-    Returns:
-        Whether the system accepted. Memory contents are unchanged.
-    """
+    """Advise the system to use large pages for [address, address + size) bytes; returns whether it
+    accepted."""
     advice = getattr(mmap, "MADV_HUGEPAGE", None)  # only on Linux
     first = -(-address // mmap.PAGESIZE) * mmap.PAGESIZE
     end = (address + size) // mmap.PAGESIZE * mmap.PAGESIZE

@@ -1,8 +1,7 @@
 """Device chunk cache with prefetch: chunks of a scene in device buffers, and clouds gathered from them.
 
-Each array has a buffer with slots of one size. The chunks of a frame are copied from there, on the device,
-into arrays in the order of the scene. That order decides ties of depth, so the images are bit-identical to
-those of the complete scene.
+Each array has a buffer with slots of one size. The chunks of a frame are copied from there into arrays in
+scene order, which decides ties of depth, so that images are bit-identical to those of the complete scene.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ class Copies:
     rows: int
     """number of rows of the largest chunk"""
     evictions: int
-    """number of evictions before these parameters were made; later ones make them stale"""
+    """number of evictions when these parameters were computed; after another eviction they are invalid"""
 
 
 class OpenCLChunkCache:
@@ -85,8 +84,8 @@ class OpenCLChunkCache:
         return self._size * self._rows * sum(self.widths.values())
 
     def gather(self, chunks: Sequence[Chunk], first_id: int = 0) -> GatheredChunks:
-        """Concatenate chunks into one cloud on the device, lazily: an array is copied when a frame first
-        reads it. first_id: `splat_id` of the first splat."""
+        """Concatenate chunks into one cloud; an array is copied when a frame first reads it. first_id:
+        `splat_id` of the first splat."""
         with self._lock:
             self._rendered = {chunk.key for chunk in chunks}
             if not self.widths:
@@ -95,8 +94,7 @@ class OpenCLChunkCache:
         return GatheredChunks(self, chunks, first_id)
 
     def prefetch(self, chunks: Sequence[Chunk]) -> None:
-        """Load chunks of the next frame while one is rendered, as far as capacity allows. Called from another
-        thread."""
+        """Load chunks of the next frame from another thread, as far as there are free slots."""
         requested = {chunk.key for chunk in chunks}  # requested chunks must not evict each other
         for chunk in chunks:
             with self._lock:
@@ -111,9 +109,8 @@ class OpenCLChunkCache:
     def copy(
         self, name: str, chunks: Sequence[Chunk], spans: np.ndarray, target: cl.Buffer, known: Copies | None
     ) -> Copies | None:
-        """Copy rows of chunks into an array, on the queue of frames. spans: (k, 3) first row of each chunk,
-        its destination, and the number of rows. known: result of this method for the same rows of another
-        array."""
+        """Copy rows of chunks into an array. spans: (k, 3) first row of each chunk, its destination, number
+        of rows. known: result of this method for the same rows of another array."""
         with self._lock, self.workspace.failing("copying splats"):
             if known is not None and known.evictions == self._evictions:
                 self._launch(name, known, target)
@@ -215,13 +212,12 @@ class OpenCLChunkCache:
 
     @property
     def reserved_bytes(self) -> int:
-        """Bytes of the slots when the cache is full: the memory plan reserves them."""
+        """Bytes of the slots when the cache is full."""
         return self._max_slots * self._slot_bytes
 
     @property
     def _slot_bytes(self) -> int:
-        """Bytes of a slot in all arrays, plus those in the widest array, which exists twice while it
-        grows."""
+        """Bytes of a slot, with the widest array twice, as it exists twice while the cache grows."""
         return self._rows * (sum(self.widths.values()) + max(self.widths.values()))
 
     @property
@@ -246,8 +242,7 @@ class OpenCLChunkCache:
 
 
 class GatheredChunks(Resident):
-    """A cloud of cached chunks. An array is copied out of the slots when a frame first reads it; a cloud that
-    exceeds its share of the memory budget is copied in parts for every frame (`streamed`)."""
+    """A cloud of cached chunks; `streamed` if it exceeds its share of the memory budget."""
 
     coherent = True
 

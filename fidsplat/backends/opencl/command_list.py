@@ -28,10 +28,7 @@ class Command:
         self.group: tuple[int, ...] = ()
 
     def bind(self, index: int, value: Any) -> None:
-        """Set an argument unless it already has this value: comparing is faster than setting.
-
-        A buffer is recognised by its identity token, so that the list keeps no buffer alive.
-        """
+        """Set an argument unless it already has this value: comparing is faster than setting."""
         scalar = self._types[index]
         mark: object = token_of(value) if scalar is None else value
         bound = self._marks[index]
@@ -59,9 +56,9 @@ class CommandList:
     """Kernel launches of one program, in order.
 
     `record` appends a launch, `launch` appends and submits it, `set` changes arguments by name in all
-    commands, and `submit` replays the list. `clear` starts another recording. It reuses the kernel objects
-    and sets only arguments that differ: the n-th launch of a kernel is compared with its n-th launch in the
-    previous recording. The list keeps no buffer alive: its owner compares `BufferPool.state` before a replay.
+    launches, `submit` replays the list, `clear` starts another recording, which reuses the kernel objects and
+    sets only arguments that differ. The list keeps no buffer alive: its owner compares `BufferPool.state`
+    before a replay.
     """
 
     def __init__(self, program: Program) -> None:
@@ -72,7 +69,7 @@ class CommandList:
         """number of launches of each kernel in this recording"""
         self._named: dict[str, _NamedArgument] = {}
         self.key: Any = None
-        """key for which the complete recording is valid, set by its owner; `clear` resets it"""
+        """key for which the recording is valid, set by its owner; `clear` resets it"""
 
     @property
     def stages(self) -> list[str]:

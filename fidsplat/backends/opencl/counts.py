@@ -1,4 +1,4 @@
-"""Counts of a frame: big splats, visible splats, pairs of splats and tiles."""
+"""Counts of a frame: visible splats, splats that cover many tiles, and (splat, tile) pairs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ COUNTS = 4
 TALLIES = 8
 """counters of the buffer `tallies`, as in prelude.cl"""
 VISIBLE, PAIRS, BIG = 0, 2, 6
-"""number of these counters with totals: visible splats, pairs (two words), big splats"""
+"""indices of the counters with totals: visible splats, pairs (two words), big splats"""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Counts:
     """The counts of one frame, of all its views."""
 
     big: int
-    """splats that cover more tiles than a window holds"""
+    """number of splats that cover more tiles than a window stores"""
     pairs: int
     visible: int
 
@@ -34,7 +34,7 @@ class Counts:
 
     @staticmethod
     def of_tallies(words: np.ndarray) -> Counts:
-        """Counts of a frame from the buffer `tallies` (views, TALLIES). `big` counts the first view only."""
+        """Counts of a frame from the buffer `tallies` (views, TALLIES). `big` is that of the first view."""
         pairs = int(words[0, PAIRS]) | int(words[0, PAIRS + 1]) << 32
         return Counts(int(words[0, BIG]), pairs, int(words[:, VISIBLE].sum(dtype=np.int64)))
 
@@ -45,14 +45,13 @@ class Counts:
 
 @dataclass(frozen=True)
 class Capacity:
-    """Buffer capacities of a frame that was submitted before the host knew its counts."""
+    """Buffer sizes of a frame that is submitted before the host knows its counts."""
 
     big: int
     pairs: int
 
     def holds(self, counts: Counts) -> bool:
-        """Whether the counts fit the capacity; otherwise the frame has empty lists and must be rendered
-        again."""
+        """Whether the counts fit; otherwise the frame's lists are empty, and it must be rendered again."""
         return counts.big <= self.big and counts.pairs <= self.pairs
 
 
@@ -62,5 +61,5 @@ def read_stats(queue: cl.CommandQueue, counts: cl.Buffer, last: cl.Event, splats
 
 
 def enlarged(pairs: int, budget: int) -> int:
-    """New capacity of lists that must grow, with a margin: the next view often has still more pairs."""
+    """New capacity for lists that are too small, with a margin for the next view."""
     return max(pairs, min(pairs * 9 // 8, budget))

@@ -1,7 +1,4 @@
-"""Elements of kernel declarations, and their translation to C text and NumPy types.
-
-layout.py has the declarations of the stages, effect_layouts.py those of effects.
-"""
+"""Kernel declarations (structs, arguments, effects), and their translation to C text and NumPy types."""
 
 from __future__ import annotations
 
@@ -119,8 +116,7 @@ class Argument:
     access: Access
     """access to a buffer: `in` if the kernel only reads it, else `out`; empty for a number"""
     source: Source = "stage"
-    """source of the value: the launch or frame, the cloud, a uniform of the view (`View.uniform`), or an
-    array of the view (`View.array`)"""
+    """source of the value: the launch or frame, the cloud, or the view (`View.uniform`, `View.array`)"""
     uniform: tuple[str, int] = ("", 0)
     """group of uniforms, and index in it"""
     note: str = ""
@@ -137,10 +133,9 @@ class Argument:
 def takes(*declared: str | tuple[Argument, ...]) -> tuple[Argument, ...]:
     """Parse declarations of kernel arguments; tuples of arguments are inserted unchanged.
 
-    A declaration is a type, the names of arguments of this type, and a note after `//`: `int width height`
-    declares two numbers. A word before the type declares buffers instead: `in`, buffers of the stage that the
-    kernel only reads (`in float raw  // 4 channels`); `out`, buffers that it writes; `cloud`, arrays with a
-    row for each splat; `array`, arrays of the view, which are copied to the device for the frame.
+    A declaration is a type, names, and a note after `//`: `int width height` declares two numbers. A word
+    before the type declares buffers: `in` (only read), `out` (written), `cloud` (with a row for each splat),
+    `array` (copied from the view): `in float raw  // 4 channels`.
     """
     found: list[Argument] = []
     for one in declared:
@@ -156,7 +151,7 @@ def takes(*declared: str | tuple[Argument, ...]) -> tuple[Argument, ...]:
 
 
 def uniforms(group: str, *declarations: str, note: str = "") -> tuple[Argument, ...]:
-    """Arguments for all numbers of a group of uniforms (`View.uniform`), in the order of the group."""
+    """Arguments for all numbers of a group of uniforms (`View.uniform`), in their order."""
     words = [declaration.split() for declaration in declarations]
     named = [(ctype, name) for ctype, *names in words for name in names]
     return tuple(
@@ -167,7 +162,7 @@ def uniforms(group: str, *declarations: str, note: str = "") -> tuple[Argument, 
 
 @dataclass(frozen=True)
 class Samples:
-    """A sample buffer of an effect, written by the blend stage and read by the resolve stage."""
+    """A buffer of values per sample, written by the blend stage and read by the resolve stage."""
 
     ctype: str
     name: str

@@ -65,13 +65,9 @@ def devices() -> list[DeviceInfo]:
 def open_device(selector: str = "") -> OpenCLBackend:
     """Open the best usable device that matches a selector: GPUs before CPUs, patched PoCL last.
 
-    Args:
-        selector: `cpu` or `gpu`; part of a platform's name; part of a GPU's name or vendor if no platform
-            matches; or a name from the list of `devices` without `opencl:`, such as `pocl2`.
-
-    Raises:
-        DeviceError: no OpenCL at all, or none of the devices can be used.
-        UnknownDeviceError: no device matches the selector.
+    selector: `cpu` or `gpu`; part of a platform's name; part of a GPU's name or vendor if no platform
+    matches; or a name from `devices` without `opencl:`, such as `pocl-2`. Raises DeviceError if no device can
+    be used, and UnknownDeviceError if none matches.
     """
     found = _named_devices()
     if not found:
@@ -164,8 +160,8 @@ class OpenCLBackend(Workspace, Backend):
         return self._pipelines[key]
 
     def frame_shape(self, view: View, count: int = 1) -> DeviceShape | None:
-        """Small tiles for frames that would not occupy a GPU (devlog/tuning.md, small frames). Not with a
-        small memory budget, as there are more pairs of a splat and a tile."""
+        """Small tiles for frames with too few tiles to occupy a GPU (devlog/tuning.md); not with a small
+        memory budget, as small tiles have more pairs."""
         if self.shape.schedule != "group" or self.memory_budget < self.info.memory_bytes // 2:
             return None
         samples = count * view.width * view.height
@@ -253,8 +249,7 @@ def _name_of(device: cl.Device) -> str:
 
 
 def _matching(devices: Iterable[cl.Device], selector: str) -> list[cl.Device]:
-    """Devices that match a selector. Names of CPUs are not compared: `intel` would match PoCL on an Intel
-    CPU."""
+    """Devices that match a selector. CPU names are not compared: `intel` would match PoCL on an Intel CPU."""
     devices = list(devices)
     if selector in ("cpu", "gpu"):
         return [each for each in devices if each.type & getattr(cl.device_type, selector.upper())]

@@ -1,4 +1,4 @@
-"""The device state of one frame: its buffers, the arguments of its kernels and its launches."""
+"""The device state of one frame: its buffers, kernel arguments and launches."""
 
 from __future__ import annotations
 
@@ -24,22 +24,21 @@ from fidsplat.effects.catalogue import Output
 
 
 class FrameBuffers:
-    """Buffers of every frame, named like the kernel arguments; a buffer is an attribute once its stage has
-    allocated it.
+    """Buffers of every frame, named like the kernel arguments; each is set by the stage that allocates it.
 
-    v views, n splats, t tiles of all views, s samples of all views.
+    v views, n splats, t tiles and s samples of all views.
     """
 
     view: cl.Buffer
     """records `View` (groups + 1, v)"""
     moving: cl.Buffer
-    """number of moving groups, then their labels"""
+    """number of moving groups of splats, then their labels"""
     splats: cl.Buffer
     """records `Splat` (v, n)"""
     keys: cl.Buffer
     """sort keys by depth (v, n) uint32"""
     windows: cl.Buffer
-    """tiles that a splat touches (v, n) uint2, or its index in `big`"""
+    """tiles that a splat touches (v, n) uint2, or for many tiles its index in `big`"""
     tallies: cl.Buffer
     """counters, then the length of each tile's list (8 + t) uint32"""
     big: cl.Buffer
@@ -68,8 +67,7 @@ class FrameBuffers:
 
 @dataclass
 class Rendered:
-    """Buffers and events of a submitted frame; unlike `DeviceFrame` it keeps no cloud and scratch buffers
-    alive."""
+    """Buffers and events of a submitted frame, without references to the cloud and scratch buffers."""
 
     queue: cl.CommandQueue
     leased: list[tuple[str, cl.Buffer]]
@@ -114,13 +112,9 @@ class DeviceFrame:
         replay_queue: cl.CommandQueue | None = None,
         pair_limit: int = 0,
     ) -> None:
-        """
-        Args:
-            commands: records the launches.
-            replay_queue: queue of frames that are recorded for replay; on a GPU the host does not wait for
-                their counts.
-            pair_limit: largest capacity of the lists of a recorded frame; 0 for no limit.
-        """
+        """commands: records the launches. replay_queue: queue of frames that are recorded for replay; on a
+        GPU the host does not wait for their counts. pair_limit: largest capacity of the lists of a recorded
+        frame; 0: no limit."""
         self.workspace, self.commands, self.shape = workspace, commands, shape
         self.resident, self.plan = resident, plan
         self.batch, self.views = views, len(views)
@@ -163,18 +157,17 @@ class DeviceFrame:
         self.uploads: list[cl.Event] = []
         self.leased: list[tuple[str, cl.Buffer]] = []
         self.counted_launches = 0
-        """launches after which the counts are complete"""
+        """number of launches after which the counts are complete"""
         self.counted: cl.Event | None = None
         """completes when the device has counted the pairs, if the host did not wait"""
         self.in_bands = False
-        """whether its lists exceeded the pair budget"""
+        """whether its lists exceeded the pair budget, so that it was rendered in bands of tiles"""
         self.pairs = 0
         """number of listed pairs; the capacity of the lists if the host did not wait"""
         self.stats: Callable[[], dict[str, int]] = dict
 
     def sub_frame(self, view: View) -> DeviceFrame:
-        """The device frame of `view`, one of the poses of a moving camera whose images the shutter
-        averages."""
+        """The frame of `view`, one of the camera poses that a shutter averages."""
         views = ViewBatch.single(view)
         frame = DeviceFrame(self.workspace, self.commands, self.shape, self.resident, views, self.plan)
         frame.is_sub_frame = True
@@ -186,8 +179,7 @@ class DeviceFrame:
         return Capacity(self.numbers["big_capacity"], self.pairs)
 
     def count_pairs(self) -> int | None:
-        """The number of pairs; None if it exceeded the capacity, so that the frame is empty. Waits until the
-        device has counted, not until it has rendered."""
+        """Wait for the number of pairs; None if it exceeded the capacity, so that the frame is empty."""
         if self.counted is None:
             return self.pairs
         counts = self.read_counts(self.counted)
@@ -207,10 +199,8 @@ class DeviceFrame:
         views: int = 1,
         **given: Any,
     ) -> cl.Event:
-        """Submit a kernel with at least `items` work-items per view; kernels check their index.
-
-        An argument's value is taken from `given`, from the frame, or from its view, in this order.
-        """
+        """Submit a kernel with at least `items` work-items per view. Arguments are from `given`, the frame or
+        its view."""
         size = tuple([-(-count // side) * side for count, side in zip(items, group, strict=True)])
         if views > 1:
             size, group = (*size, views), (*group, 1)
@@ -281,8 +271,7 @@ class DeviceFrame:
         self.put("batch_indices", self.batch.batch_indices)
 
     def put_view(self, row: int, end: int) -> None:
-        """Copy the projection's uniforms to the device, for the requested rows within rows of samples [row,
-        end)."""
+        """Copy the projection's uniforms to the device, for rows of samples [row, end)."""
         if self.view.raster is not None:
             self.put_rays()
         arrays = projection_arrays(self.batch, self.source, row, end)

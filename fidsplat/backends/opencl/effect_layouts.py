@@ -1,6 +1,6 @@
-"""OpenCL declarations of effects and outputs: additions to the records and kernel arguments of layout.py.
+"""OpenCL declarations of effects and outputs: their additions to structs and kernel arguments.
 
-Buffers are (channels, rows, columns) of the padded grid of samples, unless a comment states another shape.
+Buffers are (channels, rows, columns) of the padded sample grid, unless a note has another shape.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The stages of a frame in order: plan, project, bin, sort, blend, resolve.
 
-They are submitted to one in-order queue. A frame with more pairs of splats and tiles than the memory budget
-holds is listed and blended in bands of tiles; a frame with a shutter is blended pose by pose and resolved
-once. The images are bit-identical in every case.
+They are submitted to one in-order queue. A frame with more pairs than the memory budget allows is binned and
+blended in bands of tiles; a frame with a shutter is blended pose by pose and resolved once. Images are
+bit-identical in every case.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def allocate_samples(frame: DeviceFrame) -> None:
 
 
 def render_sorted(frame: DeviceFrame) -> None:
-    """Run the stages on a CPU: the host waits for the number of pairs, and allocates the lists."""
+    """CPU: the host waits for the number of pairs before it allocates the lists."""
     count, big = frame.resident.count, 0
     frame.put_view(0, frame.rows)
     while True:
@@ -72,8 +72,8 @@ def render_sorted(frame: DeviceFrame) -> None:
 
 
 def render_tiled(frame: DeviceFrame) -> None:
-    """Run the stages on a GPU: all are submitted with the list capacity of previous frames. If it was too
-    small, the lists are empty, and the stages are submitted again."""
+    """GPU: submit all stages with the list capacity of previous frames; again if the capacity was too
+    small."""
     frame.put_view(0, frame.rows)
     frame.lease("counts", 4 * COUNTS)
     capacity = tiling.pair_capacity(frame.workspace)
@@ -117,8 +117,8 @@ def complete_tiled(frame: DeviceFrame, counted: cl.Event, capacity: int) -> None
 
 
 def render_in_chunks(frame: DeviceFrame) -> None:
-    """Run the stages under a small memory budget: project the cloud in chunks and store only visible splats.
-    If these exceed the capacity, the cloud is projected again for each band of tile rows."""
+    """Small memory budget: project the cloud in chunks, and store only visible splats; if these exceed the
+    capacity, project again for each band of tile rows."""
     rows = [(frame.first_tile // frame.tiles_x, frame.end_tile // frame.tiles_x)]
     visible = pairs = 0
     while rows:

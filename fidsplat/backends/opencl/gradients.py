@@ -65,12 +65,9 @@ class OpenCLDifferentiable(DifferentiableImages):
 
 
 class OpenCLGradients(GradientPipeline):
-    """Compiled stages with their derivatives.
-
-    A training run renders thousands of frames that differ only in numeric arguments. Command lists are
-    therefore replayed: those of frames (`OpenCLPipeline.replay_complete`), and those of the backward pass
-    while its buffers stay the same.
-    """
+    """Compiled stages with their gradients. Frames of a training run differ only in numeric arguments, so
+    that command lists are replayed: those of frames, and those of the backward pass while its buffers stay
+    the same."""
 
     def __init__(self, pipeline: OpenCLPipeline) -> None:
         self._pipeline, self.features = pipeline, pipeline.features
@@ -173,11 +170,9 @@ class OpenCLGradients(GradientPipeline):
         frame.launch("blend backward", "blend_backward", (groups * items,), (items,), log_ceiling=log_ceiling)
 
     def _tape_bytes(self) -> int:
-        """Size in bytes of the struct `Tape` (schedule/lanes_backward.cl), rounded up to vectors.
-
-        It contains the transmittance and opacity of each pixel for a chunk of splats, two words for each
-        splat of eight chunks, and one more word.
-        """
+        """Bytes of the struct `Tape` (schedule/lanes_backward.cl): transmittance and opacity of each pixel
+        for a chunk of splats, two words for each splat of eight chunks, and one more word, rounded up to
+        vectors."""
         shape = self._pipeline.shape
         chunk, vector = backward_chunk(self.features, shape), 4 * shape.lanes
         words = 2 * 8 * chunk + 1
@@ -190,8 +185,8 @@ class OpenCLGradients(GradientPipeline):
             self.step_commands[by_camera] = CommandList(Program(self._pipeline.workspace, source))
 
     def _check_capacity(self, frame: DeviceFrame) -> None:
-        """Raise CapacityExceeded if the lists were too small: then they are empty, and gradient buffer
-        offsets exceed the buffers. The host checks this while the device is busy."""
+        """Raise CapacityExceeded if the lists were too small. The host checks this while the device is
+        busy."""
         if (pairs := frame.count_pairs()) is None:
             raise CapacityExceeded
         if self._pair_limit < pairs * 9 // 8:  # changed seldom: frames with another limit are recorded again
@@ -244,13 +239,11 @@ class TileGradients:
             return found
 
     def step(self, given: Mapping[str, Any], by_camera: bool = False) -> Callable[[], np.ndarray] | None:
-        """Submit an optimiser step (kernels/opencl/project_step.cl); `OpenCLGradients.compile_step` comes
-        first.
+        """Submit an optimiser step (kernels/opencl/project_step.cl), compiled by
+        `OpenCLGradients.compile_step`.
 
-        Args:
-            given: arguments that are not the frame's.
-            by_camera: whether to return a function that waits for the gradient (10,) with respect to the
-                camera: pose and intrinsics.
+        given: arguments that are not the frame's. by_camera: whether to return a function that waits for the
+        gradient (10,) with respect to the camera: pose and intrinsics.
         """
         with self._last():
             frame, commands = self._frame, self.pipeline.step_commands[by_camera]

@@ -1,7 +1,7 @@
-"""Page-locked host memory for the images of a GPU.
+"""Page-locked host memory for images of a GPU: a copy to it runs at the full rate of the bus, during
+rendering.
 
-A copy to page-locked memory runs at the full rate of the bus while the GPU renders. Locking takes longer
-than copying, so memory is reused for the next image of about the same size.
+Locking takes longer than copying, so that memory is reused for images of about the same size.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class _LockedBuffer:
 
 
 class _ArrayMemory:
-    """The base object of an array in locked memory. The memory is reused when the array and all its views
-    have been released."""
+    """The base object of an array in locked memory, which is reused once the array and its views are
+    released."""
 
     def __init__(self, memory: _LockedBuffer, shape: tuple[int, ...], dtype: Any) -> None:
         self._memory = memory
@@ -57,8 +57,8 @@ class HostMemory:
         self._locked, self._lock = 0, threading.Lock()
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-        """An array with undefined contents. The first of about its size is in ordinary memory: locking pages
-        for a single image takes longer than it saves."""
+        """An array with undefined contents; locked memory from the second request of about the same size
+        on."""
         size = math.prod(shape) * np.dtype(dtype).itemsize
         if not self.locks or size < _MINIMUM:
             return np.empty(shape, dtype)
@@ -100,7 +100,7 @@ class HostMemory:
 
 
 def rounded_up(count: int, bits: int) -> int:
-    """`count` rounded up to a number of `bits` binary digits and zeros, so that frames of varying sizes reuse
-    buffers."""
+    """`count` rounded up to a number with `bits` significant binary digits, so that frames of similar sizes
+    reuse buffers."""
     step = 1 << max(count.bit_length() - bits, 0)
     return -(-count // step) * step

@@ -33,12 +33,8 @@ _KERNELS: WeakKeyDictionary[Workspace, tuple[cl.Kernel, int]] = WeakKeyDictionar
 def lease_images(
     workspace: Workspace, outputs: tuple[Output, ...], views: ViewBatch
 ) -> list[tuple[str, cl.Buffer]]:
-    """Buffers for the output images of a batch, (views, h, w, channels) each, by the names of the kernel
-    arguments. Views that are masked out are blank.
-
-    Raises:
-        DeviceError: they exceed the memory budget, or one exceeds the largest buffer of the device.
-    """
+    """Buffers for the output images of a batch, (views, h, w, channels) each. Masked views are blank. Raises
+    DeviceError if they exceed the memory budget, or one exceeds the largest buffer of the device."""
     pixels = views.total * views.size[0] * views.size[1]
     bytes_of = {one.name: 4 * pixels * one.channels for one in outputs}
     largest = max(bytes_of, key=bytes_of.__getitem__)
@@ -71,11 +67,8 @@ class OpenCLImages(Images):
         leased: list[tuple[str, cl.Buffer]] | None = None,
         replay: Replay | None = None,
     ) -> None:
-        """
-        Args:
-            pipeline: the OpenCLPipeline that rendered them.
-            leased: image buffers of a batch; None if the images belong to the single frame in `rendered`.
-        """
+        """pipeline: the OpenCLPipeline that rendered them. leased: image buffers of a batch; None for a
+        single frame."""
         self._workspace, self._splats, self._outputs = pipeline.workspace, splats, pipeline.outputs
         self._view = view = views if isinstance(views, View) else views.view
         if isinstance(views, ViewBatch):
@@ -225,7 +218,7 @@ class OpenCLImages(Images):
             self._copied.append(replace(rendered, leased=[], stats=partial(dict, rendered.stats())))
 
     def _rectangles(self, tiles: np.ndarray) -> Iterator[tuple[int, int, int, int]]:
-        """Rectangles [top, bottom) x [left, right) of pixels that cover tiles (rows, columns) bool, row by
+        """Rectangles of pixels [top, bottom) x [left, right) that cover tiles (rows, columns) bool, row by
         row."""
         (rows, columns), (height, width) = self._size, (side // self._view.samples for side in self._tile)
         for row, chosen in enumerate(tiles):

@@ -1,8 +1,7 @@
-"""Records and kernel arguments, declared once for host and kernels.
+"""Structs and kernel arguments, declared once for host and kernels.
 
-assemble.py prints the C structs and signatures of kernels/opencl/ from these declarations, and the host binds
-arguments by their names. effect_layouts.py declares the additions of effects and outputs. Buffers are
-(channels, rows, columns) of the padded grid of samples, unless their note has another shape.
+assemble.py prints them as C into kernels/opencl/, and the host binds arguments by name. Buffers are
+(channels, rows, columns) of the padded sample grid, unless a note has another shape.
 """
 
 from __future__ import annotations

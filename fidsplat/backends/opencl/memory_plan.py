@@ -1,8 +1,8 @@
 """The memory plan: how a frame or batch is divided to fit the memory budget.
 
-A frame is rendered at once if its buffers fit. If only its pairs of splats and tiles exceed the budget, it is
-listed and blended in bands of tiles (tiling.py). As the last resort the cloud is projected in chunks, of
-which only the visible splats are stored (frame.py). A batch is rendered in parts of as many views as fit.
+A frame is rendered in one piece if its buffers fit. If only its (splat, tile) pairs exceed the budget, it is
+binned and blended in bands of tiles. As the last resort the cloud is projected in chunks, of which only
+visible splats are stored. A batch is rendered in parts of as many views as fit.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class MemoryPlanner:
             self._channels += samples.channels
         resolved = source.takes("resolve", "rays")
         self._separate = bool(source.view_arrays) or resolved or "backdrop" in source.arguments
-        """whether views differ in more than the record `View`"""
+        """whether the views of a batch differ in more than the struct `View`"""
         self._image_channels = 0
         for output in features.images:
             self._image_channels += output.channels
@@ -85,11 +85,8 @@ class MemoryPlanner:
         return -(-view.width // self._shape.tile_width) * -(-view.height // self._shape.tile_height)
 
     def frame(self, resident: Resident, view: View, reserved: int = 0) -> MemoryPlan:
-        """Plan one view. reserved: bytes of other buffers.
-
-        Raises:
-            DeviceError: the frame exceeds the budget even when divided.
-        """
+        """Plan one view. reserved: bytes of other buffers. Raises DeviceError if it does not fit in any
+        way."""
         shape = self._shape
         stays, upload = resident.bytes_for(self._source.cloud_arrays)
         samples, tables = self._samples_and_tables(view)
@@ -153,13 +150,10 @@ def plan_of(
     """Plan a frame of `count` splats.
 
     Args:
-        record_bytes: bytes of a splat's record.
-        upload_bytes: bytes per splat that each frame copies to the device; 0 if the cloud stays there.
-        fixed_bytes: bytes of sample buffers, outputs, tables, and the cloud if it stays on the device.
+        record_bytes: of a splat's struct. upload_bytes: per splat, copied for each frame; 0 if the cloud
+            stays.
+        fixed_bytes: of sample buffers, outputs, tables, and the cloud if it stays on the device.
         budget: maximum total bytes. largest: maximum bytes of one buffer.
-
-    Raises:
-        DeviceError: `fixed_bytes` exceed the budget.
     """
     direct = count * (record_bytes + KEYS + WINDOWS + (SORTED if lists == "ordered" else 0))
     pairs = budget // 8

@@ -43,7 +43,7 @@ class CachedFrame:
 
     plan: MemoryPlan
     kind: tuple[Any, ...]
-    """for `BufferPool.make_way`"""
+    """key of frames with equal buffer sizes"""
     raster: RayRaster | None
     """raster of the lens; it keeps the lens's rays on the device"""
     recorded: RecordedFrame | None = None
@@ -77,11 +77,7 @@ class OpenCLPipeline(Pipeline):
         return CommandList(self.program)
 
     def render_view(self, resident: Resident, view: View) -> OpenCLImages:
-        """Render one view. Frames of a kind that was rendered before are replayed; on a GPU without waiting.
-
-        Raises:
-            DeviceError: the device runs out of memory or fails.
-        """
+        """Render one view. A frame whose command list is cached is replayed, on a GPU without waiting."""
         if self._vectorises_too_few(resident):
             return self._unbatched.render_view(resident, view)
         with self.workspace.rendering():
@@ -129,11 +125,8 @@ class OpenCLPipeline(Pipeline):
             return False
 
     def render_complete(self, resident: Resident, view: View) -> DeviceFrame:
-        """Render one frame and return its buffers, which are valid until the next frame.
-
-        Raises:
-            DeviceError: the device fails, or the frame exceeds the memory budget without chunks or bands.
-        """
+        """Render one frame; returns its buffers, which are valid until the next frame. Raises DeviceError if
+        it exceeds the memory budget without chunks and bands."""
         if self._vectorises_too_few(resident):
             return self._unbatched.render_complete(resident, view)
         with self.workspace.rendering():
@@ -148,11 +141,8 @@ class OpenCLPipeline(Pipeline):
             return frame
 
     def replay_complete(self, resident: Resident, view: View, pair_limit: int) -> DeviceFrame:
-        """Render one frame without waiting for its counts, and return its buffers. `DeviceFrame.count_pairs`
-        checks later whether they sufficed. Frames of a kind that was rendered before are replayed.
-
-        pair_limit: maximum capacity of the lists.
-        """
+        """Render one frame like `render_complete` without waiting for its counts (`DeviceFrame.count_pairs`
+        does), by a replay if possible. pair_limit: maximum capacity of the lists."""
         if self.shape.lists == "ordered" or not resident.count:
             return self.render_complete(resident, view)
         workspace, key = self.workspace, (*self._key(view), pair_limit)
@@ -187,7 +177,7 @@ class OpenCLPipeline(Pipeline):
             return self._render_planned(resident, view, self._planner.frame(resident, view)).rendered()
 
     def _replay(self, resident: Resident, view: View, cached: CachedFrame) -> OpenCLImages | None:
-        """Replay a cached frame for another view; None if it exceeds the capacity, or scratch buffers were
+        """Replay a cached frame for another view; None if it exceeds the capacity or its buffers were
         replaced."""
         workspace, recorded, waits = self.workspace, cached.recorded, self.shape.lists == "ordered"
         workspace.pool.make_way(cached.kind, workspace.memory_budget - cached.plan.total, resident.capacity)
@@ -257,7 +247,7 @@ class OpenCLPipeline(Pipeline):
         cached[key] = CachedFrame(frame.plan, kind, raster)
 
     def _key(self, view: View) -> tuple[Any, ...]:
-        """Key of frames that differ only in numeric arguments."""
+        """Key of frames with the same command list, which differ only in numeric arguments."""
         labels, budgets = tuple(dict(view.groups)), (self.workspace.memory_budget, self.workspace.pair_budget)
         return self, view.width, view.height, view.raster, labels, budgets
 
@@ -266,7 +256,7 @@ class OpenCLPipeline(Pipeline):
         return self._other(self.features, replace(self.shape, lists=lists))
 
     def _vectorises_too_few(self, resident: Resident) -> bool:
-        """Whether the cloud is so small that vectorised set-up saves less time than its compilation takes."""
+        """Whether compiling the vectorised set-up would take longer than it saves, for a small cloud."""
         return self.shape.batch > 1 and resident.count < MIN_BATCHED
 
     @cached_property
@@ -284,12 +274,9 @@ class OpenCLPipeline(Pipeline):
         return self._listing("local") if few or resident.coherent else self
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
-        """Render one frame and return the data between the stages.
-
-        keys (n,) uint32; starts (tiles + 1,) uint32; lists (pairs,) uint32, of the last band; records (n,) of
-        the record `Splat` (undefined for culled splats); raw (4, rows, columns) float32: r, g, b,
-        transmittance of the padded sample grid; and the output images by name.
-        """
+        """See `Pipeline.trace`. keys (n,) uint32; starts (tiles + 1,) uint32; lists (pairs,) uint32, of the
+        last band; records (n,) of the struct `Splat`; raw (4, rows, columns) float32: r, g, b, transmittance;
+        output images by name."""
         with self.workspace.rendering():
             frame = self._render_frame(resident, view, MemoryPlan(0, resident.count, 0))
         images = self.images_of(frame)

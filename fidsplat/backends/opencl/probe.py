@@ -1,6 +1,4 @@
-"""Access to an open device for tests: small kernels with the build options and pragmas of the stages, single
-stages on artificial input, and buffers that are filled with NaN before their use.
-"""
+"""Access to an OpenCL device for tests: small kernels, single stages, and buffers filled with NaN."""
 
 from __future__ import annotations
 
@@ -22,14 +20,10 @@ from fidsplat.util.errors import DeviceError
 def evaluate(
     workspace: Workspace, text: str, inputs: Sequence[np.ndarray], outputs: Sequence[np.dtype | type]
 ) -> list[np.ndarray]:
-    """Compile `text` like the stages, after prelude.cl and math.cl, and run its kernel `probe`.
+    """Compile `text` after prelude.cl and math.cl, and run its kernel `probe` with a work-item per element.
 
-    One work-item per element: inputs are arrays (n,) of one length, outputs the types of arrays (n,). The
-    kernel's arguments are the pointers to the inputs, then to the outputs. A device without float64 has
-    SETUP_FP64 0 and `real` is float.
-
-    Raises:
-        DeviceError: the compiler refuses.
+    inputs: arrays (n,). outputs: types of arrays (n,). The kernel's arguments are the inputs, then the
+    outputs. Without float64, SETUP_FP64 is 0 and `real` is float.
     """
     kernel = check_kernels(workspace, text=text, lanes=1)["probe"]
     given = [buffer_of(workspace, array) for array in inputs]

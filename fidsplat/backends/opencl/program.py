@@ -22,15 +22,11 @@ from fidsplat.util import interrupts
 from fidsplat.util.errors import DeviceError, FidsplatError
 
 in_background = threading.local()
-"""`on` in compile threads: the parent thread has set the warning filters, which all threads share"""
+"""`on` in compile threads, for which `BackgroundCompiler.begin` has set the warning filters"""
 
 
 class _InvokerCache(dict[Any, Any]):
-    """pyopencl's cache of the Python code that sets arguments, in memory.
-
-    pyopencl's own cache is a database of code without checksums; a damaged one crashes the process. Making
-    the code takes less than a millisecond per kernel.
-    """
+    """Replacement in memory for pyopencl's cache of generated Python code, a database without checksums."""
 
     store_if_not_present = dict.setdefault
 
@@ -63,11 +59,7 @@ def build_options(device: cl.Device) -> list[str]:
 
 
 def build(workspace: Workspace, text: str, *options: str) -> cl.Program:
-    """Compile OpenCL C text.
-
-    Raises:
-        DeviceError: compilation fails; the message has the log.
-    """
+    """Compile OpenCL C text. Raises DeviceError with the compiler's log."""
     context, options = workspace.context, (*workspace.compiler_options, *options)
     try:
         with ExitStack() as stack:
@@ -101,9 +93,6 @@ def _compiled(workspace: Workspace, source: Source) -> dict[str, cl.Program]:
 
     PoCL's cache may return a program without kernels if another process is writing the entry, or was killed
     while writing it. A retry with another option uses another cache entry.
-
-    Raises:
-        DeviceError: compilation fails, or returns no kernels three times.
     """
     load_invoker()
     for attempt in range(3):
@@ -123,15 +112,8 @@ def _compiled(workspace: Workspace, source: Source) -> dict[str, cl.Program]:
 def check_kernels(
     workspace: Workspace, file: str = "", text: str = "", lanes: int = 0, effects: Sequence[str] = ()
 ) -> dict[str, cl.Kernel]:
-    """Compile a file below kernels/opencl/ or a text after prelude.cl and math.cl, like the stages.
-
-    Args:
-        lanes: SIMD width; 0 for the device's default.
-        effects: files that fill the hooks of prelude.cl and math.cl.
-
-    Raises:
-        DeviceError: compilation fails.
-    """
+    """Compile a file below kernels/opencl/ or a text after prelude.cl and math.cl, like the stages. lanes:
+    SIMD width; 0 for the device's. effects: files that fill hooks."""
     shape = replace(workspace.shape, lanes=lanes) if lanes else workspace.shape
     built = build(workspace, assemble_check(file, shape, workspace.info.float64, effects) + text)
     load_invoker()
@@ -139,17 +121,14 @@ def check_kernels(
 
 
 class BackgroundCompiler:
-    """Compiles programs one after another in background threads; drivers release the GIL while compiling.
-
-    Each thread compiles one program: a process that exits meanwhile, after Ctrl-C for example, waits for it.
-    """
+    """Compiles programs one after another in background threads; a process that exits waits for the current
+    one."""
 
     def __init__(self) -> None:
         self._threads: dict[Hashable, threading.Thread] = {}
 
     def begin(self, key: Hashable, compile: Callable[[], object]) -> None:
-        """Start to compile. Errors are ignored here: the program is compiled again when it is needed, and the
-        error is raised then."""
+        """Start to compile. An error is raised when the program is needed, as it is then compiled again."""
         if key in self._threads:
             return
         # not in the thread: `build` changes the filters of all threads

@@ -1,8 +1,7 @@
-"""Frame replay: the command list of a frame is submitted again for the next frame of its kind.
+"""Frame replay: the command list of a frame is submitted again for another view of the same cloud.
 
-Frames of a kind run the same kernels; only output images and numbers of the view differ. Setting these is
-much faster for the host than planning a frame. On a GPU the host does not wait for the device. On a CPU it
-reads the counts before the lists are written, as in `render_sorted`.
+Only output images and numbers of the view differ, which takes the host much less time than planning a frame.
+On a CPU the host reads the counts before the lists are written, as in `render_sorted`.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ _ZERO = np.zeros(1, np.uint32)
 
 
 class RecordedFrame:
-    """The command list of a frame, and the arguments that differ between views. The cloud caches it
-    (`Resident.cached_frames`), so it must not reference the cloud."""
+    """The command list of a frame, and the arguments that differ between views. Cached by the cloud, so that
+    it must not reference the cloud."""
 
     def __init__(self, frame: DeviceFrame) -> None:
         self.workspace, self.commands, self.capacity = frame.workspace, frame.commands, frame.capacity
@@ -61,8 +60,8 @@ class RecordedFrame:
         self._scratch = [name for name in frame.named if name not in dict(frame.leased)]
 
     def set_view(self, view: View, queue: cl.CommandQueue) -> bool:
-        """Bind the uniforms of a view. Returns False if a scratch buffer was replaced, so that the command
-        list is invalid."""
+        """Bind the uniforms of a view. Returns False if a scratch buffer was replaced: the command list is
+        invalid then."""
         pool = self.workspace.pool
         if pool.state is not self.state:
             return False
@@ -79,8 +78,7 @@ class RecordedFrame:
         return pool.state is self.state
 
     def submit(self, queue: cl.CommandQueue, splats: int) -> Rendered | None:
-        """Render the bound view of a cloud with this many splats. None if the host waits for the counts and
-        they exceed the capacity."""
+        """Render the bound view. None if the host waits for the counts and they exceed the capacity."""
         commands, pool = self.commands, self.workspace.pool
         leased = [(name, pool.lease(name, size)) for name, size in self._leases]
         commands.set(dict(leased))
@@ -105,8 +103,7 @@ class RecordedFrame:
         return Rendered(queue, leased, partial(counts.stats, splats), events, self._stages)
 
     def _enlarge_lists(self, counts: Counts) -> bool:
-        """Bind larger lists if needed; used where the host waits for the counts. Returns whether they
-        suffice."""
+        """Bind larger lists if needed, where the host waits for the counts; returns whether they suffice."""
         if counts.big > self.capacity.big or counts.pairs > self.workspace.pair_budget:
             return False
         pairs = enlarged(counts.pairs, self.workspace.pair_budget)
@@ -146,7 +143,7 @@ class RecordedFrame:
 
 
 class Replay:
-    """A frame replayed on a GPU; its capacity is checked when it is first read."""
+    """A frame replayed on a GPU; its counts are compared with the capacity when it is first read."""
 
     def __init__(
         self,

@@ -48,8 +48,7 @@ class Resident(ResidentData):
 
     @abstractmethod
     def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
-        """Memory of these arrays: bytes that stay on the device, and bytes per splat that each frame
-        copies."""
+        """Bytes of these arrays that stay on the device, and bytes per splat that each frame copies."""
 
     @abstractmethod
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
@@ -63,11 +62,8 @@ class Resident(ResidentData):
 
 
 class UploadedCloud(Resident):
-    """A SplatCloud on the device.
-
-    A CPU reads the host's arrays without a copy. Other devices have copies; labels and colours are copied
-    when a frame first reads them. A cloud that exceeds half of the memory budget is `streamed`.
-    """
+    """A SplatCloud on the device. A CPU reads the host's arrays. Other devices have copies, of labels and
+    colours from their first use on; a cloud of more than half of the memory budget is `streamed`."""
 
     def __init__(self, workspace: Workspace, cloud: SplatCloud) -> None:
         super().__init__(len(cloud))

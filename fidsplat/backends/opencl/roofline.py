@@ -19,12 +19,8 @@ _GROUP = 64
 
 
 def measure_rates(workspace: Workspace) -> Rates:
-    """Measure peak rates: the best of several launches each, with the vector width of the blend stage. Takes
-    less than a second.
-
-    Raises:
-        DeviceError: the device cannot compile or run the kernels.
-    """
+    """Measure peak rates, the best of several launches each, with the vector width of the blend stage. Takes
+    less than a second."""
     kernels = check_kernels(workspace, "check/roofline.cl")
     try:
         return Rates(

@@ -13,12 +13,10 @@ class DeviceShape:
     """Build constants that follow from the kind of device, not from the scene."""
 
     schedule: str
-    """`lanes` (CPUs: a work-item renders a tile, in vectors of pixels) or `group` (GPUs: a work-group renders
-    a tile)"""
+    """`lanes` (CPU: a work-item renders a tile, in vectors of pixels) or `group` (GPU: a work-group renders a
+    tile)"""
     lists: str
-    """tile-binning strategy (tiling.py): `ordered` (sort the splats by depth, then append them to tile
-    lists), `tiled` (append to tile lists, then sort each list) or `local` (like `tiled`, with counters in
-    local memory, for many small views and for stores)"""
+    """tile-binning strategy (tiling.py): `ordered`, `tiled` or `local`"""
     lanes: int
     tile_width: int
     tile_height: int
@@ -29,13 +27,12 @@ class DeviceShape:
     scan_items: int
     fast_fma: bool
     k_buffer_size: int
-    """size of the k-buffer: fragments of a pixel that are sorted by depth at once; at most 254, or 31 in
-    `group`"""
+    """fragments of a pixel that the k-buffer sorts by depth at once; at most 254, or 31 in `group`"""
     rows: int = 2
     """pixels that a work-item blends, one below the other (`group`)"""
     tape: int = 1024
-    """capacity of the tape (`lanes`): splats of a tile whose fragments the forward pass stores for the
-    backward pass, 2 KiB each for each core; longer lists are evaluated twice"""
+    """splats of a tile whose fragments are stored for the backward pass (`lanes`), 2 KiB each; others are
+    evaluated twice"""
     batch: int = 1
     """splats that a work-item of the project stage sets up: more than one are vectorised (`lanes`)"""
     dialect: str = ""

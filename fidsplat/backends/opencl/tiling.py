@@ -1,11 +1,10 @@
 """Tile binning: the splats of each tile, in depth order.
 
-On CPUs (`ordered`) all visible splats are sorted by depth, then listed per tile in that order, by counting
-sorts over a few contiguous chunks: long sequential loops and no atomics. On GPUs (`tiled`) the projection
-counts the splats of each tile, pairs of splats and tiles are written in any order, and each tile's list is
-sorted in local memory: few kernels, all of them wide. For many small views and for stores (`local`), tiles
-are counted for thousands of splats at a time in local memory, since atomics of neighbouring splats on one
-tile's counter serialise. devlog/growth.md compares the strategies on both kinds of device.
+`ordered` (CPU): all visible splats are sorted by depth, then appended to tile lists in that order, by
+counting sorts over a few contiguous pieces: long sequential loops, no atomics. `tiled` (GPU): the projection
+counts the splats of each tile, (splat, tile) pairs are written in any order, and each tile's list is sorted
+in local memory. `local`: like `tiled`, with counters in local memory, for many small views and for stores,
+where atomics of neighbouring splats on one tile's counter would serialise.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ _GROUP_SPLATS = 4096
 _ITEMS = 256
 """work-group size: BIN_ITEMS and SORT_ITEMS of the kernels"""
 _START_TILES, _START_SHARES = 512, 32
-"""tiles of a share of tile_starts, and most shares: each reads the lengths of all lists"""
+"""tiles of a work-group of tile_starts, and maximum number of work-groups: each reads all list lengths"""
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 
 
@@ -44,7 +43,7 @@ class TileBand(NamedTuple):
 
 
 def allocate_tallies(frame: DeviceFrame, words: int, big: int = 0) -> None:
-    """Allocate zeroed counters, and buffers for at least `big` big splats."""
+    """Allocate zeroed counters, and buffers for at least `big` splats that touch many tiles."""
     capacity = max(big * 5 // 4, frame.pool.size("big") // 4, MIN_BIG)
     frame.numbers["big_capacity"] = capacity
     frame.take("big", 4 * capacity)
@@ -136,8 +135,8 @@ def list_sorted(frame: DeviceFrame, band: TileBand, count: int) -> None:
 def _prefix_sums(
     frame: DeviceFrame, stage: str, table: cl.Buffer, bins: int, slot: int, lists: int
 ) -> cl.Buffer:
-    """Prefix sums over tables of counts. lists: 1 for a single list of all views, or the number of views.
-    Returns the start of each bin (lists, bins of a list + 1)."""
+    """Prefix sums over tables of counts: the start of each bin (lists, bins of a list + 1). lists: 1 for a
+    single list of all views, or the number of views."""
     views, items = frame.views, frame.shape.scan_items
     totals = frame.take(f"{stage} totals", 4 * bins * views)
     each = bins * views // lists
@@ -180,8 +179,8 @@ def pack_visible(frame: DeviceFrame, top: int, end: int) -> Packed:
 
 
 def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[Packed, int]:
-    """Project and pack chunks until one of the capacities is exceeded; returns the splats and the number of
-    big splats."""
+    """Project and pack chunks until a capacity is exceeded; returns the splats and the number of big
+    splats."""
     count, chunk, chunks = frame.resident.count, frame.plan.chunk, frame.shape.chunks
     out: dict[str, Any] = {f"{name}_out": buffer for name, buffer in packed.items()}
     total = visible = 0
@@ -205,8 +204,7 @@ def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[Pack
 
 
 def split_rows(frame: DeviceFrame, top: int, end: int, count: int) -> list[tuple[int, int]]:
-    """Split tile rows [top, end) with `count` splats into bands that fit the capacity if the splats are
-    spread evenly."""
+    """Split tile rows [top, end) with `count` splats into bands that probably fit the capacity."""
     capacity = frame.plan.capacity
     if end - top == 1:
         raise DeviceError(

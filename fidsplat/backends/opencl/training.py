@@ -112,12 +112,12 @@ class LossReadback:
 
 
 class OpenCLTraining:
-    """Device kernels of a training step other than rendering: loss, optimiser, densification, noise.
+    """Device kernels of a training step except rendering: loss, optimiser, densification, noise.
 
     The state is n splats before their activation functions, float32: `means` (n, 3), `log_scales` (n, 2) of
-    disks or (n, 3) of 3D Gaussians, `quats` (n, 4), `logits` (n,), `sh` (n, k, 3); Adam's moments of each as
-    `first_NAME` and `second_NAME`; `gradient_sums` (n,) and `visible_counts` (n,), the statistics of
-    densification.
+    disks or (n, 3) of 3D Gaussians, `quats` (n, 4), `logits` (n,), `sh` (n, k, 3); Adam's moments of each,
+    `first_NAME` and `second_NAME`; and the statistics of densification, `gradient_sums` and `visible_counts`
+    (n,).
     """
 
     max_pending_losses = SLOTS // 2 - 1  # a frame that exceeds its capacity uses two slots
@@ -166,8 +166,8 @@ class OpenCLTraining:
         self._splats_changed()
 
     def gather_rows(self, rows: np.ndarray, remaining: int) -> None:
-        """Keep or duplicate splats: row i of the new state is row `rows[i]` (m,) uint32 of the old one.
-        Moments are zeroed from row `remaining` on."""
+        """Keep or duplicate splats: row i of the new state is row `rows[i]` of the old one, (m,) uint32.
+        Moments are zero from row `remaining` on."""
         self._bound["rows"], self._count = self._put("rows", rows), len(rows)
         for name, shape in self._shapes.items():
             made = len(rows), *shape[1:]
@@ -214,7 +214,7 @@ class OpenCLTraining:
         return found
 
     def resident(self, degree: int, origin: np.ndarray) -> ResidentArrays:
-        """The splats as a cloud to render, with SH up to `degree`; it shares the state, so that steps change
+        """The splats as a cloud to render, with SH up to `degree`; it shares the state and changes with
         it."""
         if self._resident is None or self._resident[0] != degree:
             count, rendered, every = self._count, (degree + 1) ** 2, self._shapes["sh"][1]
@@ -243,14 +243,12 @@ class OpenCLTraining:
     def loss(
         self, images: Any, view: int, dssim_weight: float, exposure: np.ndarray | None = None
     ) -> tuple[Callable[[], tuple[Any, ...]], Any]:
-        """Compare a frame with the ground truth of view number `view`.
+        """Compare a frame with the ground truth of view number `view`. exposure: (2, 3) logarithms of gains,
+        and offsets, applied to the frame first; None: as rendered.
 
-        exposure: (2, 3) logarithms of gains, and offsets, applied to the frame first; None: as rendered.
-
-        Returns:
-            A function that waits for the loss, the mean squared difference and, with an exposure, the
-            gradient (2, 3) by it, and returns them, to be called before `max_pending_losses` more frames; and
-            the gradient of the loss (h, w, 3), a device array that is valid until the next call.
+        Returns a function that waits for the loss, the mean squared difference and, with an exposure, the
+        gradient (2, 3) with respect to it, to be called before `max_pending_losses` more frames; and the
+        gradient of the loss (h, w, 3), a device array that is valid until the next call.
         """
         rgb, (height, columns, _) = images.device_buffer("rgb")
         rendered, shown = rgb, _exposure_arguments(exposure)
@@ -306,8 +304,8 @@ class OpenCLTraining:
         return value, gradient
 
     def _exposure_readback(self, given: Mapping[str, Any]) -> Callable[[], np.ndarray]:
-        """Continue the gradient of the loss to the render; returns a function that waits for the gradient by
-        the exposure."""
+        """Continue the gradient through the exposure; returns a function that waits for the exposure's
+        gradient."""
         groups = _EXPOSURE_GROUPS
         sums, found = self._scratch("exposure sums", 24 * groups), np.empty((groups, 6), np.float32)
         launch = self._one(
@@ -323,8 +321,8 @@ class OpenCLTraining:
         return read
 
     def normal_loss_gradients(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:
-        """Gradients of `fidsplat.train.losses.normal_loss` with respect to `depth` and `normal`, times the
-        weight, as device arrays that are valid until the next call."""
+        """Gradients of `train.losses.normal_loss` with respect to `depth` and `normal`, times the weight;
+        device arrays that are valid until the next call."""
         depth, target = images.device_array("depth"), self._targets[view]
         height, width = depth.shape
         shapes = {"depth": (height, width), "normal": (height, width, 3)}
@@ -343,8 +341,8 @@ class OpenCLTraining:
         return found
 
     def accumulate_statistics(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
-        """Add the frame's screen gradients and visibility to `gradient_sums` and `visible_counts`. taken: the
-        result of `backward_to_tiles`."""
+        """Add screen gradients and visibility of a frame to the statistics. taken: the result of
+        `backward_to_tiles`."""
         self._step(taken, dict.fromkeys(_STEP_NUMBERS, 0.0) | {"move": 0, "sparse": 0}, camera, origin)
 
     def step(
@@ -363,11 +361,10 @@ class OpenCLTraining:
             sizes: learning rates of `means`, `scales`, `quats`, `logits`, `sh` (degree 0) and `rest` (higher
                 degrees).
             numbers: `beta1`, `beta2`, `epsilon`, `root` (square root of 1 - beta2^step); `scale_penalty` and
-                `opacity_penalty`, added to the gradients; `sparse`: 1 where splats on which the frame does
-                not depend are left unchanged.
-            camera: if given, statistics are accumulated first, as by `accumulate_statistics`.
-            by_camera: whether to return a function that waits for the gradient (10,) of the loss with
-                respect to the camera: pose and intrinsics.
+                `opacity_penalty`, added to the gradients; `sparse`: 1 to update only splats that contribute
+                to the frame.
+            camera: if given, statistics are accumulated first.
+            by_camera: whether to return a function that waits for the gradient (10,) of pose and intrinsics.
         """
         given = {f"size_{name}": size for name, size in sizes.items()} | dict(numbers)
         given |= {"rest1": 1 - numbers["beta1"], "rest2": 1 - numbers["beta2"]}
@@ -398,8 +395,8 @@ class OpenCLTraining:
 
     def add_noise(self, size: float, slope: float, threshold: float, words: Sequence[int]) -> None:
         """Add MCMC noise to the means: random steps in the plane of each disk with `size` times its variance,
-        reduced by a sigmoid of this `slope` for opacities above `threshold`. words: low and high word of the
-        seed, iteration, purpose of the random numbers."""
+        reduced by a sigmoid of this `slope` for opacities above `threshold`. words: seed (low, high),
+        iteration, purpose."""
         names = ("seed_low", "seed_high", "iteration", "purpose")
         given = {"size": size, "slope": slope, "threshold": threshold, **dict(zip(names, words, strict=True))}
         self._launch("add_position_noise", self._count, given)
@@ -438,10 +435,8 @@ class OpenCLTraining:
         given: Mapping[str, Any],
         launches: Callable[[], list[Launch]],
     ) -> list[cl.Event]:
-        """Replay a command list of a training step, with the arguments `given`; record it again if necessary.
-
-        launches: returns the launches; called if the key, the splats or the buffers have changed.
-        """
+        """Replay a command list of a training step with the arguments `given`. launches: returns the
+        launches; called to record again if the key, the splats or the buffers have changed."""
         commands = self._replayed.setdefault(name, CommandList(self._program))
         key = (*key, self._version, self._workspace.pool.state)
         with self._workspace.failing("training"):

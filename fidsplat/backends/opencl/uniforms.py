@@ -32,8 +32,8 @@ def numbers_of(view: View, source: Source) -> dict[str, Any]:
 
 
 def projection_arrays(views: ViewBatch, source: Source, row: int, end: int) -> dict[str, np.ndarray]:
-    """Array arguments of the projection kernels by name, for rows of samples [row, end). They are read-only,
-    so that `BufferPool.put` copies each only once."""
+    """Array arguments of the projection by name, for rows of samples [row, end); read-only, so that
+    `BufferPool.put` copies each once."""
     view = views.view
     if view.band is not None:
         row, end = max(row, view.band[0]), min(end, view.band[1])
@@ -46,7 +46,7 @@ def projection_arrays(views: ViewBatch, source: Source, row: int, end: int) -> d
 
 
 def view_records(views: ViewBatch, row: int, end: int, record: np.dtype) -> np.ndarray:
-    """Records `View` (layout.py), (moving groups + 1, views), for rows of samples [row, end)."""
+    """Structs `View` (layout.py), (moving groups + 1, views), for rows of samples [row, end)."""
     real = record[0].base  # all members have one type
     if len(views) == 1:
         numbers = _numbers(views.view, row, end, record)

@@ -1,7 +1,7 @@
 """Registration of Intel's OpenCL CPU runtime from pip with the OpenCL loader, and detection of CPU features.
 
-The packages intel-opencl-rt and intel-cmplr-lib-rt contain the libraries but do not register them in
-/etc/OpenCL/vendors, and the loader does not find their dependencies.
+The packages intel-opencl-rt and intel-cmplr-lib-rt are not listed in /etc/OpenCL/vendors, and the loader does
+not find their dependencies.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def processor_flags() -> frozenset[str]:
 
 @contextmanager
 def intel_registered() -> Iterator[None]:
-    """A context in which the loader, when it first lists platforms, finds Intel's runtime in addition to
-    those of the system. A vendors folder set by the user is not replaced."""
+    """A context in which the loader, when it first lists platforms, finds Intel's runtime too. A vendors
+    folder set by the user is not replaced."""
     library = None if _VENDORS in os.environ else intel_library()
     if library is None:
         yield

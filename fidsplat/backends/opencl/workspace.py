@@ -60,12 +60,8 @@ class Workspace:
 
     @contextmanager
     def rendering(self) -> Iterator[None]:
-        """A context with exclusive use of the device. After a failure it waits until the device is idle,
-        since a CPU may still be reading a cloud's arrays.
-
-        Raises:
-            DeviceError: the device fails.
-        """
+        """A context with exclusive use of the device. Raises DeviceError on failure, after all queues are
+        idle, since a CPU may be reading a cloud's arrays."""
         with self.lock:
             try:
                 yield

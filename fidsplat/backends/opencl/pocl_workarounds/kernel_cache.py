@@ -1,9 +1,7 @@
 """Check of PoCL's kernel cache, from which PoCL loads files without a check.
 
-A truncated or damaged bitcode file or shared object ends the process ("LLVM ERROR", SIGBUS, abort) or yields
-a program without kernels, in every run. Such files are removed before PoCL first builds a program, and PoCL
-compiles them again. PoCL writes files as tempfile_* and renames them when complete; those are not removed,
-since this would end the process that writes them.
+A damaged bitcode file or shared object ends the process or yields a program without kernels, in every run.
+Such files are removed before PoCL first builds a program. Files named tempfile_* are still being written.
 """
 
 from __future__ import annotations

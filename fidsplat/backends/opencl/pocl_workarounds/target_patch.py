@@ -1,14 +1,9 @@
-"""Correction of PoCL 3.0's target processor in memory: the last resort.
+"""Correction of PoCL 3.0's target processor in memory: the last resort; FIDSPLAT_NO_POCL_PATCH forbids it.
 
-Devices that need no patch are preferred (device.py), and the variable FIDSPLAT_NO_POCL_PATCH forbids it.
-
-PoCL 3.0 from PyPI asks its LLVM 14 for the processor's name. A processor newer than LLVM 14 (such as AMD Zen
-5) is called "generic". PoCL passes this to clang as -target-cpu, and every build fails with "unknown target
-CPU 'generic'" (pocl issues #512, #1049). Zen 4 (with AVX-512) is called Zen 3 (without): builds crash or
-never end, since PoCL selects its AVX-512 kernel library by the feature flags. PoCL 3.1 and later read
-POCL_LLVM_CPU_NAME, but 3.0 has no such setting. Therefore the name is replaced in the field `llvm_cpu` of
-PoCL's device record, after `llvm_target_triplet`. The new name is the one for which PoCL built its kernel
-library.
+PoCL 3.0 asks its LLVM 14 for the processor's name. LLVM calls a newer processor (AMD Zen 5) "generic", with
+which every build fails ("unknown target CPU", pocl issues #512, #1049), and Zen 4 "znver3" (without AVX-512),
+with which builds crash. PoCL 3.1 reads POCL_LLVM_CPU_NAME; 3.0 has no such setting. The name is replaced in
+the field `llvm_cpu` of PoCL's device record by the name for which PoCL built its kernel library.
 """
 
 from __future__ import annotations
@@ -61,8 +56,8 @@ def why_not(device_address: int, device_version: str) -> str:
 
 
 def correct_target(device_address: int, device_version: str) -> str:
-    """Patch the processor name of the PoCL device with its record at this address, and return the new name.
-    If `why_not` returns a reason, nothing is changed, and LLVM's name is returned."""
+    """Patch the processor name of a PoCL device, and return the new name; the old one if `why_not` forbids
+    it."""
     if device_address not in _corrected:
         place = None if why_not(device_address, device_version) else _place(device_address, device_version)
         if place is None:
@@ -85,11 +80,7 @@ def announce_once(cache: Path, text: str) -> None:
 
 
 def _place(device_address: int, device_version: str) -> int | None:
-    """The address of the field `llvm_cpu` of a device's record; None if the record is not as expected.
-
-    Raises:
-        OSError: the system hides the process's memory.
-    """
+    """The address of the field `llvm_cpu` of a device's record; None if the record is not as expected."""
     wrong = _name_of_llvm(device_version).encode()
     memory = os.open("/proc/self/mem", os.O_RDONLY)
     try:
