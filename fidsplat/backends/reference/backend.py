@@ -55,11 +55,7 @@ def devices() -> list[DeviceInfo]:
 
 
 def open_device(selector: str = "") -> ReferenceBackend:
-    """Open the reference device; it has no variants.
-
-    Raises:
-        UnknownDeviceError: a selector was given.
-    """
+    """Open the reference device; any selector is an error."""
     if selector:
         raise UnknownDeviceError(
             f"the reference must have no selector, got {selector!r}; use device='reference'"
@@ -147,7 +143,7 @@ class ReferencePipeline(Pipeline):
         widest: int = _WIDEST,
     ) -> dict[str, np.ndarray]:
         """Render single pixels (row, column): outputs (k,) or (k, 3) float64, and `certificate` (k,). widest:
-        maximum side in samples of a tile, for which splats are culled together."""
+        maximum side in samples of the tiles for which splats are culled together."""
         n = view.samples
         sub_rows, sub_columns = np.mgrid[0:n, 0:n]
         y = (np.asarray(rows)[:, None] * n + sub_rows.ravel() + 0.5).ravel()
@@ -181,7 +177,7 @@ class ReferencePipeline(Pipeline):
         self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray, widest: int
     ) -> dict[str, np.ndarray]:
         """Combine the samples of several sub-frames: colour, fog and transmittance are averaged, other
-        outputs are from the middle sub-frame; `certificate_middle` is its certificate."""
+        outputs are from the middle sub-frame, as is `certificate_middle`."""
         out: dict[str, np.ndarray] = {}
         rows_of = [
             (y > sub_frame.top) & (y < sub_frame.top + sub_frame.view.height) for sub_frame in view.sub_frames
@@ -200,8 +196,8 @@ class ReferencePipeline(Pipeline):
 
 
 def _by_tile(view: View, x: np.ndarray, y: np.ndarray, widest: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sort samples by tile: their indices (k,), and the start of each tile except the first. Tiles are wider,
-    up to `widest` samples a side, where samples are far apart."""
+    """Sort samples by tile: their indices (k,), and the start of each tile except the first. Tiles are up to
+    `widest` samples wide where samples are far apart."""
     side = _TILE
     while True:
         tile = y // side * view.width + x // side

@@ -104,8 +104,7 @@ def composite(
 
 
 def inverse_depth(z: np.ndarray) -> np.ndarray:
-    """Inverse depth in the units of the depth distortion: a depth buffer from 0.2 to 100 m, as in 2DGS;
-    smaller depths are clamped to 0.2 m."""
+    """Inverse depth in the units of the depth distortion: a depth buffer from 0.2 to 100 m, as in 2DGS."""
     return INVERSE_DEPTH / np.maximum(z, SPREAD_NEAR)
 
 
@@ -140,16 +139,11 @@ def _pick(values: np.ndarray, index: np.ndarray, found: np.ndarray, otherwise: f
 def median_of(
     before: np.ndarray, alpha: np.ndarray, contributes: np.ndarray, span: error_bounds.Span
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the fragment or layer of the median depth: the last in front of which transmittance exceeds 0.5.
+    """Find the fragment or layer of the median depth: the last with a transmittance above 0.5 in front of it.
+    Consecutive fragments that together absorb less than `MIN_ALPHA` count as the last of them.
 
-    Consecutive fragments that absorb less than `MIN_ALPHA` together count as the last of them.
-
-    Args:
-        before: (k, m) transmittance in front of each of m fragments or layers.
-        alpha: (k, m). contributes: (k, m) bool.
-
-    Returns:
-        (k,) index; (k,) whether there is one; (k,) whether rounding to float32 may choose another.
+    before, alpha: (k, m) transmittance in front of m fragments or layers, and their opacity. contributes: (k,
+    m) bool. Returns (k,) index; whether there is one; whether rounding to float32 may choose another.
     """
     k = len(before)
     last, left = np.full(k, -1), np.ones(k)  # left: transmittance behind the last fragment that counted

@@ -1,7 +1,7 @@
 """Culling of splats for a block of samples, by interval arithmetic over the samples' coordinates.
 
-A culled splat has an opacity of exactly 0 at each of the samples, however float32 rounds, so the result does
-not change. The bounding boxes of devices are not used, so a comparison finds errors in them.
+A culled splat has an opacity of exactly 0 at each sample for any rounding. The bounding boxes of devices are
+not used, so that a comparison finds errors in them.
 """
 
 from __future__ import annotations
@@ -17,11 +17,8 @@ _SPARE = 1.001
 
 
 def may_contribute(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Whether each splat, (n,) bool, may contribute to any of the samples (k,) at grid positions x, y.
-
-    The first splat of a visible coplanar group is always kept: it determines the layer's position in the
-    order.
-    """
+    """(n,) bool: whether each splat may contribute to any sample (k,) at grid positions x, y. The first splat
+    of a visible coplanar group always counts, as it determines the layer's position in the order."""
     samples = samples_of(view, x, y)
     if not samples.valid.any():
         return np.zeros(len(s.order), bool)

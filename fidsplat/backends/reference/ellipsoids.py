@@ -1,9 +1,9 @@
 """3D Gaussians as disks with the same image (docs/primitives.md).
 
 `exact`: W maps the covariance to the unit matrix. In that space the disk contains the centre W p and is
-perpendicular to it. A ray that meets the disk at the squared distance rho from the centre has the minimum
-squared distance rho / (1 + rho / |W p|^2) from it. `ewa`: a disk parallel to the image plane; the image of
-this disk has the covariance that 3DGS computes.
+perpendicular to it. For a ray that meets the disk at the squared distance rho from the centre, the squared
+distance of ray and centre is rho / (1 + rho / |W p|^2). `ewa`: a disk parallel to the image plane whose image
+has the covariance that 3DGS computes.
 """
 
 from __future__ import annotations
@@ -39,8 +39,7 @@ class Axes:
     faint: np.ndarray
     """term added to the logarithm of the opacity"""
     turned: np.ndarray
-    """error bound of the normal; large for flat ellipsoids near edge-on, whose surface normal turns by a
-    right angle within a small change of direction"""
+    """error bound of the normal [rad], large for flat ellipsoids near edge-on"""
 
 
 def disks(unit_a: np.ndarray, unit_b: np.ndarray, scale: np.ndarray) -> Axes:
@@ -51,10 +50,8 @@ def disks(unit_a: np.ndarray, unit_b: np.ndarray, scale: np.ndarray) -> Axes:
 
 
 def exact(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View) -> Axes:
-    """Axes of 3D Gaussians.
-
-    axes: unit axes (n, 3, 3), in rows. scales: standard deviations (n, 3). p: centres (n, 3).
-    """
+    """Axes of 3D Gaussians with unit axes (n, 3, 3), in rows, standard deviations `scales` (n, 3) and centres
+    p (n, 3)."""
     towards = np.broadcast_to([0.0, 0.0, 1.0], p.shape) if view.parallel else p
     white = np.einsum("nkc,nc->nk", axes, towards) / scales
     m = np.linalg.norm(white, axis=1)
@@ -76,8 +73,8 @@ def exact(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View) -> Ax
 def _surface_normals(
     axes: np.ndarray, scales: np.ndarray, towards: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals (n, 3) as in RaDe-GS and GOF: the direction of the inverse covariance times the ray
-    through the centre; and the angle by which rounding may turn them."""
+    """Unit normals (n, 3) as in RaDe-GS and GOF, along the inverse covariance times the ray through the
+    centre, and their rounding error [rad]."""
     shares = (scales.min(axis=1)[:, None] / scales) ** 2
     normal = np.einsum("nk,nkc->nc", np.einsum("nkc,nc->nk", axes, towards) * shares, axes)
     length = np.linalg.norm(normal, axis=1)

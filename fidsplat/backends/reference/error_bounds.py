@@ -1,10 +1,10 @@
 """Error bounds (certificates) of the reference's outputs for rendering in float32.
 
-A device evaluates the affine forms n_u, n_v, D of a pixel in float32, about the pixel nearest to the splat's
-centre. Interval arithmetic over their rounding gives the lowest and the highest opacity of each fragment.
-They are far apart where a value is near a threshold (the cut-off, the near plane, the horizon) or where the
-splat is thinner than the rounding error of its distance (needles, disks seen edge-on). The certificate of a
-pixel adds up the possible changes of its fragments, to first order.
+A device evaluates the affine forms n_u, n_v, D of a pixel in float32, relative to the pixel nearest to the
+splat's centre. Interval arithmetic over their rounding yields an interval of each fragment's opacity. It is
+wide near a threshold (cut-off, near plane, horizon) and for splats that are thinner than the rounding error
+of their distance. The certificate of a pixel is the sum of the possible changes of its fragments, to first
+order.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class Span:
 
     @classmethod
     def of(cls, low: np.ndarray, high: np.ndarray, z_low: np.ndarray, z_high: np.ndarray) -> Span:
-        """Intervals of opacities and depths in compositing order, and of the transmittances that they
-        imply."""
+        """Intervals of opacities and depths in compositing order, with the transmittances that follow from
+        them."""
         fronts = shifted(np.cumprod(1 - high, axis=1)), shifted(np.cumprod(1 - low, axis=1))
         return cls(low, high, z_low, z_high, *fronts)
 
@@ -130,8 +130,8 @@ _Pair = tuple[np.ndarray, np.ndarray]
 
 
 def _of_mirrored_depth(s: Setup, d: _Pair, q: _Pair, dz: _Pair, circle: _Pair) -> _Pair:
-    """Bounds (k, n) of the depths of fragments outside the circle rho = C (docs/correctness.md, "The depth of
-    a fragment"): pz + circle (dz - pz d) 2 d / q, from bounds of the factors. circle: C / 2."""
+    """Depth bounds (k, n) of fragments outside the circle rho = C (docs/correctness.md, "The depth of a
+    fragment"): pz + circle (dz - pz d) 2 d / q, from bounds of the factors. circle: C / 2."""
     d = np.maximum(d[0], 0.0), np.maximum(d[1], 0.0)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         beyond = dz[0] - np.maximum(s.pz * d[0], s.pz * d[1]), dz[1] - np.minimum(s.pz * d[0], s.pz * d[1])
@@ -151,8 +151,8 @@ def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np
 
 
 def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Error bound (k,) of colour and alpha, per unit of colour. moved (k, m): error bound of each fragment's
-    own colour."""
+    """Error bound (k,) of colour and alpha, per unit of colour. moved (k, m): that of each fragment's own
+    colour."""
     bound = (before * (span.high - span.low)).sum(1)
     t_low = span.front_low * (1 - span.high) * (1 - STOP)
     t_high = span.front_high * (1 - span.low) * (1 + STOP)
@@ -171,9 +171,8 @@ def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.nda
 
 
 def of_layer_color(thin: np.ndarray, thick: np.ndarray) -> np.ndarray:
-    """Error bound (k, 1) of the colour of a layer, per unit of light in front of it, whose n splats have
-    optical depths (k, n) between `thin` and `thick`.
-    """
+    """Error bound (k, 1) of a layer's colour, per unit of light in front of it; its n splats have optical
+    depths (k, n) between `thin` and `thick`."""
     lowest = thin.sum(1, keepdims=True)
     others = thick.sum(1, keepdims=True) - thick
     # maximum derivative of the layer's colour with respect to one splat's optical depth
@@ -183,11 +182,8 @@ def of_layer_color(thin: np.ndarray, thick: np.ndarray) -> np.ndarray:
 
 
 def of_box_color(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Error bound (k, 1) of the colour of a layer of n boxes with opacities between `low` and `high` (k, n).
-
-    The layer's colour times its opacity is the sum over its boxes, or the mean if their opacities add up to
-    more than 1.
-    """
+    """Error bound (k, 1) of the colour of a layer of n boxes with opacities between `low` and `high` (k, n):
+    the sum over the boxes, or their mean if the opacities add up to more than 1."""
     return np.where((high > 0).sum(1, keepdims=True) > 1, (high - low).sum(1, keepdims=True), 0.0)
 
 
@@ -215,22 +211,20 @@ def of_layer_depth(
 
 
 def first_column(mask: np.ndarray, start: int) -> np.ndarray:
-    """Number of the first column (k,) where mask (k, m) is set; columns are numbered from `start`; start + m
-    if there is none."""
+    """Index (k,) of the first column where mask (k, m) is set, counted from `start`; start + m if there is
+    none."""
     k, m = mask.shape
     return start + np.where(mask.any(1), np.argmax(mask, axis=1), m) if m else np.full(k, start)
 
 
 def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
-    """Bounds for fragments or layers (k, m) sorted by depth, over all depth orders that rounding allows.
+    """Bounds over all depth orders that rounding allows, for fragments or layers (k, m) sorted by depth.
 
     Returns the span with bounds of the transmittance in front of each fragment, and (k,) the largest change
-    of a pixel's colour by another order, if all colours are in [0, 1]. lift (k, m): length that is subtracted
-    from the depth of each before sorting.
-
-    A swap of two neighbours changes a colour by at most the product of their opacities and the transmittance
-    in front of them. Every possible order results from swaps of pairs whose depth intervals overlap. Exactly
-    equal depths have an order that rounding does not change.
+    of a pixel's colour, for colours in [0, 1]. lift (k, m): length subtracted from each depth before sorting.
+    Swapping two neighbours changes a colour by at most the product of their opacities and the transmittance
+    in front of them, and every possible order results from swaps of pairs with overlapping depth intervals.
+    Exactly equal depths keep their order.
     """
     near, far = _sort_depths(span, lift)
     may, exact = span.high > 0, span.z_low == span.z_high
@@ -248,8 +242,8 @@ def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
 
 
 def of_layers(span: Span, lift: np.ndarray, place: np.ndarray) -> tuple[Span, np.ndarray]:
-    """Bounds over all orders that rounding allows, for fragments in the order of the splats' centres between
-    layers sorted by depth. Returns the same as `of_order`.
+    """The same as `of_order` for fragments in the order of the splats' centres between layers sorted by
+    depth.
 
     Two fragments may also swap where rounding decides whether a layer is between them. place (k, m): position
     in the order of centres; negative for layers.
@@ -294,8 +288,8 @@ def _sort_depths(span: Span, lift: np.ndarray) -> _Pair:
 
 
 def _of_swaps(span: Span, pairs: list[tuple]) -> tuple[Span, np.ndarray]:
-    """Bounds over all orders in which pairs may be swapped. pairs: two slices of columns, and a mask of the
-    samples where they may be swapped."""
+    """Bounds over all orders in which pairs may be swapped. pairs: two slices of columns, and a mask of
+    samples."""
     dimmed = np.log1p(-np.minimum(span.low, 1 - 2.0**-53))
     light = np.cumsum(dimmed, axis=1) - dimmed
     lowest = span.front_low.copy()
@@ -321,8 +315,8 @@ def of_depth(span: Span, weight: np.ndarray, z: np.ndarray) -> dict[str, np.ndar
 
 
 def of_first(span: Span, light: float) -> np.ndarray:
-    """Whether rounding may change the first fragment behind which the transmittance is at most `light`; (k,)
-    bool."""
+    """(k,) bool: whether rounding may change the first fragment behind which transmittance is at most
+    `light`."""
     high, low = span.high, span.low
     may = (high > 0) & (span.front_low * (1 - high) * (1 - STOP) <= light)
     sure = (low > 0) & (span.front_high * (1 - low) * (1 + STOP) <= light)
@@ -330,8 +324,8 @@ def of_first(span: Span, light: float) -> np.ndarray:
 
 
 def of_count(span: Span, count: np.ndarray, bound: np.ndarray, stop: float) -> np.ndarray:
-    """Error bound (k,) of the number of blended splats. count, bound (k, m): number of splats of each
-    fragment or layer, and its error bound."""
+    """Error bound (k,) of the number of blended splats. count, bound (k, m): that of each fragment or
+    layer."""
     may, must = span.high > 0, span.low > 0
     off = np.where(may, bound + np.where(must, 0, count), 0)
     # rounding decides between the first fragment that may reach the stop and the first that must

@@ -1,6 +1,4 @@
-"""Depth order of a sample's fragments (docs/correctness.md): by splat centres, or by depth at each sample,
-with one layer per coplanar group.
-"""
+"""Depth order of a sample's fragments (docs/correctness.md): by splat centres, or by depth at each sample."""
 
 from __future__ import annotations
 
@@ -14,8 +12,7 @@ from fidsplat.backends.reference.fragments import Fragments, optical_depth
 from fidsplat.backends.reference.setup import Setup
 
 COPLANAR_BIAS = 2.0**-16
-"""share of its depth by which a coplanar layer counts as nearer: more than rounding errors, too little to
-be visible"""
+"""share of its depth by which a coplanar layer counts as nearer: more than rounding errors, but invisible"""
 
 
 @dataclass
@@ -80,8 +77,8 @@ def by_center(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
 
 
 def by_depth(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
-    """Fragments, and one layer per coplanar group, sorted by their depths at each sample. Ties: layers first,
-    then the splats' order. Fragments that do not contribute are omitted."""
+    """Fragments, and a layer for each coplanar group, sorted by their depths at each sample. Ties: layers
+    first, then the splats' order. Fragments that do not contribute are left out."""
     columns, lift, arrival = _with_layers(s, f, span)
     may = columns.span.high > 0
     depth = np.where(may, columns.z - lift, np.inf)
@@ -92,9 +89,8 @@ def by_depth(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
 
 
 def by_layers(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
-    """Fragments in the order of the splats' centres, and layers of coplanar groups by depth at each sample:
-    fragments nearer than a layer are in front of it, the others behind. Fragments that do not contribute are
-    left out."""
+    """Fragments in the order of the splats' centres, and layers of coplanar groups by depth at each sample,
+    behind nearer fragments and in front of the others. Fragments that do not contribute are left out."""
     columns, lift, arrival = _with_layers(s, f, span)
     may, layered = columns.span.high > 0, arrival < 0
     depth, exists = columns.z - lift, columns.alpha > 0
@@ -112,8 +108,8 @@ def by_layers(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
 
 
 def _with_layers(s: Setup, f: Fragments, span: Span) -> tuple[OrderedFragments, np.ndarray, np.ndarray]:
-    """Fragments (k, n) of splats without a group, then layers (k, p); the share of its depth by which each
-    counts as nearer; and the order of ties (n + p,), negative for layers."""
+    """Fragments (k, n) of splats without a group, then layers (k, p); the length by which each counts as
+    nearer; and the order of ties (n + p,), negative for layers."""
     groups = np.full(f.alpha.shape[1], -1) if s.coplanar_groups is None else s.coplanar_groups
     plain = np.flatnonzero(groups < 0)
     members = [np.flatnonzero(groups == group) for group in np.unique(groups[groups >= 0])]
@@ -192,8 +188,7 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> OrderedFra
 
 
 def _coverage(opacity: np.ndarray, boxes: bool) -> np.ndarray:
-    """Opacity (k, 1) of a layer: the sum for boxes, which do not overlap; 1 - prod(1 - opacity) for
-    Gaussians."""
+    """Opacity (k, 1) of a layer: the sum for boxes, which do not overlap; else 1 - prod(1 - opacity)."""
     if boxes:
         return np.minimum(opacity.sum(1, keepdims=True), 1.0)
     return 1 - (1 - opacity).prod(1, keepdims=True)

@@ -76,10 +76,8 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
 
 
 def bulged(inverse_m2: np.ndarray, d: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert D and q = n_u^2 + n_v^2 (k, n) of equivalent disks to those of 3D Gaussians.
-
-    Both grow so that rho = q / D^2 is divided by 1 + rho / m^2. inverse_m2 (n,): 0 for disks.
-    """
+    """Convert D and q = n_u^2 + n_v^2 (k, n) of equivalent disks to those of 3D Gaussians: both grow so that
+    rho = q / D^2 is divided by 1 + rho / m^2. inverse_m2 (n,): 0 for disks."""
     if not inverse_m2.any():
         return d, q
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -88,11 +86,8 @@ def bulged(inverse_m2: np.ndarray, d: np.ndarray, q: np.ndarray) -> tuple[np.nda
 
 
 def cover(edges: np.ndarray, n_u: np.ndarray, n_v: np.ndarray, d: np.ndarray, shift) -> np.ndarray:
-    """Coverage of samples by boxes (k, n), 0 to 1, every edge moved outwards by `shift` (broadcast to (4, k,
-    n)).
-
-    `shift` is in samples, or one array for each of the edges.
-    """
+    """Coverage (k, n) of samples by boxes, 0 to 1, with each of the 4 edges moved outwards by `shift`
+    samples, broadcast to (4, k, n)."""
     shift = np.broadcast_to(shift, (4, *d.shape))
 
     def ramp(form: np.ndarray, edge: int) -> np.ndarray:
@@ -108,9 +103,7 @@ def optical_depth(alpha: np.ndarray) -> np.ndarray:
 
 
 def shifted(after: np.ndarray, last: bool = False) -> np.ndarray:
-    """Transmittance in front of each fragment (k, n), from that behind each.
-
-    last: append the final transmittance, (k, n + 1).
-    """
+    """Transmittance in front of each fragment (k, n) from that behind each. last: append the final one, (k, n
+    + 1)."""
     before = np.concatenate([np.ones((len(after), 1)), after], axis=1)
     return before if last else before[:, :-1]

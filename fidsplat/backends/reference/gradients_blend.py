@@ -1,7 +1,4 @@
-"""Samples as functions of placed splats, with the frame's decisions held constant; and their derivatives.
-
-gradients_shapes.py computes the weights and depths of splats along rays.
-"""
+"""Samples as functions of placed splats, with the frame's decisions held constant, and their derivatives."""
 
 from __future__ import annotations
 
@@ -178,7 +175,7 @@ class Blend:
 
     def _by_opacity(self, by: Samples) -> np.ndarray:
         """Derivatives (k, m) with respect to the fragments' opacities: the value of a fragment's own colour
-        minus that of the colour behind it; from back to front, without a division by the transmittance."""
+        minus that of the colour behind it, from back to front."""
         worth = by.rgb @ self._rgb.T + by.normal @ self._facing.T + by.depth[:, None] * self._z
         worth = worth + by.weight[:, None] + by.inverse[:, None] * self._inverse
         worth = worth + by.squares[:, None] * self._inverse**2

@@ -26,8 +26,7 @@ class Parameters:
     sh: np.ndarray | None
     background: np.ndarray
     pose: np.ndarray
-    """(6,): rotation vector [rad] and translation [m] of a motion applied after world_to_camera, in camera
-    axes"""
+    """(6,): rotation vector [rad] and translation [m] of a motion after world_to_camera, in camera axes"""
     intrinsics: np.ndarray
     """(4,): fx, fy, cx, cy [samples]"""
     thickness: np.ndarray | None = None
@@ -75,8 +74,7 @@ class Placed:
     log_opacity: np.ndarray
     rgb: np.ndarray
     intrinsics: np.ndarray
-    """(n, 4), of derivatives: the shares of the splats in those with respect to fx, fy, cx, cy; without
-    `center`"""
+    """(n, 4), of derivatives: those with respect to fx, fy, cx, cy by splat, except through `center`"""
 
     @classmethod
     def zeros(cls, n: int) -> Placed:
@@ -217,8 +215,8 @@ def _unclamped(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
 def _rgb_backward(
     parameters: Parameters, eye: np.ndarray, by_rgb: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives with respect to the SH coefficients or colours, and to the rays (n, 3) from eye to
-    centre."""
+    """Derivatives with respect to SH coefficients or colours, and to the rays (n, 3) from the eye to the
+    centres."""
     if parameters.sh is None:
         return by_rgb, np.zeros_like(by_rgb)
     directions, length = _directions(parameters.means - eye)
@@ -234,7 +232,7 @@ def _rgb_backward(
 
 def _basis_slope(degree: int, directions: np.ndarray, axis: int) -> np.ndarray:
     """Derivatives (n, k) of the SH basis with respect to a coordinate, by Richardson extrapolation of central
-    differences, which is exact for polynomials of degree 3."""
+    differences, which is exact for degree 3."""
 
     def difference(h: float) -> np.ndarray:
         step = np.zeros(3)

@@ -1,8 +1,7 @@
 """Weights and depths of splats along rays, with their derivatives: disks, and 3D Gaussians exact and by EWA.
 
-The formulas differ from those of the set-up, which devices have, so that each finds mistakes of the other:
-the intersection of a ray with a plane, the maximum of a Gaussian along a ray, the inverse of a projected
-covariance.
+The formulas differ from those of set-up and devices, so that each finds mistakes of the other: ray-plane
+intersection, maximum of a Gaussian along a ray, inverse of a projected covariance.
 """
 
 from __future__ import annotations
@@ -133,8 +132,8 @@ class _Solid:
 
 
 class _Ellipsoids(_Solid):
-    """The maximum along each ray. With y the centre and r the ray after whitening, it is where the distance
-    |y x r| / |r| is reached."""
+    """The maximum along each ray: with y the centre and r the ray after whitening, at the distance |y x r| /
+    |r|."""
 
     def __init__(self, placed: Placed, rays: np.ndarray, view: View) -> None:
         super().__init__(placed)
@@ -163,7 +162,7 @@ class _Ellipsoids(_Solid):
 
 
 class _Projected(_Solid):
-    """3D Gaussians by EWA: their covariance on the image by the Jacobian at the centre, plus 0.3 square
+    """3D Gaussians by EWA: their covariance in the image by the Jacobian at the centre, plus 0.3 square
     pixels."""
 
     def __init__(self, placed: Placed, view: View, antialiased: bool, x: np.ndarray, y: np.ndarray) -> None:

@@ -1,7 +1,7 @@
 """Camera models of the reference: rays of samples, and the linear forms of splats in the rays' coordinates.
 
 A sample has three coordinates, in which the numerators n_u, n_v and the denominator D of a splat are linear:
-1, x, y for a pinhole or parallel rays, and X, Y, Z of the sample's float32 ray behind a lens.
+1, x, y for a pinhole or parallel rays, X, Y, Z of the sample's float32 ray behind a lens.
 """
 
 from __future__ import annotations
@@ -65,11 +65,10 @@ def ray_lengths(x: np.ndarray, y: np.ndarray, view: View) -> np.ndarray:
 
 
 def forms_of(view: View, a: np.ndarray, b: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Linear forms of splats with scaled tangents a, b and centres p (n, 3), camera frame.
+    """Linear forms of splats with scaled tangents a, b and centres p (n, 3) in the camera frame.
 
-    Returns:
-        (3, n, 3) coefficients of the coordinates in n_u, n_v and D; (3, n) coefficients in D times the depth,
-        for parallel rays; and, for other rays, D times the depth divided by the volume of a, b, p.
+    Returns (3, n, 3) coefficients of the coordinates in n_u, n_v and D; (3, n) coefficients in D times the
+    depth, for parallel rays; and, for other rays, D times the depth divided by the volume of a, b, p.
     """
     if view.raster is not None:
         forms = np.stack([np.cross(b, p), np.cross(p, a), np.cross(a, b)], axis=2)
@@ -109,8 +108,7 @@ def derivatives_of(view: View, p: np.ndarray) -> np.ndarray:
 
 
 def along_of(view: View, p: np.ndarray) -> np.ndarray:
-    """Derivative (n, 3) of log(depth) with respect to the coordinates of points p (n, 3), for the view's
-    definition of depth; 0 for parallel rays."""
+    """Derivative (n, 3) of log(depth) with respect to points p (n, 3); 0 for parallel rays."""
     if view.parallel:
         return np.zeros_like(p)
     if view.along_ray:
@@ -121,10 +119,9 @@ def along_of(view: View, p: np.ndarray) -> np.ndarray:
 def edges_of(view: View, forms: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Inverse gradients of the edge functions of boxes with linear `forms` (3, n, 3), at samples (k,).
 
-    Returns:
-        1 / |gradient| of D + n_u, D - n_u, D + n_v, D - n_v with respect to the sample position, (4, n), or
-        (4, k, n) behind a lens; and the sum of the absolute terms relative to the gradient, for its rounding
-        error (0 where devices compute it in the set-up).
+    Returns 1 / |gradient| of D + n_u, D - n_u, D + n_v, D - n_v with respect to the sample position, (4, n),
+    or (4, k, n) behind a lens; and the sum of absolute terms relative to the gradient, for its rounding
+    error.
     """
     sides = [(axis, sign) for axis in (0, 1) for sign in (1, -1)]
     if view.raster is None:

@@ -15,7 +15,7 @@ _ROUND = 2e-6
 
 def background_at(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Background colours (k, 3) at samples with grid positions x, y (k,), 0 without a ray, and their error
-    bounds (k,) in float32."""
+    bounds (k,)."""
     around = view.surroundings
     assert around is not None
     rays, valid = rays_of(view, x, y)
@@ -65,8 +65,7 @@ def apply_sensor(
     light: np.ndarray, bound: np.ndarray, steps: tuple[str, ...], view: View, x: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Values (k, 3) after the sensor's steps for light (k, 3) at pixels (column x, row y), and their error
-    bounds (k,) for light with the error bound `bound` (k,): each step is evaluated at both ends.
-    """
+    bounds (k,): each step is evaluated at both ends of the interval light +- bound."""
     low, high = light - bound[:, None], light + bound[:, None]
     for step in steps:
         slack = _ROUND * np.maximum(np.abs(low), np.abs(high))

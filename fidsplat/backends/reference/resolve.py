@@ -15,12 +15,12 @@ _ROUND = 1e-6  # relative rounding error of a sum of weights
 
 
 def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) -> dict[str, np.ndarray]:
-    """Images of pixels (k, ...) from their samples (k, n * n, ...), and their certificates.
+    """Images of pixels (k, ...) from their sample buffers (k, n * n, ...), which include grid positions `x`,
+    `y`.
 
-    The certificates are upper bounds of the error in float32: `certificate` of alpha, and of rgb per unit of
-    colour; `certificate_depth` and `certificate_distance` in metres; `certificate_normal` of unit vectors;
-    `depth_median_may_flip`, `label_may_flip` and so on (bool); `blended_bound` in splats. samples: sample
-    buffers, with grid positions `x`, `y`.
+    Also their certificates, upper bounds of the error in float32: `certificate` of alpha, and of rgb per unit
+    of colour; `certificate_depth`, `certificate_distance` [m]; `certificate_normal` of unit vectors;
+    `label_may_flip` and so on (bool); `blended_bound` in splats.
     """
     t, bound = samples["t"].mean(1), samples["certificate"]
     center_x, center_y = samples["x"].mean(1), samples["y"].mean(1)

@@ -145,11 +145,10 @@ class Setup:
 DEPTH_SHARE = 1 / 8
 """standard deviation along the ray of the low-pass `pixel`, per metre of depth"""
 _RANGE_RADIUS = math.sqrt(2 * math.log(255))
-"""radius in standard deviations of the part of a splat whose depth range limits the depths of its
-fragments"""
+"""radius in standard deviations of the part of a splat that limits the depths of its fragments"""
 _PLANE_RADIUS = 64.0
-"""the same for splats of a coplanar group (boxes: in half sides); larger than any cut-off and low-pass, so
-that culling a splat does not move the layer"""
+"""the same for splats of a coplanar group, larger than any cut-off, so that culling a splat does not move the
+layer"""
 _OF_SPLATS = (
     *("order", "log_opacity", "half_r2", "z_low", "z_high", "labels", "pz", "z_numerator", "inverse_m2"),
     *(
@@ -179,10 +178,8 @@ def _shapes(
     view: View,
     features: FeatureSet,
 ) -> ellipsoids.Axes:
-    """Equivalent disks of the splats: a disk with the same image for each 3D Gaussian.
-
-    unit_a, unit_b, p (n, 3) in the camera frame, scale (n, 2).
-    """
+    """Equivalent disks of the splats: a disk with the same image for each 3D Gaussian. unit_a, unit_b, p (n,
+    3) in the camera frame, scale (n, 2)."""
     found = ellipsoids.disks(unit_a, unit_b, scale)
     if cloud.thickness is None:
         return found
@@ -204,8 +201,8 @@ def _shapes(
 def _posed(
     view: View, tangent_u: np.ndarray, tangent_v: np.ndarray, mean: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Unit tangents and centres in the camera frame, and centres relative to the eye in the cloud's axes,
-    (n, 3) each."""
+    """Unit tangents and centres in the camera frame, and centres relative to the eye in the cloud's axes, (n,
+    3)."""
     rotation = view.rotation.T
     return tangent_u @ rotation, tangent_v @ rotation, mean @ rotation + view.translation, mean - view.eye
 
@@ -213,13 +210,13 @@ def _posed(
 def _filtered(
     a: np.ndarray, b: np.ndarray, p: np.ndarray, view: View, chosen: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Scaled tangents (n, 3) after the low-pass `pixel`, and the factor (n,) by which areas grow.
+    """Scaled tangents (n, 3) after the low-pass `pixel`, and the factor (n,) by which areas grow; unchanged
+    if not `chosen` (n,) or if the centre has no image.
 
-    chosen (n,) bool: other splats, and splats whose centre has no image, are unchanged. The filter of a
-    sample is a Gaussian about its ray, with a standard deviation of half a sample across the ray and of
-    `DEPTH_SHARE` of the depth along it (infinite for parallel rays, whose projection is linear). Its
-    covariance in (u, v) is (G^T G)^-1, with G the derivative of these two coordinates, in units of their
-    standard deviations, with respect to (u, v) at the centre.
+    The filter of a sample is a Gaussian about its ray, with a standard deviation of half a sample across the
+    ray and of `DEPTH_SHARE` of the depth along it (infinite for parallel rays). Its covariance in (u, v) is
+    (G^T G)^-1, with G the derivative of these coordinates, in standard deviations, with respect to (u, v) at
+    the centre.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         across, along = optics.derivatives_of(view, p) / 0.5, optics.along_of(view, p) / DEPTH_SHARE

@@ -94,9 +94,8 @@ class Launcher:
         self._cache.launch(kernel, count, _arguments(kernel, given), block)
 
     def launch_tiles(self, kernel: Any, first: int, end: int, area: int, given: Mapping[str, Any]) -> None:
-        """Launch a CPU thread per tile; the kernel's first parameter is the first tile of a piece, its last
-        the offset of the piece's `area` samples of state.
-        """
+        """Launch a CPU thread per tile. The kernel's first parameter is the first tile of a piece, its last
+        the offset of the piece's `area` samples of state."""
         pieces = min(self.pieces, -(-(end - first) // _MIN_TILES))
         cuts = [first + (end - first) * k // pieces for k in range(pieces + 1)]
         args = _arguments(kernel, {**given, "state_first": 0}, 1)[:-1]
@@ -152,9 +151,8 @@ class Launcher:
 
 
 def capture(workspace: Workspace, launch: Callable[[], object]) -> Any:
-    """Capture the launches that `launch` submits as a CUDA graph, without running them; on the CPU (in tests)
-    as a list of Warp. Returns None after a warning if the device cannot capture; later frames are then not
-    captured either."""
+    """Capture the launches of `launch` as a CUDA graph, without running them. Returns None after a warning if
+    the device cannot capture; later frames are then not captured either."""
     wp, device = load(), workspace.device
     try:
         # a separate stream, as the caller's current stream may not support capture

@@ -35,12 +35,7 @@ def devices() -> list[DeviceInfo]:
 
 def open_device(selector: str = "") -> WarpBackend:
     """Open a Warp device: `cpu`, `cuda` (the first), `cuda:1`, or part of a device's name; without a selector
-    a CUDA device if there is one, else the CPU.
-
-    Raises:
-        DeviceError: Warp is missing or cannot be started, or there is no CUDA device.
-        UnknownDeviceError: no device matches the selector.
-    """
+    a CUDA device if there is one, else the CPU."""
     found = runtime.load().get_devices()
     requested = selector.strip().lower()
     matching = [
@@ -72,11 +67,7 @@ class WarpBackend(Workspace, Backend):
         self._gradients: dict[tuple[FeatureSet, WarpShape], WarpGradients] = {}
 
     def limit_memory(self, budget: int) -> None:
-        """Limit the device memory of a frame and its cloud to `budget` bytes.
-
-        A frame with longer lists is rendered in bands of tiles, bit-identically; a cloud that does not fit is
-        an error.
-        """
+        """A frame with longer lists is rendered in bands of tiles; a cloud that does not fit is an error."""
         self.memory_budget = budget
 
     def upload(self, cloud: SplatCloud) -> Resident:

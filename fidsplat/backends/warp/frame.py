@@ -1,13 +1,10 @@
 """The stages of a frame with one or many views: project, sort, bin, blend, resolve.
 
 Splats, tiles and samples of all views are numbered consecutively, view after view. Between the stages the
-host reads the number of visible splats and the number of pairs of a splat and a tile: they are the sizes of
-arrays and launches. A frame with more pairs than the memory budget allows is rendered in bands of tiles,
-bit-identically.
-
-A frame of a kind that was rendered before does not wait for these numbers: its lists have the `Capacity` of
-earlier frames, and `totals` on the device holds the true numbers. If they exceed the capacity, the lists are
-empty, and pipeline.py renders the frame again.
+host reads the numbers of visible splats and of (splat, tile) pairs, which are sizes of arrays and launches. A
+frame with more pairs than the memory budget allows is rendered in bands of tiles. A frame like an earlier one
+does not wait for these numbers: its lists have the `Capacity` of earlier frames, and are empty if `totals` on
+the device exceeds it; pipeline.py then renders the frame again.
 """
 
 from __future__ import annotations
@@ -72,12 +69,8 @@ class DeviceFrame:
         capacity: Capacity | None = None,
         inputs: ArrayPool | None = None,
     ) -> None:
-        """
-        Args:
-            reserved: device memory in bytes of the frame or batch to which this one belongs.
-            capacity: capacity of the lists; by default the host waits for their sizes.
-            inputs: pool of the arrays that the host fills for the views; by default that of the workspace.
-        """
+        """reserved: bytes of the frame or batch of which this one is a part. capacity: capacity of the lists;
+        None: the host waits for their sizes. inputs: pool of the arrays that the host fills for the views."""
         self.program, self.planner, self.workspace = program, planner, planner.workspace
         self.pool = self.workspace.pool
         self.resident, self.launcher = resident, launcher

@@ -27,8 +27,7 @@ class Rendered:
     counts: dict[str, int]
     """number of splats, visible splats and pairs; final after `settle`"""
     complete: Callable[[], Rendered | None] | None = None
-    """for a frame with unknown counts: waits for it, renders it again into the same arrays if it exceeded its
-    capacity, and returns it"""
+    """for a frame with unknown counts: waits for it, and renders it again if it exceeded its capacity"""
     profile: Callable[[], Mapping[str, float]] | None = None
     """for a replayed frame: renders it again to measure its stages"""
 
@@ -59,11 +58,7 @@ class WarpImages(Images):
         views: int = 1,
         splats: int = 0,
     ) -> None:
-        """New arrays. size: rows and columns of pixels. splats: in the cloud.
-
-        Raises:
-            DeviceError: they exceed the memory budget, or the memory of the device.
-        """
+        """Allocate images of (rows, columns) pixels. Raises DeviceError if they exceed the memory budget."""
         self._outputs, self._size, self.views, self._splats = outputs, size, views, splats
         self.nbytes, pixels = 0, views * size[0] * size[1]
         self.arrays: dict[str, Any] = {}

@@ -50,11 +50,8 @@ class MemoryPlanner:
         return rows * columns * self._tile_width * self._tile_height
 
     def max_pairs(self, resident: Resident, stack: ViewBatch, visible: int, reserved: int) -> int:
-        """Maximum number of pairs that may be listed at once. reserved: bytes of other arrays.
-
-        Raises:
-            DeviceError: the rest of the frame exceeds the memory budget.
-        """
+        """Maximum number of (splat, tile) pairs in the lists at once. reserved: bytes of other arrays. Raises
+        DeviceError if the rest of the frame exceeds the memory budget."""
         workspace = self.workspace
         fixed = resident.memory_bytes + self._splat_bytes * len(stack) * resident.count + _VISIBLE * visible
         fixed += len(stack) * self.sample_bytes(stack.view) + reserved + memory_bytes(stack.view, workspace)

@@ -1,10 +1,9 @@
 """The stages compiled for one FeatureSet on one Warp device, and the replay of frames.
 
-A frame of a kind that was rendered before is rendered without waiting for its counts: its lists have the
-largest capacity that earlier frames of the same cloud, size and number of views needed, plus an eighth. A
-frame that exceeds this capacity is rendered again when it is read. From the third frame of a kind on, all
-stages except resolve are one captured CUDA graph. The arguments of its launches are constant: values that
-differ between views are in input arrays, which the host fills before the replay.
+The second frame of a cloud, image size and number of views does not wait for its counts: its lists have the
+largest capacity that earlier frames needed, plus an eighth, and it is rendered again when read if that was
+exceeded. From the third frame on, all stages except resolve are one captured CUDA graph with constant
+arguments; values that differ between views are in input arrays.
 """
 
 from __future__ import annotations
@@ -97,12 +96,8 @@ class WarpPipeline(Pipeline):
             return images
 
     def render_counted(self, resident: Resident, view: View) -> tuple[DeviceFrame, WarpImages]:
-        """Render one view and wait for its counts. Returns the frame, whose arrays are valid until the next
-        frame, and the images.
-
-        Raises:
-            DeviceError: the device runs out of memory or fails.
-        """
+        """Render one view and wait for its counts; returns the frame, whose arrays are valid until the next
+        frame, and the images."""
         with self.workspace.working("while rendering"):
             images, into = self._new_images(resident, view)
             frame, rendered = self._render_counted(resident, ViewBatch.single(view), into)
@@ -115,12 +110,9 @@ class WarpPipeline(Pipeline):
         return images, ImageArrays(images.arrays, self.workspace.first_index, images.nbytes)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
-        """Render one view and return the data between the stages.
-
-        keys (n,) uint32; order (visible,), splat indices by depth; starts (tiles + 1,); lists (pairs,), of
-        the last band; records (n, words) float32 (undefined for culled splats); raw (4, rows, columns)
-        float32: r, g, b, transmittance of the padded sample grid; and the finished outputs by name.
-        """
+        """See `Pipeline.trace`. keys (n,) uint32; order (visible,), splat indices by depth; starts (tiles +
+        1,); lists (pairs,), of the last band; records (n, words) float32; raw (4, rows, columns) float32: r,
+        g, b, transmittance; output images by name."""
         frame, images = self.render_counted(resident, view)
         named, stats, n = frame.named, images.stats, resident.count
         rows, stride = frame.grid

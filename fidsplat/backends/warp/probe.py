@@ -84,11 +84,7 @@ def poison(array: Any) -> Any:
 def run(
     workspace: Workspace, kernel: str, count: int, inputs: Sequence[np.ndarray], outputs: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
-    """Launch `count` threads of a kernel of kernels/warp/check.py on arrays, and return the output arrays.
-
-    Raises:
-        DeviceError: the compiler refuses, or the device fails.
-    """
+    """Launch `count` threads of a kernel of kernels/warp/check.py on arrays, and return the output arrays."""
     wp, device = load(), workspace.device
     arrays = [wp.array(array, device=device) for array in (*inputs, *outputs)]
     try:

@@ -109,11 +109,7 @@ class Program:
     """Compiled kernels of all stages, and their struct types."""
 
     def __init__(self, device: Any, name: str, features: FeatureSet, shape: WarpShape) -> None:
-        """name: name of the device, for errors.
-
-        Raises:
-            DeviceError: an effect is not supported, or the compiler fails.
-        """
+        """name: of the device, for errors. Raises DeviceError for an effect that is not supported."""
         if why := unsupported(features, name):
             raise DeviceError(why)
         self.device, self.shape, self.features, self._name = device, shape, features, name
@@ -185,11 +181,7 @@ class Program:
         self.sensor = SensorKernel(needs.steps) if needs.steps else None
 
     def compile(self, kernel: Any, block: int = BLOCK) -> None:
-        """Compile a kernel for the device. block: its threads on a GPU.
-
-        Raises:
-            DeviceError: the kernels cannot be compiled.
-        """
+        """Compile a kernel for the device. block: its threads on a GPU."""
         # compiled here, not at the first launch, as several threads may launch it
         try:
             loaded = kernel.module.load(self.device, block if self.device.is_cuda else 1)
@@ -209,10 +201,6 @@ class GradientKernels:
     """The kernels of the backward pass, compiled on first use."""
 
     def __init__(self, program: Program) -> None:
-        """
-        Raises:
-            DeviceError: the kernels cannot be compiled.
-        """
         features, needs, shape = program.features, program.needs, program.shape
         rendered = {"rgb", *features.outputs}
         self.losses = tuple(name for name in GRADIENT_OUTPUTS if name in rendered)

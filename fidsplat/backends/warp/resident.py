@@ -57,11 +57,8 @@ class Resident(ResidentData):
 
     @classmethod
     def around(cls, given: Mapping[str, Any], origin: np.ndarray, pool: ArrayPool) -> Resident:
-        """Adopt arrays of the device or of NumPy, without a copy where possible.
-
-        Raises:
-            InputError: an array has the wrong shape or type, or is on another device.
-        """
+        """Use arrays of the device or of NumPy, without a copy where possible. Raises InputError for a wrong
+        shape, type or device."""
         arrays, ellipsoids = {name: _adopted(name, value, pool) for name, value in given.items()}, "none"
         count = arrays["means"].size
         if count and arrays["scales"].dtype is load().vec3:

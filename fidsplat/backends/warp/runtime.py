@@ -29,11 +29,7 @@ def installed() -> bool:
 
 @cache
 def load() -> ModuleType:
-    """The module `warp`, initialised.
-
-    Raises:
-        DeviceError: it is not installed, or cannot be started.
-    """
+    """The module `warp`, initialised. Raises DeviceError if it is not installed or cannot be started."""
     if not installed():
         raise DeviceError(MISSING)
     try:

@@ -1,7 +1,4 @@
-"""Conversion of views to the structs of kernels/warp: uniforms, rays, lens, moving groups, background.
-
-Device arrays of lenses and panoramas are cached as long as their host objects exist.
-"""
+"""Conversion of views to the structs of kernels/warp: uniforms, rays, lens, moving groups, background."""
 
 from __future__ import annotations
 
@@ -28,8 +25,8 @@ def _record() -> Any:
 
 
 def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> np.ndarray:
-    """Make the structs `View` (views,). splats: number of splats of the cloud. sloped: whether kernels read
-    the derivatives of rays."""
+    """The structs `View` (views,). splats: number of splats. sloped: whether kernels read the derivatives of
+    rays."""
     view = stack.view
     derived = {
         **{"tile_w": shape.tile_width, "tile_h": shape.tile_height, "splats": splats},
@@ -61,16 +58,10 @@ def rays_of(
     sloped: bool = False,
     opaque: bool = False,
 ) -> Any:
-    """Make the struct `Rays` of a view.
+    """The struct `Rays` of a view.
 
-    Args:
-        inputs: pool for the external depth image.
-        bent: include the rays, if the view has a lens.
-        sloped: include the derivatives of the rays.
-        opaque: include the external depth image.
-
-    Raises:
-        DeviceError: the device has too little memory.
+    inputs: pool for the external depth image. bent: include the rays of a lens. sloped: include their
+    derivatives. opaque: include the external depth image.
     """
     wp, raster = load(), view.raster if bent else None
     kind = kernels("rays").struct_of_rays(raster is not None, raster is not None and sloped, opaque)
@@ -102,11 +93,7 @@ def array_of(stack: ViewBatch, name: str) -> np.ndarray:
 
 
 def lens_of(view: View, workspace: Workspace) -> Any:
-    """Make the struct `Lens` of a view; empty if the view has no lens.
-
-    Raises:
-        DeviceError: the device has too little memory.
-    """
+    """The struct `Lens` of a view; empty without a lens."""
     wp, declared, raster = load(), kernels("lens"), view.raster
     if raster is None:
         return _empty(declared.make_lens(None))
@@ -123,7 +110,7 @@ def lens_of(view: View, workspace: Workspace) -> Any:
 
 
 def moving_of(resident: Resident, stack: ViewBatch, inputs: ArrayPool) -> Any:
-    """Make the struct `Moving` of a frame; empty if nothing moves. inputs: pool for its arrays."""
+    """The struct `Moving` of a frame; empty if nothing moves. inputs: pool for its arrays."""
     declared, groups = kernels("motion"), stack.view.groups
     kind = declared.make_motion(bool(groups)).Moving
     if not groups:
@@ -146,11 +133,7 @@ def _empty(kind: Any) -> Any:
 
 
 def surroundings_of(view: View, workspace: Workspace) -> Any:
-    """Make the struct `Surroundings` of a gradient or panorama.
-
-    Raises:
-        DeviceError: the device has too little memory for the panorama.
-    """
+    """The struct `Surroundings` of a gradient or panorama."""
     wp, behind = load(), view.surroundings
     kind = "gradient" if isinstance(behind, Gradient) else "panorama"
     filled = kernels("background").struct_of_surroundings(kind)()

@@ -92,11 +92,7 @@ class ArrayPool:
         self._spare[name].append(array)
 
     def fresh(self, name: str, size: int, dtype: Any) -> Any:
-        """A new array outside the pool.
-
-        Raises:
-            DeviceError: the device has too little memory.
-        """
+        """A new array outside the pool. Raises DeviceError if the device has too little memory."""
         wp = load()
         try:
             return wp.empty(max(size, 1), dtype=dtype, device=self.device)
@@ -141,22 +137,14 @@ class Workspace:
 
     @contextmanager
     def working(self, doing: str) -> Iterator[None]:
-        """A context with exclusive use of the device; needed for reading images too, as that may render
-        again.
-
-        Raises:
-            DeviceError: the device fails.
-        """
+        """A context with exclusive use of the device, also for reading images, as that may render again."""
         with self._lock, self.failing(doing), load().ScopedDevice(self.device):
             yield
 
     @contextmanager
     def failing(self, doing: str) -> Iterator[None]:
-        """A context that raises failures of the device as DeviceError. doing: for the message.
-
-        Raises:
-            DeviceError: the device fails.
-        """
+        """A context that raises failures of the device as DeviceError. doing: the activity, for the
+        message."""
         try:
             yield
         except RuntimeError as error:
