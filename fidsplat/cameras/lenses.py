@@ -29,11 +29,8 @@ _NOTHING = 1e-200  # smaller leading coefficients are dropped: roots would overf
 @dataclass(frozen=True)
 class BrownConrady:
     """OpenCV's distortion of a perspective image (`cv2.projectPoints`): radial (k1 to k6), tangential (p1,
-    p2), thin prism (s1 to s4). All 0 is a pinhole.
-
-    Directions beyond the first fold of the radial part are outside the field of view. Raises InputError for a
-    coefficient that is not finite.
-    """
+    p2), thin prism (s1 to s4). All 0 is a pinhole. Directions beyond the first fold of the radial part are
+    outside the field of view. Raises InputError for a coefficient that is not finite."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -58,11 +55,7 @@ class BrownConrady:
     @classmethod
     def opencv(cls, coefficients) -> BrownConrady:
         """From OpenCV's distCoeffs: 4, 5, 8, 12 or 14 numbers (k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty).
-
-        Raises:
-            InputError: another count, or a tilted sensor: tx and ty must be 0, as calibrateCamera returns
-                them with CALIB_RATIONAL_MODEL.
-        """
+        Raises InputError for another count or a tilted sensor (tx or ty not 0)."""
         order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
         values = real_array("distortion", coefficients).ravel().tolist()
         if len(values) not in (4, 5, 8, 12, 14):
@@ -170,12 +163,10 @@ class BrownConrady:
 
 @dataclass(frozen=True)
 class Fisheye:
-    """Kannala-Brandt fisheye (`cv2.fisheye`): a ray at the angle t from the axis has the distance
-    t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the middle of the image. All 0 is the equidistant lens.
-
-    The field of view reaches 100 degrees from the axis, or less where that polynomial folds back. Raises
-    InputError for a coefficient that is not finite.
-    """
+    """Kannala-Brandt fisheye (`cv2.fisheye`): a ray at the angle t from the axis has the distance t (1 + k1
+    t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the image centre. All 0 is the equidistant lens. The field of view
+    reaches 100 degrees from the axis, or less where that polynomial folds back. Raises InputError for a
+    coefficient that is not finite."""
 
     k1: float = 0.0
     k2: float = 0.0

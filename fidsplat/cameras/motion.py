@@ -25,11 +25,8 @@ Pose: TypeAlias = Callable[[float], np.ndarray]
 
 @dataclass(frozen=True)
 class Shutter:
-    """Exposure times of the rows of an image. All 0 is the instant global shutter.
-
-    The middle of the middle row's exposure time is `time`. Row i of h is exposed
-    `readout` * ((i + 1/2) / h - 1/2) seconds later. Raises InputError for a value out of range.
-    """
+    """Exposure times of the rows of an image. All 0 is the instant global shutter. The middle of the middle
+    row's exposure is `time`; row i of h is exposed `readout` * ((i + 1/2) / h - 1/2) seconds later."""
 
     time: float = 0.0
     """seconds, on the clock of the poses"""

@@ -286,14 +286,9 @@ class Camera(PickledByFields, Summarised):
         return self._posed(pose, position)
 
     def with_size(self, width: int, height: int) -> "Camera":
-        """The same camera with another number of pixels.
-
-        The horizontal field of view and the shape of pixels stay; rows are added or cut off around the
-        principal point. A panorama is scaled in both directions.
-
-        Raises:
-            InputError: a size out of range.
-        """
+        """The same camera with another number of pixels. The horizontal field of view and the shape of pixels
+        stay; rows are added or cut off around the principal point. A panorama is scaled in both
+        directions."""
         width, height = _size("width", width), _size("height", height)
         x = width / self.width
         y = height / self.height if isinstance(self.lens, Equirectangular) else x
@@ -303,11 +298,7 @@ class Camera(PickledByFields, Summarised):
         )
 
     def resampled(self, width: int, height: int) -> "Camera":
-        """The camera of the same image resampled to another number of pixels, in both directions.
-
-        Raises:
-            InputError: a size out of range.
-        """
+        """The camera of the same image resampled to another number of pixels, in both directions."""
         width, height = _size("width", width), _size("height", height)
         x, y = width / self.width, height / self.height
         intrinsics = {"fx": self.fx * x, "fy": self.fy * y, "cx": self.cx * x, "cy": self.cy * y}
@@ -333,8 +324,8 @@ class Camera(PickledByFields, Summarised):
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, points) -> np.ndarray:
-        """Pixel coordinates (n, 2) float64 of world points (n, 3), NaN outside the field of view: for a depth
-        that is not above 0, or beyond the limit of the lens."""
+        """Pixel coordinates (n, 2) float64 of world points (n, 3), NaN for depths of 0 and below and outside
+        the lens."""
         world = real_array("points", points)
         if world.ndim != 2 or world.shape[1] != 3:
             raise InputError(f"points must have the shape (n, 3), got {world.shape}")
@@ -352,12 +343,8 @@ class Camera(PickledByFields, Summarised):
         return np.stack([x, y], -1)
 
     def rays(self, pixels) -> np.ndarray:
-        """Directions (n, 3) float64 in the camera frame of pixel coordinates (n, 2), NaN outside
-        the field of view.
-
-        Scaled to Z = 1, or to unit length for a fisheye or panorama. Raises InputError for an orthographic
-        camera, whose rays are parallel.
-        """
+        """Directions (n, 3) float64 in the camera frame of pixel coordinates (n, 2), NaN outside the field of
+        view; with Z = 1, or of unit length for a fisheye or panorama. Raises InputError for parallel rays."""
         image = real_array("pixels", pixels)
         if image.ndim != 2 or image.shape[1] != 2:
             raise InputError(f"pixels must have the shape (n, 2), got {image.shape}")
@@ -371,8 +358,8 @@ class Camera(PickledByFields, Summarised):
         return self.lens.rays(image)
 
     def unproject(self, pixels, depths) -> np.ndarray:
-        """World points (n, 3) float64 at depths (n,) in metres of pixel coordinates (n, 2), NaN outside the
-        field of view. The inverse of `project`, for depths as in the output `depth`."""
+        """World points (n, 3) float64 of pixel coordinates (n, 2) at depths (n,) in metres, as in the output
+        `depth`; NaN outside the field of view."""
         depths = real_array("depths", depths)
         if depths.ndim != 1:
             raise InputError(f"depths must have the shape (n,), got {depths.shape}")
@@ -385,10 +372,8 @@ class Camera(PickledByFields, Summarised):
 
 
 def fisheye_focal_length(width: int, fov_x: float, lens: Fisheye) -> float:
-    """Focal length of a fisheye in pixels, from its width in pixels and horizontal field of view in radians.
-
-    Raises InputError when fov_x is not above 0 (1e-9), or beyond the field of view of the lens.
-    """
+    """Focal length of a fisheye in pixels, from its width in pixels and horizontal field of view in
+    radians."""
     angle = _number("fov_x", fov_x)
     if not 1e-9 < angle <= 2 * lens.limit + 1e-12:
         raise InputError(
@@ -399,10 +384,8 @@ def fisheye_focal_length(width: int, fov_x: float, lens: Fisheye) -> float:
 
 
 def focal_length(width: int, fov_x: float) -> float:
-    """Focal length of a pinhole in pixels, from its width in pixels and horizontal field of view in radians.
-
-    Raises InputError when fov_x is not between 0 (above 1e-9) and pi.
-    """
+    """Focal length of a pinhole in pixels, from its width in pixels and horizontal field of view in
+    radians."""
     width, angle = _size("width", width), _number("fov_x", fov_x)
     if not 1e-9 < angle < math.pi:
         remedy = f"math.radians({angle:g}) converts degrees" if 10 <= angle < 180 else ""
@@ -411,11 +394,8 @@ def focal_length(width: int, fov_x: float) -> float:
 
 
 def look_at_matrix(position, target, up=(0.0, -1.0, 0.0)) -> np.ndarray:
-    """world_to_camera (4, 4) float64 of a camera at ``position`` whose axis passes through ``target``.
-
-    Raises InputError when a vector is not three finite numbers, the points coincide, or up is parallel to the
-    axis.
-    """
+    """world_to_camera (4, 4) float64 of a camera at ``position`` whose axis passes through ``target``. Raises
+    InputError if the points coincide, or up is parallel to the axis."""
     eye, aim, upward = (_vector(n, v) for n, v in (("position", position), ("look_at", target), ("up", up)))
     forward = aim - eye
     distance = np.linalg.norm(forward)

@@ -94,13 +94,9 @@ class RayRaster:
 
     @cached_property
     def map(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of the samples whose rays are in each cell of the chart.
-
-        Returns:
-            boxes (cells^2 + (cells / 2)^2 + ... + 1, 4) int16: first and last column, first and last row of
-            the samples in a cell (last < first: none), for grids of cells, cells / 2, ..., 1 cells a side,
-            row by row; and (low_x, low_y, cells per unit along x, along y, cells).
-        """
+        """Bounds of the samples whose rays are in each cell of the chart: boxes (cells^2 + (cells / 2)^2 +
+        ... + 1, 4) int16, first and last column, first and last row (last < first: none), for grids of cells,
+        cells / 2, ..., 1 cells a side; and (low_x, low_y, cells per unit along x, along y, cells)."""
         if self.whole is not None:
             return self.whole.map
         rows, columns = np.nonzero(np.isfinite(self.rays[..., 0]))

@@ -23,13 +23,11 @@ MAX_SAMPLES = 10_000_000
 
 @dataclass(frozen=True, eq=False)
 class Trajectory(PickledByFields):
-    """Pose as a function of time, by interpolation of keyframes: screw motions (geodesics of SE(3)), constant
-    before the first and after the last. Call it with a time in seconds.
+    """Pose as a function of time in seconds, by interpolation of keyframes along screw motions (geodesics of
+    SE(3)); constant before the first and after the last.
 
-    Trajectory files hold camera-to-world poses; `Motion.camera` is world to camera, the `inverse()`.
-
-    Raises InputError for times that do not increase, poses that are not rigid and quaternions whose length is
-    not 1 (within 1e-3).
+    Trajectory files hold camera-to-world poses; `Motion.camera` is world to camera, the `inverse()`. Raises
+    InputError for times that do not increase, and for poses that are not rigid.
     """
 
     times: Sequence[float] | np.ndarray
@@ -118,11 +116,7 @@ class Trajectory(PickledByFields):
         return Trajectory(self.times, poses, self.smooth)
 
     def sampled(self, rate: float) -> Trajectory:
-        """Poses at a rate per second, from the first keyframe to the last.
-
-        Raises:
-            InputError: the rate is not above 0 or gives more than 10 million poses.
-        """
+        """Poses at a rate per second, from the first keyframe to the last; at most 10 million."""
         check_rate(rate)
         first, last = float(self.times[0]), float(self.times[-1])
         steps = (last - first) * float(rate)

@@ -92,11 +92,8 @@ class Capture(PickledByFields):
         return replace(self, motion=self.motion.sampled(times))
 
     def with_(self, **changes: Any) -> Capture:
-        """A copy with some parts changed; None keeps a part.
-
-        Raises:
-            InputError: an unknown part, or a value of the wrong kind.
-        """
+        """A copy with some parts changed; None keeps a part. Raises InputError for an unknown part or a wrong
+        type."""
         given = {}
         for name, value in changes.items():
             if name not in self.__dataclass_fields__:
@@ -119,8 +116,7 @@ class CaptureParts(TypedDict, total=False):
 
 
 def output_names(outputs: Any) -> tuple[str, ...]:
-    """Distinct names of outputs from one name or several. Raises InputError for anything else, and if
-    empty."""
+    """Distinct names of outputs from one name or several. Raises InputError for anything else, or none."""
     try:
         names: tuple[Any, ...] = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     except TypeError:  # a 0-dimensional array is an Iterable too

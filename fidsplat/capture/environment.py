@@ -17,12 +17,8 @@ MAX_PANORAMA = 16384
 
 @dataclass(frozen=True)
 class Fog:
-    """Homogeneous fog: a surface at distance r keeps the share exp(-density r) of its colour;
-    the other share is the fog's colour.
-
-    The fog also replaces the background. Raises InputError for a negative density or a colour that is not
-    three finite numbers.
-    """
+    """Homogeneous fog: a surface at distance r keeps the share exp(-density r) of its colour; the rest is the
+    fog's colour, which also replaces the background."""
 
     density: float
     """1 / metres"""
@@ -173,11 +169,9 @@ class ExternalDepth(PickledByFields):
 
 @dataclass(frozen=True, eq=False)
 class DeviceExternalDepth(ExternalDepth):
-    """External depth images of a batch in the memory of a Warp renderer's device, which are not checked.
-
-    rgb: (views, h, w) wp.vec3. depth: (views, h, w) wp.float32, infinite where there is no surface. label:
-    (views, h, w) wp.int32. The arrays must not change until the images are read.
-    """
+    """External depth images of a batch in the memory of a Warp renderer's device, not checked: wp.arrays
+    (views, h, w) of vec3, float32 (infinite: no surface) and int32. They must not change until the images are
+    read."""
 
     def __post_init__(self) -> None:
         pass
@@ -190,9 +184,7 @@ Background = tuple[float, float, float] | Gradient | Panorama
 
 
 def background_of(value: Any) -> Background:
-    """Validated background; a gradient between equal colours becomes that colour.
-
-    Raises InputError for anything but three numbers, a Gradient or a Panorama."""
+    """Validated background; a gradient between equal colours becomes that colour."""
     if isinstance(value, Gradient) and value.top == value.bottom:
         return value.top
     if isinstance(value, (Gradient, Panorama)):

@@ -24,10 +24,7 @@ _GOLDEN = math.pi * (3 - math.sqrt(5))
 
 @dataclass(frozen=True)
 class Spinning:
-    """Lasers on a rotor: one turn about the z axis, from azimuth pi (behind) clockwise as seen from above.
-
-    Raises InputError for an angle out of range or numbers of lasers that differ.
-    """
+    """Lasers on a rotor: one turn about the z axis, from azimuth pi (behind) clockwise as seen from above."""
 
     elevations: tuple[float, ...]
     """radians above the xy plane, one for each laser (ring)"""
@@ -82,10 +79,7 @@ class Spinning:
 
 @dataclass(frozen=True)
 class Rosette:
-    """One laser behind two thin rotating prisms, about the x axis: the pattern differs from scan to scan.
-
-    Raises InputError for an angle or a rate out of range.
-    """
+    """One laser behind two thin rotating prisms, about the x axis: the pattern differs from scan to scan."""
 
     half_angle: float
     """radians between the x axis and the outermost beams"""
@@ -133,10 +127,7 @@ Pattern: TypeAlias = Spinning | Rosette
 
 @dataclass(frozen=True, eq=False)
 class Lidar:
-    """LiDAR sensor. Its frame has x forward, y left and z up, as in ROS.
-
-    Raises InputError for a value out of range.
-    """
+    """LiDAR sensor. Its frame has x forward, y left and z up, as in ROS."""
 
     pattern: Pattern
     """directions of the beams"""
@@ -219,11 +210,7 @@ class Lidar:
 
     @staticmethod
     def preset(name: str, **changes: Any) -> Lidar:
-        """A sensor by its name: vlp-16, os1-64 or livox-mid-40. changes: fields with other values.
-
-        Raises:
-            InputError: an unknown name or field.
-        """
+        """A sensor by its name: vlp-16, os1-64 or livox-mid-40. changes: fields with other values."""
         known = presets()
         if not isinstance(name, str) or name.lower() not in known:
             raise InputError(unknown("lidar", name, known))
@@ -289,8 +276,8 @@ def _rays(lidar: Lidar, start: float, moving: bool) -> tuple[RayTable, np.ndarra
 
 
 def _grid(rays: np.ndarray, begin: int, end: int, rows: int, width: int) -> np.ndarray:
-    """Indices of rays [begin, end) in a grid in which neighbours are neighbours in space: columns by the
-    horizontal direction, rows by the vertical; -1 in the rest of the grid."""
+    """Indices of rays [begin, end) in a grid, columns by horizontal direction, rows by vertical; -1 in unused
+    cells."""
     grid = np.full((width, rows), -1)
     across = begin + np.argsort(rays[begin:end, 1], kind="stable")
     for column in range(width):
@@ -301,7 +288,7 @@ def _grid(rays: np.ndarray, begin: int, end: int, rows: int, width: int) -> np.n
 
 def _spread(beams: np.ndarray, divergence: float, count: int) -> np.ndarray:
     """(n x count, 3) directions of the rays of beams (n, 3): evenly over a disk (Vogel's spiral), the first
-    in its middle."""
+    at its centre."""
     if count == 1:
         return beams
     k = np.arange(count)

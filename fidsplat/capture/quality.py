@@ -241,10 +241,8 @@ class Quality:
         return chosen.with_(**changes)
 
     def with_(self, **changes) -> Quality:
-        """A copy with some settings changed. Raises InputError for an unknown setting.
-
-        marker: a `MarkerQuality`, or a dict of its settings to change.
-        """
+        """A copy with some settings changed. marker: a `MarkerQuality`, or a dict of its settings to
+        change."""
         for name in changes:
             _check_known(Quality, name)
         marker = changes.get("marker")

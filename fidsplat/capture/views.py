@@ -17,10 +17,7 @@ from fidsplat.util.errors import InputError
 
 @dataclass(frozen=True)
 class Views:
-    """The v views of a batch: captures, with poses that replace those of the captures.
-
-    Raises InputError for different numbers of views, and for poses of something that a motion already moves.
-    """
+    """The v views of a batch: captures, and poses that replace those of the captures."""
 
     captures: tuple[Capture, ...]
     """one for each view, or one for all"""
@@ -115,11 +112,7 @@ def camera_at(camera: Camera, pose: np.ndarray) -> Camera:
 
 
 def views_of(captures: Iterable[Capture], poses: Any = None, groups: Any = None, mask: Any = None) -> Views:
-    """Validated views of `Renderer.render_batch`.
-
-    Raises:
-        InputError: arrays of another shape or without poses, or different numbers of views or sizes.
-    """
+    """Validated views of `Renderer.render_batch`."""
     if groups is not None and not isinstance(groups, Mapping):
         raise InputError(f"groups must be {{label: poses (views, 7)}}, got {groups!r}")
     for label in groups or ():
@@ -138,11 +131,7 @@ def views_of(captures: Iterable[Capture], poses: Any = None, groups: Any = None,
 
 def pose_matrices(name: str, poses: Any) -> np.ndarray:
     """Rigid matrices (v, 4, 4) float64 of poses (v, 7): x y z in metres, quaternion w x y z of any length but
-    0.
-
-    Raises:
-        InputError: another shape, a value that is not finite, or a quaternion of length 0.
-    """
+    0."""
     given = real_array(name, poses, "(views, 7) numbers: x y z, quaternion w x y z")
     if given.ndim != 2 or given.shape[1] != 7:
         raise InputError(

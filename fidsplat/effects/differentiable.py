@@ -34,11 +34,7 @@ _REMEDIES = {
 
 
 def check_differentiable(features: FeatureSet) -> None:
-    """Refuse features without gradient.
-
-    Raises:
-        InputError: names the first such effect and a remedy.
-    """
+    """Raise InputError, with a remedy, for the first effect that has no gradient."""
     for name in features.slots:
         if name not in DIFFERENTIABLE:
             raise InputError(f"{name} has no gradient; use {_REMEDIES[name.partition('_')[0]]}")
@@ -49,17 +45,13 @@ def check_differentiable(features: FeatureSet) -> None:
 
 
 def with_distortion(features: FeatureSet) -> FeatureSet:
-    """These features and the output `distortion` (h, w), the depth distortion loss of 2DGS: sum over pairs of
-    fragments of w_i w_j (m_i - m_j)^2, m the depth-buffer value."""
+    """These features and the output `distortion` (h, w), the depth distortion loss of 2DGS: the sum over
+    pairs of fragments of w_i w_j (m_i - m_j)^2, with m the depth-buffer value."""
     return replace(features, outputs=tuple(sorted({*features.outputs, "distortion"})))
 
 
 def check_gradients(features: FeatureSet, names: Iterable[str]) -> None:
-    """Refuse gradients of outputs without a backward pass, or that were not rendered.
-
-    Raises:
-        InputError: names the output and the possible ones.
-    """
+    """Raise InputError for gradients of outputs without a backward pass, or that were not rendered."""
     rendered = [name for name in GRADIENT_OUTPUTS if name == "rgb" or name in features.names]
     for name in names:
         if name not in rendered:

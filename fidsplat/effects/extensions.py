@@ -34,11 +34,8 @@ EXTENSIONS: dict[str, Extension] = {}
 
 
 def register(extension: Extension) -> None:
-    """Add an output or a step in this process.
-
-    Raises:
-        InputError: a name that exists, or is not an identifier.
-    """
+    """Add an output or a step in this process. Raises InputError for a name that exists, or is not an
+    identifier."""
     name = instance("an extension", extension, Extension).name
     if not name.isidentifier() or name in CATALOGUE or name in IMAGES:
         raise InputError(f"the name of an extension must be a new identifier, got {name!r}; use another name")

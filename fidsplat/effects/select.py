@@ -20,15 +20,12 @@ _KINDS = {Gradient: "gradient", Panorama: "panorama"}
 
 @dataclass(frozen=True)
 class FeatureSet:
-    """Effects of a frame: names and small integers only, so that it is a cache key.
-
-    Numbers that change from view to view (intrinsics, poses, thresholds, background) are uniforms.
-    """
+    """Effects of a frame: names and small integers only, so that it is a cache key. Numbers that change from
+    view to view (intrinsics, poses, thresholds, background) are uniforms."""
 
     slots: tuple[str, ...]
     """One effect per kind in fixed order: camera, color, ellipsoids (optional), lowpass, stop, external depth
-    (optional), compose, footprint, background, arithmetic; then optional motion, shutter, blending in
-    float16 or float64, and termination depths."""
+    (optional), compose, footprint, background, arithmetic; then optional ones."""
     outputs: tuple[str, ...]
     """Sorted names of the outputs other than rgb."""
     sh_degree: int
@@ -57,12 +54,8 @@ class FeatureSet:
 
 
 def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
-    """Select the features that a capture of a cloud requires. Values without effect select nothing. A capture
-    without a camera counts as a pinhole.
-
-    Raises:
-        InputError: an unknown output, or two effects that exclude each other.
-    """
+    """Select the features that a capture of a cloud requires. A capture without a camera counts as a pinhole.
+    Raises InputError for an unknown output, or two effects that exclude each other."""
     _load_extensions_of(capture)
     for name in capture.outputs:
         if name not in (*OUTPUTS, *COMPOSED):
@@ -122,11 +115,8 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
 
 
 def _load_extensions_of(capture: Capture) -> None:
-    """Load extensions if the capture requests an unknown name.
-
-    Raises:
-        InputError: an unknown step of the sensor, or another number of values than it has.
-    """
+    """Load extensions if the capture requests an unknown name. Raises InputError for an unknown step of the
+    sensor, or another number of values than it has."""
     steps = capture.sensor.extra
     if not {*capture.outputs, *steps} <= {*OUTPUTS, *COMPOSED, *EXTENSIONS}:
         load_extensions()
@@ -147,11 +137,8 @@ def with_termination_depths(features: FeatureSet) -> FeatureSet:
 
 def _composing(cloud: CloudTraits, order: str, one_depth_each: bool) -> str:
     """Select the compositing effect: by centre depth or by fragment depth, with or without layers of coplanar
-    groups, which are placed by their depth at each pixel in either order.
-
-    If every fragment has the float32 depth of its splat's centre, both orders are equal and the k-buffer is
-    not needed.
-    """
+    groups. If every fragment has the depth of its splat's centre, both orders are equal and no k-buffer is
+    needed."""
     if cloud.has_coplanar_groups:
         ways = {"centre": "compose_ordered", "auto": "compose_coplanar", "pixel": "compose_coplanar_pixel"}
         return ways[order]
@@ -167,11 +154,7 @@ def _ellipsoid(cloud: CloudTraits, quality: Quality, lens: Lens | None) -> str:
 
 
 def _refuse_float64(lens: Lens | None, foggy: bool) -> None:
-    """Refuse float64 blending where rays are float32, which would limit its accuracy.
-
-    Raises:
-        InputError: names both effects and a remedy.
-    """
+    """Raise InputError for float64 blending of float32 rays, which would limit its accuracy."""
     if foggy or not (lens is None or isinstance(lens, Orthographic)):
         what = "the fog's" if foggy or lens is None else f"a {lens.kind} lens's"
         raise InputError(

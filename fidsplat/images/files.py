@@ -61,9 +61,8 @@ def read_rgba(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def read_on_background(path: str | os.PathLike[str], background: Sequence[float]) -> np.ndarray:
-    """Read an image as (h, w, 3) uint8 RGB, blended over a background of display values where it is
-    transparent. `read_rgba` defines the accepted files and the errors.
-    """
+    """Read an image as (h, w, 3) uint8 RGB; transparent pixels are blended over a background of display
+    values."""
     rgba = read_rgba(path)
     if rgba[:, :, 3].min() == 255:
         return rgba[:, :, :3].copy()
@@ -171,9 +170,7 @@ _MIN_TASKS, _THREADS = 8, 4
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
-    """Convert floats in [0, 1] to uint8, clamped and rounded; bool becomes 0 and 255, uint8 stays.
-
-    Raises InputError for anything but numbers."""
+    """Convert floats in [0, 1] to uint8, clamped and rounded; bool becomes 0 and 255, uint8 stays."""
     image = pixels_of(image)
     if image.dtype == np.uint8:
         return image
@@ -317,11 +314,8 @@ def encode_webp(image: np.ndarray) -> bytes:
 
 
 def decode_rgba(data: bytes, name: str) -> np.ndarray:
-    """Decode an image file's content to (h, w, 4) uint8 RGBA, alpha 255 where it has none.
-
-    name: the file's name in errors. Raises InputError for content that is not an image of 8 bits or exceeds
-    `input_limit`.
-    """
+    """Decode an image file's content to (h, w, 4) uint8 RGBA, alpha 255 where it has none. name: for
+    errors."""
     image = _decode(data, name, cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype != np.uint8:
         raise InputError(f"{name} cannot be read as an image of 8 bits")

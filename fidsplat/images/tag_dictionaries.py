@@ -1,5 +1,4 @@
-"""Bits of the tags predefined by OpenCV's aruco module, four AprilTag families and all ArUco families, and of
-AprilTag 3."""
+"""Bits of the tags of OpenCV's aruco module (AprilTag and ArUco families) and of AprilTag 3."""
 
 from functools import cache
 from typing import NamedTuple
@@ -31,13 +30,8 @@ BORDER = 1
 
 
 def families(kind: str | None = None) -> dict[str, Family]:
-    """All known families by name, for example {"36h11": Family(size=8, count=587), ...}.
-
-    Args:
-        kind: "apriltag" or "aruco"; None for both (names are unique over both).
-
-    Raises InputError for another kind.
-    """
+    """All known families by name, such as {"36h11": Family(size=8, count=587), ...}. kind: "apriltag",
+    "aruco", or None for both."""
     if kind is not None and kind not in _KINDS:
         raise InputError(f"unknown kind of tag {kind!r}; known: {', '.join(_KINDS)}")
     kinds = _KINDS if kind is None else (kind,)
@@ -46,9 +40,7 @@ def families(kind: str | None = None) -> dict[str, Family]:
 
 def parse_family(text: str) -> tuple[str, str]:
     """Split "apriltag:36h11", or just "36h11", "tag36h11" or "DICT_APRILTAG_36h11", into (kind, family).
-
-    Raises InputError with a list of the families for an unknown name.
-    """
+    Raises InputError with a list of the families for an unknown name."""
     kind, colon, name = str(text).lower().rpartition(":")
     foreign = foreign_family(name)
     if foreign is not None and kind in ("", foreign[0]):
@@ -63,13 +55,9 @@ def parse_family(text: str) -> tuple[str, str]:
 
 
 def dictionary_bits(kind: str, family: str, tag_id: int) -> np.ndarray:
-    """The modules of one tag, (size, size) uint8, 1 = dark, its one-module black border included.
-
-    Row 0 is the top of the image that ``cv2.aruco.generateImageMarker`` prints. Round and recursive tags have
-    modules without paper, 255.
-
-    Raises InputError for an unknown family or an id outside it.
-    """
+    """The modules of one tag, (size, size) uint8, 1 = dark, with its one-module black border. Row 0 is the
+    top of the image of ``cv2.aruco.generateImageMarker``. Missing modules of round and recursive tags are
+    255."""
     kind, family = parse_family(f"{kind}:{family}")
     size, count = _family(kind, family)
     if not 0 <= tag_id < count:
@@ -82,10 +70,8 @@ def dictionary_bits(kind: str, family: str, tag_id: int) -> np.ndarray:
 
 @cache
 def predefined(kind: str, family: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a known family.
-
-    Raises InputError for a family of AprilTag 3, which OpenCV lacks.
-    """
+    """OpenCV's dictionary of a known family. Raises InputError for a family of AprilTag 3, which OpenCV
+    lacks."""
     if family in apriltag3.LAYOUTS:
         raise InputError(f"the family must be one of OpenCV's dictionaries, got {kind}:{family}; e.g. 36h11")
     prefix = "DICT_APRILTAG_" if kind == "apriltag" else "DICT_ARUCO_" if "x" not in family else "DICT_"

@@ -14,11 +14,7 @@ from fidsplat.util.files import atomic_path, ordinary_file, writable_folder
 
 
 def check_video(path: str | os.PathLike[str]) -> Path:
-    """Check that a video can be written to a path, before long work.
-
-    Raises:
-        InputError: a suffix other than .mp4, a folder that cannot be written, or imageio-ffmpeg is missing.
-    """
+    """Check that a video can be written to a path: its suffix, its folder and the package imageio-ffmpeg."""
     file = ordinary_file(path)
     if file.suffix.lower() != ".mp4":
         raise InputError(

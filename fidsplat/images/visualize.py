@@ -14,8 +14,7 @@ KEY_WIDTH = 132  # pixels of the colour key next to the images of a sheet
 
 
 def depth_span(depths: Iterable[np.ndarray]) -> tuple[float, float]:
-    """Range of metres for the colours of depth images (h, w): percentiles 1 and 99, so that single splats
-    do not stretch it. (0, 0) if nothing is visible."""
+    """Range [m] of the colours of depth images (h, w): percentiles 1 and 99; (0, 0) if nothing is visible."""
     valid = [depth[np.isfinite(depth) & (depth > 0)] for depth in depths]
     every = np.concatenate(valid) if valid else np.zeros(0)
     if not every.size:
@@ -44,7 +43,7 @@ def depth_key(span: tuple[float, float], height: int) -> np.ndarray:
 
 
 def depth_millimetres(depth: np.ndarray) -> np.ndarray:
-    """Depth (h, w) in metres as uint16 millimetres, the format of depth cameras; 0 for no surface, at most
+    """Depth (h, w) in metres as uint16 millimetres, the format of depth cameras; 0: no surface, at most
     65535."""
     clean = np.nan_to_num(depth, nan=0.0, posinf=np.inf, neginf=0.0)
     return np.rint(np.clip(clean * 1000.0, 0, 65535)).astype(np.uint16)

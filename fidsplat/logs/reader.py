@@ -51,11 +51,7 @@ class LogImage:
 
 
 def messages(path: str | os.PathLike[str], *topics: str) -> Iterator[tuple[str, Any]]:
-    """Topic and message of each message of a log in its order; of all topics if none is given.
-
-    Raises:
-        InputError: not a log, or a damaged log.
-    """
+    """Topic and message of each message of a log in its order; of all topics if none is given."""
     file, store = path_of(path), typestore()
     with _as_input_error(file):
         for name, kind, _, data in log_messages(file):
@@ -64,14 +60,8 @@ def messages(path: str | os.PathLike[str], *topics: str) -> Iterator[tuple[str, 
 
 
 def log_images(path: str | os.PathLike[str], topic: str | None = None) -> Iterator[LogImage]:
-    """Colour images of a log in its order: rgb8, bgr8, rgba8, bgra8, mono8 and compressed.
-
-    Args:
-        topic: topic to read; None for every topic with such images.
-
-    Raises:
-        InputError: not a log, a damaged log, or a log without such images.
-    """
+    """Colour images of a log in its order: rgb8, bgr8, rgba8, bgra8, mono8 and compressed. topic: topic to
+    read; None for all. Raises InputError if there are none."""
     file, store, found = path_of(path), typestore(), False
     with _as_input_error(file):
         for name, kind, time, data in log_messages(file):
@@ -91,12 +81,7 @@ def log_images(path: str | os.PathLike[str], topic: str | None = None) -> Iterat
 
 def log_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int], np.ndarray]:
     """Poses (4, 4) in the scene by frame and nanoseconds, from `/tf`: relative to the frame `scene`, or else
-    to the frame without a parent. Each frame on the way must have a pose
-    of the same time.
-
-    Raises:
-        InputError: not a log, a damaged log, or an invalid pose.
-    """
+    to the frame without a parent. Each frame in between must have a pose of the same time."""
     file, store, found = path_of(path), typestore(), {}
     with _as_input_error(file):
         for _, kind, _, data in log_messages(file):

@@ -61,11 +61,7 @@ _METADATA = "fidsplat.source"
 
 
 def log_file(path: str | os.PathLike[str], store: Any, overwrite: bool, source: str) -> LogFile:
-    """A writer of an MCAP file for NAME.mcap, else of a rosbag2 folder. source: see `RobotLog`.
-
-    Raises:
-        InputError: the log exists and may not be overwritten, or cannot be written.
-    """
+    """A writer of an MCAP file for NAME.mcap, else of a rosbag2 folder. source: see `RobotLog`."""
     target = _target(path, overwrite)
     try:
         return (_McapFile if target.suffix == ".mcap" else _Bag)(target, store, source)

@@ -95,8 +95,7 @@ def cutoff_of(splats: int) -> float:
 
 
 def ideal_quality(quality: Quality, cutoff: float) -> Quality:
-    """The quality of the second rendering: a smaller cut-off, no transmittance stop, no opacity ceiling and a
-    float64 set-up."""
+    """The quality of the second rendering: a smaller cut-off, no stop, no ceiling and a float64 set-up."""
     return quality.with_(
         alpha_cutoff=cutoff,
         detail_error=0.0,
@@ -144,11 +143,8 @@ class ErrorImage:
 
 
 def ideal_of(data: Any, capture: Capture, backend: Backend) -> Ideal:
-    """Prepare the second rendering of an uploaded cloud: its features, view and error bound.
-
-    Raises:
-        InputError: an effect of the capture has no bound, on any device or on this one.
-    """
+    """Prepare the second rendering of an uploaded cloud: its features, view and error bound. Raises
+    InputError for an effect without a bound."""
     _refuse_unbounded(capture)
     if not isinstance(data, ResidentData):
         raise InputError(
@@ -167,10 +163,7 @@ def ideal_of(data: Any, capture: Capture, backend: Backend) -> Ideal:
 
 
 def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -> tuple[FeatureSet, View]:
-    """Features and view of the second rendering.
-
-    If the kernels can bound their rounding, it uses float32 and the output `rounding`, else float64.
-    """
+    """Features and view of the second rendering: float32 with the output `rounding`, or else float64."""
     plain = capture.with_(outputs=("rgb",), quality=quality)
     info = backend.info
     if info.always_float64:

@@ -18,9 +18,8 @@ def device_surface(
     renderer: Renderer, packed: Any, depths: Any, ids: Any, size: tuple[int, int], red: int
 ) -> ExternalDepth:
     """External depth images of all views from wp.arrays (views, pixels): colours packed in uint32 with red at
-    the bit `red`, depths along z, and int32 ids of surfaces, negative for none. They stay on the device if it
-    is the renderer's.
-    """
+    the bit `red`, depths along z, and int32 ids of surfaces, negative for none. They stay on the renderer's
+    device."""
     wp, device = load(), packed.device
     made = [wp.empty(packed.shape, dtype=dtype, device=device) for dtype in (wp.vec3, wp.float32, wp.int32)]
     given = [packed, depths, ids, red, MESH, MESH_OFFSET]

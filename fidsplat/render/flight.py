@@ -180,11 +180,7 @@ class FlightFolder:
         return write_png(self.folder / SHEET, contact_sheet(rows, width=320))
 
     def write_video(self, path: str | Path, rate: float) -> Iterator[int]:
-        """Write the frames as a video; yields the number of each after it is encoded.
-
-        Raises:
-            InputError: the extra `video` is not installed.
-        """
+        """Write the frames as a video; yields the number of each after it is encoded."""
         return write_video(path, (read_image(file) for file in self.previews()), rate)
 
     def _clear(self) -> None:
@@ -225,10 +221,8 @@ class FlightFolder:
 
 
 def scene_of_frame(scene: Scene, image: Path) -> Scene:
-    """The scene with the camera pose and time of a flight's frame, given an image file of that frame.
-
-    For any other image file, the scene is unchanged.
-    """
+    """The scene with the pose and time of the flight's frame with this image file; unchanged for other
+    files."""
     folder = image.parent.parent
     if not image.stem.isdigit() or not (folder / RECORD).is_file():
         return scene

@@ -54,9 +54,8 @@ class LightField:
     ) -> LightField:
         """Measure until interpolated irradiance differs by at most `step` of its maximum.
 
-        levels: numbers of panoramas along a side, the last of which is not checked. places: (m, 2) on the
-        marker. radiance_at: called with (k, 2) places, returns (k, d, 3). normal: (3,)
-        for the irradiance that is compared.
+        levels: numbers of panoramas along a side; the last is not checked. places: (m, 2) on the marker.
+        radiance_at: called with (k, 2) places, returns (k, d, 3). normal: (3,) for the compared irradiance.
         """
         field = LightField(*panorama_directions(rows))
         field.low, field.high = places.min(axis=0), places.max(axis=0)

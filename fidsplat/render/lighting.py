@@ -1,7 +1,7 @@
 """Lighting of markers: colours of their splats from the light of the scene.
 
-The light of the splats around a marker is measured in panoramas, that of explicit lights by shadow maps.
-Boxes are split where the light changes.
+The light around a marker is measured in panoramas, that of explicit lights by shadow maps. Boxes are split
+where the light changes.
 """
 
 from __future__ import annotations
@@ -51,10 +51,7 @@ _WALL = 0.1
 
 
 def lit_scene(scene: Scene, renderer: Any) -> Scene:
-    """The scene with the colours of markers with `light` computed, and without further requests of light.
-
-    Raises InputError if the light of a marker cannot be computed.
-    """
+    """The scene with the colours of markers with `light` computed, and without lights."""
     if not any(placed.light for placed in scene.markers):
         return scene
     around = _Surroundings(scene, renderer)
@@ -293,12 +290,11 @@ def _by_normal(normals: np.ndarray, within: float = 1e-4) -> Iterator[np.ndarray
 def _split(
     points: _Points, colors: np.ndarray, step: float, largest: int | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Parts of the splats in which colours (m, 3) at the points differ by at most `step`.
+    """Parts of the splats in which colours (m, 3) at the points differ by at most `step`. largest: largest
+    number of points along a side of a part.
 
-    largest: largest number of points along a side of a part.
-
-    Returns the splat (p,) of each part, its first and last columns and rows (p, 4) x0, y0, x1, y1 on the grid
-    of the splat, half-open, and the part (m,) of each point.
+    Returns the splat (p,) of each part; its columns and rows [x0, x1) x [y0, y1) on the splat's grid, (p, 4)
+    x0, y0, x1, y1; and the part (m,) of each point.
     """
     owner, corners, part = [], [], np.empty(len(colors), np.int64)
     for splat, (start, (width, height)) in enumerate(zip(points.starts, points.counts, strict=True)):

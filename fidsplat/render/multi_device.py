@@ -174,10 +174,8 @@ class SeveralDevices:
         return list(pairwise(borders.tolist()))
 
     def _balance(self, rows: list[int], seconds: list[float]) -> None:
-        """Load balancing: move the borders of the bands to equalise their times.
-
-        All rows of a band are assumed to take the same time.
-        """
+        """Load balancing: move the borders of the bands to equalise their times, as if all rows of a band
+        were equal."""
         if len(rows) < len(self.renderers) or max(seconds) <= _MAX_IMBALANCE * np.mean(seconds):
             return
         spent = np.concatenate([[0.0], np.cumsum(seconds)])
@@ -257,8 +255,7 @@ class _BandImages(Images):
 
     @property
     def stats(self) -> dict[str, Any]:
-        """splats: maximum over the devices. visible, pairs: sums over the bands; a splat counts in every band
-        in which it is visible."""
+        """splats: maximum over the devices; visible, pairs: sums over the bands."""
         each = [frame.stats for frame in self.frames]
         most = max(one["splats"] for one in each)
         return {"splats": most} | {name: sum(one[name] for one in each) for name in ("visible", "pairs")}

@@ -39,14 +39,8 @@ def suffixes_of(name: str) -> tuple[str, ...]:
 def save_output(
     name: str, image: np.ndarray, name_of: Callable[[str, str], Path], bits: int | None = None
 ) -> list[Path]:
-    """Write one output image and return the files.
-
-    Args:
-        name: "rgb", "depth", ...
-        image: (h, w) or (h, w, 3).
-        bits: 16 writes rgb as a 16-bit PNG.
-        name_of: file of an output's name and a suffix such as ".png" or "-turbo.png".
-    """
+    """Write one output image (h, w) or (h, w, 3) and return the files. bits: 16 writes rgb as a 16-bit PNG.
+    name_of: file of an output's name and a suffix such as ".png" or "-turbo.png"."""
     if name == "rgb" and bits == 16:
         image16 = np.rint(np.clip(np.nan_to_num(image, nan=0.0), 0, 1) * 65535).astype(np.uint16)
         return [write_png(name_of(name, ".png"), image16)]
@@ -57,11 +51,7 @@ def save_output(
 
 
 def load_output(file: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Read an output image (h, w) that `save_output` wrote as .npy.
-
-    Raises:
-        InputError: the file is damaged, or its image has another shape.
-    """
+    """Read an output image (h, w) that `save_output` wrote as .npy. Raises InputError if it is damaged."""
     try:
         image = load_npy(file)
         if image.shape != shape or image.dtype.kind not in "fi":

@@ -40,10 +40,8 @@ def gloss(
     cosine: np.ndarray, to_viewer: np.ndarray, to_light: np.ndarray, normal: np.ndarray, surface: Gloss
 ) -> np.ndarray:
     """Radiance towards viewers (n, v, 3) per irradiance that a surface facing the light would receive, (n,
-    v): the BRDF times the cosine of the light.
-
-    cosine: (n, v) of viewer and normal (n, 3); to_light: (n, 3).
-    """
+    v): the BRDF times the cosine of the light. cosine: (n, v) of viewer and normal (n, 3); to_light: (n,
+    3)."""
     square = surface.alpha**2
     light = np.einsum("nc,nc->n", to_light, normal)[:, None]
     above = (cosine > _BELOW) & (light > _BELOW)
@@ -61,10 +59,8 @@ def gloss(
 
 def lobe(to_viewer: np.ndarray, normal: np.ndarray, surface: Gloss) -> tuple[np.ndarray, np.ndarray]:
     """Directions (n, v, k, 3) from which reflected light comes, and their weights (n, v, k): the sum of
-    weights times radiance is the radiance towards viewers (n, v, 3).
-
-    Visible normals are sampled (Heitz 2018) at the points of a Hammersley set.
-    """
+    weights times radiance is the radiance towards viewers (n, v, 3). Visible normals are sampled (Heitz
+    2018)."""
     square, i = surface.alpha**2, np.arange(_LOBE)
     radius, angle = np.sqrt((i + 0.5) / _LOBE), 2 * np.pi * _van_der_corput(_LOBE)
     axes = np.concatenate([_frames(normal), normal[:, None]], 1)
@@ -122,10 +118,8 @@ def view_directions(normal: np.ndarray) -> np.ndarray:
 
 
 def fit_harmonics(to_viewer: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """Harmonics (n, 16, 3) of degree 3 for colours (n, v, 3) in directions (v, 3), by least squares.
-
-    Directions on the hemisphere alone leave the other one free; the smallest coefficients are chosen.
-    """
+    """Harmonics (n, 16, 3) of degree 3 for colours (n, v, 3) in directions (v, 3), by least squares; the
+    smallest coefficients, as only one hemisphere is given."""
     basis = sh_basis(MAX_DEGREE, -to_viewer)  # harmonics have the direction from camera to splat
     base = colors.mean(axis=1, keepdims=True)
     fitted = np.einsum("kv,nvc->nkc", np.linalg.pinv(basis, rcond=1e-3), colors - base)

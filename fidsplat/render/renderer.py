@@ -460,11 +460,7 @@ def _banded(view: View, band: tuple[int, int]) -> View:
 
 
 def _capture_of(scene: Any, capture: Capture | Camera | None, **parts: Any) -> Capture:
-    """The given capture, or by default the scene's, with the given parts replaced.
-
-    Raises:
-        InputError: an unknown part, a part of the wrong type, or no camera.
-    """
+    """The given capture, or by default the scene's, with the given parts replaced."""
     if not isinstance(capture, Capture):
         if capture is not None:
             parts["camera"] = capture

@@ -19,10 +19,8 @@ from fidsplat.util.errors import InputError
 
 
 class ResidentCloud:
-    """A cloud on a renderer's device, which is rendered without another upload.
-
-    Of a store, only the chunks that a view needs are uploaded, when it is rendered. The device caches them.
-    """
+    """A cloud on a renderer's device, which is rendered without another upload. Of a store, only the chunks
+    that a view needs are uploaded and cached."""
 
     def __init__(
         self,
@@ -59,7 +57,7 @@ class ResidentCloud:
     def gather(
         self, views: Iterable[View], features: FeatureSet, qualities: Iterable[Quality]
     ) -> tuple[Any, SceneIds]:
-        """Upload the splats that these views need; returns the device data and the scene indices of its
+        """Upload the splats that these views need; returns the device data, and the scene indices of its
         splats."""
         if isinstance(self.data, Residency):
             return self.data.gather(list(views), features, qualities)

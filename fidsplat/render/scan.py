@@ -71,7 +71,7 @@ class Scan:
         return np.einsum("bij,rbj->rbi", poses[:, :3, :3], self.points) + poses[:, :3, 3]
 
     def image(self, name: str = "range") -> np.ndarray:
-        """range, intensity or label as (r, rings, columns), from left (azimuth pi) to right, for a spinning
+        """range, intensity or label as (r, rings, columns), left (azimuth pi) to right, for a spinning
         lidar."""
         pattern = self.lidar.pattern
         if not isinstance(pattern, Spinning):
@@ -297,8 +297,8 @@ def _pose_of(pose: Any, camera: Camera | None) -> np.ndarray:
 
 
 def _returns(rays: dict[str, np.ndarray], lidar: Lidar) -> dict[str, np.ndarray]:
-    """Returns (r, beams) of the rays of beams, (beams, n): neighbours in range are one return. A return has
-    the mean range of its rays by signal, their sum of intensities over n, and the label of the first."""
+    """Returns (r, beams) of the rays of beams, (beams, n): neighbours in range are one return, with their
+    mean range by signal, their sum of intensities over n, and the label of the first."""
     count = lidar.rays
     if count == 1:
         empty = np.zeros((len(lidar.returns) - 1, len(rays["range"])))

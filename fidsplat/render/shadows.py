@@ -93,11 +93,9 @@ def visibility(
     """Transmittance (m,) float32 between the surface's points and a point of a light; 0 where the surface
     faces away.
 
-    The marker is an opaque white surface in an external depth image, and the other splats are black, so that
-    the image from the light is the transmittance.
-
-    black: the other splats with the colour 0, which `motion` moves. extent: largest distance of a splat from
-    the marker.
+    The marker is an opaque white surface in an external depth image and other splats are black, so that the
+    image from the light is the transmittance. black: the other splats with the colour 0, which `motion`
+    moves. extent: largest distance of a splat from the marker.
     """
     towards, irradiance = point.arriving(surface.points)
     found = np.zeros(len(towards), np.float32)
@@ -129,10 +127,7 @@ def _camera(point: LightPoint, points: np.ndarray, pitch: float, extent: float) 
 
 
 def _depth_image(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Depth (h, w) of the surface through points (m, 3): their plane, and their distances from it.
-
-    The depth of a plane is linear in the pixels for parallel rays, and its inverse in a pinhole image.
-    """
+    """Depth (h, w) of the surface through points (m, 3): their plane, and their distances from it."""
     pixels = camera.project(points)
     z = (points - camera.position) @ camera.world_to_camera[2, :3]
     inverse = not isinstance(camera.lens, Orthographic)

@@ -158,7 +158,7 @@ def _ray_camera(ray) -> Camera:
 
 
 def _patch(camera: Camera, pixel: tuple[float, float], radius: float) -> Camera:
-    """A camera that images only the square of half side `radius` around a pixel, in `SAMPLES` samples per
+    """A camera with the square of half side `radius` around a pixel as its image, in `SAMPLES` samples per
     side."""
     zoom = SAMPLES / (2 * radius)
     cx = (camera.cx - pixel[0] + radius) * zoom

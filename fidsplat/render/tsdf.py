@@ -28,12 +28,8 @@ _VOXELS = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), -1).resha
 
 
 class DistanceField:
-    """A truncated signed distance field, positive outside.
-
-    Args:
-        voxel: metres.
-        origin: (3,) world position that voxel coordinates are relative to.
-    """
+    """A truncated signed distance field, positive outside. voxel: edge [m]. origin: (3,) world position of
+    voxel 0."""
 
     def __init__(self, voxel: float, origin) -> None:
         self.voxel, self.origin = voxel, np.asarray(origin, np.float64)
@@ -56,10 +52,8 @@ class DistanceField:
         self.keys = np.unique(np.concatenate(found))
 
     def integrate(self, depth: np.ndarray, cosine: np.ndarray, rgb: np.ndarray, camera: Camera) -> None:
-        """Average a depth image (h, w) and its colours (h, w, 3) into the blocks that exist.
-
-        cosine: (h, w) of the angle between ray and normal, the weight of an observation.
-        """
+        """Average a depth image (h, w) and its colours (h, w, 3) into the blocks that exist. cosine: (h, w)
+        of the angle between ray and normal, the weight of an observation."""
         if len(self._sums) != len(self.keys):
             self._sums = np.zeros((len(self.keys), SIDE**3, 6), np.float32)
         rotation, size = camera.world_to_camera[:3, :3], SIDE * self.voxel
@@ -167,8 +161,7 @@ class DistanceField:
 
 
 def _edges(value: np.ndarray, first: np.ndarray, quads: list[np.ndarray]) -> None:
-    """Append the keys (n, 4) of the cells around each voxel edge that the surface crosses, in the order of a
-    counter-clockwise face."""
+    """Append the cells (n, 4) around each voxel edge that the surface crosses, as counter-clockwise faces."""
     own = value[:, :SIDE, :SIDE, :SIDE]
     for axis in range(3):
         step = np.eye(3, dtype=int)[axis]
