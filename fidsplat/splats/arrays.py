@@ -26,8 +26,7 @@ def all_scales(cloud: Any) -> np.ndarray:
 
 
 def rows_beyond(array: np.ndarray, limit: float) -> np.ndarray | None:
-    """Mask of the rows with a value that is not finite or beyond +-limit; None, without a copy, if there is
-    none."""
+    """Mask of the rows with a value that is not finite or beyond +-limit; None if there is none."""
     with np.errstate(invalid="ignore"):
         if not array.size or (array.min() >= -limit and array.max() <= limit):  # false where there is a NaN
             return None
@@ -37,8 +36,8 @@ def rows_beyond(array: np.ndarray, limit: float) -> np.ndarray | None:
 
 
 def find_defects(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, dict[str, int]]:
-    """Mask of the rows to keep, or None for all; and the number of other rows by reason, each under its
-    first."""
+    """Mask of the valid rows, or None if all are; and the number of other rows by the first defect of
+    each."""
     bad: np.ndarray | None = None
     dropped: dict[str, int] = {}
     s, o = arrays["scales"], arrays["opacities"]
@@ -76,8 +75,7 @@ _STORED = {
     "scale not above 0": "scales are standard deviations in metres: take exp() of logarithms",
     "opacity outside [0, 1]": "opacities are from 0 to 1: take the sigmoid of logits",
 }
-"""hints for a reason by which more than a quarter of all splats are left out: often the raw parameters of
-trainers were given"""
+"""hints at raw parameters of trainers, for defects of more than a quarter of all splats"""
 
 
 def square_of(quats: np.ndarray) -> np.ndarray:
@@ -155,13 +153,11 @@ def as_single(array: np.ndarray) -> np.ndarray:
 
 
 def choose_origin(means: np.ndarray, single: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(means (n, 3) float32 relative to the origin, origin (3,) float64) for finite means (n, 3) in the
-    world.
+    """Means (n, 3) float32 relative to an origin (3,) float64, and the origin, for finite world means (n, 3).
 
-    ``single`` is the means as float32. The origin is 0 unless the means are not all float32 numbers and lie
-    further from 0 than 64 times the cloud's reach, so that float32 would lose at least 6 of its 24 bits.
-    Then it is the centre of the bounding box, rounded to a power of two near the reach, which keeps it a
-    short number.
+    ``single`` is the means as float32. The origin is 0 unless means that are not all float32 numbers are
+    further from 0 than 64 times the cloud's reach, so that float32 would lose at least 6 of its 24 bits. Then
+    it is the centre of the bounding box, rounded to a power of two near the reach.
     """
     zero = np.zeros(3)
     if means.dtype == F32 or not len(means) or np.array_equal(single, means):
@@ -176,8 +172,7 @@ def choose_origin(means: np.ndarray, single: np.ndarray, scales: np.ndarray) -> 
 
 
 def unit_quaternions(quats: np.ndarray) -> np.ndarray:
-    """Normalised quaternions. Quaternions that are normalised up to float32 rounding stay unchanged, so
-    normalising twice has no effect."""
+    """Normalised quaternions; those that are normalised up to float32 rounding stay unchanged."""
     unit = quats  # only arrays of the cloud are writable
     for start in range(0, len(quats), 4096):  # bounds the float64 copy
         part = slice(start, start + 4096)
@@ -190,10 +185,7 @@ def unit_quaternions(quats: np.ndarray) -> np.ndarray:
 
 
 def with_thinnest_last(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotate 3D Gaussians so that their third axis is the thinnest; the third wins ties.
-
-    quats (n, 4) wxyz, scales (n, 3), none of them NaN -> both new.
-    """
+    """Rotate 3D Gaussians, quats (n, 4) wxyz and scales (n, 3), so that their third axis is the thinnest."""
     thin = 2 - np.argmin(scales[:, ::-1], axis=1)
     turned = thin != 2
     if turned.any():
@@ -239,10 +231,8 @@ def joined_groups(clouds: Sequence[Any]) -> np.ndarray | None:
 
 
 def group_offsets(largest: Sequence[int]) -> list[int]:
-    """Offsets that keep the coplanar group ids of several clouds distinct.
-
-    largest: largest id of each cloud, -1 for no group. Raises InputError if an id would exceed int32.
-    """
+    """Offsets that keep the coplanar group ids of several clouds distinct. largest: largest id of each cloud,
+    -1 for no group. Raises InputError if an id would exceed int32."""
     offsets, free = [], 0
     for last in largest:
         offsets.append(free if last >= 0 else 0)

@@ -144,11 +144,8 @@ class SplatCloud(PickledByFields, Summarised):
         origin,
         dropped,
     ) -> "SplatCloud":
-        """A cloud of validated arrays, without a copy.
-
-        means (n, 3) float32 or float64; quats of any length above 0; one of sh and colors is None; the rest
-        like the attributes. dropped: counts of a reader.
-        """
+        """A cloud of validated arrays, without a copy: means float32 or float64, quats of any length above 0,
+        and either sh or colors. dropped: counts of a reader."""
         cloud = object.__new__(cls)
         single = {"quats": quats, "scales": scales, "opacities": opacities, "colors": colors, "sh": sh}
         single["means"] = means if means.dtype == F32 else as_single(means)
@@ -207,8 +204,7 @@ class SplatCloud(PickledByFields, Summarised):
 
     @property
     def plain_colors(self) -> np.ndarray | None:
-        """View-independent colours (n, 3) float32: `colors`, or those of SH of degree 0; None for a higher
-        degree."""
+        """Colours (n, 3) float32 that are the same from all directions; None with SH above degree 0."""
         if self.sh is None or self.sh_degree > 0:
             return self.colors
         return colors_of_degree({"sh": self.sh}, -1)["colors"]
@@ -244,18 +240,15 @@ class SplatCloud(PickledByFields, Summarised):
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """World bounding box (min (3,), max (3,)) float64 of Gaussians to 3 sigma and of boxes to their
-        corners.
-
-        Raises InputError for an empty cloud.
-        """
+        corners. Raises InputError for an empty cloud."""
         if not len(self):
             raise InputError("the cloud must have at least one splat to have bounds, got none")
         reach = self.reach(3.0)
         return (self.means - reach).min(axis=0) + self.origin, (self.means + reach).max(axis=0) + self.origin
 
     def reach(self, sigmas: float) -> np.ndarray:
-        """Half extents (n, 3) float64 [m] along the world axes: Gaussians to a number of standard deviations,
-        boxes to their corners."""
+        """Half extents (n, 3) float64 [m] along the world axes: Gaussians to `sigmas`, boxes to their
+        corners."""
         sigmas = number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
         turns = quaternion_to_matrix(self.quats)
         axes = turns[:, :, :2] * (sigmas * self.scales.astype(np.float64))[:, None, :]

@@ -57,10 +57,8 @@ def sh_basis(degree: int, dirs: np.ndarray) -> np.ndarray:
 
 
 def colors_of_degree(given: Mapping[str, np.ndarray], sh_degree: int) -> dict[str, np.ndarray]:
-    """`colors` or `sh` converted to an SH degree, with 0 for missing bands.
-
-    given: also `means`. Degree -1: plain colours; `sh` must then have degree 0.
-    """
+    """`colors` or `sh` converted to an SH degree, with 0 for missing bands; degree -1: plain colours, from
+    `sh` of degree 0. given: also `means`."""
     if sh_degree < 0:
         if "colors" in given:
             return {"colors": given["colors"]}
@@ -106,10 +104,8 @@ def _sample_directions() -> np.ndarray:
 
 
 def rotation_of_coefficients(degree: int, rotation: np.ndarray) -> np.ndarray:
-    """Matrix D (k, k) float64 that rotates SH coefficients by R (3, 3): basis(R d) D f = basis(d) f.
-
-    Bands do not mix, so D is block diagonal; each block is solved for on fixed directions.
-    """
+    """Matrix D (k, k) float64 that rotates SH coefficients by R (3, 3): basis(R d) D f = basis(d) f. It is
+    block diagonal; each band is solved for on fixed directions."""
     dirs = _sample_directions()
     before, after = sh_basis(degree, dirs), sh_basis(degree, dirs @ np.asarray(rotation, np.float64).T)
     result = np.zeros((before.shape[1],) * 2)

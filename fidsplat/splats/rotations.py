@@ -44,8 +44,7 @@ def matrix_to_quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def matrices_to_quaternions(rotations: np.ndarray) -> np.ndarray:
-    """Unit quaternions (..., 4) float64 of rotation matrices (..., 3, 3); each is independent of the
-    others."""
+    """Unit quaternions (..., 4) float64 of rotation matrices (..., 3, 3)."""
     outer = _outer_product(np.moveaxis(np.asarray(rotations, np.float64), (-2, -1), (0, 1)))
     largest = np.argmax(outer[range(4), range(4)], axis=0)
     rows = np.take_along_axis(outer, largest[None, None], 0)[0]
@@ -54,9 +53,8 @@ def matrices_to_quaternions(rotations: np.ndarray) -> np.ndarray:
 
 
 def _outer_product(r: np.ndarray) -> np.ndarray:
-    """4 q q^T (4, 4, ...) of rotation matrices (3, 3, ...). The row of its largest diagonal entry is a
-    multiple of q that is never small.
-    """
+    """4 q q^T (4, 4, ...) of rotation matrices (3, 3, ...); the row of its largest diagonal entry is parallel
+    to q."""
     xx, yy, zz = r[0, 0], r[1, 1], r[2, 2]
     wx, wy, wz = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
     xy, zx, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
@@ -72,11 +70,8 @@ def _outer_product(r: np.ndarray) -> np.ndarray:
 
 def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray, float, np.ndarray]:
     """Split a 4x4 rigid transform with uniform scale into rotation (3, 3), scale, translation (3,), float64.
-
-    Raises InputError, naming ``name``, when the shape is not 4x4, a value is not finite, the last row is not
-    (0, 0, 0, 1), or the upper left 3x3 is not scale * rotation within 1e-6 (a reflection is not; with
-    ``rigid`` the scale must be 1).
-    """
+    Raises InputError, naming ``name``, for another matrix (within 1e-6); with ``rigid`` the scale must be
+    1."""
     m = real_array(name, matrix, "a 4x4 matrix of numbers")
     if m.shape != (4, 4):
         raise InputError(f"{name} must be a 4x4 matrix, got shape {m.shape}")
@@ -109,10 +104,8 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
 
 def pose_matrix(pose: Any, name: str) -> Any:
     """The matrix of a pose: a 4x4 matrix, which is returned unchecked, a pair (position, quaternion w, x, y,
-    z), or both in 7 numbers.
-
-    Raises InputError, naming ``name``, for a pair or 7 numbers without a unit quaternion (within 1e-3).
-    """
+    z), or both in 7 numbers. Raises InputError, naming ``name``, for a quaternion whose length is not 1
+    within 1e-3."""
     pair = isinstance(pose, tuple | list) and len(pose) == 2
     try:
         vector = not pair and np.shape(pose) == (7,)
@@ -132,11 +125,8 @@ def pose_matrix(pose: Any, name: str) -> Any:
 
 
 def rigid_matrix(position, quaternion=(1.0, 0.0, 0.0, 0.0), scale: float = 1.0) -> np.ndarray:
-    """4x4 float64 matrix: scale, then rotation by a quaternion (w, x, y, z) of any length, then translation.
-
-    Raises InputError when position is not three finite numbers, quaternion not four or all 0, or scale not
-    above 0.
-    """
+    """4x4 float64 matrix: scale, then rotation by a quaternion (w, x, y, z) of any length but 0, then
+    translation."""
     translation, rotation = real_array("position", position), real_array("quaternion", quaternion)
     if translation.shape != (3,) or not np.isfinite(translation).all():
         raise InputError(f"position must be three finite numbers, got {position!r}")

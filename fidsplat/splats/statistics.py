@@ -70,8 +70,7 @@ def describe(cloud: SplatCloud) -> dict[str, Any]:
 
 
 def level_rotation(up) -> np.ndarray:
-    """Axes of a horizontal camera for an up direction (3,), as columns (3, 3): right (x where possible), down
-    and ahead. A marker with these axes faces the camera."""
+    """Axes of a horizontal camera for an up direction (3,), as columns (3, 3): right, down and ahead."""
     up = np.asarray(up, np.float64) / np.linalg.norm(up)
     ahead = np.cross(up, (0.0, 1.0, 0.0) if np.abs(up[1:]).max() < 1e-6 else (1.0, 0.0, 0.0))
     ahead /= np.linalg.norm(ahead)
@@ -79,11 +78,9 @@ def level_rotation(up) -> np.ndarray:
 
 
 def guess_up(cloud: SplatCloud) -> Up:
-    """The up axis of a cloud, from a sample of its splats.
-
-    Away from the level areas, if they are a share of `GROUND` and twice that of any vertical area; else along
-    y or z if it is by far the longest side. Else -y, the axis of markers and of most captures.
-    """
+    """The up axis of a cloud, from a sample of its splats: away from the level areas, if they are a share of
+    `GROUND` and twice that of any vertical area; else along y or z if it is by far the longest side; else
+    -y."""
     if not len(cloud):
         return Up("-y", "no splats", False)
     some = slice(None, None, -(-len(cloud) // SAMPLE))

@@ -124,10 +124,7 @@ class _Build:
         return fresh | dict.fromkeys(("windows", "thick", "sorted", "nodes", "level", "merged"), 0)
 
     def _is_on_disk(self, state: dict[str, Any]) -> bool:
-        """Whether all files of a saved state are complete; after a power cut they may not be.
-
-        Raises OSError for a missing file.
-        """
+        """Whether all files of a saved state are complete. Raises OSError for a missing file."""
         left = list(enumerate(state["lengths"]))[state["sorted"] :]
         needed = [(self._bucket(number), count * self.plan.record.itemsize) for number, count in left]
         needed += [(self.folder / "nodes", state["nodes"] * NODE.itemsize)] if state["nodes"] else []
@@ -145,8 +142,8 @@ class _Build:
         given: Iterable[Any],
         most: int | None = None,
     ) -> Iterator[Any]:
-        """Run `work` in threads and yield results in the order of inputs. most: maximum number of pending
-        results; None: threads + 1."""
+        """Run `work` in threads, and yield results in the order of inputs. most: maximum number of pending
+        results."""
         waiting: deque[Future] = deque()
         for one in given:
             waiting.append(pool.submit(work, one))
@@ -311,8 +308,8 @@ class _Build:
 
 
 def _groups(nodes: np.ndarray, level: int, pinned: int) -> list[np.ndarray]:
-    """Group the nodes of a level: each group becomes a node of the next level. Chunks from row `pinned` on
-    are never merged."""
+    """Group the nodes of a level; each group becomes a node of the next. Rows from `pinned` on are not
+    merged."""
     below = np.flatnonzero((nodes["level"] == level) & ((level > 0) | (nodes["first"] < pinned)))
     return np.array_split(below, -(-len(below) // REDUCTION)) if len(below) else []
 

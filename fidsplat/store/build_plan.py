@@ -22,20 +22,15 @@ COLORS = ("float32", "float16")
 _MAX_BUCKETS = 1000
 _MIN_MEMORY = 256 * 2**20
 _MERGE_BYTES = 400, 6
-"""memory per merged splat: a constant in bytes plus a multiple of its size (in total 610 bytes with plain
-colours, 1,530 with SH of degree 3)"""
+"""memory per merged splat: a constant in bytes, and a multiple of its size"""
 ON_PLANE = np.uint64(1 << 63)
-"""Morton code that sorts coplanar splats last, into their own chunks; these are part of every frame, as a
-group is composited as one layer"""
+"""Morton code that sorts coplanar splats last, into chunks that are part of every frame, as a group is one
+layer"""
 
 
 @dataclass(frozen=True)
 class BuildSettings:
-    """Chunks and columns of a store.
-
-    Raises:
-        InputError: an unusable value.
-    """
+    """Chunks and columns of a store. Raises InputError for an unusable value."""
 
     chunk: int = CHUNK
     """maximum number of splats per chunk"""

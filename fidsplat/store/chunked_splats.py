@@ -1,8 +1,4 @@
-"""Splats of several stores and of a cloud in memory, as one scene that is read in chunks.
-
-The splats keep the order stores, then cloud. A frame of the chunks that a view needs is bit-identical to that
-of all splats in memory.
-"""
+"""Splats of several stores, then of a cloud in memory, as one scene that is read in chunks."""
 
 from __future__ import annotations
 
@@ -28,7 +24,7 @@ HOST_CACHE_BYTES = 2 * 2**30
 """capacity in bytes of the cache of chunks whose arrays are computed, not mapped from files"""
 
 CellSizes = float | tuple[tuple[float, ...], ...]
-"""projected size in samples below which cells are merged; one number, or one for each level of each store"""
+"""projected size [samples] below which cells are merged; one number, or one for each level of each store"""
 
 NodeMasks = tuple[np.ndarray, ...]
 """for each store (instances * nodes,) bool: mask of the selected nodes"""
@@ -113,12 +109,8 @@ class ChunkedSplats:
 
     def cell_sizes(self, *qualities: Quality) -> CellSizes:
         """Projected size [samples] below which cells are merged, from the `detail_error` of the strictest
-        quality. 0: exact.
-
-        Raises:
-            InputError: `detail_error` is positive, but the errors of the store's levels of detail were not
-                measured.
-        """
+        quality; 0: exact. Raises InputError if the errors of the store's levels of detail were not
+        measured."""
         if not all(quality.detail_error for quality in qualities):
             return 0.0
         each = ([store.cell_sizes(quality) for quality in qualities] for store in self.stores)
@@ -234,8 +226,8 @@ class ChunkedSplats:
         return arrays | {"means": (arrays["means"] + offset).astype(np.float32)}
 
     def _with_columns(self, arrays: dict[str, np.ndarray], first_group: int) -> dict[str, np.ndarray]:
-        """Convert the arrays of a chunk to the columns of this scene; absent columns have default values.
-        first_group: offset of the coplanar group ids."""
+        """The arrays of a chunk in the columns of this scene. first_group: offset of the coplanar group
+        ids."""
         count = len(arrays["means"])
         columns = {name: arrays[name] for name in ("means", "quats", "scales", "opacities", "labels")}
         columns |= colors_of_degree(arrays, self.sh_degree)

@@ -16,17 +16,12 @@ from fidsplat.util.files import atomic_write, from_json, read_input
 
 FILE = "detail.json"
 MARGIN = 3.0
-"""safety factor between the requested error and the largest measured error, as other views may have larger
-errors; a few still exceed the requested error"""
+"""ratio of the requested error to the largest measured error, as other views may have larger errors"""
 
 
 @dataclass(frozen=True)
 class DetailSettings:
-    """Views of a measurement of levels of detail.
-
-    Raises:
-        InputError: an unusable value.
-    """
+    """Views of a measurement of levels of detail. Raises InputError for an unusable value."""
 
     views: int = 60
     """number of viewpoints; levels are measured in rotation, one for each viewpoint"""
@@ -60,10 +55,10 @@ class DetailErrors:
 
 
 def allowed_cell_size(measured: Iterable[DetailErrors], level: int, error: float) -> float:
-    """Largest cell size [samples] of a level whose error in the measured views is at most `error` / `MARGIN`.
+    """Largest cell size [samples] of a level whose error in the measured views is at most `error` / `MARGIN`;
+    0 if there is none.
 
-    0 if there is none. Other views may exceed `error`. Sizes that no measured view contained are not used.
-    Measurements of the adjacent levels are used too: cells of equal size have similar errors, but few views
+    Measurements of the adjacent levels count too: cells of equal size have similar errors, but few views
     contain a level's cells in the gaps between surfaces, where their error is largest.
     """
     near = [one for one in measured if abs(one.level - level) <= 1]
@@ -90,8 +85,7 @@ def save_detail_errors(folder: Path, identity: str, measured: Sequence[DetailErr
 
 
 def load_detail_errors(folder: Path, identity: str) -> list[DetailErrors]:
-    """The measured errors of a store; empty if the store's content has changed since. Raises InputError for a
-    damaged file."""
+    """The measured errors of a store; empty if its content has changed since."""
     file = folder / FILE
     if not file.exists():
         return []

@@ -21,11 +21,8 @@ from fidsplat.util.files import atomic_write
 
 
 def grid_poses(counts: Sequence[int], pitch: Sequence[float]) -> list[np.ndarray]:
-    """Poses (4, 4) on a grid along the world's axes; the first is the identity.
-
-    Args:
-        counts: instances along x, y, z, each at least 1. pitch: metres between them.
-    """
+    """Poses (4, 4) on a grid along the world's axes, the first the identity. counts: instances along x, y, z.
+    pitch: metres between them."""
     if math.prod(counts) > 10_000_000:
         raise InputError(f"a grid must have at most 10,000,000 instances, got {' x '.join(map(str, counts))}")
     steps = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)

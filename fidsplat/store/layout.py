@@ -190,7 +190,7 @@ def shapes_of(sh_degree: int) -> dict[str, tuple[int, ...]]:
 
 
 def npy_header(kind: str, shape: tuple[int, ...]) -> bytes:
-    """Header of a .npy file; of fixed length, so that it can be rewritten when the number of rows is
+    """Header of a .npy file, of fixed length, so that it can be rewritten when the number of rows is
     known."""
     text = f"{{'descr': '{np.dtype(kind).str}', 'fortran_order': False, 'shape': {shape!r}, }}"
     body = text.encode("ascii").ljust(NPY_HEADER - 11) + b"\n"
@@ -216,10 +216,8 @@ def checksum(parts: Mapping[str, np.ndarray]) -> int:
 
 
 def map_column(folder: Path, name: str, kind: str, shape: tuple[int, ...], starts: np.ndarray) -> np.ndarray:
-    """Memory-map a column (rows, ...), read-only. starts: (n,) first rows of the nodes.
-
-    Raises InputError if the file is missing, truncated or does not match the header.
-    """
+    """Memory-map a column (rows, ...), read-only. starts: (n,) first rows of the nodes. Raises InputError if
+    the file is missing, truncated or does not match the header."""
     file, header = column_file(folder, name), npy_header(kind, shape)
     size = NPY_HEADER + row_bytes(kind, shape[1:]) * shape[0]
     try:
@@ -271,8 +269,8 @@ def read_nodes(folder: Path, header: Header) -> np.ndarray:
 
 
 def _misfit(nodes: np.ndarray, header: Header) -> str:
-    """Describe a contradiction between an index and its header; empty if there is none. Rendering relies on
-    every condition."""
+    """Describe a contradiction between an index and its header on which rendering relies; empty if there is
+    none."""
     first, count, level, parent = (
         nodes[name].astype(np.int64) for name in ("first", "count", "level", "parent")
     )

@@ -29,12 +29,9 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def merged(splats: dict[str, np.ndarray], grid: Grid) -> tuple[dict[str, np.ndarray], float]:
-    """Merge splats to about a quarter of their number; returns the merged splats and the edge [m] of the
-    cells.
-
-    A merged splat has the label of the splat with the largest weight. splats: arrays of a store's
-    columns.
-    """
+    """Merge splats (arrays of a store's columns) to about a quarter of their number; returns the merged
+    splats and the edge [m] of the cells. A merged splat has the label of the splat with the largest
+    weight."""
     u, v, normal = _frames(splats["quats"])
     sides = np.abs(normal)
     classes = np.where(sides[0] > sides[1], np.where(sides[0] > sides[2], 0, 2), 1 + (sides[2] > sides[1]))
@@ -76,8 +73,7 @@ def _frames(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _cells(codes: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
-    """(n,) key of each splat's cell and class, and the size of the cells as a number of combined grid
-    levels."""
+    """(n,) key of each splat's cell and class, and the number of combined grid levels."""
     target = max(1, len(codes) // REDUCTION)
     ordered = np.sort(codes)
     # number of levels at which neighbouring splats in Morton order differ
@@ -98,8 +94,8 @@ def _cells(codes: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
 def _by_moments(
     splats: dict[str, np.ndarray], frames: tuple[np.ndarray, np.ndarray, np.ndarray], starts: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """One splat for each run of splats, or copies where its opacity would be too high; a run of one is
-    unchanged. frames: tangents and normal."""
+    """One splat for each run of splats, or copies where its opacity would be too high. frames: tangents and
+    normal."""
     count = len(splats["means"])
     lengths = np.diff(np.append(starts, count))
     scales = splats["scales"].T.astype(np.float64)

@@ -1,5 +1,4 @@
-"""Partial clouds: some splats of a scene, with the traits of the complete scene; operations on their
-arrays."""
+"""Partial clouds: some splats of a scene, with the traits of the complete scene."""
 
 from __future__ import annotations
 
@@ -67,10 +66,8 @@ def concatenated(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndar
 def transformed(
     splats: Mapping[str, np.ndarray], rotation: np.ndarray, offset: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Splats rotated by a matrix (3, 3) and moved by (3,) metres.
-
-    Sums have a fixed order, so that the result for a splat does not depend on the others.
-    """
+    """Splats rotated by a matrix (3, 3) and moved by (3,) metres; each result is independent of other
+    splats."""
     x, y, z = splats["means"].T.astype(np.float64)
     means = [rotation[i, 0] * x + rotation[i, 1] * y + rotation[i, 2] * z + offset[i] for i in range(3)]
     w, a, b, c = splats["quats"].T.astype(np.float64)

@@ -102,10 +102,8 @@ def degree_of(source: Source) -> int:
 
 
 def sample(sources: Sequence[Source]) -> tuple[np.ndarray, np.ndarray]:
-    """Sampled centres (n, 3) float32 [m] of all sources, relative to the returned origin (3,) float64.
-
-    The origin: the common origin of all sources, or else a point near the splats.
-    """
+    """Sampled centres (n, 3) float32 [m] of all sources, and the origin (3,) float64 that they are relative
+    to: that of all sources, or else a point near the splats."""
     means, single, scales = [], [], []
     for source in sources:
         count = source.rows.count
@@ -127,8 +125,8 @@ def sample(sources: Sequence[Source]) -> tuple[np.ndarray, np.ndarray]:
 def splats_of(
     source: Source, span: tuple[int, int], origin: np.ndarray, columns: dict[str, str], sh_degree: int
 ) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Splats of a range of rows, in a store's columns and relative to its origin (3,) float64; and the number
-    of invalid splats by reason."""
+    """Splats of a range of rows, in a store's columns and relative to its origin; and invalid splats by
+    reason."""
     part, dropped = window(source.rows, *span)
     count = len(part["means"])
     means = part["means"]

@@ -37,11 +37,8 @@ def refuse_existing(folder: Path, overwrite: bool) -> None:
 
 @contextmanager
 def staged(folder: Path) -> Iterator[Path]:
-    """Lock the staging folder next to `folder` and yield it, with the files of an interrupted build.
-
-    On success it is renamed to `folder`, and the folder of that name is removed. Raises InputError if another
-    process builds there or it cannot be written.
-    """
+    """Lock the staging folder next to `folder` and yield it, with the files of an interrupted build. On
+    success it replaces `folder`. Raises InputError if another process builds there."""
     part = folder.with_name(f".{folder.name}.part")
     writable_folder(part)
     try:

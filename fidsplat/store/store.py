@@ -178,11 +178,8 @@ class Store(Summarised):
         return sum(layout.row_bytes("<f4", shapes[name]) for name in {*self._own.columns, "labels"})
 
     def bounds(self, sigmas: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
-        """Axis-aligned box (min (3,), max (3,)) float64, world, around all splats to that many standard
-        deviations. It is the union of the chunks' boxes, so somewhat larger than that of a cloud.
-
-        Raises InputError for an empty store.
-        """
+        """Axis-aligned box (min (3,), max (3,)) float64, world, around all chunks to that many standard
+        deviations. Raises InputError for an empty store."""
         low, high = self.boxes(sigmas)
         leaves = np.tile(self.nodes["level"] == 0, self.instances)
         if not leaves.any():
@@ -200,11 +197,8 @@ class Store(Summarised):
         return int(self.nodes["level"].max(initial=0))
 
     def cell_sizes(self, quality: Quality) -> tuple[float, ...]:
-        """Projected cell size [samples] below which cells of a level are rendered, for each level from 0; 0:
-        never.
-
-        Determined by the quality's `detail_error`. Raises InputError if the errors were not measured.
-        """
+        """Projected cell size [samples] below which cells of each level are rendered, from the quality's
+        `detail_error`; 0: never. Raises InputError if the errors were not measured."""
         instance("quality", quality, Quality)
         if not self.levels:
             return (0.0,)  # no levels of detail: always exact
@@ -223,7 +217,7 @@ class Store(Summarised):
 
     def boxes(self, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corners, (instances * nodes, 3) float64 [m] from the origin, of boxes around the
-        splats of each node to that many standard deviations; 0: around their centres."""
+        splats of each node to that many standard deviations."""
         sigmas = checked_number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
         nodes, share = self.nodes, min(sigmas / layout.FAR, 1.0)
         beyond = np.maximum(sigmas - layout.FAR, 0.0) * nodes["reach"].astype(np.float64)[:, None]
@@ -273,10 +267,8 @@ class Store(Summarised):
         return given.astype(np.int64)
 
     def load(self, number: int, placed: bool = True) -> dict[str, np.ndarray]:
-        """Splats of a node, by its number: arrays like those of a cloud, relative to `origin`.
-
-        placed: whether to apply the pose of the instance.
-        """
+        """Splats of a node, by its number: arrays like those of a cloud, relative to `origin`. placed:
+        whether to apply the pose of the instance."""
         last = self.instances * len(self.nodes) - 1
         flag("placed", placed)
         instance, node = divmod(whole_number("the number of a node", number, 0, last), len(self.nodes))
@@ -309,8 +301,8 @@ class Store(Summarised):
         return int(self._columns["coplanar_groups"][self._own.pinned : self._own.splats].max(initial=-1))
 
     def cloud(self) -> SplatCloud:
-        """All splats in one cloud, memory-mapped if possible. Frames of the store are bit-identical to frames
-        of this cloud."""
+        """All splats in one cloud, memory-mapped if possible. Its frames are bit-identical to those of the
+        store."""
         parts = [self._rows(0, self._own.splats, instance) for instance in range(self.instances)]
         return PartialCloud.of(concatenated(parts), self, self.header.dropped)
 
@@ -350,8 +342,7 @@ class Store(Summarised):
 
 
 def _unrenderable(rows: dict[str, np.ndarray], merged: bool = False) -> str:
-    """Describe invalid values and their counts; empty if all are valid. merged: whether these are merged
-    splats, whose opacities may exceed 1."""
+    """Describe invalid values and their counts; empty if there are none. merged: opacities may exceed 1."""
     names = rows.keys() - {"labels", "coplanar_groups"}
     _, found = find_defects({name: rows[name].astype(np.float32, copy=False) for name in names})
     if merged:

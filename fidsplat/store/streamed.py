@@ -36,10 +36,8 @@ def is_streamed(inputs: object) -> bool:
 
 
 def import_streamed(path: Path, folder: Path, progress: Progress) -> None:
-    """Write a store with the chunks and levels of a streamed SOG.
-
-    Raises InputError for a damaged file, or an environment, which stores do not support.
-    """
+    """Write a store with the chunks and levels of a streamed SOG. Raises InputError for one with an
+    environment."""
     scene = read_streamed(path)
     scene.check_memory()
     if scene.environment is not None:
@@ -117,13 +115,9 @@ def _area(means: np.ndarray) -> float:
 
 
 def export_streamed(store: Store, path: Path) -> None:
-    """Write a store as streamed SOG with its levels, next to a file lod-meta.json.
-
-    A leaf of the file is a node of the store that represents at most 262,144 splats of the scene; coarser
-    levels are left out. Coplanar groups and labels are left out.
-
-    Raises InputError for an instanced store or a file that cannot be written.
-    """
+    """Write a store as streamed SOG with its levels, next to a file lod-meta.json. A leaf of the file is a
+    node of the store that represents at most 262,144 splats of the scene. Coarser levels, coplanar groups and
+    labels are left out. Raises InputError for an instanced store."""
     if store.poses is not None:
         raise InputError(
             f"a store written as streamed SOG must have no instances, got {len(store.poses):,}; write the "

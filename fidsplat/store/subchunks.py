@@ -1,7 +1,4 @@
-"""Subchunks: runs of 1024 splats of a chunk with their own bounding boxes, for finer occlusion culling.
-
-The boxes of a chunk are computed when a view first needs them.
-"""
+"""Subchunks: runs of 1024 splats of a chunk with their own bounding boxes, for finer occlusion culling."""
 
 from __future__ import annotations
 
@@ -45,12 +42,8 @@ class Subchunks:
 
 
 class SubchunkTable:
-    """Subchunks of a store, computed on first use.
-
-    Args:
-        offset: (3,) metres, added to all boxes.
-        pinned: (n,) bool: nodes that are part of every frame.
-    """
+    """Subchunks of a store, computed on first use. offset: (3,) metres, added to all boxes. pinned: (n,)
+    bool: nodes that are part of every frame."""
 
     def __init__(self, store: Store, offset: np.ndarray, pinned: np.ndarray) -> None:
         self._store, self._offset, self._pinned = store, offset, pinned

@@ -1,8 +1,5 @@
 """Row bands: a frame that does not fit on the device is rendered in bands of rows, each from its visible
-chunks.
-
-If a band cannot be split further, the device projects its splats in chunks: slower, with the same image.
-"""
+chunks. If a band cannot be split further, the device projects its splats in chunks."""
 
 from __future__ import annotations
 
@@ -27,8 +24,7 @@ from fidsplat.streaming.occlusion_test import contributing_tiles, node_keys, occ
 _MIN_ROWS = 16
 """pixels"""
 _MAX_OVERLAP = 1.6
-"""a band is split if its halves together have at most this many times its splats; with a fisheye each half
-may need all"""
+"""a band is split if its halves have at most this many times its splats; with a fisheye each may need all"""
 
 
 @dataclass(frozen=True)
@@ -187,7 +183,7 @@ class BandSplitter:
         """largest number of splats that fitted"""
 
     def split(self, full: Band, fits: Callable[[Band], bool]) -> Iterator[Band]:
-        """Bands from the top that fit, or cannot be split further. `fits` is called right before its band is
+        """Bands from the top that fit, or cannot be split further. `fits` is called right before a band is
         yielded."""
         waiting = [full.with_rows(*rows) for rows in pairwise(self._cuts.get(full.rows, full.rows))]
         bands: list[Band] = []

@@ -1,8 +1,7 @@
 """Frustum culling of boxes of splats, and their size on the image.
 
 The test is conservative for every camera model, low-pass and shutter: a culled box contains no splat that
-contributes to the frame. It applies the criteria of `project.cl` to all splats that a box can contain, and
-keeps a box where it cannot decide.
+contributes to the frame. It applies the criteria of `project.cl` to all splats that a box can contain.
 """
 
 from __future__ import annotations
@@ -34,12 +33,8 @@ _ROUNDING = 1e-5
 
 
 def in_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
-    """Frustum culling: (n,) bool, whether a box can contain splats that contribute to the frame.
-
-    Args:
-        boxes: tested at all poses of the shutter and with the motion of each moving group.
-        reach: (n,) metres: largest standard deviation of a box's splats.
-    """
+    """(n,) bool: whether a box can contain splats that contribute to the frame, at any pose of the shutter
+    and of moving groups. reach: (n,) metres: largest standard deviation of a box's splats."""
     if view.sub_frames:
         visible = np.zeros(len(reach), bool)
         for sub_frame in view.sub_frames:
@@ -77,11 +72,9 @@ class Extent:
 
     @staticmethod
     def of(view: View, features: FeatureSet, minimum: float = 0.0) -> Extent | None:
-        """The extent of a view's splats, of at least `minimum` standard deviations; None if unbounded.
-
-        The low-pass `pixel` has no bound for distorted lenses (a fold stretches without limit), for parallel
-        rays (an unbounded footprint) and for cut-offs as low as 1e-13.
-        """
+        """The extent of a view's splats, of at least `minimum` standard deviations; None if unbounded: the
+        low-pass `pixel` has no bound for distorted lenses, for parallel rays and for cut-offs as low as
+        1e-13."""
         radius = max(cutoff_radius(view), minimum)
         # margin for the low-pass disc, or for the low-pass of EWA
         plain = Extent(radius, radius * view.samples + 2.0, radius)
@@ -97,7 +90,7 @@ class Extent:
         return Extent(larger * radius, margin, radius / nearer, nearer)
 
     def nearest(self, view: View, boxes: CameraBoxes) -> np.ndarray:
-        """(n,) metres: lower bound on the depths and sort keys of splats, by boxes to `depths` standard
+        """(n,) metres: lower bound on depths and sort keys of splats. boxes: to `depths` standard
         deviations."""
         nearest = boxes.nearest(view)
         return np.minimum(self.nearer * nearest, nearest)
@@ -113,10 +106,10 @@ def cutoff_radius(view: View) -> float:
 
 
 def ewa_reach(view: View, features: FeatureSet, radius: float, reach: np.ndarray) -> np.ndarray | None:
-    """Extent of EWA footprints around projected centres, (n,) samples times the depth [m] (perspective).
+    """Extent of EWA footprints around projected centres, (n,) samples times the depth [m]; None without EWA.
 
     EWA projects by the derivative at the centre, so a footprint can reach further than the splat. radius:
-    standard deviations; reach: (n,) metres, largest standard deviation. None without EWA.
+    standard deviations; reach: (n,) metres, largest standard deviation.
     """
     if not {"ellipsoid_ewa", "ellipsoid_ewa_antialiased"} & features.names:
         return None
@@ -200,10 +193,8 @@ class CameraBoxes:
         return np.linalg.norm(self._half, axis=1) + self.rounding
 
     def within(self, angle: float, step: float = 0.0, further: np.ndarray | None = None) -> np.ndarray:
-        """(n,) bool: boxes that can have points within an angle [rad] of the optical axis.
-
-        Points may be displaced by a share `step` of their distance to the camera, and `further` (n,) metres.
-        """
+        """(n,) bool: boxes that can have points within an angle [rad] of the optical axis, if displaced by a
+        share `step` of their distance to the camera, and `further` (n,) metres."""
         distance = np.linalg.norm(self.middle, axis=1)
         with np.errstate(over="ignore"):  # infinite for a box around the camera
             around = np.arcsin(np.minimum(self._radius / np.maximum(distance, 1e-300), 1.0))
@@ -234,8 +225,8 @@ def _pinhole_sides(view: View, margin: float) -> list[tuple[np.ndarray, float]]:
 
 
 def _max_ray_rotation(view: View) -> float:
-    """Largest angle [rad] between rays one sample apart, of a fisheye or a panorama; infinite for a fisheye
-    that folds."""
+    """Largest angle [rad] between rays one sample apart, of a fisheye or panorama; infinite for a folding
+    fisheye."""
     lens = view.lens
     if not isinstance(lens, Fisheye):
         return 1.0 / min(view.focal_x, view.focal_y)
@@ -262,11 +253,8 @@ def _slopes(raster: RayRaster) -> tuple[np.ndarray, np.ndarray]:
 
 
 def projected_sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
-    """(n,) samples: upper bound on the projected size of lengths (n,) [m] anywhere in each box.
-
-    The bound is over all poses of the shutter and all moving groups; it is infinite where a box reaches the
-    camera.
-    """
+    """(n,) samples: upper bound on the projected size of lengths (n,) [m] anywhere in each box, over all
+    poses of the shutter and moving groups; infinite where a box reaches the camera."""
     if view.sub_frames:
         return np.max(
             [projected_sizes(sub_frame.view, boxes, edges) for sub_frame in view.sub_frames], axis=0

@@ -30,15 +30,14 @@ _MAX_GROWTH = 2.0
 _MAX_VISIBLE = 0.7
 """share of splats that are not occluded above which all splats of a view are rendered"""
 _PROBE_SHARE, _PROBE_SPLATS = 4, 4_000_000
-"""occlusion culling is always tried with a guess of at most 1 / _PROBE_SHARE of the splats, or
-_PROBE_SPLATS"""
+"""maximum size of a guess with which occlusion culling is always tried: share of all splats, and number"""
 _PAUSE = 16
 """number of views without occlusion culling after a view with little occlusion"""
 _SAMPLES_PER_TILE, _MOTION_SLACK = 4, 4.0
 """reprojection of termination depths: number of sampled directions per tile, across and down; and the
 multiple of the camera's motion that is added to the depths"""
 _PATCH_RATIO = 2
-"""missing chunks are rendered alone, only in their tiles, if they have this many times fewer splats than the
+"""missing chunks are rendered alone, in their tiles, if they have this many times fewer splats than the
 frame"""
 _MAX_PASSES = 12
 """maximum number of passes; then a view is rendered from all visible chunks"""

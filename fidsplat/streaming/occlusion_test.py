@@ -1,7 +1,6 @@
 """Occlusion test of boxes of splats against the termination depths of a frame's tiles.
 
-A box is occluded if its lowest sort key is above the termination depth of every tile that it can touch
-(fidsplat/backends/termination_depth.py says why the frame is then bit-identical).
+A box is occluded if its lowest sort key is above the termination depth of every tile that it can touch.
 """
 
 from __future__ import annotations
@@ -18,8 +17,7 @@ from fidsplat.store.chunked_splats import ChunkedSplats, NodeMasks
 from fidsplat.streaming.frustum_culling import PADDING, Boxes, CameraBoxes, Extent, ewa_reach
 
 _RANGE = 3.33
-"""standard deviations within which a splat's depth varies between pixels, at least sqrt(2 ln 255)
-(slot/compose_pixel.cl)"""
+"""standard deviations within which a splat's depth varies between pixels (slot/compose_pixel.cl)"""
 
 
 def is_supported(view: View, features: FeatureSet) -> bool:
@@ -39,10 +37,7 @@ def minimum_keys(view: View, features: FeatureSet, boxes: Boxes) -> np.ndarray:
 def occluded(
     view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, termination: TerminationDepths
 ) -> np.ndarray:
-    """(n,) bool: boxes none of whose splats can contribute to a frame with these termination depths.
-
-    boxes, reach: those of `in_frustum`.
-    """
+    """(n,) bool: boxes whose splats cannot contribute to a frame with these termination depths."""
     keys, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, termination)
     return keys > _RangeMaximum(termination.depths).within(*spans)
 
@@ -50,10 +45,7 @@ def occluded(
 def contributing_tiles(
     view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, termination: TerminationDepths
 ) -> np.ndarray:
-    """(rows, columns) bool: tiles to which splats of the boxes can contribute, given termination depths.
-
-    boxes, reach: those of `in_frustum`.
-    """
+    """(rows, columns) bool: tiles to which splats of the boxes can contribute."""
     tiles = np.zeros(termination.depths.shape, bool)
     keys, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, termination)
     for key, top, bottom, left, right in zip(keys, *spans, strict=True):
@@ -104,8 +96,8 @@ def _extent(view: View, features: FeatureSet) -> Extent | None:
 def _projected_extent(
     view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds on x, y of the splats of each box on the image, (n, 2) samples each, by a pinhole or parallel
-    rays; infinite where a box reaches the camera."""
+    """Bounds on x, y of the splats of each box on the image, (n, 2) samples each, without a lens; infinite
+    where a box reaches the camera."""
     extent = _extent(view, features)
     assert extent is not None  # the caller has checked `is_supported`
     radius, margin = extent.radius, extent.margin

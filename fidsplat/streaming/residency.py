@@ -51,12 +51,8 @@ class Residency:
     def bands(
         self, view: View, features: FeatureSet, quality: Quality, pipeline: Pipeline
     ) -> Iterator[BandData]:
-        """Bands of a view with their visible splats, from the top; one band if the device can render all at
-        once. Each is uploaded when the caller requests it.
-
-        Raises:
-            InputError: the quality allows an error that was not measured.
-        """
+        """Bands of a view with their visible splats, from the top, each uploaded when requested; one if all
+        fits."""
         full = Band.of(self.scene, view, features, self.scene.cell_sizes(quality))
 
         def fits(band: Band, first_id: int = 0) -> bool:
@@ -90,11 +86,7 @@ class Residency:
         self, views: Sequence[View], features: FeatureSet, qualities: Iterable[Quality]
     ) -> tuple[ResidentData, Callable[[], np.ndarray]]:
         """Load the splats that are visible in any of several views; returns them, and a function that returns
-        their scene indices (n,) int32. The strictest quality applies to all views.
-
-        Raises:
-            InputError: a quality allows an error that was not measured.
-        """
+        their scene indices (n,) int32. The strictest quality applies to all views."""
         selection = select(self.scene, views, features, self.scene.cell_sizes(*qualities))
         self.nodes = len(selection)
         return self._data(selection), partial(self.scene.ids, selection)
@@ -139,10 +131,8 @@ class Residency:
                 self._prefetch_thread.join()
 
     def _prefetch(self, capture: Capture) -> None:
-        """Start to prefetch the chunks of a view in another thread, unless one is still running.
-
-        An error is ignored here: rendering the view reports it again.
-        """
+        """Start to prefetch the chunks of a view in another thread, unless one is running. Rendering reports
+        errors."""
         features, view = prepare(self.scene, capture)
         cell_sizes = self.scene.cell_sizes(capture.quality)
         if self._prefetch_thread is not None and self._prefetch_thread.is_alive():

@@ -168,8 +168,7 @@ def made_of(what: str, kind: type[T], values: dict[str, Any]) -> T:
 
 
 class PickledByFields:
-    """Base of frozen dataclasses that are pickled and copied by their fields, without cached values. Their
-    arrays are read-only afterwards."""
+    """Base of frozen dataclasses that are pickled and copied by their fields, with read-only arrays."""
 
     def __getstate__(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]

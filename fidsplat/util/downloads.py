@@ -20,12 +20,8 @@ _BLOCK, _SECONDS = 2**18, 30
 def download(
     url: str, target: Path, size: int, sha256: str, progress: Callable[[int], None] = lambda _: None
 ) -> Path:
-    """Download a file unless it is present, check its size and SHA-256, and return its path.
-
-    progress: callback of the number of bytes of each part read.
-
-    Raises InputError if the file cannot be read from the URL or differs from what was expected.
-    """
+    """Download a file unless it is present, check its size and SHA-256, and return its path. progress: called
+    with the number of bytes of each part read."""
     if target.is_file() and target.stat().st_size == size:
         progress(size)
         return target

@@ -48,10 +48,8 @@ def path_of(path: str | os.PathLike[str]) -> Path:
 
 
 def ordinary_file(path: str | os.PathLike[str]) -> Path:
-    """The path of a file that exists or can be created.
-
-    Raises InputError for a folder, a device or a pipe, which an atomic write would replace.
-    """
+    """The path of a file that exists or can be created. Raises InputError for a folder, a device or a
+    pipe."""
     target = path_of(path)
     if target.exists() and not target.is_file():
         raise InputError(
@@ -72,11 +70,8 @@ _KINDS = {
 
 
 def regular_file(path: str | os.PathLike[str]) -> Path:
-    """Check that a path is a regular file, for libraries that open files themselves.
-
-    Raises InputError for a missing file, and for a folder, a pipe or a device, whose opening or reading may
-    block.
-    """
+    """Check that a path is a regular file, for libraries that open files themselves. Raises InputError for a
+    folder, and for a pipe or a device, whose reading may block."""
     file = path_of(path)
     try:
         mode = file.stat().st_mode
@@ -96,8 +91,7 @@ def kind_of(path: Path) -> str:
 
 
 def open_input(path: str | os.PathLike[str]) -> BinaryIO:
-    """Open an input file for binary reading. Raises InputError if it is not a regular file or cannot be
-    opened."""
+    """Open an input file for binary reading. Raises InputError if it is not a regular file."""
     file = regular_file(path)
     try:
         # O_NONBLOCK: a pipe that has replaced the file since the check is then read as empty
@@ -107,14 +101,8 @@ def open_input(path: str | os.PathLike[str]) -> BinaryIO:
 
 
 def read_input(path: str | os.PathLike[str], most: int | None = None, first: int | None = None) -> bytes:
-    """Read an input file.
-
-    Args:
-        most: maximum size in bytes.
-        first: read only this number of first bytes.
-
-    Raises InputError for a file that is not regular, too large, beyond `input_limit` or unreadable.
-    """
+    """Read an input file, or only its `first` bytes. most: maximum size in bytes. Raises InputError if it is
+    not regular, too large, beyond `input_limit` or unreadable."""
     with open_input(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         if most is not None and size > most:
@@ -153,8 +141,7 @@ def printable(text: str) -> str:
 
 
 def from_json(text: str | bytes, finite: bool = False) -> Any:
-    """Parse JSON. Raises ValueError for anything else, including nesting that is too deep, and with
-    `finite` for infinities and NaN."""
+    """Parse JSON. Raises ValueError for anything else, and with `finite` for infinities and NaN."""
     numbers: dict[str, Any] = {"parse_float": _finite, "parse_constant": _finite} if finite else {}
     try:
         return json.loads(text, **numbers)
@@ -170,15 +157,8 @@ def _finite(text: str) -> float:
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str], durable: bool = False) -> Iterator[BinaryIO]:
-    """Open a temporary file next to ``path`` for binary writing, and rename it to ``path`` after success.
-
-    Readers never get an incomplete file, and an interrupted run keeps the old one.
-
-    Args:
-        durable: wait until the file is on the disk, so that a power cut leaves the new or the old file.
-
-    Raises InputError if the folder is missing or not writable.
-    """
+    """Open a temporary file next to ``path`` for binary writing, and rename it to ``path`` after success, so
+    that no reader gets an incomplete file. durable: wait until it is on the disk, for a power cut."""
     with atomic_path(path) as part, part.open("wb") as stream:
         yield stream
         if durable:
@@ -200,18 +180,14 @@ def write_file(path: str | os.PathLike[str], content: bytes | str) -> Path:
 
 
 def write_json(path: str | os.PathLike[str], value: Any, indent: int | None = None) -> Path:
-    """Write plain data as a JSON file, atomically. Raises InputError if it cannot be written, and ValueError
-    for infinities and NaN."""
+    """Write plain data as a JSON file, atomically. Raises ValueError for infinities and NaN."""
     return write_file(path, json.dumps(value, indent=indent, allow_nan=False))
 
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str], suffix: str = "") -> Iterator[Path]:
     """An empty temporary file that is renamed to ``path`` after success, for libraries that open files.
-
-    Args:
-        suffix: ending of the temporary name, for libraries that depend on it.
-    """
+    suffix: ending of the temporary name."""
     interrupts.check()
     target = ordinary_file(path)
     try:
@@ -234,10 +210,7 @@ def atomic_path(path: str | os.PathLike[str], suffix: str = "") -> Iterator[Path
 
 
 def writable_folder(path: str | os.PathLike[str]) -> Path:
-    """Create a folder with its parents and check that a file can be written in it, before long work.
-
-    Raises InputError if the folder cannot be written.
-    """
+    """Create a folder with its parents and check that a file can be written in it, before long work."""
     folder = path_of(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -267,10 +240,7 @@ def _umask() -> int:
 
 def kernels_folder() -> Path:
     """The folder of the kernels: `kernels/` next to the package in a checkout, `fidsplat/_kernels` in a
-    wheel.
-
-    Raises DeviceError if both are missing.
-    """
+    wheel."""
     here = Path(__file__).resolve().parents[1]
     places = (here / "_kernels", here.parent / "kernels")
     for place in places:

@@ -42,11 +42,8 @@ class Terminated(KeyboardInterrupt):
 
 
 def install() -> dict[int, Any]:
-    """Let SIGINT and SIGTERM set the flag; returns the replaced handlers.
-
-    Ignored signals stay ignored, as in a background command of a shell. Outside the main thread nothing
-    changes.
-    """
+    """Let SIGINT and SIGTERM set the flag, unless they are ignored; returns the replaced handlers. Outside
+    the main thread nothing changes."""
     if threading.current_thread() is not threading.main_thread():
         return {}
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}

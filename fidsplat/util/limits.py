@@ -55,12 +55,9 @@ def check_total(what: str, need: int, remedy: str) -> None:
 def check_expansion(path: Path | str, need: float, what: str, size: int | None = None) -> None:
     """Raise InputError if a file would expand beyond `input_limit`.
 
-    Args:
-        path: the file, or with a size a description of its part.
-        need: bytes of memory after expansion.
-        what: content that the file declares, for the message: "100,000,000 splats".
-        size: bytes of the file or of its compressed part; by default those on the disk, without the holes
-            of a sparse file.
+    path: the file, or with a size a description of its part. need: bytes of memory after expansion. what:
+    declared content, for the message: "100,000,000 splats". size: bytes of the file or of its compressed
+    part; None: those on the disk, without the holes of a sparse file.
     """
     if size is None:
         status = Path(path).stat()
@@ -74,10 +71,8 @@ def check_expansion(path: Path | str, need: float, what: str, size: int | None =
 
 
 def check_holes(path: Path | str) -> None:
-    """Raise InputError for a sparse file that is much larger than its data on the disk.
-
-    For files that are mapped into memory and may exceed it: they have no other limit.
-    """
+    """Raise InputError for a sparse file that is much larger than its data on the disk, for memory-mapped
+    files."""
     status = Path(path).stat()
     stored = 512 * status.st_blocks
     if status.st_size > (limit := max(input_limit(0), RATIO * stored)):
@@ -109,8 +104,7 @@ def check_imports() -> None:
 @cache
 def check_driver(family: str) -> None:
     """Raise DeviceError if a limit is too low for the driver of a family, which would abort the process.
-    Checked once per family, as the loaded driver counts as used memory.
-    """
+    Checked once, as the loaded driver counts as used memory."""
     if (largest := _limit("RLIMIT_FSIZE")) < _FILE:
         raise DeviceError(
             f"the limit on file size must be at least {bytes_words(_FILE)} for compiled kernels, got "

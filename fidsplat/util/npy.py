@@ -21,26 +21,14 @@ _MAGIC = b"\x93NUMPY\x01\x00"
 
 
 def load_npy(file: Path) -> np.ndarray:
-    """The array of a .npy file, read-only.
-
-    Raises:
-        InputError: the file is not a regular file, or cannot be read.
-        ValueError: its content is damaged, or its array holds Python objects.
-    """
+    """The array of a .npy file, read-only. Raises ValueError for damaged content or Python objects."""
     with open_input(file) as stream:
         return _array(stream.read())
 
 
 def load_npz(file: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file that `numpy.savez` wrote, read-only, with their CRC-32 checked.
-
-    Args:
-        names: arrays to read; None for all.
-
-    Raises:
-        InputError: the file is not a regular file, or cannot be read.
-        ValueError: an array is missing, damaged or compressed, or holds Python objects.
-    """
+    """The arrays of a .npz file of `numpy.savez`, or those of some names, read-only, with their CRC-32
+    checked. Raises ValueError if an array is missing, damaged or compressed, or holds Python objects."""
     with open_input(file) as stream:
         try:
             with ZipFile(stream) as members:

@@ -25,18 +25,15 @@ _WITHOUT_SOURCES = {"__pycache__", "_kernels"}
 
 
 def digest_of(content: object) -> str:
-    """SHA-256 of plain data as 16 hexadecimal digits; large arrays are not copied.
-
-    Raises PicklingError, AttributeError or TypeError for content other than data.
-    """
+    """SHA-256 of plain data as 16 hexadecimal digits. Raises PicklingError, AttributeError or TypeError for
+    others."""
     digest = _Digest()
     _DataPickler(digest, protocol=5).dump(content)
     return digest.sha.hexdigest()[:16]
 
 
 class _DataPickler(pickle.Pickler):
-    """Pickler that refuses functions and other callables: pickle stores only their names, which may refer to
-    something else later."""
+    """Pickler that refuses functions, of which pickle stores only the names."""
 
     def persistent_id(self, obj: Any) -> None:
         known = (getattr(obj, "__module__", None) or "").partition(".")[0] in _REBUILDING
@@ -58,10 +55,8 @@ class _Digest:
 
 @cache
 def code_hash() -> str:
-    """SHA-256 of all sources, data and templates of the package and the kernels, as 16 hexadecimal digits.
-
-    Equal in a checkout and in a wheel, which have different folders of kernels.
-    """
+    """SHA-256 of all files of the package and the kernels, as 16 hexadecimal digits, equal in a checkout and
+    a wheel."""
     found = hashlib.sha256()
     for name, file in sorted(sources().items()):
         content = file.read_bytes()
@@ -82,13 +77,8 @@ def sources() -> dict[str, Path]:
 
 
 def run_facts(device: str | None, seed: int, versions: Mapping[str, str] | None = None) -> dict:
-    """Provenance of a run as plain data.
-
-    Args:
-        device: title and driver of the rendering device; None without rendering.
-        seed: seed of texts, views and scenes.
-        versions: versions of other packages by name.
-    """
+    """Provenance of a run as plain data. device: title and driver of the rendering device. seed: of texts,
+    views and scenes. versions: those of other packages by name."""
     return {
         "device": device,
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",

@@ -43,16 +43,9 @@ class Timer:
         catch_errors: bool = False,
         parts: Callable[[Any], Mapping[str, float]] | None = None,
     ) -> None:
-        """
-        Args:
-            work: function that returns when the work is complete. It may return milliseconds of its parts by
-                name.
-            clock: time in seconds.
-            catch_errors: store a FidsplatError of `work` in `error` and stop timing it, instead of raising
-                it.
-            parts: function that converts the result of `work` to milliseconds by name, such as
-                `frame.timings`; not timed.
-        """
+        """work: function that returns when the work is complete; it may return milliseconds of its parts by
+        name. clock: time in seconds. catch_errors: store a FidsplatError of `work` in `error` and stop timing
+        it. parts: function that converts the result of `work` to milliseconds by name; not timed."""
         self._work, self._clock, self._catch_errors, self._parts = work, clock, catch_errors, parts
         self.ms: list[float] = []
         """milliseconds of each timed run"""
@@ -105,12 +98,8 @@ def frame_timer(
     clock: Callable[[], float] = time.perf_counter,
     **how,
 ) -> Timer:
-    """A timer of frames of a resident scene; the image stays on the device. A run ends when the device is
-    done; its parts are the stages, by the device's clock.
-
-    Args:
-        renderer, scene, camera, how: arguments of `renderer.render(scene, camera, **how)`.
-    """
+    """A timer of frames, `renderer.render(scene, camera, **how)`, that stay on the device. A run ends when
+    the device is done; its parts are the stages, by the device's clock."""
     render = lambda: renderer.render(scene, camera, **how).wait()  # noqa: E731
     return Timer(render, clock, catch_errors, parts=lambda frame: frame.timings)
 
@@ -126,11 +115,8 @@ def time_interleaved(
 ) -> None:
     """Run all timers once per round, in reversed order every second round.
 
-    Args:
-        rounds: maximum number of timed rounds.
-        min_rounds, seconds: after `min_rounds` rounds, none is started later than `seconds`.
-        warm_up: number of rounds before the timed ones.
-        tick: called after each timed run.
+    rounds: maximum number of timed rounds. min_rounds, seconds: after `min_rounds` rounds, none is started
+    later than `seconds`. warm_up: number of rounds before the timed ones. tick: called after each timed run.
     """
     for _ in range(warm_up):
         for timer in timers:

@@ -11,10 +11,7 @@ def compress(data: bytes) -> bytes:
 
 
 def decompress(data: bytes | memoryview, size: int) -> bytes:
-    """The content of a frame of `size` bytes; nothing beyond it is expanded.
-
-    Raises ValueError for damaged data or another size.
-    """
+    """The content of a frame of `size` bytes. Raises ValueError for damaged data or another size."""
     library = _library()
     try:
         # a frame declares its own size, which the other calls would allocate unchecked
