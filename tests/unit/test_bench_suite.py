@@ -157,6 +157,11 @@ def test_our_adapter_renders_the_scene(made, tmp_path):
     assert made.kind in adapter.settings["standard"]
 
 
+def test_our_adapter_leaves_out_settings_that_the_device_lacks(monkeypatch):
+    monkeypatch.setattr(own_adapter, "PRESETS", ("fast", "fast,blend_precision=float16"))
+    assert list(own_adapter.Adapter("warp:cpu").settings) == ["fast", own_adapter.EXACT]
+
+
 def test_a_definition_that_gives_the_same_image_is_rendered_once():
     made = views()
     references = suite.References(fs.Renderer("reference"), made, [0])

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 import fidsplat as fs
+from fidsplat.effects import select
 from fidsplat.splats.rotations import matrices_to_quaternions
 
 PRESETS = ("standard", "fast", "gsplat", "reference")
@@ -24,9 +25,10 @@ class Adapter:
         self.renderer = fs.Renderer(device)
         info = self.renderer.device
         names = (*PRESETS, EXACT, *(ON_GPUS if info.kind == "gpu" else ()))
+        qualities = ((name, fs.Quality.of(name)) for name in names)
         self.resident: Any = None
-        self.qualities = {name: fs.Quality.of(name) for name in names}
-        self.settings = {name: self._claims(name) for name in names}
+        self.qualities = {name: quality for name, quality in qualities if self._supported(quality)}
+        self.settings = {name: self._claims(name) for name in self.qualities}
         self.facts = {
             "renderer": "fidsplat",
             "version": fs.__version__,
@@ -35,6 +37,11 @@ class Adapter:
             "platform": info.platform,
             "driver": info.version,
         }
+
+    def _supported(self, quality: fs.Quality) -> bool:
+        """Whether the device has the quality setting: Warp lacks half precision."""
+        features = select(fs.SplatCloud.empty(), fs.Capture(quality=quality))
+        return not self.renderer.backend.unsupported(features)
 
     def _claims(self, name: str) -> dict[str, dict]:
         """Definition of the image by kind of splats."""
