@@ -3,9 +3,8 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Devices, check_plot, writable_file
 from fidsplat.commands.output import (
     console,
@@ -73,12 +72,8 @@ class Bench:
     scene: UserScenes = ()
     cameras: Cameras = None
     device: Devices = ()
-    repeats: Annotated[
-        int,
-        option(
-            "N", "timed frames of each scene on each device; of your own, 3 or as many as start in a minute"
-        ),
-    ] = 20
+    repeats: int = 20
+    """N: timed frames of each scene on each device; of your own, 3 or as many as start in a minute"""
     json: str | None = None
     """FILE: also write all figures to a file after each scene; - for stdout only"""
     plot: str | None = None
@@ -88,10 +83,10 @@ class Bench:
     """compare renderers by time and error on scenes of every regime"""
     quick: bool = False
     """with --suite: few scenes and frames"""
-    adapters: Annotated[
-        Path | None, option("DIR", "with --suite: folder of other renderers (benchmarks/adapters)")
-    ] = None
-    overwrite: Annotated[bool, switch("with --suite: replace existing results")] = False
+    adapters: Path | None = None
+    """DIR: with --suite: folder of other renderers (benchmarks/adapters)"""
+    overwrite: bool = False
+    """with --suite: replace existing results"""
 
     def run(self) -> int:
         if self.suite:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Device, Json, Overwrite, new_file, repeatable, require_packages
 from fidsplat.commands.output import console, json_text, print_lines, report, run_sweeps, show_progress
 from fidsplat.experiments.calibrate import CalibrationSettings
@@ -26,7 +24,8 @@ class Calibrate:
       fidsplat experiment calibrate --lens fisheye --views 64 --electrons 1000
     """
 
-    out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-calibrate"
+    out: str = "fidsplat-calibrate"
+    """DIR: folder"""
     camera: CalibrationSettings = field(default_factory=CalibrationSettings)
     device: Device = None
     overwrite: Overwrite = False

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Json, repeatable
 from fidsplat.commands.output import delayed_progress, report
 from fidsplat.photographs.settings import CaptureSettings
@@ -34,8 +33,10 @@ class Capture:
       fidsplat train bench -o bench/splats.ply && fidsplat view bench/scene.toml
     """
 
-    photos: Annotated[tyro.conf.Positional[str], option("PHOTOS|VIDEO", "folder of photographs, or a video")]
-    out: Annotated[str, option("DIR", "folder for the data set and its scene file", "-o")]
+    photos: tyro.conf.Positional[str]
+    """PHOTOS|VIDEO: folder of photographs, or a video"""
+    out: str
+    """DIR: folder for the data set and its scene file"""
     settings: CaptureSettings = field(default_factory=CaptureSettings)
     overwrite: bool = False
     """restart, also for other photographs"""

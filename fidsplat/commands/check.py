@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Device, Json
 from fidsplat.commands.output import (
     console,
@@ -48,9 +47,12 @@ class Check:
     """
 
     device: Device = None
-    out: Annotated[str, option("DIR", "folder for the image and the fuzzer's state", "-o")] = "fidsplat-check"
-    fuzz: Annotated[int | None, option("N", "render random scenes until they add up to N splats")] = None
-    digests: Annotated[bool, switch("compare the digests of 200 random scenes")] = False
+    out: str = "fidsplat-check"
+    """DIR: folder for the image and the fuzzer's state"""
+    fuzz: int | None = None
+    """N: render random scenes until they add up to N splats"""
+    digests: bool = False
+    """compare the digests of 200 random scenes"""
     json: Json = False
 
     def run(self) -> int:

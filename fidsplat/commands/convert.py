@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import tyro
 
-from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Device, Json, Overwrite, new_file
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.util.errors import InputError
@@ -19,16 +18,16 @@ from fidsplat.util.errors import InputError
 class MeshOptions:
     """Options of a triangle mesh."""
 
-    mesh: Annotated[bool, switch("write a triangle mesh: .glb, .ply, .obj, .stl, or .xml for MuJoCo")] = False
-    voxel: Annotated[
-        float | None, option("M", "voxel of the mesh in metres (default: a 200th of the longest side)")
-    ] = None
-    cameras: Annotated[
-        str | None,
-        option("FILE", "views of the mesh: COLMAP, transforms.json, a trajectory (default: from outside)"),
-    ] = None
-    faces: Annotated[int | None, option("N", "largest number of triangles (extra: mesh)")] = None
-    parts: Annotated[int, option("N", "largest number of convex parts in .xml (extra: mesh)")] = 32
+    mesh: bool = False
+    """write a triangle mesh: .glb, .ply, .obj, .stl, or .xml for MuJoCo"""
+    voxel: float | None = None
+    """M: voxel of the mesh in metres (default: a 200th of the longest side)"""
+    cameras: str | None = None
+    """FILE: views of the mesh: COLMAP, transforms.json, a trajectory (default: from outside)"""
+    faces: int | None = None
+    """N: largest number of triangles (extra: mesh)"""
+    parts: int = 32
+    """N: largest number of convex parts in .xml (extra: mesh)"""
 
     def __post_init__(self) -> None:
         if not self.mesh and (self.voxel, self.cameras, self.faces, self.parts) != (None, None, None, 32):
@@ -55,11 +54,13 @@ class Convert:
       fidsplat convert pot.ply pot.xml --mesh --voxel 0.01                   convex parts for MuJoCo
     """
 
-    source: Annotated[tyro.conf.Positional[str], option("IN", "splat file to read")]
-    target: Annotated[tyro.conf.Positional[str], option("OUT", "splat file to write")]
+    source: tyro.conf.Positional[str]
+    """IN: splat file to read"""
+    target: tyro.conf.Positional[str]
+    """OUT: splat file to write"""
     spz_version: int = 4
     """3|4: version of SPZ; 3 is for older readers and has no labels and coplanar groups"""
-    no_images: Annotated[bool, switch("do not render and compare both files", "--no-pictures")] = False
+    no_images: Annotated[bool, "do not render and compare both files", "--no-pictures"] = False
     mesh: MeshOptions = field(default_factory=MeshOptions)
     device: Device = None
     overwrite: Overwrite = False

@@ -1,8 +1,10 @@
 """Options from dataclasses: rules for tyro, which parses the command line.
 
 The fields of a command and of the settings that it nests are its options. The docstring of a field is the
-help of its option, with a placeholder for the value as in `FILE.mp4: also write a video`. `-o` is short for a
-field `out`. `option` describes options that a docstring cannot.
+help of its option, with a placeholder for the value as in `FILE.mp4: also write a video`; a type that several
+commands use has its help as a string in `Annotated`. Another string there, which begins with --, is a second
+name of the option. `-o` is short for a field `out`. The help states a default that is computed; other
+defaults are appended.
 """
 
 from __future__ import annotations
@@ -38,23 +40,9 @@ rules = ConstructorRegistry()
 _UNSET = "unset"
 _PLACEHOLDERS = {int: "N", float: "X", str: "TEXT", Path: "DIR"}
 """placeholders of values in help, by type; settings have no paths but folders"""
-_PLACEHOLDER = re.compile(r"[A-Z]+([.|,][A-Za-z0-9.]*| [A-Z])*")
-"""placeholders in docstrings: `FILE.mp4: text`"""
-_Description: Any = type(tyro.conf.arg())
-
-
-def option(metavar: str, text: str | None = None, short: str | None = None):
-    """tyro's description of an option: placeholder, help (else the field's docstring) and short form.
-
-    The help states a default that is computed; other defaults are appended.
-    """
-    aliases = [] if short is None else [short]
-    return tyro.conf.arg(metavar=metavar, help=text, aliases=aliases, help_behavior_hint=_shown_default)
-
-
-def switch(text: str | None, alias: str | None = None):
-    """tyro's description of an option without a value."""
-    return tyro.conf.arg(help=text, aliases=[] if alias is None else [alias], help_behavior_hint="")
+_VALUE = r"[A-Z][A-Z0-9,=]*(?:\.[a-z0-9.]+)?|\d"
+_PLACEHOLDER = re.compile(rf"(?:{_VALUE})(?:[| ](?:{_VALUE}))*|[a-z]+(?:\|[a-z]+)+")
+"""placeholders in docstrings: FILE.mp4|BAG, WIDTH HEIGHT, NX,NY,NZ, jpeg|png"""
 
 
 def _shown_default(value: str) -> str:
@@ -120,34 +108,37 @@ def describe_fields(info: StructTypeInfo) -> StructConstructorSpec | None:
     repeated = tyro.conf.UseAppendAction in info.markers
     options = []
     for field in dataclasses.fields(info.type):
-        text, default = texts.get(field.name), _default_of(field, info.default)
-        if default is True and text:  # the option is --no-NAME
-            text = f"do not {text}"
-        kind = _described(field.name, hints[field.name], text, repeated)
+        default = _default_of(field, info.default)
+        text = texts.get(field.name)
+        kind = _described(field.name, hints[field.name], text, repeated, negated=default is True)
         options.append(StructFieldSpec(field.name, kind, default))
     return StructConstructorSpec(info.type, tuple(options))
 
 
-def _described(name: str, kind: Any, text: str | None, repeated: bool) -> Any:
+def _described(name: str, kind: Any, text: str | None, repeated: bool, negated: bool) -> Any:
     """The type of a field, with tyro's description of its option."""
     base, *marks = get_args(kind) if get_origin(kind) is Annotated else (kind,)
-    given: Any = next((mark for mark in marks if isinstance(mark, _Description)), None)
+    if dataclasses.is_dataclass(base):
+        return kind
+    strings = [mark for mark in marks if isinstance(mark, str)]
+    aliases = [string for string in strings if string.startswith("--")] + (["-o"] if name == "out" else [])
+    text = text or next((string for string in strings if string not in aliases), None)
     kinds = (kind, base, *get_args(base))
     if Bytes in kinds:
         parse = partial(parse_bytes, "--" + name.replace("_", "-"))
         kind = Annotated[base, _spec("SIZE", parse, _shown_bytes), *marks]
     elif Names in kinds:
         kind = Annotated[base, _spec("A,B,...", _parse_names, ",".join), *marks]
-    if dataclasses.is_dataclass(base) or (given is not None and given.help):
-        return kind
-    if base is bool:
-        return Annotated[kind, switch(text)]
+    if base is bool:  # a default of True has the option --no-NAME
+        text = f"do not {text}" if negated else text
+        return Annotated[kind, tyro.conf.arg(help=text, aliases=aliases, help_behavior_hint="")]
     placeholder, _, rest = (text or "").partition(": ")
     if _PLACEHOLDER.fullmatch(placeholder):
         text = rest
     else:
-        placeholder = given.metavar if given is not None and given.metavar else _placeholder(kind, repeated)
-    return Annotated[kind, option(placeholder, text, "-o" if name == "out" else None)]
+        placeholder = _placeholder(kind, repeated)
+    shown = tyro.conf.arg(metavar=placeholder, help=text, aliases=aliases, help_behavior_hint=_shown_default)
+    return Annotated[kind, shown]
 
 
 def _placeholder(kind: Any, repeated: bool) -> str:

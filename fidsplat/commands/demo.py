@@ -2,9 +2,8 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Device, Json
 from fidsplat.commands.output import (
     console,
@@ -33,7 +32,8 @@ class DemoViews:
       fidsplat demo views -o yard --views 60 --width 640
     """
 
-    out: Annotated[str, option("DIR", "folder for the data set", "-o")] = "fidsplat-demo-views"
+    out: str = "fidsplat-demo-views"
+    """DIR: folder for the data set"""
     images: DemoViewSettings = field(default_factory=DemoViewSettings)
     device: Device = None
     json: Json = False
@@ -65,7 +65,8 @@ class Demo:
 
     PARTS: ClassVar[dict[str, type]] = {"views": DemoViews}
 
-    out: Annotated[str, option("DIR", "folder for images, scene and figures", "-o")] = "fidsplat-demo"
+    out: str = "fidsplat-demo"
+    """DIR: folder for images, scene and figures"""
     device: Device = None
     mixture: str = "exact"
     """NAME: mixture of the markers: exact, fitted, facets or paper"""

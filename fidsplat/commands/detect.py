@@ -3,11 +3,10 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Json
 from fidsplat.commands.output import console, delayed_progress, print_json, print_table
 from fidsplat.util.errors import InputError
@@ -42,20 +41,15 @@ class Detect:
       fidsplat detect fidsplat-flight --scene scene.toml
     """
 
-    images: Annotated[
-        tyro.conf.Positional[tuple[str, ...]],
-        option("IMAGE", "image, folder of images, video, MCAP file or rosbag2 folder"),
-    ]
-    family: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]],
-        option(
-            "FAMILY",
-            "tag family, repeat for several (default: the scene's, or 36h11 25h9 4x4_50 5x5_100 6x6_250 "
-            "7x7_250)",
-        ),
-    ] = ()
-    scene: Annotated[str | None, option("SCENE.toml", "scene of the images")] = None
-    topic: Annotated[str | None, option("TOPIC", "topic of a log (default: all topics with images)")] = None
+    images: tyro.conf.Positional[tuple[str, ...]]
+    """IMAGE: image, folder of images, video, MCAP file or rosbag2 folder"""
+    family: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """FAMILY: tag family, repeat for several (default: the scene's, or 36h11 25h9 4x4_50 5x5_100 6x6_250
+    7x7_250)"""
+    scene: str | None = None
+    """SCENE.toml: scene of the images"""
+    topic: str | None = None
+    """TOPIC: topic of a log (default: all topics with images)"""
     json: Json = False
 
     def run(self) -> int:

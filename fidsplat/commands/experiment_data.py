@@ -5,9 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
-from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import (
     BlenderEnvironment,
     Device,
@@ -71,7 +69,8 @@ class Blender(BlenderSettings):
       fidsplat experiment blender --view raw --category small --markers 1 --samples 16
     """
 
-    install: Annotated[bool, switch("install Blender instead of rendering")] = False
+    install: bool = False
+    """install Blender instead of rendering"""
     environment: BlenderEnvironment = None
     json: Json = False
 
@@ -113,7 +112,8 @@ class Plants:
       fidsplat experiment plants -o sampled --iterations 0
     """
 
-    out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-plants"
+    out: str = "fidsplat-plants"
+    """DIR: folder"""
     plants: PlantSettings = field(default_factory=PlantSettings)
     environment: BlenderEnvironment = None
     device: Device = None
@@ -143,8 +143,10 @@ class Merge:
       fidsplat experiment merge machine-1 machine-2 -o results
     """
 
-    folders: Annotated[Folders, option("DIR", "folders with results of shards")]
-    out: Annotated[str, option("DIR", "folder for the joined results", "-o")] = "fidsplat-experiments"
+    folders: Folders
+    """DIR: folders with results of shards"""
+    out: str = "fidsplat-experiments"
+    """DIR: folder for the joined results"""
     json: Json = False
 
     def run(self) -> int:
@@ -184,7 +186,8 @@ class Report:
       fidsplat experiment report results -o devlog/results.md
     """
 
-    folders: Annotated[Folders, option("DIR", "folders with results (default: fidsplat-experiments)")] = ()
+    folders: Folders = ()
+    """DIR: folders with results (default: fidsplat-experiments)"""
     out: ReportTo = None
     json: Json = False
 

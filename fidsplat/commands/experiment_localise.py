@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import tyro
 
-from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Device, Json, require_packages
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.experiments.localise import Drive
@@ -34,20 +33,22 @@ class Localise:
       fidsplat experiment localise --variant odometry --variant exact -o drive
     """
 
-    out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-localise"
-    quick: Annotated[bool, switch("measure one row of four plants and the first three variants")] = False
-    sensors: Annotated[bool, switch("measure with a LiDAR and each sensor left out")] = False
+    out: str = "fidsplat-localise"
+    """DIR: folder"""
+    quick: bool = False
+    """measure one row of four plants and the first three variants"""
+    sensors: bool = False
+    """measure with a LiDAR and each sensor left out"""
     drive: Drive = field(default_factory=Drive)
-    variant: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]],
-        option("NAME", "variant to measure, repeat for several (default: all)"),
-    ] = ()
+    variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME: variant to measure, repeat for several (default: all)"""
     log: str | None = None
     """FILE.mcap|BAG: also write the drive of `exact` as a ROS 2 log (extra: logs)"""
     video: str | None = None
     """FILE.mp4: also write the images of `exact` as a video (extra: video)"""
     device: Device = None
-    overwrite: Annotated[bool, switch("replace existing results")] = False
+    overwrite: bool = False
+    """replace existing results"""
     json: Json = False
 
     def run(self) -> int:

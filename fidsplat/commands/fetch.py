@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Annotated
 
 import tyro
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Json
 from fidsplat.commands.output import console, delayed_progress, print_lines, report
 
@@ -25,7 +23,8 @@ class Fetch:
       fidsplat view $(fidsplat fetch biker)
     """
 
-    name: Annotated[tyro.conf.Positional[str | None], option("NAME", "scene to download")] = None
+    name: tyro.conf.Positional[str | None] = None
+    """NAME: scene to download"""
     json: Json = False
 
     def run(self) -> int:

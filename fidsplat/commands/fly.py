@@ -7,10 +7,9 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from fidsplat.commands.declarations import option, switch
-from fidsplat.commands.options import Json, Overwrite, RayAddress, Workers, check_workers, writable_file
+from fidsplat.commands.options import Json, Overwrite, writable_file
 from fidsplat.commands.output import console, report, show_progress
 from fidsplat.commands.scenes import RenderInput, Size
 from fidsplat.util.errors import InputError
@@ -54,11 +53,14 @@ class Fly(RenderInput):
     """FILE: poses of the camera (default: the scene's [[camera.motion]])"""
     out: str = DEFAULT_FOLDER
     """DIR|RUN.mcap: folder, or a log with its images in the folder RUN"""
-    rate: Annotated[float, option("HZ", "frames per second, also of the video")] = 30.0
+    rate: float = 30.0
+    """HZ: frames per second, also of the video"""
     times: str | None = None
     """T,T,...: seconds on the trajectory's clock instead of --rate"""
-    file_rate: Annotated[float, option("HZ", "poses per second of a file without times")] = 10.0
-    smooth: Annotated[bool, switch("interpolate poses by smooth curves instead of straight lines")] = False
+    file_rate: float = 10.0
+    """HZ: poses per second of a file without times"""
+    smooth: bool = False
+    """interpolate poses by smooth curves instead of straight lines"""
     video: str | None = None
     """FILE.mp4: also write a video of the first output (extra: video)"""
     log: str | None = None
@@ -67,12 +69,13 @@ class Fly(RenderInput):
     """FILE.json: also write the markers in each image as COCO annotations"""
     bop: str | None = None
     """DIR: also write a scene of a BOP data set, e.g. dataset/train/000000 (outputs: rgb, depth, label)"""
-    compress: Annotated[
-        Literal["jpeg", "png"] | None, option("jpeg|png", "compress rgb in the log, as CompressedImage")
-    ] = None
+    compress: Literal["jpeg", "png"] | None = None
+    """jpeg|png: compress rgb in the log, as CompressedImage"""
     size: Size = None
-    ray: RayAddress = None
-    workers: Workers = None
+    ray: str | None = None
+    """ADDRESS: Ray cluster that renders: local, auto, ray://HOST:10001 (extra: ray)"""
+    workers: int | None = None
+    """N: workers of --ray (default: one per GPU, or one per machine)"""
     overwrite: Overwrite = False
     json: Json = False
 
@@ -84,7 +87,8 @@ class Fly(RenderInput):
         from fidsplat.vision.coco import CocoAnnotations
 
         self.check()
-        check_workers(self.ray, self.workers)
+        if self.workers is not None and (self.ray is None or self.workers < 1):
+            raise InputError(f"--workers must be at least 1 and needs --ray ADDRESS, got {self.workers}")
         if self.out.endswith(".mcap"):
             self.log, self.out = self.log or self.out, self.out.removesuffix(".mcap")
         check_rate(self.rate)

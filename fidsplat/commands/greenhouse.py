@@ -1,9 +1,7 @@
 """`fidsplat greenhouse`."""
 
 from dataclasses import dataclass, field
-from typing import Annotated
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Json, Overwrite
 from fidsplat.commands.output import report
 from fidsplat.util.errors import InputError
@@ -27,7 +25,8 @@ class Greenhouse:
       fidsplat render greenhouse/greenhouse.toml
     """
 
-    out: Annotated[str, option("DIR", "folder", "-o")] = "greenhouse"
+    out: str = "greenhouse"
+    """DIR: folder"""
     layout: GreenhouseSettings = field(default_factory=GreenhouseSettings)
     plants_from: str | None = None
     """DIR: folder of plants KIND-NUMBER.ply (default: plants are grown as disks)"""

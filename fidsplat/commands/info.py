@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import tyro
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Json
 from fidsplat.commands.output import delayed_progress, report
 
@@ -27,9 +26,8 @@ class Info:
       fidsplat info scene.ply --json
     """
 
-    file: Annotated[
-        tyro.conf.Positional[str], option("FILE", "PLY, .splat, SPZ, glTF or USD file, or a store")
-    ]
+    file: tyro.conf.Positional[str]
+    """FILE: PLY, .splat, SPZ, glTF or USD file, or a store"""
     json: Json = False
 
     def run(self) -> int:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Device, Json
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.util.errors import InputError
@@ -34,23 +33,16 @@ class Localise:
       fidsplat localise stills/ --scene scene.toml --candidates sparse/0 -o poses.tum
     """
 
-    images: Annotated[
-        tyro.conf.Positional[tuple[str, ...]],
-        option("IMAGE", "photograph, folder of photographs, or video"),
-    ]
-    scene: Annotated[str, option("SCENE", "scene file, with the camera of the photographs")]
+    images: tyro.conf.Positional[tuple[str, ...]]
+    """IMAGE: photograph, folder of photographs, or video"""
+    scene: str
+    """SCENE: scene file, with the camera of the photographs"""
     start: str | None = None
     """X,Y,Z,QW,QX,QY,QZ: initial pose of the camera in the world, metres and a unit quaternion"""
     candidates: str | None = None
     """FILE: poses where a search may start: COLMAP, transforms.json or a trajectory, e.g. of training"""
-    out: Annotated[
-        str | None,
-        option(
-            "FILE",
-            "also write the found poses: .tum, .kitti, .json (transforms.json) or a folder (COLMAP)",
-            "-o",
-        ),
-    ] = None
+    out: str | None = None
+    """FILE: also write the found poses: .tum, .kitti, .json (transforms.json) or a folder (COLMAP)"""
     device: Device = None
     json: Json = False
 

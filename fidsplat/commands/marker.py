@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Json, Overwrite, new_file
 from fidsplat.commands.output import delayed_progress, report
 from fidsplat.util.arguments import changes_of
@@ -23,23 +22,18 @@ if TYPE_CHECKING:
 class Placing:
     """Place of a marker in a scene."""
 
-    scene: Annotated[
-        str | None, option("SCENE.toml|FILE.ply|STORE.fss", "scene to place the marker in; prints its table")
-    ] = None
-    at_pixel: Annotated[
-        tuple[float, float] | None, option("X Y", "place it on the surface at this pixel of --scene")
-    ] = None
-    up: Annotated[
-        tuple[float, float, float] | None,
-        option("X Y Z", "vertical of the scene (default: the guess of `fidsplat info`)"),
-    ] = None
-    lift: Annotated[
-        float | None, option("M", "metres in front (default: 1 mm and twice the roughness of the surface)")
-    ] = None
-    radius: Annotated[
-        float | None, option("M", "radius of the fitted patch (default: that of the marker)")
-    ] = None
-    append: Annotated[bool, switch("append the table to SCENE.toml")] = False
+    scene: str | None = None
+    """SCENE.toml|FILE.ply|STORE.fss: scene to place the marker in; prints its table"""
+    at_pixel: tuple[float, float] | None = None
+    """X Y: place it on the surface at this pixel of --scene"""
+    up: tuple[float, float, float] | None = None
+    """X Y Z: vertical of the scene (default: the guess of `fidsplat info`)"""
+    lift: float | None = None
+    """M: metres in front (default: 1 mm and twice the roughness of the surface)"""
+    radius: float | None = None
+    """M: radius of the fitted patch (default: that of the marker)"""
+    append: bool = False
+    """append the table to SCENE.toml"""
 
     def __post_init__(self) -> None:
         if (self.scene is None) != (self.at_pixel is None):
@@ -123,25 +117,28 @@ class Marker:
       fidsplat marker apriltag:36h11:5 --size 0.16 --scene scene.toml --at-pixel 640 360 --append
     """
 
-    spec: Annotated[tyro.conf.Positional[str], option("SPEC", "marker, e.g. apriltag:36h11:5")]
-    out: Annotated[str | None, option("FILE.ply", "file for the splats", "-o")] = None
+    spec: tyro.conf.Positional[str]
+    """SPEC: marker, e.g. apriltag:36h11:5"""
+    out: str | None = None
+    """FILE.ply: file for the splats"""
     size: float = 1.0
     """M: edge of the code (width of a board) in metres, without the quiet zone"""
     mixture: str | None = None
     """NAME: mixture: exact, fitted, facets, paper or refined (default: exact)"""
-    iterations: Annotated[int | None, option("N", "iterations of refined (default: 1000)")] = None
-    device: Annotated[
-        str | None, option("D", "device of refined and --scene (default: FIDSPLAT_DEVICE, or auto)")
-    ] = None
-    quality: Annotated[str | None, option("Q", "quality with settings of the mixtures, as above")] = None
-    shape: Annotated[
-        str | None, option("KIND,KEY=VALUE", "surface that the sheet is bent to, e.g. cylinder,radius=0.05")
-    ] = None
-    wear: Annotated[
-        str | None, option("KEY=VALUE", "print defects and wear, e.g. fading=0.4,dirt=0.2,seed=3")
-    ] = None
-    native_2dgs: Annotated[bool, switch("leave the third scale out of the file, as 2DGS does")] = False
-    max_splats: Annotated[int | None, option("N", "maximum number of splats (default: 1000000)")] = None
+    iterations: int | None = None
+    """N: iterations of refined (default: 1000)"""
+    device: str | None = None
+    """D: device of refined and --scene (default: FIDSPLAT_DEVICE, or auto)"""
+    quality: str | None = None
+    """Q: quality with settings of the mixtures, as above"""
+    shape: str | None = None
+    """KIND,KEY=VALUE: surface that the sheet is bent to, e.g. cylinder,radius=0.05"""
+    wear: str | None = None
+    """KEY=VALUE: print defects and wear, e.g. fading=0.4,dirt=0.2,seed=3"""
+    native_2dgs: bool = False
+    """leave the third scale out of the file, as 2DGS does"""
+    max_splats: int | None = None
+    """N: maximum number of splats (default: 1000000)"""
     placing: Placing = field(default_factory=Placing)
     overwrite: Overwrite = False
     json: Json = False

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import tyro
 
-from fidsplat.commands.declarations import option, switch
 from fidsplat.util.arguments import Bytes
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import ordinary_file, path_of, writable_folder
@@ -18,33 +17,22 @@ repeatable = tyro.conf.configure(tyro.conf.UseAppendAction)
 """Decorator of a command whose options with several values are repeated, one value each time."""
 
 
-Device = Annotated[
-    str | None, option("D", "device; see `fidsplat devices` (default: FIDSPLAT_DEVICE, or auto)")
-]
+Device = Annotated[str | None, "D: device; see `fidsplat devices` (default: FIDSPLAT_DEVICE, or auto)"]
 Devices = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
-    option("D", "device, repeat for several; see `fidsplat devices` (default: FIDSPLAT_DEVICE, or auto)"),
+    "D: device, repeat for several; see `fidsplat devices` (default: FIDSPLAT_DEVICE, or auto)",
 ]
-Json = Annotated[bool, switch("print one JSON object on stdout and nothing else there")]
-Overwrite = Annotated[bool, switch("replace existing files")]
+Json = Annotated[bool, "print one JSON object on stdout and nothing else there"]
+Overwrite = Annotated[bool, "replace existing files"]
 """Commands whose output may be a user's own file or cost hours refuse to replace it without this option.
 Images, charts and tables replace earlier ones without asking."""
 MemoryBudget = Annotated[
-    Bytes | None,
-    option("SIZE", "device memory for an image and its splats, e.g. 2GiB (default: nine tenths of it)"),
+    Bytes | None, "SIZE: device memory for an image and its splats, e.g. 2GiB (default: nine tenths of it)"
 ]
-RayAddress = Annotated[
-    str | None,
-    option("ADDRESS", "Ray cluster that does the work: local, auto, ray://HOST:10001 (extra: ray)"),
-]
-Workers = Annotated[int | None, option("N", "workers of --ray (default: one per GPU, or one per machine)")]
 Folders = tyro.conf.Positional[tuple[str, ...]]
-ReportTo = Annotated[
-    str | None, option("DIR|FILE.md", "folder or file for the report (default: the first folder)", "-o")
-]
+ReportTo = Annotated[str | None, "DIR|FILE.md: folder or file for the report (default: the first folder)"]
 BlenderEnvironment = Annotated[
-    Path | None,
-    option("DIR", "Blender's virtual environment (default: fidsplat/blender in the user's cache)"),
+    Path | None, "DIR: Blender's virtual environment (default: fidsplat/blender in the user's cache)"
 ]
 
 
@@ -54,12 +42,6 @@ def check_request(outputs: tuple[str, ...] | None, quality: str | None) -> None:
     from fidsplat.effects import select
 
     select(fs.SplatCloud.empty(), fs.Capture(outputs=outputs or "rgb", quality=fs.Quality.of(quality)))
-
-
-def check_workers(ray: str | None, workers: int | None) -> None:
-    """Raise InputError for an impossible number of workers, before anything is read."""
-    if workers is not None and (ray is None or workers < 1):
-        raise InputError(f"--workers must be at least 1 and needs --ray ADDRESS, got {workers}")
 
 
 def writable_file(path: str | Path) -> Path:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
 
 import tyro
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Device, Json, Overwrite, require_packages
 from fidsplat.commands.output import delayed_progress, report
 from fidsplat.experiments.plan_tags import PlanSettings
@@ -31,11 +29,12 @@ class PlanTags:
       fidsplat plan-tags scene.toml --trajectory flight.tum --count 50 --target 0.01 --size 0.2 -o hall
     """
 
-    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss", "scene")]
-    trajectory: Annotated[
-        str, option("FILE", "camera-to-world poses of the camera (docs/formats.md#trajectories)")
-    ]
-    out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-plan"
+    source: tyro.conf.Positional[str]
+    """SCENE.toml|FILE.ply|STORE.fss: scene"""
+    trajectory: str
+    """FILE: camera-to-world poses of the camera (docs/formats.md#trajectories)"""
+    out: str = "fidsplat-plan"
+    """DIR: folder"""
     settings: PlanSettings = field(default_factory=PlanSettings)
     device: Device = None
     overwrite: Overwrite = False

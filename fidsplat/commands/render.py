@@ -10,11 +10,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from textwrap import indent
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import tyro
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Device, Json, check_request
 from fidsplat.commands.output import console, delayed_progress, report, steps_shown
 from fidsplat.commands.scenes import RenderInput, Size
@@ -79,10 +78,8 @@ class Render(RenderInput):
     """T: use the most accurate quality that takes at most T milliseconds per frame"""
     every: int | None = None
     """N: render every Nth pixel in both directions as a smaller image (device reference only)"""
-    depth_camera: Annotated[
-        str | None,
-        option("NAME", "also write what a depth camera measures there: d435, azure-kinect or kinect-v1"),
-    ] = None
+    depth_camera: str | None = None
+    """NAME: also write what a depth camera measures there: d435, azure-kinect or kinect-v1"""
     pose: StartPose = field(default_factory=StartPose)
     size: Size = None
     json: Json = False
@@ -231,8 +228,10 @@ class Gallery:
       fidsplat gallery fidsplat-demo/scene.toml room.ply -o images --device opencl:nvidia
     """
 
-    sources: Annotated[tyro.conf.Positional[tuple[str, ...]], option("SCENE.toml|FILE.ply...", "scenes")]
-    out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-gallery"
+    sources: tyro.conf.Positional[tuple[str, ...]]
+    """SCENE.toml|FILE.ply...: scenes"""
+    out: str = "fidsplat-gallery"
+    """DIR: folder"""
     device: Device = None
     json: Json = False
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated
 
 import numpy as np
 import tyro
 
-from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Json, Overwrite, new_file
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.commands.scenes import SceneDevice
@@ -30,15 +28,18 @@ class Scan:
       fidsplat scan scene.toml --lidar livox-mid-40 --frame world --labels -o scan.npy
     """
 
-    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss", "scene to scan")]
+    source: tyro.conf.Positional[str]
+    """SCENE.toml|FILE.ply|STORE.fss: scene to scan"""
     lidar: str = "os1-64"
     """NAME: sensor"""
     out: str = "scan.pcd"
     """FILE.pcd|FILE.ply|FILE.npy: points"""
     frame: str = "lidar"
     """lidar|world: frame of the points"""
-    labels: Annotated[bool, switch("also write the label of the splats")] = False
-    ideal: Annotated[bool, switch("no noise, no drop-outs, detection up to the maximum range")] = False
+    labels: bool = False
+    """also write the label of the splats"""
+    ideal: bool = False
+    """no noise, no drop-outs, detection up to the maximum range"""
     seed: int = 0
     """N: seed of noise and detection"""
     pose: StartPose = field(default_factory=StartPose)

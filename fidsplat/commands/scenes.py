@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import MemoryBudget, check_request
 from fidsplat.commands.output import delayed_progress
 from fidsplat.scenes.sources import OWN_POSE, StartPose
@@ -21,10 +20,10 @@ if TYPE_CHECKING:
 
 SceneDevice = Annotated[
     str | None,
-    option("D", "device; see `fidsplat devices` (default: the scene's, or FIDSPLAT_DEVICE, or auto)"),
+    "D: device; see `fidsplat devices` (default: the scene's, or FIDSPLAT_DEVICE, or auto)",
 ]
 SceneQuality = Annotated[
-    str | None, option("Q", "preset, settings as key=value, or both (default: the scene's, or standard)")
+    str | None, "Q: preset, settings as key=value, or both (default: the scene's, or standard)"
 ]
 
 
@@ -32,7 +31,8 @@ SceneQuality = Annotated[
 class SceneInput:
     """A scene, its outputs and its quality."""
 
-    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss", "scene to render")]
+    source: tyro.conf.Positional[str]
+    """SCENE.toml|FILE.ply|STORE.fss: scene to render"""
     outputs: Names | None = None
     """output images; `fidsplat render --help` lists them (default: the scene's, or rgb)"""
     quality: SceneQuality = None
@@ -62,15 +62,13 @@ class RenderInput(SceneInput):
 
 Size = Annotated[
     tuple[int, int] | None,
-    option("WIDTH HEIGHT", "pixels of the image (default: the scene's; for a splat file 1280 720)"),
+    "WIDTH HEIGHT: pixels of the image (default: the scene's; for a splat file 1280 720)",
 ]
 UserScenes = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
-    option("SCENE.toml|FILE.ply", "your own scene instead of --scenes; repeat for several"),
+    "SCENE.toml|FILE.ply: your own scene instead of --scenes; repeat for several",
 ]
-Cameras = Annotated[
-    str | None, option("FILE", "camera-to-world poses for --scene (docs/formats.md#trajectories)")
-]
+Cameras = Annotated[str | None, "FILE: camera-to-world poses for --scene (docs/formats.md#trajectories)"]
 
 
 def load_user_scenes(

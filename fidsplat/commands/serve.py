@@ -6,12 +6,11 @@ import math
 import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fidsplat.cameras.screw import exponential
-from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Json, require_packages
 from fidsplat.commands.output import console, report
 from fidsplat.commands.scenes import RenderInput, Size
@@ -51,15 +50,18 @@ class Serve(RenderInput):
 
     trajectory: str | None = None
     """FILE: poses of the camera (default: the scene's [[camera.motion]])"""
-    rate: Annotated[float, option("HZ", "frames and scans per second")] = 10.0
-    file_rate: Annotated[float, option("HZ", "poses per second of a file without times")] = 10.0
+    rate: float = 10.0
+    """HZ: frames and scans per second"""
+    file_rate: float = 10.0
+    """HZ: poses per second of a file without times"""
     lidar: str | None = None
     """NAME: also scan with this sensor, at the camera; `fidsplat scan --help` lists them"""
-    compress: Annotated[bool, switch("send rgb as JPEG, as CompressedImage")] = False
-    ros2: Annotated[bool, switch("publish ROS 2 topics, in the domain ROS_DOMAIN_ID")] = False
-    foxglove: Annotated[bool, switch("serve Foxglove's WebSocket protocol; the default without --ros2")] = (
-        False
-    )
+    compress: bool = False
+    """send rgb as JPEG, as CompressedImage"""
+    ros2: bool = False
+    """publish ROS 2 topics, in the domain ROS_DOMAIN_ID"""
+    foxglove: bool = False
+    """serve Foxglove's WebSocket protocol; the default without --ros2"""
     host: str = "127.0.0.1"
     """ADDRESS: address to listen on; the default is this machine only, 0.0.0.0 opens it to the network"""
     port: int = 8765

@@ -2,9 +2,8 @@
 
 import sys
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.scenes import SceneInput
 from fidsplat.util.errors import InputError
 
@@ -35,7 +34,8 @@ class Source(SceneInput):
 
     schedule: Literal["lanes", "group"] = "lanes"
     """S: lanes: for CPUs, one work-item per tile; group: for GPUs, one work-group per tile"""
-    device: Annotated[str | None, option("D", "OpenCL device, instead of a schedule")] = None
+    device: str | None = None
+    """D: OpenCL device, instead of a schedule"""
 
     def run(self) -> int:
         from fidsplat.backends.opencl.assemble import assemble

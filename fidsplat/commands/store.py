@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Device, Json, Overwrite
 from fidsplat.commands.output import console, delayed_progress, print_json, print_table, report
 from fidsplat.experiments.city_demo import CityDemoSettings
@@ -19,8 +18,8 @@ from fidsplat.util.errors import InputError, several
 if TYPE_CHECKING:
     import fidsplat as fs
 
-Out = Annotated[str, option("OUT.fss", "store to write", "-o")]
-StorePath = Annotated[tyro.conf.Positional[str], option("STORE.fss", "store to read")]
+Out = Annotated[str, "OUT.fss: store to write"]
+StorePath = Annotated[tyro.conf.Positional[str], "STORE.fss: store to read"]
 
 
 @dataclass
@@ -36,7 +35,8 @@ class Build:
       fidsplat store build block-*.ply -o city.fss --memory 1GiB --sh-degree 1 --colors float16
     """
 
-    inputs: Annotated[tyro.conf.Positional[list[str]], option("IN...", "splat files")]
+    inputs: tyro.conf.Positional[list[str]]
+    """IN...: splat files"""
     out: Out
     settings: BuildSettings = field(default_factory=BuildSettings)
     overwrite: Overwrite = False
@@ -76,9 +76,12 @@ class Place:
 
     source: StorePath
     out: Out
-    grid: Annotated[str | None, option("NX,NY,NZ", "instances along the world's axes")] = None
-    pitch: Annotated[str, option("DX,DY,DZ", "metres between instances")] = "10,10,10"
-    poses: Annotated[str | None, option("FILE", "poses, for example TUM, instead of a grid")] = None
+    grid: str | None = None
+    """NX,NY,NZ: instances along the world's axes"""
+    pitch: str = "10,10,10"
+    """DX,DY,DZ: metres between instances"""
+    poses: str | None = None
+    """FILE: poses, for example TUM, instead of a grid"""
     overwrite: Overwrite = False
     json: Json = False
 
@@ -215,7 +218,8 @@ class StoreDemo:
       fidsplat fly city/city.toml -o flight --rate 2
     """
 
-    out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-city"
+    out: str = "fidsplat-city"
+    """DIR: folder"""
     city: CityDemoSettings = field(default_factory=CityDemoSettings)
     device: Device = None
     overwrite: Overwrite = False

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Devices, Folders, Json, ReportTo, check_plot, require_packages
 from fidsplat.commands.output import console, point_label, print_lines, print_table, report, run_sweeps
 from fidsplat.commands.progress_lines import duration
@@ -37,7 +36,8 @@ class TradeoffReport:
       fidsplat tradeoff report cpu gpu -o accuracy.md
     """
 
-    folders: Annotated[Folders, option("DIR", f"folders with results (default: {DEFAULT_FOLDER})")] = ()
+    folders: Folders = ()
+    """DIR: folders with results (default: fidsplat-tradeoff)"""
     out: ReportTo = None
     json: Json = False
 
@@ -48,21 +48,6 @@ class TradeoffReport:
         folders = [Path(folder) for folder in self.folders or (DEFAULT_FOLDER,)]
         files = write_report(folders, Path(self.out or folders[0]))
         return report(self.json, {"files": [str(file) for file in files]}, f"report in {files[0]}")
-
-
-@dataclass(frozen=True)
-class Measurement(TradeoffSettings):
-    """Options of the measurement."""
-
-    settings: Annotated[
-        tuple[str, ...] | None,
-        option(
-            "NAME...",
-            "quality settings to vary: names of Quality's fields, or preset, alone, marker, together "
-            "(default: all)",
-            "--knobs",
-        ),
-    ] = None
 
 
 @dataclass
@@ -95,16 +80,10 @@ class Tradeoff:
 
     PARTS: ClassVar[dict[str, type]] = {"report": TradeoffReport}
 
-    out: Annotated[
-        str | None,
-        option(
-            "DIR",
-            f"folder for results (default: {DEFAULT_FOLDER}, with --quick {DEFAULT_FOLDER}-quick)",
-            "-o",
-        ),
-    ] = None
+    out: str | None = None
+    """DIR: folder for results (default: fidsplat-tradeoff, with --quick fidsplat-tradeoff-quick)"""
     device: Devices = ()
-    measurement: Measurement = field(default_factory=Measurement)
+    measurement: TradeoffSettings = field(default_factory=TradeoffSettings)
     scene: UserScenes = ()
     cameras: Cameras = None
     plot: str | None = None

@@ -7,11 +7,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Device, Json, new_file, require_packages, writable_file
 from fidsplat.commands.output import console, delayed_progress, print_lines, progress_bar, report
 from fidsplat.train.settings import TrainSettings
@@ -42,20 +41,24 @@ class Train:
       fidsplat train photos -o finer.ply --primitive 3d --start capture.ply --sh-every 1 --densify-until 0
     """
 
-    dataset: Annotated[tyro.conf.Positional[str], option("DATASET", "folder or transforms.json")]
-    out: Annotated[str, option("FILE.ply", "file for the splats", "-o")]
+    dataset: tyro.conf.Positional[str]
+    """DATASET: folder or transforms.json"""
+    out: str
+    """FILE.ply: file for the splats"""
     device: Device = None
     training: TrainSettings = field(default_factory=TrainSettings)
     within_memory: float | None = None
     """GIB: memory of splats and images while training; reduces the number of splats"""
     hold_out: int | None = None
     """N: hold out every Nth view, 0 for none (default: see above)"""
-    random_points: Annotated[int, option("N", "start from N random points instead of the data set's")] = 0
+    random_points: int = 0
+    """N: start from N random points instead of the data set's"""
     masks: str | None = None
     """DIR: masks NAME.png of the images, 0 for ignored pixels (default: those of the data set)"""
     alpha_masks: bool = False
     """ignore transparent pixels, instead of showing the background there"""
-    start: Annotated[str | None, option("FILE", "splats to refine, instead of one at each point")] = None
+    start: str | None = None
+    """FILE: splats to refine, instead of one at each point"""
     report: str | None = None
     """DIR|FILE.md: write a page with curves and images of the held-out views"""
     overwrite: bool = False

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import tyro
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.options import MemoryBudget
 from fidsplat.commands.output import console, delayed_progress, print_lines
 from fidsplat.commands.scenes import SceneDevice, SceneQuality
@@ -50,10 +49,8 @@ class View:
       fidsplat view yard.training.npz --trajectory yard/sparse/0       a training, and its cameras
     """
 
-    source: Annotated[
-        tyro.conf.Positional[str | None],
-        option("SCENE.toml|FILE.ply|STORE.fss|RUN", "scene to show (default: the demo's scene)"),
-    ] = None
+    source: tyro.conf.Positional[str | None] = None
+    """SCENE.toml|FILE.ply|STORE.fss|RUN: scene to show (default: the demo's scene)"""
     trajectory: str | None = None
     """FILE: poses to show as keyframes (docs/formats.md#trajectories), e.g. a flight's trajectory.tum"""
     pose: StartPose = field(default_factory=StartPose)

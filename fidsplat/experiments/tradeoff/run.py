@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Annotated
 
 from fidsplat.experiments.run import device_name
 from fidsplat.experiments.sweep import Key, Results, Sweep, TimeLimit, Work, thread_pool
@@ -39,8 +40,9 @@ class TradeoffSettings:
 
     scenes: tuple[str, ...] | None = None
     """Scenes to measure. By default all, with --quick four."""
-    settings: tuple[str, ...] | None = None
-    """Quality settings to vary, see `points.SETTINGS`. By default all."""
+    settings: Annotated[tuple[str, ...] | None, "--knobs"] = None
+    """NAME...: quality settings to vary: names of Quality's fields, or preset, alone, marker, together
+    (default: all)"""
     quick: bool = False
     """Measure few values and frames, four scenes or two of your views, for at most 3 minutes per device; the
     same command continues."""
