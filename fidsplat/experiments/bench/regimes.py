@@ -270,6 +270,7 @@ SUITE: dict[str, SuiteScene] = {
     "biker_1080p": _captured("biker", 1920, 1080),
     "biker_4k": _captured("biker", 3840, 2160, large=True),
     "biker_orbit": _captured("biker", 1280, 720, 120),
+    "guitar_1080p": _captured("guitar", 1920, 1080),
     "playbot_1080p": _captured("playbot", 1920, 1080),
     "agents_64": _agents(64, quick=True),
     "agents_1024": _agents(1024, large=True),
