@@ -240,7 +240,8 @@ class Drive:
             np.array([*first[:2, 3], math.atan2(first[1, 0], first[0, 0])]),
             noise,
             drift=0.1 if without == "wheels" else 0.0,
-            bias=0.05 if without == "gyroscope" else 0.005,
+            # wheels of different size turn the robot by its speed
+            **({"bias": 0.05, "bias_walk": 0.02} if without == "gyroscope" else {}),
         )
         used_codes = None if without == "tags" else detections
         by_pose = {} if used_codes is None else {k: codes for k, codes, _ in self._known(run, used_codes)}

@@ -34,15 +34,21 @@ class Localiser:
         corner_noise: pixels, standard deviation of a detected corner.
         drift: standard deviation of the position after a second in addition to that of the wheels, metres.
         bias: standard deviation of the bias of the gyroscope at the start, radians per second.
+        bias_walk: standard deviation of the change of the bias after a second.
     """
 
     def __init__(
-        self, start: np.ndarray, corner_noise: float = 0.5, drift: float = 0.0, bias: float = 0.005
+        self,
+        start: np.ndarray,
+        corner_noise: float = 0.5,
+        drift: float = 0.0,
+        bias: float = 0.005,
+        bias_walk: float = 1e-5,
     ) -> None:
         self.state = np.array([*start, 0.0, 1.0])
-        self._noise, self._drift = corner_noise, drift
+        self._noise, self._drift, self._bias_walk = corner_noise, drift, bias_walk
         self.covariance = np.diag([0.01, 0.01, 0.01, bias, 0.02]) ** 2
-        self._reference = self.state[:3].copy()
+        self._reference, self._reference_is_new = self.state[:3].copy(), False
         self.rejected = 0
         """number of tags and scans rejected as outliers"""
 
@@ -70,31 +76,35 @@ class Localiser:
         transition[2, 3] = -seconds
         slip, turn = 0.003**2 * abs(rolled), (0.003 * seconds) ** 2 + 1e-6 * abs(rolled)
         slip += self._drift**2 * seconds
+        walk = self._bias_walk**2 * seconds
         self.covariance = transition @ self.covariance @ transition.T
-        self.covariance[range(5), range(5)] += slip, slip, turn, 1e-10 * seconds, 1e-9 * abs(rolled)
+        self.covariance[range(5), range(5)] += slip, slip, turn, walk, 1e-9 * abs(rolled)
 
     def set_reference(self) -> None:
         """Make the current pose that of the reference scan."""
         clone = np.vstack([np.eye(5), np.eye(3, 5)])
         self.covariance = clone @ self.covariance[:5, :5] @ clone.T
-        self._reference = self.state[:3].copy()
+        self._reference, self._reference_is_new = self.state[:3].copy(), True
 
     def match(self, relative: np.ndarray, noise: np.ndarray) -> bool:
         """Correct the state by a matched scan; returns False if the match was rejected.
 
         Args:
             relative: (3,) measured x, y and heading of the robot in its pose at the reference scan.
-            noise: (3, 3) covariance of the measurement.
+            noise: (3, 3) covariance of the measurement, of which each of the two scans has half.
         """
         expected, heading = self.relative, self._reference[2]
-        back = np.array([[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]])
+        back = np.eye(3)
+        back[:2, :2] = [[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]]
+        if self._reference_is_new:  # its error is common to all matches with it
+            self.covariance[5:, 5:] += back.T @ noise @ back / 2
+            self._reference_is_new = False
         by = np.zeros((3, 8))
-        by[:2, :2], by[:2, 5:7] = back, -back
+        by[:, :3], by[:, 5:] = back, -back
         by[:2, 7] = expected[1, 3], -expected[0, 3]
-        by[2, 2], by[2, 7] = 1, -1
         off = relative - [*expected[:2, 3], self.state[2] - heading]
         off[2] = math.remainder(off[2], math.tau)
-        return self._correct(off, by, noise)
+        return self._correct(off, by, noise / 2)
 
     def correct(self, corners: np.ndarray, tag: np.ndarray, camera: Callable[[np.ndarray], Camera]) -> bool:
         """Correct the state by a detected tag; returns False if the tag was rejected.

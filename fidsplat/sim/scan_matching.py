@@ -1,4 +1,4 @@
-"""Scan matching by point-to-plane ICP: the motion of a robot on a floor between two LiDAR scans."""
+"""Scan matching by generalised ICP: the motion of a robot on a floor between two LiDAR scans."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ KEY_DISTANCE, KEY_TURN = 1.0, 0.5
 """metres and radians from a reference scan to the next"""
 VOXEL = 0.08
 """metres: points are averaged over cubes of this edge"""
+NEIGHBOURS = 10
+"""points that determine the plane of a point"""
 MINIMUM = 20
 """smallest number of averaged points of a scan; small_gicp crashes without points"""
-REACH = 0.3
+REACH = 0.15
 """metres: longest distance between corresponding points"""
-SPREAD = 0.6
-"""metres: standard deviation of the distance of a point to its plane, of which the covariance of a match
-follows; larger than the residuals, since errors of neighbours and of scans with one reference are
-correlated"""
+FLOOR = 0.2
+"""metres: lower points are ignored, since rings on a floor move with the sensor"""
 
 
 class ScanMatcher:
@@ -38,13 +38,16 @@ class ScanMatcher:
 
     def __init__(self, height: float) -> None:
         self._reference: tuple[Any, Any] | None = None
+        self._height = height
         self._sway = np.diag([height * TILT[1], height * TILT[0], 1e-3]) ** 2
 
     def correct(self, localiser: Localiser, points: np.ndarray) -> bool:
-        """Correct a localiser by the points (n, 3) of a scan in the axes of the robot; returns whether they
-        matched the reference scan. Scans of fewer points than `MINIMUM` have no effect."""
+        """Correct a localiser by the points (n, 3) of a scan in the frame of the LiDAR, whose axes are those
+        of the robot; returns whether they matched the reference scan. Scans of fewer points than `MINIMUM`
+        have no effect."""
         points, matched = np.asarray(points, np.float64), False
-        scan = small_gicp.preprocess_points(points[np.isfinite(points).all(1)], VOXEL, 10)
+        above = np.isfinite(points).all(1) & (points[:, 2] > FLOOR - self._height)
+        scan = small_gicp.preprocess_points(points[above], VOXEL, NEIGHBOURS)
         if scan[0].size() < MINIMUM:
             return False
         if self._reference is not None:
@@ -62,14 +65,30 @@ class ScanMatcher:
         convergence."""
         assert self._reference is not None
         found = small_gicp.align(
-            self._reference[0], scan, self._reference[1], start, registration_type="PLANE_ICP",
+            self._reference[0], scan, self._reference[1], start, registration_type="GICP",
             max_correspondence_distance=REACH, max_iterations=30,
         )  # fmt: skip
-        if not found.converged or np.linalg.cond(found.H) > 1e12:
+        if not found.converged or found.num_inliers < MINIMUM:
             return None
         pose = found.T_target_source
         # the error is a small motion of the scan in its own axes: rotation, then translation
         axes = np.eye(3)
         axes[:2, :2] = pose[:2, :2]
-        noise = SPREAD**2 * axes @ np.linalg.inv(found.H)[np.ix_([3, 4, 2], [3, 4, 2])] @ axes.T
-        return np.array([*pose[:2, 3], math.atan2(pose[1, 0], pose[0, 0])]), noise + self._sway
+        # residuals of points are correlated whose neighbourhoods overlap: within twice their radius
+        variance = 4 * NEIGHBOURS * 2 * found.error / found.num_inliers
+        inverse = np.linalg.inv(_information(found, scan.points()[:, :3]))[np.ix_([3, 4, 2], [3, 4, 2])]
+        noise = variance * axes @ inverse @ axes.T + 2 * self._sway
+        return np.array([*pose[:2, 3], math.atan2(pose[1, 0], pose[0, 0])]), noise
+
+
+def _information(found: Any, points: np.ndarray) -> np.ndarray:
+    """Hessian (6, 6) of a match without information along the planes of points, such as in a corridor.
+
+    It has 1/2 for each point along its plane, as the Gaussians of points end, and about as much by noise of
+    the normals.
+    """
+    turned = np.cross(points[:, None], np.eye(3)).swapaxes(1, 2)
+    by = np.concatenate([turned, np.broadcast_to(-np.eye(3), turned.shape)], 2)
+    along = np.einsum("nki,nkj->ij", by, by) * found.num_inliers / len(points)
+    values, vectors = np.linalg.eigh(found.H - along)
+    return vectors * np.maximum(values, 1e-8 * values[-1]) @ vectors.T
