@@ -6,7 +6,7 @@
 
 Errors are of the random scenes of tests/contract/test_gradients.py: for the array of each parameter the
 relative error and one less the cosine, as median and maximum over the scenes; the number of scenes with
-errors above 1e-4; and the maximum error relative to the change by one unit in the last place of means and
+errors above 1e-4; and the largest of these relative to the change by units in the last place of means and
 quaternions. Times are of a frame and of its gradients by colour, with resident splats: medians of each stage
 by the device's clock.
 """
@@ -18,9 +18,10 @@ from collections import defaultdict
 import numpy as np
 from derivative_errors import (
     NORM,
+    certain_loss,
+    conditioning,
     derivatives,
     differences,
-    last_place,
     random_loss,
     random_picture,
 )
@@ -41,15 +42,15 @@ def errors(backend: Backend, scenes: int, solid: float, quality: str | None) -> 
     reference, found, beyond = ReferenceBackend(), defaultdict(list), defaultdict(list)
     for seed in track(range(scenes), "Scenes", console=PROGRESS):
         cloud, capture = random_picture(seed, solid=solid, quality=quality)
-        truth = derivatives(reference, cloud, capture)
-        off = list(differences(derivatives(backend, cloud, capture), truth))
+        loss = certain_loss(cloud, capture)
+        truth = derivatives(reference, cloud, capture, loss)
+        off = list(differences(derivatives(backend, cloud, capture, loss), truth))
         for one in off:
             found[one.parameter].append(one[1:])
         if any(one.norm > NORM for one in off):
-            moved = differences(derivatives(reference, last_place(cloud), capture), truth)
-            for one, place in zip(off, moved, strict=True):
+            for one, known in zip(off, conditioning(cloud, capture, loss), strict=True):
                 if one.norm > NORM:
-                    beyond[one.parameter].append(one.norm / place.norm)
+                    beyond[one.parameter].append(one.norm / known.norm)
     return [
         {
             "parameter": name,

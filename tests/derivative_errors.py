@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import pickle
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -13,6 +14,8 @@ from fidsplat.backends.gradients import on_host
 from fidsplat.backends.interface import Backend
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
+from fidsplat.backends.reference.blend import MIN_ALPHA
+from fidsplat.backends.reference.error_bounds import STOP
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
@@ -22,7 +25,7 @@ from fidsplat.scenes.random_clouds import random_splats
 from fidsplat.splats.cloud import SplatCloud
 
 NORM, COSINE = 1e-4, 1e-6
-"""what a device may be off at most, as `Difference` has it; or by twice what `last_place` changes"""
+"""largest error of a device, as in `Difference`, where the derivatives are not worse conditioned"""
 _BEHIND = (0.3, 0.6, 0.1)
 _ORIGIN = (40.0, -25.0, 7.0)
 """of the clouds, metres: a derivative by a world position instead of one relative to it shows"""
@@ -129,22 +132,49 @@ def reference_derivatives(
     return _TRUTHS[key]
 
 
-def last_place(cloud: SplatCloud) -> SplatCloud:
-    """The cloud with every mean and quaternion moved to a neighbour in float32, up or down by chance.
+def certain_loss(cloud: SplatCloud, capture: Capture) -> dict[str, np.ndarray]:
+    """`random_loss` with the distortion of depths. Depths and normals of pixels whose coverage rounding may
+    move across `MIN_ALPHA`, where they end, have no derivative to compare: their weight is 0."""
+    features, view = prepare(cloud, capture)
+    if "depth" in features.names:
+        features = with_distortion(features)
+    loss = random_loss(features, view)
+    reference, (covered, _) = ReferenceBackend(), prepare(cloud, capture.with_(outputs=("alpha",)))
+    alpha = reference.pipeline(covered).render_view(reference.upload(cloud), view).read("alpha", 0)
+    for name in {"depth", "normal"} & loss.keys():
+        loss[name][np.abs(alpha - MIN_ALPHA) <= STOP] = 0
+    return loss
 
-    What that changes in derivatives no device can be asked to know, as its splats' records are float32 too:
-    needles of a small part of a pixel change by more than `NORM`.
+
+def conditioning(
+    cloud: SplatCloud, capture: Capture, by_images: Mapping[str, np.ndarray]
+) -> list[Difference]:
+    """Largest change, to first order, of the reference's derivatives if each number of means and quaternions
+    moves by at most one unit in the last place of float32.
+
+    Records of splats are rounded to float32, which turns and moves them by such amounts: no device has the
+    derivatives of needles more exactly. The numbers are moved one after another, for all splats at once, and
+    the changes added up: moved together, those of a single needle may cancel.
     """
-    rng = np.random.default_rng(0)
-
-    def moved(array: np.ndarray) -> np.ndarray:
-        towards = np.where(rng.random(array.shape) < 0.5, -np.inf, np.inf).astype(np.float32)
-        return np.nextafter(array, towards)
-
-    means, quats = moved(cloud.means), moved(cloud.quats)
+    expected = reference_derivatives(cloud, capture, by_images)
     third = [] if cloud.thickness is None else [cloud.thickness]
-    scales = np.column_stack([cloud.scales, *third])
-    return SplatCloud(means, quats, scales, cloud.opacities, origin=cloud.origin, **colors_of(cloud))
+    scales, rng = np.column_stack([cloud.scales, *third]), np.random.default_rng(0)
+    changes = []
+    for column in range(7):
+        numbers = np.column_stack([cloud.means, cloud.quats])
+        towards = rng.choice(np.array([-np.inf, np.inf], np.float32), len(cloud))
+        numbers[:, column] = np.nextafter(numbers[:, column], towards)
+        arrays = numbers[:, :3], numbers[:, 3:], scales, cloud.opacities
+        moved = SplatCloud(*arrays, origin=cloud.origin, **colors_of(cloud))
+        changes.append(differences(derivatives(ReferenceBackend(), moved, capture, by_images), expected))
+    return [
+        Difference(
+            of[0].parameter,
+            sum(one.norm for one in of),
+            sum(math.sqrt(max(one.turned, 0)) for one in of) ** 2,  # an angle adds up, this is its square
+        )
+        for of in zip(*changes, strict=True)
+    ]
 
 
 def differences(found: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> Iterator[Difference]:
