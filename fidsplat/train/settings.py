@@ -48,8 +48,7 @@ class TrainSettings:
     seed: int = 0
     """seed of all random numbers: order of views, initial rotations, means of split splats"""
     primitive: str = "2d"
-    """`2d`: disks, as 2DGS; `3d`: 3D Gaussians, as 3DGS, in the projection of `quality`; on OpenCL and the
-    reference"""
+    """`2d`: disks, as 2DGS; `3d`: 3D Gaussians, as 3DGS, in the projection of `quality`"""
     strategy: str = "default"
     """`default`: clone, split and prune by screen gradients, as the authors; `mcmc`: relocation of dead
     splats, growth up to `max_splats`, and noise"""

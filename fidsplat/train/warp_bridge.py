@@ -12,7 +12,8 @@ import numpy as np
 
 from fidsplat.backends.gradients import on_host
 from fidsplat.backends.warp.device import WarpBackend
-from fidsplat.backends.warp.gradients import add_to, flat_of
+from fidsplat.backends.warp.gradients import add_to
+from fidsplat.backends.warp.resident import scales_apart
 from fidsplat.backends.warp.runtime import load
 from fidsplat.cameras.pose_offset import offset_camera, offset_gradient
 from fidsplat.capture.capture import Capture
@@ -43,8 +44,8 @@ def render(
         tape: a `warp.Tape`.
         renderer: a Warp device.
         capture: camera, outputs (`rgb`, `alpha`, `depth`, `normal`), quality; see docs/gradients.md.
-        means, quats, scales, opacities: (n,) float32 vectors or (n, 3), (n, 4) wxyz of any length, (n, 2),
-            (n,), as in a `SplatCloud`, on the renderer's device; read without a copy.
+        means, quats, scales, opacities: (n,) float32 vectors or (n, 3), (n, 4) wxyz of any length, (n, 2) or
+            (n, 3) for 3D Gaussians, (n,), as in a `SplatCloud`; on the renderer's device; not copied.
         colors, sh: (n, 3), or (n, k, 3) harmonics of degree 1 to 3; one of them.
         background: (3,), instead of the capture's.
         pose: (6,) rotation vector [rad] and translation [m] of a motion after the camera's
@@ -84,7 +85,11 @@ def render(
             by_offset = offset_gradient(on_host(found["pose"]).astype(np.float64), offset)
             found["pose"] = wp.array(by_offset, dtype=wp.float32, device=backend.device)
         for name, array in with_grad.items():
-            add_to(flat_of(array.grad), flat_of(found[name]))
+            own = {name: array.grad}
+            if name == "scales" and "thickness" in found:
+                own = scales_apart(array.grad)
+            for part, sums in own.items():
+                add_to(sums, found[part])
 
     tape.record_func(backward, [*with_grad.values(), *images.values()])
     return images

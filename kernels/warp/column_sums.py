@@ -57,6 +57,6 @@ def background_parts(
 
 
 @wp.kernel(enable_backward=False)
-def add_to(sums: wp.array(dtype=wp.float32), values: wp.array(dtype=wp.float32)):
-    k = wp.tid()
-    sums[k] = sums[k] + values[k]
+def add_to(sums: wp.array2d(dtype=wp.float32), values: wp.array2d(dtype=wp.float32)):
+    row, column = wp.tid()
+    sums[row, column] = sums[row, column] + values[row, column]

@@ -21,7 +21,7 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
     that bounds the ellipsoid. reach: half of the ellipsoid's depth range. clipped: bounds of an ellipsoid
     that crosses the plane of the camera.
     """
-    vec3 = wp.types.vector(3, real)
+    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
     zero, half, one = real(0.0), real(0.5), real(1.0)
     margin, within = (real(1e-12), real(1e-15)) if real is wp.float64 else (real(1e-4), real(1e-6))
     widening = real(0.3)
@@ -73,10 +73,9 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
         return u, v, facet, area, inverse_m
 
     @wp.func
-    def ewa(a: vec3, b: vec3, c: vec3, p: vec3, view: View):
-        """Equivalent disk with ellipsoid="ewa", from scaled axes: half axes along x and of y along x and y of
-        a disk that faces the camera and has the widened image; the determinants of the covariance before and
-        after."""
+    def image(a: vec3, b: vec3, c: vec3, p: vec3, view: View):
+        """Scaled axes on the image: their columns and rows [samples]; samples per metre at the centre, and
+        the slopes of its ray, within the limits of the Jacobian."""
         per_x, per_y = real(view.focal_x), real(view.focal_y)
         slope_x, slope_y = zero, zero
         if wp.static(not parallel):
@@ -87,14 +86,27 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
             slope_y = wp.clamp(p[1] * ahead, -real(view.slopes[2]), real(view.slopes[3]))
         across = per_x * vec3(a[0] - slope_x * a[2], b[0] - slope_x * b[2], c[0] - slope_x * c[2])
         down = per_y * vec3(a[1] - slope_y * a[2], b[1] - slope_y * b[2], c[1] - slope_y * c[2])
+        return across, down, vec4(per_x, per_y, slope_x, slope_y)
+
+    @wp.func
+    def widened(across: vec3, down: vec3, view: View):
+        """Cholesky factor of the widened covariance on the image; determinants before and after."""
         spread = widening / real(view.per_pixel)
         xx, xy, yy = wp.dot(across, across), wp.dot(across, down), wp.dot(down, down)
         crossed = wp.cross(across, down)  # so that the determinant does not cancel
         before = wp.dot(crossed, crossed)
         after = before + spread * (xx + yy + spread)
         l11 = wp.sqrt(xx + spread)
-        l21, l22 = xy / l11, wp.sqrt(after) / l11
-        return vec3(l11 / per_x, l21 / per_y, l22 / per_y), before, after
+        return vec3(l11, xy / l11, wp.sqrt(after) / l11), before, after
+
+    @wp.func
+    def ewa(a: vec3, b: vec3, c: vec3, p: vec3, view: View):
+        """Equivalent disk with ellipsoid="ewa", from scaled axes: half axes along x and of y along x and y of
+        a disk that faces the camera and has the widened image; the determinants of the covariance before and
+        after."""
+        across, down, per = image(a, b, c, p, view)
+        factor, before, after = widened(across, down, view)
+        return vec3(factor[0] / per[0], factor[1] / per[1], factor[2] / per[1]), before, after
 
     @wp.func
     def disk(a: vec3, b: vec3, facet: vec3, sizes: vec3, p: vec3, view: View):
@@ -184,4 +196,6 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
             wp.min(box.y + box.half_y, float(fy * (middle_y + reach_y) + cy)),
         )
 
-    return SimpleNamespace(disk=disk, surface=surface, rim=rim, reach=reach, clipped=clipped)
+    return SimpleNamespace(
+        disk=disk, image=image, widened=widened, surface=surface, rim=rim, reach=reach, clipped=clipped
+    )

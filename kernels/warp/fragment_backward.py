@@ -14,6 +14,7 @@ import warp as wp
 
 from .buffers import make_samples, sample_fields
 from .common import View, fma, line_of, of_bits, struct_of
+from .ellipsoids import EXACT
 from .intersection import HALF_RHO_OF_RANGE, make_intersection
 from .output.distortion import INVERSE_DEPTH, SPREAD_NEAR
 from .records import Layout
@@ -31,6 +32,7 @@ def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str,
     names += ("disc_x", "disc_y") if "lowpass_screen" in effects else ()
     names += ("z_numerator", "z_numerator_x", "z_numerator_y", "z_center") if "ray_depth" in effects else ()
     names += ("nx", "ny", "nz") if "normal" in outputs else ()
+    names += ("bulge",) if EXACT in effects else ()
     return tuple(names)
 
 
@@ -42,8 +44,8 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
     splats, intersection = make_splat(effects, outputs), make_intersection(effects, outputs)
     Splat, Intersection = splats.Splat, intersection.Intersection
     cross, column_of, opacity_of = intersection.cross, intersection.column, intersection.opacity_of
-    screen, exclusive, has_depth = (
-        name in effects for name in ("lowpass_screen", "stop_exclusive", "ray_depth")
+    screen, exclusive, has_depth, thick = (
+        name in effects for name in ("lowpass_screen", "stop_exclusive", "ray_depth", EXACT)
     )
     alpha, depth, normal, distortion = (name in losses for name in ("alpha", "depth", "normal", "distortion"))
     names = moments_of(effects, outputs)
@@ -138,7 +140,8 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         """Depth of a fragment, and its derivatives by z_numerator, z_center, and D at constant
         z_numerator - z_center D; by q and by the low-pass's half rho `low_pass`, which may be the circle that
         z_center + circle (z_numerator - z_center D) D / q is mirrored at. It leaves the splat's range by
-        rounding alone, and then has the centre's."""
+        rounding alone, and then has the centre's. The last result is the derivative by the bulge of a 3D
+        Gaussian, whose D and q in `c` are those of its disk times 1 + t, t = bulge q / D^2."""
         place = index * each
         center = line_of(lines, place + zc_line)[zc_lane]
         reach = line_of(lines, place + zr_line)[zr_lane]
@@ -156,7 +159,17 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
             z = wp.clamp(fma(taken, beyond, center), center - reach, center + reach)
             by_record = wp.vec3(taken, 1.0 - taken * c.d, circle / c.q * beyond)
             by_dot = wp.vec2(-taken * beyond / c.q, wp.where(circle == low_pass, beyond * c.d / c.q, 0.0))
-        return z, by_record, by_dot
+        by_bulge = float(0.0)
+        if wp.static(thick):
+            if s.bulge > 0.0 and ahead:
+                half_rho = c.q * inverse_d * inverse_d
+                rest = wp.max(1.0 - s.bulge * half_rho, 1.0e-6)  # 1 / (1 + t)
+                t, slant = s.bulge * half_rho / rest, half_rho * c.d  # q / D
+                by_d = by_record[2] - center * by_record[0]
+                by_bulge = slant * fma(slant, by_dot[0], by_d)
+                by_record[2] = by_record[2] - t * fma(2.0 * slant, by_dot[0], by_d)
+                by_dot[0] = fma(2.0 * t, by_dot[0], by_dot[0]) + by_d * s.bulge * inverse_d / rest
+        return z, by_record, by_dot, by_bulge
 
     @wp.func
     def back(
@@ -191,13 +204,13 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         weight = light * opacity
         color = wp.vec3(s.c[1], s.c[2], s.c[3])
         worth = wp.dot(loss.light, color)
-        z, by_record, by_dot_depth = float(0.0), wp.vec3(), wp.vec2()
+        z, by_record, by_dot_depth, by_bulge = float(0.0), wp.vec3(), wp.vec2(), float(0.0)
         by_z = float(0.0)
         if wp.static(has_depth):
             low_pass = float(wp.inf)
             if wp.static(screen):
                 low_pass = c.screen
-            z, by_record, by_dot_depth = depth_at(lines, index, s, c, inverse_d, low_pass)
+            z, by_record, by_dot_depth, by_bulge = depth_at(lines, index, s, c, inverse_d, low_pass)
         if wp.static(depth):
             worth += fma(loss.depth, z, loss.depth_weight)
             by_z += weight * loss.depth
@@ -250,6 +263,12 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         if wp.static(normal):
             for k in range(3):
                 m[wp.static(at.get("nx", 0)) + k] = weight * loss.normal[k]
+        if wp.static(thick):
+            if on_plane:
+                by_bulge = fma(by_log, half_rho * half_rho, by_z * by_bulge)
+            else:
+                by_bulge *= by_z
+            m[wp.static(at.get("bulge", 0))] = by_bulge
         m[0] = by_nu
         m[1] = by_nu * x
         m[2] = by_nu * y

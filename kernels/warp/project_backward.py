@@ -13,6 +13,8 @@ import warp as wp
 
 from .color import basis_value
 from .common import CULLED, STRICT, View, line_of
+from .ellipsoids import EWA, EXACT, make_ellipsoids
+from .ellipsoids_backward import make_ellipsoids_backward
 from .project import SMALLEST_SCALE
 from .records import Layout
 
@@ -74,9 +76,12 @@ def make_project_backward(
     at = {name: place for place, name in enumerate(names)}
     Moments, Totals = (wp.types.vector(fields, real) for real in (wp.float32, wp.float64))
     screen_filter, has_depth, normal = (name in at for name in ("disc_x", "z_center", "nx"))
+    exact, ewa = EXACT in effects, any(name in effects for name in EWA)
+    thick_too = exact or ewa
+    ellipsoid, solid_backward = make_ellipsoids(effects, wp.float64), make_ellipsoids_backward(effects)
     zc_line, zc_lane = layout.place("z_center")
     terms = max(sh_terms, 1)
-    disc_x, z_numerator, nx = (at.get(name, 0) for name in ("disc_x", "z_numerator", "nx"))
+    disc_x, z_numerator, nx, bulge = (at.get(name, 0) for name in ("disc_x", "z_numerator", "nx", "bulge"))
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def project_backward(
@@ -85,6 +90,7 @@ def make_project_backward(
         means: wp.array(dtype=wp.vec3),
         quats: wp.array(dtype=wp.vec4),
         scales: wp.array(dtype=wp.vec2),
+        thickness: wp.array(dtype=wp.float32),  # of a cloud that has 3D Gaussians; 0: a disk
         opacities: wp.array(dtype=wp.float32),
         colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_terms)
         lines: wp.array(dtype=wp.vec4),
@@ -95,6 +101,7 @@ def make_project_backward(
         by_means: wp.array(dtype=wp.vec3),  # out, as all below; 0 of splats that are not drawn
         by_quats: wp.array(dtype=wp.vec4),
         by_scales: wp.array(dtype=wp.vec2),
+        by_thickness: wp.array(dtype=wp.float32),  # of a cloud that has 3D Gaussians
         by_opacities: wp.array(dtype=wp.float32),
         by_colors: wp.array(dtype=wp.vec3),
         screen: wp.array(dtype=wp.float32),  # norm of that by the projected centre, in half pictures
@@ -105,6 +112,8 @@ def make_project_backward(
         by_means[i] = wp.vec3()
         by_quats[i] = wp.vec4()
         by_scales[i] = wp.vec2()
+        if wp.static(thick_too):
+            by_thickness[i] = 0.0
         by_opacities[i] = 0.0
         screen[i] = 0.0
         by_cameras[i] = TEN()
@@ -153,6 +162,13 @@ def make_project_backward(
         size = scales[i]
         su, sv = wp.float64(wp.max(size[0], SMALLEST_SCALE)), wp.float64(wp.max(size[1], SMALLEST_SCALE))
         a, b = su * unit_a, sv * unit_b
+        if wp.static(thick_too):
+            facet, sizes = wp.cross(unit_a, unit_b), wp.vec3d(su, sv, _ZERO)
+            if thickness[i] > 0.0:
+                sizes[2] = wp.float64(wp.max(thickness[i], SMALLEST_SCALE))
+                of_disk = ellipsoid.disk(a, b, facet, sizes, p, view)
+                a = of_disk[0]
+                b = of_disk[1]
 
         # the record's forms, and their common factor
         anchor = line_of(lines, i * each + 2)[3]
@@ -164,6 +180,10 @@ def make_project_backward(
         form_u, form_v, form_d = wp.cross(b, p), wp.cross(p, a), wp.cross(a, b)
         steep_x = wp.max(wp.abs(form_u[0]), wp.abs(form_v[0])) * view.per_focal_x
         steep_y = wp.max(wp.abs(form_u[1]), wp.abs(form_v[1])) * view.per_focal_y
+        if wp.static(ewa):
+            if thickness[i] > 0.0:
+                steep_x = wp.abs(form_d[2])
+                steep_y = steep_x
         height = wp.dot(form_d, p)
         scale = wp.where(height < _ZERO, -_ONE, _ONE) / wp.max(steep_x, steep_y)
         n_scale = scale * _SQRT_HALF
@@ -198,14 +218,31 @@ def make_project_backward(
         if wp.static(has_depth):
             by_p[2] = by_p[2] + total[z_numerator + 3]
         by_su, by_sv = wp.dot(by_a, unit_a), wp.dot(by_b, unit_b)
+        by_unit_a, by_unit_b = su * by_a, sv * by_b
+        by_facet = wp.vec3d()
+        if wp.static(normal):
+            by_facet = wp.vec3d(total[nx], total[nx + 1], total[nx + 2])
+            by_facet *= wp.where(height > _ZERO, -_ONE, _ONE)
+        if wp.static(thick_too):
+            if thickness[i] > 0.0:
+                by_axes, by_sizes, by_p, by_camera = solid_backward(
+                    wp.matrix_from_rows(unit_a, unit_b, facet), sizes, p, by_a, by_b, by_p,
+                    wp.vec4d(by_fx, by_fy, by_cx, by_cy), by_log, total[bulge], by_facet, view,
+                )  # fmt: skip
+                by_fx, by_fy, by_cx, by_cy = by_camera[0], by_camera[1], by_camera[2], by_camera[3]
+                by_unit_a, by_unit_b, by_facet = by_axes[0], by_axes[1], by_axes[2]
+                by_su, by_sv = by_sizes[0], by_sizes[1]
+                if thickness[i] >= SMALLEST_SCALE:
+                    by_thickness[i] = float(by_sizes[2])
+                if wp.static(exact):
+                    across = wp.float64(view.width) * by_p[0] * per_x
+                    down = wp.float64(view.height) * by_p[1] * per_y
+                    screen[i] = float(_HALF * p[2] * wp.sqrt(across * across + down * down))
         by_scales[i] = wp.vec2(
             wp.where(size[0] >= SMALLEST_SCALE, float(by_su), 0.0),
             wp.where(size[1] >= SMALLEST_SCALE, float(by_sv), 0.0),
         )
-        by_unit_a, by_unit_b = su * by_a, sv * by_b
-        if wp.static(normal):
-            by_facet = wp.vec3d(total[nx], total[nx + 1], total[nx + 2])
-            by_facet *= wp.where(height > _ZERO, -_ONE, _ONE)
+        if wp.static(normal or thick_too):
             by_unit_a += wp.cross(unit_b, by_facet)
             by_unit_b += wp.cross(by_facet, unit_a)
 

@@ -83,9 +83,10 @@ def blending_back(*effects):
     return made("blend_backward.make_blend_backward", *rendered, GRADIENTS, True, 256).kernel
 
 
-def projecting_back(terms):
-    names = made("fragment_backward.moments_of", *OF_GRADIENTS)
-    return made("project_backward.make_project_backward", OF_GRADIENTS[0], NORMAL, names, terms)
+def projecting_back(terms, *effects):
+    effects = (*OF_GRADIENTS[0], *effects)
+    names = made("fragment_backward.moments_of", effects, OF_GRADIENTS[1])
+    return made("project_backward.make_project_backward", effects, NORMAL, names, terms)
 
 
 def resolving(stretched, samples):
@@ -127,7 +128,8 @@ def started():
         pytest.param(lambda: blending("rays", *RECORD, "rays_length"), id="blend-rays", marks=LONG),
         pytest.param(lambda: blending("camera_orthographic", *RECORD), id="blend-parallel", marks=LONG),
         pytest.param(lambda: blending("lowpass_screen", "stop_exclusive", outputs=()), id="blend-exclusive"),
-        pytest.param(lambda: projecting_back(16), id="project-backward"),
+        pytest.param(lambda: projecting_back(16, "ellipsoid_exact"), id="project-backward-exact"),
+        pytest.param(lambda: projecting_back(0, "ellipsoid_ewa_antialiased"), id="project-backward-ewa"),
         pytest.param(lambda: made("blend_backward.make_slots", True), id="slots"),
         pytest.param(lambda: made("column_sums.add_rows"), id="sums"),
         pytest.param(lambda: resolving(False, 3), id="resolve"),
@@ -178,7 +180,8 @@ def test_records_move_as_whole_lines(tmp_path):
 def test_derivatives_read_records_where_they_lie(tmp_path):
     """They stage no records."""
     assert "staged" in compiled(blending(outputs=()), tmp_path / "blend")
-    assert "staged" not in compiled(blending_back("stop_exclusive", "arithmetic_fast"), tmp_path / "back")
+    effects = "stop_exclusive", "arithmetic_fast", "ellipsoid_exact"
+    assert "staged" not in compiled(blending_back(*effects), tmp_path / "back")
 
 
 def test_a_record_grows_by_the_requested_fields():

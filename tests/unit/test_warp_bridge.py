@@ -40,11 +40,14 @@ def picture():
 
 
 def on_device(cloud, gradients=tuple(TYPES)):
+    arrays = {name: getattr(cloud, name) for name in TYPES}
+    types = TYPES
+    if cloud.thickness is not None:
+        arrays["scales"] = np.column_stack([cloud.scales, cloud.thickness])
+        types = TYPES | {"scales": "vec3"}
     return {
-        name: wp.array(
-            getattr(cloud, name), dtype=getattr(wp, kind), device="cpu", requires_grad=name in gradients
-        )
-        for name, kind in TYPES.items()
+        name: wp.array(array, dtype=getattr(wp, types[name]), device="cpu", requires_grad=name in gradients)
+        for name, array in arrays.items()
     }
 
 
@@ -65,6 +68,20 @@ def test_a_tape_differentiates_frames_and_kernels(renderer, render):
     for name, array in arrays.items():
         assert np.abs(truth[name]).max() > 0
         np.testing.assert_array_equal(array.grad.numpy(), truth[name], err_msg=name)
+
+
+def test_a_tape_differentiates_3d_gaussians(renderer, render):
+    style = {"degree": None, "quality": "gsplat", "outputs": ("rgb",), "origin": (0.0, 0.0, 0.0)}
+    cloud, capture = random_picture(0, solid=1.0, **style)
+    arrays, ones = on_device(cloud), wp.ones((43, 61, 3), dtype=float, device="cpu")
+    tape = wp.Tape()
+    images = render(tape, renderer, capture, **arrays)
+    for _ in range(2):
+        tape.backward(grads={images["rgb"]: ones})
+    truth = derivatives(renderer.backend, cloud, capture, {"rgb": ones.numpy()})
+    truth["scales"] = np.column_stack([truth["scales"], truth["thickness"]])
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(array.grad.numpy(), 2 * truth[name], err_msg=name)
 
 
 def test_a_tape_has_the_gradients_of_pose_and_background(renderer, render):
@@ -194,8 +211,8 @@ def test_derivatives_that_cannot_be_taken_are_errors(renderer):
 
 
 def test_training_on_warp_repeats_to_the_byte_and_after_a_stop(renderer, tmp_path):
-    """By the work of a step in NumPy, as Warp has no kernels of its own for it."""
-    settings = {**QUICK, "iterations": 20, "sh_degree": 0, "growth": 1.2}
+    """3D Gaussians, by the work of a step in NumPy, as Warp has no kernels of its own for it."""
+    settings = {**QUICK, "iterations": 20, "sh_degree": 0, "growth": 1.2, "primitive": "3d"}
     dataset = scene()
     whole = Trainer(dataset, renderer, **settings)
     before = np.mean([each.psnr for each in whole.evaluate(dataset.views)])

@@ -88,10 +88,6 @@ class WarpBackend(Workspace, Backend):
 
     def differentiate(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpGradients:
         check_differentiable(features)
-        if any(name.startswith("ellipsoid") for name in features.slots):
-            raise DeviceError(
-                f"{self.info.name} (NVIDIA Warp) has no gradients of 3D Gaussians; use an OpenCL device"
-            )
         key = (features, shape or self.shape)
         if key not in self._gradients:
             self._gradients[key] = WarpGradients(self.pipeline(*key))

@@ -77,7 +77,9 @@ class _Backward:
         self._frame, self._made, self._wp = frame, made, load()
         self._launcher: Launcher = frame.launcher
         self._count, self._pairs = frame.resident.count, frame.stats["pairs"]
-        self._given = dict(frame.named) | frame.resident.arrays | {"by": self._by(gradients)}
+        # not read if all splats are disks, so any array will do
+        self._given = {**frame.named, "thickness": frame.resident.arrays["opacities"]}
+        self._given |= frame.resident.arrays | {"by": self._by(gradients)}
         self._given |= {
             "samples": frame.samples,
             "color": frame.samples.color,
@@ -185,8 +187,9 @@ class _Backward:
             "by_scales": wp.vec2,
             "by_opacities": wp.float32,
             "screen": wp.float32,
-        }
+        } | ({"by_thickness": wp.float32} if self._frame.resident.ellipsoids != "none" else {})
         found = {name.removeprefix("by_"): self._take(name, count, dtype) for name, dtype in kinds.items()}
+        self._given.setdefault("by_thickness", self._given["by_opacities"])  # not written for disks
         colors = self._take("by_colors", count * terms, wp.vec3)
         if self._made.sh_terms:
             found["sh"] = colors.reshape((count, terms))
@@ -214,10 +217,20 @@ def flat_of(array: Any) -> Any:
 
 
 def add_to(sums: Any, values: Any) -> None:
-    """Add flat float32 values to sums of equal length on the device."""
+    """Add float32 numbers or vectors to sums of equal size on the device."""
+    arrays = _components_of(sums), _components_of(values)
     given = {"device": sums.device, "record_tape": False}
     with quiet():
-        load().launch(kernels("column_sums").add_to, sums.size, [sums, values], **given)
+        load().launch(kernels("column_sums").add_to, arrays[0].shape, [*arrays], **given)
+
+
+def _components_of(array: Any) -> Any:
+    """View an array of float32 numbers or vectors, which may lie apart, as (elements, components)."""
+    wp = load()
+    shape, strides = (array.size, wp.types.type_size(array.dtype)), (array.strides[-1], 4)
+    view = wp.array(ptr=array.ptr, dtype=wp.float32, shape=shape, strides=strides, device=array.device)
+    view._ref = array  # keeps the memory alive
+    return view
 
 
 def _shape_of(array: Any) -> tuple[int, ...]:

@@ -213,7 +213,7 @@ class GradientKernels:
             self.blend = backward.make_blend_backward(effects, outputs, self.losses, grouped, block)
             self.slots = backward.make_slots("lowpass_screen" in effects)
             made = kernels("project_backward").make_project_backward
-            self.project = made(needs.among(_RECORD), outputs, names, self.sh_terms)
+            self.project = made(needs.among(_PROJECT), outputs, names, self.sh_terms)
             self.sums = kernels("column_sums")
             program.compile(self.blend.kernel, block)
             for kernel in (self.slots, self.project, self.sums.add_rows):
