@@ -98,7 +98,6 @@ class SceneMeasurement:
         return [Times(timer.median, float(np.quantile(timer.ms, 0.9))) for timer in timers]
 
     def timer(self, quality: Quality) -> Timer:
-        """Timer of frames of a quality."""
         return frame_timer(self.renderer, self._resident, self._capture, quality=quality)
 
 

@@ -187,7 +187,6 @@ _ERRORS = (("position_error_mm", 2), ("angle_error_deg", 3), ("corner_error_px",
 
 
 def reading_row(reading: "Reading") -> tuple[str, ...]:
-    """Table row of a reading."""
     facts = reading.as_dict()
     found, share = "yes" if facts["found"] else "no", facts["visible"]
     if share == 0 and not facts["found"]:

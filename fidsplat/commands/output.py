@@ -41,7 +41,6 @@ def report(as_json: bool, facts: dict[str, Any], *lines: str, table: Table | Non
 
 
 def print_json(value: dict[str, Any]) -> None:
-    """Print an object as JSON."""
     sys.stdout.write(json_text(value) + "\n")
 
 

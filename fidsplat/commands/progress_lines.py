@@ -30,7 +30,6 @@ class ProgressLines(Progress):
         threading.Thread(target=self._print, name="progress", daemon=True).start()
 
     def stop(self) -> None:
-        """Stop printing."""
         self._ended.set()
 
     def _print(self) -> None:

@@ -138,7 +138,6 @@ def table_of(found: Found) -> Frame:
 
 
 def write_report(folder: Path, drive: Drive, device: str, found: Found) -> Path:
-    """Write the report and its chart."""
     _write_chart(folder, found)
     context = {
         "length": next(iter(found.values()))["length_m"],

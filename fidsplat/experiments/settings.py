@@ -25,7 +25,6 @@ class FolderSettings:
 
     @property
     def folder(self) -> Path:
-        """Folder for results."""
         return self.out or Path("fidsplat-experiments")
 
 

@@ -20,7 +20,6 @@ _PIXELS = 160
 
 
 def sheet_files(folder: Path) -> list[Path]:
-    """Sheets in a folder."""
     return sorted(folder.glob("sheet-*.png"))
 
 

@@ -119,7 +119,6 @@ class TimeLimit:
 
     @contextmanager
     def batch(self) -> Iterator[None]:
-        """Time a batch."""
         begun = time.monotonic()
         yield
         self._longest = max(self._longest, time.monotonic() - begun)

@@ -84,7 +84,6 @@ def marker_of(
 
 @cache
 def placed_in(scene: str, spec: str) -> PlacedMarker:
-    """The marker of a scene."""
     _, pose, size = scene_of(scene)
     return PlacedMarker(marker_of(spec, size), pose)
 
@@ -142,7 +141,6 @@ class View:
 
     @property
     def camera(self) -> Camera:
-        """The camera at its pose."""
         distance = self.edges * self.placed.marker.size
         sine = math.sin(self.tilt)
         towards = np.array(

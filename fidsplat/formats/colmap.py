@@ -231,7 +231,6 @@ class _Bytes:
         return text
 
     def skip(self, size: int) -> None:
-        """Skip some bytes."""
         if self._place + size > len(self._data):
             raise ValueError("it is truncated")
         self._place += size

@@ -42,8 +42,6 @@ def _tag_bits(spec: Spec) -> tuple[Spec, np.ndarray]:
 
 @dataclass(frozen=True, kw_only=True)
 class QrSpec(Spec):
-    """Spec of a QR code."""
-
     version: int | None = None
     """1 to 40; None for the smallest"""
     level: str = _DEFAULT_LEVEL

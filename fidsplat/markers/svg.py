@@ -48,8 +48,6 @@ _MOVES = ("transform", "transform-origin", "translate", "rotate", "scale")
 
 @dataclass(frozen=True, kw_only=True)
 class DrawingSpec(Spec):
-    """Spec of a drawing."""
-
     modules: int = MODULES
     """modules across"""
 

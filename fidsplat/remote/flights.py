@@ -77,7 +77,6 @@ class FlightRenderer:
         self.title = self._renderer.device.title
 
     def __call__(self, k: int) -> Files:
-        """The files of frame k."""
         flight = self._flight
         frame = self._renderer.render(self._resident, flight.captures[k])
         found: Files = {}

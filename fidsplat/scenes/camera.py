@@ -111,7 +111,6 @@ def read_shutter(camera: Table) -> Shutter | None:
 
 
 def shutter_table(shutter: Shutter) -> dict:
-    """Content of the table of a shutter."""
     return {
         "time": float(shutter.time),
         "exposure_time_ms": shutter.exposure_time * 1e3,

@@ -70,32 +70,27 @@ def environment_tables(scene: SceneParts, folder: Path) -> dict[str, dict]:
     return tables
 
 
-_RENDER_KEYS = ("samples", "lowpass", "first_hit")
-
-
 def read_quality(top: Table, render: Table) -> Quality | str | None:
-    """Quality of a scene file: the table [quality], or the preset and keys of [render]."""
-    given = [key for key in ("quality", *_RENDER_KEYS) if key in render]
-    if "quality" in top:
-        if given:
-            raise render.error(given[0], "and the table [quality] exclude each other; write it there")
-        table = top.table("quality", ("preset", *setting_types(Quality), "marker"))
-        with table.at("preset"):
-            plain = Quality.named(table.text("preset", "standard"))
-        changes = table.values(Quality)
-        if "marker" in table:
-            changes["marker"] = table.table("marker", names_of(MarkerQuality)).values(MarkerQuality)
-        with table.at():
-            return plain.with_(**changes)
-    text = render.text("quality", None)
-    with render.at("quality"):
-        quality = Quality.of(text)
-    readers = {"samples": render.whole, "lowpass": render.text, "first_hit": render.number}
-    for key in _RENDER_KEYS:
-        if key in render:
-            with render.at(key):
-                quality = quality.with_(**{key: readers[key](key)})
-    return quality if set(given) - {"quality"} else text
+    """Quality of a scene file: the table [quality], or the text `quality` of [render]."""
+    # samples, lowpass and first_hit are keys of [render] in files without [quality]
+    older = {"samples": render.whole, "lowpass": render.text, "first_hit": render.number}
+    given = [key for key in ("quality", *older) if key in render]
+    if "quality" not in top:
+        words = [f"{key}={older[key](key)}" if key in older else render.text(key) for key in given]
+        text = ",".join(words) or None
+        with render.at("quality"):
+            Quality.of(text)
+        return text
+    if given:
+        raise render.error(given[0], "and the table [quality] exclude each other; write it there")
+    table = top.table("quality", ("preset", *setting_types(Quality), "marker"))
+    with table.at("preset"):
+        plain = Quality.named(table.text("preset", "standard"))
+    changes = table.values(Quality)
+    if "marker" in table:
+        changes["marker"] = table.table("marker", names_of(MarkerQuality)).values(MarkerQuality)
+    with table.at():
+        return plain.with_(**changes)
 
 
 def quality_tables(quality: Quality | str | None) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
@@ -104,10 +99,9 @@ def quality_tables(quality: Quality | str | None) -> tuple[dict[str, Any], dict[
         return {}, {}
     if isinstance(quality, str):
         return {"quality": quality}, {}
-    own = {key: getattr(quality, key) for key in _RENDER_KEYS}
-    for name, preset in PRESETS.items():
-        if preset.with_(**own) == quality:
-            return {"quality": name} | _changes(quality, preset), {}
+    for name, plain in PRESETS.items():
+        if plain == quality:
+            return {"quality": name}, {}
     plain = PRESETS["standard"]
     tables = {"quality": {"preset": "standard"} | _changes(quality, plain)}
     if of_markers := _changes(quality.marker, plain.marker):

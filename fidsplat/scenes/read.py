@@ -187,7 +187,6 @@ def _pose(table: Table, scale: float = 1.0):
 
 
 def _store(table: Table, folder: Path) -> Store:
-    """Store of a [[splats]] table."""
     for key in SPLATS[1:]:
         if key in table:
             raise table.error(key, "cannot be used with a store; use `fidsplat store place`")

@@ -53,7 +53,6 @@ class FrameSpec:
 
     @property
     def capture(self) -> Capture:
-        """The capture of the frame."""
         sensor = self.sensor or Sensor()
         return Capture(self.camera, self.outputs, self.quality, self.background, sensor=sensor, fog=self.fog)
 
@@ -97,7 +96,6 @@ def tolerance_of(name: str) -> float:
 
 
 def render(renderer: Renderer, spec: FrameSpec) -> Frame:
-    """Render the frame on a device."""
     return renderer.render(spec.cloud, spec.capture)
 
 

@@ -48,7 +48,6 @@ class CaseResult:
 
     @property
     def passed(self) -> bool:
-        """Whether the case has no failure."""
         return not self.wrong
 
 
@@ -70,7 +69,6 @@ class CheckResult:
 
     @property
     def failures(self) -> list[str]:
-        """Failures as messages."""
         measured = self.arithmetic.findings if self.arithmetic else []
         return [
             *(f"arithmetic: {f.what} is {f.value:.3g}, above {f.bound:.3g}" for f in measured if not f.holds),
@@ -79,7 +77,6 @@ class CheckResult:
 
     @property
     def passed(self) -> bool:
-        """Whether there are no failures."""
         return not self.failures
 
     def as_dict(self) -> dict:

@@ -306,7 +306,6 @@ def _view(renderer: Renderer, scene: Scene, camera: Camera) -> DepthView:
 
 
 def _shifted(camera: Camera, right: float) -> Camera:
-    """The camera moved to its right."""
     moved = camera.world_to_camera.copy()
     moved[0, 3] -= right
     return camera.with_pose(world_to_camera=moved)

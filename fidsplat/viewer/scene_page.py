@@ -151,7 +151,6 @@ def _obtain(folder: Path, run: Callable[[list[str]], str]) -> None:
 
 
 def _npm(words: list[str]) -> str:
-    """Output of npm."""
     program = shutil.which("npm")
     if program is None:
         raise InputError(

@@ -296,7 +296,6 @@ class Viewer:
         self._nodes.show_keyframes(self.session.state.scene.camera, self._keyframes)
 
     def clear_keyframes(self, client: Any) -> None:
-        """Remove all keyframes."""
         self._keyframes = []
         self._nodes.show_keyframes(None, [])
 

@@ -130,7 +130,6 @@ class Stream:
                     self._wake.wait_for(lambda: self._closed or self._new, wait)
 
     def close(self) -> None:
-        """End the stream."""
         with self._wake:
             self._closed = True
             self._wake.notify_all()

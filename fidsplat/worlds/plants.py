@@ -268,7 +268,6 @@ def _blade(
 
 
 def _ball(middle: np.ndarray, radii: Sequence[float], colour: np.ndarray) -> Mesh:
-    """Ellipsoid mesh."""
     rows, columns = 9, 12
     down = np.linspace(0.02, math.pi - 0.02, rows)[:, None]
     around = np.arange(columns) * 2 * math.pi / columns

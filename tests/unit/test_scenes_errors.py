@@ -107,7 +107,7 @@ CHANGES = [
     ('["rgb"]', "[1]", "render.outputs must be a list of one or more texts"),
     ("background = [0.0, 0.0, 0.0]", "background = [0.0]", "render.background must be a list of 3 numbers"),
     ('"fast"', '"fats"', "render.quality: unknown quality 'fats' (did you mean 'fast'?)"),
-    ("samples = 1", "samples = 99", "render.samples: quality: samples must be"),
+    ("samples = 1", "samples = 99", "render.quality: samples must be"),
     ("samples = 1", "samples = 1.5", "render.samples must be a whole number"),
     ('"reference"', "1", "render.device must be text"),
     ("[render]", "[[render]]", "render must be a table, got a list of 1"),

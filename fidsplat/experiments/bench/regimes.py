@@ -48,7 +48,6 @@ class Views:
 
     @property
     def kind(self) -> str:
-        """Kind of the splats."""
         if self.cloud.boxes is not None and np.any(self.cloud.boxes):
             return BOXES
         return DISKS if self.cloud.thickness is None else ELLIPSOIDS

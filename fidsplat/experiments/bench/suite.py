@@ -134,7 +134,6 @@ class RendererProcess:
         return found
 
     def close(self) -> None:
-        """End the process."""
         assert self._process.stdin is not None
         with suppress(OSError):  # it may have ended
             self._process.stdin.close()
