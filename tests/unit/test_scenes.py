@@ -157,7 +157,8 @@ def test_all_keys_of_a_scene_file(load):
         (1, "paper", 0),
         (2, "exact", 1),
     ]
-    assert fs.Quality.of(scene.quality) == fs.Quality.named("fast").with_(samples=2, lowpass="pixel", first_hit=0.25)
+    expected = fs.Quality.named("fast").with_(samples=2, lowpass="pixel", first_hit=0.25)
+    assert fs.Quality.of(scene.quality) == expected
     assert (scene.background, scene.device) == ((1, 0.5, 0), "reference")
     assert scene.cloud().labels.tolist() == [0] * 10 + [1, 1, 2, 2]
 
