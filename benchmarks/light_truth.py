@@ -63,6 +63,11 @@ class Case:
         return "linear" if self.emits else "srgb"
 
     @property
+    def colors(self) -> str:
+        """Response of the colours of our splats: pixels are means of light for poses, as Blender's."""
+        return "linear" if self.name == "poses" else "srgb"
+
+    @property
     def marker(self) -> fs.Marker:
         return fs.marker("apriltag:36h11:5", SIZE, shape=self.shape)
 
@@ -87,7 +92,7 @@ def panels() -> list[tuple[np.ndarray, np.ndarray, tuple[float, float, float], n
     return [(m, np.stack([u, v]), radiance, np.cross(u, v)) for m, u, v, radiance in room]
 
 
-def cloud() -> fs.SplatCloud:
+def cloud(response: str = "srgb") -> fs.SplatCloud:
     """The panels as boxes."""
     parts = []
     for number, (middle, halves, radiance, _) in enumerate(panels()):
@@ -100,7 +105,7 @@ def cloud() -> fs.SplatCloud:
         n = len(at)
         boxes = fs.SplatCloud(
             middle + at @ halves, [turn] * n, [lengths / counts] * n, np.ones(n),
-            colors=np.tile(to_colors(np.array(radiance), "srgb"), (n, 1)),
+            colors=np.tile(to_colors(np.array(radiance), response), (n, 1)),
         ).with_boxes()  # fmt: skip
         parts.append(boxes.with_coplanar_groups(np.full(n, number)))
     return fs.SplatCloud.concatenate(parts)
@@ -162,7 +167,7 @@ def scene_of(case: Case, camera: fs.Camera) -> fs.Scene:
     light = fs.Lighting(
         roughness=case.roughness,
         view="any" if case.roughness is None else "camera",
-        rows=32 if case.roughness is None else 64,
+        response=case.colors,
     )
     if case.emits:
         greys = (tuple(to_colors(np.full(3, value), "srgb").tolist()) for value in (light.ink, light.paper))
@@ -170,20 +175,16 @@ def scene_of(case: Case, camera: fs.Camera) -> fs.Scene:
         made = fs.marker(case.marker.spec, SIZE, shape=case.shape, black=black, white=white)
         return fs.Scene((cloud(),), markers=(PlacedMarker(made),))
     placed = PlacedMarker(case.marker, light=light)
-    return fs.Scene((cloud(),), camera, markers=(placed,), lights=case.lights)
+    return fs.Scene((cloud(case.colors),), camera, markers=(placed,), lights=case.lights)
 
 
 def ours(case: Case, renderer: fs.Renderer) -> Iterator[np.ndarray]:
-    """Our images in display values, (h, w, 3)."""
-    scene, quality = None, fs.Quality(samples=2)
+    """Our images (h, w, 3) in display values; of poses in linear light."""
+    scene, quality = None, fs.Quality(samples=1 if case.name == "poses" else 2)
     for camera in case.cameras:
         if scene is None or case.roughness is not None:  # gloss depends on the camera
             scene = scene_of(case, camera)
-        if case.name == "poses":  # pixels are means of light, as Blender's
-            rgb = renderer.render(scene, resized(camera, 4))["rgb"]
-            yield to_colors(reduced(to_light(rgb, "srgb"), 4), "srgb")
-        else:
-            yield renderer.render(scene, camera, quality=quality)["rgb"]
+        yield renderer.render(scene, camera, quality=quality)["rgb"]
 
 
 def job_of(case: Case, folder: Path) -> dict:
@@ -360,7 +361,7 @@ def main() -> int:
         shown = [
             (f"{case.name}, {name}", to_uint8(image))
             for name, image in (
-                ("ours", own[0]),
+                ("ours", to_colors(to_light(own[0], case.colors), "srgb")),
                 ("Cycles", to_colors(truth[0], "linear" if case.emits else "srgb")),
             )
         ]
@@ -392,10 +393,10 @@ def detection(case: Case, light: dict[str, list[np.ndarray]], factor: int) -> di
 
 
 def compare(case: Case, own: list[np.ndarray], truth: list[np.ndarray]) -> dict[str, Any]:
-    """Figures of a case: our images in display values, Blender's in linear light."""
+    """Figures of a case: our images of `ours`, Blender's in linear light."""
     shown = [np.asarray(to_colors(image, case.response), np.float32) for image in truth]
     if case.name == "poses":
-        light = {"ours": [to_light(image, "srgb") for image in own], "Cycles": truth}
+        light = {"ours": own, "Cycles": truth}
         return {"views": len(own)} | {f"1/{k}": detection(case, light, k) for k in (1, 2, 3)}
     if case.shape is not None and not case.emits:
         return smooth_errors([(to_light(a, "srgb"), b) for a, b in zip(own, truth, strict=True)])

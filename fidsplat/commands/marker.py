@@ -32,21 +32,26 @@ class Placing:
     """M: metres in front (default: 1 mm and twice the roughness of the surface)"""
     radius: float | None = None
     """M: radius of the fitted patch (default: that of the marker)"""
+    light: str | None = None
+    """SOURCE,KEY=VALUE: light it by the scene, e.g. scene or lights,roughness=0.3"""
     append: bool = False
     """append the table to SCENE.toml"""
 
     def __post_init__(self) -> None:
         if (self.scene is None) != (self.at_pixel is None):
             raise InputError("--scene SCENE and --at-pixel X Y must be given together, got one of them")
-        others = (self.up, self.lift, self.radius)
+        others = (self.up, self.lift, self.radius, self.light)
         if self.scene is None and (self.append or any(value is not None for value in others)):
-            raise InputError("--up, --lift, --radius and --append need --scene SCENE and --at-pixel X Y")
+            raise InputError(
+                "--up, --lift, --radius, --light and --append need --scene SCENE and --at-pixel X Y"
+            )
         if self.append and not str(self.scene).lower().endswith(".toml"):
             raise InputError(f"--append must have a scene file (.toml), got {self.scene}")
 
     def placed(self, marker: fs.Marker, device: str | None) -> tuple[dict[str, Any], str]:
         """Facts of the surface, and the [[markers]] table."""
         import fidsplat as fs
+        from fidsplat.scenes.lights import Lighting
         from fidsplat.scenes.sources import load_source
         from fidsplat.scenes.write import marker_block
         from fidsplat.splats.rotations import matrix_to_quaternion
@@ -54,13 +59,14 @@ class Placing:
 
         assert self.scene is not None
         file = SceneFile(Path(self.scene)) if self.append else None
+        light = Lighting.of(self.light)
         with delayed_progress() as progress:
             scene = load_source(self.scene, None, progress)
         renderer = fs.Renderer(device or scene.device)
         options: dict[str, Any] = {"renderer": renderer, "resident": renderer.upload(scene)}
         options["radius"] = marker.radius if self.radius is None else self.radius
         surface = scene.surface_at(pixel=self.at_pixel, **options)
-        scene = scene.place(marker, pixel=self.at_pixel, up=self.up, lift=self.lift, **options)
+        scene = scene.place(marker, pixel=self.at_pixel, up=self.up, lift=self.lift, light=light, **options)
         pose = scene.markers[-1].pose
         block = marker_block(scene.markers[-1], Path(self.scene).parent, scene.quality)
         if file is not None:
@@ -106,7 +112,8 @@ class Marker:
     --shape bends the sheet: cylinder (radius, axis x or y), cone (radius, taper), bent (radius, length,
     axis), edge (radius, offset, axis) or crumpled (height, length, seed), lengths in metres; deviation is the
     largest distance of the splats from the surface. --wear has severities from 0 to 1: bleed, coarseness,
-    fading, dirt, drops, scratches, tear, fold, cover; and a seed.
+    fading, dirt, drops, scratches, tear, fold, cover; and a seed. --light has the settings of fs.Lighting:
+    paper, ink, roughness, reflectance, view, exposure, response, ambient ("0.4 0.4 0.5") ...
 
     Examples:
       fidsplat marker apriltag:36h11:5 --size 0.16 -o tag.ply

@@ -15,7 +15,7 @@ from fidsplat.markers.surfaces import Frames, SheetShape
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrices_to_quaternions, quaternion_multiply
 
-FINE = 1500
+FINE = 2500
 """The default bound of the deviation is the size of the marker divided by this number."""
 
 GAP = 2

@@ -115,7 +115,7 @@ class Cylinder(_Profile):
     axis: str | tuple[float, ...] = "y"
     """direction of the axis on the sheet: "x", "y" or two numbers x, y"""
     deviation: float | None = None
-    """metres: maximum distance of the splats from the surface; None: size / 1500"""
+    """metres: maximum distance of the splats from the surface; None: size / 2500"""
     kind: ClassVar[str] = "cylinder"
 
     def __post_init__(self) -> None:
@@ -142,7 +142,7 @@ class BentSheet(_Profile):
     axis: str | tuple[float, ...] = "y"
     """direction of the axis on the sheet: "x", "y" or two numbers x, y"""
     deviation: float | None = None
-    """metres: maximum distance of the splats from the surface; None: size / 1500"""
+    """metres: maximum distance of the splats from the surface; None: size / 2500"""
     kind: ClassVar[str] = "bent"
 
     def __post_init__(self) -> None:
@@ -186,7 +186,7 @@ class BoxEdge(_Profile):
     axis: str | tuple[float, ...] = "y"
     """direction of the edge on the sheet: "x", "y" or two numbers x, y"""
     deviation: float | None = None
-    """metres: maximum distance of the splats from the surface; None: size / 1500"""
+    """metres: maximum distance of the splats from the surface; None: size / 2500"""
     kind: ClassVar[str] = "edge"
 
     def __post_init__(self) -> None:
@@ -223,7 +223,7 @@ class Cone(_Along):
     axis: str | tuple[float, ...] = "y"
     """direction on the sheet away from the apex: "x", "y" or two numbers x, y"""
     deviation: float | None = None
-    """metres: maximum distance of the splats from the surface; None: size / 1500"""
+    """metres: maximum distance of the splats from the surface; None: size / 2500"""
     kind: ClassVar[str] = "cone"
 
     def __post_init__(self) -> None:
@@ -288,7 +288,7 @@ class Crumpled(SheetShape):
     """metres: mean distance of creases"""
     seed: int = 0
     deviation: float | None = None
-    """metres: maximum distance of the splats from the surface; None: size / 1500"""
+    """metres: maximum distance of the splats from the surface; None: size / 2500"""
     kind: ClassVar[str] = "crumpled"
 
     def __post_init__(self) -> None:

@@ -1,6 +1,7 @@
 """Reflection of light by a surface: Lambert's law, and gloss by the microfacet model GGX.
 
-GGX with Smith's height-correlated masking (Walter et al. 2007, Heitz 2014) and Schlick's Fresnel factor.
+GGX with Smith's height-correlated masking (Walter et al. 2007, Heitz 2014) and Fresnel's factor of a
+dielectric.
 """
 
 from __future__ import annotations
@@ -32,8 +33,13 @@ class Gloss(NamedTuple):
 
 
 def fresnel(cosine: np.ndarray, reflectance: float) -> np.ndarray:
-    """Schlick's approximation of the Fresnel factor."""
-    return reflectance + (1 - reflectance) * (1 - np.clip(cosine, 0, 1)) ** 5
+    """Fresnel factor of unpolarised light on a dielectric. reflectance: at normal incidence."""
+    root = min(np.sqrt(reflectance), 1 - 1e-9)
+    index, cosine = (1 + root) / (1 - root), np.clip(cosine, 0, 1)
+    inner = np.sqrt(index**2 - 1 + cosine**2)
+    mirrored, along = inner - cosine, np.maximum(inner + cosine, 1e-12)
+    across = 1 + cosine * mirrored
+    return 0.5 * (mirrored / along) ** 2 * (1 + ((cosine * along - 1) / across) ** 2)
 
 
 def gloss(
@@ -51,9 +57,8 @@ def gloss(
     half = (view + light) / length
     distribution = square / (np.pi * (half**2 * (square - 1) + 1) ** 2)
     masking = 0.5 / (light * _slope(view, square) + view * _slope(light, square))
-    factor = fresnel(
-        (1 + along) / length, surface.reflectance
-    )  # the cosine is between viewer and half vector
+    # the cosine is between viewer and half vector
+    factor = fresnel((1 + along) / length, surface.reflectance)
     return np.where(above, distribution * masking * factor * light, 0.0)
 
 

@@ -12,7 +12,16 @@ import numpy as np
 from fidsplat.capture.environment import three_numbers
 from fidsplat.capture.sensor import GAMMAS
 from fidsplat.scenes.table import Table, names_of
-from fidsplat.util.arguments import LARGEST, as_float, changes_of, invalid, number, own_scalars, whole_number
+from fidsplat.util.arguments import (
+    LARGEST,
+    as_float,
+    changes_of,
+    invalid,
+    number,
+    own_scalars,
+    parse_settings,
+    whole_number,
+)
 from fidsplat.util.errors import InputError, unknown
 from fidsplat.util.response import to_colors
 
@@ -52,7 +61,7 @@ class Lighting:
     above 1 are kept"""
     ambient: tuple[float, float, float] | None = None
     """linear RGB radiance where the panorama contains no splats; None: the scene's background"""
-    rows: int = 32
+    rows: int = 64
     """rows of the panorama that is rendered at each measured point, 8 to 1024"""
     panoramas: int = 5
     """largest number of panoramas along a side: 1, 2, 3, 5, 9 or 17; fewer where `step` holds"""
@@ -94,11 +103,13 @@ class Lighting:
 
     @staticmethod
     def of(value: Any) -> Lighting | None:
-        """A Lighting from itself, the name of a source, or None. Raises InputError for anything else."""
+        """A Lighting from itself, a text such as "scene" or "lights,roughness=0.3", or None. Raises InputError
+        for anything else."""
         if value is None or isinstance(value, Lighting):
             return value
         if isinstance(value, str):
-            return Lighting(value)
+            parts = (part if "=" in part else f"source={part}" for part in value.split(","))
+            return Lighting(**parse_settings("light", Lighting, parts))
         raise invalid("a marker's light", "'scene', 'lights', an fs.Lighting or None", value)
 
 

@@ -87,6 +87,7 @@ class Scene(SceneParts, Summarised):
         up: Any = None,
         lift: float | None = None,
         bundle: str | None = None,
+        light: Any = None,
         **options: Any,
     ) -> Scene:
         """The scene with one more marker, upright on the surface at a pixel or along a ray.
@@ -98,7 +99,7 @@ class Scene(SceneParts, Summarised):
             camera, pixel: by default the scene's camera; (x, y).
             up: (3,) vertical of the scene; by default `fidsplat info` guesses it.
             lift: metres in front of the surface; by default 1 mm and twice the roughness.
-            bundle: see `PlacedMarker`.
+            bundle, light: see `PlacedMarker`.
             options: ray, radius, renderer, resident of `fs.surface_at`.
 
         Raises:
@@ -114,4 +115,4 @@ class Scene(SceneParts, Summarised):
         else:
             directions = [-view.world_to_camera[1, :3], view.world_to_camera[2, :3]]
         pose = found.pose([scene_up(self) if up is None else up, *directions], lift)
-        return replace(self, markers=(*self.markers, PlacedMarker(marker, pose, bundle=bundle)))
+        return replace(self, markers=(*self.markers, PlacedMarker(marker, pose, bundle=bundle, light=light)))

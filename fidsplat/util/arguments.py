@@ -6,6 +6,7 @@ Every check raises InputError with a message `<what> must be <requirement>, got 
 import math
 import operator
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import MISSING, fields, replace
 from numbers import Real
 from typing import Annotated, Any, TypeVar
@@ -135,18 +136,27 @@ def parse_settings(what: str, kind: type, parts: Iterable[str]) -> dict[str, Any
 
 
 def parse_setting(what: str, kind: type, name: str, text: str) -> Any:
-    """Value of a field of a dataclass from a text, by the first type of its annotation."""
+    """Value of a field of a dataclass from a text, by its annotation; spaces separate several numbers."""
     types = {field.name: str(field.type) for field in fields(kind)}
     if name not in types:
         raise InputError(unknown(f"setting of {what}", name, types))
     if types[name].endswith("| None") and text.lower() == "none":
         return None
-    convert = {"float": float, "int": int, "str": str}[types[name].split()[0]]
+    kinds = types[name].removesuffix(" | None").split(" | ")
+    convert = {"int": int, "str": str, "float": float}.get(kinds[0], _numbers)
     try:
+        if len(kinds) > 1:  # text or numbers
+            with suppress(ValueError):
+                return _numbers(text)
         return convert(text)
     except ValueError:
-        wanted = "a whole number" if convert is int else "a number"
+        wanted = {int: "a whole number", float: "a number"}.get(convert, "numbers with spaces between")
         raise InputError(f"{what}: {name} must be {wanted}, got {text!r}") from None
+
+
+def _numbers(text: str) -> float | tuple[float, ...]:
+    first, *others = map(float, text.split() or [""])
+    return (first, *others) if others else first
 
 
 def changes_of(settings: Any) -> dict[str, Any]:

@@ -244,13 +244,16 @@ def test_reflections_by_sampling_equal_the_integral(roughness):
         assert found == pytest.approx(reflected @ (field.angles * light), abs=0.0025)
 
 
-def test_fresnel_at_normal_incidence():
-    """A smooth surface under uniform light reflects its reflectance at normal incidence, and more at
-    grazing angles by Schlick's formula."""
-    assert fresnel(np.array(1.0), 0.04) == 0.04
+def test_fresnel_by_polarisation():
+    """A smooth surface of refractive index 1.5 under uniform light reflects 4 % at normal incidence, and the
+    mean of s- and p-polarised light by Snell's law at 1.2 rad."""
+    inner = math.asin(math.sin(1.2) / 1.5)
+    s, p = math.sin(1.2 - inner) / math.sin(1.2 + inner), math.tan(1.2 - inner) / math.tan(1.2 + inner)
+    expected = 0.04, (s**2 + p**2) / 2
+    assert np.allclose(fresnel(np.cos([0, 1.2]), 0.04), expected)
+    assert (fresnel(np.array([0.0, 0.3]), 0.0) == 0).all() and fresnel(np.array([0.0, 0.5]), 1.0) == pytest.approx(1)
     views = np.array([[0, 0, 1.0], [math.sin(1.2), 0, math.cos(1.2)]])
     _, weights = lobe(views[None], UP[None], Gloss(0.1, 0.04))
-    expected = 0.04 + 0.96 * (1 - np.array([1, math.cos(1.2)])) ** 5
     assert np.allclose(weights[0].sum(-1), expected, rtol=0.03)
 
 

@@ -57,9 +57,9 @@ def test_splats_are_near_the_surface_with_its_normals(shape):
     distance, near = grid.query(points)
     # nearest grid points are up to 0.7 steps aside; the distance along the normal is what counts there
     along_normal = np.abs(((points - frames.points[near]) * frames.normals[near]).sum(1))
-    assert along_normal.max() < SIZE / 1500 + step**2 / 4 / sharpest
-    assert along_normal.max() > SIZE / 15000
-    assert distance.max() < SIZE / 1500 + step
+    assert along_normal.max() < SIZE / 2500 + step**2 / 4 / sharpest
+    assert along_normal.max() > SIZE / 25000
+    assert distance.max() < SIZE / 2500 + step
 
     near = grid.query(made.cloud.means)[1]
     cosine = (quaternion_to_matrix(made.cloud.quats)[:, :, 2] * frames.normals[near]).sum(1)
@@ -76,7 +76,7 @@ def test_pieces_do_not_skip_waves(length):
     along = quaternion_to_matrix(cloud.quats)[:, :, 0] * cloud.scales[:, :1]
     points = (cloud.world_means() + share * along).reshape(-1, 3)
     curve = shape.frames(np.column_stack([np.linspace(-0.1, 0.1, 20001), np.zeros(20001)])).points
-    assert cKDTree(curve[:, ::2]).query(points[:, ::2])[0].max() < SIZE / 1500 + 1e-5
+    assert cKDTree(curve[:, ::2]).query(points[:, ::2])[0].max() < SIZE / 2500 + 1e-5
 
 
 def test_shapes_with_a_list_or_an_array_as_axis_are_values():
@@ -113,7 +113,7 @@ def test_a_cylinder_in_closed_form():
     # the arc between the outer edges of the splats is the width of the flat sheet
     corners = corners_of(made.cloud)
     angles = np.arctan2(corners[..., 0], radius - corners[..., 2])
-    assert radius * (angles.max() - angles.min()) == pytest.approx(SHEET, abs=4 * SIZE / 1500)
+    assert radius * (angles.max() - angles.min()) == pytest.approx(SHEET, abs=4 * SIZE / 2500)
     inside = fs.marker(SPEC, SIZE, shape=Cylinder(-radius, axis="x"))
     assert np.allclose(inside.corners, [[-y, -x, -z], [y, -x, -z], [y, x, -z], [-y, x, -z]], atol=1e-15)
 
@@ -220,7 +220,7 @@ def test_gaussians_of_a_bent_marker(renderer):
     """As Gaussians the marker has the same surface, and the facets of its mixture are refused."""
     made = fs.marker("apriltag:16h5:3", SIZE, "fitted", template=5, shape=Cylinder(0.1))
     radii = np.hypot(made.cloud.means[:, 0], 0.1 - made.cloud.means[:, 2])
-    assert np.abs(radii - 0.1).max() < SIZE / 1500
+    assert np.abs(radii - 0.1).max() < SIZE / 2500
     camera = fs.Camera.look_at(160, 160, 0.7, (0, 0, -0.35), (0, 0, 0))
     image = renderer.render(made.cloud, camera, background=(0.5, 0.5, 0.5))["rgb"]
     assert [code.name for code in detect(to_uint8(image), ["apriltag:16h5"])] == ["apriltag:16h5:3"]

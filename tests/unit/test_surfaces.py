@@ -201,6 +201,7 @@ def test_the_command_places_a_marker(wall, tmp_path, capsys):
     text = f"# mine\n{file.read_text()}"
     file.write_text(text)
     words = ["marker", "apriltag:36h11:5", "--size", "0.2", "--scene", str(file), "--at-pixel", "100", "45"]
+    words += ["--light", "lights,response=2.2,ambient=0.4 0.4 0.5"]
     assert main(words) == 0
     printed = capsys.readouterr().out
     assert file.read_text() == text
@@ -208,11 +209,14 @@ def test_the_command_places_a_marker(wall, tmp_path, capsys):
     assert file.read_text().startswith(text.rstrip())
     assert printed.partition("[[markers]]")[2].strip() == file.read_text().partition("[[markers]]")[2].strip()
     (placed,) = fs.Scene.load(file).markers
+    assert placed.light == fs.Lighting("lights", response=2.2, ambient=(0.4, 0.4, 0.5))
     np.testing.assert_allclose(placed.pose[:3, 3], facts["position"])
     assert angle(facts["normal"], NORMAL) < 0.02
     assert angle(-placed.pose[:3, 2], NORMAL) < 0.02
     file.write_text(f'markers = [{{spec = "aruco:4x4_50:1", size = 0.1}}]\n{text}')
     assert "must be [[markers]] tables" in fails(capsys, *words, "--append")[1]
+    for light, expected in (("ambient=red", "ambient must be numbers with spaces"), ("scen", "'scene'?")):
+        assert expected in fails(capsys, *words, "--light", light)[1]
 
 
 @pytest.mark.parametrize(
@@ -220,6 +224,7 @@ def test_the_command_places_a_marker(wall, tmp_path, capsys):
     [
         ["--at-pixel", "3", "4"],
         ["--lift", "0.1"],
+        ["--light", "scene"],
         ["--append"],
         ["--scene", "a.ply", "--at-pixel", "3", "4", "--append"],
     ],
