@@ -251,7 +251,8 @@ def test_fresnel_by_polarisation():
     s, p = math.sin(1.2 - inner) / math.sin(1.2 + inner), math.tan(1.2 - inner) / math.tan(1.2 + inner)
     expected = 0.04, (s**2 + p**2) / 2
     assert np.allclose(fresnel(np.cos([0, 1.2]), 0.04), expected)
-    assert (fresnel(np.array([0.0, 0.3]), 0.0) == 0).all() and fresnel(np.array([0.0, 0.5]), 1.0) == pytest.approx(1)
+    assert (fresnel(np.array([0.0, 0.3]), 0.0) == 0).all()
+    assert fresnel(np.array([0.0, 0.5]), 1.0) == pytest.approx(1)
     views = np.array([[0, 0, 1.0], [math.sin(1.2), 0, math.cos(1.2)]])
     _, weights = lobe(views[None], UP[None], Gloss(0.1, 0.04))
     assert np.allclose(weights[0].sum(-1), expected, rtol=0.03)
