@@ -103,8 +103,8 @@ class Lighting:
 
     @staticmethod
     def of(value: Any) -> Lighting | None:
-        """A Lighting from itself, a text such as "scene" or "lights,roughness=0.3", or None. Raises InputError
-        for anything else."""
+        """A Lighting from itself, a text such as "lights,roughness=0.3", or None. Raises InputError for
+        anything else."""
         if value is None or isinstance(value, Lighting):
             return value
         if isinstance(value, str):
