@@ -70,12 +70,10 @@ def breaking_severity(severities: Sequence[float], rates: Sequence[float]) -> fl
     return None
 
 
-def breaks_of(rates: Frame, name: str = "rate") -> Frame:
+def breaks_of(rates: Frame) -> Frame:
     """Table of causes and families: the amount at which each detector reads half of the views.
 
-    Args:
-        rates: `statistics_of` by family, detector, cause and severity.
-        name: "rate", or "precise" for readings with corner errors of at most `PRECISE`.
+    rates: `statistics_of` by family, detector, cause and severity.
     """
     detectors = _detectors(rates)
     table = []
@@ -88,7 +86,7 @@ def breaks_of(rates: Frame, name: str = "rate") -> Frame:
                 own = own[own["cause"].isin((cause, NONE))]
                 row[detector] = NOTHING
                 if len(own):
-                    severity = breaking_severity(own["severity"].tolist(), own[name].tolist())
+                    severity = breaking_severity(own["severity"].tolist(), own["rate"].tolist())
                     row[detector] = NEVER if severity is None else CAUSES[cause].text(severity)
             table.append(row)
     return pd.DataFrame(table)
@@ -169,7 +167,6 @@ def write_report(records: Sequence[Record], folder: Path, out: Path, seed: int) 
     context = {
         "figures": [{"title": group, "file": file.name} for group, file in files],
         "breaks": compact(breaks),
-        "imprecise": compact(breaks_of(pooled, "precise")),
         "precise": PRECISE,
         "errors": _errors(pooled[pooled["cause"] == NONE]),
         "detectors": [f"`{name}`: {TITLES[name]}" for name in detectors if name in TITLES],
