@@ -43,8 +43,10 @@ def times(renderer: fs.Renderer, name: str, batch: int, repeats: int) -> tuple[s
         seconds.append((time.perf_counter() - begun, time.process_time() - used))
     capture = fs.Capture(
         lidar.camera().with_pose(camera_to_world=POSE),
-        outputs=("rgb", "normal", "distance_first"),
-        quality=fs.Quality.of("standard,lowpass=none"),
+        outputs=("rgb", "alpha", "normal", "distance_first"),
+        quality=fs.Quality.of(
+            "standard,lowpass=none,alpha_cutoff=0.001,first_hit=0.5,transmittance_stop=0.4999995"
+        ),
     )
     frames = [renderer.render_batch(resident, capture, poses=poses) for _ in range(repeats + 1)]
     device = [sum(frame.timings.values()) / batch for frame in frames[1:]]

@@ -31,7 +31,8 @@ LINK_FROM_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0,
 """the lidar's axes (x forward, y left, z up) from those of a camera (z forward, y down)"""
 _REFERENCE = 0.1  # reflectivity for which `Lidar.detection_range` is stated
 _ODDS = 9  # odds of a detection at that range: a probability of 90 %
-_SHARPNESS = 4  # power of the signal in the odds: a third of the signal is detected with 10 %
+# the odds grow with the fourth power of the signal: a third of the signal is detected with 10 %
+_CUTOFF = 1e-3  # minimum alpha of a fragment; fainter ones hardly move the surface at `Lidar.opacity`
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,12 +231,19 @@ class _Request:
             camera = camera.with_pose(camera_to_world=_pose_of(pose, self.base.camera))
         elif pose is not None:
             raise InputError("pose and motion.camera both move the lidar; leave one out")
-        outputs = ["rgb", "normal", "distance_first"] + ["label"] * self.label
+        quality = replace(
+            self.base.quality,
+            samples=1,
+            lowpass="none",
+            alpha_cutoff=max(self.base.quality.alpha_cutoff, _CUTOFF),
+            first_hit=lidar.opacity,
+            transmittance_stop=(1 - lidar.opacity) * (1 - 1e-6),  # behind the surface; below its rounding
+        )
         return replace(
             self.base,
             camera=camera,
-            outputs=tuple(outputs),
-            quality=replace(self.base.quality, samples=1, lowpass="none", first_hit=lidar.opacity),
+            outputs=("rgb", "alpha", "normal", "distance_first", *["label"] * self.label),
+            quality=quality,
             background=(0.0, 0.0, 0.0),
             motion=self.motion,
             shutter=Shutter(
@@ -255,11 +263,15 @@ class _Request:
         pixels = lidar.pixels(self.start, self.moving)
 
         def of_rays(image: np.ndarray) -> np.ndarray:
-            return image.reshape(-1, *image.shape[2:])[pixels]
+            flat = image.reshape(-1, *image.shape[2:])
+            if isinstance(lidar.pattern, Spinning):  # its rays are all pixels, in order
+                return flat.reshape(*pixels.shape, *flat.shape[1:])
+            return flat[pixels]
 
-        ranges = of_rays(images["distance_first"]).astype(np.float64)
-        reflectivity = to_light(np.clip(of_rays(images["rgb"]), 0, 1), "srgb") @ LUMINANCE
-        rays = {"range": ranges}
+        ranges = of_rays(images["distance_first"])
+        rgb = of_rays(images["rgb"]) / np.maximum(of_rays(images["alpha"]), 1e-6)[..., None]
+        reflectivity = to_light(np.clip(rgb, 0, 1), "srgb") @ LUMINANCE
+        rays = {"range": ranges.astype(np.float64)}
         if "label" in images:
             rays["label"] = of_rays(images["label"])
             for label, value in lidar.reflectivity.items():
@@ -347,13 +359,17 @@ def _measure(found: dict[str, np.ndarray], lidar: Lidar, random: np.random.Gener
     ranges = found["range"]
     kept = (ranges >= lidar.near) & (ranges <= lidar.far)
     if math.isfinite(lidar.detection_range):
-        signal = found["intensity"] * lidar.detection_range**2 / _REFERENCE  # signal times the squared range
-        signal, lost = _ODDS * signal**_SHARPNESS, ranges ** (2 * _SHARPNESS)
-        kept &= random.random(ranges.shape) * (signal + lost) < signal
+        # ratio of the signal to that at the detection range
+        signal = (
+            found["intensity"] / _REFERENCE * (lidar.detection_range / np.maximum(ranges, lidar.near)) ** 2
+        )
+        odds = _ODDS * np.square(np.square(signal))
+        kept &= random.random(ranges.shape, np.float32) * (1 + odds) < odds
     if lidar.dropouts:
-        kept &= random.random(ranges.shape) >= lidar.dropouts
+        kept &= random.random(ranges.shape, np.float32) >= lidar.dropouts
     if lidar.noise or lidar.noise_growth:
-        ranges += random.standard_normal(ranges.shape) * (lidar.noise + lidar.noise_growth * ranges)
+        noise = random.standard_normal(ranges.shape, np.float32)
+        ranges += noise * (lidar.noise + lidar.noise_growth * ranges)
         kept &= ranges > 0
     for name, values in found.items():
         values[~kept] = -1 if name == "label" else 0

@@ -35,9 +35,7 @@ def turned(yaw: float, pitch: float, roll: float, position) -> np.ndarray:
 MOUNT = turned(2.4, -0.3, 0.2, (0.7, -0.4, 0.3))
 
 
-def plane(
-    normal, offset: float, side: float, count: int = 16, color: float = 0.6, label: int = 0, left: float = -99
-):
+def plane(normal, offset: float, side: float, count=16, color=0.6, label=0, left=-99.0, opacity=0.97):
     """A square of overlapping disks in the plane normal . x = offset, those with y > left."""
     w = np.asarray(normal, float) / np.linalg.norm(normal)
     u = np.cross(w, np.eye(3)[np.argmin(np.abs(w))])
@@ -50,7 +48,7 @@ def plane(
     quats = np.tile(matrix_to_quaternion(rotation), (n, 1))
     scales = np.full((n, 2), 1.2 * side / count)
     return fs.SplatCloud(
-        means, quats, scales, np.full(n, 0.97), colors=np.full((n, 3), color), labels=np.full(n, label)
+        means, quats, scales, np.full(n, opacity), colors=np.full((n, 3), color), labels=np.full(n, label)
     )
 
 
@@ -116,6 +114,18 @@ def test_a_wall_is_where_its_equation_says(device, pattern):
     expected = ((0.6 + 0.055) / 1.055) ** 2.4 * np.abs(rays @ normal)[hit]
     middle = np.linalg.norm(points - 3.0 * normal, axis=1) < 3
     np.testing.assert_allclose(found.intensity[0][hit][middle], expected[middle], rtol=2e-2)
+
+
+def test_the_intensity_is_that_of_the_surface_however_opaque(device):
+    """A wall of faint disks in front of a black one; the rays end at the first."""
+    faint, black = plane((1, 0, 0), 5.0, 18.0, 32, opacity=0.12), plane((1, 0, 0), 9.0, 18.0, color=0.0)
+    full, found = (
+        fs.scan(joined(*walls), IDEAL, np.eye(4), renderer=device).intensity[0]
+        for walls in ((plane((1, 0, 0), 5.0, 18.0, 32),), (faint, black))
+    )
+    ahead = (full > 0) & (np.abs(np.arctan2(*IDEAL.directions().T[1::-1])) < 0.3)
+    assert ahead.sum() > 20
+    np.testing.assert_allclose(found[ahead], full[ahead], rtol=0.01)
 
 
 def test_a_moving_lidar_sees_a_wall_from_its_pose_at_the_time_of_the_beam(device):
