@@ -4,7 +4,7 @@
 
 DIR: folders with results of `fidsplat tradeoff` or their tables; by default devlog/accuracy. Replaces the
 generated block of docs/accuracy.md, with a chart for each device of benchmarks/results/suite-*.json, and
-writes devlog/accuracy.md, the report of `fidsplat tradeoff report`.
+writes devlog/accuracy.md, with tables and charts in the folder devlog/accuracy.
 """
 
 from __future__ import annotations
@@ -16,17 +16,13 @@ from typing import NamedTuple
 
 import pandas as pd
 import splatmark
+from tradeoff_report import EXACT, verdict, write_report
 
 from fidsplat.experiments.charts import chart, label_points, literal, plain_ticks
 from fidsplat.experiments.pages import NOTHING, fill_template, number, percent
 from fidsplat.experiments.summary import Frame
+from fidsplat.experiments.tradeoff.plot import disk_scenes
 from fidsplat.experiments.tradeoff.points import ABLATION, PRESET
-from fidsplat.experiments.tradeoff.report import (
-    EXACT,
-    disk_scenes,
-    verdict,
-    write_report,
-)
 from fidsplat.experiments.tradeoff.scenes import HARD
 from fidsplat.experiments.tradeoff.summary import DeviceResults, load
 from fidsplat.util.files import write_file

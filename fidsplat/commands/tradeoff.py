@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
-from fidsplat.commands.options import Devices, Folders, Json, ReportTo, check_plot, require_packages
+from fidsplat.commands.options import Devices, Json, check_plot
 from fidsplat.commands.output import console, point_label, print_lines, print_table, report, run_sweeps
 from fidsplat.commands.progress_lines import duration
 from fidsplat.commands.scenes import Cameras, UserScenes, load_user_scenes
@@ -20,34 +20,6 @@ if TYPE_CHECKING:
     from fidsplat.experiments.sweep import Sweep
 
 DEFAULT_FOLDER = "fidsplat-tradeoff"
-
-
-@dataclass
-class TradeoffReport:
-    """Write a report of results: time and error of each quality setting, and recommendations.
-
-    Results of several devices are compared. Results of one device in several folders are joined; of a point
-    that was measured twice the larger measurement counts. Charts and a small table per device are written to
-    the report's folder, or for FILE.md to a folder of that name; the report can be made again from these
-    tables. The statements of the text are computed from the numbers.
-
-    Examples:
-      fidsplat tradeoff report
-      fidsplat tradeoff report cpu gpu -o accuracy.md
-    """
-
-    folders: Folders = ()
-    """DIR: folders with results (default: fidsplat-tradeoff)"""
-    out: ReportTo = None
-    json: Json = False
-
-    def run(self) -> int:
-        require_packages()
-        from fidsplat.experiments.tradeoff.report import write_report
-
-        folders = [Path(folder) for folder in self.folders or (DEFAULT_FOLDER,)]
-        files = write_report(folders, Path(self.out or folders[0]))
-        return report(self.json, {"files": [str(file) for file in files]}, f"report in {files[0]}")
 
 
 @dataclass
@@ -75,10 +47,7 @@ class Tradeoff:
       fidsplat tradeoff --scenes hard --settings alpha_cutoff transmittance_stop
       fidsplat tradeoff --scene room.ply --cameras poses.tum --quick -o room
       fidsplat tradeoff --device opencl:nvidia --device opencl:pocl --plot both.svg
-      fidsplat tradeoff report cpu gpu -o accuracy.md   a page of the results
     """
-
-    PARTS: ClassVar[dict[str, type]] = {"report": TradeoffReport}
 
     out: str | None = None
     """DIR: folder for results (default: fidsplat-tradeoff, with --quick fidsplat-tradeoff-quick)"""
@@ -119,7 +88,7 @@ class Tradeoff:
         if not self.json:
             _print_results(sweeps, False)
         if self.plot is not None:
-            from fidsplat.experiments.tradeoff.report import write_plot
+            from fidsplat.experiments.tradeoff.plot import write_plot
 
             write_plot(folders, Path(self.plot))
         refused = [
@@ -133,7 +102,6 @@ class Tradeoff:
         lines = [*(f"not measured: {line}" for line in refused), *files]
         if left > len(refused):  # the time limit ended the sweep
             lines.append(f"{left} of {points} points are not measured yet; the same command continues")
-        lines.append(f"a page of them: fidsplat tradeoff report {' '.join(map(str, folders))}")
         return report(self.json, {"files": files, "points": points, "refused": refused}, *lines)
 
 

@@ -4,13 +4,14 @@ import json
 import xml.dom.minidom
 
 import pytest
+import tradeoff_report as report
 
 import fidsplat as fs
 from fidsplat.capture.quality import PRESETS
 from fidsplat.cli import main
 from fidsplat.experiments.summary import summarise
 from fidsplat.experiments.sweep import Record
-from fidsplat.experiments.tradeoff import report
+from fidsplat.experiments.tradeoff import plot
 from fidsplat.experiments.tradeoff.points import (
     ABLATION,
     BASE,
@@ -111,53 +112,53 @@ def write(folder, records: list[Record]) -> None:
 )
 def test_a_verdict_follows_from_time_and_error(setting, expected):
     found = device(plain_records("hard"))
-    assert found.verdict(found.at("hard", *setting), found.at("hard", "base", "base")) == expected
+    assert report.compared(found, found.at("hard", *setting), found.at("hard", "base", "base")) == expected
 
 
 def test_times_within_the_noise_of_the_base_do_not_differ():
     records = plain_records("hard")
     records[0].result["ratio_quartiles"] = [0.7, 1.1]  # the machine was not quiet
     found = device(records)
-    assert found.noise("hard") == pytest.approx(0.3)
+    assert report.noise_of(found, "hard") == pytest.approx(0.3)
     base = found.at("hard", "base", "base")
-    assert found.verdict(found.at("hard", "transmittance_stop", "1/512"), base) == "no difference"
+    assert report.compared(found, found.at("hard", "transmittance_stop", "1/512"), base) == "no difference"
     # quartiles on both sides of 1 are no difference either
     wide = result(0.9, 0.02, ratio_quartiles=[0.8, 1.02])
     records = [*plain_records("hard"), record("hard", Point("samples", "2", BASE), wide)]
     found = device(records)
     base = found.at("hard", "base", "base")
-    assert found.verdict(found.at("hard", "samples", "2"), base) == "no difference"
+    assert report.compared(found, found.at("hard", "samples", "2"), base) == "no difference"
 
 
 def test_a_time_at_the_limit_of_the_noise_does_not_differ():
     records = plain_records("hard")
     records[0].result["ratio_quartiles"] = [0.8, 1.25]
     found = device(records)
-    assert found.noise("hard") == 0.25
+    assert report.noise_of(found, "hard") == 0.25
     base = found.at("hard", "base", "base")
-    assert found.verdict(found.at("hard", "alpha_cutoff", "1/1024"), base) == "more accurate"
-    assert found.verdict(found.at("hard", "alpha_cutoff", "0.0001"), base) == "slower, more accurate"
+    assert report.compared(found, found.at("hard", "alpha_cutoff", "1/1024"), base) == "more accurate"
+    assert report.compared(found, found.at("hard", "alpha_cutoff", "0.0001"), base) == "slower, more accurate"
 
 
 def test_what_was_measured_twice_shows_the_noise():
     records = plain_records("hard")
-    assert device(records).noise("hard") == 0.02
+    assert report.noise_of(device(records), "hard") == 0.02
     twice = Point(ABLATION, "reference again", preset("reference"))
     records.append(record("hard", twice, result(2.14, 1e-6)))
-    assert device(records).noise("hard") == pytest.approx(0.07)
+    assert report.noise_of(device(records), "hard") == pytest.approx(0.07)
 
 
 def test_the_cheapest_invisible_error_is_the_cheapest_on_all_scenes():
     records = plain_records("hard") + plain_records("r100k_720p")
-    chosen = device(records).cheapest_within(("hard", "r100k_720p"), report.INVISIBLE)
+    chosen = report.cheapest_within(device(records), ("hard", "r100k_720p"), report.INVISIBLE)
     assert [point["value"] for point in chosen] == ["1/1024", "1/1024"]
     # beyond its certificates another is invisible too, on one of the scenes
     for each in records:
         if each.key["value"] == "fast" and each.key["scene"] == "hard":
             each.result["maximum_sure"] = 0.001
-    chosen = device(records).cheapest_within(("hard",), report.INVISIBLE)
+    chosen = report.cheapest_within(device(records), ("hard",), report.INVISIBLE)
     assert [point["value"] for point in chosen] == ["fast"]
-    assert device(records).cheapest_within(("hard",), 1e-9) == []
+    assert report.cheapest_within(device(records), ("hard",), 1e-9) == []
 
 
 def test_on_a_gpu_what_delays_both_frames_makes_nothing_cheaper():
@@ -166,20 +167,18 @@ def test_on_a_gpu_what_delays_both_frames_makes_nothing_cheaper():
         slow = next(each for each in records if each.key["value"] == "1/1024")
         slow.result.update(base_ms=20.0, ratio=1.125)
         found = device(records)
-        assert found.cost(found.at("hard", "alpha_cutoff", "1/1024")) == pytest.approx(expected)
+        assert report.cost(found, found.at("hard", "alpha_cutoff", "1/1024")) == pytest.approx(expected)
 
 
 @pytest.mark.sweep
-def test_the_report_says_what_the_numbers_say(capsys, tmp_path):
+def test_the_report_says_what_the_numbers_say(tmp_path):
     parts = plain_records("hard"), plain_records("r100k_720p"), marker_records(), thick_records()
     write(tmp_path / "cpu", [each for part in parts for each in part])
     write(tmp_path / "gpu", plain_records("hard", **GPU) + plain_records("r100k_720p", **GPU))
     page = tmp_path / "docs" / "accuracy.md"
-    words = ["tradeoff", "report", str(tmp_path / "cpu"), str(tmp_path / "gpu"), "-o", str(page), "--json"]
-    assert main(words) == 0
-    files = json.loads(capsys.readouterr().out)["files"]
-    assert files[0] == str(page)
-    assert {name.rpartition("/")[2] for name in files[1:]} == {"cpu.csv", "cpu.svg", "gpu.csv", "gpu.svg"}
+    files = report.write_report([tmp_path / "cpu", tmp_path / "gpu"], page)
+    assert files[0] == page
+    assert {file.name for file in files[1:]} == {"cpu.csv", "cpu.svg", "gpu.csv", "gpu.svg"}
     text = page.read_text()
     for words in (
         "| alone | alpha_cutoff 1/255 | faster, less accurate | +20 % | 0.019 | - | - | +20 % | 0.019 |",
@@ -198,14 +197,8 @@ def test_the_report_says_what_the_numbers_say(capsys, tmp_path):
 
     # the page can be made again from its own tables, and these are small
     before = {file: file.read_bytes() for file in (tmp_path / "docs").rglob("*.*")}
-    assert main(["tradeoff", "report", str(tmp_path / "docs" / "accuracy"), "-o", str(page)]) == 0
+    report.write_report([tmp_path / "docs" / "accuracy"], page)
     assert {file: file.read_bytes() for file in (tmp_path / "docs").rglob("*.*")} == before
-
-    # another page is not overwritten
-    page.write_text("# Accuracy\n")
-    assert main(["tradeoff", "report", str(tmp_path / "docs" / "accuracy"), "-o", str(page)]) == 2
-    assert "new file or an earlier report" in capsys.readouterr().err
-    assert page.read_text() == "# Accuracy\n"
 
 
 def test_a_device_that_rendered_only_3d_gaussians_takes_nothing_from_the_others(tmp_path):
@@ -229,8 +222,8 @@ def test_names_in_a_chart_cover_neither_each_other_nor_the_legend(tmp_path):
     for each in every:
         ratio, maximum = numbered.get((each.key["knob"], each.key["value"]), (1.05, 0.02))
         each.result.update(result(ratio, maximum))
-    report.write_chart([device(every)], "hard", tmp_path / "a.svg")
-    report.write_chart([device(every)], "hard", tmp_path / "b.svg")
+    plot.write_chart([device(every)], "hard", tmp_path / "a.svg")
+    plot.write_chart([device(every)], "hard", tmp_path / "b.svg")
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
     chart = xml.dom.minidom.parse(str(tmp_path / "a.svg"))
     comments = [node.data.strip() for node in walk(chart) if node.nodeType == node.COMMENT_NODE]
@@ -241,14 +234,14 @@ def test_devices_are_side_by_side_in_one_chart(tmp_path):
     """Of a scene that all of them have rendered."""
     write(tmp_path / "cpu", [*plain_records("hard"), *plain_records("r1m_1080p")])
     write(tmp_path / "gpu", plain_records("hard", **GPU))
-    report.write_plot([tmp_path / "cpu", tmp_path / "gpu"], tmp_path / "both.svg")
+    plot.write_plot([tmp_path / "cpu", tmp_path / "gpu"], tmp_path / "both.svg")
     chart = xml.dom.minidom.parse(str(tmp_path / "both.svg"))
     comments = [node.data.strip() for node in walk(chart) if node.nodeType == node.COMMENT_NODE]
     assert {"hard on A processor", "hard on A card", "half an 8-bit level"} <= set(comments)
     assert comments.count("gsplat") == 2
     write(tmp_path / "other", plain_records("r100k_720p", **GPU))
     with pytest.raises(fs.InputError, match="A processor and A card have no scene in common to plot"):
-        report.write_plot([tmp_path / "cpu", tmp_path / "other"], tmp_path / "none.svg")
+        plot.write_plot([tmp_path / "cpu", tmp_path / "other"], tmp_path / "none.svg")
     assert not (tmp_path / "none.svg").exists()
 
 
@@ -299,15 +292,15 @@ def test_refused_settings_are_named(tmp_path):
     records = plain_records("hard")
     records.append(record("hard", Point("samples", "3", EXACT), {"error": "no such samples"}))
     write(tmp_path / "a", records)
-    assert main(["tradeoff", "report", str(tmp_path / "a")]) == 0
-    text = (tmp_path / "a" / "report.md").read_text()
+    report.write_report([tmp_path / "a"], tmp_path / "page.md")
+    text = (tmp_path / "page.md").read_text()
     assert "Not rendered: samples 3 (no such samples)." in text
 
 
 def test_a_few_results_are_enough(tmp_path):
     write(tmp_path / "a", plain_records("hard")[:1])
-    assert main(["tradeoff", "report", str(tmp_path / "a")]) == 0
-    assert "cpu.svg" in (tmp_path / "a" / "report.md").read_text()
+    report.write_report([tmp_path / "a"], tmp_path / "page.md")
+    assert "cpu.svg" in (tmp_path / "page.md").read_text()
 
 
 def test_other_results_are_refused_by_name(tmp_path):
@@ -348,6 +341,5 @@ def test_a_quality_in_words_is_the_same_for_the_same():
 def test_without_what_makes_reports_one_line_says_what_to_install(capsys, tmp_path, monkeypatch):
     found = "fidsplat.commands.options.find_spec"
     monkeypatch.setattr(found, lambda name: None if name == "jinja2" else True)
-    for words in (["tradeoff", "report", str(tmp_path)], ["experiment", "report", str(tmp_path)]):
-        assert main(words) == 2
-        assert "a report needs jinja2; pip install 'fidsplat[experiments]'" in capsys.readouterr().err
+    assert main(["experiment", "report", str(tmp_path)]) == 2
+    assert "a report needs jinja2; pip install 'fidsplat[experiments]'" in capsys.readouterr().err

@@ -609,7 +609,6 @@ SLOW = [
     "check --device nowhere",
     "bench --scenes nothing --json out.json",
     "tradeoff --scenes nothing -o out",
-    "tradeoff report nowhere -o out",
     "experiment nothing -o out",
     "experiment dataset --markers 9 -o out",
     "experiment merge nowhere -o out",
@@ -644,7 +643,6 @@ NAMED = [
     "fly a.toml NAME",
     "gallery NAME -o a",
     "experiment report NAME -o a",
-    "tradeoff report NAME -o a",
 ]
 
 

@@ -1,8 +1,7 @@
-"""Results of a trade-off on a device as a table, and verdicts on settings."""
+"""Results of `fidsplat tradeoff` on a device as a table."""
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -26,18 +25,6 @@ COLUMNS = (
 )  # fmt: skip
 TILT = 60
 """degrees: tilt of the marker images of a summary"""
-MIN_TIME_CHANGE = 0.02
-"""minimum relative difference of times, in addition to both quartiles"""
-MIN_ERROR_FACTOR = 1.1
-"""minimum factor between errors that differ"""
-_ROUNDING = 1e-6
-"""errors below this are rounding"""
-_VERDICTS = {
-    (0, -1): "more accurate", (-1, -1): "more accurate", (1, -1): "slower, more accurate", (-1, 0): "faster",
-    (-1, 1): "faster, less accurate", (0, 1): "dominated", (1, 1): "dominated", (1, 0): "slower",
-    (0, 0): "no difference",
-}  # fmt: skip
-"""signs of the changes of time and error -> verdict"""
 
 
 def rows_of(record: Record) -> Iterator[dict[str, Any]]:
@@ -121,15 +108,6 @@ class DeviceResults:
         found = found.iloc[order.argsort(kind="stable")]
         return found.assign(ms=self.base_ms(scene) * found["ratio"])
 
-    @property
-    def refused(self) -> Frame:
-        """Rows of settings that the device did not render, with the `error`."""
-        return self.summary.rows[self.summary.rows["error"].notna()]
-
-    def is_comparable(self, point: Row) -> bool:
-        """Whether a row has the low-pass, samples and order of the base setting."""
-        return point.name in self.same_definition(point["scene"]).index
-
     def same_definition(self, scene: str) -> Frame:
         """Rows with the low-pass, samples and order of the base setting, whose errors are comparable."""
         found = self.of(scene)
@@ -141,57 +119,6 @@ class DeviceResults:
     def base_ms(self, scene: str) -> float:
         """Median time of the base in milliseconds."""
         return statistics.median(self.points.loc[self.points["scene"] == scene, "base_ms"])
-
-    def noise(self, scene: str) -> float:
-        """Noise of times as a relative difference.
-
-        Measured on the base relative to itself, and on qualities with two names.
-        """
-        base = self.points.loc[(scene, "base", "base")]
-        ratios = self.of(scene).groupby("quality")["ratio"]
-        repeated = (ratios.max() / ratios.min() - 1).max()
-        return max(MIN_TIME_CHANGE, abs(base["ratio_low"] - 1), abs(base["ratio_high"] - 1), repeated)
-
-    def cost(self, point: Row) -> float:
-        """Time of a setting relative to the base, comparable between settings.
-
-        The host of a GPU delays both frames of a pair equally, so there the difference is divided by the
-        median of the base.
-        """
-        if self.kind != "gpu":
-            return point["ratio"]
-        return 1 + (point["ratio"] - 1) * point["base_ms"] / self.base_ms(point["scene"])
-
-    def verdict(self, point: Row, other: Row) -> str:
-        """Verdict on a setting relative to another with the same low-pass, samples and order."""
-        errors = {_sign(point[name], other[name]) for name in ("maximum", "rmse")}
-        if {-1, 1} <= errors:
-            return "mixed"
-        unit, noise = other["ratio"], self.noise(point["scene"])
-        faster = point["ratio"] / unit < 1 - noise and point["ratio_high"] < unit
-        slower = point["ratio"] / unit > 1 + noise and point["ratio_low"] > unit
-        return _VERDICTS[int(slower) - int(faster), sum(errors)]
-
-    def cheapest_within(self, scenes: Iterable[str], bound: float) -> list[Row]:
-        """Rows of the cheapest setting with errors of at most a bound on all scenes; [] if there is none.
-
-        The cost is the product over scenes; errors within certificates do not count.
-        """
-        scenes = list(scenes)
-        rows: Frame = pd.concat([self.same_definition(scene) for scene in scenes])
-        best: tuple[float, list[Row]] = (math.inf, [])
-        for _, found in rows.groupby(["knob", "value"], sort=False):
-            error = found["beyond"].fillna(found["maximum"]).max()
-            own = [row for _, row in found.iterrows()]
-            cost = math.prod(map(self.cost, own))
-            if len(own) == len(scenes) and error <= bound and cost < best[0]:
-                best = cost, own
-        return best[1]
-
-
-def _sign(error: float, other: float) -> int:
-    error, other = max(error, _ROUNDING), max(other, _ROUNDING)
-    return int(error > other * MIN_ERROR_FACTOR) - int(error * MIN_ERROR_FACTOR < other)
 
 
 def quality_text(changes: dict[str, Any]) -> str:

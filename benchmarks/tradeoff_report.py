@@ -1,57 +1,47 @@
-"""Report of `fidsplat tradeoff report`: tables, charts and recommendations from results."""
+"""Report of the results of `fidsplat tradeoff`: tables, charts and recommendations; see accuracy_page.py."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from itertools import combinations
 from pathlib import Path
 
 import pandas as pd
 
-from fidsplat.experiments.charts import Axes, chart, label_points, literal, plain_ticks
-from fidsplat.experiments.pages import NOTHING, fixed, number, page_and_folder, percent, write_page
+from fidsplat.experiments.pages import NOTHING, fill_template, fixed, number, percent
 from fidsplat.experiments.summary import Frame, Row, provenance
+from fidsplat.experiments.tradeoff.plot import INVISIBLE, disk_scenes, write_chart
 from fidsplat.experiments.tradeoff.points import ABLATION, COMBINED, MARKER, PRESET
-from fidsplat.experiments.tradeoff.scenes import HARD, RANDOM, is_marker
+from fidsplat.experiments.tradeoff.scenes import HARD, is_marker
 from fidsplat.experiments.tradeoff.summary import TILT, DeviceResults, load
-from fidsplat.util.errors import InputError
+from fidsplat.util.files import printable, writable_folder, write_file
 
-INVISIBLE = 1 / 512
-"""half an 8-bit level"""
-SMALLEST = 1e-7
-"""lower limit of the error axis; smaller errors are plotted at this value"""
 SHOWN_MARKER = "qr10"
 """marker of the table of mixtures"""
 BASE, EXACT = ("base", "base"), (ABLATION, "exact")
 """setting and value of the baseline, and of the exact image"""
-_LABELS = {
-    (PRESET, "gsplat"): "gsplat",
-    (PRESET, "fast"): "fast",
-    (PRESET, "standard"): "standard",
-    (PRESET, "reference"): "reference",
-    ("alpha_cutoff", "4/255"): "cut-off 4/255",
-    ("alpha_cutoff", "1/1024"): "cut-off 1/1024",
-    ("alpha_cutoff", "0.0001"): "cut-off 1e-4",
-    (ABLATION, "opacity_ceiling 0.99"): "only alpha up to 0.99",
-    (ABLATION, "transmittance_stop 1/256"): "only T down to 1/256",
-    (ABLATION, "stop_rule exclusive"): "only the last fragment dropped",
-}
-"""labelled points of a chart"""
+MIN_TIME_CHANGE = 0.02
+"""minimum relative difference of times, in addition to both quartiles"""
+MIN_ERROR_FACTOR = 1.1
+"""minimum factor between errors that differ"""
+_ROUNDING = 1e-6
+"""errors below this are rounding"""
+_VERDICTS = {
+    (0, -1): "more accurate", (-1, -1): "more accurate", (1, -1): "slower, more accurate", (-1, 0): "faster",
+    (-1, 1): "faster, less accurate", (0, 1): "dominated", (1, 1): "dominated", (1, 0): "slower",
+    (0, 0): "no difference",
+}  # fmt: skip
+"""signs of the changes of time and error -> verdict"""
 
 
-def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
-    """Write the report, and for each device a chart and a table; returns the files, the report first.
+def write_report(folders: Sequence[Path], page: Path) -> list[Path]:
+    """Write the report into FILE.md, and for each device a chart and a table into a folder of that name
+    without .md; returns the files, the report first.
 
-    The tables suffice to make the same report again.
-
-    Args:
-        folders: folders with results, see `load`.
-        out: folder for report.md and its files; or a name that ends in .md, whose files are written to a
-            folder of that name without .md.
-
-    Raises InputError when there are no results or the folder cannot be written.
+    The tables suffice to make the same report again. Raises InputError when there are no results.
     """
-    page, folder = page_and_folder(out, "tradeoff.md.j2")
+    folder = writable_folder(page.with_suffix(""))
     devices, files = save_results(folders, folder)
     every = list(devices.values())
     repeated = {one.title for one, other in combinations(every, 2) if one.title == other.title}
@@ -59,7 +49,8 @@ def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
         name: f"{device.title} ({name})" if device.title in repeated else device.title
         for name, device in devices.items()
     }
-    refused = (row for device in every for row in device.refused.itertuples())
+    rows = [device.summary.rows for device in every]
+    refused = (row for own in rows for row in own[own["error"].notna()].itertuples())
     context = {
         "devices": [
             {
@@ -77,7 +68,7 @@ def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
         "notes": [note for device in every for note in device.summary.notes],
         "marker": f"{SHOWN_MARKER} at {TILT} degrees",
     }
-    write_page(page, folder, "tradeoff.md.j2", context)
+    write_file(page, printable(fill_template(page, folder, "tradeoff.md.j2", context, Path(__file__).parent)))
     return [page, *files]
 
 
@@ -96,66 +87,6 @@ def save_results(folders: Sequence[Path], folder: Path) -> tuple[dict[str, Devic
             files.append(folder / f"{name}.svg")
             write_chart([device], scenes[0], files[-1])
     return devices, files
-
-
-def write_plot(folders: Sequence[Path], file: Path) -> None:
-    """Write one chart of results, with a panel for each device.
-
-    Raises InputError when there are no results, the devices have no scene in common, or the file cannot be
-    written.
-    """
-    devices = load(folders)
-    first = devices[0]
-    for scene in dict.fromkeys((*disk_scenes(first), *first.scenes)):
-        if all(scene in device.scenes for device in devices):
-            write_chart(devices, scene, file)
-            return
-    raise InputError(f"{' and '.join(device.title for device in devices)} have no scene in common to plot")
-
-
-def write_chart(devices: Sequence[DeviceResults], scene: str, file: Path) -> None:
-    """Write a chart of time and largest error of settings, with a panel for each device.
-
-    Only settings with the image definition of the base are comparable.
-    """
-    with chart(file, len(devices), (9.0 * len(devices), 5.2)) as (figure, panels):
-        labels = [_plot(axes, device, scene) for axes, device in zip(panels, devices, strict=True)]
-        panels[0].set_ylabel("largest error (peak 1)")
-        handles, texts = panels[0].get_legend_handles_labels()
-        figure.legend(handles, texts, loc="outside lower center", ncols=4, frameon=False)
-        for axes, points in zip(panels, labels, strict=True):
-            label_points(figure, axes, points)
-
-
-def _plot(axes: Axes, device: DeviceResults, scene: str) -> list[tuple[float, float, str]]:
-    """Plot the settings of a device; returns labelled points."""
-    points = device.same_definition(scene)
-    points = points[points["value"] != "float64"]  # for reference images, and much slower
-    points = points.assign(
-        error=points["maximum"].clip(lower=SMALLEST),
-        label=[_LABELS.get(key) for key in zip(points["knob"], points["value"], strict=True)],
-    )
-    labelled = points[points["label"].notna()]
-    cutoffs = points[points["knob"].isin(("base", "alpha_cutoff"))].sort_values("error")
-    axes.set(xscale="log", yscale="log", xlabel="milliseconds per frame")
-    axes.plot(points["ms"], points["error"], ".", color="#bbbbbb", label="every setting")
-    axes.plot(cutoffs["ms"], cutoffs["error"], "-", color="#00798c", label="only the cut-off")
-    for setting, style, colour, text in (
-        (PRESET, "o", "#d1495b", "presets"),
-        ("alpha_cutoff", "o", "#00798c", None),
-        (ABLATION, "s", "#edae49", "one constant in an exact image"),
-    ):
-        chosen = labelled[labelled["knob"] == setting]
-        axes.plot(chosen["ms"], chosen["error"], style, color=colour, label=text)
-    axes.axhline(INVISIBLE, color="#777777", linestyle="--", linewidth=0.8)
-    axes.annotate(
-        "half an 8-bit level", (0, INVISIBLE), (4, 3), xycoords=("axes fraction", "data"),
-        textcoords="offset points", fontsize=9, color="#555555",
-    )  # fmt: skip
-    axes.margins(0.08)
-    plain_ticks(axes.xaxis)
-    axes.set_title(literal(f"{scene} on {device.title}"))
-    return list(labelled[["ms", "error", "label"]].itertuples(index=False, name=None))
 
 
 def settings_table(device: DeviceResults) -> Frame:
@@ -178,9 +109,13 @@ def verdict(device: DeviceResults, point: Row, base: tuple[str, str] | None = No
     changed there; empty for another definition of the image."""
     base = base or (EXACT if point["knob"] == ABLATION else BASE)
     other = device.at(point["scene"], *base)
-    if other is None or (point["knob"], point["value"]) == base or not device.is_comparable(point):
+    if (
+        other is None
+        or (point["knob"], point["value"]) == base
+        or point.name not in device.same_definition(point["scene"]).index
+    ):
         return ""
-    found = device.verdict(point, other)
+    found = compared(device, point, other)
     return "no effect" if found == "dominated" and point["maximum"] <= INVISIBLE / 2 else found
 
 
@@ -213,7 +148,7 @@ def recommendations(devices: Sequence[DeviceResults]) -> list[dict[str, str]]:
         every = disk_scenes(device)
         kind = "one's own scenes" if device.own else "random scenes"
         for text, scenes in ((kind, [s for s in every if s != HARD]), ("all scenes", every)):
-            best = device.cheapest_within(scenes, INVISIBLE) if scenes else []
+            best = cheapest_within(device, scenes, INVISIBLE) if scenes else []
             if best:
                 costs = ", ".join(f"{row['scene']} {percent(row['ratio'])}" for row in best)
                 setting, value = best[0]["knob"], best[0]["value"]
@@ -222,10 +157,59 @@ def recommendations(devices: Sequence[DeviceResults]) -> list[dict[str, str]]:
     return found
 
 
-def disk_scenes(device: DeviceResults) -> list[str]:
-    """The user's scenes, random scenes of disks, the largest first, and the hard cases."""
-    order = [*device.own, *reversed(RANDOM), HARD]
-    return sorted((scene for scene in device.scenes if scene in order), key=order.index)
+def noise_of(device: DeviceResults, scene: str) -> float:
+    """Noise of times as a relative difference.
+
+    Measured on the base relative to itself, and on qualities with two names.
+    """
+    base = device.points.loc[(scene, "base", "base")]
+    ratios = device.of(scene).groupby("quality")["ratio"]
+    repeated = (ratios.max() / ratios.min() - 1).max()
+    return max(MIN_TIME_CHANGE, abs(base["ratio_low"] - 1), abs(base["ratio_high"] - 1), repeated)
+
+
+def cost(device: DeviceResults, point: Row) -> float:
+    """Time of a setting relative to the base, comparable between settings.
+
+    The host of a GPU delays both frames of a pair equally, so there the difference is divided by the
+    median of the base.
+    """
+    if device.kind != "gpu":
+        return point["ratio"]
+    return 1 + (point["ratio"] - 1) * point["base_ms"] / device.base_ms(point["scene"])
+
+
+def compared(device: DeviceResults, point: Row, other: Row) -> str:
+    """Verdict on a setting relative to another with the same low-pass, samples and order."""
+    errors = {_sign(point[name], other[name]) for name in ("maximum", "rmse")}
+    if {-1, 1} <= errors:
+        return "mixed"
+    unit, noise = other["ratio"], noise_of(device, point["scene"])
+    faster = point["ratio"] / unit < 1 - noise and point["ratio_high"] < unit
+    slower = point["ratio"] / unit > 1 + noise and point["ratio_low"] > unit
+    return _VERDICTS[int(slower) - int(faster), sum(errors)]
+
+
+def cheapest_within(device: DeviceResults, scenes: Iterable[str], bound: float) -> list[Row]:
+    """Rows of the cheapest setting with errors of at most a bound on all scenes; [] if there is none.
+
+    The cost is the product over scenes; errors within certificates do not count.
+    """
+    scenes = list(scenes)
+    rows: Frame = pd.concat([device.same_definition(scene) for scene in scenes])
+    best: tuple[float, list[Row]] = (math.inf, [])
+    for _, found in rows.groupby(["knob", "value"], sort=False):
+        error = found["beyond"].fillna(found["maximum"]).max()
+        own = [row for _, row in found.iterrows()]
+        product = math.prod(cost(device, row) for row in own)
+        if len(own) == len(scenes) and error <= bound and product < best[0]:
+            best = product, own
+    return best[1]
+
+
+def _sign(error: float, other: float) -> int:
+    error, other = max(error, _ROUNDING), max(other, _ROUNDING)
+    return int(error > other * MIN_ERROR_FACTOR) - int(error * MIN_ERROR_FACTOR < other)
 
 
 def _short_names(devices: Sequence[DeviceResults]) -> list[str]:
