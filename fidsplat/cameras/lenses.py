@@ -14,6 +14,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 
 from fidsplat.util.arguments import number, real_array
+from fidsplat.util.directions import perpendicular
 from fidsplat.util.errors import InputError
 
 FISHEYE_LIMIT = math.radians(100)
@@ -351,11 +352,7 @@ class RayTable:
         """Jacobian (n, 2, 3) of coordinates across the beam, in beam widths, at points (n, 3)."""
         points = _rows("points", points, 3)
         far = np.linalg.norm(points, axis=1, keepdims=True)
-        unit = points / far
-        aside = np.eye(3)[np.argmin(np.abs(unit), axis=1)]
-        first = np.cross(unit, aside)
-        first /= np.linalg.norm(first, axis=1, keepdims=True)
-        return np.stack([first, np.cross(unit, first)], 1) / (self.divergence * far[:, :, None])
+        return perpendicular(points / far) / (self.divergence * far[:, :, None])
 
     def rays(self, image: np.ndarray) -> np.ndarray:
         """Unit directions (n, 3) of the pixels of image coordinates (n, 2); NaN outside the table."""

@@ -15,11 +15,11 @@ import numpy as np
 from fidsplat.cameras import Camera, RayTable
 from fidsplat.cameras.pinhole import MAX_SIZE
 from fidsplat.util.arguments import array_of, instance, invalid, items, number, own_scalars, whole_number
+from fidsplat.util.directions import disk, perpendicular, unit
 from fidsplat.util.errors import InputError, unknown
 
 RETURNS = ("first", "strongest", "last")
 MAX_BEAMS = 2**22
-_GOLDEN = math.pi * (3 - math.sqrt(5))
 
 
 @dataclass(frozen=True)
@@ -291,15 +291,7 @@ def _spread(beams: np.ndarray, divergence: float, count: int) -> np.ndarray:
     at its centre."""
     if count == 1:
         return beams
-    k = np.arange(count)
-    away, turn = divergence / 2 * np.sqrt(k / (count - 0.5)), _GOLDEN * k
-    aside = np.eye(3)[np.argmin(np.abs(beams), axis=1)]
-    first = np.cross(beams, aside)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(beams, first)
-    tilt = away * np.cos(turn), away * np.sin(turn)
-    rays = beams[:, None] + tilt[0][:, None] * first[:, None] + tilt[1][:, None] * second[:, None]
-    return (rays / np.linalg.norm(rays, axis=2, keepdims=True)).reshape(-1, 3)
+    return unit(beams[:, None] + divergence / 2 * (disk(count, 0) @ perpendicular(beams))).reshape(-1, 3)
 
 
 @cache

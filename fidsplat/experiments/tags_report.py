@@ -75,19 +75,17 @@ def breaks_of(rates: Frame) -> Frame:
 
     rates: `statistics_of` by family, detector, cause and severity.
     """
-    detectors = _detectors(rates)
     table = []
     for cause in (name for name in CAUSES if name in set(rates["cause"])):
+        own = rates[rates["cause"].isin((cause, NONE))]
         for family in (name for name in FAMILIES if name in set(rates["family"])):
             row = {"cause": f"{CAUSES[cause].title} [{CAUSES[cause].unit}]"}
             row |= {"to": CAUSES[cause].text(1.0), "family": family.rpartition(":")[2]}
-            for detector in detectors:
-                own = rates[(rates["family"] == family) & (rates["detector"] == detector)]
-                own = own[own["cause"].isin((cause, NONE))]
-                row[detector] = NOTHING
-                if len(own):
-                    severity = breaking_severity(own["severity"].tolist(), own["rate"].tolist())
-                    row[detector] = NEVER if severity is None else CAUSES[cause].text(severity)
+            for detector in _detectors(rates):
+                each = own[(own["family"] == family) & (own["detector"] == detector)]
+                severity = breaking_severity(each["severity"].tolist(), each["rate"].tolist())
+                row[detector] = NEVER if severity is None else CAUSES[cause].text(severity)
+                row[detector] = row[detector] if len(each) else NOTHING
             table.append(row)
     return pd.DataFrame(table)
 
@@ -171,11 +169,11 @@ def write_report(records: Sequence[Record], folder: Path, out: Path, seed: int) 
         "errors": _errors(pooled[pooled["cause"] == NONE]),
         "detectors": [f"`{name}`: {TITLES[name]}" for name in detectors if name in TITLES],
         "scenes": " and ".join(dict.fromkeys(views["scene"])),
-        "views": len(views.drop_duplicates(["scene", "family", "cause", "severity"])),
-        "images": int(views.groupby(["scene", "family", "cause", "severity", "detector"]).size().groupby(
-            level=[0, 1, 2, 3]).max().sum()),
+        "images": int(
+            table.rows.groupby([name for name in _GROUP if name != "detector"])["amount"].max().sum()
+        ),
         "runs": provenance({"`experiment tags`": summary}),
-    }  # fmt: skip
+    }
     write_page(page, charts, "tags.md.j2", context)
     return [page, folder / f"{NAME}.csv", *(file for _, file in files)], breaks
 

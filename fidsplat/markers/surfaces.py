@@ -8,8 +8,8 @@ and the tangent plane of the centre is the plane of the flat marker.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from dataclasses import dataclass, field, fields
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -33,6 +33,8 @@ WAVES = 7
 CREASE = 0.2
 """width of the creases of a crumpled sheet, relative to their distance: 0 is a sharp edge"""
 
+_POSITIVE = "a positive length in metres", 1e-9
+
 
 class Frames(NamedTuple):
     """Points of a surface with orthonormal tangents, in the marker's frame."""
@@ -50,11 +52,22 @@ class Frames(NamedTuple):
         return np.cross(self.along_x, self.along_y)
 
 
+@dataclass(frozen=True)
 class SheetShape:
-    """Base of the shapes, which are dataclasses; `kind` is their name in scene files."""
+    """Base of the shapes; `kind` is their name in scene files."""
 
     kind: ClassVar[str]
-    deviation: float | None
+    limits: ClassVar[dict[str, tuple]] = {}
+    """requirement, minimum and maximum of fields"""
+    deviation: float | None = field(default=None, kw_only=True)
+    """metres: maximum distance of the splats from the surface; None: size / 2500"""
+
+    def __post_init__(self) -> None:
+        own_scalars(self)
+        for name in [each.name for each in fields(self) if each.type == "float"]:
+            number(f"shape: {name}", getattr(self, name), *self.limits.get(name, ()))
+        if self.deviation is not None:
+            number("shape: deviation", self.deviation, "a positive length in metres, or None", 1e-9)
 
     def fit(self, half: tuple[float, float]) -> None:
         """Raise InputError if a sheet with these half edges in metres does not fit on the surface."""
@@ -74,10 +87,19 @@ class SheetShape:
         return None
 
 
+@dataclass(frozen=True)
 class _Along(SheetShape):
-    """Shape with an axis: straight lines of the sheet along `axis` stay straight."""
+    """Shape with an axis."""
 
-    axis: str | tuple[float, ...]
+    axis: str | tuple[float, ...] = field(default="y", kw_only=True)
+    """direction on the sheet, "x", "y" or two numbers x, y, of the lines that stay straight; of a cone away
+    from the apex"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        axis_of(self.axis)
+        if not isinstance(self.axis, str):
+            object.__setattr__(self, "axis", tuple(map(float, self.axis)))
 
     @property
     def across(self) -> np.ndarray:
@@ -112,14 +134,7 @@ class Cylinder(_Profile):
 
     radius: float
     """metres; negative: on the inside of a pipe"""
-    axis: str | tuple[float, ...] = "y"
-    """direction of the axis on the sheet: "x", "y" or two numbers x, y"""
-    deviation: float | None = None
-    """metres: maximum distance of the splats from the surface; None: size / 2500"""
     kind: ClassVar[str] = "cylinder"
-
-    def __post_init__(self) -> None:
-        _check(self, "radius")
 
     def fit(self, half: tuple[float, float]) -> None:
         width = 2 * self._extent(half)
@@ -139,15 +154,8 @@ class BentSheet(_Profile):
     farthest"""
     length: float
     """metres along the sheet from one wave to the next"""
-    axis: str | tuple[float, ...] = "y"
-    """direction of the axis on the sheet: "x", "y" or two numbers x, y"""
-    deviation: float | None = None
-    """metres: maximum distance of the splats from the surface; None: size / 2500"""
     kind: ClassVar[str] = "bent"
-
-    def __post_init__(self) -> None:
-        _check(self, "radius", "length")
-        number("shape: length", self.length, "a positive length in metres", 1e-9)
+    limits: ClassVar[dict[str, tuple]] = {"length": _POSITIVE}
 
     def fit(self, half: tuple[float, float]) -> None:
         width = 2 * self._extent(half)
@@ -183,14 +191,7 @@ class BoxEdge(_Profile):
     """metres: radius of the arc; negative: foil in an inner corner"""
     offset: float = 0.0
     """metres from the centre of the marker to the edge, across the axis"""
-    axis: str | tuple[float, ...] = "y"
-    """direction of the edge on the sheet: "x", "y" or two numbers x, y"""
-    deviation: float | None = None
-    """metres: maximum distance of the splats from the surface; None: size / 2500"""
     kind: ClassVar[str] = "edge"
-
-    def __post_init__(self) -> None:
-        _check(self, "radius", "offset")
 
     def fit(self, half: tuple[float, float]) -> None:
         width = 2 * self._extent(half)
@@ -220,16 +221,11 @@ class Cone(_Along):
     """metres: radius of the cone at the centre of the marker"""
     taper: float
     """decrease of the radius per metre of height towards the apex, 0.001 to 100"""
-    axis: str | tuple[float, ...] = "y"
-    """direction on the sheet away from the apex: "x", "y" or two numbers x, y"""
-    deviation: float | None = None
-    """metres: maximum distance of the splats from the surface; None: size / 2500"""
     kind: ClassVar[str] = "cone"
-
-    def __post_init__(self) -> None:
-        _check(self, "radius", "taper")
-        number("shape: radius", self.radius, "a positive length in metres", 1e-9)
-        number("shape: taper", self.taper, "a number from 0.001 to 100; a cylinder has none", 1e-3, 100)
+    limits: ClassVar[dict[str, tuple]] = {
+        "radius": _POSITIVE,
+        "taper": ("a number from 0.001 to 100; a cylinder has none", 1e-3, 100),
+    }
 
     def fit(self, half: tuple[float, float]) -> None:
         corners = np.array([[x, y] for x in (-1, 1) for y in (-1, 1)]) * half
@@ -287,13 +283,11 @@ class Crumpled(SheetShape):
     length: float
     """metres: mean distance of creases"""
     seed: int = 0
-    deviation: float | None = None
-    """metres: maximum distance of the splats from the surface; None: size / 2500"""
     kind: ClassVar[str] = "crumpled"
+    limits: ClassVar[dict[str, tuple]] = {"length": _POSITIVE}
 
     def __post_init__(self) -> None:
-        _check(self, "height", "length")
-        number("shape: length", self.length, "a positive length in metres", 1e-9)
+        super().__post_init__()
         limit = f"0 to a tenth of the length, {self.length / 10:g} m"
         number("shape: height", self.height, limit, 0, self.length / 10)
         whole_number("shape: seed", self.seed, 0, 2**63 - 1)
@@ -354,7 +348,8 @@ def shape_of(shape: SheetShape | str | None) -> SheetShape | None:
     if shape is None:
         return None
     if not isinstance(shape, str):
-        return instance("shape", shape, SheetShape, "a shape, its text or None", _REMEDY)
+        remedy = "e.g. fidsplat.markers.Cylinder(radius=0.05)"
+        return instance("shape", shape, SheetShape, "a shape, its text or None", remedy)
     name, *settings = (part.strip() for part in shape.split(","))
     if name not in SHAPES:
         raise InputError(unknown("shape", name, SHAPES))
@@ -371,22 +366,6 @@ def axis_of(axis: str | tuple[float, ...]) -> np.ndarray:
     if found.shape != (2,) or not np.isfinite(found).all() or not found.any():
         raise InputError(f"shape: axis must be x, y or two numbers, not both 0, got {axis!r}")
     return found / np.linalg.norm(found)
-
-
-_REMEDY = "e.g. fidsplat.markers.Cylinder(radius=0.05)"
-
-
-def _check(shape: Any, *lengths: str) -> None:
-    """Validate the numbers, the axis and the deviation of a shape."""
-    own_scalars(shape)
-    for name in lengths:
-        number(f"shape: {name}", getattr(shape, name))
-    if hasattr(shape, "axis"):
-        axis_of(shape.axis)
-        if not isinstance(shape.axis, str):
-            object.__setattr__(shape, "axis", tuple(map(float, shape.axis)))
-    if shape.deviation is not None:
-        number("shape: deviation", shape.deviation, "a positive length in metres, or None", 1e-9)
 
 
 def _require_length(length: float, smallest: float) -> None:

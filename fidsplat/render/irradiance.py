@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+Neighbour = tuple[tuple[np.ndarray, np.ndarray], np.ndarray]
+
 
 def panorama_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
     """World directions (d, 3) of the pixels of an equirectangular panorama of 2 rows x rows pixels, and their
@@ -25,6 +27,14 @@ def cosine_weights(normal: np.ndarray, directions: np.ndarray, angles: np.ndarra
     """Weights (d,) of radiance in the irradiance of a surface; their sum is pi."""
     weights = np.maximum(directions @ normal, 0) * angles
     return weights * (np.pi / weights.sum())
+
+
+def neighbours(x: np.ndarray, y: np.ndarray) -> Iterator[Neighbour]:
+    """Indices (row, column) and weights of the four cells around positions, for bilinear interpolation."""
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    for dy in (0, 1):
+        for dx in (0, 1):
+            yield (top + dy, left + dx), np.abs(x - left - 1 + dx) * np.abs(y - top - 1 + dy)
 
 
 class LightField:
@@ -81,18 +91,12 @@ class LightField:
                 break
         return field
 
-    def _between(self, places: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], np.ndarray]]:
+    def _between(self, places: np.ndarray) -> Iterator[Neighbour]:
         """Grid indices (y, x) and weights of the four measurements around each place (m, 2)."""
         size = np.array(self.radiance.shape[1::-1]) - 1
         span = np.where(self.high > self.low, self.high - self.low, 1)
-        at = np.clip((places - self.low) / span, 0, 1) * size
-        cell = np.minimum(at.astype(int), np.maximum(size - 1, 0))
-        part = at - cell
-        for dy in (0, 1):
-            for dx in (0, 1):
-                x, y = np.minimum(cell + np.array([dx, dy]), size).T
-                share = np.where(dx, part[:, 0], 1 - part[:, 0]) * np.where(dy, part[:, 1], 1 - part[:, 1])
-                yield (y, x), share
+        for (y, x), share in neighbours(*(np.clip((places - self.low) / span, 0, 1) * size).T):
+            yield (np.minimum(y, size[1]), np.minimum(x, size[0])), share
 
     def interpolated(self, values: np.ndarray, places: np.ndarray) -> np.ndarray:
         """Values (rows, columns, ...) of the grid at places (m, 2)."""
@@ -107,17 +111,14 @@ class LightField:
         rows = round(np.sqrt(len(self.angles) / 2))
         return self.radiance.reshape(*self.radiance.shape[:2], rows, 2 * rows, 3)
 
-    def _pixels(self, directions: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], np.ndarray]]:
+    def _pixels(self, directions: np.ndarray) -> Iterator[Neighbour]:
         """Indices (y, x) and weights of the four pixels of a panorama around each direction (..., 3)."""
         rows, columns = self._images.shape[2:4]
         x, y, z = np.moveaxis(directions, -1, 0)
         u = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * columns - 0.5
         v = (np.arcsin(np.clip(y, -1, 1)) / np.pi + 0.5) * rows - 0.5
-        left, top = np.floor(u).astype(int), np.floor(v).astype(int)
-        for dy in (0, 1):
-            for dx in (0, 1):
-                share = np.where(dx, u - left, left + 1 - u) * np.where(dy, v - top, top + 1 - v)
-                yield (np.clip(top + dy, 0, rows - 1), (left + dx) % columns), share
+        for (row, column), share in neighbours(u, v):
+            yield (np.clip(row, 0, rows - 1), column % columns), share
 
     def arriving(self, directions: np.ndarray, places: np.ndarray) -> np.ndarray:
         """Radiance (m, k, 3) from directions (m, k, 3) at places (m, 2), interpolated in both."""

@@ -24,12 +24,13 @@ from fidsplat.render.reflection import (
     lobe,
     view_directions,
 )
-from fidsplat.render.shadows import LightPoint, ReceiverPoints, light_points, unit, visibility
+from fidsplat.render.shadows import LightPoint, ReceiverPoints, light_points, visibility
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.lights import GRIDS, Lighting, PointLight
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import rotation_of_coefficients
 from fidsplat.splats.rotations import quaternion_to_matrix
+from fidsplat.util.directions import unit
 from fidsplat.util.errors import InputError
 from fidsplat.util.response import to_light
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fidsplat.splats.harmonics import C0, MAX_DEGREE, sh_basis
+from fidsplat.util.directions import perpendicular, sphere
 
 _DIRECTIONS = 256
 _GRAZING = 0.05
@@ -68,7 +69,7 @@ def lobe(to_viewer: np.ndarray, normal: np.ndarray, surface: Gloss) -> tuple[np.
     2018)."""
     square, i = surface.alpha**2, np.arange(_LOBE)
     radius, angle = np.sqrt((i + 0.5) / _LOBE), 2 * np.pi * _van_der_corput(_LOBE)
-    axes = np.concatenate([_frames(normal), normal[:, None]], 1)
+    axes = np.concatenate([perpendicular(normal), normal[:, None]], 1)
     local = np.einsum("nvd,ncd->nvc", to_viewer, axes)
     stretched = local * (surface.alpha, surface.alpha, 1.0)
     stretched = (stretched / np.linalg.norm(stretched, axis=-1, keepdims=True))[..., None, :]
@@ -104,22 +105,9 @@ def _van_der_corput(count: int) -> np.ndarray:
     return bits @ 0.5 ** np.arange(1, 17)
 
 
-def _frames(normals: np.ndarray) -> np.ndarray:
-    """Two unit vectors (n, 2, 3) perpendicular to normals (n, 3) and to each other."""
-    helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
-    x = np.cross(normals, helper)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return np.stack([x, np.cross(normals, x)], 1)
-
-
 def view_directions(normal: np.ndarray) -> np.ndarray:
     """Unit directions (v, 3) from a surface to viewers, evenly over the hemisphere of its normal (3,)."""
-    i = np.arange(_DIRECTIONS)
-    height = _GRAZING + (1 - _GRAZING) * (i + 0.5) / _DIRECTIONS
-    angle, radius = i * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - height**2)
-    x, y = _frames(normal[None])[0]
-    local = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
-    return local @ np.stack([x, y, normal])
+    return sphere(_DIRECTIONS, _GRAZING) @ np.stack([*perpendicular(normal), normal])
 
 
 def fit_harmonics(to_viewer: np.ndarray, colors: np.ndarray) -> np.ndarray:

@@ -10,7 +10,9 @@ from fidsplat.cameras import Camera, Motion, look_at_matrix
 from fidsplat.cameras.lenses import Orthographic
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.environment import ExternalDepth
+from fidsplat.render.irradiance import neighbours
 from fidsplat.scenes.lights import Light, PointLight, SpotLight, Sun
+from fidsplat.util.directions import disk, perpendicular, unit
 
 if TYPE_CHECKING:
     from fidsplat.render.resident import ResidentCloud
@@ -65,20 +67,17 @@ def light_points(light: Light, middle: np.ndarray) -> list[LightPoint]:
     """Points of the disk that a light shows at a place (3,)."""
     size = light.angle if isinstance(light, Sun) else getattr(light, "radius", 0.0)
     count = light.samples if size > 0 else 1
-    i = np.arange(count)
-    radius, angle = np.sqrt((i + 0.5) / count) * (count > 1), i * np.pi * (3 - np.sqrt(5))
-    share = np.full(count, 1 / count)
-    disk = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    share, places = np.full(count, 1 / count), disk(count) * (count > 1)
     if isinstance(light, Sun):
         axis = unit(np.array(light.direction))
-        sine = np.sin(size / 2) * radius
-        cosine = np.sqrt(1 - sine**2)
-        places = cosine[:, None] * axis + np.sin(size / 2) * (disk @ _across(axis))
+        across = np.sin(size / 2) * (places @ perpendicular(axis))
+        cosine = np.sqrt(1 - (across**2).sum(axis=1))
+        places = cosine[:, None] * axis + across
         share = share / cosine  # a surface that faces the sun receives its intensity
     else:
         assert isinstance(light, PointLight)
         center = np.array(light.position)
-        places = center + size * (disk @ _across(unit(center - middle)))
+        places = center + size * (places @ perpendicular(unit(center - middle)))
     return [LightPoint(light, *pair) for pair in zip(places, share, strict=True)]
 
 
@@ -117,12 +116,14 @@ def _camera(point: LightPoint, points: np.ndarray, pitch: float, extent: float) 
     inner = int(np.clip(np.ceil(2 * reach / pitch), 8, MAX_PIXELS))
     side = inner + 2 * _MARGIN
     if isinstance(point.light, Sun):
-        pose = look_at_matrix(middle - (extent + 2 * reach) * point.place, middle, _across(point.place)[0])
+        pose = look_at_matrix(
+            middle - (extent + 2 * reach) * point.place, middle, perpendicular(point.place)[0]
+        )
         return Camera.orthographic(side, side, 2 * reach * side / inner, pose, near=1e-6)
     away = float(np.linalg.norm(middle - point.place))
     tangent = min(reach / np.sqrt(max(away**2 - reach**2, 1e-12)), _WIDEST)
     focal = inner / (2 * tangent)
-    pose = look_at_matrix(point.place, middle, _across(unit(middle - point.place))[0])
+    pose = look_at_matrix(point.place, middle, perpendicular(unit(middle - point.place))[0])
     return Camera.pinhole(side, side, focal, focal, side / 2, side / 2, pose, near=min(1e-3, away / 10))
 
 
@@ -163,20 +164,5 @@ def _bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     height, width = image.shape
     inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)  # NaN is outside
     x, y = np.clip(np.where(inside.reshape(-1, 1), pixels, 0) - 0.5, 0, (width - 1, height - 1)).T
-    left, top = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
-    right, below = x - left, y - top
-    upper = image[top, left] * (1 - right) + image[top, left + 1] * right
-    lower = image[top + 1, left] * (1 - right) + image[top + 1, left + 1] * right
-    return np.where(inside, upper * (1 - below) + lower * below, 1.0)
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) of length 1; (0, 0, 1) for those of length 0."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(length > 0, vectors / np.where(length > 0, length, 1), (0.0, 0.0, 1.0))
-
-
-def _across(axis: np.ndarray) -> np.ndarray:
-    """Two unit vectors (2, 3) perpendicular to an axis (3,) and to each other."""
-    first = unit(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]))
-    return np.stack([first, np.cross(axis, first)])
+    padded = np.pad(image, ((0, 1), (0, 1)))
+    return np.where(inside, sum(share * padded[cell] for cell, share in neighbours(x, y)), 1.0)

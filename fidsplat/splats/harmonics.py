@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from fidsplat.util.directions import sphere
 from fidsplat.util.errors import InputError
 
 C0 = 0.28209479177387814
@@ -94,19 +95,10 @@ def color_range(colors: np.ndarray | None, sh: np.ndarray | None) -> tuple[float
     return 0.0, float(highest[np.isfinite(highest)].max(initial=0.0))
 
 
-def _sample_directions() -> np.ndarray:
-    """32 unit directions of a Fibonacci lattice, on which every band is well conditioned."""
-    i = np.arange(32)
-    z = 1 - (2 * i + 1) / 32
-    angle = i * np.pi * (3 - np.sqrt(5))
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
-
-
 def rotation_of_coefficients(degree: int, rotation: np.ndarray) -> np.ndarray:
     """Matrix D (k, k) float64 that rotates SH coefficients by R (3, 3): basis(R d) D f = basis(d) f. It is
     block diagonal; each band is solved for on fixed directions."""
-    dirs = _sample_directions()
+    dirs = sphere(32)  # every band is well conditioned on these
     before, after = sh_basis(degree, dirs), sh_basis(degree, dirs @ np.asarray(rotation, np.float64).T)
     result = np.zeros((before.shape[1],) * 2)
     for band in range(degree + 1):

@@ -186,7 +186,7 @@ def test_shapes_in_scene_files(tmp_path):
         read = fs.Scene.load(tmp_path / "scene.toml").markers[0].marker
         assert read.shape == shape
         assert np.array_equal(read.cloud.means, scene.markers[0].marker.cloud.means)
-    assert fs.marker(SPEC, SIZE, shape="cylinder,radius=0.05,axis=x").shape == Cylinder(0.05, "x")
+    assert fs.marker(SPEC, SIZE, shape="cylinder,radius=0.05,axis=x").shape == Cylinder(0.05, axis="x")
 
 
 @pytest.mark.parametrize(
