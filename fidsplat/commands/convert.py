@@ -69,7 +69,7 @@ class Convert:
     def run(self) -> int:
         import fidsplat as fs
         from fidsplat.formats import losses, save_splats
-        from fidsplat.formats.files import check_writable
+        from fidsplat.formats.files import check_writable, stored_bytes
         from fidsplat.formats.sog_streamed import META
         from fidsplat.formats.spz import save_spz
         from fidsplat.store.layout import SUFFIX
@@ -92,7 +92,7 @@ class Convert:
             save_spz(cloud, target, self.spz_version)
         else:
             save_splats(cloud, self.target)
-        sizes = [Path(name).stat().st_size for name in (self.source, self.target)]
+        sizes = [stored_bytes(name) for name in (self.source, self.target)]
         facts: dict[str, Any] = {"source": self.source, "target": self.target, "format": known.name}
         facts |= {"splats": len(cloud), "bytes": sizes, "lost": lost, "error": None}
         if not self.no_images and len(cloud):

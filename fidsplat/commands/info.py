@@ -33,6 +33,7 @@ class Info:
     def run(self) -> int:
         import fidsplat as fs
         from fidsplat.commands.store import report_store
+        from fidsplat.formats.files import stored_bytes
         from fidsplat.splats.statistics import describe
         from fidsplat.store.layout import SUFFIX
 
@@ -40,7 +41,7 @@ class Info:
             return report_store(self.file, self.json)
         with delayed_progress() as progress:
             cloud = fs.load_splats(self.file, progress)
-        facts = {"file": self.file, "bytes": Path(self.file).stat().st_size, **describe(cloud)}
+        facts = {"file": self.file, "bytes": stored_bytes(self.file), **describe(cloud)}
         return report(self.json, facts, table=(self.file, ("", ""), _rows(facts)))
 
 

@@ -88,7 +88,9 @@ class Marker:
     """Make a marker of splats; -o writes it as a PLY file, --at-pixel places it on a surface of a scene.
 
     SPEC is one of
-      apriltag:FAMILY:ID   16h5, 25h9, 36h10, 36h11         apriltag:36h11:5
+      apriltag:FAMILY:ID   16h5, 25h9, 36h10, 36h11,        apriltag:36h11:5
+                           standard41h12, standard52h13,
+                           circle21h7, circle49h12, custom48h12
       aruco:FAMILY:ID      4x4_50 ... original, mip_36h12   aruco:4x4_50:7
       qr:TEXT              the smallest code that fits      qr:https://example.org
       qr-vN-L:TEXT         version N, error level L M Q H   qr-v22-L:TEXT

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,6 +69,18 @@ NAMED = {
     META: Format("streamed SOG", load_streamed, None),
 }
 """formats by file name"""
+
+
+def stored_bytes(path: str | os.PathLike[str]) -> int:
+    """Size of a splat file, in bytes, with the files that a JSON file (SOG, glTF) names."""
+    path = Path(path)
+    size = path.stat().st_size
+    if path.suffix.lower() in (".json", ".gltf"):
+        named = {
+            path.parent / name for name in re.findall(r'"([^"\n]{1,200}\.\w{2,4})"', path.read_text("utf-8"))
+        }
+        size += sum(stored_bytes(file) for file in named - {path} if file.is_file())
+    return size
 
 
 def format_of(path: str | os.PathLike[str]) -> Format:

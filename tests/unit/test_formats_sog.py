@@ -10,6 +10,7 @@ import pytest
 from test_formats import some
 
 import fidsplat as fs
+from fidsplat.formats.files import stored_bytes
 from fidsplat.formats.sog import _clustered
 
 
@@ -149,6 +150,7 @@ def test_sog_files_that_are_written(tmp_path, name):
     np.testing.assert_allclose(again.opacities, cloud.opacities, atol=0.002)
     np.testing.assert_allclose(again.sh, cloud.sh, atol=0.03)
     assert np.abs((again.quats * cloud.quats).sum(1)).min() > 1 - 1e-4
+    assert stored_bytes(tmp_path / name) == sum(file.stat().st_size for file in tmp_path.iterdir())
     written = (tmp_path / name).read_bytes()
     fs.save_splats(cloud, tmp_path / name)
     assert (tmp_path / name).read_bytes() == written
