@@ -1,13 +1,19 @@
 """PoCL links kernels without a linker of the system, and does not leak programs."""
 
+import math
 import os
 import subprocess
 import sys
 import warnings
 
+import numpy as np
+import pyopencl as cl
 import pytest
 
+import fidsplat as fs
 from fidsplat.backends.opencl.pocl_workarounds import linker, target_patch
+from fidsplat.backends.opencl.pocl_workarounds.declarations import declared
+from fidsplat.backends.opencl.program import build
 
 RENDER = """
 import sys
@@ -76,6 +82,29 @@ def test_the_patch_is_announced_once(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         target_patch.announce_once(tmp_path, "patched")
+
+
+def test_programs_are_built_with_the_declarations_that_they_need():
+    """A name that a macro puts together needs all of PoCL's."""
+    renderer = fs.Renderer("opencl:pocl")
+    backend, values = renderer.backend, np.linspace(0.5, 3.5, 8, dtype=np.float32)
+    for expression, few in (
+        ("tgamma(a[0]), a[1], (float)convert_int8_rtn(vload8(0, a)).s7", True),
+        ("PASTE(tga, mma)(a[0]), a[1], 3", False),
+    ):
+        text = f"kernel void f(global float *a) {{ vstore3((float3)({expression}), 0, a); }}"
+        text = f"#define PASTE(a, b) a##b\n{text}"
+        short = declared(text, backend.device.platform.version)
+        assert (short.count("tgamma(") > 1) == few
+        assert len(short) < 250_000
+        out = cl.Buffer(backend.context, cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR, hostbuf=values)
+        build(backend, text).f(backend.queue, (1,), None, out)
+        found = np.empty(3, np.float32)
+        cl.enqueue_copy(backend.queue, found, out)
+        np.testing.assert_allclose(found, [math.gamma(values[0]), values[1], 3], rtol=1e-6)
+    with pytest.raises(fs.DeviceError, match="no_such_name"):
+        build(backend, "kernel void g(global float *a) { a[0] = no_such_name(a[0]); }")
+    assert declared(text, "OpenCL 3.0 PoCL 5.0") is None
 
 
 LEAK = """

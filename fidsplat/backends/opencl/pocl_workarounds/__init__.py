@@ -1,8 +1,11 @@
 """Workarounds for faults of PoCL; README.md says which versions need which."""
 
+from contextlib import suppress
 from functools import cache
 
 import pyopencl as cl
+
+from fidsplat.backends.opencl.pocl_workarounds.declarations import OPTION, declared
 
 
 def is_pocl(device: cl.Device) -> bool:
@@ -23,4 +26,8 @@ def shared_context(device: cl.Device) -> cl.Context:
 @cache
 def shared_program(context: cl.Context, text: str, options: tuple[str, ...]) -> cl.Program:
     """The program of a text compiled with these options, in this call or an earlier one."""
+    short = declared(text, context.devices[0].platform.version)
+    if short is not None:
+        with suppress(cl.RuntimeError):  # the text calls what the header does not declare, or is wrong
+            return cl.Program(context, short).build(options=[*options, OPTION])
     return cl.Program(context, text).build(options=list(options))

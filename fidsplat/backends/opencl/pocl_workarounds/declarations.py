@@ -1,0 +1,54 @@
+"""Declarations of OpenCL's built-in functions for PoCL 3.0: only of those that a program may call.
+
+PoCL's compiler reads 14,000 declarations with each program, in half of the time of a build.
+"""
+
+import importlib.util
+import re
+from functools import cache
+from pathlib import Path
+
+_HEADER = "pocl_binary_distribution/.libs/share/pocl/include/opencl-c.h"
+_TYPES = {sign + name for name in ("char", "short", "int", "long") for sign in ("", "u")}
+_TYPES |= {"half", "float", "double"}
+_DIGITS = dict.fromkeys(map(ord, "0123456789"))
+"""macros append the length of a vector to a name: names are compared without digits"""
+OPTION = "-D_OPENCL_H_"
+"""PoCL does not read its own declarations"""
+
+
+def declared(text: str, version: str) -> str | None:
+    """A program text after the declarations of functions whose names and types are in it, to be compiled with
+    `OPTION`. None: the header of this version of PoCL is not known."""
+    lines = _lines() if "PoCL 3.0" in version else None
+    if lines is None:
+        return None
+    words = set(re.findall(r"[a-z_]\w*", text.translate(_DIGITS)))
+    absent = _TYPES - words
+    found = (
+        line
+        for line, name in lines
+        if not name or (name in words and absent.isdisjoint(re.findall("[a-z]+", line)))
+    )
+    return "\n".join([*found, "#pragma OPENCL EXTENSION all : disable", "#line 1", text])
+
+
+@cache
+def _lines() -> list[tuple[str, str]] | None:
+    """Lines of the header; those that declare a function with its name."""
+    package = importlib.util.find_spec("pocl_binary_distribution")
+    header = Path(package.origin).parents[1] / _HEADER if package and package.origin else Path()
+    if not header.is_file():
+        return None
+    text = header.read_text("utf-8").replace("#ifndef _OPENCL_H_", "#if 1")
+    text = text.replace('"opencl-c-base.h"', f'"{header.with_name("opencl-c-base.h")}"')
+    found, lines = [], iter(text.splitlines())
+    for line in lines:
+        name = ""
+        if "__ovld" in line and line[0] != "#":
+            while ";" not in line:
+                line += " " + next(lines)
+            name = line.partition("(")[0].split()[-1].translate(_DIGITS)
+        if line and not line.startswith("//"):
+            found.append((line, name))
+    return found
