@@ -14,6 +14,7 @@ from fidsplat.cameras.screw import exponential
 from fidsplat.commands.options import Json, require_packages
 from fidsplat.commands.output import console, report
 from fidsplat.commands.scenes import RenderInput, Size
+from fidsplat.logs.robot_log import SCENE
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
@@ -38,9 +39,9 @@ class Serve(RenderInput):
     Without options, open ws://127.0.0.1:8765 in Foxglove. --ros2 publishes ROS 2 topics over DDS; ROS need
     not be installed here, and nodes on this machine need ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST. The camera
     follows --trajectory or the scene's [[camera.motion]], again and again. Otherwise it does not move, or
-    with --ros2 by /cmd_vel (Twist) and /pose (PoseStamped) of its robot. Topics: /camera/image_raw,
-    /camera/camera_info, /tf, /clock, and with --lidar /lidar/points. Frames that would be late are dropped
-    and counted. Ctrl-C ends it. Needs the extra `live`.
+    with --ros2 by /cmd_vel (Twist) and /pose (PoseStamped in the frame map, scene or base_link) of its robot.
+    Topics: /camera/image_raw, /camera/camera_info, /tf, /clock, and with --lidar /lidar/points. Frames that
+    would be late are dropped and counted. Ctrl-C ends it. Needs the extra `live`.
 
     Examples:
       fidsplat serve scene.toml
@@ -185,8 +186,11 @@ class _Driver:
         self._time = time
         for stamped in self._log.received("/pose", "geometry_msgs/msg/PoseStamped"):
             at, turn = stamped.pose.position, stamped.pose.orientation
-            with suppress(InputError):  # an invalid pose of another program must not end the server
-                self._place(rigid_matrix((at.x, at.y, at.z), (turn.w, turn.x, turn.y, turn.z)))
+            frames = {self._log.world: np.eye(4), SCENE: self._log.world_from_scene, "base_link": self._base}
+            # a wrong frame or an invalid pose of another program must not end the server
+            with suppress(InputError, KeyError):
+                frame = frames[stamped.header.frame_id or self._log.world]
+                self._place(frame @ rigid_matrix((at.x, at.y, at.z), (turn.w, turn.x, turn.y, turn.z)))
         for twist in self._log.received("/cmd_vel", "geometry_msgs/msg/Twist"):
             parts = [getattr(part, axis) for part in (twist.angular, twist.linear) for axis in "xyz"]
             self._twist, self._until = np.array(parts), time + TIMEOUT

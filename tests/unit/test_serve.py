@@ -286,8 +286,12 @@ def test_a_ros2_node_receives_and_drives(served):
     expected = fs.Renderer().render(fs.Scene.load(file), camera.with_pose(camera_to_world=nearer))["rgb"]
     np.testing.assert_allclose(pixels / 255, np.clip(expected, 0, 1), atol=0.5 / 255 + 1e-5)
 
-    for invalid in (np.nan, 1e30):  # ignored
-        place.write(PoseStamped(stamped.header, Pose(Point(invalid, 0.0, 0.0), Quaternion(*turn))))
+    for frame, x in (("map", np.nan), ("map", 1e30), ("lidar", 9.0)):  # ignored
+        place.write(PoseStamped(Header(Time(0, 0), frame), Pose(Point(x, 0.0, 0.0), Quaternion(*turn))))
+    # a step of 0.1 m forward from where it stands
+    place.write(PoseStamped(Header(Time(0, 0), "base_link"), Pose(Point(0.1, 0, 0), Quaternion(0, 0, 0, 1))))
+    here[:3, 3] += 0.1 * here[:3, 0]
+    next_of(transforms, lambda m: (b := base(m)) is not None and np.allclose(b, here, atol=1e-9))
     drive.write(Twist(Vector3(0.4, 0.0, 0.0), Vector3(0.0, 0.0, 0.2)))
     # it drives for half a second, since no other command follows: 0.2 m along an arc to the left
     arc = 0.1
