@@ -6,6 +6,7 @@ import math
 import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,8 +37,8 @@ FAR = 1e9
 class Serve(RenderInput):
     """Send live images, poses and LiDAR points of a scene as ROS 2 messages.
 
-    Without options, open ws://127.0.0.1:8765 in Foxglove. --ros2 publishes ROS 2 topics over DDS; ROS need
-    not be installed here, and nodes on this machine need ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST. The camera
+    Without options, open ws://127.0.0.1:8765 in Foxglove. --ros2 publishes ROS 2 topics, by rclpy where it is
+    installed, else by Cyclone DDS; nodes need ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST. The camera
     follows --trajectory or the scene's [[camera.motion]], again and again. Otherwise it does not move, or
     with --ros2 by /cmd_vel (Twist) and /pose (PoseStamped in the frame map, scene or base_link) of its robot.
     Topics: /camera/image_raw, /camera/camera_info, /tf, /clock, and with --lidar /lidar/points. Frames that
@@ -81,7 +82,9 @@ class Serve(RenderInput):
         self.check()
         check_rate(self.rate)
         foxglove = self.foxglove or not self.ros2
-        packages = ["rosbags", "mcap"] + ["foxglove"] * foxglove + ["cyclonedds"] * self.ros2
+        packages = ["rosbags", "mcap"] + ["foxglove"] * foxglove
+        if self.ros2 and find_spec("rclpy") is None:
+            packages.append("cyclonedds")
         require_packages("fidsplat serve", packages, "live")
         from fidsplat.logs.live import LiveLog
 

@@ -18,7 +18,7 @@ class LiveLog(RobotLog):
     manager.
 
     Clients of the server are Foxglove (app.foxglove.dev, `ws://HOST:PORT`) and programs of the protocol
-    `foxglove.sdk.v1`. ROS 2 nodes receive topics over DDS; ROS need not be installed here.
+    `foxglove.sdk.v1`. ROS 2 nodes receive topics by rclpy where it is installed, else by Cyclone DDS.
 
     Args:
         host: address to listen on; 127.0.0.1 is this machine only.
@@ -45,9 +45,7 @@ class LiveLog(RobotLog):
         self._path, self.port, self._topics = host, None, None
         self._file = _Both()
         if ros2:
-            from fidsplat.logs.ros2 import Ros2Topics
-
-            self._topics = Ros2Topics(self._store, host)
+            self._topics = _ros2_topics(self._store, host)
             self._file.append(self._topics)
         if port is not None:
             whole_number("port", port, 0, 65535)
@@ -62,6 +60,17 @@ class LiveLog(RobotLog):
         kind: type, such as geometry_msgs/msg/Twist.
         """
         return [] if self._topics is None else self._topics.received(topic, kind)
+
+
+def _ros2_topics(store: Any, host: str) -> Any:
+    """Topics by ROS, or without it where this Python has no rclpy."""
+    try:
+        from fidsplat.logs.rclpy_topics import RclpyTopics
+    except ImportError:
+        from fidsplat.logs.ros2 import Ros2Topics
+
+        return Ros2Topics(store, host)
+    return RclpyTopics(host)
 
 
 class _Both(list[LogFile]):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
+from fidsplat.logs.writers import DEPTH, DEPTHS
 from fidsplat.util.errors import InputError
 
 try:
@@ -21,9 +22,6 @@ try:
 except ImportError as error:
     raise InputError(f"ROS 2 topics need another package ({error}); pip install 'fidsplat[live]'") from None
 
-DEPTHS = {"/tf": 100, "/clock": 1}
-"""history by topic: number of messages that wait for a slow subscriber; the oldest are dropped"""
-DEPTH = 10
 BLOCKING = duration(milliseconds=100)
 """longest wait for a subscriber; then a message is dropped"""
 _LOCAL = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="{host}"/></Interfaces>

@@ -44,6 +44,11 @@ def typestore() -> Any:
     return store
 
 
+DEPTHS = {"/tf": 100, "/clock": 1}
+"""history by topic: number of messages that wait for a slow subscriber; the oldest are dropped"""
+DEPTH = 10
+
+
 class LogFile(Protocol):
     """Writer of messages; the log appears when it is closed."""
 

@@ -270,15 +270,15 @@ class _Request:
 
         ranges = of_rays(images["distance_first"])
         rgb = of_rays(images["rgb"]) / np.maximum(of_rays(images["alpha"]), 1e-6)[..., None]
-        reflectivity = to_light(np.clip(rgb, 0, 1), "srgb") @ LUMINANCE
-        rays = {"range": ranges.astype(np.float64)}
+        reflectivity = to_light(np.minimum(rgb, 1), "srgb", np.float32) @ LUMINANCE.astype(np.float32)
+        rays = {"range": ranges}
         if "label" in images:
             rays["label"] = of_rays(images["label"])
             for label, value in lidar.reflectivity.items():
                 reflectivity[rays["label"] == label] = value
         directions = of_rays(camera.lens.directions)  # type: ignore[union-attr]
         incidence = np.abs(np.einsum("brk,brk->br", directions, of_rays(images["normal"])))
-        rays["intensity"] = np.where(ranges > 0, reflectivity * incidence, 0.0)
+        rays["intensity"] = reflectivity * incidence * (ranges > 0)
         found = _returns(rays, lidar)
         _measure(found, lidar, np.random.default_rng((lidar.seed, number_of_scan)))
         bands = capture.shutter.bands(camera.height)

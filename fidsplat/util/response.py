@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 
-def to_light(colors: np.ndarray, response: str | float) -> np.ndarray:
-    """Linear light of colours; the curve of sRGB continues above 1."""
-    colors = np.maximum(np.asarray(colors, np.float64), 0)
+def to_light(colors: np.ndarray, response: str | float, dtype: type = np.float64) -> np.ndarray:
+    """Linear light of colours, computed as `dtype`; the curve of sRGB continues above 1."""
+    colors = np.maximum(np.asarray(colors, dtype), 0)
     if response == "linear":
         return colors
     if response == "srgb":

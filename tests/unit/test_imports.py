@@ -74,6 +74,7 @@ HOME_OF = {
     "mcap": ("logs",),
     "foxglove": ("logs.live",),
     "cyclonedds": ("logs.ros2",),
+    "rclpy": ("logs.rclpy_topics",),
     "rosbags": ("logs",),
     "pandas": ("experiments",),
     "matplotlib": ("experiments.charts",),
