@@ -23,7 +23,7 @@ for topic, kind in (("/camera/image_raw", Image), ("/lidar/points", PointCloud2)
 wheel = node.create_publisher(Twist, "/cmd_vel", 10)
 drive = Twist()
 drive.linear.x = 0.3
-end = time.monotonic() + 60
+end = time.monotonic() + 40
 while time.monotonic() < end and min(map(len, received.values()), default=0) < 5:
     wheel.publish(drive)
     rclpy.spin_once(node, timeout_sec=0.1)

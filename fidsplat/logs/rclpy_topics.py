@@ -49,7 +49,9 @@ class RclpyTopics:
     def received(self, topic: str, kind: str) -> list[Any]:
         """Messages of a topic since the last call, oldest first; the first call subscribes to it."""
         if topic not in self._received:
-            self._node.create_subscription(_class(kind), topic, self._received[topic].append, DEPTH)
+            messages = self._received[topic]
+            # a function of Python, whose signature rclpy reads
+            self._node.create_subscription(_class(kind), topic, lambda one: messages.append(one), DEPTH)
         for _ in range(DEPTH):
             self._executor.spin_once(timeout_sec=0)
         found = list(self._received[topic])

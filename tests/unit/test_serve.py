@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -303,6 +304,31 @@ def test_a_ros2_node_receives_and_drives(served):
     time.sleep(0.2)
     np.testing.assert_allclose(base(next_of(transforms, lambda m: base(m) is not None)), after, atol=1e-6)
     del images, transforms, clocks, drive, place, node, domain
+
+
+RCLPY = os.environ.get("FIDSPLAT_RCLPY", "")
+"""a Python with rclpy and fidsplat[live]: see examples/ros2_node.py"""
+
+
+@pytest.mark.skipif(not RCLPY, reason="FIDSPLAT_RCLPY must name a Python with rclpy")
+@pytest.mark.parametrize("publisher", [sys.executable, RCLPY], ids=["cyclonedds", "rclpy"])
+def test_a_node_of_ros_itself_receives_and_drives(tmp_path, publisher):
+    """The example, in ROS's own middleware, with topics of Cyclone DDS and of rclpy."""
+    root = Path(__file__).resolve().parents[2]
+    (tmp_path / "scene.toml").write_text(SCENE)
+    domain = str(201 + (publisher == RCLPY))
+    environment = os.environ | {"ROS_DOMAIN_ID": domain, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    options = ("--ros2", "--lidar", "vlp-16", "--rate", "10")
+    command = [publisher, "-m", "fidsplat", "serve", str(tmp_path / "scene.toml"), *options]
+    with subprocess.Popen(command, env=environment | {"PYTHONPATH": str(root)}) as server:
+        try:
+            node = [RCLPY, str(root / "examples" / "ros2_node.py")]
+            said = subprocess.run(node, env=environment, capture_output=True, text=True, check=True).stdout
+        finally:
+            server.terminate()
+    assert "/camera/image_raw: 5 messages, 64 x 48, frame camera_optical_frame" in said
+    assert "/lidar/points: 5 messages" in said
+    assert "the image changes as the robot drives" in said
 
 
 def test_late_steps_are_dropped_and_counted(monkeypatch):
