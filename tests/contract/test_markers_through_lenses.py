@@ -13,6 +13,7 @@ from fidsplat.vision.detect import detect
 from fidsplat.vision.pose import marker_pose, pose_error
 from fidsplat.vision.undistort import undistort
 
+BACKEND = "opencl"
 pytestmark = pytest.mark.usefixtures("optimised")
 SIZE, SPEC = 0.4, "apriltag:36h11:5"
 DENSE = fs.Quality(lowpass="none", samples=2)

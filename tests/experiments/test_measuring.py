@@ -14,6 +14,7 @@ from fidsplat.markers import marker
 from fidsplat.vision.metrics import psnr
 
 pytestmark = pytest.mark.usefixtures("optimised")
+BACKEND = "opencl"
 CEILING = MarkerRenderer(None)
 
 
