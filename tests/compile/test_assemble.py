@@ -16,7 +16,6 @@ from fidsplat.backends.opencl.effect_layouts import LAYOUTS
 from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
 from fidsplat.capture.quality import ELLIPSOID
 from fidsplat.effects import OUTPUTS, select
-from fidsplat.util.files import kernels_folder
 
 BACKEND = "opencl"
 
@@ -48,32 +47,6 @@ def record_bytes(features):
     return assemble(features, SHAPE).records["Splat"].itemsize
 
 
-def test_base_text_names_no_other_effect():
-    text = assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE).text
-    assert "//" not in text
-    parts = {path.stem for path in (kernels_folder() / "opencl/part").glob("*.cl")}
-    absent = (parts | set(LAYOUTS)) - {
-        "camera_pinhole",
-        "conic",
-        "perspective",
-        "resolve_fused",
-        "resolve_pixel",
-        "blend_float",
-        "tile_loop_lanes",
-        "color_rgb",
-        "lowpass_none",
-        "stop_inclusive",
-        "compose_ordered",
-        "footprint_gaussian",
-        "arithmetic_fast",
-    }
-    of_quality = ("wide", "WIDE")
-    of_layers = ("coplanar_groups", "layers", "Layer", "Layers", "pass_finish", "optical_depth")
-    of_order = (*of_layers, "k_buffer", "KBuffer", "K_BUFFER_SIZE", "nearest")
-    for name in (*absent, *FURTHER, "sh", "finished", *of_order, *of_quality):
-        assert not re.search(rf"\b{name}(_|\b)", text), name
-
-
 @pytest.mark.parametrize("output", FURTHER)
 def test_an_output_adds_its_own_text_only(output):
     base = assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE)
@@ -94,27 +67,6 @@ def test_an_output_adds_its_own_text_only(output):
         if not any(other.startswith(own) or own.startswith(other) for own in needed)
     ]
     assert not any(re.search(rf"\b{other}_(out|raw)", with_output.text) for other in others)
-
-
-@pytest.mark.parametrize("outputs", [("rgb",), tuple(FURTHER)])
-def test_only_coplanar_groups_add_layers(outputs):
-    """Sections of outputs for layers are absent too; layers add the fragment depth that they require."""
-    words = ("Layer", "layer_close", "layer_add", "pass_finish", "label_tau", "share")
-    plain = assemble(select(COLORS, fs.Capture(outputs=outputs, quality=PLAIN)), SHAPE).text
-    layered = assemble(
-        select(Traits(has_coplanar_groups=True), fs.Capture(outputs=outputs, quality=PLAIN)), SHAPE
-    ).text
-    in_order = assemble(
-        select(
-            Traits(has_coplanar_groups=True), fs.Capture(outputs=outputs, quality=PLAIN.with_(order="centre"))
-        ),
-        SHAPE,
-    ).text
-    for word in words:
-        assert not re.search(rf"\b{word}\b", plain), word
-        assert re.search(rf"\b{word}\b", layered) or (word == "label_tau" and "label" not in outputs), word
-    assert in_order == plain
-    assert layered.count("float z_numerator;") == 1
 
 
 def test_only_a_scene_of_both_footprints_selects_per_splat():
@@ -174,6 +126,14 @@ def test_a_section_of_an_unknown_hook_is_refused(monkeypatch):
     monkeypatch.setattr(assembly, "sections_of", lambda path: {"no_such_hook": [(1, ("x",))]})
     with pytest.raises(fs.DeviceError, match="no_such_hook"):
         assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE)
+
+
+def test_order_by_centres_has_no_layers():
+    layered = Traits(has_coplanar_groups=True)
+    in_order = fs.Capture(outputs=tuple(FURTHER), quality=PLAIN.with_(order="centre"))
+    plain = fs.Capture(outputs=tuple(FURTHER), quality=PLAIN)
+    texts = [assemble(select(*each), SHAPE).text for each in ((layered, in_order), (COLORS, plain))]
+    assert texts[0] == texts[1] != assemble(select(layered, plain), SHAPE).text
 
 
 def test_text_does_not_depend_on_numbers():

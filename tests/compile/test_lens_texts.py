@@ -1,7 +1,5 @@
 """Only frames that request a lens or shutter have its kernel code."""
 
-import re
-
 import numpy as np
 import pytest
 from agreement import random_splats
@@ -60,22 +58,6 @@ def test_values_without_effect_select_nothing(renderer):
     renderer.render(cloud, nothing, quality=PLAIN, shutter=fs.Shutter(exposure_time=0.1, readout=0.2))
     added = set(renderer.backend._pipelines) - before
     assert not any("shutter" in slot or "motion" in slot for features, _ in added for slot in features.slots)
-
-
-@pytest.mark.parametrize("kind", CAMERAS)
-def test_a_lens_adds_its_own_text_only(kind):
-    text = assemble(select(COLORS, fs.Capture(CAMERAS[kind], quality=PLAIN)), SHAPE).text
-    words = {
-        "brown_conrady": ("lens_fold",),
-        "fisheye": ("chart_box", "lens_limit"),
-        "equirectangular": ("cone_bounds",),
-        "orthographic": ("z_near",),
-    }
-    for other, theirs in words.items():
-        for word in theirs:
-            assert bool(re.search(rf"\b{word}\b", text)) == (other == kind), word
-    assert bool(re.search(r"\brays\b", text)) == (kind not in ("pinhole", "orthographic"))
-    assert not re.search(r"\b(expose|moving)\b", text)
 
 
 def test_record_sizes_of_lenses():

@@ -36,6 +36,7 @@ from fidsplat.vision.detect import detect
 
 COUNT = int(os.environ.get("FIDSPLAT_HOSTILE", "0"))
 """examples of each kind; 0: a few, the same in every run"""
+AWAY = np.eye(4) + 4.5e6 * np.eye(4, k=3)
 CAMERA = fs.Camera.look_at(24, 16, 1.0, (0.0, 0.0, -9.0), (0.0, 0.0, 0.0))
 
 
@@ -64,6 +65,21 @@ def splats(suffix):
         fs.save_splats(cloud(), folder / f"a{suffix}")
 
     return make
+
+
+def marked(folder):
+    """Labels, coplanar groups and an origin."""
+    groups = np.arange(12) % 4 - 1
+    moved = cloud().with_labels(np.arange(12) - 3).with_coplanar_groups(groups).transformed(AWAY)
+    fs.save_ply(moved, folder / "a.ply", native_2dgs=True)
+
+
+def trained(folder):
+    """A 3DGS file of SH degree 3, as from training: three scales."""
+    r, two = np.random.default_rng(3), cloud()
+    scales = r.uniform(0.1, 1, (12, 3))
+    thick = fs.SplatCloud(two.means, two.quats, scales, two.opacities, sh=r.normal(size=(12, 16, 3)))
+    fs.save_ply(thick, folder / "a.ply", native_2dgs=False)
 
 
 def splats_folder(folder):
@@ -263,8 +279,22 @@ def render(made):
         RENDERER.render(made, CAMERA, ["rgb", "depth"])
 
 
+def assert_valid(made):
+    """All splats of a loaded cloud can be rendered; those that could not were left out."""
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        array = getattr(made, name)
+        assert len(array) == len(made) == len(made.labels)
+        assert np.isfinite(array).all(), name
+    assert (made.scales > 0).all()
+    assert ((made.opacities >= 0) & (made.opacities <= 1)).all()
+    np.testing.assert_allclose((made.quats.astype(float) ** 2).sum(1), 1, atol=1e-6)
+    assert made.coplanar_groups is None or (made.coplanar_groups >= -1).all()
+    assert np.isfinite(made.origin).all()
+
+
 def use_splats(file):
     made = fs.load_splats(file)
+    assert_valid(made)
     render(made)
     fs.save_ply(made, file.with_name("again.ply"))
 
@@ -351,7 +381,10 @@ def signed(folder):
 
 
 INPUTS = {
-    ".ply": (splats(".ply"), use_splats, "a.ply", 40),
+    ".ply": (splats(".ply"), use_splats, "a.ply", 100),
+    ".ply with labels, groups and an origin": (marked, use_splats, "a.ply", 100),
+    ".ply of 3DGS": (trained, use_splats, "a.ply", 100),
+    ".compressed.ply": (splats(".compressed.ply"), use_splats, "a.compressed.ply", 100),
     ".splat": (splats(".splat"), use_splats, "a.splat", 20),
     ".spz": (splats(".spz"), use_splats, "a.spz", 40),
     "SPZ 3": (lambda folder: save_spz(cloud(), folder / "a.spz", version=3), use_splats, "a.spz", 20),

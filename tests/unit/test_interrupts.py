@@ -1,6 +1,5 @@
 """Signals and full disks: the short form of tools/interrupt.py."""
 
-import json
 import os
 import shutil
 import signal
@@ -186,47 +185,3 @@ def test_damage_is_found(trial):
         f"{images[0]} differs",
         f"{images[-1]} is incomplete",
     ]
-
-
-def test_logs_and_figures_are_compared_by_value(tmp_path):
-    log = tmp_path / "rows.jsonl"
-    log.write_text('{"run": {}}\n{"key": {"n": 1}, "result": {"a": [1, 2]}}\n{"key": {')
-    assert interrupt.facts(log) == {('{"n": 1}', "a", 0): 1, ('{"n": 1}', "a", 1): 2}
-    log.write_text('{"key": {"n": 1\n{"key": {"n": 2}, "result": {}}\n')
-    with pytest.raises(json.JSONDecodeError):
-        interrupt.facts(log)
-    figures = tmp_path / "figures.json"
-    figures.write_text('{"a": {"b": 1}}\n')
-    assert interrupt.facts(figures) == {("a", "b"): 1}
-    figures.write_text('{"a": ')
-    with pytest.raises(json.JSONDecodeError):
-        interrupt.facts(figures)
-
-
-def test_charts_of_times_must_only_be_complete(tmp_path):
-    chart = tmp_path / "seconds.svg"
-    chart.write_text("<svg>\n</svg>\n")
-    assert interrupt.facts(chart) == {}
-    chart.write_text("<svg>\n</sv")
-    with pytest.raises(ValueError, match="truncated"):
-        interrupt.facts(chart)
-
-
-def test_clear_ends_of_a_run():
-    assert interrupt.is_clear(0, "")
-    assert interrupt.is_clear(143, "half of a bar\nfidsplat: terminated")
-    assert interrupt.is_clear(-2, "Traceback ...\n  File site.py, line 3, in getpath\nKeyboardInterrupt")
-    assert not interrupt.is_clear(-2, "Traceback ...\n  File cli.py, line 3, in main\nKeyboardInterrupt")
-    assert not interrupt.is_clear(143, "fidsplat: terminated\nException ignored in\nTraceback")
-    assert not interrupt.is_clear(1, "OSError: [Errno 28]")
-    assert not interrupt.is_clear(
-        1, "fidsplat: OSError: [Errno 28] (a fault of fidsplat; --debug shows where)"
-    )
-
-
-def test_the_plan_of_trials_is_deterministic():
-    plans = {name: interrupt.planned(name, 0) for name in interrupt.COMMANDS}
-    assert plans == {name: interrupt.planned(name, 0) for name in interrupt.COMMANDS}
-    kills = {name: sum(how != interrupt.DISK for how, _ in plan.values()) for name, plan in plans.items()}
-    assert all(kills[name] > 50 for name in ("render", "demo", "tradeoff", "experiment"))
-    assert sum(map(len, plans.values())) > 300
