@@ -2,7 +2,9 @@
 
 import math
 import random
+import signal
 
+import hypothesis
 import pytest
 import sampling
 from rich.progress import Progress
@@ -10,6 +12,9 @@ from rich.progress import Progress
 import fidsplat as fs
 
 pytest_plugins = ["certificates", "optimisation"]
+# other processes make an example slow, not the code
+hypothesis.settings.register_profile("tests", deadline=None)
+hypothesis.settings.load_profile("tests")
 
 USABLE = [info for info in fs.devices() if info.usable and info.name != "reference"]
 
@@ -29,6 +34,8 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells start processes in the background
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     if hasattr(config, "workerinput"):
         config.option.turn = config.workerinput["turn"]
     elif config.option.turn is None:

@@ -113,7 +113,7 @@ def splats(n, seed=0, thin=1e-5):
 @given(
     seed=st.integers(0, 2**32 - 1), n=st.sampled_from([1, 2, 255, 256, 257, 600]), degree=st.integers(0, 3)
 )
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_round_trip_within_the_packing_steps(tmp_path, seed, n, degree):
     true = splats(n, seed)
     rest = np.random.default_rng(seed).uniform(-4, 4, (n, 3 * ((degree + 1) ** 2 - 1))) if degree else None

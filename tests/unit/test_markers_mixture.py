@@ -195,7 +195,7 @@ def grown_by_definition(grid: np.ndarray, box: list[int], growth: float) -> list
     return grown
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.integers(0, 1)),
     st.sampled_from([0.0, 0.4, 1.0]),

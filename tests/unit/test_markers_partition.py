@@ -123,7 +123,7 @@ def fewest_rectangles(cells: frozenset) -> int:
     return fewest(cells)
 
 
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=250)
 @given(SMALL)
 @example(CHECKERBOARD)
 @example(PLUS)
@@ -137,7 +137,7 @@ def test_small_grids_are_exact_and_match_the_formula(grid):
     check_formula(grid, boxes)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(arrays(np.uint8, st.tuples(st.integers(2, 5), st.integers(2, 5)), elements=st.integers(0, 1)))
 @example(PLUS)
 @example(TOUCHING)
@@ -150,7 +150,7 @@ def test_no_partition_has_fewer_rectangles(grid):
         assert found[i] == fewest_rectangles(cells)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(SMALL)
 @example(CHECKERBOARD)
 @example(TOUCHING)

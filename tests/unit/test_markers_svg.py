@@ -87,7 +87,7 @@ def test_gaussians_stay_within_their_colour(tmp_path):
         assert shapely.distance(region, shapely.points(x[own], y[own])).max() < 0.05
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.tuples(st.floats(-3, 15), st.floats(-3, 15)), min_size=3, max_size=8), st.booleans())
 def test_what_rings_enclose(points, evenodd):
     """Against the winding number as the sum over triangles from one corner to each edge."""

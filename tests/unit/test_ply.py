@@ -84,7 +84,7 @@ def test_round_trip(tmp_path, degree, native):
     origin=st.none() | st.tuples(*[st.floats(-1e8, 1e8)] * 3),
     opacity=st.floats(0, 1, width=32),
 )
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_round_trip_of_anything(tmp_path, seed, n, degree, native, labels, origin, opacity):
     cloud = cloud_of(n, degree, seed, labels=labels, origin=origin, opacities=np.full(n, opacity, F32))
     fs.save_ply(cloud, tmp_path / "a.ply", native_2dgs=native)

@@ -210,7 +210,7 @@ def test_a_placed_markers_cloud_is_its_own():
     quality=st.sampled_from([None, "fast", "gsplat", fs.Quality.named("surfel").with_(samples=3)]),
     origin=st.sampled_from([None, (5e5, 4.5e6, 300.0)]),
 )
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_saving_and_loading(tmp_path, seed, turn, move, size, text, quality, origin):
     pose = rigid_matrix(move, turn)
     camera = fs.Camera.pinhole(33, 77, 50.1, 60.2, 1 / 3, 40.0, np.linalg.inv(pose), near=0.3)

@@ -77,7 +77,7 @@ def test_an_origin_is_scaled_rotated_and_moved():
 
 
 @given(quaternion, vector, st.floats(0.01, 100))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_transform_moves_centres_and_covariances(turn, move, scale):
     matrix = rigid_matrix(move, turn, scale)
     before = cloud_of()
@@ -93,7 +93,7 @@ def test_transform_moves_centres_and_covariances(turn, move, scale):
 
 
 @given(quaternion, vector, st.floats(0.1, 10), vector, st.integers(0, 3))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_transform_rotates_the_colours_with_the_splats(turn, move, scale, eye, degree):
     matrix = rigid_matrix(move, turn, scale)
     before = cloud_of(degree=degree)
