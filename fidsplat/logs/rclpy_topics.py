@@ -8,9 +8,9 @@ from collections import defaultdict, deque
 from importlib import import_module
 from typing import Any
 
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import QoSProfile
+import rclpy  # type: ignore[import-not-found]
+from rclpy.executors import SingleThreadedExecutor  # type: ignore[import-not-found]
+from rclpy.qos import QoSProfile  # type: ignore[import-not-found]
 
 from fidsplat.logs.writers import DEPTH, DEPTHS
 from fidsplat.util.errors import InputError

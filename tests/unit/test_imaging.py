@@ -195,9 +195,7 @@ def test_a_scene_file_keeps_the_low_pass_and_the_first_hit(tmp_path):
     assert fs.Scene.load(tmp_path / "a.toml").quality == quality
     text = (tmp_path / "a.toml").read_text()
     (tmp_path / "a.toml").write_text(text.replace('"pixel"', '"pixels"'))
-    with pytest.raises(
-        fs.InputError, match=r"render.lowpass: quality: lowpass must be one of .*got 'pixels'"
-    ):
+    with pytest.raises(fs.InputError, match=r"a\.toml: quality: lowpass must be one of .*got 'pixels'"):
         fs.Scene.load(tmp_path / "a.toml")
 
 
