@@ -329,9 +329,10 @@ class Suite:
 
     def save(self) -> None:
         """Write the file, with a line for each result."""
+        compact = partial(json.dumps, allow_nan=False, separators=(",", ":"))
         facts = {name: value for name, value in self.found.items() if name != "results"}
-        lines = ",\n".join(json.dumps(one, allow_nan=False) for one in self.found["results"])
-        text = f'{json.dumps(facts, allow_nan=False)[:-1]}, "results": [\n{lines}\n]}}\n'
+        lines = ",\n".join(compact(one) for one in self.found["results"])
+        text = f'{compact(facts)[:-1]},"results":[\n{lines}\n]}}\n'
         with interrupts.postponed(), atomic_write(self._file) as stream:
             stream.write(text.encode())
 
