@@ -149,7 +149,7 @@ def certain_loss(cloud: SplatCloud, capture: Capture) -> dict[str, np.ndarray]:
 def conditioning(
     cloud: SplatCloud, capture: Capture, by_images: Mapping[str, np.ndarray]
 ) -> list[Difference]:
-    """Largest change, to first order, of the reference's derivatives if each number of means and quaternions
+    """Estimate of the largest change of the reference's derivatives if each number of means and quaternions
     moves by at most one unit in the last place of float32.
 
     Records of splats are rounded to float32, which turns and moves them by such amounts: no device has the
@@ -171,7 +171,8 @@ def conditioning(
         Difference(
             of[0].parameter,
             sum(one.norm for one in of),
-            sum(math.sqrt(max(one.turned, 0)) for one in of) ** 2,  # an angle adds up, this is its square
+            # angles add up; `turned` is half of an angle's square
+            sum(math.sqrt(max(one.turned, 0)) for one in of) ** 2,
         )
         for of in zip(*changes, strict=True)
     ]
