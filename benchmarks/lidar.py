@@ -17,6 +17,7 @@ import numpy as np
 
 import fidsplat as fs
 from fidsplat.capture.lidar import Spinning
+from fidsplat.render.scan import ScanRequest
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.worlds.greenhouse import Greenhouse
 from fidsplat.worlds.plants import KINDS
@@ -41,13 +42,7 @@ def times(renderer: fs.Renderer, name: str, batch: int, repeats: int) -> tuple[s
         else:
             fs.scan_batch(resident, lidar, poses, renderer=renderer)
         seconds.append((time.perf_counter() - begun, time.process_time() - used))
-    capture = fs.Capture(
-        lidar.camera().with_pose(camera_to_world=POSE),
-        outputs=("rgb", "alpha", "normal", "distance_first"),
-        quality=fs.Quality.of(
-            "standard,lowpass=none,alpha_cutoff=0.001,first_hit=0.5,transmittance_stop=0.4999995"
-        ),
-    )
+    capture = ScanRequest.of(lidar, scene, False, fs.Motion(), None).capture(POSE)
     frames = [renderer.render_batch(resident, capture, poses=poses) for _ in range(repeats + 1)]
     device = [sum(frame.timings.values()) / batch for frame in frames[1:]]
     complete, cpu = 1e3 / batch * np.median(seconds[1:], axis=0)

@@ -101,7 +101,7 @@ def _parse_names(text: str) -> tuple[str, ...]:
 
 @rules.struct_rule
 def describe_fields(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """tyro's description of a dataclass; the docstrings of fields without `option` are their help."""
+    """tyro's description of a dataclass; the docstrings of its fields are their help."""
     if not dataclasses.is_dataclass(info.type):
         return None
     hints, texts = get_type_hints(info.type, include_extras=True), _field_docstrings(info.type)

@@ -147,7 +147,7 @@ def scan(
         InputError: no pose, or a pose that is not rigid; as `Renderer.render`.
     """
     renderer, resident = _resident(scene, renderer)
-    request = _Request.of(lidar, scene, label, motion, start)
+    request = ScanRequest.of(lidar, scene, label, motion, start)
     capture = request.capture(pose)
     frame = renderer.render(resident, capture)
     return request.decoded(
@@ -175,7 +175,7 @@ def scan_batch(
     """
     renderer, resident = _resident(scene, renderer)
     matrices = pose_matrices("poses", poses)
-    request = _Request.of(lidar, scene, label, Motion(), start)
+    request = ScanRequest.of(lidar, scene, label, Motion(), start)
     batch = renderer.render_batch(resident, request.capture(np.eye(4)), poses=poses)
     images = {name: batch[name] for name in batch.outputs}
     return [
@@ -198,7 +198,7 @@ def _resident(scene: Any, renderer: Renderer | None) -> tuple[Renderer, Any]:
 
 
 @dataclass(frozen=True)
-class _Request:
+class ScanRequest:
     """Arguments of a scan, except the pose."""
 
     lidar: Lidar
@@ -209,7 +209,9 @@ class _Request:
     label: bool
 
     @classmethod
-    def of(cls, lidar: Lidar | str, scene: Any, label: bool, motion: Motion | None, start: Any) -> _Request:
+    def of(
+        cls, lidar: Lidar | str, scene: Any, label: bool, motion: Motion | None, start: Any
+    ) -> ScanRequest:
         lidar = Lidar.preset(lidar) if isinstance(lidar, str) else instance("lidar", lidar, Lidar)
         base = getattr(scene, "capture", None) or Capture()
         if motion is None:
