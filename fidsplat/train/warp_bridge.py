@@ -13,7 +13,7 @@ import numpy as np
 from fidsplat.backends.gradients import on_host
 from fidsplat.backends.warp.device import WarpBackend
 from fidsplat.backends.warp.gradients import add_to
-from fidsplat.backends.warp.resident import scales_apart
+from fidsplat.backends.warp.resident import split_scales
 from fidsplat.backends.warp.runtime import load
 from fidsplat.cameras.pose_offset import offset_camera, offset_gradient
 from fidsplat.capture.capture import Capture
@@ -87,7 +87,7 @@ def render(
         for name, array in with_grad.items():
             own = {name: array.grad}
             if name == "scales" and "thickness" in found:
-                own = scales_apart(array.grad)
+                own = split_scales(array.grad)
             for part, sums in own.items():
                 add_to(sums, found[part])
 

@@ -21,10 +21,12 @@ def make_ellipsoids_backward(effects: tuple[str, ...]):
     def exact(
         axes: wp.mat33d, sizes: wp.vec3d, p: wp.vec3d, by_a: wp.vec3d, by_b: wp.vec3d, by_bulge: wp.float64
     ):
-        """Gradients with respect to the scaled axes, in rows, and the centre.
+        """Gradients with respect to the scaled axes, in rows, and the centre. by_bulge: with respect to
+        2 / m^2.
 
-        The disk's tangents and p / m are the images of unit vectors e1, e2, e3 under V, whose columns are the
-        scaled axes; V^-1 p = m e3. Only a a^T + b b^T counts, so that e1 and e2 turn with e3.
+        The disk's tangents a, b and p / m are the images of unit vectors e1, e2, e3 under V, whose columns
+        are the scaled axes; V^-1 p = m e3. The splat depends on a a^T + b b^T only, so that e1 and e2 turn
+        with e3.
         """
         shortest = wp.min(wp.min(sizes[0], sizes[1]), sizes[2])
         i0 = int(2)

@@ -77,7 +77,7 @@ def make_project_backward(
     Moments, Totals = (wp.types.vector(fields, real) for real in (wp.float32, wp.float64))
     screen_filter, has_depth, normal = (name in at for name in ("disc_x", "z_center", "nx"))
     exact, ewa = EXACT in effects, any(name in effects for name in EWA)
-    thick_too = exact or ewa
+    has_gaussians = exact or ewa
     ellipsoid, solid_backward = make_ellipsoids(effects, wp.float64), make_ellipsoids_backward(effects)
     zc_line, zc_lane = layout.place("z_center")
     terms = max(sh_terms, 1)
@@ -104,7 +104,7 @@ def make_project_backward(
         by_thickness: wp.array(dtype=wp.float32),  # of a cloud that has 3D Gaussians
         by_opacities: wp.array(dtype=wp.float32),
         by_colors: wp.array(dtype=wp.vec3),
-        screen: wp.array(dtype=wp.float32),  # norm of that by the projected centre, in half pictures
+        screen: wp.array(dtype=wp.float32),  # norm of that by the projected centre, in half images
         by_cameras: wp.array(dtype=TEN),
     ):
         view = views[0]
@@ -112,7 +112,7 @@ def make_project_backward(
         by_means[i] = wp.vec3()
         by_quats[i] = wp.vec4()
         by_scales[i] = wp.vec2()
-        if wp.static(thick_too):
+        if wp.static(has_gaussians):
             by_thickness[i] = 0.0
         by_opacities[i] = 0.0
         screen[i] = 0.0
@@ -162,7 +162,7 @@ def make_project_backward(
         size = scales[i]
         su, sv = wp.float64(wp.max(size[0], SMALLEST_SCALE)), wp.float64(wp.max(size[1], SMALLEST_SCALE))
         a, b = su * unit_a, sv * unit_b
-        if wp.static(thick_too):
+        if wp.static(has_gaussians):
             facet, sizes = wp.cross(unit_a, unit_b), wp.vec3d(su, sv, _ZERO)
             if thickness[i] > 0.0:
                 sizes[2] = wp.float64(wp.max(thickness[i], SMALLEST_SCALE))
@@ -206,7 +206,7 @@ def make_project_backward(
         if wp.static(screen_filter):
             by_x, by_y = total[disc_x] * view.focal_x / p[2], total[disc_x + 1] * view.focal_y / p[2]
             by_p += wp.vec3d(by_x, by_y, -(by_x * p[0] + by_y * p[1]) / p[2])
-        # by the entries of the homography that place the centre, in half pictures
+        # by the entries of the homography that place the centre, in half images
         across = wp.float64(view.width) * by_p[0] * per_x
         down = wp.float64(view.height) * by_p[1] * per_y
         screen[i] = float(_HALF * p[2] * wp.sqrt(across * across + down * down))
@@ -223,7 +223,7 @@ def make_project_backward(
         if wp.static(normal):
             by_facet = wp.vec3d(total[nx], total[nx + 1], total[nx + 2])
             by_facet *= wp.where(height > _ZERO, -_ONE, _ONE)
-        if wp.static(thick_too):
+        if wp.static(has_gaussians):
             if thickness[i] > 0.0:
                 by_axes, by_sizes, by_p, by_camera = solid_backward(
                     wp.matrix_from_rows(unit_a, unit_b, facet), sizes, p, by_a, by_b, by_p,
@@ -242,7 +242,7 @@ def make_project_backward(
             wp.where(size[0] >= SMALLEST_SCALE, float(by_su), 0.0),
             wp.where(size[1] >= SMALLEST_SCALE, float(by_sv), 0.0),
         )
-        if wp.static(normal or thick_too):
+        if wp.static(normal or has_gaussians):
             by_unit_a += wp.cross(unit_b, by_facet)
             by_unit_b += wp.cross(by_facet, unit_a)
 

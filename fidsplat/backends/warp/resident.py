@@ -62,7 +62,7 @@ class Resident(ResidentData):
         arrays, ellipsoids = {name: _adopted(name, value, pool) for name, value in given.items()}, "none"
         count = arrays["means"].size
         if count and arrays["scales"].dtype is load().vec3:
-            arrays |= scales_apart(arrays["scales"])
+            arrays |= split_scales(arrays["scales"])
             ellipsoids = "some"  # the kernels decide for each splat
         terms = 0
         if "sh" in arrays:
@@ -103,7 +103,7 @@ def _dtype(name: str) -> Any:
     }[name]
 
 
-def scales_apart(scales: Any) -> dict[str, Any]:
+def split_scales(scales: Any) -> dict[str, Any]:
     """Split an array of three scales into views of scales and thickness."""
     wp = load()
 
