@@ -59,16 +59,18 @@ class Effort:
     seconds: float
     """time after which no round is started, after `min_rounds` rounds"""
     min_rounds: int = 3
+    fast: float = 400.0
+    """milliseconds of a submission up to which settings are interleaved; slower ones are interleaved
+    separately, so that faster ones have more rounds"""
     slow: float = 1000.0
-    """Milliseconds of a submission above which a renderer is measured at its first setting, and interleaved
-    separately, so that faster renderers have more rounds"""
+    """milliseconds of a submission above which only the first setting of a renderer is measured"""
     burst: float = 0.5
     """seconds of frames for the energy of a frame"""
     compared_views: int = 3
     """maximum number of views whose images are compared"""
 
 
-FULL, QUICK = Effort(40, 6.0), Effort(7, 1.0, min_rounds=1, slow=250.0, compared_views=1)
+FULL, QUICK = Effort(40, 3.0), Effort(7, 1.0, min_rounds=1, fast=250.0, slow=250.0, compared_views=1)
 
 
 class RendererProcess:
@@ -383,8 +385,8 @@ class Suite:
         report("interleaved frames")
         effort = self._effort
         seconds = effort.seconds * (0.5 if scene.x is not None else 1.0)
-        fast = [one for one in found if one.second_ms <= effort.slow]
-        slow = [one for one in found if one.second_ms > effort.slow]
+        fast = [one for one in found if one.second_ms <= effort.fast]
+        slow = [one for one in found if one.second_ms > effort.fast]
         for one in fast:  # the frame so far had no warm-up
             one.timer.ms.clear()
             one.timer.parts.clear()
