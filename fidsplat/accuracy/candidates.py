@@ -15,8 +15,7 @@ from fidsplat.capture.quality import Quality
 
 FILE = Path(__file__).with_name("candidates.json")
 MARGIN = 1.5
-"""factor between a promised error and the largest measured one, as other scenes may slightly exceed the
-latter"""
+"""factor of a promised error over the largest measured error, which other scenes may exceed slightly"""
 
 DEFAULTS: dict[str, Any] = {
     "alpha_cutoff": 1.0 / 255.0,
@@ -25,13 +24,13 @@ DEFAULTS: dict[str, Any] = {
     "arithmetic": "precise",
     "blend_precision": "float32",
 }
-"""Quality settings that `quality_within` chooses, and their values unless a candidate differs.
+"""Default values of the quality settings that `quality_within` chooses.
 
-Settings that only add errors (opacity ceiling, exclusive stop) are always off. All others define the image,
-and are taken from the base quality.
+Settings that only add errors (opacity ceiling, exclusive stop) are always off. All other settings define the
+image and are copied from the base quality.
 """
 PORTABLE = ("alpha_cutoff", "transmittance_stop", "arithmetic")
-"""names of the settings of `DEFAULTS` that every device supports"""
+"""settings of `DEFAULTS` that every device supports"""
 
 
 @dataclass(frozen=True)
@@ -43,27 +42,24 @@ class Candidate:
     error_easy: float
     """largest absolute error of an image, 5th percentile over the measured scenes"""
     error_median: float
-    """the same, median over the scenes"""
+    """largest absolute error of an image, median over the measured scenes"""
     error_max: float
-    """the same, maximum over the scenes"""
+    """largest absolute error of an image, maximum over the measured scenes"""
     cost: float
     """frame time relative to `DEFAULTS` (processor time on CPUs)"""
 
     def quality(self, base: Quality) -> Quality:
-        """The quality with the image definition of `base` and the accuracy of this candidate."""
+        """The base quality with the accuracy settings of this candidate."""
         return base.with_(**(DEFAULTS | {"opacity_ceiling": 1.0, "stop_rule": "inclusive"} | self.settings))
 
     @property
     def portable(self) -> Candidate:
-        """The candidate without settings that some devices lack.
-
-        It is as accurate, except without blending in float64.
-        """
+        """A copy with the settings in `PORTABLE` only: equally accurate unless this one blends in float64."""
         return replace(self, settings={k: value for k, value in self.settings.items() if k in PORTABLE})
 
     @property
     def expected_error(self) -> float:
-        """Error to expect in a scene like the measured ones; not a bound."""
+        """Expected error in a scene similar to the measured scenes; not a bound."""
         return MARGIN * self.error_max
 
 
@@ -71,8 +67,8 @@ class Candidate:
 def load(kind: str) -> tuple[Candidate, ...]:
     """The candidates for a kind of device (cpu, gpu), the fastest first.
 
-    A kind without measurements uses those of CPUs: errors in float32 are similar, and costs have the same
-    order.
+    A kind without measurements uses the candidates of CPUs: errors in float32 are similar, and costs have
+    the same order.
     """
     classes = json.loads(FILE.read_text("utf-8"))["classes"]
     rows = classes.get(kind, classes["cpu"])["candidates"]
@@ -81,14 +77,14 @@ def load(kind: str) -> tuple[Candidate, ...]:
 
 @dataclass(frozen=True)
 class Choice:
-    """A chosen quality, with its error and time, and the origin of these numbers."""
+    """A chosen quality with its error, its frame time and their source."""
 
     quality: Quality
     error: float
     """largest absolute error of rgb: measured in the scene, or promised for a class of scenes"""
     ms: float | None
     """median frame time in milliseconds; None if not measured"""
-    ms_late: float | None
+    ms_p90: float | None
     """90th percentile of the frame time"""
     source: str
     """`promised`, `measured`, or `cached`: measured earlier and read from the user's cache folder"""
@@ -103,12 +99,11 @@ class Choice:
 
     def as_dict(self) -> dict[str, Any]:
         """All fields except the quality, for JSON."""
-        keys = ("error", "ms", "ms_late", "source", "device", "settings", "certified", "remark")
-        return {key: getattr(self, key) for key in keys}
+        return {name: value for name, value in vars(self).items() if name != "quality"}
 
     @property
     def summary(self) -> str:
-        """One line of text."""
+        """Settings, error and frame time in one line of text."""
         settings = ", ".join(
             f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
             for name, value in ({"alpha_cutoff": self.quality.alpha_cutoff} | self.settings).items()

@@ -1,4 +1,4 @@
-"""Certification of a choice by the output `error`, an upper bound on the error of every pixel."""
+"""Certification of a chosen quality by the output `error`, an upper bound on the error of each pixel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fidsplat.scenes import Scene
 from fidsplat.util.errors import InputError
 
 REFINEMENT = 1 / 16
-"""factor on cut-off and stop of a quality whose error is not certified"""
+"""factor that lowers cut-off and stop until the error is certified"""
 
 
 def certify(
@@ -28,13 +28,13 @@ def certify(
     renderer: Renderer,
     report: Callable[[str], None] = lambda message: None,
 ) -> Choice:
-    """The choice, refined until the output `error` of a frame is at most `error` everywhere.
+    """Refine a choice until the output `error` of a frame is at most `error` at every pixel.
 
-    If the output is not available, the choice is returned as measured, with the reason as its remark.
+    If the output is not available, returns the choice with the reason as its remark.
 
     Raises:
-        InputError: the finest quality is not certified either, or takes longer than `ms`; the message says
-            what is possible.
+        InputError: the finest quality is not certified, or takes longer than `ms`; the message names the
+            smallest possible value.
     """
     plain = replace(capture, outputs=("error",), sensor=Sensor())
     resident, quality = renderer.upload(scene), choice.quality
@@ -61,22 +61,22 @@ def certify(
             continue
         raise InputError(
             f"error must be at least {certified:.2g} to be certified for this scene on {choice.device}, got "
-            f"{error:g}; allow that"
+            f"{error:g}; allow a larger error"
         )
     if quality == choice.quality:
         return replace(choice, certified=certified)
     measurement = SceneMeasurement(renderer, scene, plain.with_(outputs=("rgb",)), report)
     (times,) = measurement.times([quality])
-    if ms is not None and times.late > ms:
+    if ms is not None and times.p90 > ms:
         raise InputError(
-            f"ms must be at least {times.late:.3g} on {choice.device} for a certified error of {error:g}, "
+            f"ms must be at least {times.p90:.3g} on {choice.device} for a certified error of {error:g}, "
             f"got {ms:g}; allow more time or a larger error"
         )
     settings = {
         name: getattr(quality, name) for name, value in DEFAULTS.items() if getattr(quality, name) != value
     }
-    # the certified bound replaces an error that was not measured
+    # the error of the refined quality was not measured; its certified bound replaces it
     return Choice(
-        *(quality, certified, times.median, times.late, "measured", choice.device, settings),
+        *(quality, certified, times.median, times.p90, "measured", choice.device, settings),
         certified=certified,
     )

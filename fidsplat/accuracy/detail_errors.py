@@ -1,4 +1,4 @@
-"""Measurement of the error of a store's levels of detail: merged against exact frames, from many poses."""
+"""Measurement of the error of a store's levels of detail: frames with merged cells against exact frames."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from fidsplat.util.arguments import settings_with
 from fidsplat.util.errors import InputError
 
 SIZES = tuple(2.0 ** (k / 2) for k in range(-8, 3))
-"""samples: 1/16 to 2"""
+"""measured cell sizes in samples, 1/16 to 2"""
 WIDTH, HEIGHT, FOV_X = 320, 180, math.radians(60.0)
 
 
@@ -34,20 +34,20 @@ def measure_detail(
     progress: Callable[[str, float], object] = lambda words, share: None,
     **changes: Any,
 ) -> list[DetailErrors]:
-    """Measure errors by cell size from random poses around and inside a store, for `Quality.detail_error`.
+    """Measure errors by cell size from random poses around and inside a store, and save them in its folder.
 
-    The errors are saved in the store's folder.
+    `Quality.detail_error` selects levels of detail by these errors.
 
     Args:
-        settings: `DetailSettings`; None: the defaults. `changes` are settings by name: views, lowpass, seed.
-        progress: called with the current step and its share done, 0 to 1.
+        settings: None: `DetailSettings()`. `changes` are settings by name: views, lowpass, seed.
+        progress: called with the current step and its completed share, 0 to 1.
 
     Raises:
-        InputError: an instanced store, one without levels of detail or splats, or an invalid option.
+        InputError: the store is instanced or has no splats or levels of detail, or an option is invalid.
     """
     settings = settings_with(DetailSettings, settings, changes)
     if store.poses is not None:
-        raise InputError(f"{store.path} is instanced; measure {store.header.store} instead")
+        raise InputError(f"store must not be instanced, got {store.path}; measure {store.header.store}")
     if not len(store) or not store.nodes["level"].any():
         raise InputError(
             f"{store.path} must have levels of detail, got none; build it again with levels, from more splats"
@@ -57,7 +57,7 @@ def measure_detail(
         worst: dict[int, list[float | None]] = {level: [None] * len(SIZES) for level in levels}
         for done, camera in enumerate(cameras_around(store, views, settings.seed)):
             level = levels[done % len(levels)]
-            # a cut-off omits a larger share of small splats than of merged ones
+            # a larger cut-off would omit more of the small splats than of the merged splats
             capture = Capture(camera, quality=Quality(lowpass=one, alpha_cutoff=REFERENCE_CUTOFF))
             found = errors_of(store, renderer, capture, SIZES, level)
             worst[level] = [_larger(*pair) for pair in zip(worst[level], found, strict=True)]
@@ -78,9 +78,9 @@ def _larger(one: float | None, other: float | None) -> float | None:
 def errors_of(
     store: Store, renderer: Renderer, capture: Capture, sizes: Sequence[float], level: int
 ) -> list[float | None]:
-    """Largest difference of rgb from the exact frame, for each cell size below which cells are merged.
+    """Largest difference of rgb from the exact frame for each size of cells: smaller cells are merged.
 
-    None for a size that merges no other cells than the next smaller size, or changes nothing visible.
+    None for a size that merges the same cells as the next smaller size, or that changes no pixel.
 
     Args:
         sizes: ascending, in samples.
@@ -99,14 +99,14 @@ def errors_of(
         if exact is None:
             exact = renderer.render(splats.part(complete), capture)["rgb"].astype(np.float64)
         merged = renderer.render(splats.part(selection), capture)["rgb"]
-        # cells that are merged without a visible change give no error
+        # no change of a pixel gives None, not an error of 0
         worst[number], before = float(np.abs(merged - exact).max()) or None, selection
     return worst
 
 
 def cameras_around(store: Store, count: int, seed: int = 0) -> Iterator[Camera]:
-    """Cameras that look at random chunks, at distances where the cells of each level in turn have the sizes
-    `SIZES` on the image."""
+    """Cameras that look at random chunks. The distance is drawn such that cells of the camera's level have a
+    size within `SIZES` in the image; the levels are used in turn."""
     generator = np.random.default_rng(seed)
     nodes = store.nodes
     chunks = nodes[nodes["level"] == 0]
@@ -117,7 +117,7 @@ def cameras_around(store: Store, count: int, seed: int = 0) -> Iterator[Camera]:
     for number in range(count):
         chunk = chunks[generator.integers(len(chunks))]
         target = (chunk["low"] + chunk["high"]).astype(np.float64) / 2 + store.origin
-        # stratified over the sizes
+        # stratified sampling of the logarithm of the size
         share = (number // len(edges) + generator.random()) / rounds
         size = SIZES[0] * (SIZES[-1] / SIZES[0]) ** share
         away = edges[number % len(edges)] * focal / size

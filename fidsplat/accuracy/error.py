@@ -1,7 +1,7 @@
 """Error of an image against the same image at full precision.
 
-Low-pass, samples per pixel and order define the image. Constants that omit contributions (cut-off, stop,
-ceiling) and the arithmetic determine its error.
+Low-pass, samples per pixel and order define the image. The error results from constants that omit
+contributions (cut-off, stop, ceiling) and from the arithmetic.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import DeviceError, InputError
 
 REFERENCE_CUTOFF = 1e-8
-"""alpha below which the reference image omits a contribution: a thousand such layers contribute 1e-5"""
+"""alpha below which the reference image omits a contribution: a thousand of them contribute 1e-5"""
 
 FLOAT32_OUTPUT_ERROR = 1e-7
-"""error of a reference image of colours up to 1 that a device returns in float32"""
+"""error of a float64 reference image with colours up to 1 that a device returns in float32"""
 FLOAT32_REFERENCE_ERROR = 1e-5
-"""error of a reference image that is rendered in float32: above that of any image at full precision in
+"""error of a reference image that is rendered in float32: above all full-precision errors in
 candidates.json"""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Statistics of the differences between two images, over all pixels and channels."""
+    """Statistics of the difference between two images over all pixels and channels."""
 
     maximum: float
     """largest absolute difference"""
@@ -42,28 +42,28 @@ class Errors:
     rmse: float
     """root of the mean squared difference"""
     psnr: float
-    """dB against a peak of 1; infinite where the images are equal"""
+    """dB against a peak of 1; infinite for equal images"""
 
 
 def errors(image: ArrayLike, reference: ArrayLike) -> Errors:
-    """Error of an image, computed in float64.
+    """Statistics of the error of an image, computed in float64.
 
     Args:
         image: any shape, e.g. (h, w, 3) or (h, w).
         reference: the same shape.
 
     Raises:
-        InputError: the shapes differ, there are no values, or one is not finite.
+        InputError: the shapes differ, the images are empty, or a value is not finite.
     """
     found, expected = np.asarray(image, np.float64), np.asarray(reference, np.float64)
     if found.shape != expected.shape:
         raise InputError(f"image must have the shape {expected.shape} of the reference, got {found.shape}")
     if found.size == 0:
-        raise InputError(f"image must have values to compare, got shape {found.shape}")
+        raise InputError(f"image must not be empty, got shape {found.shape}")
     for name, values in (("image", found), ("reference", expected)):
         bad = values.size - int(np.isfinite(values).sum())
         if bad:
-            raise InputError(f"{name} must be finite, got {bad} of {values.size} values that are not")
+            raise InputError(f"{name} must be finite, got {bad} of {values.size} values NaN or infinite")
     off = np.abs(found - expected)
     mean_square = float(np.mean(off**2))
     return Errors(
@@ -77,8 +77,8 @@ def errors(image: ArrayLike, reference: ArrayLike) -> Errors:
 def full_precision(capture: Capture, renderer: Renderer) -> Capture:
     """The capture without omitted contributions, in the device's most precise arithmetic.
 
-    Low-pass, samples, order and first_hit stay. The device composites in float64 if it can
-    (`supports_float64`); otherwise only the set-up is in float64, if supported.
+    Low-pass, samples, order and first_hit are unchanged. The device blends in float64 if it supports that
+    (`supports_float64`).
     """
     best = ideal_quality(capture.quality, REFERENCE_CUTOFF)
     best = best.with_(arithmetic="precise", blend_precision="float32")
@@ -88,10 +88,10 @@ def full_precision(capture: Capture, renderer: Renderer) -> Capture:
 
 
 def supports_float64(renderer: Renderer, capture: Capture) -> bool:
-    """Whether images at full precision are computed in float64 throughout.
+    """Whether the device renders this capture completely in float64.
 
-    True for the reference, and for devices that composite in float64, except with lenses and fog, whose rays
-    are float32.
+    True for the reference renderer, and for devices that blend in float64, unless the capture has a lens or
+    fog, whose rays are float32.
     """
     if renderer.device.always_float64:
         return True
@@ -104,15 +104,15 @@ def supports_float64(renderer: Renderer, capture: Capture) -> bool:
 
 
 def reference_error(reference: Renderer, capture: Capture) -> float:
-    """Bound on the error of a renderer's reference image."""
+    """Upper bound on the error of a renderer's reference image."""
     if reference.device.always_float64:
         return 0.0
     return FLOAT32_OUTPUT_ERROR if supports_float64(reference, capture) else FLOAT32_REFERENCE_ERROR
 
 
 def reference_renderer(renderer: Renderer, capture: Capture) -> Renderer:
-    """Renderer of reference images: OpenCL on this machine's processor if only that supports float64, else
-    the renderer itself."""
+    """Renderer of reference images: the renderer itself, or OpenCL on this machine's processor if only the
+    processor supports float64."""
     if supports_float64(renderer, capture):
         return renderer
     try:
@@ -128,14 +128,10 @@ def reference_image(
     """The image at full precision (`full_precision`), (h, w, 3) float64.
 
     Args:
-        renderer: device "reference" computes float64 images; images of others are converted.
-        scene: scene to render.
-        capture: capture; its outputs are ignored.
-
-    Raises:
-        InputError, DeviceError: as `Renderer.render`.
+        renderer: float32 images of devices other than "reference" are converted.
+        capture: its outputs are ignored.
     """
     frame = renderer.render(scene, full_precision(capture.with_(outputs="rgb"), renderer))
-    if renderer.device.always_float64:  # other reads round to float32
+    if renderer.device.always_float64:  # frame["rgb"] would round to float32
         return frame._images.read_float64("rgb", 0)
     return np.asarray(frame["rgb"], np.float64)

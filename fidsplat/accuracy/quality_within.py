@@ -1,4 +1,4 @@
-"""`quality_within`: the quality that keeps a bound on the error, on the frame time, or on both."""
+"""Choice of the quality within a bound on the error, on the frame time, or on both (`quality_within`)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from fidsplat.accuracy import candidates
 from fidsplat.accuracy.candidates import Candidate, Choice
-from fidsplat.accuracy.search import CandidateSearch, SceneMeasurement, late_ms
+from fidsplat.accuracy.search import CandidateSearch, SceneMeasurement, p90_ms
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality, whole_number
@@ -29,7 +29,7 @@ from fidsplat.util.provenance import code_hash, digest_of
 LAYERS = 100
 """default maximum number of faint fragments at a pixel"""
 DETAIL_ERRORS = (1 / 255, 4 / 255, 16 / 255, 0.5)
-"""errors of levels of detail to try if only the time is bounded"""
+"""errors of levels of detail that are tried if only the time is bounded"""
 
 
 def quality_within(
@@ -42,32 +42,34 @@ def quality_within(
     layers: int = LAYERS,
     colors: float = 1.0,
 ) -> Quality:
-    """The fastest quality within an error, or the most accurate one within a frame time.
+    """Choose the fastest quality within an error, or the most accurate quality within a frame time.
 
-    The error is the largest absolute difference of rgb over all pixels and channels, before any sensor, from
-    the same image at full precision in float64 (`fidsplat.accuracy.error.reference_image`). Low-pass,
-    samples, order and markers stay those of the capture's quality.
+    The error is the largest absolute difference of rgb, without sensor, from the same image at full precision
+    in float64 (`fidsplat.accuracy.error.reference_image`). Low-pass, samples, order and markers are those of
+    the capture's quality.
 
-    With the error alone, the answer is a promise for a class of scenes: at no pixel is the total opacity of
-    fragments below the cut-off above `layers` times the cut-off, which holds for at most `layers` splats, and
-    colours and background have a range of at most `colors`. The share of cut-off and stop in the error is
-    then bounded; that of float32 rounding is measured over random scenes. With a scene and a camera the error
-    is measured on this device in that scene, and cached in the user's cache folder. docs/accuracy.md says how
-    often each promise was kept.
+    Without a scene, the error is promised for a class of scenes: at each pixel, the opacities of the
+    fragments below the cut-off sum to at most `layers` times the cut-off (true for at most `layers` splats),
+    and colours and background have a range of at most `colors`. The errors of cut-off and stop are bounded
+    for this class; the error of float32 rounding was measured over random scenes (docs/accuracy.md).
+
+    With a scene and a camera, the error is measured in that scene on this device, and the choice is cached in
+    the user's cache folder.
 
     Args:
         error: largest allowed error.
-        ms: milliseconds for nine frames of ten, with splats and image on the device; needs a scene and a
-            camera.
-        scene: scene to measure with. For a store, half of the error is allowed for levels of detail
-            (`Quality.detail_error`), if the store's errors are measured; with `ms` alone, several such errors
-            are tried.
-        capture: capture or camera to measure with; default: the Scene's own.
-        device: name of a device, or a Renderer; default: that of `Renderer()`.
+        ms: largest allowed 90th percentile of the frame time in milliseconds, with splats and image on the
+            device; requires a scene and a camera.
+        scene: scene in which errors and times are measured. Levels of detail of a store may use half of the
+            error (`Quality.detail_error`), if the store's errors are measured; with `ms` alone, several such
+            errors are tried.
+        capture: capture or camera of the measurement; default: the scene's own.
+        device: name of a device, or a Renderer; default: the device of `Renderer()`.
         layers, colors: class of scenes, without a scene.
 
     Raises:
-        InputError: no bound, an invalid one, or one that no quality keeps; the message says what is possible.
+        InputError: a bound is missing, invalid, or not possible; the message names the smallest possible
+            value.
         DeviceError: the device cannot be used or fails.
     """
     return choose(error, ms, scene, capture, device, layers=layers, colors=colors).quality
@@ -83,7 +85,10 @@ def choose(
     layers: int = LAYERS,
     colors: float = 1.0,
 ) -> Choice:
-    """The quality of `quality_within`, with its error and time. report: called with the current step."""
+    """Choose a quality as `quality_within` does; returns it with its error and time.
+
+    report: called with the current step.
+    """
     check_bounds(error, ms)
     if scene is not None and not isinstance(scene, (Scene, SplatCloud, Store)):
         raise InputError(f"scene must be a SplatCloud, a Scene or a Store, got a {type(scene).__name__}")
@@ -94,8 +99,8 @@ def choose(
     requested = replace(requested, camera=requested.camera or own.camera, outputs=("rgb",), sensor=Sensor())
     for name, given in (("scene", scene), ("camera", requested.camera)):
         if given is None and (ms is not None or scene is not None or requested.camera is not None):
-            what = "ms" if ms is not None else "an error that is to be measured"
-            raise InputError(f"{what} needs a {name}, got none; give scene=... and capture=...")
+            what = "ms" if ms is not None else "an error that is measured"
+            raise InputError(f"{name} must be given with {what}, got none; give scene=... and capture=...")
     renderer = device if isinstance(device, Renderer) else Renderer(device or default_device())
     front = candidates.load(renderer.device.kind)
     if scene is None:
@@ -106,7 +111,8 @@ def choose(
     bases, content = [requested.quality], splats
     if isinstance(splats, ChunkedSplats):
         content = splats.content
-        # levels of detail may use half of the error; their measured errors do not bound those of this view
+        # levels of detail may use half of the error, and the search measures the sum: errors that the store
+        # measured from other views are no bound
         allowed = [0.0, *DETAIL_ERRORS] if error is None else [min(max(error, 0) / 2, DETAIL_ERRORS[-1]), 0.0]
         bases = [_with_detail(splats, requested.quality, detail) for detail in allowed]
         requested = replace(requested, quality=requested.quality.with_(detail_error=0.0))
@@ -128,9 +134,12 @@ def choose(
 
 
 def check_bounds(error: float | None, ms: float | None) -> None:
-    """Raise InputError for bounds that are missing or not numbers."""
+    """Raise InputError if both bounds are missing, or one is not a finite number."""
     if error is None and ms is None:
-        raise InputError("an empty budget: give error=1e-3, or ms=20 with scene=... and capture=...")
+        raise InputError(
+            "quality_within must have a bound, error or ms, got neither; give error=1e-3, or ms=20 with "
+            "scene=... and capture=..."
+        )
     for name, value, example in (("error", error, "1e-3"), ("ms", ms, "20")):
         if value is not None and not math.isfinite(as_float(value)):
             raise InputError(f"{name} must be a finite number, got {value!r}; try {name}={example}")
@@ -142,23 +151,20 @@ def _color_range(value: Any) -> float:
     return found
 
 
-# promises for a class of scenes
-
-
 @dataclass(frozen=True)
 class SceneClass:
-    """Scenes for which an error is promised without measuring."""
+    """Class of scenes for which an error is promised without a measurement."""
 
     layers: int
-    """maximum total opacity of a pixel's fragments below the cut-off, divided by the cut-off"""
+    """maximum sum of the opacities of a pixel's fragments below the cut-off, divided by the cut-off"""
     colors: float
     """maximum range of the colours of splats and background"""
 
     def promised_error(self, candidate: Candidate, base: Quality) -> float:
-        """Upper bound on the error of a candidate.
+        """Promised error of a candidate: that of cut-off, stop and float32 rounding.
 
-        A fragment below the cut-off changes a colour by at most its opacity times the range of colours, the
-        stop by the remaining transmittance; the measured error of float32 is added.
+        Omitting a fragment changes a colour by at most its opacity times the range of colours; the stop omits
+        at most the remaining transmittance.
         """
         quality = candidate.quality(base)
         omitted = self.layers * quality.alpha_cutoff + quality.transmittance_stop
@@ -174,7 +180,7 @@ def _promised(
     """The fastest candidate whose promised error is within the bound."""
     name = renderer.device.name
     for candidate in front:
-        # the rounding of float16 grows with the number of fragments
+        # the rounding error of float16 grows with the number of fragments
         unbounded = candidate.settings.get("blend_precision") == "float16"
         if unbounded or scenes.promised_error(candidate, base) > error:
             continue
@@ -190,13 +196,13 @@ def _promised(
         if _supported(candidate, base, renderer)
     )
     raise InputError(
-        f"error must be at least {best:.2g} to be promised {scenes} on {name}, got {error:g}; allow that, "
-        "name fewer layers, or give scene=... and capture=... to measure yours"
+        f"error must be at least {best:.2g} to be promised {scenes} on {name}, got {error:g}; allow a "
+        "larger error, set fewer layers, or give scene=... and capture=... to measure the error"
     )
 
 
 def _supported(candidate: Candidate, base: Quality, renderer: Renderer) -> Candidate | None:
-    """The candidate, or an as accurate one that the device supports, or None."""
+    """The candidate if the device supports it, else its portable copy if that is as accurate, else None."""
     if candidate == candidate.portable:
         return candidate
     pixel = Camera.pinhole(1, 1, 1.0, 1.0, 0.5, 0.5)
@@ -207,17 +213,14 @@ def _supported(candidate: Candidate, base: Quality, renderer: Renderer) -> Candi
     return candidate
 
 
-# measured choices
-
-
 def _search(search: CandidateSearch, error: float | None, ms: float | None) -> Choice:
     if error is None:
         assert ms is not None
         return search.most_accurate_in(ms)
     found = search.fastest_within(error)
-    if ms is not None and late_ms(found) > ms:
+    if ms is not None and p90_ms(found) > ms:
         raise InputError(
-            f"ms must be at least {late_ms(found):.3g} on {search.device} for an error of {error:g}, got "
+            f"ms must be at least {p90_ms(found):.3g} on {search.device} for an error of {error:g}, got "
             f"{ms:g}; {_best_in(search, ms)}"
         )
     return found
@@ -231,7 +234,7 @@ def _best_in(search: CandidateSearch, ms: float) -> str:
 
 
 def _with_detail(splats: ChunkedSplats, quality: Quality, error: float) -> Quality:
-    """The quality with this `detail_error`, or with 0 if the errors of the stores were not measured."""
+    """The quality with this `detail_error`, or with 0 if it allows no level of detail of the stores."""
     detailed = quality.with_(detail_error=error)
     try:
         sizes = splats.cell_sizes(detailed)
@@ -244,9 +247,9 @@ def _with_detail(splats: ChunkedSplats, quality: Quality, error: float) -> Quali
 def _best_of(
     bases: Iterable[Quality], search_with: Callable[[Quality], Choice], first: bool = False
 ) -> Choice:
-    """The choice with the lowest error over base qualities of rising `detail_error`, or the first one found.
+    """Search with base qualities of increasing `detail_error`; returns the choice with the lowest error.
 
-    Bases that allow a larger error than the best choice has are not tried.
+    Bases whose `detail_error` is above the lowest error found are not tried. first: return the first choice.
     """
     best, refused = None, None
     for base in bases:
@@ -266,10 +269,10 @@ def _best_of(
     return best
 
 
-def _key(*question: object) -> str | None:
-    """Cache key of a question; None if it contains functions, e.g. the motion of a camera."""
+def _key(*arguments: object) -> str | None:
+    """Cache key of the arguments of a search; None if they contain functions, e.g. a camera's motion."""
     try:
-        return digest_of(question)
+        return digest_of(arguments)
     except (pickle.PicklingError, AttributeError, TypeError):
         return None
 
@@ -281,17 +284,17 @@ def _cached(key: str | None, base: Quality, device: str) -> Choice | None:
     try:
         value = from_json(read_text(cache_folder() / f"{key}.json"))
         candidate = Candidate(value["settings"], 0, 0, 0, 0)
-        error, ms, late = (float(value[name]) for name in ("error", "ms", "ms_late"))
-        return Choice(candidate.quality(base), error, ms, late, "cached", device, candidate.settings)
+        error, ms, p90 = (float(value[name]) for name in ("error", "ms", "ms_p90"))
+        return Choice(candidate.quality(base), error, ms, p90, "cached", device, candidate.settings)
     except (OSError, KeyError, TypeError, ValueError, AttributeError):
         return None
 
 
 def _save(key: str | None, choice: Choice) -> None:
-    """Cache a choice. Errors of writing are ignored."""
+    """Cache a choice; a failure to write is ignored."""
     if key is None:
         return
-    value = {name: getattr(choice, name) for name in ("settings", "error", "ms", "ms_late")}
+    value = {name: getattr(choice, name) for name in ("settings", "error", "ms", "ms_p90")}
     try:
         cache_folder().mkdir(parents=True, exist_ok=True)
         write_json(cache_folder() / f"{key}.json", value, indent=1)
@@ -300,5 +303,5 @@ def _save(key: str | None, choice: Choice) -> None:
 
 
 def cache_folder() -> Path:
-    """Folder of the measured choices, in the user's cache folder."""
+    """Cache folder of measured choices."""
     return user_cache() / "fidsplat" / "quality_within"

@@ -1,4 +1,4 @@
-"""Search among candidates by measuring their errors and times in a scene on a device."""
+"""Search for the best candidate by measuring errors and times in a scene on a device."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from fidsplat.util.errors import DeviceError, InputError
 from fidsplat.util.timing import Timer, frame_timer, time_interleaved
 
 REPEATS = 9
-"""number of timed frames of each quality; frames of all qualities are interleaved"""
+"""timed frames of each quality; frames of all qualities are interleaved"""
 MIN_REPEATS = 3
 MAX_SECONDS = 10.0
-"""limit on the time of a comparison of qualities, with at least `MIN_REPEATS` frames of each"""
+"""time limit of one comparison of qualities, which still times at least `MIN_REPEATS` frames of each"""
 GROUP = 4
 """candidates that are timed together before one is chosen"""
 TOO_SLOW = 1.5
-"""multiple of the allowed time: a candidate whose first frame takes longer is not timed further"""
+"""multiple of the allowed time; a candidate whose first frame takes longer is not timed further"""
 START = 0.5
-"""share of the allowed time: candidates whose expected time is below are tried last"""
+"""share of the allowed time; candidates with a shorter expected time are tried last"""
 SCENE_VARIATION = 4.0
-"""factor by which the error of a candidate in this scene may be below the proportional expectation"""
+"""factor by which a candidate's error in this scene may be below the error that other scenes predict"""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Times:
     """Frame time in milliseconds, with splats and image on the device."""
 
     median: float
-    late: float
+    p90: float
     """90th percentile"""
 
 
@@ -76,7 +76,7 @@ class SceneMeasurement:
         return image, scale * reference_error(reference, self._capture)
 
     def error(self, quality: Quality) -> float:
-        """Largest absolute error of rgb, with the bound on the error of the reference image added."""
+        """Largest absolute error of rgb plus the bound on the error of the reference image."""
         if quality not in self._errors:
             reference, reference_bound = self._reference
             self._report(f"measuring errors ({len(self._errors) + 1} candidates so far)")
@@ -89,7 +89,7 @@ class SceneMeasurement:
         return self.timer(quality).run()
 
     def times(self, qualities: Iterable[Quality], repeats: int = REPEATS) -> list[Times]:
-        """Frame times of qualities, interleaved, after one warm-up frame of each."""
+        """Frame times of qualities, from interleaved frames after one warm-up frame of each."""
         timers = [self.timer(quality) for quality in qualities]
         self._report(f"timing {len(timers)} candidates")
         time_interleaved(
@@ -106,23 +106,23 @@ Measured = tuple[Candidate, float]
 
 
 class CandidateSearch:
-    """Search among candidates, the fastest first, with a scene to measure them."""
+    """Search among candidates, sorted by cost, with a scene in which they are measured."""
 
     def __init__(self, measurement: SceneMeasurement, candidates: tuple[Candidate, ...]) -> None:
         self.measurement, self._candidates = measurement, candidates
         self.device = measurement.renderer.device.name
 
     def fastest_within(self, error: float) -> Choice:
-        """The fastest of the first few candidates within the error.
+        """The fastest of the first `GROUP` candidates within the error.
 
         Raises:
-            InputError: no candidate is; the message names the lowest error.
+            InputError: no candidate is within the error; the message names the lowest possible error.
         """
         hits: list[Measured] = []
         missed: Measured | None = None
         for candidate in self._candidates:
-            # skip candidates that are too inaccurate even in easy scenes, and those that are hardly more
-            # accurate than the last that exceeded the error
+            # skip candidates that exceed the error even in easy scenes, and candidates that are hardly more
+            # accurate than the last measured candidate that exceeded it
             if candidate.error_easy > SCENE_VARIATION * error:
                 continue
             if missed and not _much_more_accurate(candidate, *missed):
@@ -148,10 +148,11 @@ class CandidateSearch:
         )
 
     def most_accurate_in(self, ms: float) -> Choice:
-        """The candidate with the lowest error among those that render nine frames of ten in time.
+        """The candidate with the lowest error among candidates whose 90th percentile of the frame time is at
+        most `ms`.
 
         Raises:
-            InputError: no candidate does; the message says how long the fastest takes.
+            InputError: no candidate is fast enough; the message names the time of the fastest.
         """
         tried: list[tuple[Measured, Choice]] = []
         start = self._start(ms)
@@ -160,23 +161,23 @@ class CandidateSearch:
             for first in range(0, len(likely), GROUP):
                 pairs = likely[first : first + GROUP]
                 tried += zip(pairs, self._timed(pairs), strict=True)
-                in_time = [choice for _, choice in tried if late_ms(choice) <= ms]
+                in_time = [choice for _, choice in tried if p90_ms(choice) <= ms]
                 if in_time:
                     return min(in_time, key=lambda choice: choice.error)
-        # the fastest are timed again, since other work on the machine can delay frames
-        fastest = [pair for pair, _ in sorted(tried, key=lambda pair: late_ms(pair[1]))]
+        # time the fastest candidates again, since other programs may have delayed their frames
+        fastest = [pair for pair, _ in sorted(tried, key=lambda pair: p90_ms(pair[1]))]
         if not fastest:
             fastest = list(itertools.islice(self._measured(self._candidates), GROUP))
-        best = min(self._timed(fastest[:GROUP]), key=late_ms)
-        if late_ms(best) <= ms:
+        best = min(self._timed(fastest[:GROUP]), key=p90_ms)
+        if p90_ms(best) <= ms:
             return best
         raise InputError(
-            f"ms must be at least {late_ms(best):.3g} for this scene on {self.device}, got {ms:g}; the "
+            f"ms must be at least {p90_ms(best):.3g} for this scene on {self.device}, got {ms:g}; the "
             f"fastest quality has an error of {best.error:.2g}"
         )
 
     def _start(self, ms: float) -> int:
-        """Index of the first candidate whose expected time is above a share `START` of the allowed time."""
+        """Index of the first candidate whose expected time is at least `START` times the allowed time."""
         usual = min(self._candidates, key=lambda candidate: abs(math.log(candidate.cost))).portable
         (times,) = self.measurement.times([self._quality(usual)], MIN_REPEATS)
         costs = [candidate.cost * times.median / usual.cost for candidate in self._candidates]
@@ -184,7 +185,7 @@ class CandidateSearch:
         return max(0, min(start, len(costs) - 2 * GROUP))
 
     def _likely(self, group: Iterable[Candidate], ms: float) -> list[Measured]:
-        """Candidates whose first frame is not much too slow, the most accurate first."""
+        """Candidates whose first frame takes at most `TOO_SLOW` times the allowed time, sorted by error."""
         likely, slow = [], 0
         for candidate, measured in self._measured(group):
             if self.measurement.time(self._quality(candidate)) <= TOO_SLOW * ms:
@@ -199,7 +200,7 @@ class CandidateSearch:
         return candidate.quality(self.measurement.base)
 
     def _measured(self, candidates: Iterable[Candidate]) -> Iterator[Measured]:
-        """Candidates with their errors, without settings that the device lacks."""
+        """Candidates with their errors; settings that the device lacks are removed."""
         for candidate in candidates:
             try:
                 measured = self.measurement.error(self._quality(candidate))
@@ -211,25 +212,26 @@ class CandidateSearch:
             yield candidate, measured
 
     def _timed(self, pairs: list[Measured]) -> list[Choice]:
-        """Choices with their times."""
+        """Choices of candidates, with their frame times."""
         qualities = [self._quality(candidate) for candidate, _ in pairs]
         every = zip(pairs, qualities, self.measurement.times(qualities), strict=True)
         return [
-            Choice(quality, error, times.median, times.late, "measured", self.device, candidate.settings)
+            Choice(quality, error, times.median, times.p90, "measured", self.device, candidate.settings)
             for (candidate, error), quality, times in every
         ]
 
 
-def late_ms(choice: Choice) -> float:
+def p90_ms(choice: Choice) -> float:
     """90th percentile of the frame time of a measured choice."""
-    assert choice.ms_late is not None
-    return choice.ms_late
+    assert choice.ms_p90 is not None
+    return choice.ms_p90
 
 
 def _much_more_accurate(candidate: Candidate, missed: Candidate, factor: float) -> bool:
-    """Whether the error of a candidate is probably at most `factor` times that of `missed`.
+    """Whether the error of a candidate is probably at most `factor` times the error of `missed`.
 
-    The median over the measured scenes depends on the cut-off, the maximum on the stop: one of them suffices.
+    The median over the measured scenes depends on the cut-off, the maximum on the stop; a candidate that is
+    better in one of them is tried.
     """
     enough = SCENE_VARIATION * factor
     by_median = candidate.error_median <= enough * missed.error_median

@@ -132,7 +132,7 @@ class ViewBatch:
             return replace(ViewBatch.single(self.one(first)), batch_indices=indices, total=self.total)
         external = self.view.external_depth
         return ViewBatch(
-            replace(self.view, external_depth=external.part(slice(first, end)))
+            replace(self.view, external_depth=external.of_views(slice(first, end)))
             if external and external.stacked
             else self.view,
             self.rotation[:, first:end],
@@ -151,7 +151,7 @@ class ViewBatch:
         own: dict[str, Any] = {name: _plain(each[number]) for name, each in self.numbers.items()}
         external = self.view.external_depth
         if external and external.stacked:
-            own["external_depth"] = external.part(number)
+            own["external_depth"] = external.of_views(number)
 
         def at(view: View, group: int) -> View:
             arrays = {name: getattr(self, name)[group, number] for name in ("rotation", "translation", "eye")}

@@ -49,7 +49,7 @@ def prepare_batch(cloud: PlacedTraits, views: Views) -> tuple[FeatureSet, ViewBa
             moved = {label: each[numbers] for label, each in groups}
             external = views.captures[0].external_depth
             if external and external.stacked:
-                own = external if len(rendered) == len(views) else external.part(numbers)
+                own = external if len(rendered) == len(views) else external.of_views(numbers)
                 view = replace(view, external_depth=own)
             return features, ViewBatch.of_poses(view, cloud.origin, poses, moved, indices, len(views))
     own = [prepare(cloud, views.capture(number)) for number in range(len(views))]

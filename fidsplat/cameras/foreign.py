@@ -1,4 +1,5 @@
-"""Cameras of COLMAP, nerfstudio and ROS: their intrinsics, lenses and conventions of axes and pixels."""
+"""Conversion of camera models of COLMAP, nerfstudio and ROS: intrinsics, lenses, axes and pixel
+coordinates."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from fidsplat.cameras.lenses import BrownConrady, Fisheye, Lens
 from fidsplat.util.errors import InputError, unknown
 
 PIXEL = 0.5
-"""offset to the pixel coordinates of ROS and OpenCV, whose first pixel centre is at 0"""
+"""added to pixel coordinates of ROS and OpenCV, where the centre of the first pixel is 0, not 0.5"""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """rotation between OpenGL's camera axes (y up, z backwards) and OpenCV's"""
 _COLMAP: dict[str, tuple[type[BrownConrady | Fisheye], tuple[str, ...]]] = {
@@ -26,14 +27,14 @@ _COLMAP: dict[str, tuple[type[BrownConrady | Fisheye], tuple[str, ...]]] = {
     "SIMPLE_RADIAL_FISHEYE": (Fisheye, ("k1",)),
     "RADIAL_FISHEYE": (Fisheye, ("k1", "k2")),
 }
-"""supported camera models: lens and its parameters, which follow f or fx, fy, and cx, cy"""
+"""supported camera models: lens, and its coefficients after the parameters f or fx, fy, and cx, cy"""
 _BROWN = ("k1", "k2", "k3", "p1", "p2")
 _NERFSTUDIO: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), _BROWN),
     "FULL_OPENCV": (*_BROWN, "k4", "k5", "k6"),
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
-"""values of `camera_model`, each with its coefficients"""
+"""supported values of `camera_model` with their lens coefficients"""
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 """coefficients of lenses in transforms.json"""
 _ROS: dict[str, tuple[type[BrownConrady | Fisheye], tuple[str, ...]]] = {
@@ -45,10 +46,10 @@ _ROS: dict[str, tuple[type[BrownConrady | Fisheye], tuple[str, ...]]] = {
     ),
     "equidistant": (Fisheye, ("k1", "k2", "k3", "k4")),
 }
-"""values of `distortion_model`: lens and the order of its coefficients"""
+"""supported values of `distortion_model`: lens and its coefficients in order"""
 
 
-class Parts(NamedTuple):
+class PinholeArguments(NamedTuple):
     """Arguments of `Camera.pinhole`."""
 
     width: Any
@@ -61,8 +62,9 @@ class Parts(NamedTuple):
     lens: Lens | None
 
 
-def colmap_parts(camera: Any, pose: Any) -> Parts:
-    """The camera of objects of pycolmap, or of (model, width, height, parameters) and a pose."""
+def colmap_arguments(camera: Any, pose: Any) -> PinholeArguments:
+    """Arguments of `Camera.pinhole` from pycolmap's camera and image or pose, or from (model, width, height,
+    parameters) and a pose."""
     try:
         if hasattr(camera, "params"):
             model = getattr(camera.model, "name", camera.model)
@@ -92,11 +94,11 @@ def colmap_parts(camera: Any, pose: Any) -> Parts:
         )
     lens = kind(**dict(zip(names, parameters[own:], strict=True)))
     fx, fy, cx, cy = parameters[:own] if own == 4 else (parameters[0], *parameters[:3])
-    return Parts(width, height, fx, fy, cx, cy, pose, lens)
+    return PinholeArguments(width, height, fx, fy, cx, cy, pose, lens)
 
 
-def nerfstudio_parts(transforms: Any, frame: Any) -> Parts:
-    """The camera of a frame of transforms.json, by its number or file_path."""
+def nerfstudio_arguments(transforms: Any, frame: Any) -> PinholeArguments:
+    """Arguments of `Camera.pinhole` for a frame of transforms.json, by its index or file_path."""
     try:
         frames = list(transforms["frames"])
         paths = [one.get("file_path") for one in frames]
@@ -145,18 +147,18 @@ def nerfstudio_parts(transforms: Any, frame: Any) -> Parts:
     pose = matrix @ OPENGL
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3], world_to_camera[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
-    return Parts(width, height, fx, fy, cx, cy, world_to_camera, _nerfstudio_lens(given))
+    return PinholeArguments(width, height, fx, fy, cx, cy, world_to_camera, _nerfstudio_lens(given))
 
 
-def ros_parts(info: Any, world_to_camera: Any, rectified: bool) -> Parts:
-    """The camera of a sensor_msgs/CameraInfo, or of a calibration file of ROS as a dict."""
+def ros_arguments(info: Any, world_to_camera: Any, rectified: bool) -> PinholeArguments:
+    """Arguments of `Camera.pinhole` from a sensor_msgs/CameraInfo, or a ROS calibration file as a dict."""
     try:
         if isinstance(info, Mapping):
             width, height = info["image_width"], info["image_height"]
             k, p = (info[f"{name}_matrix"]["data"] for name in ("camera", "projection"))
             factors, model = info["distortion_coefficients"]["data"], info["distortion_model"]
             reduced = False
-        else:  # ROS 1 has capital letters
+        else:  # ROS 1 names the fields K, D and P
             k, d, p = (getattr(info, name, None) for name in "kdp")
             k, factors, p = (
                 getattr(info, name.upper()) if v is None else v
@@ -172,7 +174,10 @@ def ros_parts(info: Any, world_to_camera: Any, rectified: bool) -> Parts:
             f"camera_matrix and so on, got {type(info).__name__}"
         ) from None
     if reduced:
-        raise InputError("info must describe the complete image, got binning or a region of interest")
+        raise InputError(
+            "info must describe the complete image, got binning or a region of interest; publish the "
+            "complete image"
+        )
     if model not in _ROS:
         raise InputError(unknown("distortion_model of CameraInfo", model, tuple(filter(None, _ROS))))
     kind, names = _ROS[model]
@@ -183,7 +188,7 @@ def ros_parts(info: Any, world_to_camera: Any, rectified: bool) -> Parts:
         )
     lens = None if rectified else kind(**dict(zip(names, coefficients, strict=False)))
     (fx, _, cx), (_, fy, cy) = matrix[0, :3], matrix[1, :3]
-    return Parts(width, height, fx, fy, cx + PIXEL, cy + PIXEL, world_to_camera, lens)
+    return PinholeArguments(width, height, fx, fy, cx + PIXEL, cy + PIXEL, world_to_camera, lens)
 
 
 def _nerfstudio_lens(given: Mapping[str, Any]) -> Lens:

@@ -1,7 +1,7 @@
 """Lens models: projection of directions in the camera frame to image coordinates, and its inverse.
 
-A lens maps a point (X, Y, Z) of the camera frame to image coordinates (a, b) without unit or in radians or
-metres; the pixel is x = fx a + cx, y = fy b + cy. Conventions and coefficients are OpenCV's.
+A lens maps a point (X, Y, Z) of the camera frame to normalised image coordinates (a, b), which are
+dimensionless, radians or metres; the pixel is x = fx a + cx, y = fy b + cy. Coefficients follow OpenCV.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from fidsplat.util.directions import perpendicular
 from fidsplat.util.errors import InputError
 
 FISHEYE_LIMIT = math.radians(100)
-"""largest angle of a fisheye from its axis: a field of view of 200 degrees"""
+"""largest angle in radians between a fisheye's rays and its axis: a field of view of 200 degrees"""
 MAX_COEFFICIENT = 1e12
-"""largest size of a lens coefficient: beyond those of invertible lenses, and small enough for products"""
-_STEPS = 4096  # entries of the table of start values for Newton's iteration
+"""largest magnitude of a lens coefficient: more than any invertible lens has; products stay finite"""
+_STEPS = 4096  # entries of the table of initial values of Newton's method
 _ITERATIONS = 12
 _LOWEST = math.cos(math.radians(1))  # the stereographic projection maps -z to infinity
-_NOTHING = 1e-200  # smaller leading coefficients are dropped: roots would overflow
+_NEGLIGIBLE = 1e-200  # smaller leading coefficients are dropped: roots would overflow
 
 
 @dataclass(frozen=True)
 class BrownConrady:
-    """OpenCV's distortion of a perspective image (`cv2.projectPoints`): radial (k1 to k6), tangential (p1,
-    p2), thin prism (s1 to s4). All 0 is a pinhole. Directions beyond the first fold of the radial part are
-    outside the field of view. Raises InputError for a coefficient that is not finite."""
+    """OpenCV's distortion model (`cv2.projectPoints`): radial (k1 to k6), tangential (p1, p2) and thin prism
+    (s1 to s4). Directions beyond the first fold of the radial polynomial are outside the field of view.
+    Raises InputError for a coefficient that is not finite."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -55,7 +55,7 @@ class BrownConrady:
 
     @classmethod
     def opencv(cls, coefficients) -> BrownConrady:
-        """From OpenCV's distCoeffs: 4, 5, 8, 12 or 14 numbers (k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty).
+        """Lens of OpenCV's distCoeffs: 4, 5, 8, 12 or 14 numbers (k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty).
         Raises InputError for another count or a tilted sensor (tx or ty not 0)."""
         order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
         values = real_array("distortion", coefficients).ravel().tolist()
@@ -71,13 +71,13 @@ class BrownConrady:
         return cls(**dict(zip(order, values, strict=False)))
 
     @property
-    def does_nothing(self) -> bool:
-        """Whether all coefficients are 0, so that the lens is a pinhole."""
+    def is_pinhole(self) -> bool:
+        """Whether all coefficients are 0."""
         return not any(getattr(self, field.name) for field in fields(self))
 
     @cached_property
     def fold(self) -> float:
-        """tan of the angle from the axis at which the radial part folds back; inf if it never does."""
+        """tan of the angle from the axis at which the radial polynomial folds back; inf if it never does."""
         above = np.polynomial.Polynomial([1, self.k1, self.k2, self.k3])
         below = np.polynomial.Polynomial([1, self.k4, self.k5, self.k6])
         q = np.polynomial.Polynomial([0, 2])
@@ -85,7 +85,7 @@ class BrownConrady:
         return math.sqrt(min(_first_root(slope), _first_root(below)))
 
     def _distorted(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Image coordinates and their derivatives (a, b, a_x, a_y, b_x, b_y)."""
+        """Image coordinates and their derivatives by x and y: a, b, a_x, a_y, b_x, b_y."""
         q = x * x + y * y
         above = 1 + q * (self.k1 + q * (self.k2 + q * self.k3))
         below = 1 + q * (self.k4 + q * (self.k5 + q * self.k6))
@@ -143,7 +143,7 @@ class BrownConrady:
         return np.where(visible[:, None], np.stack([x, y, np.ones_like(x)], 1), np.nan)
 
     def _undistorted(self, distance: np.ndarray) -> np.ndarray:
-        """tan of the angles whose images have these distances from the centre, by the radial part alone."""
+        """tan of the angles whose images have these distances from the centre, by the radial terms alone."""
         symmetric = BrownConrady(self.k1, self.k2, self.k3, self.k4, self.k5, self.k6)
 
         def radial(tangent: np.ndarray) -> np.ndarray:
@@ -165,9 +165,9 @@ class BrownConrady:
 @dataclass(frozen=True)
 class Fisheye:
     """Kannala-Brandt fisheye (`cv2.fisheye`): a ray at the angle t from the axis has the distance t (1 + k1
-    t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the image centre. All 0 is the equidistant lens. The field of view
-    reaches 100 degrees from the axis, or less where that polynomial folds back. Raises InputError for a
-    coefficient that is not finite."""
+    t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the image centre; with coefficients 0, an equidistant fisheye. The
+    field of view reaches 100 degrees from the axis, or less if that polynomial folds back earlier. Raises
+    InputError for a coefficient that is not finite."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -176,7 +176,7 @@ class Fisheye:
 
     kind: ClassVar[str] = "fisheye"
     along_ray: ClassVar[bool] = True
-    does_nothing: ClassVar[bool] = False
+    is_pinhole: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         _check(self)
@@ -188,7 +188,7 @@ class Fisheye:
         return min(math.sqrt(_first_root(slope)), FISHEYE_LIMIT)
 
     def distance(self, angle):
-        """Distance from the image centre at which a ray with that angle (radians) from the axis appears."""
+        """Distance from the image centre of a ray at an angle in radians from the axis."""
         q = angle * angle
         return angle * (1 + q * (self.k1 + q * (self.k2 + q * (self.k3 + q * self.k4))))
 
@@ -253,7 +253,7 @@ class Equirectangular:
 
     kind: ClassVar[str] = "equirectangular"
     along_ray: ClassVar[bool] = True
-    does_nothing: ClassVar[bool] = False
+    is_pinhole: ClassVar[bool] = False
     uniforms: ClassVar[tuple[float, ...]] = ()
 
     def image(self, points: np.ndarray) -> np.ndarray:
@@ -292,7 +292,7 @@ class Orthographic:
 
     kind: ClassVar[str] = "orthographic"
     along_ray: ClassVar[bool] = False
-    does_nothing: ClassVar[bool] = False
+    is_pinhole: ClassVar[bool] = False
     uniforms: ClassVar[tuple[float, ...]] = ()
 
     def image(self, points: np.ndarray) -> np.ndarray:
@@ -308,22 +308,22 @@ class Orthographic:
 
 @dataclass(frozen=True, eq=False)
 class RayTable:
-    """Arbitrary rays from one point, one for each pixel: for scanners. The camera has fx = fy = 1 and
-    cx = cy = 0, and the size of the table.
+    """Arbitrary rays from one point, one for each pixel, for scanners. The camera has the size of the table,
+    fx = fy = 1 and cx = cy = 0.
 
-    Points have no image coordinates, so low-pass filters have no effect. Neighbours in the table should be
-    neighbours in space: the larger the angles between them, the slower is rendering. Raises InputError for
-    another shape, no ray at all, or a ray within 1 degree of -z.
+    Points have no image coordinates, so low-pass filters have no effect. Rendering is fastest if neighbours
+    in the table have similar directions. Raises InputError for another shape, a table without rays, or a ray
+    within 1 degree of -z.
     """
 
     directions: np.ndarray
-    """(h, w, 3) float64 in the camera's frame, of any length but 0; NaN for a pixel without a ray"""
+    """(h, w, 3) float64 in the camera frame, normalised; NaN for a pixel without a ray"""
     divergence: float = 1e-3
-    """radians between the edges of a ray's beam: it blurs the edges of box splats"""
+    """full angle of a ray's beam in radians; it blurs the edges of box splats"""
 
     kind: ClassVar[str] = "ray_table"
     along_ray: ClassVar[bool] = True
-    does_nothing: ClassVar[bool] = False
+    is_pinhole: ClassVar[bool] = False
     uniforms: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0, 0.0, -1.0)
     """uniforms of a fisheye with an empty field of view, so that no splat's centre has an image"""
 
@@ -369,14 +369,14 @@ Lens: TypeAlias = RayLens | Orthographic
 
 
 def camera_effect(lens: Lens | None) -> str:
-    """Name of the effect that projects splats. A table of rays has the chart of directions of a fisheye."""
+    """Name of the camera effect of a lens; a ray table uses the fisheye's projection of directions."""
     if lens is None:
         return "camera_pinhole"
     return "camera_fisheye" if isinstance(lens, RayTable) else f"camera_{lens.kind}"
 
 
 def _rows(name: str, value: np.ndarray, width: int) -> np.ndarray:
-    """An array (n, width) of real numbers; not copied if it is one."""
+    """Validated array (n, width) of real numbers; a NumPy array of floats is not copied."""
     if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
         value = real_array(name, value)
     if value.ndim != 2 or value.shape[1] != width:
@@ -393,7 +393,7 @@ def _check(lens) -> None:
 
 def _first_root(polynomial: np.polynomial.Polynomial) -> float:
     """Smallest root above 0; inf if there is none."""
-    coefficients = polynomial.trim(_NOTHING).coef
+    coefficients = polynomial.trim(_NEGLIGIBLE).coef
     # a root that overflows is beyond all images
     with np.errstate(over="ignore"):
         roots = np.polynomial.Polynomial(coefficients).roots() if len(coefficients) > 1 else np.empty(0)
@@ -402,6 +402,6 @@ def _first_root(polynomial: np.polynomial.Polynomial) -> float:
 
 
 def _scaled(a: np.ndarray, b: np.ndarray, length: np.ndarray, target: np.ndarray):
-    """Vectors (a, b) scaled to another length; 0 stays 0."""
+    """Vectors (a, b) of a length, scaled to a target length; 0 stays 0."""
     factor = target / np.where(length > 0, length, 1.0)
     return a * factor, b * factor

@@ -1,4 +1,4 @@
-"""Shutters, and poses as functions of time."""
+"""Shutters and motion: poses as functions of time."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ Pose: TypeAlias = Callable[[float], np.ndarray]
 
 @dataclass(frozen=True)
 class Shutter:
-    """Exposure times of the rows of an image. All 0 is the instant global shutter. The middle of the middle
-    row's exposure is `time`; row i of h is exposed `readout` * ((i + 1/2) / h - 1/2) seconds later."""
+    """Exposure times of the rows of an image; by default an instant global shutter. The exposure of the
+    middle row is centred at `time`; row i of h is exposed `readout` * ((i + 1/2) / h - 1/2) seconds later."""
 
     time: float = 0.0
-    """seconds, on the clock of the poses"""
+    """seconds, in the time of the poses"""
     exposure_time: float = 0.0
     """seconds that each row is exposed; the image is the mean of `sub_poses` sub-frames"""
     sub_poses: int = 8
-    """number n of poses of an exposure, one in the middle of each n-th of the exposure time"""
+    """number n of poses per exposure, each in the middle of an n-th of the exposure time"""
     readout: float = 0.0
-    """seconds from the first row's exposure to the last's (rolling shutter)"""
+    """seconds between the exposures of the first and the last row (rolling shutter)"""
     rows_per_band: int = 8
-    """rows that share the poses of the band's middle row. An object that crosses v pixels during the readout
-    of h rows is displaced by at most v (rows_per_band - 1) / (2 h) pixels; 1 is exact and slow"""
+    """rows that share the poses of the band's middle row. An object that moves v pixels during the readout of
+    h rows is displaced by at most v (rows_per_band - 1) / (2 h) pixels; 1 is exact and slow"""
 
     def __post_init__(self) -> None:
         own_scalars(self)
@@ -55,7 +55,7 @@ class Shutter:
                 raise InputError(f"shutter {name} must be a whole number, {limit}, got {value!r}")
 
     def bands(self, height: int) -> list[tuple[int, int, float]]:
-        """(first row, end row, middle of its exposure time) of the bands of an image of `height` rows."""
+        """(first row, end row, middle of the exposure time) of each band of an image of `height` rows."""
         height = whole_number("the height of an image", height, 1, 2**24)
         rows = self.rows_per_band if self.readout > 0 else height
         cuts = [*range(0, height, rows), height]
@@ -65,7 +65,7 @@ class Shutter:
         ]
 
     def times(self, middle: float) -> list[float]:
-        """Times of the sub-poses of an exposure around a middle."""
+        """Times of the sub-poses of an exposure, from the middle of its exposure time."""
         middle = number("the middle of an exposure", middle)
         n = self.sub_poses if self.exposure_time > 0 else 1
         return [middle + self.exposure_time * ((k + 0.5) / n - 0.5) for k in range(n)]
@@ -77,9 +77,9 @@ class Motion:
     `Trajectory` or any callable."""
 
     camera: Pose | None = None
-    """world_to_camera; None: the camera does not move"""
+    """world_to_camera; None: a static camera"""
     groups: Mapping[int, Pose] = field(default_factory=dict)
-    """label of splats -> their rigid motion in the world, applied to the poses in their cloud"""
+    """label of splats -> their rigid motion in the world, applied to the poses of their cloud"""
 
     def __post_init__(self) -> None:
         if self.camera is not None and not callable(self.camera):
@@ -97,20 +97,20 @@ class Motion:
         object.__setattr__(self, "groups", MappingProxyType(dict(self.groups)))
 
     def __reduce__(self):
-        return Motion, (self.camera, dict(self.groups))  # a mapping proxy is not pickled
+        return Motion, (self.camera, dict(self.groups))  # a mapping proxy cannot be pickled
 
     @cached_property
     def is_still(self) -> bool:
-        """Whether nothing moves."""
+        """Whether neither the camera nor a group moves."""
         return self.camera is None and not self.groups
 
     def camera_at(self, time: float) -> np.ndarray | None:
-        """world_to_camera (4, 4) at a time; None if the camera does not move."""
+        """world_to_camera (4, 4) at a time; None for a static camera."""
         time = number("the time of a motion", time)
         return None if self.camera is None else _checked(self.camera(time), "the camera", time)
 
     def sampled(self, times: Iterable[float]) -> Motion:
-        """A motion restricted to the poses at these times; it pickles even if made of functions."""
+        """Copy restricted to the poses at these times, which can be pickled even if poses are functions."""
         try:
             moments = [number("a time", time, "a finite number of seconds") for time in times]
         except TypeError:
@@ -120,10 +120,9 @@ class Motion:
         return Motion(camera, groups)
 
     def moved(self, camera: Camera, time: float) -> Camera:
-        """The camera at its pose at a time."""
+        """The camera at the pose of a time."""
         instance("the camera of a motion", camera, Camera)
         pose = self.camera_at(time)
-        # the position follows from the pose
         return camera if pose is None else camera.with_pose(pose)
 
     def groups_at(self, time: float) -> list[tuple[int, np.ndarray]]:
@@ -137,7 +136,7 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class _PoseTable:
-    """Poses at some times, callable as a function of the time."""
+    """Poses at given times, callable as a function of the time."""
 
     poses: dict[float, np.ndarray]
 
@@ -148,8 +147,8 @@ class _PoseTable:
         return self.poses[time]
 
 
-def _checked(matrix, who: str, time: float) -> np.ndarray:
-    """A rigid pose as float64. Raises InputError."""
-    matrix = pose_matrix(matrix, f"the pose of {who} at {time:g} s")
-    check_similarity(matrix, f"the pose of {who} at {time:g} s", rigid=True)
+def _checked(matrix, what: str, time: float) -> np.ndarray:
+    """Validated rigid pose (4, 4) float64."""
+    matrix = pose_matrix(matrix, f"the pose of {what} at {time:g} s")
+    check_similarity(matrix, f"the pose of {what} at {time:g} s", rigid=True)
     return np.asarray(matrix, np.float64)

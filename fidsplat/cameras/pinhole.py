@@ -1,4 +1,4 @@
-"""The camera: a pinhole, or one with a lens."""
+"""Camera: size, intrinsics, lens and pose."""
 
 import math
 import operator
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.cameras.foreign import colmap_parts, nerfstudio_parts, ros_parts
+from fidsplat.cameras.foreign import colmap_arguments, nerfstudio_arguments, ros_arguments
 from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye, Lens, Orthographic
 from fidsplat.splats.rotations import check_similarity, pose_matrix
 from fidsplat.util.arguments import LARGEST, PickledByFields, invalid, real_array
@@ -18,16 +18,16 @@ MAX_SIZE = 32767
 """largest width and height in pixels: pixel numbers fit 16 bits on every device"""
 
 FOCAL_LENGTHS = 1e-6, 1e18
-"""smallest and largest, pixels: beyond them the quadratic forms of splats leave the range of float32"""
+"""smallest and largest focal length in pixels: beyond them quadratic forms of splats exceed float32"""
 
 
 @dataclass(frozen=True, eq=False)
 class Camera(PickledByFields, Summarised):
-    """Camera: a pinhole, or one with a lens. A pinhole projects a point (X, Y, Z) of the camera frame to
+    """Camera: size, intrinsics, lens and pose. A pinhole projects a point (X, Y, Z) of the camera frame to
     x = fx X / Z + cx, y = fy Y / Z + cy; a lens replaces X / Z and Y / Z.
 
-    Pixel (row i, column j) has its centre at x = j + 0.5, y = i + 0.5. Raises InputError for values that
-    are invalid, among them a distortion that leaves less than half of the image with rays.
+    Pixel (row i, column j) has its centre at x = j + 0.5, y = i + 0.5. Raises InputError for invalid values,
+    and for a distortion that cannot be inverted in half of the image.
     """
 
     width: int
@@ -39,24 +39,25 @@ class Camera(PickledByFields, Summarised):
     fy: float
     """pixels, 1e-6 to 1e18"""
     cx: float
-    """pixels, anywhere; width / 2 is the middle"""
+    """pixels, any value; width / 2 is the centre"""
     cy: float
-    """pixels, anywhere; height / 2 is the middle"""
+    """pixels, any value; height / 2 is the centre"""
     world_to_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
-    """(4, 4) float64, rigid, read-only; or given as (position, quaternion w, x, y, z) of the world in the
-    camera's frame"""
+    """(4, 4) float64, rigid, read-only; or given as (position, quaternion w, x, y, z), the pose of the world
+    in the camera frame"""
     near: float = 0.01
-    """metres along z (along the ray for a fisheye or panorama), above 0; nearer parts of a splat are
+    """metres along z (along the ray for a fisheye or panorama), above 0; fragments nearer than this are
     clipped"""
     far: float = math.inf
-    """metres, measured like near and above it; a splat completely beyond it is not rendered"""
+    """metres, measured like near, above near; splats completely beyond it are not rendered"""
 
     position: np.ndarray = None  # type: ignore[assignment]
-    """(3,) float64, centre of projection in the world, metres, read-only. By default it follows from
-    world_to_camera, which far from the origin has rounded it; a camera made from its position keeps it"""
+    """(3,) float64, centre of projection in the world, metres, read-only. By default it is computed from
+    world_to_camera, which loses digits far from the origin; a camera made from a position stores it
+    exactly"""
 
     lens: Lens | None = None
-    """None, or a lens whose coefficients are all 0: a pinhole"""
+    """lens model; None: a pinhole, also for a lens whose coefficients are all 0"""
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -83,27 +84,27 @@ class Camera(PickledByFields, Summarised):
             self._check_lens()
 
     def _set_pose(self, world_to_camera: Any, position: Any) -> None:
-        """Set the pose of a new camera. Raises InputError if it is not rigid."""
+        """Set and validate the pose of a new camera."""
         given = pose_matrix(world_to_camera, "camera world_to_camera")
         check_similarity(given, "camera world_to_camera", rigid=True)
         matrix = np.array(given, dtype=np.float64)
         rotation, moved = matrix[:3, :3], matrix[:3, 3]
         if position is None:
-            # by the inverse, not the transpose: a rotation from a float32 file is orthonormal to 1e-7 only
+            # the inverse, not the transpose: a rotation from a float32 file is orthonormal to 1e-7 only
             position = np.linalg.solve(rotation, -moved) + 0.0
         else:
             position = _vector("position", position)
             if np.abs(rotation @ position + moved).max() > 1e-6 * (1 + np.abs(position).max()):
                 raise InputError(
-                    f"camera position must be that of world_to_camera, got {tuple(position.tolist())}; leave "
-                    "it out, or move a camera by camera.with_pose(world_to_camera)"
+                    "camera position must be the centre of projection of world_to_camera, got "
+                    f"{tuple(position.tolist())}; omit it, or use camera.with_pose(world_to_camera)"
                 )
         for name, array in (("world_to_camera", matrix), ("position", position)):
             array.flags.writeable = False
             object.__setattr__(self, name, array)
 
     def _posed(self, world_to_camera: Any, position: Any = None) -> "Camera":
-        """A copy at another pose; the other fields were checked when this camera was made."""
+        """A copy at another pose. The other fields are not validated again."""
         camera = object.__new__(Camera)
         camera.__dict__.update(self.__dict__)
         camera._set_pose(world_to_camera, position)
@@ -113,7 +114,7 @@ class Camera(PickledByFields, Summarised):
         lens = self.lens
         if not isinstance(lens, Lens):
             raise InputError(f"camera lens must be BrownConrady, Fisheye, ... or None, got {lens!r}")
-        if lens.does_nothing:
+        if lens.is_pinhole:
             object.__setattr__(self, "lens", None)
         elif not isinstance(lens, Orthographic):
             y, x = np.mgrid[0.5 : self.height : self.height / 24, 0.5 : self.width : self.width / 32]
@@ -137,9 +138,10 @@ class Camera(PickledByFields, Summarised):
     def pinhole(
         width, height, fx, fy, cx, cy, world_to_camera=None, near=0.01, far=math.inf, position=None, lens=None
     ) -> "Camera":
-        """A camera from its intrinsics in pixels and its pose (4, 4), by default the identity.
+        """A camera from intrinsics in pixels, a pose world_to_camera (4, 4), by default the identity, and a
+        lens.
 
-        position (3,): exact centre of projection, if the pose was made from one. lens: a distortion.
+        position (3,): exact centre of projection in metres, for a pose that was computed from it.
         """
         pose = np.eye(4) if world_to_camera is None else world_to_camera
         return Camera(width, height, fx, fy, cx, cy, pose, near, far, position, lens)  # type: ignore[arg-type]
@@ -150,8 +152,8 @@ class Camera(PickledByFields, Summarised):
     ) -> "Camera":
         """A Kannala-Brandt fisheye with a horizontal field of view of ``fov_x`` radians, at most 200 degrees.
 
-        coefficients: k1 to k4 of `cv2.fisheye`. With calibrated intrinsics use
-        `Camera.pinhole(..., lens=Fisheye(...))`.
+        coefficients: k1 to k4 of `cv2.fisheye`. `Camera.pinhole(..., lens=Fisheye(...))` accepts calibrated
+        intrinsics.
         """
         factors = np.ravel(coefficients).tolist()
         if len(factors) != 4:
@@ -163,7 +165,7 @@ class Camera(PickledByFields, Summarised):
 
     @staticmethod
     def equirectangular(width, height, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
-        """A panorama of the sphere: z in the middle, -z at the left and right edges, -y at the top."""
+        """A panorama of the sphere: z in the centre, -z at the left and right edges, -y at the top."""
         width, height = _size("width", width), _size("height", height)
         fx, fy = width / (2 * math.pi), height / math.pi
         place = width / 2, height / 2, world_to_camera, near, far
@@ -171,7 +173,7 @@ class Camera(PickledByFields, Summarised):
 
     @staticmethod
     def orthographic(width, height, metres_wide, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
-        """An orthographic camera whose image is ``metres_wide`` metres across, with square pixels."""
+        """An orthographic camera with square pixels whose image is ``metres_wide`` metres wide."""
         width, height = _size("width", width), _size("height", height)
         across = _number("metres_wide", metres_wide)
         if not 0 < across < math.inf:
@@ -186,8 +188,8 @@ class Camera(PickledByFields, Summarised):
     ) -> "Camera":
         """A camera with square pixels at ``position`` whose optical axis passes through ``target``, metres.
 
-        fov_x: horizontal field of view in radians, between 0 and pi. up: the world direction that points up
-        in the image; by default -y, so that y points down as in a marker.
+        fov_x: horizontal field of view in radians, between 0 and pi. up: world direction that points up in
+            the image; by default -y, as markers have y down.
         """
         width, height = _size("width", width), _size("height", height)
         f = focal_length(width, fov_x)
@@ -196,48 +198,48 @@ class Camera(PickledByFields, Summarised):
 
     @staticmethod
     def from_colmap(camera, world_to_camera=None) -> "Camera":
-        """Camera from COLMAP, which uses the same axes and pixel coordinates.
+        """A camera of COLMAP, which uses the same axes and pixel coordinates.
 
         Args:
             camera: a `pycolmap.Camera`, or (model, width, height, parameters) as in cameras.txt.
-            world_to_camera: its pose, also a `pycolmap.Image` or `Rigid3d`; by default the identity.
+            world_to_camera: its pose, a `pycolmap.Image` or `Rigid3d`; by default the identity.
 
         Raises:
-            InputError: another kind of object, or a lens that is not supported. `load_cameras` reads files.
+            InputError: another type of object, or an unsupported camera model. `load_cameras` reads files.
         """
-        return Camera.pinhole(**colmap_parts(camera, world_to_camera)._asdict())
+        return Camera.pinhole(**colmap_arguments(camera, world_to_camera)._asdict())
 
     @staticmethod
     def from_nerfstudio(transforms, frame=0) -> "Camera":
-        """The camera of a frame of nerfstudio's transforms.json; its poses have OpenGL's axes.
+        """The camera of a frame of nerfstudio's transforms.json; poses are converted from OpenGL's axes.
 
         Args:
-            transforms: its content, a dict. It must have the size of the images, w and h.
+            transforms: content of the file, a dict with the image size, w and h.
             frame: number of the frame, or its file_path.
 
         Raises:
-            InputError: another content, or a lens that is not supported. `load_cameras` reads files.
+            InputError: another content, or an unsupported camera model. `load_cameras` reads files.
         """
-        return Camera.pinhole(**nerfstudio_parts(transforms, frame)._asdict())
+        return Camera.pinhole(**nerfstudio_arguments(transforms, frame)._asdict())
 
     @staticmethod
     def from_ros_camera_info(info, world_to_camera=None, *, rectified: bool = False) -> "Camera":
-        """The camera of a `sensor_msgs/CameraInfo` of ROS 1 or 2, or of a calibration file of ROS as a dict.
+        """The camera of a `sensor_msgs/CameraInfo` of ROS 1 or 2, or of a ROS calibration file as a dict.
 
         Args:
-            info: the message. Its pixel coordinates are smaller by 0.5 than ours.
+            info: the message. ROS pixel coordinates are smaller by 0.5.
             world_to_camera: pose of the world in the camera's optical frame; by default the identity.
             rectified: the camera of rectified images, from P without distortion, instead of K and D.
 
         Raises:
-            InputError: another kind of object, a distortion model that is not supported, binning or a region
-                of interest.
+            InputError: another type of object, an unsupported distortion model, binning, or a region of
+                interest.
         """
-        return Camera.pinhole(**ros_parts(info, world_to_camera, rectified)._asdict())
+        return Camera.pinhole(**ros_arguments(info, world_to_camera, rectified)._asdict())
 
     @property
     def camera_to_world(self) -> np.ndarray:
-        """(4, 4) float64, the inverse of world_to_camera: the pose of the camera in the world."""
+        """(4, 4) float64 pose of the camera in the world: the inverse of world_to_camera."""
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = self.world_to_camera[:3, :3].T, self.position
         return pose
@@ -254,21 +256,21 @@ class Camera(PickledByFields, Summarised):
         """The same camera (size, intrinsics, lens, near, far) at another pose.
 
         Args:
-            world_to_camera, camera_to_world: (4, 4), rigid, or (position, quaternion w, x, y, z). One of
-                them instead of the others.
+            world_to_camera, camera_to_world: (4, 4), rigid, or (position, quaternion w, x, y, z). Give only
+                one of them, or position and target.
             position: (3,) metres, centre of projection; by default the camera's own.
-            target: (3,) metres, a point on the new optical axis; without it the rotation stays.
-            up: (3,) world direction that points up in the image, with a target.
+            target: (3,) metres, a point on the new optical axis; by default the rotation is unchanged.
+            up: (3,) world direction that points up in the image; used with a target.
 
         Raises:
-            InputError: no pose, two poses, or one that is not rigid.
+            InputError: no pose, several poses, or a pose that is not rigid.
         """
         looks = position is not None or target is not None
-        ways = (world_to_camera is not None) + (camera_to_world is not None) + looks
-        if ways != 1:
+        count = (world_to_camera is not None) + (camera_to_world is not None) + looks
+        if count != 1:
             raise InputError(
                 "the pose of a camera must be given as world_to_camera, as camera_to_world, or as position, "
-                f"target or both, got {'none of them' if ways == 0 else 'both' if ways == 2 else 'all'}"
+                f"target or both, got {('none', '', 'both', 'all')[count]}"
             )
         if camera_to_world is not None:
             pose = pose_matrix(camera_to_world, "camera_to_world")
@@ -286,9 +288,9 @@ class Camera(PickledByFields, Summarised):
         return self._posed(pose, position)
 
     def with_size(self, width: int, height: int) -> "Camera":
-        """The same camera with another number of pixels. The horizontal field of view and the shape of pixels
-        stay; rows are added or cut off around the principal point. A panorama is scaled in both
-        directions."""
+        """The same camera with another number of pixels. The horizontal field of view and the pixel aspect
+        ratio are unchanged; rows are added or removed around the principal point. A panorama is scaled in
+        both directions."""
         width, height = _size("width", width), _size("height", height)
         x = width / self.width
         y = height / self.height if isinstance(self.lens, Equirectangular) else x
@@ -298,14 +300,14 @@ class Camera(PickledByFields, Summarised):
         )
 
     def resampled(self, width: int, height: int) -> "Camera":
-        """The camera of the same image resampled to another number of pixels, in both directions."""
+        """The camera of an image that is resampled to another size, with a scale for each axis."""
         width, height = _size("width", width), _size("height", height)
         x, y = width / self.width, height / self.height
         intrinsics = {"fx": self.fx * x, "fy": self.fy * y, "cx": self.cx * x, "cy": self.cy * y}
         return replace(self, width=width, height=height, **intrinsics)
 
     def summary(self) -> dict[str, str]:
-        """Size, intrinsics, lens and pose in words, for notebooks."""
+        """Size, intrinsics, lens and pose as text, for notebooks."""
         lens = self.lens
         changes = [] if lens is None else [(f.name, getattr(lens, f.name)) for f in fields(lens)]
         values = ", ".join(f"{name} = {value:g}" for name, value in changes if np.ndim(value) == 0 and value)
@@ -324,8 +326,8 @@ class Camera(PickledByFields, Summarised):
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, points) -> np.ndarray:
-        """Pixel coordinates (n, 2) float64 of world points (n, 3), NaN for depths of 0 and below and outside
-        the lens."""
+        """Pixel coordinates (n, 2) float64 of world points (n, 3); NaN behind the camera and outside the
+        lens's field of view."""
         world = real_array("points", points)
         if world.ndim != 2 or world.shape[1] != 3:
             raise InputError(f"points must have the shape (n, 3), got {world.shape}")
@@ -343,8 +345,9 @@ class Camera(PickledByFields, Summarised):
         return np.stack([x, y], -1)
 
     def rays(self, pixels) -> np.ndarray:
-        """Directions (n, 3) float64 in the camera frame of pixel coordinates (n, 2), NaN outside the field of
-        view; with Z = 1, or of unit length for a fisheye or panorama. Raises InputError for parallel rays."""
+        """Directions (n, 3) float64 in the camera frame of pixel coordinates (n, 2), with Z = 1, or of unit
+        length for a fisheye or panorama; NaN outside the field of view. Raises InputError for an orthographic
+        camera, whose rays are parallel."""
         image = real_array("pixels", pixels)
         if image.ndim != 2 or image.shape[1] != 2:
             raise InputError(f"pixels must have the shape (n, 2), got {image.shape}")
@@ -358,8 +361,8 @@ class Camera(PickledByFields, Summarised):
         return self.lens.rays(image)
 
     def unproject(self, pixels, depths) -> np.ndarray:
-        """World points (n, 3) float64 of pixel coordinates (n, 2) at depths (n,) in metres, as in the output
-        `depth`; NaN outside the field of view."""
+        """World points (n, 3) float64 of pixel coordinates (n, 2) at depths (n,) in metres, defined as in the
+        output `depth`; NaN outside the field of view."""
         depths = real_array("depths", depths)
         if depths.ndim != 1:
             raise InputError(f"depths must have the shape (n,), got {depths.shape}")
@@ -372,7 +375,7 @@ class Camera(PickledByFields, Summarised):
 
 
 def fisheye_focal_length(width: int, fov_x: float, lens: Fisheye) -> float:
-    """Focal length of a fisheye in pixels, from its width in pixels and horizontal field of view in
+    """Focal length in pixels of a fisheye with a width in pixels and a horizontal field of view in
     radians."""
     angle = _number("fov_x", fov_x)
     if not 1e-9 < angle <= 2 * lens.limit + 1e-12:
@@ -384,7 +387,7 @@ def fisheye_focal_length(width: int, fov_x: float, lens: Fisheye) -> float:
 
 
 def focal_length(width: int, fov_x: float) -> float:
-    """Focal length of a pinhole in pixels, from its width in pixels and horizontal field of view in
+    """Focal length in pixels of a pinhole with a width in pixels and a horizontal field of view in
     radians."""
     width, angle = _size("width", width), _number("fov_x", fov_x)
     if not 1e-9 < angle < math.pi:
@@ -394,8 +397,8 @@ def focal_length(width: int, fov_x: float) -> float:
 
 
 def look_at_matrix(position, target, up=(0.0, -1.0, 0.0)) -> np.ndarray:
-    """world_to_camera (4, 4) float64 of a camera at ``position`` whose axis passes through ``target``. Raises
-    InputError if the points coincide, or up is parallel to the axis."""
+    """world_to_camera (4, 4) float64 of a camera at ``position`` whose optical axis passes through
+    ``target``. Raises InputError if both points coincide, or up is parallel to the axis."""
     eye, aim, upward = (_vector(n, v) for n, v in (("position", position), ("look_at", target), ("up", up)))
     forward = aim - eye
     distance = np.linalg.norm(forward)
@@ -413,7 +416,7 @@ def look_at_matrix(position, target, up=(0.0, -1.0, 0.0)) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
     matrix[:3, 3] = -rotation @ eye
-    return matrix + 0.0  # no minus zeros, which saved scene files would show
+    return matrix + 0.0  # removes the signs of zeros, which scene files would contain
 
 
 def _size(name: str, value) -> int:

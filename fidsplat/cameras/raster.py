@@ -1,4 +1,4 @@
-"""Tables of a lens for devices: the ray of each sample, and the samples in each cell of directions."""
+"""Ray tables of a lens on a sample grid, and bounds of the samples per cell of directions."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from fidsplat.cameras.lenses import Fisheye, RayLens, RayTable
 
 CELLS = 512
-"""maximum number of cells of the finest map along an axis"""
-_ROWS = 1 << 18  # samples whose rays are computed at once
+"""maximum number of cells per axis of the finest grid"""
+_ROWS = 1 << 18  # samples whose rays are computed at once, which bounds memory
 _EMPTY = np.array([32767, -1, 32767, -1], np.int16)
 
 
 @dataclass(frozen=True, eq=False)
 class RayRaster:
-    """Sample grid of a lens, independent of the pose; sizes, focal lengths and centre in samples."""
+    """Sample grid of a lens, independent of the pose. Sizes, focal lengths and centre are in samples."""
 
     lens: RayLens
     width: int
@@ -38,7 +38,7 @@ class RayRaster:
     @cached_property
     def rays(self) -> np.ndarray:
         """(h, w, 3) float32: direction of each sample's ray, with Z = 1 or of unit length; NaN outside the
-        field of view. Every device and the reference render with these rounded rays."""
+        field of view. All devices and the reference renderer use these rounded rays."""
         if self.whole is not None:
             return self.whole.rays[self.top : self.top + self.height]
         rays = np.empty((self.height, self.width, 3), np.float32)
@@ -53,8 +53,8 @@ class RayRaster:
 
     @cached_property
     def slopes(self) -> np.ndarray:
-        """(h, w, 2, 3) float32: derivatives of the rays with respect to x and y, per sample; NaN outside
-        the field of view."""
+        """(h, w, 2, 3) float32: derivatives of the rays with respect to x and y in samples; NaN outside the
+        field of view."""
         if self.whole is not None:
             return self.whole.slopes[self.top : self.top + self.height]
         slopes = np.empty((self.height, self.width, 2, 3), np.float32)
@@ -64,7 +64,7 @@ class RayRaster:
             by_ray = self.lens.derivative(rays) * np.array([[self.focal_x], [self.focal_y]])
             if not self.lens.along_ray:
                 by_ray[:, :, 2] = 0.0  # all rays have Z = 1, so their differences have Z = 0
-            # the inverse among neighbouring rays: J^T (J J^T)^-1
+            # the pseudo-inverse J^T (J J^T)^-1 of the Jacobian J of the projection
             xx, yy, xy = ((by_ray[:, i] * by_ray[:, j]).sum(1)[:, None] for i, j in ((0, 0), (1, 1), (0, 1)))
             with np.errstate(divide="ignore", invalid="ignore"):
                 along_x = (yy * by_ray[:, 0] - xy * by_ray[:, 1]) / (xx * yy - xy * xy)
@@ -75,7 +75,7 @@ class RayRaster:
 
     @cached_property
     def step(self) -> float:
-        """The largest length of a ray's derivative in any direction of the image, rounded up."""
+        """Maximum length of a ray's derivative over all samples and image directions, rounded up."""
         if self.whole is not None:
             return self.whole.step
         along_x, along_y = np.moveaxis(self.slopes, 2, 0)
@@ -84,8 +84,8 @@ class RayRaster:
         return float(np.sqrt(np.nanmax(squared))) * 1.00001
 
     def chart(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates in which kernels bound a splat: the ideal pinhole image in samples, or, for a fisheye
-        or a table of rays, the stereographic projection (X, Y) / (|ray| + Z)."""
+        """Coordinates in which kernels bound splats: the undistorted pinhole image in samples, or, for a
+        fisheye or a ray table, the stereographic projection (X, Y) / (|ray| + Z)."""
         x, y, z = np.moveaxis(rays.astype(np.float64), -1, 0)
         if isinstance(self.lens, Fisheye | RayTable):
             below = z + np.sqrt(x * x + y * y + z * z)
@@ -94,9 +94,12 @@ class RayRaster:
 
     @cached_property
     def map(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of the samples whose rays are in each cell of the chart: boxes (cells^2 + (cells / 2)^2 +
-        ... + 1, 4) int16, first and last column, first and last row (last < first: none), for grids of cells,
-        cells / 2, ..., 1 cells a side; and (low_x, low_y, cells per unit along x, along y, cells)."""
+        """Pyramid of sample bounds over the chart, from grids of cells x cells to 1 x 1, for culling.
+
+        Returns boxes (cells^2 + (cells / 2)^2 + ... + 1, 4) int16, the first and last column and the first
+        and last row of the samples whose rays are in a cell (last < first if there are none); and (low_x,
+        low_y, cells per unit along x, along y, cells) float64.
+        """
         if self.whole is not None:
             return self.whole.map
         rows, columns = np.nonzero(np.isfinite(self.rays[..., 0]))
@@ -105,7 +108,7 @@ class RayRaster:
             cells *= 2
         x, y = self.chart(self.rays[rows, columns])
         low = np.array([x.min(), y.min()])
-        # the furthest sample is in the last cell, not beyond it
+        # the samples at the upper edge belong to the last cell
         scale = cells * (1 - 1e-9) / np.maximum(np.array([x.max(), y.max()]) - low, 1e-12)
         cell = np.minimum((y - low[1]) * scale[1], cells - 1).astype(np.int64) * cells
         cell += np.minimum((x - low[0]) * scale[0], cells - 1).astype(np.int64)
@@ -126,12 +129,12 @@ class RayRaster:
 
     @property
     def uniforms(self) -> tuple[float, ...]:
-        """Uniforms of the kernels: those of the lens, of the map, and the first row."""
+        """Uniforms of the kernels: of the lens, of the map, and the first row."""
         if self.lens.kind == "equirectangular":
             return self.lens.uniforms
         low_x, low_y, *rest = map(float, self.map[1])
         if not isinstance(self.lens, Fisheye | RayTable):
-            low_y -= self.top  # the chart counts rows as the image does
+            low_y -= self.top  # a band counts rows from its own top, the map from the complete raster's
         return (*self.lens.uniforms, low_x, low_y, *rest, float(self.top))
 
 
@@ -139,5 +142,5 @@ class RayRaster:
 def raster_of(
     lens: RayLens, width: int, height: int, focal_x: float, focal_y: float, center_x: float, center_y: float
 ) -> RayRaster:
-    """Cached raster of these parameters, for images from many poses."""
+    """Cached raster, shared by images from many poses."""
     return RayRaster(lens, width, height, focal_x, focal_y, center_x, center_y)

@@ -1,4 +1,4 @@
-"""Rigid motions and their logarithms: the screw motion from one pose to another."""
+"""Screw motions between rigid poses: exponential and logarithm of SE(3)."""
 
 import math
 
@@ -8,26 +8,26 @@ from fidsplat.splats.rotations import matrix_to_quaternion
 
 
 def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
-    """The rigid pose (4, 4) at a share of the screw motion from one pose to another."""
+    """Interpolate along the screw motion from one rigid pose (4, 4) to another; share: 0 to 1."""
     return start @ exponential(twist(start, end) * share)
 
 
 def twist(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """The twist (6,) of the screw motion that moves one rigid pose (4, 4) to another in time 1: axis times
-    angle, and velocity, in the axes of `start`."""
-    turn = start[:3, :3].T @ end[:3, :3]
-    move = start[:3, :3].T @ (end[:3, 3] - start[:3, 3])
-    axis = _rotation_vector(turn)
-    # the velocity whose integral over the whole turn is `move`
-    return np.concatenate([axis, np.linalg.solve(_integral(axis), move)])
+    """The twist (6,) of the screw motion from one rigid pose (4, 4) to another in time 1: axis times angle,
+    and velocity, in the axes of `start` (logarithm of SE(3))."""
+    rotation = start[:3, :3].T @ end[:3, :3]
+    translation = start[:3, :3].T @ (end[:3, 3] - start[:3, 3])
+    axis = _rotation_vector(rotation)
+    # the velocity that integrates to `translation` over the complete rotation
+    return np.concatenate([axis, np.linalg.solve(_integral(axis), translation)])
 
 
 def exponential(motion: np.ndarray) -> np.ndarray:
-    """The rigid pose (4, 4) to which a twist (6,) takes the identity in time 1."""
-    part = np.eye(4)
-    part[:3, :3] = _turned(motion[:3])
-    part[:3, 3] = _integral(motion[:3]) @ motion[3:]
-    return part
+    """The rigid motion (4, 4) along a twist (6,) in time 1 (exponential of SE(3))."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_matrix(motion[:3])
+    pose[:3, 3] = _integral(motion[:3]) @ motion[3:]
+    return pose
 
 
 def _skew(axis: np.ndarray) -> np.ndarray:
@@ -35,22 +35,22 @@ def _skew(axis: np.ndarray) -> np.ndarray:
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
-def _rotation_vector(turn: np.ndarray) -> np.ndarray:
+def _rotation_vector(rotation: np.ndarray) -> np.ndarray:
     """Axis times angle (0 to pi) of a rotation matrix."""
-    w, *xyz = matrix_to_quaternion(turn)
+    w, *xyz = matrix_to_quaternion(rotation)
     length = np.linalg.norm(xyz)
     return np.array(xyz) * (2 * math.atan2(length, w) / length if length > 0 else 2.0)
 
 
-def _turned(axis: np.ndarray) -> np.ndarray:
-    """The rotation matrix of axis times angle."""
+def rotation_matrix(axis: np.ndarray) -> np.ndarray:
+    """Rotation matrix (3, 3) of a rotation vector (3,), axis times angle in radians (Rodrigues)."""
     angle, skew = float(np.linalg.norm(axis)), _skew(axis)
     half = np.sinc(angle / 2 / math.pi)
     return np.eye(3) + np.sinc(angle / math.pi) * skew + half * half / 2 * skew @ skew
 
 
 def _integral(axis: np.ndarray) -> np.ndarray:
-    """The integral over s in [0, 1] of the rotations by s times the axis."""
+    """Integral (3, 3) of the rotation matrices of s times the axis, over s from 0 to 1."""
     angle, skew = float(np.linalg.norm(axis)), _skew(axis)
     half = np.sinc(angle / 2 / math.pi)
     third = 1 / 6 - angle**2 / 120 if angle < 1e-3 else (1 - np.sinc(angle / math.pi)) / angle**2

@@ -1,4 +1,4 @@
-"""Trajectory: a pose as a function of time, through keyframes."""
+"""Trajectories: poses as functions of time, interpolated between keyframes."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from fidsplat.util.arguments import PickledByFields, as_float, flag, invalid, nu
 from fidsplat.util.errors import InputError
 
 UNIT = 1e-3
-"""largest deviation of a quaternion's length from 1, as files round quaternions"""
+"""largest deviation of a quaternion's length from 1, for quaternions that files round"""
 MAX_SAMPLES = 10_000_000
 """maximum number of sampled poses"""
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory(PickledByFields):
-    """Pose as a function of time in seconds, by interpolation of keyframes along screw motions (geodesics of
-    SE(3)); constant before the first and after the last.
+    """Pose as a function of time in seconds, interpolated between keyframes along screw motions (geodesics of
+    SE(3)); constant before the first and after the last keyframe.
 
-    Trajectory files hold camera-to-world poses; `Motion.camera` is world to camera, the `inverse()`. Raises
-    InputError for times that do not increase, and for poses that are not rigid.
+    Trajectory files contain camera-to-world poses; `Motion.camera` is world to camera, the `inverse()`.
+    Raises InputError for times that do not increase, and for poses that are not rigid.
     """
 
     times: Sequence[float] | np.ndarray
@@ -36,7 +36,7 @@ class Trajectory(PickledByFields):
     """(k, 4, 4) rigid; or given as pairs of a position and a unit quaternion w, x, y, z, or as (k, 7)"""
     smooth: bool = False
     """continuous velocity: a cubic Bezier curve of screw motions between keyframes. The velocity at a
-    keyframe is the slope of the parabola through it and its neighbours, limited where rotations are fast.
+    keyframe is the slope of the parabola through it and its neighbours, limited for fast rotations.
     Keyframes must be less than half a rotation apart"""
 
     def __post_init__(self) -> None:
@@ -71,7 +71,7 @@ class Trajectory(PickledByFields):
         return f"Trajectory({len(self)} poses, {first:g} to {last:g} s, {kind})"
 
     def __call__(self, time: float) -> np.ndarray:
-        """(4, 4) float64. Raises InputError for a time that is not finite."""
+        """Pose (4, 4) float64 at a time in seconds. Raises InputError for a time that is not finite."""
         time = number("the time of a trajectory", time)
         times = np.asarray(self.times)
         after = int(np.searchsorted(times, time, side="right"))
@@ -83,21 +83,21 @@ class Trajectory(PickledByFields):
             return between(start, end, share)
         curve = [start, start @ exponential(self._velocities[after - 1] * (duration / 3))]
         curve += [end @ exponential(self._velocities[after] * (-duration / 3)), end]
-        while len(curve) > 1:  # de Casteljau, a screw motion in place of each line
+        while len(curve) > 1:  # de Casteljau's algorithm with screw motions instead of lines
             curve = [between(a, b, share) for a, b in itertools.pairwise(curve)]
         return curve[0]
 
     @cached_property
     def _velocities(self) -> np.ndarray:
-        """(k, 6) twists per second at the keyframes, in their own axes."""
+        """(k, 6) twists per second at the keyframes, in the axes of each keyframe."""
         durations = np.diff(self.times)[:, None]
         if not len(durations):
             return np.zeros((1, 6))
         along = np.array([twist(*pair) for pair in itertools.pairwise(self.poses)]) / durations
         before, after = durations[:-1], durations[1:]
         inner = (along[:-1] * after + along[1:] * before) / (before + after)
-        # limits a fast rotation of a short interval in its long neighbour: the curve uses a third of the
-        # rotation there, which stays below a quarter rotation and therefore has one direction
+        # limits rotations: a third of an interval's velocity must rotate by less than a quarter rotation,
+        # otherwise a fast rotation in a short interval makes the long neighbour's curve ambiguous
         rotations = np.linalg.norm(inner[:, :3], axis=1, keepdims=True) * np.maximum(before, after) / 3
         inner *= np.minimum(1.0, math.pi / 2 / np.maximum(rotations, 1e-300))
         return np.concatenate([along[:1], inner, along[-1:]])
@@ -108,7 +108,7 @@ class Trajectory(PickledByFields):
         return np.array([[*pose[:3, 3], *matrix_to_quaternion(pose[:3, :3])] for pose in self.poses])
 
     def inverse(self) -> Trajectory:
-        """The inverse pose at every time: world to camera from camera to world, and vice versa."""
+        """Trajectory of the inverse poses: world to camera from camera to world, and vice versa."""
         turned = self.poses[:, :3, :3].transpose(0, 2, 1)
         poses = np.zeros_like(self.poses)
         poses[:, :3, :3], poses[:, 3, 3] = turned, 1.0
@@ -125,7 +125,8 @@ class Trajectory(PickledByFields):
                 f"a trajectory must have at most {MAX_SAMPLES:,} poses, got {rate:g} per second over "
                 f"{last - first:g} s; give a lower rate"
             )
-        times = first + np.arange(int(steps + 1e-6) + 1) / rate  # the last one too where it falls on a step
+        # 1e-6: the end is included if it is a multiple of 1 / rate
+        times = first + np.arange(int(steps + 1e-6) + 1) / rate
         return Trajectory(times, np.array([self(time) for time in times]))
 
 
@@ -136,7 +137,7 @@ def check_rate(rate: float) -> None:
 
 
 def _of_vector(k: int, vector) -> np.ndarray:
-    """The matrix of x, y, z and a unit quaternion. Raises InputError, naming pose k, for anything else."""
+    """Matrix of pose k, given as x, y, z and a unit quaternion w, x, y, z."""
     numbers = real_array(f"pose {k} of a trajectory", vector, "x, y, z and a quaternion w, x, y, z")
     if numbers.shape != (7,) or not np.isfinite(numbers).all():
         raise InputError(
@@ -153,7 +154,7 @@ def _of_vector(k: int, vector) -> np.ndarray:
 
 
 def _shown(given, times: np.ndarray) -> str:
-    """The times for an error message; if times do not increase, only these times."""
+    """The times for an error message: the first pair that does not increase, or all times."""
     if times.ndim == 1 and len(times) > 1 and np.isfinite(times).all():
         k = int(np.argmax(np.diff(times) <= 0))
         return f"{times[k]:.15g} and then {times[k + 1]:.15g} (number {k + 1}, counted from 0)"

@@ -1,1 +1,1 @@
-"""Capture settings of a frame as plain data: camera, outputs, quality, sensor, environment."""
+"""Capture settings of a frame: camera, outputs, quality, sensor, environment; independent of the device."""

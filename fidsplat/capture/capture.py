@@ -1,4 +1,4 @@
-"""Capture: everything that defines a frame except the splats."""
+"""Capture: all settings of a frame except the splats."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ _DEFAULTS = {"motion": _MOTION, "shutter": _SHUTTER, "sensor": _SENSOR}
 class Capture(PickledByFields):
     """Camera, outputs, quality, background, motion, shutter, sensor and fog of a frame.
 
-    It does not depend on the device. Raises InputError for a value of the wrong type; output names are
-    checked when the frame is rendered.
+    Raises InputError for a value of the wrong type; output names are validated when the frame is rendered.
     """
 
     camera: Camera | None = None
@@ -36,19 +35,19 @@ class Capture(PickledByFields):
     outputs: tuple[str, ...] = ("rgb",)
     """names of the output images; a single name may be a str"""
     quality: Quality = _QUALITY
-    """a Quality, or text such as "fast" or "fast,samples=2" (`Quality.of`); None: standard"""
+    """a Quality, or text as of `Quality.of`, such as "fast" or "fast,samples=2"; None: standard"""
     background: Background = (0.0, 0.0, 0.0)
     """behind the splats: RGB in display space, a Gradient or a Panorama"""
     motion: Motion = _MOTION
-    """motion of the camera and of groups of splats; None: nothing moves"""
+    """motion of the camera and of groups of splats; None: no motion"""
     shutter: Shutter = _SHUTTER
-    """time, exposure and readout; None: at time 0, without duration"""
+    """time, exposure and readout; None: an instant at time 0"""
     sensor: Sensor = _SENSOR
     """sensor applied to rgb; None: no sensor"""
     fog: Fog | None = None
     """fog between the camera and the splats"""
     external_depth: ExternalDepth | None = None
-    """external depth image from another renderer, of the camera's size: an opaque surface among the splats"""
+    """external depth image of the camera's size from another renderer: an opaque surface among the splats"""
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -66,12 +65,12 @@ class Capture(PickledByFields):
 
     @cached_property
     def foggy(self) -> bool:
-        """Whether the fog is visible."""
+        """Whether there is fog with a density above 0."""
         return self.fog is not None and self.fog.density > 0
 
     @cached_property
     def backdrop(self) -> Background:
-        """Background behind all splats: the colour of the fog if there is fog, else the background."""
+        """Background behind all splats: the colour of the fog, or the background if there is no fog."""
         return self.fog.color if self.fog is not None and self.foggy else self.background
 
     @cached_property
@@ -83,7 +82,7 @@ class Capture(PickledByFields):
         return len(self.shutter.bands(rows)) > 1 or len(self.shutter.times(0.0)) > 1
 
     def picklable(self) -> Capture:
-        """A copy that can be pickled: motion functions are replaced by poses at the times of the shutter."""
+        """A copy that can be pickled: motion functions are replaced by poses at the shutter's times."""
         if self.motion.is_still or self.camera is None:
             return self
         shutter = self.shutter
@@ -92,19 +91,19 @@ class Capture(PickledByFields):
         return replace(self, motion=self.motion.sampled(times))
 
     def with_(self, **changes: Any) -> Capture:
-        """A copy with some parts changed; None keeps a part. Raises InputError for an unknown part or a wrong
-        type."""
+        """A copy with some fields changed; None leaves a field unchanged. Raises InputError for an unknown
+        field or a value of the wrong type."""
         given = {}
         for name, value in changes.items():
             if name not in self.__dataclass_fields__:
-                raise InputError(unknown("part of a capture", name, self.__dataclass_fields__))
+                raise InputError(unknown("field of a capture", name, self.__dataclass_fields__))
             if value is not None:
                 given[name] = value
         return replace(self, **given) if given else self
 
 
-class CaptureParts(TypedDict, total=False):
-    """Keyword arguments that change parts of a capture; None keeps a part."""
+class CaptureFields(TypedDict, total=False):
+    """Keyword arguments that replace fields of a capture; None leaves a field unchanged."""
 
     camera: Camera | None
     background: Background | Iterable[float] | None
@@ -116,7 +115,7 @@ class CaptureParts(TypedDict, total=False):
 
 
 def output_names(outputs: Any) -> tuple[str, ...]:
-    """Distinct names of outputs from one name or several. Raises InputError for anything else, or none."""
+    """Distinct names of outputs, from one name or several. Raises InputError for other types or no name."""
     try:
         names: tuple[Any, ...] = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     except TypeError:  # a 0-dimensional array is an Iterable too

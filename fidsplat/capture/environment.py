@@ -12,13 +12,13 @@ from fidsplat.util.arguments import LARGEST, PickledByFields, array_of, as_float
 from fidsplat.util.errors import InputError
 
 MAX_PANORAMA = 16384
-"""pixels along a side"""
+"""maximum number of pixels per side"""
 
 
 @dataclass(frozen=True)
 class Fog:
-    """Homogeneous fog: a surface at distance r keeps the share exp(-density r) of its colour; the rest is the
-    fog's colour, which also replaces the background."""
+    """Homogeneous fog: a surface at distance r contributes the share exp(-density r) of its colour, the fog's
+    colour the rest. The fog's colour replaces the background."""
 
     density: float
     """1 / metres"""
@@ -37,7 +37,7 @@ class Fog:
 
 @dataclass(frozen=True)
 class Gradient:
-    """Background gradient between two colours, by the sine of the elevation of the ray.
+    """Background gradient between two colours by the sine of the elevation of the ray.
 
     Raises InputError for a colour or direction that is not three finite numbers, or a direction of length 0.
     """
@@ -66,7 +66,7 @@ class Panorama(PickledByFields):
     image: np.ndarray
     """(h, w, 3) float32 RGB, read-only; uint8 is divided by 255, uint16 by 65535"""
     file: str | None = None
-    """file of the image"""
+    """path of the image file"""
 
     def __post_init__(self) -> None:
         given = array_of("background: a panorama", self.image, "(h, w, 3) numbers", "fiu")
@@ -98,18 +98,18 @@ class Panorama(PickledByFields):
 
 @dataclass(frozen=True, eq=False)
 class ExternalDepth(PickledByFields):
-    """An image with depths from another renderer, composited with the splats as an opaque surface.
+    """Colour and depth image from another renderer, composited with the splats as an opaque surface.
 
-    In each pixel the surface occludes the splats behind it, and splats in front are composited over it.
-    For the one capture of a batch, the arrays may be those of all views: (views, h, w) instead of (h, w).
+    In each pixel the surface occludes the splats behind it, and splats in front are composited over it. If
+    all views of a batch share one capture, the arrays may contain the images of all views, (views, h, w).
     Raises InputError for arrays of other shapes, colours that are not finite, or depths below 0.
     """
 
     rgb: Any
     """(h, w, 3) float32 in display space, read-only; uint8 is divided by 255"""
     depth: Any
-    """(h, w) float32 metres, along z (along the ray for a fisheye or panorama); infinite where there is no
-    surface, which may also be given as 0 or NaN"""
+    """(h, w) float32 metres, along z (along the ray for a fisheye or panorama); infinite, 0 or NaN where
+    there is no surface"""
     label: Any = 0
     """(h, w) int32, or one label for all pixels"""
 
@@ -148,30 +148,30 @@ class ExternalDepth(PickledByFields):
 
     @property
     def stacked(self) -> bool:
-        """Whether these are the images of all views of a batch."""
+        """Whether the arrays contain the images of all views of a batch."""
         return len(self.depth.shape) > 2
 
     @property
     def nbytes(self) -> int:
-        """Bytes of its arrays on a device."""
+        """Size of the arrays on a device in bytes."""
         return 20 * math.prod(self.depth.shape)
 
-    def part(self, views: int | slice | np.ndarray) -> ExternalDepth:
-        """The images of one view of a batch, or of some; those of an array of numbers are on the host."""
-        part = object.__new__(type(self))  # they are checked
+    def of_views(self, views: int | slice | np.ndarray) -> ExternalDepth:
+        """The images of some views of a batch. For an index array, they are copied to the host."""
+        images = object.__new__(type(self))  # they are validated already
         for name in ("rgb", "depth", "label"):
             array = getattr(self, name)
             if isinstance(views, np.ndarray) and not isinstance(array, np.ndarray):
                 array = array.numpy()
-            object.__setattr__(part, name, array[views])
-        return part
+            object.__setattr__(images, name, array[views])
+        return images
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceExternalDepth(ExternalDepth):
-    """External depth images of a batch in the memory of a Warp renderer's device, not checked: wp.arrays
-    (views, h, w) of vec3, float32 (infinite: no surface) and int32. They must not change until the images are
-    read."""
+    """External depth images of a batch on the device of a Warp renderer, not validated: wp.arrays (views, h,
+    w) of vec3, float32 (infinite where there is no surface) and int32. They must not change until the
+    rendered images are read."""
 
     def __post_init__(self) -> None:
         pass
@@ -198,7 +198,7 @@ def background_of(value: Any) -> Background:
 
 
 def three_numbers(name: str, value: Any) -> tuple[float, float, float]:
-    """Validated tuple of three finite floats; errors name it."""
+    """Validated tuple of three finite floats."""
     try:
         x, y, z = map(as_float, value)
     except (TypeError, ValueError):

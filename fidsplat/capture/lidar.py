@@ -1,4 +1,4 @@
-"""LiDAR model: directions and times of its beams, returns, noise and detection."""
+"""LiDAR model: beam pattern, returns, noise and detection."""
 
 from __future__ import annotations
 
@@ -24,14 +24,15 @@ MAX_BEAMS = 2**22
 
 @dataclass(frozen=True)
 class Spinning:
-    """Lasers on a rotor: one turn about the z axis, from azimuth pi (behind) clockwise as seen from above."""
+    """Lasers on a rotor: a scan is one rotation about z, clockwise seen from above, from azimuth pi
+    (behind)."""
 
     elevations: tuple[float, ...]
     """radians above the xy plane, one for each laser (ring)"""
     columns: int = 1024
-    """firings in a turn"""
+    """firings per rotation"""
     azimuths: tuple[float, ...] = ()
-    """radians, counterclockwise offset of each laser; empty: 0"""
+    """radians, counterclockwise azimuth offset of each laser; empty: all 0"""
 
     def __post_init__(self) -> None:
         limit = math.radians(88)
@@ -56,11 +57,11 @@ class Spinning:
 
     @property
     def beams(self) -> int:
-        """Number of beams in a scan."""
+        """Number of beams per scan."""
         return self.columns * self.rings
 
     def directions(self, start: float, duration: float) -> np.ndarray:
-        """(columns x rings, 3) unit directions in the order of firing; the same for every scan."""
+        """(columns x rings, 3) unit directions in the order of firing, the same for every scan."""
         turn = math.pi - 2 * math.pi * (np.arange(self.columns) + 0.5) / self.columns
         azimuth = turn[:, None] + (np.array(self.azimuths) if self.azimuths else 0.0)
         elevation = np.broadcast_to(self.elevations, (self.columns, self.rings))
@@ -69,7 +70,7 @@ class Spinning:
         return np.stack(rays, 2).reshape(-1, 3)
 
     def fractions(self) -> np.ndarray:
-        """(beams,) times of the beams as shares of the scan; lasers of a column fire together."""
+        """(beams,) times of the beams as shares of the scan; the lasers of a column fire together."""
         return np.repeat((np.arange(self.columns) + 0.5) / self.columns, self.rings)
 
     def ring_of(self) -> np.ndarray:
@@ -79,14 +80,14 @@ class Spinning:
 
 @dataclass(frozen=True)
 class Rosette:
-    """One laser behind two thin rotating prisms, about the x axis: the pattern differs from scan to scan."""
+    """One laser behind two rotating prisms (Risley prisms), around the x axis; each scan differs."""
 
     half_angle: float
     """radians between the x axis and the outermost beams"""
     rates: tuple[float, float]
-    """radians per second of the two prisms"""
+    """angular velocities of the two prisms in radians per second"""
     points: int = 10_000
-    """beams in a scan"""
+    """beams per scan"""
 
     def __post_init__(self) -> None:
         number("half_angle", self.half_angle, "an angle above 0, at most 1.4 rad", 1e-6, 1.4)
@@ -100,11 +101,11 @@ class Rosette:
 
     @property
     def beams(self) -> int:
-        """Number of beams in a scan."""
+        """Number of beams per scan."""
         return self.points
 
     def directions(self, start: float, duration: float) -> np.ndarray:
-        """(points, 3) unit directions in the order of firing, of a scan from a time in seconds."""
+        """(points, 3) unit directions in the order of firing, of a scan that starts at a time in seconds."""
         time = start + duration * self.fractions()
         first, second = (rate * time for rate in self.rates)
         left = self.half_angle / 2 * (np.cos(first) + np.cos(second))
@@ -118,7 +119,7 @@ class Rosette:
         return (np.arange(self.points) + 0.5) / self.points
 
     def ring_of(self) -> np.ndarray:
-        """(points,) zeros: there is one laser."""
+        """(points,) zeros, the index of the only laser."""
         return np.zeros(self.points, np.int64)
 
 
@@ -134,40 +135,39 @@ class Lidar:
     rate: float = 10.0
     """scans per second"""
     near: float = 0.5
-    """metres, minimum range; nearer returns are empty"""
+    """metres, minimum range; nearer returns are omitted"""
     far: float = 100.0
     """metres, maximum range"""
     divergence: float = 2e-3
-    """radians between the edges of a beam"""
+    """full angle of a beam in radians"""
     rays: int = 1
-    """rays per beam, spread over its cross-section; several returns need several rays"""
+    """rays per beam, distributed over its cross-section; several returns require several rays"""
     returns: tuple[str, ...] = ("strongest",)
-    """which returns a beam has: some of first, strongest, last. A return that an earlier one of them has
-    already is empty"""
+    """returns that are reported for each beam, from first, strongest and last; a return that equals an
+    earlier one in this list is empty"""
     separation: float = 1.0
-    """metres in range below which surfaces in a beam are one return"""
+    """metres; surfaces of a beam that are closer in range than this are one return"""
     opacity: float = 0.5
-    """opacity in front of and including a surface at which a ray ends: 0.5 is the median, less is a first
-    surface"""
+    """accumulated opacity at which a ray ends: 0.5 is the median surface, lower values are nearer surfaces"""
     noise: float = 0.0
-    """metres, standard deviation of ranges"""
+    """standard deviation of ranges in metres"""
     noise_growth: float = 0.0
-    """standard deviation per metre of range, added to `noise`"""
+    """standard deviation per metre of range, in addition to `noise`"""
     detection_range: float = math.inf
     """metres at which a surface of 10 % reflectivity, facing the sensor, is detected with a probability of
-    90 %; the signal falls with the square of the range, the cosine of incidence and the reflectivity"""
+    90 %. The signal is proportional to reflectivity, cosine of incidence and inverse square of the range"""
     dropouts: float = 0.0
-    """share of returns that are lost at random, 0 to 1"""
+    """share of returns that are dropped at random, 0 to 1"""
     reflectivity: dict[int, float] = field(default_factory=dict)
-    """label of splats: reflectivity, 0 or more; that of other splats is the luminance of their colour as
-    linear light"""
+    """label -> reflectivity of its splats, 0 or more; by default the luminance of a splat's colour in linear
+    light"""
     bands: int = 32
-    """poses of a scan while something moves; a beam is up to duration / (2 bands) away from the time of its
-    pose. At most the number of columns"""
+    """number of poses per scan if anything moves, at most the number of columns; a beam and its pose are up
+    to duration / (2 bands) apart in time"""
     seed: int = 0
     """seed of noise and detection, 0 to 2^32 - 1"""
     source: str = ""
-    """source of the values of a preset"""
+    """publication with the values of a preset"""
 
     def __post_init__(self) -> None:
         own_scalars(self)
@@ -210,7 +210,7 @@ class Lidar:
 
     @staticmethod
     def preset(name: str, **changes: Any) -> Lidar:
-        """A sensor by its name: vlp-16, os1-64 or livox-mid-40. changes: fields with other values."""
+        """A sensor by name: vlp-16, os1-64 or livox-mid-40. changes: values of other fields."""
         known = presets()
         if not isinstance(name, str) or name.lower() not in known:
             raise InputError(unknown("lidar", name, known))
@@ -221,28 +221,28 @@ class Lidar:
 
     @property
     def duration(self) -> float:
-        """Seconds of a scan."""
+        """Duration of a scan in seconds."""
         return 1 / self.rate
 
     def rows_per_band(self, moving: bool) -> int:
-        """Rows of the rendered image that share a pose."""
+        """Rows of the ray table that share a pose."""
         height = self.camera(0.0, moving).height
         return height if not moving else -(-height // self.bands)
 
     def camera(self, start: float = 0.0, moving: bool = False) -> Camera:
-        """The camera whose pixels are the rays of a scan from a time in seconds, in the lidar's frame. Rows
-        are in the order of firing."""
+        """Camera in the lidar's frame whose pixels are the rays of a scan that starts at a time in seconds.
+        Rows are in the order of firing."""
         lens = self._rays(start, moving)[0]
         height, width = lens.directions.shape[:2]
         return Camera(width, height, 1.0, 1.0, 0.0, 0.0, near=min(self.near, 0.05), far=self.far, lens=lens)
 
     def pixels(self, start: float = 0.0, moving: bool = False) -> np.ndarray:
-        """(beams, rays) int: pixel of each ray in the image of `camera`, counted row by row."""
+        """(beams, rays) int: index of each ray's pixel in the image of `camera`, in row-major order."""
         return self._rays(start, moving)[1]
 
     def directions(self, start: float = 0.0) -> np.ndarray:
-        """(beams, 3) unit directions of the beams of a scan from a time in seconds, in the order of firing,
-        as float32 rays round them."""
+        """(beams, 3) unit directions of a scan that starts at a time in seconds, in the order of firing,
+        rounded to float32 like the rays."""
         return self._rays(start, False)[2]
 
     def _rays(self, start: float, moving: bool) -> tuple[RayTable, np.ndarray, np.ndarray]:
@@ -251,7 +251,7 @@ class Lidar:
 
 @lru_cache(maxsize=8)
 def _rays(lidar: Lidar, start: float, moving: bool) -> tuple[RayTable, np.ndarray, np.ndarray]:
-    """Lens of the camera, pixels and directions of a scan: see methods of `Lidar`."""
+    """Lens, pixels and directions of a scan, as returned by `Lidar.camera`, `pixels` and `directions`."""
     pattern, n = lidar.pattern, lidar.rays
     beams = pattern.directions(start, lidar.duration)
     rays = _spread(beams, lidar.divergence, n)
@@ -276,8 +276,8 @@ def _rays(lidar: Lidar, start: float, moving: bool) -> tuple[RayTable, np.ndarra
 
 
 def _grid(rays: np.ndarray, begin: int, end: int, rows: int, width: int) -> np.ndarray:
-    """Indices of rays [begin, end) in a grid, columns by horizontal direction, rows by vertical; -1 in unused
-    cells."""
+    """Indices (rows, width) of rays [begin, end), sorted into columns by horizontal direction and into rows
+    by vertical direction; -1 in unused cells."""
     grid = np.full((width, rows), -1)
     across = begin + np.argsort(rays[begin:end, 1], kind="stable")
     for column in range(width):
@@ -287,8 +287,8 @@ def _grid(rays: np.ndarray, begin: int, end: int, rows: int, width: int) -> np.n
 
 
 def _spread(beams: np.ndarray, divergence: float, count: int) -> np.ndarray:
-    """(n x count, 3) directions of the rays of beams (n, 3): evenly over a disk (Vogel's spiral), the first
-    at its centre."""
+    """(n x count, 3) directions of the rays of beams (n, 3), evenly distributed over the beam's disk by
+    Vogel's spiral; the first ray is at its centre."""
     if count == 1:
         return beams
     return unit(beams[:, None] + divergence / 2 * (disk(count, 0) @ perpendicular(beams))).reshape(-1, 3)
@@ -296,7 +296,7 @@ def _spread(beams: np.ndarray, divergence: float, count: int) -> np.ndarray:
 
 @cache
 def presets() -> dict[str, Lidar]:
-    """Sensors of lidars.json by name."""
+    """Presets of lidars.json by name."""
     found = json.loads(Path(__file__).with_name("lidars.json").read_text("utf-8"))
     return {name: _of_preset(values) for name, values in found.items()}
 

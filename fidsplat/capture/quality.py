@@ -1,4 +1,4 @@
-"""Quality settings that trade accuracy for time, and the named presets. They do not depend on the device."""
+"""Quality settings that trade accuracy for time, and their presets; independent of the device."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from numbers import Real
 from typing import Any
 
-import numpy as np
-
-from fidsplat.util.arguments import as_float, instance, invalid, parse_setting, whole_number
+from fidsplat.util.arguments import as_float, instance, invalid, own_scalars, parse_setting, whole_number
 from fidsplat.util.errors import InputError, unknown
 
 LOWPASS = ("screen", "pixel", "none")
@@ -23,8 +21,8 @@ MAX_SAMPLES = 8
 MIXTURES = ("exact", "fitted", "paper", "facets")
 BY_FORMULA = LADDER, NESTED = 121, 562
 TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41, *BY_FORMULA)
-"""Gaussians per rectangle in the templates of fidsplat/markers/templates.json, and in those computed by
-fidsplat/markers/mixture.py"""
+"""supported numbers of Gaussians per rectangle: templates of fidsplat/markers/templates.json, and the last
+two, which fidsplat/markers/mixture.py computes"""
 MAX_LEVELS, MAX_DENSITY = 8, 100
 
 
@@ -35,10 +33,10 @@ def _one_of(what: str, value: Any, known: tuple) -> None:
 
 @dataclass(frozen=True)
 class MarkerQuality:
-    """Conversion of the rectangles of a marker to splats.
+    """Quality settings of the conversion of markers to splats.
 
-    More Gaussians reproduce sharp edges better and cost time in every frame. These are the defaults of
-    `fs.marker`, of the markers of scene files and of `fidsplat marker`.
+    More Gaussians reproduce edges more sharply and increase the time of each frame. The defaults apply to
+    `fs.marker`, markers of scene files and `fidsplat marker`.
 
     Raises:
         InputError: a value is out of range.
@@ -46,25 +44,26 @@ class MarkerQuality:
 
     mixture: str = "exact"
     """`exact`: one box per rectangle, with edges filtered by the pixel; opaque and sharp at any distance.
-    `fitted`: Gaussians by templates optimised on complete markers, for splat files and other renderers.
-    `facets`: Gaussians in planes that cross along the edges of modules; opaque and sharp, but only with
-    `order="pixel"`. `paper`: Gaussians by the construction of the paper's section 3.2."""
+    `fitted`: Gaussians by templates optimised on complete markers; for splat files and other renderers.
+    `facets`: Gaussians in planes that intersect along the edges of modules; opaque and sharp, but only with
+    `order="pixel"`. `paper`: Gaussians as in the paper's section 3.2."""
 
     levels: int = 4
-    """Levels L of `paper`, 1 to 8: 2^(L+2) - 7 Gaussians per rectangle at density 1, edges blurred over 2^-L
-    half widths."""
+    """Levels L of `paper`, 1 to 8: 2^(L+2) - 7 Gaussians per rectangle at density 1; edges are blurred over
+    2^-L of the half width."""
 
     density: int = 3
-    """Copies of all levels but the last in `paper`, 1 to 100: more are more opaque and slower."""
+    """Copies of all levels but the last in `paper`, 1 to 100: more copies are more opaque and slower."""
 
     growth: float | None = None
-    """Modules, 0 to 1, by which a rectangle extends into neighbours of its own colour (a long one further
-    along its axis). Closes seams and rounds corners. None: 0.4 for fitted, 0 for paper."""
+    """Modules, 0 to 1, by which a rectangle extends into neighbours of the same colour (a long rectangle more
+    along its axis). It closes gaps and rounds corners. None: 0.4 for fitted, 0 for paper."""
 
     template: int = 25
-    """Gaussians per rectangle of `fitted`, and of `exact` in splat files, up to an aspect ratio of 6: 1, 5,
-    9, 13, 25, 41, 121 or 562. Fewer render faster, with blurred edges and round corners; 562 are opaque and
-    sharp, with a low-pass from 24 pixels per module; 121 are a start for `fs.train.refine`."""
+    """Gaussians per rectangle with an aspect ratio up to 6 in `fitted`, and in splat files of `exact`: 1, 5,
+    9, 13, 25, 41, 121 or 562. Fewer render faster, with blurred edges and round corners. 562 are opaque and
+    sharp, with a low-pass filter from 24 pixels per module; 121 are an initial value for
+    `fs.train.refine`."""
 
     def __post_init__(self) -> None:
         _one_of("marker quality: mixture", self.mixture, MIXTURES)
@@ -78,30 +77,31 @@ class MarkerQuality:
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality settings of a frame. They do not bound the error for every scene; the output `error` bounds it
-    for one frame (docs/accuracy.md).
+    """Quality settings of a frame. The output `error` bounds their error in one frame (docs/accuracy.md);
+    they have no bound for all scenes.
 
     Raises:
         InputError: a value is out of range.
     """
 
     alpha_cutoff: float = 1e-5
-    """Minimum alpha of a fragment, in (0, 1), default 1e-5. It sets the radius of each splat, R^2 = 2
-    ln(opacity / cutoff), in bounds and in the per-pixel test. Lower values cost area, higher ones remove rims
-    and haze: at 1/255, the value of other renderers, images are off by 0.018 where splats overlap, and 100
-    splats of alpha 0.0039 lose 32 % opacity (docs/accuracy.md)."""
+    """Minimum alpha of a fragment, in (0, 1), default 1e-5. It determines the radius R of each splat in
+    standard deviations, R^2 = 2 ln(opacity / cutoff). Lower values make splats larger and slower; higher
+    values remove their faint rims: at 1/255, the value of other renderers, images are off by 0.018 where
+    splats overlap, and 100 splats of alpha 0.0039 lose 32 % opacity (docs/accuracy.md)."""
 
     transmittance_stop: float = 1e-4
-    """Transmittance at which a pixel terminates, in [0, 1), default 1e-4: further splats change the pixel by
-    at most this. Higher values skip more occluded splats; 0 never stops."""
+    """Transmittance at which a pixel terminates, in [0, 1), default 1e-4: the omitted splats would change the
+    pixel by at most this. Higher values omit more occluded splats; 0 omits none."""
 
     stop_rule: str = "inclusive"
-    """`inclusive`: the fragment that reaches the stop is composited. `exclusive` (gsplat, 2DGS authors): it
-    is dropped, which leaks up to 1 % of the background through opaque splats; for parity only."""
+    """`inclusive`: the fragment that reaches the transmittance stop is composited. `exclusive` (gsplat, 2DGS
+    authors): it is dropped, which leaks up to 1 % of the background through opaque splats; for parity
+    only."""
 
     opacity_ceiling: float = 1.0
-    """Maximum alpha of a fragment, in (0, 1], default 1. gsplat and the 2DGS authors use 0.99, which keeps
-    their gradients finite and leaks 1 % of the background; it saves no time."""
+    """Maximum alpha of a fragment, in (0, 1], default 1. gsplat and the 2DGS authors use 0.99 for finite
+    gradients, which leaks 1 % of the background and saves no time."""
 
     lowpass: str = "screen"
     """Low-pass filter of splats. `screen`: as in 2DGS, the maximum of the splat and a Gaussian of sigma 0.707
@@ -118,22 +118,23 @@ class Quality:
 
     order: str = "auto"
     """Compositing order. `centre`: by the depth of splat centres, as in other renderers and in the training
-    of captured scenes; large splats pop as the camera turns. `pixel`: by the depth of each fragment, where
-    the ray meets the splat. `auto`: as `centre`, with coplanar groups (markers) placed by their depth at each
-    pixel. In `pixel` and `auto` a coplanar group is one layer without an order (docs/correctness.md)."""
+    of captured scenes; large splats pop when the camera rotates. `pixel`: by the depth of each fragment, the
+    intersection of ray and splat. `auto`: as `centre`, but coplanar groups (markers) are ordered by their
+    depth at each pixel. In `pixel` and `auto` a coplanar group is one layer without an order
+    (docs/correctness.md)."""
 
     samples: int = 1
     """Samples per pixel side, 1 to 8, default 1: a pixel is the mean of n x n samples on a regular grid.
-    Blending costs n^2 as much."""
+    Blending takes n^2 times as long."""
 
     detail_error: float = 0.0
     """Error of rgb allowed for levels of detail of stores, in [0, 1), as measured on sample views of the
-    store with this low-pass and an `alpha_cutoff` of 1e-8. Other views may exceed it, more so with a larger
-    cut-off (docs/large-scenes.md). 0 renders all splats. Scenes in memory have no levels of detail."""
+    store with this low-pass filter and an `alpha_cutoff` of 1e-8. Other views and larger cut-offs may exceed
+    it (docs/large-scenes.md). 0 renders all splats. Scenes in memory have no levels of detail."""
 
     first_hit: float = 0.1
     """Accumulated opacity of the surface in depth_first and distance_first, in (0, 1): the first fragment or
-    layer behind which the transmittance is at most 1 - first_hit."""
+    layer after which the transmittance is at most 1 - first_hit."""
 
     setup_precision: str = "float64"
     """Arithmetic of the per-splat set-up. `float32` shifts small and grazing splats (docs/correctness.md) and
@@ -142,25 +143,22 @@ class Quality:
     arithmetic: str = "fast"
     """Exponentials and logarithms of blending. `fast`: polynomials, within 2.3 ulp for exponentials and 1.1
     for logarithms, bit-identical on devices with fused multiply-adds. `precise`: the device library's, 3 ulp
-    in OpenCL. Colours differ by less than 1e-6, or by the stop if a pixel reaches it one splat earlier.
-    `approximate`: as `fast`, but exponentials by NVIDIA's GPUs through OpenCL, within 1e-6; images are no
-    longer bit-identical to those of other devices."""
+    in OpenCL. Colours differ by less than 1e-6, or by the transmittance stop if a pixel terminates one splat
+    earlier. `approximate`: as `fast`, but exponentials by NVIDIA's GPUs through OpenCL, within 1e-6; images
+    are no longer bit-identical to those of other devices."""
 
     blend_precision: str = "float32"
     """Arithmetic of fragments. `float16` sums colours and transmittance in half precision, always with
-    approximate arithmetic: faster on NVIDIA's GPUs, slower elsewhere; n fragments with colours up to 1 change
-    a pixel by at most (n + 3) / 2048. `float64` computes intersection, weight and blending in float64: a
-    reference image of the device, many times slower and always precise; it needs float64 in the device and in
-    the set-up."""
+    approximate arithmetic: faster on NVIDIA's GPUs, slower on others; n fragments with colours up to 1 change
+    a pixel by at most (n + 3) / 2048. `float64` computes intersection, weight and blending in float64, for
+    reference images: many times slower, always with precise arithmetic; requires a device with float64 and
+    `setup_precision="float64"`."""
 
     marker: MarkerQuality = field(default_factory=MarkerQuality)
     """Conversion of markers to splats."""
 
     def __post_init__(self) -> None:
-        for setting in fields(self):
-            value = getattr(self, setting.name)
-            if isinstance(value, np.generic):  # not by `own_scalars`, whose module would be loaded too
-                object.__setattr__(self, setting.name, value.item())
+        own_scalars(self)
 
         def within(name: str, low: float, high: float, low_open: bool, high_open: bool) -> None:
             value = getattr(self, name)
@@ -213,7 +211,7 @@ class Quality:
         """Convert a `Quality`, a text or None (the default) to a `Quality`.
 
         Text is the name of a preset, settings as key=value, or both: "fast", "alpha_cutoff=1e-3",
-        "fast,samples=2,marker.template=9". Without a name the settings change standard.
+        "fast,samples=2,marker.template=9". Settings without a name change the preset standard.
 
         Raises:
             InputError: an unknown preset or setting, or a value out of range.
@@ -241,8 +239,7 @@ class Quality:
         return chosen.with_(**changes)
 
     def with_(self, **changes) -> Quality:
-        """A copy with some settings changed. marker: a `MarkerQuality`, or a dict of its settings to
-        change."""
+        """A copy with some settings changed. marker: a `MarkerQuality`, or a dict of changed settings."""
         for name in changes:
             _check_known(Quality, name)
         marker = changes.get("marker")
@@ -254,7 +251,7 @@ class Quality:
 
 
 def setting_types(kind: type[Quality] | type[MarkerQuality]) -> dict[str, str]:
-    """Annotated type of each scalar setting by name: `float`, `int | None` ..."""
+    """Annotated type of each scalar setting by name, such as `float` or `int | None`."""
     return {setting.name: str(setting.type) for setting in fields(kind) if setting.name != "marker"}
 
 
@@ -275,9 +272,9 @@ def _read(kind: type[Quality] | type[MarkerQuality], name: str, text: str) -> An
     return parse_setting("quality", kind, name, text)
 
 
-# gsplat: gsplat 1.5/1.6 `rasterization_2dgs`; surfel: the 2DGS authors' diff-surfel-rasterization.
-# Both clamp alpha at 0.99, cut at 1/255 and drop the fragment that would take T below 1e-4. Their differences
-# (bounding boxes, low-pass centre, near plane) are defects and are not reproduced: see docs/conventions.md.
+# gsplat: `rasterization_2dgs` of gsplat 1.5 and 1.6; surfel: diff-surfel-rasterization of the 2DGS authors.
+# Both clamp alpha at 0.99, cut at 1/255 and drop the fragment whose transmittance would be below 1e-4. They
+# differ in bounding boxes, low-pass centre and near plane, which are defects (docs/conventions.md).
 _PARITY = Quality(
     alpha_cutoff=1.0 / 255.0,
     transmittance_stop=1e-4,

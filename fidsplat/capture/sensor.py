@@ -1,4 +1,4 @@
-"""Sensor model: veiling glare, exposure, vignetting, noise, saturation, white balance, response, bits."""
+"""Sensor model: exposure, optics, noise, white balance, response and quantisation."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LARGEST = 1e15
 
 @dataclass(frozen=True)
 class Sensor:
-    """Sensor model of a camera. Values are linear light. A step with its default value costs nothing.
+    """Sensor model of a camera. Values are linear light. A step with its default value is skipped.
 
     Order of the steps: decode, veiling_glare, exposure, vignetting, noise, saturation, gain, white_balance,
     response, extra_steps, bits.
@@ -37,38 +37,38 @@ class Sensor:
     """
 
     exposure: float = 1.0
-    """factor of the gathered light, at least 0"""
+    """factor of the incoming light, at least 0"""
     vignetting: tuple[float, ...] = ()
-    """up to three numbers a, b, c: light times 1 + a r^2 + b r^4 + c r^6, with r the distance from the
-    principal point in half diagonals of the image"""
+    """up to three coefficients a, b, c: light is multiplied by 1 + a r^2 + b r^4 + c r^6, with r the distance
+    from the principal point in half diagonals of the image"""
     full_well: float = math.inf
-    """electrons at the value 1, at least 1: n electrons have a shot noise of sqrt(n); inf: no shot noise"""
+    """electrons at value 1, at least 1: n electrons have a shot noise of sqrt(n); inf: no shot noise"""
     read_noise: float = 0.0
     """standard deviation of the read-out noise in electrons, 0 to full_well; requires full_well"""
     seed: int = 0
-    """seed of the noise, 0 to 2^32 - 1; use another one for each frame"""
+    """seed of the noise, 0 to 2^32 - 1; use a different one for each frame"""
     gain: float = 1.0
     """factor after the read-out, at least 0"""
     response: str | float | tuple[float, ...] = "linear"
-    """"linear"; "srgb", its transfer function; a gamma: v^(1 / gamma); or the curve's values at two or more
-    even steps of v from 0 to 1. All but "linear" clamp v to [0, 1]."""
+    """"linear"; "srgb", its transfer function; a gamma: v^(1 / gamma); or a table of two or more values at
+    equidistant v from 0 to 1. All except "linear" clamp v to [0, 1]."""
     bits: int | None = None
-    """bits of quantisation and of the rgb file, 8 or 16; None: no quantisation"""
+    """bits of quantisation and of the rgb file, 8 or 16; None: none"""
     extra_steps: tuple[str, ...] = ()
     """steps of other packages before quantisation, NAME or NAME:NUMBER,NUMBER (docs/effects.md)"""
     decode: str = "linear"
-    """meaning of the frame's colours: "linear" light, or display colours ("srgb"), which are decoded"""
+    """encoding of the frame's colours: "linear" light, or "srgb" display colours, which are decoded"""
     veiling_glare: float = 0.0
     """share of the light, 0 to below 1, that the lens scatters evenly over the image"""
     glare_light: tuple[float, ...] = ()
     """RGB of the scattered light; empty: the mean of the image, measured in a small frame"""
     auto_exposure: float = 0.0
-    """luminance that the mean of the image is exposed to, e.g. 0.18, measured in a small frame; `exposure` is
-    its correction. 0: off"""
+    """target luminance of the mean of the image, e.g. 0.18, measured in a small frame; `exposure` is an
+    additional factor. 0: off"""
     saturation: float = math.inf
-    """largest value that the sensor registers, above 0; before gain"""
+    """largest registered value, above 0; before gain"""
     white_balance: str | tuple[float, ...] = (1.0, 1.0, 1.0)
-    """factors of R, G and B, or "grey": those that make the mean of the image grey, measured in a small
+    """factors of R, G and B; "grey": the factors that make the mean of the image grey, measured in a small
     frame"""
 
     def __post_init__(self) -> None:
@@ -114,7 +114,7 @@ class Sensor:
 
     @cached_property
     def extra(self) -> dict[str, tuple[float, ...]]:
-        """Names of `extra_steps` with their numbers."""
+        """Numbers of `extra_steps` by name."""
         found = {}
         for text in self.extra_steps:
             name, colon, numbers = text.partition(":")
@@ -139,7 +139,7 @@ class Sensor:
         elif self.response == "srgb":
             found.append(("response_srgb", True))
         elif isinstance(self.response, tuple):
-            # a table from 0 to 1 only clamps, as every output does
+            # a table that is the identity only clamps, as every output does
             line = np.linspace(0, 1, len(self.response))
             found.append(("response_table", not np.array_equal(self.response, line)))
         found += [(name, True) for name in self.extra]
@@ -148,18 +148,18 @@ class Sensor:
 
     @property
     def meters(self) -> bool:
-        """Whether a small frame must be measured first."""
+        """Whether exposure, white balance or glare must be measured in a small frame."""
         glare = self.veiling_glare > 0 and not self.glare_light
         return glare or self.auto_exposure > 0 or self.white_balance == "grey"
 
     def metered(self, colors: np.ndarray) -> Sensor:
-        """The sensor with fixed exposure, white balance and glare, measured in an image (h, w, 3) without a
-        sensor."""
+        """The sensor with fixed exposure, white balance and glare, measured in an image (h, w, 3) that was
+        rendered without a sensor."""
         if not self.meters:
             return self
         mean = to_light(colors, self.decode).reshape(-1, 3).mean(axis=0)
         glare = self.glare_light or tuple(mean.tolist())
-        # scattering changes the mean if glare_light is given
+        # scattering changes the mean only if glare_light is given
         mean = (1 - self.veiling_glare) * mean + self.veiling_glare * np.array(glare)
         luminance = max(float(mean @ LUMINANCE), 1 / LARGEST)
         exposure = self.exposure * (self.auto_exposure / luminance if self.auto_exposure > 0 else 1.0)

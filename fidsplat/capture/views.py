@@ -1,9 +1,9 @@
-"""Views of a batch: captures of one size, with poses of the camera and of groups of splats."""
+"""Views of a batch: captures of one size, with poses of the cameras and of groups of splats."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,14 +17,14 @@ from fidsplat.util.errors import InputError
 
 @dataclass(frozen=True)
 class Views:
-    """The v views of a batch: captures, and poses that replace those of the captures."""
+    """The v views of a batch: captures, and poses that replace poses of the captures."""
 
     captures: tuple[Capture, ...]
     """one for each view, or one for all"""
     poses: np.ndarray | None = None
-    """(v, 4, 4) float64 camera to world, rigid; None: the poses of the cameras"""
+    """(v, 4, 4) float64 camera to world, rigid; None: the poses of the captures' cameras"""
     groups: Mapping[int, np.ndarray] | None = None
-    """label: (v, 4, 4) float64, rigid world transforms of its splats"""
+    """label: (v, 4, 4) float64, rigid world transforms of the label's splats"""
     mask: np.ndarray | None = None
     """(v,) bool: views to render; None: all"""
 
@@ -48,16 +48,18 @@ class Views:
 
     def _check_motion(self, number: int, motion: Motion) -> None:
         if self.poses is not None and motion.camera is not None:
-            raise InputError(f"poses and the motion of view {number} both move its camera; leave one out")
+            raise InputError(
+                f"the camera of view {number} must be moved by poses or by its motion, got both; omit one"
+            )
         for label in self.groups or ():
             if label in motion.groups:
                 raise InputError(
-                    f"groups and the motion of view {number} both move the splats of label {label}; leave "
-                    "one out"
+                    f"the splats of label {label} in view {number} must be moved by groups or by the view's "
+                    "motion, got both; omit one"
                 )
 
     def __len__(self) -> int:
-        """Number of views, masked ones included."""
+        """Number of views, including masked views."""
         if len(self.captures) > 1:
             return len(self.captures)
         external = self.captures[0].external_depth if self.captures else None
@@ -72,23 +74,20 @@ class Views:
         return list(range(len(self))) if self.mask is None else np.flatnonzero(self.mask).tolist()
 
     def capture(self, number: int) -> Capture:
-        """Capture of one view, which renders bit-identically to the view in the batch."""
+        """Capture of one view, which renders bit-identically to this view of the batch."""
         base = self.captures[number if len(self.captures) > 1 else 0]
         camera, motion = base.camera, base.motion
         if base.external_depth and base.external_depth.stacked:
-            base = base.with_(external_depth=base.external_depth.part(number))
+            base = base.with_(external_depth=base.external_depth.of_views(number))
         if self.poses is not None and camera is not None:
-            camera = camera_at(camera, self.poses[number])
+            camera = camera.with_pose(camera_to_world=self.poses[number])
         if self.groups:
             moved = {label: _constant(each[number]) for label, each in self.groups.items()}
             motion = Motion(motion.camera, {**motion.groups, **moved})
-        return (
-            base
-            if camera is base.camera and motion is base.motion
-            else base.with_(camera=camera, motion=motion)
-        )
+        unchanged = camera is base.camera and motion is base.motion
+        return base if unchanged else base.with_(camera=camera, motion=motion)
 
-    def refuse_other_sizes(self) -> None:
+    def check_sizes(self) -> None:
         """Raise InputError if captures differ in size or outputs."""
         first = self.captures[0]
         for number, capture in enumerate(self.captures[1:], 1):
@@ -98,21 +97,13 @@ class Views:
             ):
                 if one != other:
                     raise InputError(
-                        f"the views of a batch must have the same {what}, got {one} of view 0 and {other} "
-                        f"of view {number}; render them in separate batches"
+                        f"the views of a batch must have the same {what}, got {one} for view 0 and {other} "
+                        f"for view {number}; render them in separate batches"
                     )
 
 
-def camera_at(camera: Camera, pose: np.ndarray) -> Camera:
-    """The camera at a pose (4, 4), camera to world; its position is stored exactly."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = pose[:3, :3].T
-    matrix[:3, 3] = -matrix[:3, :3] @ pose[:3, 3]
-    return replace(camera, world_to_camera=matrix, position=pose[:3, 3])
-
-
 def views_of(captures: Iterable[Capture], poses: Any = None, groups: Any = None, mask: Any = None) -> Views:
-    """Validated views of `Renderer.render_batch`."""
+    """Validated views of the arguments of `Renderer.render_batch`."""
     if groups is not None and not isinstance(groups, Mapping):
         raise InputError(f"groups must be {{label: poses (views, 7)}}, got {groups!r}")
     for label in groups or ():
@@ -125,13 +116,13 @@ def views_of(captures: Iterable[Capture], poses: Any = None, groups: Any = None,
             raise InputError(f"mask must be (views,) bools, got the shape {mask.shape}")
     matrices = None if poses is None else pose_matrices("poses", poses)
     views = Views(tuple(captures), matrices, given or None, mask)
-    views.refuse_other_sizes()
+    views.check_sizes()
     return views
 
 
 def pose_matrices(name: str, poses: Any) -> np.ndarray:
-    """Rigid matrices (v, 4, 4) float64 of poses (v, 7): x y z in metres, quaternion w x y z of any length but
-    0."""
+    """Rigid matrices (v, 4, 4) float64 of poses (v, 7): x y z in metres, and a quaternion w x y z of any
+    non-zero length."""
     given = real_array(name, poses, "(views, 7) numbers: x y z, quaternion w x y z")
     if given.ndim != 2 or given.shape[1] != 7:
         raise InputError(
@@ -154,7 +145,7 @@ def pose_matrices(name: str, poses: Any) -> np.ndarray:
 
 
 def _constant(pose: np.ndarray):
-    """Constant motion, with one pose."""
+    """Motion function with a constant pose."""
     return lambda time: pose
 
 

@@ -1,4 +1,4 @@
-"""Declarations of effects and outputs, and the selection of what a frame requires."""
+"""Declarations of effects and outputs, and selection of the effects that a frame requires."""
 
 from fidsplat.effects.catalogue import CATALOGUE, IMAGES, OUTPUTS, Effect, Output, declared_output
 from fidsplat.effects.extensions import Extension, load_extensions, register

@@ -1,7 +1,7 @@
-"""Declarations of all effects and output images, by name. Backends map the names to kernel code.
+"""Declarations of all effects and output images by name. Backends map the names to kernel code.
 
-A frame has exactly one effect of each of some kinds (camera, color, lowpass, stop, compose, footprint,
-background, arithmetic), at most one ellipsoid effect, and any number of outputs and of steps after blending.
+A frame has exactly one camera, color, lowpass, stop, compose, footprint, background and arithmetic effect, at
+most one ellipsoid effect, and any number of outputs and of steps after blending.
 """
 
 from __future__ import annotations
@@ -20,36 +20,37 @@ class Output:
     channels: int
     dtype: str
     summary: str = ""
-    """one line for `fidsplat render --help`"""
+    """line for `fidsplat render --help`"""
     display: str = "color"
-    """representation in files and previews, one of `DISPLAYS`; all except color and normal are stored as
-    arrays too"""
+    """representation in image files and previews, one of `DISPLAYS`; the array is stored too, except for
+    color and normal"""
     tolerance: float = 0.0
-    """largest error of a device beyond the reference's certificate (`NAME_certificate` of a pixel)"""
+    """largest allowed error of a device in addition to the reference's certificate of a pixel
+    (`NAME_certificate`)"""
     relative: bool = False
     """whether the tolerance is relative to the value"""
     discontinuous: bool = False
-    """whether the value jumps where a decision changes: pixels that the reference marks as `NAME_may_flip`
-    are not compared; others may differ by the tolerance or by the reference's `NAME_bound`"""
+    """whether the value jumps where a decision changes: pixels that the reference marks by `NAME_may_flip`
+    are not compared; other pixels may differ by the tolerance or by the reference's `NAME_bound`"""
     blank: int = 0
     """value of a pixel without splats"""
     public: bool = True
-    """whether captures can request it; False for outputs of measurements and training"""
+    """whether captures can request it; False for outputs of measurement and training"""
 
     @property
     def as_array(self) -> bool:
-        """Whether files store the array in addition to a PNG image."""
+        """Whether files contain the array in addition to a PNG image."""
         return self.display not in ("color", "normal")
 
 
 @dataclass(frozen=True)
 class Effect:
-    """Declaration of one effect."""
+    """Declaration of an effect."""
 
     name: str
     output: Output | None = None
     needs: tuple[str, ...] = ()
-    """other outputs from which this one is computed"""
+    """outputs from which this output is computed"""
 
 
 def _image(
@@ -91,7 +92,7 @@ _IMAGES = (
     _image("distance_median", "distance [m] of depth_median", needs="depth_median", **_DEPTH_OF_ONE),
     _image("distance_first", "distance [m] of depth_first", needs="depth_first", **_DEPTH_OF_ONE),
     _image("normal", "unit normal towards the camera, in camera axes", **_NORMAL),
-    _image("normal_world", "the same in world axes", needs="normal", **_NORMAL),
+    _image("normal_world", "unit normal towards the camera, in world axes", needs="normal", **_NORMAL),
     _image("label", "label of the splat with the largest weight, or -1", **_ID),
     _image("splat_id", "index of the splat with the largest weight, or -1", **_ID),
     _image("blended", "number of composited splats", dtype="int32", display="count", discontinuous=True),
@@ -109,7 +110,7 @@ IMAGES: dict[str, Output] = {
 }
 """all output images of backends"""
 OUTPUTS = {name: output for name, output in IMAGES.items() if output.public}
-"""outputs that captures can request and backends render"""
+"""outputs that backends render and captures can request"""
 COMPOSED = {
     "error": Output(
         "error", 1, "float32", "certified upper bound of the error of rgb (docs/accuracy.md)", "count"
@@ -119,6 +120,6 @@ COMPOSED = {
 
 
 def declared_output(name: str) -> Output:
-    """Declaration of an output that captures can request, or of an internal one."""
+    """Declaration of an output, including internal outputs."""
     effect = CATALOGUE.get(name)
     return effect.output if effect is not None and effect.output else {"rgb": RGB, **COMPOSED}[name]

@@ -1,4 +1,4 @@
-"""Effects and outputs with gradients, and checks that a frame is differentiable."""
+"""Differentiable effects and outputs, and validation of gradient requests."""
 
 from __future__ import annotations
 
@@ -34,24 +34,28 @@ _REMEDIES = {
 
 
 def check_differentiable(features: FeatureSet) -> None:
-    """Raise InputError, with a remedy, for the first effect that has no gradient."""
+    """Raise InputError, with a remedy, for the first effect of a frame without a gradient."""
     for name in features.slots:
         if name not in DIFFERENTIABLE:
-            raise InputError(f"{name} has no gradient; use {_REMEDIES[name.partition('_')[0]]}")
+            remedy = _REMEDIES[name.partition("_")[0]]
+            raise InputError(f"effects must be differentiable, got {name}; use {remedy}")
     if features.samples > 1:
-        raise InputError(f"{features.samples} x {features.samples} samples have no gradient; use samples=1")
+        raise InputError(f"samples must be 1 in a differentiable frame, got {features.samples}")
     if features.posts:
-        raise InputError(f"{features.posts[0]} has no gradient; use a capture without fog and sensor steps")
+        raise InputError(
+            f"a differentiable frame must have no fog or sensor, got {features.posts[0]}; use a capture "
+            "without them"
+        )
 
 
 def with_distortion(features: FeatureSet) -> FeatureSet:
-    """These features and the output `distortion` (h, w), the depth distortion loss of 2DGS: the sum over
-    pairs of fragments of w_i w_j (m_i - m_j)^2, with m the depth-buffer value."""
+    """Add the output `distortion` (h, w), the depth distortion loss of 2DGS: the sum over pairs of fragments
+    of w_i w_j (m_i - m_j)^2, with m the depth-buffer value."""
     return replace(features, outputs=tuple(sorted({*features.outputs, "distortion"})))
 
 
 def check_gradients(features: FeatureSet, names: Iterable[str]) -> None:
-    """Raise InputError for gradients of outputs without a backward pass, or that were not rendered."""
+    """Raise InputError for gradients of outputs that have no backward pass or were not rendered."""
     rendered = [name for name in GRADIENT_OUTPUTS if name == "rgb" or name in features.names]
     for name in names:
         if name not in rendered:

@@ -13,28 +13,28 @@ from fidsplat.util.plugins import load_plugins
 
 @dataclass(frozen=True)
 class Extension:
-    """An output or a sensor step, with its kernels (CONTRIBUTING.md, "Add an output")."""
+    """An output or a sensor step with its kernels (CONTRIBUTING.md, "Add an output")."""
 
     name: str
     opencl: Path
-    """absolute path of its OpenCL sections, in the format of the files in kernels/opencl/output and post"""
+    """absolute path of its OpenCL sections, in the format of kernels/opencl/output and kernels/opencl/post"""
     output: Output | None = None
-    """declaration of the image; None: a step of a sensor, requested by `Sensor.extra_steps`"""
+    """declaration of the image; None for a sensor step, which `Sensor.extra_steps` requests"""
     parts: tuple[str, ...] = ()
-    """OpenCL parts that it requires, such as "ray_depth\""""
+    """names of required OpenCL parts, such as "ray_depth\""""
     samples: tuple[str, ...] = ()
-    """its sample buffers of floats"""
+    """names of its float sample buffers"""
     uniforms: tuple[str, ...] = ()
-    """names of a step's float arguments; `Sensor.extra_steps` has their values"""
+    """names of a step's float arguments, whose values are in `Sensor.extra_steps`"""
     warp: Path | None = None
-    """absolute path of a folder with NAME.py for Warp; None: not supported"""
+    """absolute path of a folder with NAME.py for Warp; None if Warp is not supported"""
 
 
 EXTENSIONS: dict[str, Extension] = {}
 
 
 def register(extension: Extension) -> None:
-    """Add an output or a step in this process. Raises InputError for a name that exists, or is not an
+    """Add an output or a sensor step in this process. Raises InputError for a name that exists or is not an
     identifier."""
     name = instance("an extension", extension, Extension).name
     if not name.isidentifier() or name in CATALOGUE or name in IMAGES:
@@ -52,7 +52,7 @@ def load_extensions() -> None:
 
 
 def outputs_help() -> str:
-    """Table of all outputs that captures can request, a line each, with those of installed packages."""
+    """Table of all outputs that captures can request, including installed packages', with a line for each."""
     load_extensions()
     outputs = (*OUTPUTS.values(), *COMPOSED.values())
     width = max(len(output.name) for output in outputs) + 2

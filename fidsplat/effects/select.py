@@ -1,4 +1,4 @@
-"""Selection of the effects that a capture of a cloud requires; no other module decides this."""
+"""Selection of the effects that a capture of a cloud requires, for all backends."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _KINDS = {Gradient: "gradient", Panorama: "panorama"}
 
 @dataclass(frozen=True)
 class FeatureSet:
-    """Effects of a frame: names and small integers only, so that it is a cache key. Numbers that change from
-    view to view (intrinsics, poses, thresholds, background) are uniforms."""
+    """Effects of a frame, as names and small integers, so that it can be a cache key. Numbers that change
+    from view to view (intrinsics, poses, thresholds, background) are uniforms instead."""
 
     slots: tuple[str, ...]
     """One effect per kind in fixed order: camera, color, ellipsoids (optional), lowpass, stop, external depth
@@ -36,12 +36,12 @@ class FeatureSet:
 
     @cached_property
     def names(self) -> frozenset[str]:
-        """Names of all effects, including outputs that other outputs need."""
+        """Names of all effects, including outputs that are inputs of other outputs."""
         return frozenset((*self.slots, *(image.name for image in self.images[1:]), *self.posts))
 
     @cached_property
     def images(self) -> tuple[Output, ...]:
-        """Output images: first rgb, then inputs of other outputs, then the others."""
+        """Output images: rgb, then inputs of other outputs, then the other outputs."""
         needed: set[str] = set()
         for name in self.outputs:
             needed.update(CATALOGUE[name].needs)
@@ -54,8 +54,8 @@ class FeatureSet:
 
 
 def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
-    """Select the features that a capture of a cloud requires. A capture without a camera counts as a pinhole.
-    Raises InputError for an unknown output, or two effects that exclude each other."""
+    """Select the effects that a capture of a cloud requires; without a camera, those of a pinhole.
+    Raises InputError for an unknown output or incompatible effects."""
     _load_extensions_of(capture)
     for name in capture.outputs:
         if name not in (*OUTPUTS, *COMPOSED):
@@ -69,7 +69,7 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
             "a capture with external_depth must have a shutter with exposure_time=0 and readout=0, got "
             f"{shutter.exposure_time:g} and {shutter.readout:g}"
         )
-    # boxes and EWA have their own filter
+    # boxes and EWA have their own low-pass filter
     ewa_only = cloud.ellipsoids == "all" and ellipsoid != "exact"
     filtered = cloud.footprint == "box" or ewa_only
     lowpass = "none" if filtered else quality.lowpass
@@ -84,7 +84,7 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
         )
     flat = cloud.footprint == "gaussian" and not ellipsoid
     in_spheres = lens is None and flat and lowpass != "pixel"
-    # harmonics of degree 0 do not depend on the view and are RGB colours (`SplatCloud.plain_colors`)
+    # spherical harmonics of degree 0 do not depend on the view: RGB colours (`SplatCloud.plain_colors`)
     sh_degree = max(cloud.sh_degree, 0)
     return FeatureSet(
         slots=(
@@ -94,12 +94,12 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
             *(("ellipsoids_only",) if ewa_only else ()),
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
-            # before compositing, whose fragments it occludes
+            # before the compositing effect, whose fragments it occludes
             *(("external_depth",) if capture.external_depth is not None else ()),
             _composing(cloud, quality.order, one_depth_each=ewa_only and not double),
             f"footprint_{cloud.footprint}",
             f"background_{_KINDS.get(type(background), 'constant')}",
-            # other functions are in float32; half precision needs only approximate ones
+            # float64 blending requires precise functions; half precision suffices with approximate ones
             f"arithmetic_{'precise' if double else 'approximate' if half else quality.arithmetic}",
             *(("motion_groups",) if capture.motion.groups else ()),
             *(("shutter_exposure",) if capture.exposed else ()),
@@ -115,8 +115,8 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
 
 
 def _load_extensions_of(capture: Capture) -> None:
-    """Load extensions if the capture requests an unknown name. Raises InputError for an unknown step of the
-    sensor, or another number of values than it has."""
+    """Load extensions if the capture requests an unknown name. Raises InputError for an unknown sensor step,
+    or for a wrong number of its values."""
     steps = capture.sensor.extra
     if not {*capture.outputs, *steps} <= {*OUTPUTS, *COMPOSED, *EXTENSIONS}:
         load_extensions()
@@ -131,22 +131,22 @@ def _load_extensions_of(capture: Capture) -> None:
 
 
 def with_termination_depths(features: FeatureSet) -> FeatureSet:
-    """These features and the termination depth of each tile, for occlusion culling of stores."""
+    """Add the termination depth of each tile, for occlusion culling of stores."""
     return replace(features, slots=(*features.slots, "termination_depths"))
 
 
 def _composing(cloud: CloudTraits, order: str, one_depth_each: bool) -> str:
     """Select the compositing effect: by centre depth or by fragment depth, with or without layers of coplanar
-    groups. If every fragment has the depth of its splat's centre, both orders are equal and no k-buffer is
-    needed."""
+    groups. If all fragments of a splat have the depth of its centre, both orders are equal, and the effect
+    without a k-buffer suffices."""
     if cloud.has_coplanar_groups:
-        ways = {"centre": "compose_ordered", "auto": "compose_coplanar", "pixel": "compose_coplanar_pixel"}
-        return ways[order]
+        orders = {"centre": "compose_ordered", "auto": "compose_coplanar", "pixel": "compose_coplanar_pixel"}
+        return orders[order]
     return "compose_pixel" if order == "pixel" and not one_depth_each else "compose_ordered"
 
 
 def _ellipsoid(cloud: CloudTraits, quality: Quality, lens: Lens | None) -> str:
-    """Projection of 3D Gaussians; empty if there are none."""
+    """Projection of 3D Gaussians; empty for a cloud without 3D Gaussians."""
     if cloud.ellipsoids == "none":
         return ""
     # EWA projection is defined for pinholes and parallel rays
@@ -154,7 +154,7 @@ def _ellipsoid(cloud: CloudTraits, quality: Quality, lens: Lens | None) -> str:
 
 
 def _refuse_float64(lens: Lens | None, foggy: bool) -> None:
-    """Raise InputError for float64 blending of float32 rays, which would limit its accuracy."""
+    """Raise InputError for float64 blending of float32 rays, which limit its accuracy."""
     if foggy or not (lens is None or isinstance(lens, Orthographic)):
         what = "the fog's" if foggy or lens is None else f"a {lens.kind} lens's"
         raise InputError(

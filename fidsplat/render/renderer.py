@@ -16,7 +16,7 @@ from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.registry import FIRST, open_backend
 from fidsplat.backends.view import NO_CAMERA, View
 from fidsplat.cameras import Camera
-from fidsplat.capture.capture import Capture, CaptureParts, output_names
+from fidsplat.capture.capture import Capture, CaptureFields, output_names
 from fidsplat.capture.environment import background_of
 from fidsplat.capture.quality import Quality
 from fidsplat.capture.sensor import Sensor
@@ -164,7 +164,7 @@ class Renderer:
         capture: Capture | Camera | None = None,
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
-        **parts: Unpack[CaptureParts],
+        **parts: Unpack[CaptureFields],
     ) -> Frame:
         """Render one frame: `render(scene, Capture(camera, ...))`, or the parts of a capture as arguments.
 
@@ -172,7 +172,7 @@ class Renderer:
             scene: splats to render.
             capture: camera and settings, or only a camera. Without a Capture the scene's own is used, which
                 its ResidentCloud has too.
-            outputs, quality, and by name the other parts (`CaptureParts`): replace those of the capture.
+            outputs, quality, and by name the other fields (`CaptureFields`): replace those of the capture.
 
         Raises:
             InputError: no camera, an unknown output or preset, a frame that is too large, a cloud
@@ -190,7 +190,7 @@ class Renderer:
         quality: Quality | str | None = None,
         *,
         distortion: bool = False,
-        **parts: Unpack[CaptureParts],
+        **parts: Unpack[CaptureFields],
     ) -> DifferentiableFrame:
         """Render one frame whose `backward` returns gradients; the images are bit-identical to `render`.
 
@@ -287,7 +287,7 @@ class Renderer:
         captures: Iterable[Capture | Camera],
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
-        **parts: Unpack[CaptureParts],
+        **parts: Unpack[CaptureFields],
     ) -> Iterator[Frame]:
         """Render one cloud many times, one Frame for each capture or camera, in their order.
 

@@ -227,7 +227,7 @@ class Rig:
         )
         noisy = "noise" in capture.sensor.steps
         if isinstance(external, ExternalDepth):
-            external = [external.part(i) for i in range(count)] if noisy else [external]
+            external = [external.of_views(i) for i in range(count)] if noisy else [external]
         if not noisy:
             return [capture.with_(external_depth=one) for one in external] or [capture]
         place = list(self.cameras).index(name)

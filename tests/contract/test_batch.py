@@ -210,7 +210,7 @@ def test_a_batch_of_exposures_counts_all_its_images(renderer, cloud):
         ({"captures": []}, "at least one view, got an empty captures"),
         ({"captures": 5}, "captures must be a list of Capture or Camera, got 5"),
         ({"captures": [CAMERA, "front"]}, "camera must be .* got 'front'"),
-        ({"captures": [CAMERA, fs.Camera.pinhole(51, 40, 9, 9, 9, 9)]}, "same size.* 51 x 40.* of view 1"),
+        ({"captures": [CAMERA, fs.Camera.pinhole(51, 40, 9, 9, 9, 9)]}, "same size.* 51 x 40.* for view 1"),
         ({"captures": [CAMERA, fs.Capture(CAMERA, "alpha")]}, "same outputs"),
         (
             {"captures": [CAMERA, fs.Capture(CAMERA, sensor=fs.Sensor(gain=2.0))]},
@@ -229,11 +229,11 @@ def test_a_batch_of_exposures_counts_all_its_images(renderer, cloud):
         ({"mask": [1, 0]}, "mask must be .* bools"),
         (
             {"captures": fs.Capture(CAMERA, motion=fs.Motion(lambda time: np.eye(4))), "poses": POSES},
-            "poses and the motion of view 0 both move its camera",
+            "the camera of view 0 must be moved by poses or by its motion, got both",
         ),
         (
             {"captures": fs.Capture(CAMERA, motion=fs.Motion(groups={1: np.eye})), "groups": {1: POSES}},
-            "the motion of view 0 both move the splats of label 1",
+            "the splats of label 1 in view 0 must be moved by groups or",
         ),
         (
             {"captures": fs.Capture(CAMERA, motion=fs.Motion(groups={1: lambda time: 2 * np.eye(4)}))},

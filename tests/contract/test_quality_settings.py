@@ -174,7 +174,9 @@ def test_half_precision_has_the_same_bits_in_both_schedules_and_words(opencl, mo
 def test_half_precision_is_refused_by_name(renderer):
     with pytest.raises(fs.InputError, match="blend_precision must be 'float32' with fog"):
         select(AROUND, fs.Capture(quality=HALF, fog=fs.Fog(0.1)))
-    with pytest.raises(fs.InputError, match="blend_half has no gradient; use blend_precision='float32'"):
+    with pytest.raises(
+        fs.InputError, match="effects must be differentiable, got blend_half; use blend_precision='float32'"
+    ):
         check_differentiable(select(AROUND, fs.Capture(quality=HALF.with_(order="centre"))))
     if not renderer.device.name.startswith("opencl"):
         with pytest.raises(fs.DeviceError, match="blend_precision='float16'; use an OpenCL device"):

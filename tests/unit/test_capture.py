@@ -56,7 +56,7 @@ def test_a_copy_keeps_what_is_not_changed():
     other = capture.with_(outputs=None, background=(0, 0, 0), fog=fs.Fog(0.1))
     assert (other.camera, other.outputs, other.quality) == (CAMERA, capture.outputs, capture.quality)
     assert (other.background, other.fog) == ((0.0, 0.0, 0.0), fs.Fog(0.1))
-    with pytest.raises(fs.InputError, match=r"part of a capture 'qualty' \(did you mean 'quality'\?\)"):
+    with pytest.raises(fs.InputError, match=r"field of a capture 'qualty' \(did you mean 'quality'\?\)"):
         capture.with_(qualty="fast")
 
 

@@ -76,7 +76,7 @@ def test_an_effect_without_a_gradient_is_an_error_before_rendering():
     renderer, cloud = fs.Renderer("reference"), fs.SplatCloud(**arrays())
     with pytest.raises(fs.InputError, match="the output 'label' has no gradient"):
         renderer.render_differentiable(cloud, CAMERA, ("rgb", "label"))
-    with pytest.raises(fs.InputError, match="samples=1"):
+    with pytest.raises(fs.InputError, match="samples must be 1"):
         renderer.render_differentiable(cloud, CAMERA, quality="samples=2")
 
 
