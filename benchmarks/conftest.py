@@ -35,7 +35,7 @@ def pytest_addoption(parser) -> None:
 def pytest_benchmark_update_machine_info(config, machine_info) -> None:
     renderer = fs.Renderer(config.getoption("--device"))
     backend = renderer.backend
-    rates = backend.rates() if backend.traits.measures_rates else None
+    rates = backend.rates() if backend.has("rates") else None
     machine_info["fidsplat"] = {
         "version": fs.__version__,
         "device": asdict(renderer.device),

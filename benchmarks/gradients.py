@@ -89,7 +89,7 @@ def main() -> None:
     parser.add_argument("--quality", help="render quality (default: standard)")
     given = parser.parse_args()
     renderer = fs.Renderer(given.device)
-    if not renderer.backend.traits.differentiates:
+    if not renderer.backend.has("differentiate"):
         raise InputError(f"--device must have gradients, got {given.device}; use an OpenCL or a Warp device")
     backend = renderer.backend
     if given.time:

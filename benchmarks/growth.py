@@ -98,7 +98,7 @@ def run(series: dict[str, list[Point]], device: str, repeats: int, longest: floa
     renderer = fs.Renderer(device)
     info, backend = renderer.device, renderer.backend
     results = Results(file, run_facts(f"{info.title}, {info.version}", 0))
-    rates = backend.rates() if backend.traits.measures_rates else None
+    rates = backend.rates() if backend.has("rates") else None
     del renderer, backend
     columns = (*Progress.get_default_columns(), TextColumn("{task.fields[now]}"))
     with Progress(*columns, console=PROGRESS) as progress:

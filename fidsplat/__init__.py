@@ -52,7 +52,7 @@ _HOME = {
     "SeveralDevices": "fidsplat.render.multi_device",
     "Frame": "fidsplat.render.frame",
     "DifferentiableFrame": "fidsplat.render.differentiable_frame",
-    "FrameBatch": "fidsplat.render.batch",
+    "FrameBatch": "fidsplat.render.frame",
     "Surface": "fidsplat.scenes.surface",
     "surface_at": "fidsplat.render.surface",
     "Lidar": "fidsplat.capture.lidar",

@@ -52,7 +52,7 @@ def main() -> None:
     options = parser.parse_args()
     renderer = fs.Renderer(options.device)
     backend = renderer.backend
-    if not backend.traits.probed:
+    if not backend.has("probe"):
         parser.error(f"--device must run single functions, got {renderer.device.name}; use an OpenCL device")
     if options.no_fma:
         if not isinstance(backend, OpenCLBackend):

@@ -40,8 +40,7 @@ class AlignmentFit(NamedTuple):
     """True: Huber's loss, gradients averaged between rendered frame and image; False: Tukey's, gradients of
     the frame"""
     noise: float = 0.0
-    """standard deviation of the residuals at the previous pose; 0: computed from the median of the
-    residuals"""
+    """standard deviation of the residuals at the previous pose; 0: from the median of the residuals"""
 
 
 class MovedFrame(NamedTuple):
@@ -113,15 +112,9 @@ class AlignmentKernels(ABC):
 
     @abstractmethod
     def sums(
-        self,
-        stage: int,
-        frame: Any,
-        fit: AlignmentFit,
-        moved: MovedFrame | None = None,
-        blocks: bool = False,
+        self, stage: int, frame: Any, fit: AlignmentFit, moved: MovedFrame | None = None, blocks: bool = False
     ) -> AlignmentSums:
-        """Sums of a stage for a Frame with rgb and depth. blocks: whether to return `scores` and
-        `matrices`."""
+        """Sums of a stage for a Frame with rgb and depth. blocks: whether to return `scores`, `matrices`."""
 
 
 def bins_of(values: np.ndarray) -> np.ndarray:

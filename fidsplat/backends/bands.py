@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
+
+
+def even_parts(count: int, most: int) -> Iterator[tuple[int, int]]:
+    """Ranges [first, end) of at most `most` items each, of equal size within one item, so that they share
+    buffers and recorded launches."""
+    parts = -(-count // most)
+    return pairwise([count * k // max(parts, 1) for k in range(parts + 1)])
 
 
 def split_by_cost(costs: np.ndarray, capacity: int, start: int = 0) -> Iterator[tuple[int, int, int]]:

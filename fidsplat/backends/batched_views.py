@@ -40,14 +40,12 @@ class ViewBatch:
     batch_indices: np.ndarray = field(default_factory=lambda: _FIRST)
     """(v,) uint32: position of each view in the batch"""
     total: int = 1
-    """number of views of the batch, including masked-out views"""
     views: tuple[View, ...] = ()
     """the views, if they differ from `view` in more than their poses"""
     stacked: bool = True
     """whether the views differ only in poses and `numbers`; if not, they are rendered one by one"""
 
     def __len__(self) -> int:
-        """Number of views that are rendered."""
         return len(self.batch_indices)
 
     @property
@@ -62,7 +60,6 @@ class ViewBatch:
 
     @staticmethod
     def single(view: View) -> ViewBatch:
-        """A batch of one view."""
         if view.groups:
             return _stacked((view,), {}, _FIRST, 1)
         poses = view.rotation[None, None], view.translation[None, None], view.eye[None, None]
@@ -70,7 +67,6 @@ class ViewBatch:
 
     @staticmethod
     def of(views: Sequence[View], batch_indices: np.ndarray, total: int) -> ViewBatch:
-        """A batch of one or more views."""
         first = views[0]
         labels = [label for label, _ in first.groups]
         for view in views:

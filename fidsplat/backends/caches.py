@@ -1,5 +1,4 @@
-"""Replacement folders for the kernel caches of PoCL, pyopencl and Warp if their own are not writable: without
-one, PoCL finds no device."""
+"""Other folders for compiled kernels if those of PoCL, pyopencl and Warp are not writable."""
 
 from __future__ import annotations
 

@@ -38,7 +38,6 @@ class DifferentiableImages:
         return self.frame.workspace.frames == self._number
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
-        """Copy an image to the host."""
         return self.images.read(name, index)
 
     @property

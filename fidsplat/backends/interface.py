@@ -1,4 +1,4 @@
-"""The interface of a device: base classes with defaults for optional capabilities (`Backend.traits`)."""
+"""The interface of a device: base classes, whose optional methods raise an error by default."""
 
 from __future__ import annotations
 
@@ -43,29 +43,6 @@ class DeviceInfo:
 
 
 @dataclass(frozen=True)
-class DeviceTraits:
-    """Optional capabilities of a device, with the methods that exist only then."""
-
-    caches_chunks: bool = False
-    """has a device cache for chunks of stores: `Backend.chunk_cache`"""
-    termination_depths: bool = False
-    """reports the depth at which blending of each tile stopped: `Backend.termination_depths` and
-    `copy_tiles`"""
-    differentiates: bool = False
-    """computes gradients of frames: `Backend.differentiate`"""
-    trains: bool = False
-    """trains splats on the device: `Backend.training`"""
-    aligns: bool = False
-    """aligns images on the device: `Backend.alignment`"""
-    measures_rates: bool = False
-    """`Backend.rates`, `memory_bytes` and `release_scratch`, and the output `overdraw`"""
-    renders_pixels: bool = False
-    """renders a subset of the pixels: `Pipeline.render_every`"""
-    probed: bool = False
-    """`Backend.probe` and `shapes`, for tests"""
-
-
-@dataclass(frozen=True)
 class Rates:
     """Measured peak rates of a device, per second."""
 
@@ -83,7 +60,6 @@ class ResidentData(ABC):
     """A cloud on a device, with the properties that select its kernels (splats/traits.py)."""
 
     count: int
-    """number of splats"""
     origin: np.ndarray
     """(3,) float64 metres: world position of the means' zero"""
     memory_bytes: int
@@ -116,8 +92,7 @@ class Chunk:
     load: Callable[[], Mapping[str, np.ndarray]]
     """function that returns the splats' arrays, float32 or int32, named as in SplatCloud"""
     pose: np.ndarray | None = None
-    """(16,) float64: pose of the chunk: rotation matrix by rows, translation [m], rotation as a quaternion;
-    None: identity"""
+    """(16,) float64: rotation matrix by rows, translation [m], rotation as a quaternion; None: identity"""
     first: int = 0
     """first row of the chunk in the arrays of `load`"""
 
@@ -195,8 +170,7 @@ class SeparateImages(Images):
     """Images of views that were rendered one after another."""
 
     def __init__(self, images: Mapping[int, Images], batch: ViewBatch, splats: int) -> None:
-        """images: those of each rendered view, by its position in the batch. splats: number of splats of the
-        cloud."""
+        """images: by position of the view in the batch. splats: number of splats of the cloud."""
         self._images, self.views, self._size, self._splats = images, batch.total, batch.size, splats
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
@@ -324,13 +298,18 @@ class Backend(ABC):
     """An open device."""
 
     info: DeviceInfo
-    traits: DeviceTraits = DeviceTraits()
     shape: Any = None
     """build constants of the kernels, such as the tile size"""
+    renders_pixels: bool = False
+    """whether pipelines implement `Pipeline.render_every`"""
     pair_budget: int = 2**30 - 1
     """maximum number of (splat, tile) pairs in the tile lists at once; tests lower it"""
     memory_bytes: int = 0
     """device memory of scratch buffers, without clouds and images"""
+
+    def has(self, method: str) -> bool:
+        """Whether the device implements an optional method, for example `probe`."""
+        return getattr(type(self), method) is not getattr(Backend, method)
 
     def lacks(self, requirement: str, remedy: str) -> str:
         """Error message for an operation that the device does not support."""
@@ -346,8 +325,7 @@ class Backend(ABC):
         None: those of the device. Raises DeviceError if the device lacks a feature or the compiler fails."""
 
     def frame_shape(self, view: View, count: int = 1) -> Any:
-        """The `shape` with which `pipeline` renders `count` views of this size fastest, with bit-identical
-        images."""
+        """The `shape` for which `pipeline` renders `count` views of this size fastest."""
         return None
 
     def unsupported(self, features: FeatureSet) -> str:
@@ -368,8 +346,7 @@ class Backend(ABC):
         raise DeviceError(self.lacks("cache chunks of a scene", "upload the scene"))
 
     def termination_depths(self, images: Any) -> TerminationDepths:
-        """Depth at which blending of each tile stopped, for a frame with the effect `termination_depths`;
-        waits for it."""
+        """Depth at which blending of each tile stopped, of a frame with the effect `termination_depths`."""
         raise DeviceError(self.lacks("report termination depths", "render without occlusion culling"))
 
     def copy_tiles(self, images: Any, other: Any, tiles: np.ndarray) -> None:
@@ -378,13 +355,11 @@ class Backend(ABC):
         raise DeviceError(self.lacks("copy tiles", "render without occlusion culling"))
 
     def differentiate(self, features: FeatureSet, shape: Any = None) -> GradientPipeline:
-        """The pipeline for these features with gradients, compiled on first use. Raises InputError for an
-        effect without a gradient."""
+        """The pipeline with gradients. Raises InputError for an effect without a gradient."""
         raise DeviceError(self.lacks("have gradients", "use device='opencl', 'warp' or 'reference'"))
 
     def compile_in_background(self, features: FeatureSet) -> None:  # noqa: B027 (optional)
-        """Start to compile the gradients of these features in the background; `differentiate` waits for the
-        compiler."""
+        """Start to compile the gradients of these features; `differentiate` waits for the compiler."""
 
     def training(self) -> Any:
         """The compiled kernels of a training step except rendering (`opencl.training.OpenCLTraining`)."""
@@ -403,7 +378,6 @@ class Backend(ABC):
         raise DeviceError(self.lacks("measure its rates", "use an OpenCL device"))
 
     def probe(self) -> Probe:
-        """Access to the device for tests."""
         raise DeviceError(self.lacks("have a probe", "use an OpenCL or Warp device"))
 
     def shapes(self, kind: str) -> dict[str, Any]:

@@ -66,8 +66,7 @@ def prepare_batch(cloud: PlacedTraits, views: Views) -> tuple[FeatureSet, ViewBa
 
 
 def view_of(capture: Capture, origin: np.ndarray) -> View:
-    """The view of a capture at the time of its shutter, with `sub_frames` if the shutter needs several
-    poses."""
+    """The view of a capture at its shutter's time, with `sub_frames` for each pose of a long exposure."""
     camera, motion, shutter = capture.camera, capture.motion, capture.shutter
     if motion.is_still:
         return View.of(capture, origin)

@@ -26,8 +26,7 @@ class Probe(ABC):
 
     @abstractmethod
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
-        """Four tests of x (n,) float32 for NaN or infinity, as int32: x != x; isnan; every comparison is
-        false; isinf."""
+        """Tests of x (n,) float32, as int32: x != x; isnan; every comparison is false; isinf."""
 
     @abstractmethod
     def arithmetic(
@@ -48,8 +47,7 @@ class Probe(ABC):
 
     @abstractmethod
     def scan(self, pipeline: Any, lengths: np.ndarray) -> tuple[np.ndarray, int]:
-        """Prefix sums of list lengths (n,) uint32, as in tile binning: sums modulo 2^32, (n + 1,) uint32, and
-        the total."""
+        """Prefix sums modulo 2^32 of list lengths (n,) uint32: (n + 1,) uint32; and the total."""
 
     @abstractmethod
     def boxes(self, pipeline: Any, trace: Mapping[str, np.ndarray]) -> np.ndarray:

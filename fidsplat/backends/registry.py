@@ -52,8 +52,7 @@ class Devices(list[DeviceInfo]):
 
 
 def devices() -> Devices:
-    """List all devices, also unusable ones with the reason. Raises DeviceError in a fork of a process that
-    has used a driver."""
+    """List all devices, also unusable ones with the reason. Raises DeviceError in some forks."""
     for family in FAMILIES:
         _prepare(family)
     return Devices(info for module in FAMILIES.values() for info in import_module(module).devices())

@@ -36,9 +36,7 @@ class View:
     per pixel."""
 
     width: int
-    """width of the sample grid"""
     height: int
-    """height of the sample grid"""
     samples: int
     """samples per pixel along each axis"""
     focal_x: float
@@ -52,8 +50,7 @@ class View:
     translation: np.ndarray
     """(3,) metres: the cloud's origin in the camera frame"""
     eye: np.ndarray
-    """(3,) metres: camera centre relative to the cloud's origin, in world axes; far behind the camera for
-    parallel rays"""
+    """(3,) metres: camera centre minus the cloud's origin; far behind the camera for parallel rays"""
     near: float
     far: float
     log_cut: float
@@ -68,14 +65,12 @@ class View:
     fog_density: float = 0.0
     """fog density per metre"""
     surroundings: Gradient | Panorama | None = None
-    """a background that is a gradient or a panorama"""
     external_depth: ExternalDepth | None = None
     """external depth image: an opaque surface among the splats; in a batch possibly one for each view"""
     raster: RayRaster | None = None
     """rays of the samples for a camera with a lens; None for a pinhole and for parallel rays"""
     along_ray: bool = False
-    """whether depths (also near, far, sort keys) are distances from the camera's centre; else z
-    coordinates"""
+    """whether depths (and near, far, sort keys) are distances from the camera; else z"""
     slopes: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """limits of -x, x, -y, y at z = 1, to which EWA clamps the centre of a splat before it linearises the
     projection"""
@@ -97,8 +92,7 @@ class View:
 
     @property
     def row_rotations(self) -> np.ndarray:
-        """(h, 3, 3) rotation world to camera for each row of pixels: that of the sub-frame from which its
-        normals are."""
+        """(h, 3, 3) rotation world to camera for the normals of each row of pixels."""
         rotations = np.tile(self.rotation, (self.height // self.samples, 1, 1))
         for sub_frame in self.sub_frames:
             if sub_frame.middle:

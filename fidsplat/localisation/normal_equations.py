@@ -30,7 +30,7 @@ from fidsplat.vision.pyramid import convolved, resized
 
 def alignment_kernels(renderer: Renderer, resident: ResidentCloud) -> AlignmentKernels:
     """Kernels of the device if it has them, else NumPy; also for stores, whose frames may be on the host."""
-    if renderer.backend.traits.aligns and resident.data is resident.complete:
+    if renderer.backend.has("alignment") and resident.data is resident.complete:
         return renderer.backend.alignment()
     return HostAlignment()
 

@@ -4,29 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from fidsplat.backends.interface import Images
 from fidsplat.util.errors import InputError, MissingOutputError
 
+if TYPE_CHECKING:
+    from fidsplat.render.certified_error import ErrorImage
+
 SceneIds = Callable[[], np.ndarray] | None
 """Function that returns, for each splat on the device, its index in the scene, (n,) int32; None if both
 indices are equal."""
-
-
-class ComputedImage(Protocol):
-    """An output image that the host computes from other images on first use."""
-
-    def read(self) -> np.ndarray:
-        """Compute the image; a new array."""
-        ...
-
-    @property
-    def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device by stage, for this image only."""
-        ...
 
 
 class ImageMapping(Mapping[str, np.ndarray]):
@@ -37,7 +27,7 @@ class ImageMapping(Mapping[str, np.ndarray]):
 
     _noun: str
     """name of the class in messages"""
-    _error: ComputedImage | None = None
+    _error: ErrorImage | None = None
     """the output `error`, if it is requested"""
 
     def __init__(
@@ -83,6 +73,22 @@ class ImageMapping(Mapping[str, np.ndarray]):
             raise InputError(f"{what} must be read on the host, got device_array; use {self._noun}[{name!r}]")
         return self._images.device_array(name, self._index)
 
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds on the device by stage, for all views together: project, sort, bin, blend, resolve;
+        error: all stages of the second rendering for the output `error`.
+
+        On a GPU a replayed frame is rendered again to measure them, since timing each launch would slow down
+        all frames. Empty if its cloud has been released.
+        """
+        return self._images.timings
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """Number of splats in the cloud, of visible (not culled) splats, and of pairs of a splat and a tile;
+        for all views together."""
+        return self._images.stats
+
     def wait(self) -> Self:
         """Wait until the device has rendered the images; nothing is copied.
 
@@ -105,7 +111,6 @@ class ImageMapping(Mapping[str, np.ndarray]):
         return name == "error" or (name == "splat_id" and self._ids is not None)
 
     def _is_shared(self, name: str) -> bool:
-        """Whether the device shares an array of an image."""
         return self._images.shares_arrays and not self._is_computed(name)
 
     def to_torch(self, name: str = "rgb") -> Any:

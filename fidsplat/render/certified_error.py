@@ -193,7 +193,6 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
 
 
 def _option_of(effect: str) -> tuple[str, str]:
-    """The option that requests an effect, and the supported alternative."""
     return next((words for prefix, words in _OPTIONS.items() if effect.startswith(prefix)), (effect, "less"))
 
 

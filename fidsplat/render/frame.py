@@ -1,15 +1,18 @@
-"""Frame: the images of one view."""
+"""Frame: the images of one view, and FrameBatch: those of many views."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Protocol, TypeVar
+from dataclasses import replace
 
 import numpy as np
 
 from fidsplat.backends.interface import HostImages, Images
 from fidsplat.capture.capture import Capture
-from fidsplat.render.array_export import ComputedImage, ImageMapping, SceneIds, check_process, with_scene_ids
+from fidsplat.capture.views import Views
+from fidsplat.render.array_export import ImageMapping, SceneIds, check_process, with_scene_ids
+from fidsplat.render.certified_error import ErrorImage
+from fidsplat.streaming.bands import BandData
 from fidsplat.util.arguments import invalid, whole_number
 
 
@@ -32,10 +35,10 @@ class Frame(ImageMapping):
         images: Images,
         capture: Capture,
         ids: SceneIds = None,
-        error: ComputedImage | None = None,
+        error: ErrorImage | None = None,
         index: int = 0,
     ) -> None:
-        """Accepts the arguments of `ImageMapping`. error: the output `error`, if it is requested."""
+        """error: the output `error`, if it is requested. Other arguments: as `ImageMapping`."""
         super().__init__(images, capture.outputs, ids, index)
         self._error, self.capture = error, capture
         """The capture of this frame. `read_back` and `truth_of` use its camera, shutter and motion."""
@@ -105,23 +108,13 @@ class Frame(ImageMapping):
 
     @property
     def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device by stage: project, sort, bin, blend, resolve; error: all stages of the
-        second rendering for the output `error`.
-
-        On a GPU a replayed frame is rendered again to measure them, since timing each launch would slow down
-        all frames. Empty if its cloud has been released.
-        """
         if self._images.views > 1:
             return {}
-        if self._error is None:
-            return self._images.timings
-        return {**self._images.timings, **self._error.timings}
+        return super().timings if self._error is None else {**super().timings, **self._error.timings}
 
     @property
     def stats(self) -> Mapping[str, int]:
-        """Number of splats in the cloud, of visible (not culled) splats, and of pairs of a splat and a
-        tile."""
-        return self._images.stats if self._images.views == 1 else {}
+        return super().stats if self._images.views == 1 else {}
 
 
 def _host_frame(
@@ -131,19 +124,49 @@ def _host_frame(
     return Frame(images, capture)
 
 
-class RowBand(Protocol):
-    """A band of rows of a frame."""
+class FrameBatch(ImageMapping):
+    """Rendered views: a mapping from output names to read-only NumPy arrays (views, h, w) or
+    (views, h, w, channels), which are copied from the device on first use.
 
-    @property
-    def rows(self) -> tuple[int, int]:
-        """Rows of pixels [first, end)."""
-        ...
+    Names, types and units are those of Frame. Masked views are -1 in `label` and `splat_id`, and 0 in all
+    other outputs. View i is bit-identical to `Renderer.render` of that view, except for stores with
+    `detail_error` (`Renderer.render_batch`).
+    """
+
+    _noun = "batch"
+
+    def __init__(self, images: Images, views: Views, ids: SceneIds = None) -> None:
+        super().__init__(images, views.captures[0].outputs, ids)
+        self._views, self.views = views, images.views
+        """Number of views, including masked ones."""
+
+    def __repr__(self) -> str:
+        camera = self._views.captures[0].camera
+        size = "" if camera is None else f", {camera.width} x {camera.height}"
+        return f"FrameBatch({self.views} views, {', '.join(self.outputs)}{size})"
+
+    def frame(self, number: int) -> Frame:
+        """One view as a Frame, without timings and stats. Images are copied to the host on first use.
+
+        Raises:
+            InputError: the number of the view is out of range.
+        """
+        number = whole_number("number of the view", number, 0, self.views - 1)
+        return Frame(self._images, self._views.capture(number), self._ids, index=number)
+
+    def __reduce__(self):
+        """Pickled and copied as NumPy arrays."""
+        views = replace(self._views, captures=tuple(one.picklable() for one in self._views.captures))
+        return _host_batch, (dict(self), dict(self.timings), dict(self.stats), views)
 
 
-P = TypeVar("P", bound=RowBand)
+def _host_batch(
+    arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int], views: Views
+) -> FrameBatch:
+    return FrameBatch(HostImages(arrays, timings, stats), views)
 
 
-def stack_bands(bands: Iterable[P], render: Callable[[P], Frame]) -> Frame:
+def stack_bands(bands: Iterable[BandData], render: Callable[[BandData], Frame]) -> Frame:
     """Render bands of rows and stack them to one frame.
 
     The device renders one band after another, so that it stores the splats of one band only. Each band is

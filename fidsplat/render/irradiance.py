@@ -130,8 +130,7 @@ class LightField:
         return found
 
     def reflected(self, directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Weighted sums (rows, columns, v, 3) of the radiance from directions (v, k, 3) at all
-        measurements."""
+        """Weighted sums (rows, columns, v, 3) of the radiance from directions (v, k, 3)."""
         return sum(  # type: ignore[return-value]
             np.einsum("vk,yxvkc->yxvc", weights * share, self._images[:, :, *pixel])
             for pixel, share in self._pixels(directions)

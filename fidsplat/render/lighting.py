@@ -16,14 +16,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.cameras.lenses import Orthographic
 from fidsplat.render.irradiance import LightField
-from fidsplat.render.reflection import (
-    Gloss,
-    fit_harmonics,
-    fresnel,
-    gloss,
-    lobe,
-    view_directions,
-)
+from fidsplat.render.reflection import Gloss, fit_harmonics, fresnel, gloss, lobe, view_directions
 from fidsplat.render.shadows import LightPoint, ReceiverPoints, light_points, visibility
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.lights import GRIDS, Lighting, PointLight
@@ -82,7 +75,6 @@ class _Surroundings:
 
     @cached_property
     def resident(self) -> Any:
-        """The splats on the device."""
         return self.renderer.upload(self.scene)
 
     @cached_property
@@ -132,7 +124,6 @@ class _Points(NamedTuple):
     counts: np.ndarray
     """(n, 2) points along the tangents of each splat"""
     surface: ReceiverPoints
-    """the points in the world"""
 
     @property
     def starts(self) -> np.ndarray:
@@ -141,8 +132,6 @@ class _Points(NamedTuple):
 
 
 class _Light(NamedTuple):
-    """Light at points of a marker."""
-
     irradiance: np.ndarray
     """(m, 3)"""
     field: LightField
@@ -151,7 +140,6 @@ class _Light(NamedTuple):
 
 
 def _lit(placed: PlacedMarker, around: _Surroundings) -> PlacedMarker:
-    """A marker with its colours from light."""
     light = Lighting.of(placed.light)
     assert light is not None
     _check_gloss(light, around)
@@ -198,7 +186,6 @@ def _check_gloss(light: Lighting, around: _Surroundings) -> None:
 
 
 def _points(placed: PlacedMarker, light: Lighting) -> _Points:
-    """Points on all splats: one on each Gaussian."""
     cloud, pose = placed.marker.cloud, placed.pose
     area = 4 * float((cloud.scales[:, 0] * cloud.scales[:, 1]).sum(dtype=np.float64))
     pitch = max(placed.marker.module / FINEST, np.sqrt(area) / MOST)
@@ -224,7 +211,6 @@ def _points(placed: PlacedMarker, light: Lighting) -> _Points:
 
 
 def _measured(placed: PlacedMarker, light: Lighting, points: _Points, around: _Surroundings) -> _Light:
-    """Light at the points, from the panoramas and the lights."""
     surface, places = points.surface, points.local[:, :2]
     field = _field(placed, light, points, around)
     irradiance = np.empty((len(places), 3))
@@ -336,8 +322,7 @@ def _placed_parts(
 def _from_camera(
     points: _Points, arriving: _Light, shiny: Gloss, around: _Surroundings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance (m, 3) that the points reflect to the scene's camera, and the factor (m,) of their matte
-    colour."""
+    """Radiance (m, 3) that points reflect to the scene's camera, and factor (m,) of their matte colour."""
     surface = points.surface
     camera = around.camera
     assert camera is not None

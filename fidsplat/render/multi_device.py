@@ -152,7 +152,6 @@ class SeveralDevices:
     def _uploaded(
         self, scene: Scene | SplatCloud | Store | Sequence[ResidentCloud]
     ) -> Sequence[ResidentCloud]:
-        """A scene on all devices, uploaded if necessary."""
         if isinstance(scene, Sequence):
             given = items("scene", scene, ResidentCloud, "a scene, or the result of `upload`")
         else:
@@ -174,8 +173,7 @@ class SeveralDevices:
         return list(pairwise(borders.tolist()))
 
     def _balance(self, rows: list[int], seconds: list[float]) -> None:
-        """Load balancing: move the borders of the bands to equalise their times, as if all rows of a band
-        were equal."""
+        """Move the borders of the bands to equalise their times, as if all rows took the same time."""
         if len(rows) < len(self.renderers) or max(seconds) <= _MAX_IMBALANCE * np.mean(seconds):
             return
         spent = np.concatenate([[0.0], np.cumsum(seconds)])

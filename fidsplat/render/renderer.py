@@ -23,10 +23,9 @@ from fidsplat.capture.sensor import Sensor
 from fidsplat.capture.views import Views, views_of
 from fidsplat.effects.differentiable import check_gradients, with_distortion
 from fidsplat.render.array_export import check_process
-from fidsplat.render.batch import FrameBatch
 from fidsplat.render.certified_error import ErrorImage, ideal_of
 from fidsplat.render.differentiable_frame import DifferentiableFrame
-from fidsplat.render.frame import Frame, stack_bands
+from fidsplat.render.frame import Frame, FrameBatch, stack_bands
 from fidsplat.render.lighting import lit_scene
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.scenes import Scene
@@ -34,7 +33,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.store.store import Store
 from fidsplat.streaming.bands import BandData
-from fidsplat.streaming.residency import Residency
+from fidsplat.streaming.residency import Residency, one_ahead
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import invalid, whole_number
 from fidsplat.util.errors import InputError, unknown
@@ -250,7 +249,7 @@ class Renderer:
         whole_number("step", step, 1, 2**31 - 1)
         requested = _capture_of(scene, capture, outputs=outputs, quality=quality)
         resident = self._resident(scene)
-        if not self.backend.traits.renders_pixels:
+        if not self.backend.renders_pixels:
             raise InputError(
                 self.backend.lacks("render subsets of pixels", "use device='reference', or render")
             )
@@ -308,23 +307,7 @@ class Renderer:
         requested = (_capture_of(scene, one, outputs=outputs, quality=quality, **parts) for one in remaining)
         if isinstance(resident.data, Residency):
             requested = resident.data.prefetched(requested)
-        previous: Frame | None = None
-        failure: Exception | None = None
-        while True:
-            try:
-                frame = self._render(resident, next(requested))
-            except StopIteration:
-                break
-            except Exception as error:
-                failure = error
-                break
-            if previous is not None:
-                yield previous
-            previous = frame
-        if previous is not None:
-            yield previous
-        if failure is not None:
-            raise failure
+        yield from one_ahead(self._render(resident, one) for one in requested)
 
     def render_batch(
         self,
@@ -375,9 +358,8 @@ class Renderer:
         if views.groups and resident.labels is not None:
             for label in views.groups:
                 if label not in resident.labels:
-                    raise InputError(
-                        unknown("label of splats", str(label), map(str, sorted(resident.labels)))
-                    )
+                    known = map(str, sorted(resident.labels))
+                    raise InputError(unknown("label of splats", str(label), known))
 
     def _render_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
         interrupts.check()
@@ -450,7 +432,6 @@ class Renderer:
 def _rendered(
     pipeline: Pipeline, data: Any, view: View, every: tuple[int, Callable[[float], object] | None] | None
 ) -> Images:
-    """Images of all pixels of a view, or of every n-th."""
     return pipeline.render_view(data, view) if every is None else pipeline.render_every(data, view, *every)
 
 

@@ -57,8 +57,7 @@ class ResidentCloud:
     def gather(
         self, views: Iterable[View], features: FeatureSet, qualities: Iterable[Quality]
     ) -> tuple[Any, SceneIds]:
-        """Upload the splats that these views need; returns the device data, and the scene indices of its
-        splats."""
+        """Upload the splats that these views need; returns them and their scene indices."""
         if isinstance(self.data, Residency):
             return self.data.gather(list(views), features, qualities)
         return self.data, None

@@ -226,7 +226,6 @@ class ScanRequest:
         return not self.motion.is_still
 
     def capture(self, pose: Any) -> Capture:
-        """The capture that renders the rays."""
         lidar = self.lidar
         camera = lidar.camera(self.start, self.moving)
         if self.motion.camera is None:

@@ -26,8 +26,6 @@ _WIDEST = np.tan(np.radians(80))
 
 
 class ReceiverPoints(NamedTuple):
-    """Measured points of a marker."""
-
     points: np.ndarray
     """(m, 3) in the world"""
     normals: np.ndarray
@@ -45,11 +43,9 @@ class LightPoint(NamedTuple):
     place: np.ndarray
     """(3,) its position; of a sun the direction of its light"""
     share: float
-    """share of the light's intensity"""
 
     def arriving(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Unit directions (m, 3) towards the light, and irradiance (m, 3) of facing surfaces without
-        shadows."""
+        """Unit directions (m, 3) to the light, and unshadowed irradiance (m, 3) of facing surfaces."""
         power = self.share * self.light.power
         if isinstance(self.light, Sun):
             return np.broadcast_to(-self.place, points.shape), np.broadcast_to(power, points.shape)

@@ -129,7 +129,6 @@ def default_radius(camera: Camera) -> float:
 
 
 def _viewpoint(camera: Camera | None, pixel, ray) -> tuple[Camera, tuple[float, float]]:
-    """Camera and pixel of a call. Raises InputError."""
     if (pixel is None) == (ray is None):
         given = "neither" if pixel is None else "both"
         raise InputError(f"the place of a surface must be a pixel or a ray, got {given}; give one of them")
@@ -158,8 +157,7 @@ def _ray_camera(ray) -> Camera:
 
 
 def _patch(camera: Camera, pixel: tuple[float, float], radius: float) -> Camera:
-    """A camera with the square of half side `radius` around a pixel as its image, in `SAMPLES` samples per
-    side."""
+    """A camera that shows a square around a pixel, of half side `radius`, in `SAMPLES` samples."""
     zoom = SAMPLES / (2 * radius)
     cx = (camera.cx - pixel[0] + radius) * zoom
     cy = (camera.cy - pixel[1] + radius) * zoom

@@ -157,7 +157,7 @@ def trace(renderer: Renderer, spec: FrameSpec, shape=None) -> dict[str, np.ndarr
     """Buffers between the stages of a device, and the outputs; `shape` replaces its build constants."""
     features, view = spec.prepared()
     backend = renderer.backend
-    if shape is not None and backend.traits.probed:
+    if shape is not None and backend.has("probe"):
         pipeline = backend.pipeline(features, shape)
     else:
         pipeline = backend.pipeline(features)

@@ -65,7 +65,7 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
         DeviceError: the device cannot compile or run the kernels.
     """
     backend = renderer.backend
-    if not backend.traits.probed:
+    if not backend.has("probe"):
         return None
     generator = np.random.default_rng(seed)
     exponents = generator.uniform(-14, 0, _COUNT).astype(np.float32).astype(float)
@@ -108,7 +108,7 @@ def worst(got: np.ndarray, truth: np.ndarray) -> float:
 )
 def f1(renderer: Renderer) -> Found:
     # products are rounded before subtraction, and FMA fuses if the device declares it
-    if not renderer.backend.traits.probed:
+    if not renderer.backend.has("probe"):
         return
     probe = renderer.backend.probe()
     generator = np.random.default_rng(61)
@@ -136,7 +136,7 @@ def f2(renderer: Renderer) -> Found:
 @case("F3", "NaN and infinity are detected", "quiet, negative and signalling NaN; the build options")
 def f3(renderer: Renderer) -> Found:
     # neither a build option nor the compiler assumes that there is no NaN
-    if not renderer.backend.traits.probed:
+    if not renderer.backend.has("probe"):
         return
     probe = renderer.backend.probe()
     unsafe = [option for option in probe.options() if any(word in option for word in UNSAFE)]
@@ -177,7 +177,7 @@ def f4(renderer: Renderer) -> Found:
 def f5(renderer: Renderer) -> Found:
     # schedules with and without barriers must agree; on a GPU, different work-group sizes must agree
     backend = renderer.backend
-    if not backend.traits.probed:
+    if not backend.has("probe"):
         return
     # lists of up to several batches of staged splats (128), and pixels that terminate early
     crowded = random_splats(260, 65, depth=(0.8, 1.5), scale=(0.02, 0.25), across=0.25)
@@ -209,7 +209,7 @@ def in_a_row(depths) -> SplatCloud:
 def f6(renderer: Renderer) -> Found:
     # depth order, tile lists and their starts at awkward lengths, against NumPy's stable sort
     backend = renderer.backend
-    if not backend.traits.probed:
+    if not backend.has("probe"):
         return
     generator = np.random.default_rng(67)
     features, view = prepare(in_a_row([1.0]), Capture(VIEW))

@@ -96,7 +96,7 @@ def a4(renderer: Renderer) -> Found:
         yield _spec(_tilted(ratio), focal=80.0)
     clouds = [_tilted(0.2), _crossing(60), random_splats(120, seed=4), _specks()]
     spec = _spec(SplatCloud.concatenate(clouds), width=93, height=77)
-    if not renderer.backend.traits.probed:
+    if not renderer.backend.has("probe"):
         return
     base = trace(renderer, spec)
     for name, shape in renderer.backend.shapes("tiles").items():

@@ -152,7 +152,7 @@ def e2(renderer: Renderer) -> Found:
 def e3(renderer: Renderer) -> Found:
     # sums beyond 32 bits, and a frame that is rendered in bands of tiles
     backend = renderer.backend
-    if not backend.traits.probed:
+    if not backend.has("probe"):
         return
     cloud = random_splats(200, 43, depth=(0.5, 4.0), scale=(0.05, 1.0))
     pipeline = backend.pipeline(select(cloud, Capture(outputs=("rgb", "alpha"))))
@@ -232,7 +232,7 @@ def e4(renderer: Renderer) -> Found:
 def e5(renderer: Renderer) -> Found:
     # buffers full of NaN before the frame: none may survive
     backend = renderer.backend
-    if not backend.traits.probed:
+    if not backend.has("probe"):
         return
     different = 0
     for cloud in (crowd(), crowd().with_coplanar_groups(0), SplatCloud.empty()):

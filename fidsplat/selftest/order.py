@@ -308,7 +308,7 @@ def c3(renderer: Renderer) -> Found:
     copies = {name: first[name].copy() for name in first}
     changed = max(differing(copies, render(renderer, spec), ALL_OUTPUTS) for _ in range(3))
     yield Finding("pixels that change when rendered again", changed, 0)
-    if renderer.backend.traits.probed:
+    if renderer.backend.has("probe"):
         tiles = next(iter(renderer.backend.shapes("tiles").values()))
         changed = differing(copies, trace(renderer, spec, tiles), ALL_OUTPUTS)
         yield Finding("pixels that change with another tile size", changed, 0)

@@ -13,7 +13,7 @@ from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture, output_names
 from fidsplat.capture.environment import ExternalDepth
 from fidsplat.capture.sensor import Sensor
-from fidsplat.render.batch import FrameBatch
+from fidsplat.render.frame import FrameBatch
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.scenes import PlacedMarker, Scene

@@ -19,7 +19,7 @@ from fidsplat.store.chunked_splats import CellSizes, ChunkedSplats, NodeMasks, S
 from fidsplat.store.subchunks import Subchunks
 from fidsplat.streaming.frustum_culling import in_frustum
 from fidsplat.streaming.level_of_detail import visible_nodes
-from fidsplat.streaming.occlusion_test import contributing_tiles, node_keys, occluded, occluded_nodes
+from fidsplat.streaming.occlusion_test import contributing_tiles, occluded, occluded_nodes
 
 _MIN_ROWS = 16
 """pixels"""
@@ -57,7 +57,6 @@ class Band:
 
     @staticmethod
     def of(scene: ChunkedSplats, view: View, features: FeatureSet, cell_sizes: CellSizes) -> Band:
-        """All rows of a view."""
         first, end = view.band or (0, view.height)
         return Band(scene, view, features, cell_sizes, (first // view.samples, end // view.samples))
 
@@ -137,12 +136,7 @@ class Band:
         return tuple(each & ~own for each, own in zip(self.visible, self.nodes, strict=True))
 
     def occluded(self, termination: TerminationDepths) -> NodeMasks:
-        """Nodes that are occluded according to termination depths."""
         return occluded_nodes(self.scene, self.view, self.features, termination)
-
-    def minimum_keys(self) -> tuple[np.ndarray, ...]:
-        """(instances * nodes,) metres for each store: lower bounds on sort keys."""
-        return node_keys(self.scene, self.view, self.features)
 
     @cached_property
     def selection(self) -> Selection:
@@ -153,13 +147,11 @@ class Band:
 
     @cached_property
     def count(self) -> int:
-        """Number of splats from which the band is rendered."""
         if self.subchunks is None:
             return self.count_of(self.nodes) + len(self.scene.in_memory)
         return sum(int(each.rows[used].sum()) for each, used in self.subchunks) + len(self.scene.in_memory)
 
     def count_of(self, nodes: NodeMasks) -> int:
-        """Number of splats of nodes."""
         return sum(int(n[own].sum()) for n, own in zip(self.scene.node_counts, nodes, strict=True))
 
     @property
@@ -183,8 +175,7 @@ class BandSplitter:
         """largest number of splats that fitted"""
 
     def split(self, full: Band, fits: Callable[[Band], bool]) -> Iterator[Band]:
-        """Bands from the top that fit, or cannot be split further. `fits` is called right before a band is
-        yielded."""
+        """Bands from the top that fit, or cannot be split. `fits` is called right before each is yielded."""
         waiting = [full.with_rows(*rows) for rows in pairwise(self._cuts.get(full.rows, full.rows))]
         bands: list[Band] = []
         while waiting:

@@ -13,8 +13,6 @@ from fidsplat.store.store import Store
 
 
 class DeviceChunks:
-    """Chunks of a scene for a device's chunk cache."""
-
     def __init__(self, scene: ChunkedSplats) -> None:
         self.scene = scene
         self._chunks: dict[tuple[int, bool], dict[int, Chunk]] = {}

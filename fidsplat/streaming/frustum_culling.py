@@ -90,8 +90,7 @@ class Extent:
         return Extent(larger * radius, margin, radius / nearer, nearer)
 
     def nearest(self, view: View, boxes: CameraBoxes) -> np.ndarray:
-        """(n,) metres: lower bound on depths and sort keys of splats. boxes: to `depths` standard
-        deviations."""
+        """(n,) metres: lower bounds on depths. boxes: to `depths` standard deviations."""
         nearest = boxes.nearest(view)
         return np.minimum(self.nearer * nearest, nearest)
 
@@ -225,8 +224,7 @@ def _pinhole_sides(view: View, margin: float) -> list[tuple[np.ndarray, float]]:
 
 
 def _max_ray_rotation(view: View) -> float:
-    """Largest angle [rad] between rays one sample apart, of a fisheye or panorama; infinite for a folding
-    fisheye."""
+    """Largest angle [rad] between neighbouring rays of a fisheye or panorama; may be infinite."""
     lens = view.lens
     if not isinstance(lens, Fisheye):
         return 1.0 / min(view.focal_x, view.focal_y)

@@ -1,5 +1,4 @@
-"""Level-of-detail selection: the coarsest visible nodes of a scene's stores that the allowed error
-permits."""
+"""Level-of-detail selection: the coarsest visible nodes that the allowed error permits."""
 
 from __future__ import annotations
 

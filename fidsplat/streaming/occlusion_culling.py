@@ -20,6 +20,7 @@ from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.store.chunked_splats import NodeMasks
 from fidsplat.streaming.bands import Band
+from fidsplat.streaming.occlusion_test import node_keys
 
 MIN_SPLATS = 1_000_000
 """views of fewer splats are rendered without occlusion culling"""
@@ -37,8 +38,7 @@ _SAMPLES_PER_TILE, _MOTION_SLACK = 4, 4.0
 """reprojection of termination depths: number of sampled directions per tile, across and down; and the
 multiple of the camera's motion that is added to the depths"""
 _PATCH_RATIO = 2
-"""missing chunks are rendered alone, in their tiles, if they have this many times fewer splats than the
-frame"""
+"""missing chunks are rendered alone if the frame has this many times more splats"""
 _MAX_PASSES = 12
 """maximum number of passes; then a view is rendered from all visible chunks"""
 
@@ -60,7 +60,6 @@ class OcclusionCulling:
         self._pause = max(self._pause - 1, 0)
 
     def initial_guess(self, full: Band) -> Band:
-        """First guess of the chunks that are not occluded."""
         last = self._last
         termination = None if last is None else _reprojected(*last, full.view)
         if termination is None:
@@ -134,7 +133,8 @@ def _without(nodes: NodeMasks, others: NodeMasks) -> NodeMasks:
 
 def _nearest(full: Band, nodes: NodeMasks, max_splats: int) -> NodeMasks:
     """The nearest of some nodes, with about `max_splats` splats in total; at least one node."""
-    depths = [depth[mask] for depth, mask in zip(full.minimum_keys(), nodes, strict=True)]
+    keys = node_keys(full.scene, full.view, full.features)
+    depths = [depth[mask] for depth, mask in zip(keys, nodes, strict=True)]
     counts = [count[mask] for count, mask in zip(full.scene.node_counts, nodes, strict=True)]
     order = np.argsort(np.concatenate(depths), kind="stable")
     near = np.zeros(len(order), bool)

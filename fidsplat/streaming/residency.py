@@ -6,6 +6,8 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
+from itertools import islice
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,13 +27,30 @@ from fidsplat.streaming.level_of_detail import select
 from fidsplat.streaming.occlusion_culling import OcclusionCulling
 from fidsplat.util.errors import FidsplatError
 
+T = TypeVar("T")
+
+
+def one_ahead(items: Iterator[T]) -> Iterator[T]:
+    """The items, each yielded after the next was computed. An error is raised after the items before."""
+    previous: list[T] = []
+    while True:
+        try:
+            following = list(islice(items, 1))
+        except Exception:
+            yield from previous
+            raise
+        yield from previous
+        if not following:
+            return
+        previous = following
+
 
 class Residency:
     """The chunks of a scene on a device. Used by one thread at a time."""
 
     def __init__(self, scene: ChunkedSplats, backend: Backend) -> None:
         self.scene, self._backend, self.chunks = scene, backend, DeviceChunks(scene)
-        self._cache = backend.chunk_cache(self.chunks) if backend.traits.caches_chunks else None
+        self._cache = backend.chunk_cache(self.chunks) if backend.has("chunk_cache") else None
         self._current: tuple[Selection, int, ResidentData] | None = None
         self._splitter, self._occlusion = BandSplitter(), OcclusionCulling()
         self._prefetch_thread: threading.Thread | None = None
@@ -51,8 +70,7 @@ class Residency:
     def bands(
         self, view: View, features: FeatureSet, quality: Quality, pipeline: Pipeline
     ) -> Iterator[BandData]:
-        """Bands of a view with their visible splats, from the top, each uploaded when requested; one if all
-        fits."""
+        """Bands of a view from the top with their splats, uploaded when requested; one if all fits."""
         full = Band.of(self.scene, view, features, self.scene.cell_sizes(quality))
 
         def fits(band: Band, first_id: int = 0) -> bool:
@@ -102,37 +120,25 @@ class Residency:
         return self._current[-1]
 
     def _can_cull(self, view: View, features: FeatureSet) -> bool:
-        """Whether occlusion culling is supported."""
-        traits = self._backend.traits
-        return (
-            traits.termination_depths and traits.caches_chunks and occlusion_test.is_supported(view, features)
-        )
+        return self._backend.has("termination_depths") and occlusion_test.is_supported(view, features)
 
     def prefetched(self, captures: Iterator[Capture]) -> Iterator[Capture]:
         """The captures, each yielded while the chunks of the next are prefetched."""
-        waiting: Capture | None = None
+
+        def started() -> Iterator[Capture]:
+            for number, capture in enumerate(captures):
+                if number:
+                    self._prefetch(capture)
+                yield capture
+
         try:
-            while True:
-                try:
-                    following = next(captures, None)
-                    if following is not None and waiting is not None:
-                        self._prefetch(following)
-                except Exception:
-                    if waiting is not None:
-                        yield waiting
-                    raise
-                if waiting is not None:
-                    yield waiting
-                if following is None:
-                    return
-                waiting = following
+            yield from one_ahead(started())
         finally:
             if self._prefetch_thread is not None:  # wait, as the device may be closed next
                 self._prefetch_thread.join()
 
     def _prefetch(self, capture: Capture) -> None:
-        """Start to prefetch the chunks of a view in another thread, unless one is running. Rendering reports
-        errors."""
+        """Start to load the chunks of a view in a thread, unless one is running. Rendering reports errors."""
         features, view = prepare(self.scene, capture)
         cell_sizes = self.scene.cell_sizes(capture.quality)
         if self._prefetch_thread is not None and self._prefetch_thread.is_alive():

@@ -119,7 +119,7 @@ class Trainer:
         if self.checkpoint is not None:
             writable_folder(self.checkpoint.parent)
         backend = self.renderer.backend
-        if not backend.traits.differentiates:
+        if not backend.has("differentiate"):
             raise DeviceError(backend.lacks("have gradients", "use device='opencl', 'warp' or 'reference'"))
         self._differentiate = backend.differentiate
         self._quality = Quality.of(self.settings.quality)
@@ -129,7 +129,7 @@ class Trainer:
         self._surface_captures = [replace(each, outputs=_SURFACE) for each in self._captures]
         self._model = (
             DeviceModel(backend.training(), dataset.views, self.settings)
-            if backend.traits.trains
+            if backend.has("training")
             else HostModel(backend, dataset.views, self.settings)
         )
         self._refinement = None

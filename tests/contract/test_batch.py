@@ -115,7 +115,7 @@ def test_a_view_as_a_frame_and_a_batch_as_arrays(renderer, cloud):
     copy = pickle.loads(pickle.dumps(batch))
     assert np.array_equal(copy["rgb"], batch["rgb"])
     assert copy.views == batch.views == 3
-    with pytest.raises(fs.InputError, match="view must be a number from 0 to 2, got 3"):
+    with pytest.raises(fs.InputError, match="view must be a whole number from 0 to 2, got 3"):
         batch.frame(3)
     with pytest.raises(fs.InputError, match="must be one of rgb, got 'depth'"):
         batch["depth"]

@@ -57,7 +57,7 @@ CASES = {
 
 @pytest.fixture
 def backend(renderer):
-    assert renderer.backend.traits.differentiates
+    assert renderer.backend.has("differentiate")
     return renderer.backend
 
 

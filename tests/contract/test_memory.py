@@ -368,7 +368,7 @@ def test_a_leased_buffer_has_the_size_that_was_requested(opencl):
 
 def test_an_image_that_cannot_be_read_is_an_error_of_the_device(opencl):
     frame = opencl.render(random_splats(10, seed=8), CAMERA)
-    frame._images._rendered[0].leased[:] = [("rgb_out", opencl.backend.pool.fresh("too small", 16))]
+    frame._images._rendered[0].leased["rgb_out"] = opencl.backend.pool.fresh("too small", 16)
     with pytest.raises(fs.DeviceError, match="failed while rendering rgb"):
         frame["rgb"]
 

@@ -1,7 +1,5 @@
 """The kernels of training: they do as NumPy does, and their losses of depths what these are for."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from derivative_errors import COSINE, NORM, derivatives, differences, random_picture
@@ -34,8 +32,10 @@ def test_kernels_and_numpy_train_alike(renderer, dataset, monkeypatch, losses):
     settings = {**QUICK, "densify_from": 99, **losses}
     for name in ("kernels", "numpy"):
         if name == "numpy":
-            traits = replace(renderer.backend.traits, trains=False)
-            monkeypatch.setattr(renderer.backend, "traits", traits)
+            has = renderer.backend.has
+            monkeypatch.setattr(
+                renderer.backend, "has", lambda name, has=has: name != "training" and has(name)
+            )
         trainer = Trainer(dataset, renderer, iterations=10, sh_degree=0, **settings)
         trainer.run()
         steps[name] = trainer.history["losses"]
@@ -100,7 +100,7 @@ def test_the_loss_of_normals_does_what_it_is_for(renderer, dataset):
 def test_the_loss_of_distortions_does_what_it_is_for(renderer, dataset):
     """With it fragments are closer together than they were, and than without it. One disk of the scene lies
     nearly along its plane to the first camera, and reaches up to it."""
-    assert renderer.backend.traits.differentiates
+    assert renderer.backend.has("differentiate")
     after = {}
     for weight in (0.0, 10.0):
         losses = {"distortion_weight": weight, "distortion_from": 0, "densify_from": 99, "sh_degree": 0}

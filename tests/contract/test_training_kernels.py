@@ -41,7 +41,7 @@ def views():
 @pytest.fixture
 def works(renderer, views):
     """What makes the kernels' work and its twin, with the same splats."""
-    assert renderer.backend.traits.trains
+    assert renderer.backend.has("training")
 
     def make(lanes=0, **changes):
         settings = TrainSettings(iterations=5, **changes)

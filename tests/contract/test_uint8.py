@@ -37,7 +37,7 @@ def put(frame, values):
         images.arrays["rgb"].assign(values.ravel())
     else:
         cl = pytest.importorskip("pyopencl")
-        cl.enqueue_copy(images._workspace.queue, images.complete()[0].buffer("rgb_out"), values)
+        cl.enqueue_copy(images._workspace.queue, images.buffer("rgb"), values)
 
 
 @pytest.mark.parametrize("size", [(37, 23), (64, 32)], ids=str)

@@ -35,7 +35,7 @@ def test_run_to_run(renderer, spec):
 
 
 def test_tile_sizes(renderer, spec):
-    if not renderer.backend.traits.probed:
+    if not renderer.backend.has("probe"):
         pytest.skip("renders without tiles")
     own = render(renderer, spec)
     for shape in renderer.backend.shapes("tiles").values():
@@ -44,7 +44,7 @@ def test_tile_sizes(renderer, spec):
 
 def test_one_tile_for_the_complete_image(renderer):
     """Cases A4 and A5: an image of one tile has every fragment that a tile could lack."""
-    if not renderer.backend.traits.probed:
+    if not renderer.backend.has("probe"):
         pytest.skip("renders without tiles")
     own = renderer.backend.shape
     width, height = (own.lanes, 32) if own.schedule == "lanes" else (32, 32)

@@ -5,6 +5,6 @@ import pytest
 
 @pytest.fixture(scope="module")
 def backend(renderer):
-    if not renderer.backend.traits.probed:
+    if not renderer.backend.has("probe"):
         pytest.skip("has no separate stages")
     return renderer.backend

@@ -84,14 +84,14 @@ def facing(depths, opacity: float) -> fs.SplatCloud:
 
 def measurable(renderer):
     """Not all backends are."""
-    if not renderer.backend.traits.measures_rates:
+    if not renderer.backend.has("rates"):
         pytest.skip("this backend is not compared with its hardware")
     return renderer.backend
 
 
 @pytest.mark.usefixtures("optimised")  # else each takes as long as the loop around it
 def test_rates_of_a_device_are_those_of_a_computer(renderer):
-    assert renderer.device.platform == "NVIDIA Warp" or renderer.backend.traits.measures_rates
+    assert renderer.device.platform == "NVIDIA Warp" or renderer.backend.has("rates")
     rates = measurable(renderer).rates()
     assert 1e8 < rates.copy_bytes < 1e14
     # results per second; which is faster than which a loaded machine may turn round

@@ -6,7 +6,6 @@ import pytest
 import fidsplat as fs
 from fidsplat.accuracy.error import supports_float64
 from fidsplat.backends import registry
-from fidsplat.backends.interface import DeviceTraits
 
 CAMERA = fs.Camera.pinhole(6, 4, 6.0, 6.0, 3.0, 2.0)
 CLOUD = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[0.3, 0.3]], [0.9], colors=[[1.0, 0.5, 0.25]])
@@ -102,7 +101,7 @@ def test_a_missing_effect_is_an_error_that_names_both(toy):
         toy.render(CLOUD, CAMERA).device_array("rgb")
     with pytest.raises(fs.InputError, match="device must have a memory budget, got toy"):
         fs.Renderer("toy", memory_budget=1)
-    assert toy.backend.traits == DeviceTraits()
+    assert not toy.backend.has("differentiate")
     assert not supports_float64(toy, fs.Capture(CAMERA))
 
 

@@ -28,7 +28,6 @@ _GROUPS = {1: 32, 32: 256}
 _SUMS = 249
 """numbers of a work-group"""
 _Image: TypeAlias = tuple[cl.Buffer, tuple[int, ...]]
-"""an image with its shape"""
 
 
 class OpenCLAlignment(AlignmentKernels):
@@ -39,7 +38,6 @@ class OpenCLAlignment(AlignmentKernels):
         self._program = Program(workspace, assemble_alignment(self._items))
         self._commands = CommandList(self._program)
         self._stages: list[dict[str, Any]] = []
-        """arguments of the kernels by stage"""
 
     def load(self, image: np.ndarray, stages: list[AlignmentStage], most: int) -> list[int]:
         with self._workspace.lock, self._workspace.failing("localising"):
@@ -61,8 +59,7 @@ class OpenCLAlignment(AlignmentKernels):
     def _prepared(
         self, number: int, stage: AlignmentStage, source: _Image, full: _Image, counted: cl.Buffer
     ) -> tuple[dict[str, Any], _Image]:
-        """Arguments of the kernels for a stage, and its image before the blur. source: the next finer level
-        of the pyramid."""
+        """Arguments of a stage's kernels, and its image before the blur. source: the next finer image."""
         camera = stage.camera
         finer, (full_height, full_width, channels) = source
         if full_width % camera.width or full_height % camera.height:
@@ -95,12 +92,7 @@ class OpenCLAlignment(AlignmentKernels):
         return given, (made, (height, width, channels))
 
     def sums(
-        self,
-        stage: int,
-        frame: Any,
-        fit: AlignmentFit,
-        moved: MovedFrame | None = None,
-        blocks: bool = False,
+        self, stage: int, frame: Any, fit: AlignmentFit, moved: MovedFrame | None = None, blocks: bool = False
     ) -> AlignmentSums:
         given, channels = self._stages[stage], len(fit.gain)
         height, width, side = given["height"], given["width"], given["side"]

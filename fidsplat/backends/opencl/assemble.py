@@ -85,8 +85,6 @@ _EFFECT_ARGUMENTS = {
 
 @dataclass(frozen=True)
 class Text:
-    """A program's text."""
-
     listing: str
     """with comments, for readers"""
     compiled: str
@@ -98,11 +96,9 @@ class Source:
     """Flat kernel sources with their declarations for the host."""
 
     programs: dict[str, Text]
-    """programs by their names"""
     records: dict[str, np.dtype]
     """structs of the texts, as NumPy types"""
     arguments: dict[str, tuple[Argument, ...]]
-    """arguments of each kernel"""
     samples: tuple[Samples, ...]
     """sample buffers of the effects"""
     scalars: Scalars
@@ -162,8 +158,7 @@ def layouts_of(features: FeatureSet) -> dict[str, Layout]:
 
 
 def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
-    """The source of all stages for these features. Raises DeviceError if an effect's file fills an unknown
-    hook."""
+    """The source for these features. Raises DeviceError if a file fills an unknown hook."""
     layouts = layouts_of(features)
     # blend and resolve are fused if a pixel has one sample and one pose, and no other pass adds to it
     separate = {"rays", "shutter_exposure", "shutter_rows"}
@@ -216,7 +211,6 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
 
 
 def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
-    """The source of the gradients of these features."""
     return _assemble_backward("gradients", _GRADIENTS, features, shape)
 
 
@@ -506,7 +500,6 @@ def lines_of(path: str) -> tuple[str, ...]:
 
 @cache
 def _hooks(path: str) -> list[str]:
-    """The names of a file's hooks."""
     return _HOOKS.findall("\n".join(lines_of(path)))
 
 

@@ -6,7 +6,7 @@ import ctypes
 import math
 import mmap
 import weakref
-from collections.abc import Collection, Hashable
+from collections.abc import Collection, Hashable, Iterable
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -70,7 +70,7 @@ class BufferPool:
                 return buffer  # a buffer of another size belonged to frames of another size, and is released
         return self.fresh(name, size)
 
-    def give_back(self, buffers: list[tuple[str, cl.Buffer]]) -> None:
+    def give_back(self, buffers: Iterable[tuple[str, cl.Buffer]]) -> None:
         """Return leased buffers; one or two of each name are reused for frames of the same size."""
         for name, buffer in buffers:
             spare = self._spare.setdefault(name, [])
@@ -79,7 +79,6 @@ class BufferPool:
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of the scratch buffers and of given-back buffers."""
         size = 0
         # copied first: the garbage collector may give back buffers at any time
         for buffers in [list(self._buffers.values()), *self._spare.values()]:
@@ -102,7 +101,6 @@ class BufferPool:
         self.state = object()
 
     def clear(self) -> None:
-        """Release all buffers."""
         self._spare.clear()
         self._arrays.clear()
         self._buffers.clear()
@@ -135,8 +133,7 @@ class BufferPool:
         return buffer
 
     def array(self, queue: cl.CommandQueue, name: str, shape: tuple[int, ...]) -> Array:
-        """A scratch buffer as a float32 array; cached, as creating one takes longer than submitting a
-        kernel."""
+        """A scratch buffer as a cached float32 array: creating one takes longer than a launch."""
         buffer = self.scratch(name, 4 * math.prod(shape))
         known = self._arrays.get(name)
         if known is None or known.base_data is not buffer or known.shape != shape or known.queue is not queue:
@@ -230,8 +227,7 @@ class RayBuffers:
 
 
 def large_pages(address: int, size: int) -> bool:
-    """Advise the system to use large pages for [address, address + size) bytes; returns whether it
-    accepted."""
+    """Advise the system to use large pages for [address, address + size); returns whether it did."""
     advice = getattr(mmap, "MADV_HUGEPAGE", None)  # only on Linux
     first = -(-address // mmap.PAGESIZE) * mmap.PAGESIZE
     end = (address + size) // mmap.PAGESIZE * mmap.PAGESIZE

@@ -41,7 +41,6 @@ class Copies:
     """parameters in the layout of `gather_chunks.cl`"""
     poses: cl.Buffer | None
     count: int
-    """number of chunks"""
     rows: int
     """number of rows of the largest chunk"""
     evictions: int
@@ -57,7 +56,6 @@ class OpenCLChunkCache:
         self.applies_poses = workspace.info.float64
         """whether the device applies `Chunk.pose`; else it must be None"""
         self.widths: dict[str, int] = {}
-        """bytes of a splat in each array"""
         self._arrays: dict[str, cl.Buffer] = {}
         self._size = 0
         self._free: list[int] = []
@@ -66,7 +64,6 @@ class OpenCLChunkCache:
         self.token = object()
         """identity that can be compared without keeping the cache alive"""
         self._evictions = 0
-        """number of evictions"""
         self._rendered: set[Hashable] = set()
         self._lock = threading.RLock()
         self._queue = cl.CommandQueue(workspace.context)
@@ -80,7 +77,6 @@ class OpenCLChunkCache:
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of all slots."""
         return self._size * self._rows * sum(self.widths.values())
 
     def gather(self, chunks: Sequence[Chunk], first_id: int = 0) -> GatheredChunks:
@@ -123,7 +119,6 @@ class OpenCLChunkCache:
             return copies if len(rounds) == 1 else None
 
     def wait(self) -> None:
-        """Wait for all copies."""
         with self._lock, self.workspace.failing("copying splats"):
             if self._last is not None:
                 self._last.wait()
@@ -222,7 +217,6 @@ class OpenCLChunkCache:
 
     @property
     def _max_slots(self) -> int:
-        """Maximum number of slots."""
         share = self.workspace.memory_budget // _SHARE // self._slot_bytes
         widest = self.workspace.device.max_mem_alloc_size // (self._rows * max(self.widths.values()))
         return max(1, self._size, min(share, widest, self.scene.distinct(self.applies_poses)))
@@ -271,7 +265,6 @@ class GatheredChunks(Resident):
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes on the device, the cache included."""
         return self._cache.memory_bytes + super().memory_bytes
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:

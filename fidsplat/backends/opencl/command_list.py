@@ -73,12 +73,10 @@ class CommandList:
 
     @property
     def stages(self) -> list[str]:
-        """The stage of each command."""
         return [command.stage for command in self._commands]
 
     @property
     def kernels(self) -> list[str]:
-        """The name of each command's kernel."""
         return [command.name for command in self._commands]
 
     def clear(self) -> None:
@@ -119,7 +117,6 @@ class CommandList:
         values: Sequence[Any],
         stage: str = "",
     ) -> cl.Event:
-        """Append a launch, and submit it."""
         command = self.record(kernel, size, group, values, stage)
         return cl.enqueue_nd_range_kernel(queue, command.kernel, size, group)
 
@@ -145,7 +142,6 @@ class CommandList:
         ]
 
     def _places(self, name: str) -> list[tuple[Command, int]]:
-        """Commands and argument indices of a name."""
         arguments = self.program.source.arguments
         return [
             (command, index)

@@ -18,8 +18,6 @@ VISIBLE, PAIRS, BIG = 0, 2, 6
 
 @dataclass(frozen=True)
 class Counts:
-    """The counts of one frame, of all its views."""
-
     big: int
     """number of splats that cover more tiles than a window stores"""
     pairs: int
@@ -39,7 +37,6 @@ class Counts:
         return Counts(int(words[0, BIG]), pairs, int(words[:, VISIBLE].sum(dtype=np.int64)))
 
     def stats(self, splats: int) -> dict[str, int]:
-        """`Frame.stats` of a cloud with this many splats."""
         return {"splats": splats, "visible": self.visible, "pairs": self.pairs}
 
 

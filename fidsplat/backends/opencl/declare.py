@@ -72,7 +72,6 @@ class Record:
     """bytes; the size is a multiple of it"""
 
     def with_members(self, members: Iterable[Member]) -> Record:
-        """The record with more members appended."""
         return Record(self.name, (*self.members, *members), self.alignment)
 
     def without(self, names: Collection[str]) -> Record:
@@ -109,8 +108,6 @@ class Record:
 
 @dataclass(frozen=True)
 class Argument:
-    """One argument of a kernel."""
-
     ctype: str
     name: str
     access: Access

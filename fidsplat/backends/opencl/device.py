@@ -11,7 +11,7 @@ import pyopencl as cl
 
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.checked_cache import check_once
-from fidsplat.backends.interface import Backend, DeviceInfo, DeviceTraits, Rates
+from fidsplat.backends.interface import Backend, DeviceInfo, Rates
 from fidsplat.backends.opencl.alignment import OpenCLAlignment
 from fidsplat.backends.opencl.assemble import Source, assemble
 from fidsplat.backends.opencl.chunk_cache import OpenCLChunkCache
@@ -88,18 +88,6 @@ def open_device(selector: str = "") -> OpenCLBackend:
 
 
 class OpenCLBackend(Workspace, Backend):
-    """An open OpenCL device and its compiled pipelines."""
-
-    traits = DeviceTraits(
-        caches_chunks=True,
-        termination_depths=True,
-        differentiates=True,
-        trains=True,
-        aligns=True,
-        measures_rates=True,
-        probed=True,
-    )
-
     def __init__(self, device: cl.Device) -> None:
         if is_pocl(device):
             linker.provide_linker()
@@ -303,7 +291,6 @@ def _describe(device: cl.Device, name: str) -> DeviceInfo:
 
 
 def _shape(device: cl.Device) -> DeviceShape:
-    """Build constants for this device."""
     fast_fma = bool(device.single_fp_config & cl.device_fp_config.FMA)
     if device.type & cl.device_type.CPU:
         fast_fma |= "fma" in processor_flags()  # Intel's runtime does not report it

@@ -70,7 +70,7 @@ class Rendered:
     """Buffers and events of a submitted frame, without references to the cloud and scratch buffers."""
 
     queue: cl.CommandQueue
-    leased: list[tuple[str, cl.Buffer]]
+    leased: dict[str, cl.Buffer]
     """output images and counts by name"""
     stats: Callable[[], dict[str, int]]
     events: list[cl.Event]
@@ -79,15 +79,6 @@ class Rendered:
     """of the launches; None on a queue without profiling"""
     uploads: list[cl.Event] | None = None
     """keeps the cloud's arrays alive until the device has read them"""
-
-    def buffer(self, name: str) -> cl.Buffer:
-        """A leased buffer."""
-        return dict(self.leased)[name]
-
-    def done(self) -> list[cl.Event]:
-        """Events that another queue must wait for before it reads the images."""
-        self.queue.flush()
-        return [self.events[-1]]
 
     def timings(self) -> dict[str, float]:
         """Milliseconds by stage; empty without profiling."""
@@ -119,7 +110,6 @@ class DeviceFrame:
         self.resident, self.plan = resident, plan
         self.batch, self.views = views, len(views)
         self.view = view = views.view
-        """the view; in a batch, the first view"""
         self.waits = replay_queue is None or shape.lists == "ordered"
         """whether the host waits for the counts"""
         self.pair_limit, self.pool = pair_limit, workspace.pool
@@ -155,7 +145,7 @@ class DeviceFrame:
         self.arrays: dict[str, np.ndarray] = {}
         """arrays copied to the device for this view"""
         self.uploads: list[cl.Event] = []
-        self.leased: list[tuple[str, cl.Buffer]] = []
+        self.leased: dict[str, cl.Buffer] = {}
         self.counted_launches = 0
         """number of launches after which the counts are complete"""
         self.counted: cl.Event | None = None
@@ -175,7 +165,6 @@ class DeviceFrame:
 
     @property
     def capacity(self) -> Capacity:
-        """Capacity of the buffers."""
         return Capacity(self.numbers["big_capacity"], self.pairs)
 
     def count_pairs(self) -> int | None:
@@ -199,8 +188,7 @@ class DeviceFrame:
         views: int = 1,
         **given: Any,
     ) -> cl.Event:
-        """Submit a kernel with at least `items` work-items per view. Arguments are from `given`, the frame or
-        its view."""
+        """Submit a kernel with at least `items` work-items per view. given: arguments by name."""
         size = tuple([-(-count // side) * side for count, side in zip(items, group, strict=True)])
         if views > 1:
             size, group = (*size, views), (*group, 1)
@@ -217,7 +205,6 @@ class DeviceFrame:
         self.events, self.stages = [], []
 
     def value(self, argument: Argument) -> Any:
-        """The value of a kernel argument, from the frame or its view."""
         name = argument.name
         for values in (self.named, self.numbers):
             if name in values:
@@ -233,8 +220,7 @@ class DeviceFrame:
 
     def lease(self, name: str, size: int) -> cl.Buffer:
         """Bind a buffer that belongs to the frame until its images are released."""
-        buffer = self.bind(name, self.pool.lease(name, size))
-        self.leased.append((name, buffer))
+        buffer = self.leased[name] = self.bind(name, self.pool.lease(name, size))
         return buffer
 
     def put(self, name: str, array: np.ndarray) -> cl.Buffer:
@@ -251,7 +237,6 @@ class DeviceFrame:
         return buffer
 
     def read(self, name: str, dtype: Any, shape: tuple[int, ...]) -> np.ndarray:
-        """The contents of a buffer; waits for the device."""
         array = np.empty(shape, dtype)
         if array.size:
             cl.enqueue_copy(self.queue, array, self.named[name])
@@ -279,7 +264,6 @@ class DeviceFrame:
             self.put(name, array)
 
     def rendered(self) -> Rendered:
-        """Buffers and events of the frame."""
         stages = None if self.queue is self.workspace.replay_queue else self.stages
         return Rendered(self.queue, self.leased, self.stats, self.events, stages, self.uploads)
 

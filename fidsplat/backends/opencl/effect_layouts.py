@@ -26,10 +26,7 @@ LAYOUTS: dict[str, Layout] = {
     "camera_fisheye": Layout(
         "slot/camera_fisheye.cl",
         parts=("polygon", "ray_map", "rays"),
-        view=(
-            member("real lens[4]", "k1 to k4"),
-            member("real lens_limit", "half field of view [rad]"),
-        ),
+        view=(member("real lens[4]", "k1 to k4"), member("real lens_limit", "half field of view [rad]")),
     ),
     "camera_equirectangular": Layout("slot/camera_equirectangular.cl", parts=("polygon", "rays")),
     "camera_orthographic": Layout(
@@ -301,8 +298,7 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "decode_srgb": Layout("post/decode_srgb.cl"),
     "veiling_glare": Layout(
-        "post/veiling_glare.cl",
-        resolve=uniforms("veiling_glare", "float glare_rest glare_r glare_g glare_b"),
+        "post/veiling_glare.cl", resolve=uniforms("veiling_glare", "float glare_rest glare_r glare_g glare_b")
     ),
     "exposure": Layout("post/exposure.cl", resolve=uniforms("exposure", "float exposure")),
     "vignetting": Layout(
@@ -337,8 +333,7 @@ LAYOUTS: dict[str, Layout] = {
     "response_table": Layout(
         "post/response_table.cl",
         resolve=takes(
-            uniforms("response_count", "int response_count"),
-            "array float response  // (response_count)",
+            uniforms("response_count", "int response_count"), "array float response  // (response_count)"
         ),
     ),
     "quantise": Layout("post/quantise.cl", resolve=uniforms("quantise_steps", "float quantise_steps")),

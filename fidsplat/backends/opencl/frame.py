@@ -140,7 +140,6 @@ def render_in_chunks(frame: DeviceFrame) -> None:
 
 
 def blend(frame: DeviceFrame, band: TileBand) -> None:
-    """Composite the splats of a band of tiles to samples."""
     group = frame.shape.blend_items
     given: dict[str, Any] = {"band_first": band.first}
     if frame.shape.schedule == "group":
@@ -185,7 +184,7 @@ def render_exposure(frame: DeviceFrame) -> None:
         for name, value in part.stats().items():
             stats[name] = max(stats[name], value)
         frame.uploads += part.uploads
-        frame.pool.give_back(part.leased)
+        frame.pool.give_back(part.leased.items())
     if frame.source.takes("resolve", "rays"):
         frame.put_rays()
     resolve(frame)

@@ -42,15 +42,12 @@ _GROUP = 64  # work-group size: RESERVE_ITEMS, POSE_ITEMS, SUM_ITEMS and STEP_IT
 _SUMS = {"background": 3, "pose": 6, "intrinsics": 4}
 """gradients that are sums over tiles or splats, and their numbers"""
 _CAMERA = 10
-"""numbers of a camera: pose and intrinsics"""
 _DOING = "taking derivatives"
 _F32 = np.dtype(np.float32)
 _ZERO = np.zeros(1, np.uint32)  # also zeroes floats
 
 
 class OpenCLDifferentiable(DifferentiableImages):
-    """Output images of `OpenCLGradients.forward`."""
-
     frame: DeviceFrame
     images: OpenCLImages
 
@@ -79,7 +76,6 @@ class OpenCLGradients(GradientPipeline):
             for name in GRADIENT_OUTPUTS
             if any(one.name == f"by_{name}" for one in arguments["blend_backward"])
         ]
-        """outputs that have gradients"""
         self.cloud_arrays = [one.name for one in arguments["project_backward"] if one.source == "cloud"]
         self._pair_limit = 0
         """list capacity of frames for whose counts the host does not wait"""
@@ -127,9 +123,8 @@ class OpenCLGradients(GradientPipeline):
         ceiling = math.log(frame.view.ceiling)
         commands, key = self._tile_commands, self._key(frame)
         if key is not None and commands.key == key:
-            leased = {name: buffer for name, buffer in frame.leased}
             given = {f"by_{name}": frame.named[f"by_{name}"] for name in self._by_outputs}
-            commands.set({**scalars_of(frame.view), "log_ceiling": ceiling, **leased, **given})
+            commands.set({**scalars_of(frame.view), "log_ceiling": ceiling, **frame.leased, **given})
             frame.events += commands.submit(frame.queue)
             frame.stages += commands.stages
             self._check_capacity(frame)
@@ -185,8 +180,7 @@ class OpenCLGradients(GradientPipeline):
             self.step_commands[by_camera] = CommandList(Program(self._pipeline.workspace, source))
 
     def _check_capacity(self, frame: DeviceFrame) -> None:
-        """Raise CapacityExceeded if the lists were too small. The host checks this while the device is
-        busy."""
+        """Raise CapacityExceeded if the lists were too small."""
         if (pairs := frame.count_pairs()) is None:
             raise CapacityExceeded
         if self._pair_limit < pairs * 9 // 8:  # changed seldom: frames with another limit are recorded again

@@ -30,8 +30,7 @@ class _LockedBuffer:
 
 
 class _ArrayMemory:
-    """The base object of an array in locked memory, which is reused once the array and its views are
-    released."""
+    """The base object of an array in locked memory, which is reused once the array is released."""
 
     def __init__(self, memory: _LockedBuffer, shape: tuple[int, ...], dtype: Any) -> None:
         self._memory = memory
@@ -57,8 +56,7 @@ class HostMemory:
         self._locked, self._lock = 0, threading.Lock()
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-        """An array with undefined contents; locked memory from the second request of about the same size
-        on."""
+        """An array with undefined contents; locked memory from the second request of its size on."""
         size = math.prod(shape) * np.dtype(dtype).itemsize
         if not self.locks or size < _MINIMUM:
             return np.empty(shape, dtype)

@@ -67,8 +67,7 @@ class OpenCLImages(Images):
         leased: list[tuple[str, cl.Buffer]] | None = None,
         replay: Replay | None = None,
     ) -> None:
-        """pipeline: the OpenCLPipeline that rendered them. leased: image buffers of a batch; None for a
-        single frame."""
+        """pipeline: an OpenCLPipeline. leased: image buffers of a batch; None for a single frame."""
         self._workspace, self._splats, self._outputs = pipeline.workspace, splats, pipeline.outputs
         self._view = view = views if isinstance(views, View) else views.view
         if isinstance(views, ViewBatch):
@@ -82,7 +81,7 @@ class OpenCLImages(Images):
         """frames from which tiles were copied; without their buffers"""
         self._leased = [*(leased or ())]
         for one in rendered:
-            self._leased += one.leased
+            self._leased += one.leased.items()
         weakref.finalize(self, self._workspace.pool.give_back, self._leased)
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
@@ -104,10 +103,9 @@ class OpenCLImages(Images):
 
     def _copy(self, name: str, into: np.ndarray, offset: int) -> None:
         with self._workspace.failing(f"rendering {name}"):
-            after = self._done()
+            buffer, after = self.buffer(name), self._done()
             # a separate queue: on the queue of the frames, the copy would wait for the next frame
-            queue, image = self._workspace.read_queue, self.buffer(name)
-            cl.enqueue_copy(queue, into, image, src_offset=offset, wait_for=after)
+            cl.enqueue_copy(self._workspace.read_queue, into, buffer, src_offset=offset, wait_for=after)
 
     def _shape(self, name: str) -> tuple[int, ...]:
         """Array shape of the image of one view."""
@@ -115,14 +113,15 @@ class OpenCLImages(Images):
         return self._size if channels == 1 else (*self._size, channels)
 
     def buffer(self, name: str) -> cl.Buffer:
-        """The images of all views."""
-        return self.complete()[0].buffer(f"{name}_out") if self._batch is None else self._batch[name][1]
+        return self.complete()[0].leased[f"{name}_out"] if self._batch is None else self._batch[name][1]
 
     def _done(self) -> list[cl.Event]:
         """Events after which the images are complete."""
         if not self._rendered:  # all views are masked out
             self._workspace.queue.finish()
-        return [event for one in self.complete() for event in one.done()]
+        for one in self.complete():
+            one.queue.flush()
+        return [one.events[-1] for one in self._rendered]
 
     def read_uint8(self, name: str, index: int = 0) -> np.ndarray:
         workspace, shape, label = self._workspace, self._shape(name), "8 bits of an image"
@@ -182,7 +181,7 @@ class OpenCLImages(Images):
             with self._workspace.lock:
                 again = self._replay.overflow(self._rendered[0])
                 if again is not None:
-                    self._leased.extend(again.leased)
+                    self._leased += again.leased.items()
                     self._rendered = [again]
         return self._rendered
 
@@ -192,8 +191,8 @@ class OpenCLImages(Images):
             (height, width), view = self._tile, self._view
             keys = np.empty((-(-view.height // height), -(-view.width // width)), np.uint32)
             (rendered,) = self.complete()
-            queue, buffer = self._workspace.read_queue, rendered.buffer("termination_depths")
-            cl.enqueue_copy(queue, keys, buffer, wait_for=rendered.done())
+            queue, buffer = self._workspace.read_queue, rendered.leased["termination_depths"]
+            cl.enqueue_copy(queue, keys, buffer, wait_for=self._done())
         return TerminationDepths.of_keys(keys, self._tile)
 
     def copy_tiles(self, other: OpenCLImages, tiles: np.ndarray) -> None:
@@ -215,11 +214,10 @@ class OpenCLImages(Images):
             if copied is not None:
                 copied.wait()  # the next frame may overwrite the buffers of `other`
             (rendered,) = other.complete()
-            self._copied.append(replace(rendered, leased=[], stats=partial(dict, rendered.stats())))
+            self._copied.append(replace(rendered, leased={}, stats=partial(dict, rendered.stats())))
 
     def _rectangles(self, tiles: np.ndarray) -> Iterator[tuple[int, int, int, int]]:
-        """Rectangles of pixels [top, bottom) x [left, right) that cover tiles (rows, columns) bool, row by
-        row."""
+        """Rectangles of pixels [top, bottom) x [left, right) that cover tiles (rows, columns) bool."""
         (rows, columns), (height, width) = self._size, (side // self._view.samples for side in self._tile)
         for row, chosen in enumerate(tiles):
             sides = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))

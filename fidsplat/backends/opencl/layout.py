@@ -162,9 +162,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("out uint table", "in uint starts", "out uint keys_out indices_out"),
     ),
     "bin_count": _WALK,
-    "bin_emit": takes(
-        *(_WALK, "in uint starts", "int band_first band_end", "out uint lists"),
-    ),
+    "bin_emit": takes(*(_WALK, "in uint starts", "int band_first band_end", "out uint lists")),
     "tile_starts": takes(
         "uint tiles capacity", "in uint tallies", "out uint starts cursors counts tile_order"
     ),
@@ -192,11 +190,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "expose_middle": takes(_EXPOSED, "in uint raw", "out uint exposed"),
     "backdrop": takes(
         *(_SIZE, "int stride", "uint channel_stride", RAY_UNIFORMS),
-        uniforms(
-            "rotation",
-            _ROTATION,
-            note="world to camera",
-        ),
+        uniforms("rotation", _ROTATION, note="world to camera"),
         "out float raw",
     ),
     "resolve": takes(
@@ -208,7 +202,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     # derivatives
     "reserve_slots": takes(
-        *(_RESERVED, "out uint big_rows  // (rows of tiles, big splats): tiles above, less the first column"),
+        *(_RESERVED, "out uint big_rows  // (rows of tiles, big splats): tiles above, less the first column")
     ),
     "blend_backward": takes(
         *(
@@ -320,12 +314,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float activated_quats activated_scales activated_thickness activated_opacities",
     ),
     "activate_sh": takes(_DRAWN_SH, "in float sh", "out float activated_sh"),
-    "gather_rows": takes(
-        "uint count row copied",
-        "in uint rows",
-        "in float source",
-        "out float gathered",
-    ),
+    "gather_rows": takes("uint count row copied", "in uint rows", "in float source", "out float gathered"),
     "count_visible": takes(
         "uint count",
         _ROTATION,
@@ -348,9 +337,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
 GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_slots": _RESERVED,
     "blend": takes(
-        "uint longest_first  // blend the tiles in the order of tile_order",
-        "in uint tile_order",
-        _BLEND,
+        "uint longest_first  // blend the tiles in the order of tile_order", "in uint tile_order", _BLEND
     ),
     "blend_checkpoints": takes(
         *("in Splat splats", "in uint lists starts", _IMAGE_SIZE, _BLENDED),

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import NamedTuple
 
+from fidsplat.backends.bands import even_parts
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.assemble import Source
 from fidsplat.backends.opencl.buffers import RayBuffers
@@ -64,8 +64,6 @@ class Part(NamedTuple):
 
 
 class MemoryPlanner:
-    """Plans frames of one pipeline."""
-
     def __init__(self, device: Workspace, source: Source, features: FeatureSet, shape: DeviceShape) -> None:
         self._device, self._source, self._shape = device, source, shape
         self._slopes = source.takes("blend", "ray_slopes")
@@ -81,12 +79,10 @@ class MemoryPlanner:
             self._image_channels += output.channels
 
     def tiles(self, view: View) -> int:
-        """Number of tiles of a view."""
         return -(-view.width // self._shape.tile_width) * -(-view.height // self._shape.tile_height)
 
     def frame(self, resident: Resident, view: View, reserved: int = 0) -> MemoryPlan:
-        """Plan one view. reserved: bytes of other buffers. Raises DeviceError if it does not fit in any
-        way."""
+        """Plan one view. reserved: bytes of other buffers. Raises DeviceError if it does not fit."""
         shape = self._shape
         stays, upload = resident.bytes_for(self._source.cloud_arrays)
         samples, tables = self._samples_and_tables(view)
@@ -124,14 +120,10 @@ class MemoryPlanner:
         each = resident.capacity * splat + tables + 4 * self._channels * samples
         free = min(self._device.memory_budget - plan.total + each, self._device.largest_buffer)
         most = min(free, PART_BYTES.get(self._device.info.kind, OTHER_PART_BYTES)) // each
-        most = max(1, min(most, _PART_SAMPLES // samples))
-        # parts of equal size, so that they reuse buffers
-        parts = -(-count // most)
-        for first, end in pairwise(count * k // parts for k in range(parts + 1)):
+        for first, end in even_parts(count, max(1, min(most, _PART_SAMPLES // samples))):
             yield Part(first, end, MemoryPlan(0, resident.count, plan.total + (end - first - 1) * each))
 
     def _image_bytes(self, view: View) -> int:
-        """Bytes of the output images of a view."""
         return 4 * self._image_channels * (view.width * view.height // view.samples**2)
 
     def _samples_and_tables(self, view: View) -> tuple[int, int]:

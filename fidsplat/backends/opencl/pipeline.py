@@ -30,7 +30,7 @@ from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import DeviceError
 
 MIN_BATCHED = 1 << 14
-"""splats of clouds whose set-up is vectorised on CPUs"""
+"""minimum splats of clouds whose set-up is vectorised on CPUs"""
 _KINDS = 32
 """maximum number of kinds of frames that are cached for a cloud"""
 _RASTERS = 4
@@ -78,7 +78,7 @@ class OpenCLPipeline(Pipeline):
 
     def render_view(self, resident: Resident, view: View) -> OpenCLImages:
         """Render one view. A frame whose command list is cached is replayed, on a GPU without waiting."""
-        if self._vectorises_too_few(resident):
+        if self.shape.batch > 1 and resident.count < MIN_BATCHED:
             return self._unbatched.render_view(resident, view)
         with self.workspace.rendering():
             key = self._key(view)
@@ -100,7 +100,7 @@ class OpenCLPipeline(Pipeline):
     def render(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
         if views.is_single:
             return self.render_view(resident, views.one(0))
-        if self._vectorises_too_few(resident):
+        if self.shape.batch > 1 and resident.count < MIN_BATCHED:
             return self._unbatched.render(resident, views)
         workspace, rendered = self.workspace, []
         with workspace.rendering():
@@ -127,7 +127,7 @@ class OpenCLPipeline(Pipeline):
     def render_complete(self, resident: Resident, view: View) -> DeviceFrame:
         """Render one frame; returns its buffers, which are valid until the next frame. Raises DeviceError if
         it exceeds the memory budget without chunks and bands."""
-        if self._vectorises_too_few(resident):
+        if self.shape.batch > 1 and resident.count < MIN_BATCHED:
             return self._unbatched.render_complete(resident, view)
         with self.workspace.rendering():
             plan, frame = self._planner.frame(resident, view), None
@@ -168,7 +168,6 @@ class OpenCLPipeline(Pipeline):
             return frame
 
     def images_of(self, frame: DeviceFrame) -> OpenCLImages:
-        """The output images of a frame."""
         return OpenCLImages(self, frame.view, [frame.rendered()], frame.resident.count)
 
     def render_again(self, resident: Resident, view: View) -> Rendered:
@@ -177,8 +176,7 @@ class OpenCLPipeline(Pipeline):
             return self._render_planned(resident, view, self._planner.frame(resident, view)).rendered()
 
     def _replay(self, resident: Resident, view: View, cached: CachedFrame) -> OpenCLImages | None:
-        """Replay a cached frame for another view; None if it exceeds the capacity or its buffers were
-        replaced."""
+        """Replay a cached frame for another view; None if its buffers are too small or were replaced."""
         workspace, recorded, waits = self.workspace, cached.recorded, self.shape.lists == "ordered"
         workspace.pool.make_way(cached.kind, workspace.memory_budget - cached.plan.total, resident.capacity)
         if not waits and not tiling.pair_capacity(workspace):
@@ -223,7 +221,6 @@ class OpenCLPipeline(Pipeline):
         return frame
 
     def _render_planned(self, resident: Resident, view: View, plan: MemoryPlan) -> DeviceFrame:
-        """Render a frame according to its memory plan."""
         # release the buffers of other kinds of frames; buffers of this kind are part of the plan
         free = self.workspace.memory_budget - plan.total
         self.workspace.pool.make_way(self._buffer_kind(resident, view, plan), free, resident.capacity)
@@ -255,13 +252,10 @@ class OpenCLPipeline(Pipeline):
         """The pipeline with another tile-binning strategy."""
         return self._other(self.features, replace(self.shape, lists=lists))
 
-    def _vectorises_too_few(self, resident: Resident) -> bool:
-        """Whether compiling the vectorised set-up would take longer than it saves, for a small cloud."""
-        return self.shape.batch > 1 and resident.count < MIN_BATCHED
-
     @cached_property
     def _unbatched(self) -> OpenCLPipeline:
-        """The pipeline that sets up splats one by one."""
+        """The pipeline that sets up splats one by one, for small clouds: compiling the vectorised set-up
+        would take longer than it saves."""
         return self._other(self.features, replace(self.shape, batch=1))
 
     def _for_part(self, resident: Resident, plan: MemoryPlan, views: ViewBatch) -> OpenCLPipeline:

@@ -62,7 +62,6 @@ def contents(workspace: Workspace, buffer: cl.Buffer) -> np.ndarray:
 
 
 def buffer_of(workspace: Workspace, array: np.ndarray) -> cl.Buffer:
-    """Copy an array to a new buffer."""
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
     return cl.Buffer(workspace.context, flags, hostbuf=np.ascontiguousarray(array))
 
@@ -91,8 +90,6 @@ kernel void probe(global const float *x, global int *unequal, global int *named,
 
 
 class OpenCLProbe(Probe):
-    """Access to an open OpenCL device for tests."""
-
     @property
     def fuses(self) -> bool:
         """Whether the device fuses multiply-adds where requested."""

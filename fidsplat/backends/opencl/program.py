@@ -121,8 +121,7 @@ def check_kernels(
 
 
 class BackgroundCompiler:
-    """Compiles programs one after another in background threads; a process that exits waits for the current
-    one."""
+    """Compiles programs in background threads; a process that exits waits for the current one."""
 
     def __init__(self) -> None:
         self._threads: dict[Hashable, threading.Thread] = {}

@@ -54,14 +54,12 @@ class RecordedFrame:
         }
         """rendered views with their arrays and numbers"""
         self._bytes = 0
-        """bytes of these arrays"""
         self._uploads: deque[cl.Event] = deque(frame.uploads, maxlen=_UPLOADS)
-        self._leases = [(name, buffer.size) for name, buffer in frame.leased]
-        self._scratch = [name for name in frame.named if name not in dict(frame.leased)]
+        self._leases = [(name, buffer.size) for name, buffer in frame.leased.items()]
+        self._scratch = [name for name in frame.named if name not in frame.leased]
 
     def set_view(self, view: View, queue: cl.CommandQueue) -> bool:
-        """Bind the uniforms of a view. Returns False if a scratch buffer was replaced: the command list is
-        invalid then."""
+        """Bind the uniforms of a view. Returns False if a scratch buffer was replaced."""
         pool = self.workspace.pool
         if pool.state is not self.state:
             return False
@@ -80,13 +78,12 @@ class RecordedFrame:
     def submit(self, queue: cl.CommandQueue, splats: int) -> Rendered | None:
         """Render the bound view. None if the host waits for the counts and they exceed the capacity."""
         commands, pool = self.commands, self.workspace.pool
-        leased = [(name, pool.lease(name, size)) for name, size in self._leases]
-        commands.set(dict(leased))
+        leased = {name: pool.lease(name, size) for name, size in self._leases}
+        commands.set(leased)
         if not self._waits:
             events = commands.submit(queue)
             queue.flush()
-            counts, reader = dict(leased)["counts"], self.workspace.read_queue
-            stats = partial(read_stats, reader, counts, events[-1], splats)
+            stats = partial(read_stats, self.workspace.read_queue, leased["counts"], events[-1], splats)
             stages = None if queue is self.workspace.replay_queue else self._stages
             return Rendered(queue, leased, stats, events, stages)
         tallies = pool.scratch("tallies", self._tallies)
@@ -96,7 +93,7 @@ class RecordedFrame:
         cl.enqueue_copy(queue, words, tallies)
         counts = Counts.of_tallies(words)
         if not (self.capacity.holds(counts) or self._enlarge_lists(counts)):
-            pool.give_back(leased)
+            pool.give_back(leased.items())
             return None
         events += commands.submit(queue, self._counted)
         queue.flush()
@@ -119,14 +116,12 @@ class RecordedFrame:
         for name in self._scratch:
             if (buffer := frame.pool.known(name)) is not None:
                 frame.bind(name, buffer)
-        for name, buffer in frame.leased:
-            frame.bind(name, buffer)
+        frame.named |= frame.leased
         frame.numbers["big_capacity"], frame.pairs = self.capacity.big, self.capacity.pairs
         frame.events, frame.stages = events, self._stages.copy()
         frame.counted, frame.stats = events[self._counted - 1], rendered.stats
 
     def _learn(self, view: View) -> tuple[View, dict[str, np.ndarray], dict[str, Any]]:
-        """Cache the uniforms of another view."""
         own = projection_arrays(ViewBatch.single(view), self._source, 0, self._rows)
         for name in self._source.view_arrays:
             own[name] = view.array(name)
@@ -165,8 +160,9 @@ class Replay:
             return None
         queue, after = rendered.queue, None  # faster than waiting from another queue
         if workspace.frames != self._number:  # later frames were submitted: do not wait for them
-            queue, after = workspace.read_queue, rendered.done()
-        counts = Counts.read(queue, rendered.buffer("counts"), after)
+            queue.flush()
+            queue, after = workspace.read_queue, rendered.events[-1:]
+        counts = Counts.read(queue, rendered.leased["counts"], after)
         again = None if self._recorded.capacity.holds(counts) else self._render_again(resident, self._view)
         self._resident = None  # release the cloud, which is no longer needed
         return again
@@ -184,5 +180,5 @@ class Replay:
                 rendered = recorded.submit(queue, resident.count)
             rendered = rendered or self._render_again(resident, self._view)
             workspace.finish()
-            workspace.pool.give_back(rendered.leased)
+            workspace.pool.give_back(rendered.leased.items())
         return rendered.timings()

@@ -19,8 +19,7 @@ _GROUP = 64
 
 
 def measure_rates(workspace: Workspace) -> Rates:
-    """Measure peak rates, the best of several launches each, with the vector width of the blend stage. Takes
-    less than a second."""
+    """Measure peak rates: the best of several launches each. Takes less than a second."""
     kernels = check_kernels(workspace, "check/roofline.cl")
     try:
         return Rates(
@@ -46,7 +45,6 @@ def _copy_rate(workspace: Workspace, kernel: cl.Kernel) -> float:
 
 
 def _operation_rate(workspace: Workspace, kernel: cl.Kernel, a: float, b: float) -> float:
-    """Results per second of a kernel."""
     # a GPU needs many work-items to hide its latencies; on a CPU a few groups per core are plenty
     groups = workspace.info.compute_units * (32 if workspace.info.kind == "gpu" else 4)
     items = groups * _GROUP

@@ -13,8 +13,7 @@ class DeviceShape:
     """Build constants that follow from the kind of device, not from the scene."""
 
     schedule: str
-    """`lanes` (CPU: a work-item renders a tile, in vectors of pixels) or `group` (GPU: a work-group renders a
-    tile)"""
+    """`lanes` (CPU: a work-item renders a tile) or `group` (GPU: a work-group renders a tile)"""
     lists: str
     """tile-binning strategy (tiling.py): `ordered`, `tiled` or `local`"""
     lanes: int
@@ -31,8 +30,7 @@ class DeviceShape:
     rows: int = 2
     """pixels that a work-item blends, one below the other (`group`)"""
     tape: int = 1024
-    """splats of a tile whose fragments are stored for the backward pass (`lanes`), 2 KiB each; others are
-    evaluated twice"""
+    """fragments of a tile stored for the backward pass (`lanes`), 2 KiB each; others are computed twice"""
     batch: int = 1
     """splats that a work-item of the project stage sets up: more than one are vectorised (`lanes`)"""
     dialect: str = ""

@@ -123,7 +123,6 @@ def tile_pairs(frame: DeviceFrame) -> np.ndarray:
 
 
 def list_sorted(frame: DeviceFrame, band: TileBand, count: int) -> None:
-    """Write the tile lists of a band, from sorted splats."""
     allocated, budget = frame.pool.size("lists") // 4, frame.workspace.pair_budget
     size = enlarged(band.pairs, budget) if 0 < allocated < band.pairs else band.pairs
     frame.take("lists", 4 * size)
@@ -179,8 +178,7 @@ def pack_visible(frame: DeviceFrame, top: int, end: int) -> Packed:
 
 
 def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[Packed, int]:
-    """Project and pack chunks until a capacity is exceeded; returns the splats and the number of big
-    splats."""
+    """Project and pack chunks until a capacity is exceeded; returns the numbers of (big) splats."""
     count, chunk, chunks = frame.resident.count, frame.plan.chunk, frame.shape.chunks
     out: dict[str, Any] = {f"{name}_out": buffer for name, buffer in packed.items()}
     total = visible = 0
@@ -220,7 +218,6 @@ def split_rows(frame: DeviceFrame, top: int, end: int, count: int) -> list[tuple
 
 
 def pair_capacity(workspace: Workspace) -> int:
-    """Capacity in pairs of the buffers of the last frames."""
     pool = workspace.pool
     return min(pool.size("lists") // 4, pool.size("pairs") // 8, workspace.pair_budget)
 
@@ -247,7 +244,6 @@ def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
 
 
 def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band: bool) -> None:
-    """Write and sort the lists of a band."""
     frame.take("pairs", 8 * capacity)
     frame.take("lists", 4 * capacity)
     count, views, groups = frame.resident.count, frame.views, _big_groups(frame)

@@ -141,17 +141,14 @@ class OpenCLTraining:
         self._targets: list[_Target] = []
         self._loss_images: tuple[tuple[int, int], cl.Buffer] | None = None
         self._sums: dict[int, LossReadback] = {}
-        """loss readback by number of work-groups"""
         self._version = object()
         """a new object whenever the buffers of the splats change"""
         self._replayed: dict[str, CommandList] = {}
-        """command lists of a step, by name"""
         self._cameras: WeakKeyDictionary[Camera, tuple[np.ndarray, dict[str, float]]] = WeakKeyDictionary()
         """origin and arguments of the kernel `count_visible` by camera"""
 
     def load_views(self, views: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> None:
-        """Copy the ground truth to the device: images (h, w, 3) uint8, each with a mask (h, w) bool or
-        None."""
+        """Copy the images to the device: (h, w, 3) uint8 each, with a mask (h, w) bool or None."""
         for image, mask in views:
             weights = np.zeros(1, np.uint8) if mask is None else mask.astype(np.uint8)
             values = image.size if mask is None else max(1, 3 * int(weights.sum()))
@@ -175,9 +172,7 @@ class OpenCLTraining:
             moments = name.startswith(_MOMENTS)
             given = {"row": math.prod(shape[1:]), "copied": remaining if moments else len(rows)}
             self._launch(
-                "gather_rows",
-                math.prod(made),
-                given | {"source": self._bound[name], "gathered": gathered},
+                "gather_rows", math.prod(made), given | {"source": self._bound[name], "gathered": gathered}
             )
             self._bound[name], self._shapes[name] = gathered, made
         self._splats_changed()
@@ -214,8 +209,7 @@ class OpenCLTraining:
         return found
 
     def resident(self, degree: int, origin: np.ndarray) -> ResidentArrays:
-        """The splats as a cloud to render, with SH up to `degree`; it shares the state and changes with
-        it."""
+        """The splats as a cloud to render, with SH up to `degree`; it changes with the training."""
         if self._resident is None or self._resident[0] != degree:
             count, rendered, every = self._count, (degree + 1) ** 2, self._shapes["sh"][1]
             shared = degree > 0 and rendered == every  # the coefficients are rendered as they are
@@ -341,8 +335,7 @@ class OpenCLTraining:
         return found
 
     def accumulate_statistics(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
-        """Add screen gradients and visibility of a frame to the statistics. taken: the result of
-        `backward_to_tiles`."""
+        """Add a frame's screen gradients to the statistics. taken: result of `backward_to_tiles`."""
         self._step(taken, dict.fromkeys(_STEP_NUMBERS, 0.0) | {"move": 0, "sparse": 0}, camera, origin)
 
     def step(
@@ -387,7 +380,6 @@ class OpenCLTraining:
         return taken.step({**self._bound, **given, "counted": int(camera is not None)}, by_camera)
 
     def _count_visible(self, camera: Camera, origin: np.ndarray) -> None:
-        """Add the visible splats to `visible_counts`."""
         if (cached := self._cameras.get(camera)) is None or cached[0] is not origin:
             cached = self._cameras[camera] = origin, _camera_arguments(camera, origin)
         given = cached[1]
@@ -419,7 +411,6 @@ class OpenCLTraining:
     def _one(
         self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: Mapping[str, Any]
     ) -> Launch:
-        """A launch with given arguments and the arrays of the splats."""
         every = {**self._bound, "count": self._count, **given}
         return kernel, size, group, [every[one.name] for one in self._program.source.arguments[kernel]]
 
@@ -429,11 +420,7 @@ class OpenCLTraining:
             self._commands.launch(self._queue, *launch)
 
     def _replay(
-        self,
-        name: str,
-        key: tuple[Any, ...],
-        given: Mapping[str, Any],
-        launches: Callable[[], list[Launch]],
+        self, name: str, key: tuple[Any, ...], given: Mapping[str, Any], launches: Callable[[], list[Launch]]
     ) -> list[cl.Event]:
         """Replay a command list of a training step with the arguments `given`. launches: returns the
         launches; called to record again if the key, the splats or the buffers have changed."""
@@ -487,7 +474,6 @@ def _exposure_arguments(exposure: np.ndarray | None) -> dict[str, float]:
 
 
 def _camera_arguments(camera: Camera, origin: np.ndarray) -> dict[str, float]:
-    """Arguments of the kernel `count_visible`."""
     rotation = camera.world_to_camera[:3, :3]
     names = [f"rotation_{i}{j}" for i in range(3) for j in range(3)]
     given = dict(zip(names, rotation.ravel().tolist(), strict=True))

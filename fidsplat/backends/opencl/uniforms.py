@@ -64,7 +64,6 @@ def view_records(views: ViewBatch, row: int, end: int, record: np.dtype) -> np.n
 
 
 def _numbers(view: View, row: int, end: int, record: np.dtype) -> list[float]:
-    """The members of the record `View` of one view, in order."""
     values: dict[str, Any] = {
         **{"rotation": view.rotation.ravel().tolist(), "translation": view.translation.tolist()},
         **{"eye": view.eye.tolist(), "focal_x": view.focal_x, "focal_y": view.focal_y},

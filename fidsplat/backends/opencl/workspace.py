@@ -76,8 +76,7 @@ class Workspace:
 
     @contextmanager
     def failing(self, what: str) -> Iterator[None]:
-        """A context that raises the device's failures as DeviceError. what: the activity, such as `rendering
-        rgb`."""
+        """A context that raises the device's failures as DeviceError. what: for example `rendering rgb`."""
         try:
             yield
         except cl.Error as error:

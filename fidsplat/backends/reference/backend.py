@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.interface import Backend, DeviceInfo, DeviceTraits, HostImages, Pipeline, ResidentData
+from fidsplat.backends.interface import Backend, DeviceInfo, HostImages, Pipeline, ResidentData
 from fidsplat.backends.reference.blend import composite
 from fidsplat.backends.reference.culling import may_contribute
 from fidsplat.backends.reference.gradients import ReferenceGradients
@@ -34,7 +34,6 @@ _FEW = 16  # tiles with fewer samples are widened: culling once more would take 
 
 
 def devices() -> list[DeviceInfo]:
-    """List the reference device: NumPy on this machine."""
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
     return [
         DeviceInfo(
@@ -64,9 +63,7 @@ def open_device(selector: str = "") -> ReferenceBackend:
 
 
 class ReferenceBackend(Backend):
-    """The reference device: NumPy in float64."""
-
-    traits = DeviceTraits(differentiates=True, renders_pixels=True)
+    renders_pixels = True
 
     def __init__(self) -> None:
         self.info = devices()[0]
@@ -89,8 +86,6 @@ class ReferenceBackend(Backend):
 
 
 class ReferenceCloud(ResidentData):
-    """A cloud in host memory."""
-
     def __init__(self, cloud: SplatCloud) -> None:
         self.cloud, self.count = cloud, len(cloud)
         self.memory_bytes = 0  # nothing is copied to a device

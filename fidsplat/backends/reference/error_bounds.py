@@ -41,8 +41,7 @@ class Span:
 
     @classmethod
     def of(cls, low: np.ndarray, high: np.ndarray, z_low: np.ndarray, z_high: np.ndarray) -> Span:
-        """Intervals of opacities and depths in compositing order, with the transmittances that follow from
-        them."""
+        """Intervals of opacities and depths in compositing order, with the resulting transmittances."""
         fronts = shifted(np.cumprod(1 - high, axis=1)), shifted(np.cumprod(1 - low, axis=1))
         return cls(low, high, z_low, z_high, *fronts)
 
@@ -151,8 +150,7 @@ def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np
 
 
 def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Error bound (k,) of colour and alpha, per unit of colour. moved (k, m): that of each fragment's own
-    colour."""
+    """Error bound (k,) of colour and alpha. moved (k, m): that of each fragment's own colour."""
     bound = (before * (span.high - span.low)).sum(1)
     t_low = span.front_low * (1 - span.high) * (1 - STOP)
     t_high = span.front_high * (1 - span.low) * (1 + STOP)
@@ -211,8 +209,7 @@ def of_layer_depth(
 
 
 def first_column(mask: np.ndarray, start: int) -> np.ndarray:
-    """Index (k,) of the first column where mask (k, m) is set, counted from `start`; start + m if there is
-    none."""
+    """First column (k,) from `start` on where mask (k, m) is set; start + m if none."""
     k, m = mask.shape
     return start + np.where(mask.any(1), np.argmax(mask, axis=1), m) if m else np.full(k, start)
 
@@ -315,8 +312,7 @@ def of_depth(span: Span, weight: np.ndarray, z: np.ndarray) -> dict[str, np.ndar
 
 
 def of_first(span: Span, light: float) -> np.ndarray:
-    """(k,) bool: whether rounding may change the first fragment behind which transmittance is at most
-    `light`."""
+    """(k,) bool: whether rounding may change the first fragment behind `light` transmittance."""
     high, low = span.high, span.low
     may = (high > 0) & (span.front_low * (1 - high) * (1 - STOP) <= light)
     sure = (low > 0) & (span.front_high * (1 - low) * (1 + STOP) <= light)
@@ -324,8 +320,7 @@ def of_first(span: Span, light: float) -> np.ndarray:
 
 
 def of_count(span: Span, count: np.ndarray, bound: np.ndarray, stop: float) -> np.ndarray:
-    """Error bound (k,) of the number of blended splats. count, bound (k, m): that of each fragment or
-    layer."""
+    """Error bound (k,) of the number of blended splats. count, bound (k, m): of each fragment."""
     may, must = span.high > 0, span.low > 0
     off = np.where(may, bound + np.where(must, 0, count), 0)
     # rounding decides between the first fragment that may reach the stop and the first that must

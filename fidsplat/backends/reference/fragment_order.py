@@ -71,7 +71,6 @@ _COLUMNS = (
 
 
 def by_center(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
-    """Fragments in the order of the splats' centres."""
     # colours and normals are stored once, not for each sample
     return replace(_plain(s, f, span, slice(None)), colors=s.colors, normal=s.normal)
 
@@ -126,7 +125,6 @@ def _rank(may: np.ndarray, arrival: np.ndarray, key: np.ndarray) -> np.ndarray:
 
 
 def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray | slice) -> OrderedFragments:
-    """Fragments of splats without a coplanar group."""
     ids = np.arange(f.alpha.shape[1])[splats]
     k, m = len(f.alpha), len(ids)
     nothing = np.zeros((k, m))

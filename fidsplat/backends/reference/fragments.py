@@ -103,7 +103,6 @@ def optical_depth(alpha: np.ndarray) -> np.ndarray:
 
 
 def shifted(after: np.ndarray, last: bool = False) -> np.ndarray:
-    """Transmittance in front of each fragment (k, n) from that behind each. last: append the final one, (k, n
-    + 1)."""
+    """Transmittance in front of each fragment (k, n) from that behind it. last: append the final."""
     before = np.concatenate([np.ones((len(after), 1)), after], axis=1)
     return before if last else before[:, :-1]

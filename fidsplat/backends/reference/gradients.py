@@ -21,8 +21,6 @@ _BLOCK = 1 << 16  # (sample, splat) pairs that are evaluated at once
 
 
 class ReferenceGradients(GradientPipeline):
-    """The reference pipeline with its gradients."""
-
     def __init__(self, pipeline: Pipeline, features: FeatureSet) -> None:
         self._pipeline, self._features = pipeline, features
         self._last: tuple[Images, FrozenFrame] | None = None

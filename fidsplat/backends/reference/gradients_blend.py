@@ -71,11 +71,8 @@ class Samples:
     rgb: np.ndarray
     """(k, 3)"""
     t: np.ndarray
-    """transmittance"""
     depth: np.ndarray
-    """sum of weights times depths"""
     weight: np.ndarray
-    """sum of weights"""
     normal: np.ndarray
     """(k, 3) sum of weights times normals"""
     inverse: np.ndarray
@@ -88,13 +85,7 @@ class Blend:
     """Differentiable blending of m placed splats at k samples under frozen decisions."""
 
     def __init__(
-        self,
-        placed: Placed,
-        view: View,
-        features: FeatureSet,
-        made: Decisions,
-        x: np.ndarray,
-        y: np.ndarray,
+        self, placed: Placed, view: View, features: FeatureSet, made: Decisions, x: np.ndarray, y: np.ndarray
     ) -> None:
         self._count, self._made = len(placed.p), made
         chosen = placed.select(made.order)
@@ -126,7 +117,6 @@ class Blend:
 
     @property
     def samples(self) -> Samples:
-        """The sample buffers."""
         return Samples(
             self._weight @ self._rgb,
             self._before[:, -1],

@@ -46,7 +46,6 @@ class Parameters:
 
     @property
     def names(self) -> list[str]:
-        """Names of the parameters of this cloud."""
         return [one.name for one in fields(self) if getattr(self, one.name) is not None]
 
     def view(self, view: View) -> View:
@@ -83,7 +82,6 @@ class Placed:
         return cls(a, b, p, np.zeros((n, 2)), scales, np.zeros(n), rgb, np.zeros((n, 4)))
 
     def select(self, rows: np.ndarray) -> Placed:
-        """Some of the splats, by index."""
         return Placed(*(array[rows] for array in vars(self).values()))
 
 
@@ -125,8 +123,7 @@ def place(parameters: Parameters, view: View) -> Placed:
 
 
 def place_backward(parameters: Parameters, view: View, placed: Placed, slopes: Placed) -> dict:
-    """Derivatives with respect to the parameters, at a zero pose, from those with respect to placed
-    splats."""
+    """Derivatives with respect to the parameters from those of the placed splats."""
     rotation = view.rotation
     by_color, by_ray = _rgb_backward(parameters, _eye(parameters, view), slopes.rgb)
     by_p = slopes.p + center_backward(view, placed.p, slopes.center)
@@ -215,8 +212,7 @@ def _unclamped(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
 def _rgb_backward(
     parameters: Parameters, eye: np.ndarray, by_rgb: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives with respect to SH coefficients or colours, and to the rays (n, 3) from the eye to the
-    centres."""
+    """Derivatives of the colours with respect to SH or colours, and to the rays (n, 3)."""
     if parameters.sh is None:
         return by_rgb, np.zeros_like(by_rgb)
     directions, length = _directions(parameters.means - eye)

@@ -33,7 +33,6 @@ def background_at(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray,
 
 
 def max_value(around: Gradient | Panorama | None) -> float:
-    """Largest absolute value of a background."""
     if around is None:
         return 0.0
     colors = (around.top, around.bottom) if isinstance(around, Gradient) else around.image

@@ -201,8 +201,7 @@ def _shapes(
 def _posed(
     view: View, tangent_u: np.ndarray, tangent_v: np.ndarray, mean: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Unit tangents and centres in the camera frame, and centres relative to the eye in the cloud's axes, (n,
-    3)."""
+    """Unit tangents and centres in the camera frame, and centres minus the eye, (n, 3) each."""
     rotation = view.rotation.T
     return tangent_u @ rotation, tangent_v @ rotation, mean @ rotation + view.translation, mean - view.eye
 

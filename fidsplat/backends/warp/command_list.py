@@ -70,8 +70,7 @@ class Launcher:
     """Launches of one frame, with arguments by the names of the kernels' parameters."""
 
     def __init__(self, cache: LaunchCache, timed: bool = True, divided: bool = True) -> None:
-        """timed: measure the stages. divided: divide CPU launches over threads; captures require one
-        thread."""
+        """timed: measure the stages. divided: divide CPU launches over threads."""
         self._wp, self.timed = load(), timed
         self._device, self._workers, self._cache = cache.device, cache.workers, cache
         self.pieces = 8 * cache.threads if divided else 1
@@ -121,7 +120,6 @@ class Launcher:
         return host.numpy().tolist()
 
     def finish(self) -> None:
-        """Wait for all launches."""
         if self._stream is not None:
             self._wp.synchronize_stream(self._stream)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.interface import Backend, DeviceInfo, DeviceTraits
+from fidsplat.backends.interface import Backend, DeviceInfo
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.command_list import LaunchCache
 from fidsplat.backends.warp.gradients import WarpGradients
@@ -53,8 +53,6 @@ def open_device(selector: str = "") -> WarpBackend:
 
 class WarpBackend(Workspace, Backend):
     """An open Warp device and its compiled pipelines."""
-
-    traits = DeviceTraits(differentiates=True, probed=True)
 
     def __init__(self, device: Any) -> None:
         self.info = _describe(device)

@@ -21,14 +21,7 @@ from fidsplat.backends.warp.memory_plan import MemoryPlanner
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load
-from fidsplat.backends.warp.uniforms import (
-    array_of,
-    lens_of,
-    moving_of,
-    rays_of,
-    surroundings_of,
-    uniforms,
-)
+from fidsplat.backends.warp.uniforms import array_of, lens_of, moving_of, rays_of, surroundings_of, uniforms
 from fidsplat.backends.warp.workspace import ArrayPool
 from fidsplat.util.errors import DeviceError
 
@@ -47,12 +40,8 @@ class ImageArrays:
 
 @dataclass(frozen=True)
 class Capacity:
-    """Sizes of the lists of a frame."""
-
     visible: int
-    """number of visible splats"""
     pairs: int
-    """number of pairs of a splat and a tile"""
 
 
 class DeviceFrame:
@@ -235,7 +224,6 @@ class DeviceFrame:
         self._launch(sort.find_starts, end - first + 1, **band, pairs=pairs)
 
     def _samples(self, kind: str) -> Any:
-        """The struct of sample buffers of a kind."""
         samples = self.program.samples_type()
         for name, dtype in self.program.sample_fields.items():
             size = self.views * self.grid[0] * self.grid[1]
@@ -243,7 +231,6 @@ class DeviceFrame:
         return samples
 
     def _blend(self, first: int, end: int, samples: Any) -> None:
-        """Blend the tiles of one band."""
         program, shape = self.program, self.program.shape
         # the placeholder is not read
         groups = self.resident.arrays.get("coplanar_groups", self.named["lists"])

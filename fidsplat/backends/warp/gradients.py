@@ -8,12 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.gradients import (
-    NOT_THE_LAST,
-    DifferentiableImages,
-    check_shape,
-    gradient_shape,
-)
+from fidsplat.backends.gradients import NOT_THE_LAST, DifferentiableImages, check_shape, gradient_shape
 from fidsplat.backends.interface import GradientPipeline
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.command_list import Launcher
@@ -31,8 +26,6 @@ _SHARES = 2048
 
 
 class WarpDifferentiable(DifferentiableImages):
-    """Output images of `WarpGradients.forward`."""
-
     frame: DeviceFrame
     images: WarpImages
 

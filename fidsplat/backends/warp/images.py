@@ -70,7 +70,6 @@ class WarpImages(Images):
             dtype = getattr(load(), output.dtype)
             self.arrays[name] = workspace.pool.fresh(name, pixels * output.channels, dtype)
         self.rendered: list[Rendered] = []
-        """the parts of the batch"""
 
     def blank(self) -> None:
         """Fill the images of all views with the blank value, as some views are masked out."""

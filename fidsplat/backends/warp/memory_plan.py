@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import pairwise
 
+from fidsplat.backends.bands import even_parts
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.program import Program
@@ -15,7 +15,6 @@ from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.util.errors import DeviceError, bytes_words
 
 _BOUNDS = 44
-"""bytes of the image bounds of a splat"""
 _PROJECTED = 36
 """bytes of its rectangle of tiles, its sort key, counts and sums"""
 _VISIBLE = 40
@@ -29,8 +28,6 @@ _MAX_NUMBERED = 1 << 30
 
 
 class MemoryPlanner:
-    """Plans frames of one program."""
-
     def __init__(self, program: Program, workspace: Workspace) -> None:
         self.workspace, shape = workspace, program.shape
         self._tile_width, self._tile_height = shape.tile_width, shape.tile_height
@@ -68,7 +65,7 @@ class MemoryPlanner:
         """Ranges [first, end) of views that are rendered together. reserved: bytes of all their images."""
         count, workspace = len(batch), self.workspace
         if not count or not batch.stacked or (self._same_settings and batch.numbers):
-            return iter([(k, k + 1) for k in range(count)])
+            return even_parts(count, 1)
         each = resident.count * (self._splat_bytes + _VISIBLE) + self.sample_bytes(batch.view)
         external = batch.view.external_depth
         each += external.nbytes // count if external and external.stacked else 0
@@ -76,7 +73,4 @@ class MemoryPlanner:
         # half of the budget is for the lists
         fitting = min(free // 2, _MAX_PART_BYTES[workspace.device.is_cuda]) // each
         numbered = _MAX_NUMBERED // max(self._samples(batch.view), resident.count * self._lines)
-        together = max(1, min(fitting, numbered))
-        # parts have equal size, so that their launches can be replayed
-        parts = -(-count // together)
-        return pairwise([count * k // parts for k in range(parts + 1)])
+        return even_parts(count, max(1, min(fitting, numbered)))

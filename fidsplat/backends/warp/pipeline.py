@@ -42,7 +42,6 @@ class RecordedFrame:
     graph: Any
 
     def replay(self, views: ViewBatch) -> None:
-        """Replay the stages for other views."""
         if len(views) > 1 or views.view is not self.frame.view:
             self.frame.set_views(views)
         load().capture_launch(self.graph)
@@ -56,11 +55,9 @@ class _CachedFrame:
     """pool of the input arrays that the host fills for the views"""
     capacity: Capacity
     token: tuple[Any, ...] = ()
-    """result of `_token` for the last frame"""
     recorded: RecordedFrame | None = None
 
     def release_arrays(self) -> None:
-        """Release the arrays of the recorded frame."""
         self.recorded = None
 
 
@@ -77,36 +74,35 @@ class WarpPipeline(Pipeline):
         )
 
     def render_view(self, resident: Resident, view: View) -> WarpImages:
-        with self.workspace.working("while rendering"):
-            images, into = self._new_images(resident, view)
-            images.rendered.append(self._render(resident, ViewBatch.single(view), into))
-            return images
+        return self.render(resident, ViewBatch.single(view))
 
     def render(self, resident: Resident, views: ViewBatch) -> WarpImages:
         wp, device = load(), self.workspace.device
         with self.workspace.working("while rendering"):
-            images = WarpImages(self.workspace, self.outputs, views.size, views.total, resident.count)
+            images, into = self._new_images(resident, views)
+            if views.is_single:
+                images.rendered.append(self._render(resident, views, into))
+                return images
             if len(views) < views.total:
                 images.blank()
             for first, end in self._planner.parts(resident, views, images.nbytes):
                 indices = views.batch_indices[first:end].astype(np.int32)
                 indices = wp.array(indices, dtype=wp.int32, device=device)
-                into = ImageArrays(images.arrays, indices, images.nbytes)
-                images.rendered.append(self._render(resident, views.part(first, end), into))
+                part = views.part(first, end)
+                images.rendered.append(self._render(resident, part, replace(into, indices=indices)))
             return images
 
     def render_counted(self, resident: Resident, view: View) -> tuple[DeviceFrame, WarpImages]:
-        """Render one view and wait for its counts; returns the frame, whose arrays are valid until the next
-        frame, and the images."""
+        """Render one view and wait; returns the frame, valid until the next one, and the images."""
         with self.workspace.working("while rendering"):
-            images, into = self._new_images(resident, view)
-            frame, rendered = self._render_counted(resident, ViewBatch.single(view), into)
+            views = ViewBatch.single(view)
+            images, into = self._new_images(resident, views)
+            frame, rendered = self._render_counted(resident, views, into)
             images.rendered.append(rendered)
             return frame, images
 
-    def _new_images(self, resident: Resident, view: View) -> tuple[WarpImages, ImageArrays]:
-        size = view.height // view.samples, view.width // view.samples
-        images = WarpImages(self.workspace, self.outputs, size, splats=resident.count)
+    def _new_images(self, resident: Resident, views: ViewBatch) -> tuple[WarpImages, ImageArrays]:
+        images = WarpImages(self.workspace, self.outputs, views.size, views.total, resident.count)
         return images, ImageArrays(images.arrays, self.workspace.first_index, images.nbytes)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
@@ -131,7 +127,6 @@ class WarpPipeline(Pipeline):
     def _render_counted(
         self, resident: Resident, views: ViewBatch, into: ImageArrays
     ) -> tuple[DeviceFrame, Rendered]:
-        """Render views and wait for their counts."""
         launcher = Launcher(self._launches)
         frame = DeviceFrame(self.program, self._planner, resident, views, launcher, into.reserved)
         self.workspace.frames += 1

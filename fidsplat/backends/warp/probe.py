@@ -15,8 +15,6 @@ from fidsplat.util.errors import DeviceError
 
 
 class WarpProbe(Probe):
-    """Access to a Warp device for tests."""
-
     fuses = True
     """always true: Warp fuses multiply-adds where requested"""
 

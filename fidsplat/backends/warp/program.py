@@ -114,7 +114,6 @@ class Program:
             raise DeviceError(why)
         self.device, self.shape, self.features, self._name = device, shape, features, name
         self.images = tuple(each for each in features.images if each.name in {"rgb", *features.outputs})
-        """the output images"""
         self.project_block = kernels("project").BLOCK
         self.tile_area = shape.tile_width * shape.tile_height
         """samples"""
@@ -204,7 +203,6 @@ class GradientKernels:
         features, needs, shape = program.features, program.needs, program.shape
         rendered = {"rgb", *features.outputs}
         self.losses = tuple(name for name in GRADIENT_OUTPUTS if name in rendered)
-        """outputs with derivatives"""
         self.sh_terms = (features.sh_degree + 1) ** 2 if "color_sh" in needs.effects else 0
         effects, outputs = needs.among(_SAMPLE), needs.blending
         backward, names = kernels("blend_backward"), kernels("fragment_backward").moments_of(effects, outputs)
@@ -228,7 +226,6 @@ class SensorKernel:
         self.kernel, self._settings = kernels("sensor").make_sensor(steps)
 
     def settings(self, view: View, pool: ArrayPool) -> Any:
-        """The struct `Settings` of a view."""
         filled = self._settings()
         for step in self._steps:
             numbers = [number for name in step.uniforms for number in view.uniform(name)]

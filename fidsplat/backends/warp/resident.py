@@ -17,8 +17,6 @@ from fidsplat.util.errors import DeviceError, InputError, bytes_words
 
 
 class Resident(ResidentData):
-    """Splats on the device."""
-
     def __init__(
         self,
         arrays: dict[str, Any],
@@ -45,7 +43,6 @@ class Resident(ResidentData):
 
     @classmethod
     def of(cls, cloud: SplatCloud, pool: ArrayPool) -> Resident:
-        """Upload a cloud."""
         arrays = kernel_arrays(cloud)
         if "sh" in arrays:
             arrays["colors"] = arrays.pop("sh").reshape(-1, 3)
@@ -57,8 +54,7 @@ class Resident(ResidentData):
 
     @classmethod
     def around(cls, given: Mapping[str, Any], origin: np.ndarray, pool: ArrayPool) -> Resident:
-        """Use arrays of the device or of NumPy, without a copy where possible. Raises InputError for a wrong
-        shape, type or device."""
+        """Use arrays of the device or of NumPy. Raises InputError for a wrong shape, type or device."""
         arrays, ellipsoids = {name: _adopted(name, value, pool) for name, value in given.items()}, "none"
         count = arrays["means"].size
         if count and arrays["scales"].dtype is load().vec3:

@@ -57,7 +57,6 @@ def quiet() -> Iterator[None]:
 
 @cache
 def kernels(name: str) -> ModuleType:
-    """A module of kernels/warp."""
     folder = kernels_folder() / "warp"
     if _PACKAGE not in sys.modules:
         spec = importlib.util.spec_from_file_location(

@@ -8,8 +8,6 @@ from typing import Any
 
 @dataclass(frozen=True)
 class WarpShape:
-    """Build constants of the kernels."""
-
     schedule: str
     """`tiles`: a thread renders a tile (CPU); `group`: a block of threads renders a tile (CUDA)"""
     tile_width: int
@@ -22,7 +20,6 @@ class WarpShape:
 
 
 def shape_for(device: Any) -> WarpShape:
-    """The build constants for a device."""
     return WarpShape("group" if device.is_cuda else "tiles", 16, 16)
 
 

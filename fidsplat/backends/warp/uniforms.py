@@ -25,8 +25,7 @@ def _record() -> Any:
 
 
 def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> np.ndarray:
-    """The structs `View` (views,). splats: number of splats. sloped: whether kernels read the derivatives of
-    rays."""
+    """The structs `View` (views,). sloped: whether kernels read the derivatives of rays."""
     view = stack.view
     derived = {
         **{"tile_w": shape.tile_width, "tile_h": shape.tile_height, "splats": splats},
@@ -133,7 +132,6 @@ def _empty(kind: Any) -> Any:
 
 
 def surroundings_of(view: View, workspace: Workspace) -> Any:
-    """The struct `Surroundings` of a gradient or panorama."""
     wp, behind = load(), view.surroundings
     kind = "gradient" if isinstance(behind, Gradient) else "panorama"
     filled = kernels("background").struct_of_surroundings(kind)()

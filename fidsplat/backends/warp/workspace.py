@@ -48,7 +48,6 @@ class ArrayPool:
         return array
 
     def exact(self, name: str, size: int, dtype: Any) -> Any:
-        """The first `size` elements of a scratch array."""
         whole = self.scratch(name, size, dtype)
         part = self._parts.get((name, dtype))
         if part is None or part.ptr != whole.ptr or part.size != size:
@@ -104,8 +103,6 @@ class ArrayPool:
 
 
 class Workspace:
-    """State of an open device."""
-
     def __init__(self, device: Any, name: str, memory_budget: int) -> None:
         """name: name of the device, for errors."""
         self.device, self.name, self._lock = device, name, threading.RLock()
@@ -132,7 +129,6 @@ class Workspace:
 
     @cached_property
     def capture_stream(self) -> Any:
-        """The stream on which launches are captured; None on the CPU."""
         return load().Stream(self.device) if self.device.is_cuda else None
 
     @contextmanager
@@ -143,8 +139,7 @@ class Workspace:
 
     @contextmanager
     def failing(self, doing: str) -> Iterator[None]:
-        """A context that raises failures of the device as DeviceError. doing: the activity, for the
-        message."""
+        """A context that raises the device's failures as DeviceError. doing: the activity."""
         try:
             yield
         except RuntimeError as error:

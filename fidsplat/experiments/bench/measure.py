@@ -149,7 +149,7 @@ class Bench:
         for name in dict.fromkeys(devices):
             report(f"rates of {name}")
             backend = Renderer(name).backend
-            self.devices[name] = backend.rates() if backend.traits.measures_rates else None
+            self.devices[name] = backend.rates() if backend.has("rates") else None
 
     def run(self, scene: str, repeats: int) -> None:
         """Render a scene `repeats` times on each device. Errors of a device are stored in its result."""
@@ -220,7 +220,7 @@ class SceneRun:
     def _count(self, cloud: SplatCloud) -> None:
         result, backend = self.result, self.renderer.backend
         result.mean_rgb = float(self.image.mean(dtype=np.float64))
-        if not backend.traits.measures_rates or result.rates is None:
+        if not backend.has("rates") or result.rates is None:
             return
         pixels = result.width * result.height
         result.memory_bytes = backend.memory_bytes + self.resident.memory_bytes + 12 * pixels

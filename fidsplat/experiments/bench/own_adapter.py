@@ -58,7 +58,7 @@ class Adapter:
         (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
         self.camera = fs.Camera.pinhole(*map(int, size), fx, fy, cx, cy, near=float(near))
         del self.resident  # releases the earlier scene first
-        if self.renderer.backend.traits.measures_rates:
+        if self.renderer.backend.has("rates"):
             self.renderer.backend.release_scratch()
         self.resident = self.renderer.upload(cloud)
         inverse = np.linalg.inv(self.poses)
@@ -83,6 +83,6 @@ class Adapter:
 
     def memory(self) -> int | None:
         backend = self.renderer.backend
-        if not backend.traits.measures_rates:
+        if not backend.has("rates"):
             return None
         return backend.memory_bytes + self.resident.memory_bytes + 12 * self.camera.width * self.camera.height

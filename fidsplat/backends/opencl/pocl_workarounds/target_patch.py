@@ -56,8 +56,7 @@ def why_not(device_address: int, device_version: str) -> str:
 
 
 def correct_target(device_address: int, device_version: str) -> str:
-    """Patch the processor name of a PoCL device, and return the new name; the old one if `why_not` forbids
-    it."""
+    """Correct the processor name of a PoCL device; returns the name."""
     if device_address not in _corrected:
         place = None if why_not(device_address, device_version) else _place(device_address, device_version)
         if place is None:
