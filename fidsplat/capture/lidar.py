@@ -217,7 +217,8 @@ class Lidar:
         for change in changes:
             if change not in Lidar.__dataclass_fields__:
                 raise InputError(unknown("field of a lidar", change, Lidar.__dataclass_fields__))
-        return replace(known[name.lower()], **changes)
+        found = known[name.lower()]
+        return replace(found, **changes) if changes else found
 
     @property
     def duration(self) -> float:
@@ -232,9 +233,7 @@ class Lidar:
     def camera(self, start: float = 0.0, moving: bool = False) -> Camera:
         """Camera in the lidar's frame whose pixels are the rays of a scan that starts at a time in seconds.
         Rows are in the order of firing."""
-        lens = self._rays(start, moving)[0]
-        height, width = lens.directions.shape[:2]
-        return Camera(width, height, 1.0, 1.0, 0.0, 0.0, near=min(self.near, 0.05), far=self.far, lens=lens)
+        return self._rays(start, moving)[0]
 
     def pixels(self, start: float = 0.0, moving: bool = False) -> np.ndarray:
         """(beams, rays) int: index of each ray's pixel in the image of `camera`, in row-major order."""
@@ -245,13 +244,13 @@ class Lidar:
         rounded to float32 like the rays."""
         return self._rays(start, False)[2]
 
-    def _rays(self, start: float, moving: bool) -> tuple[RayTable, np.ndarray, np.ndarray]:
+    def _rays(self, start: float, moving: bool) -> tuple[Camera, np.ndarray, np.ndarray]:
         return _rays(self, start if isinstance(self.pattern, Rosette) else 0.0, moving)
 
 
 @lru_cache(maxsize=8)
-def _rays(lidar: Lidar, start: float, moving: bool) -> tuple[RayTable, np.ndarray, np.ndarray]:
-    """Lens, pixels and directions of a scan, as returned by `Lidar.camera`, `pixels` and `directions`."""
+def _rays(lidar: Lidar, start: float, moving: bool) -> tuple[Camera, np.ndarray, np.ndarray]:
+    """Camera, pixels and directions of a scan, as returned by the methods of `Lidar`."""
     pattern, n = lidar.pattern, lidar.rays
     beams = pattern.directions(start, lidar.duration)
     rays = _spread(beams, lidar.divergence, n)
@@ -272,7 +271,9 @@ def _rays(lidar: Lidar, start: float, moving: bool) -> tuple[RayTable, np.ndarra
     directions = beams.astype(np.float32).astype(np.float64)
     for array in (pixels, directions):
         array.flags.writeable = False
-    return RayTable(table, lidar.divergence / math.sqrt(n)), pixels.reshape(-1, n), directions
+    lens, (height, width) = RayTable(table, lidar.divergence / math.sqrt(n)), table.shape[:2]
+    camera = Camera(width, height, 1.0, 1.0, 0.0, 0.0, near=min(lidar.near, 0.05), far=lidar.far, lens=lens)
+    return camera, pixels.reshape(-1, n), directions
 
 
 def _grid(rays: np.ndarray, begin: int, end: int, rows: int, width: int) -> np.ndarray:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fidsplat.cameras import Camera, Motion, Shutter
+from fidsplat.cameras import Camera, Motion, RayTable, Shutter
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.lidar import Lidar, Spinning
 from fidsplat.capture.sensor import LUMINANCE, Sensor
@@ -49,16 +50,30 @@ class Scan:
     is no return"""
     label: np.ndarray | None
     """(r, beams) int32, -1 where there is no return; None if not requested"""
-    time: np.ndarray
-    """(beams,) float64 seconds after the start"""
-    ring: np.ndarray
-    """(beams,) index of the laser"""
-    directions: np.ndarray
-    """(beams, 3) float64 unit directions in the lidar's frame"""
     poses: np.ndarray
     """(bands, 4, 4) world_from_lidar of each pose of the scan"""
-    band: np.ndarray
-    """(beams,) index of the pose of each beam"""
+
+    @cached_property
+    def time(self) -> np.ndarray:
+        """(beams,) float64 seconds after the start."""
+        return self.lidar.pattern.fractions() * self.lidar.duration
+
+    @cached_property
+    def ring(self) -> np.ndarray:
+        """(beams,) index of the laser."""
+        return self.lidar.pattern.ring_of()
+
+    @property
+    def directions(self) -> np.ndarray:
+        """(beams, 3) float64 unit directions in the lidar's frame."""
+        return self.lidar.directions(self.start)
+
+    @cached_property
+    def band(self) -> np.ndarray:
+        """(beams,) index of the pose of each beam."""
+        moving = len(self.poses) > 1
+        pixels = self.lidar.camera(self.start, moving).width * self.lidar.rows_per_band(moving)
+        return self.lidar.pixels(self.start, moving)[:, 0] // pixels
 
     @cached_property
     def points(self) -> np.ndarray:
@@ -149,10 +164,11 @@ def scan(
     renderer, resident = _resident(scene, renderer)
     request = ScanRequest.of(lidar, scene, label, motion, start)
     capture = request.capture(pose)
+    assert capture.camera is not None
     frame = renderer.render(resident, capture)
-    return request.decoded(
-        {name: frame[name] for name in frame.outputs}, capture, whole_number("index", index, 0, 2**32 - 1)
-    )
+    bands = capture.shutter.bands(capture.camera.height)
+    poses = [capture.motion.moved(capture.camera, middle).camera_to_world for _, _, middle in bands]
+    return request.decoded(dict(frame), np.stack(poses), whole_number("index", index, 0, 2**32 - 1))
 
 
 def scan_batch(
@@ -177,9 +193,9 @@ def scan_batch(
     matrices = pose_matrices("poses", poses)
     request = ScanRequest.of(lidar, scene, label, Motion(), start)
     batch = renderer.render_batch(resident, request.capture(np.eye(4)), poses=poses)
-    images = {name: batch[name] for name in batch.outputs}
+    images = dict(batch)
     return [
-        request.decoded({name: each[view] for name, each in images.items()}, request.capture(pose), view)
+        request.decoded({name: each[view] for name, each in images.items()}, pose[None], view)
         for view, pose in enumerate(matrices)
     ]
 
@@ -257,45 +273,39 @@ class ScanRequest:
             external_depth=None,
         )
 
-    def decoded(self, images: dict[str, np.ndarray], capture: Capture, number_of_scan: int) -> Scan:
-        """The scan of rendered images."""
-        lidar, camera = self.lidar, capture.camera
-        assert camera is not None
-        pixels = lidar.pixels(self.start, self.moving)
+    def decoded(self, images: Mapping[str, np.ndarray], poses: np.ndarray, number_of_scan: int) -> Scan:
+        """The scan of rendered images. poses: (bands, 4, 4) world_from_lidar."""
+        lidar, pixels = self.lidar, self.lidar.pixels(self.start, self.moving)
 
         def of_rays(image: np.ndarray) -> np.ndarray:
             flat = image.reshape(-1, *image.shape[2:])
-            if isinstance(lidar.pattern, Spinning):  # its rays are all pixels, in order
-                return flat.reshape(*pixels.shape, *flat.shape[1:])
-            return flat[pixels]
+            # the rays of a spinning lidar are all pixels, in order
+            return flat if isinstance(lidar.pattern, Spinning) else flat[pixels.reshape(-1)]
 
-        ranges = of_rays(images["distance_first"])
-        rgb = of_rays(images["rgb"]) / np.maximum(of_rays(images["alpha"]), 1e-6)[..., None]
-        reflectivity = to_light(np.minimum(rgb, 1), "srgb", np.float32) @ LUMINANCE.astype(np.float32)
-        rays = {"range": ranges}
+        images = {name: of_rays(image) for name, image in images.items()}
+        lens = lidar.camera(self.start, self.moving).lens
+        assert isinstance(lens, RayTable)
+        intensity = _intensity(images, of_rays(lens.directions), lidar.reflectivity)
+        rays = {"range": images["distance_first"], "intensity": intensity}
         if "label" in images:
-            rays["label"] = of_rays(images["label"])
-            for label, value in lidar.reflectivity.items():
-                reflectivity[rays["label"] == label] = value
-        directions = of_rays(camera.lens.directions)  # type: ignore[union-attr]
-        incidence = np.abs(np.einsum("brk,brk->br", directions, of_rays(images["normal"])))
-        rays["intensity"] = reflectivity * incidence * (ranges > 0)
-        found = _returns(rays, lidar)
+            rays["label"] = images["label"]
+        found = _returns({name: values.reshape(pixels.shape) for name, values in rays.items()}, lidar)
         _measure(found, lidar, np.random.default_rng((lidar.seed, number_of_scan)))
-        bands = capture.shutter.bands(camera.height)
-        ends = [end * camera.width for _, end, _ in bands]
-        return Scan(
-            lidar=lidar,
-            start=self.start,
-            range=found["range"].astype(np.float32),
-            intensity=found["intensity"].astype(np.float32),
-            label=found["label"].astype(np.int32) if self.label else None,
-            time=lidar.pattern.fractions() * lidar.duration,
-            ring=lidar.pattern.ring_of(),
-            directions=lidar.directions(self.start),
-            poses=np.stack([capture.motion.moved(camera, middle).camera_to_world for _, _, middle in bands]),
-            band=np.searchsorted(ends, pixels[:, 0], side="right"),
-        )
+        label = found["label"].astype(np.int32) if self.label else None
+        ranges, intensity = (found[name].astype(np.float32, copy=False) for name in ("range", "intensity"))
+        return Scan(lidar, self.start, ranges, intensity, label, poses)
+
+
+def _intensity(
+    images: Mapping[str, np.ndarray], directions: np.ndarray, reflectivity: Mapping[int, float]
+) -> np.ndarray:
+    """Reflectivity times cosine of incidence (rays,) float32 of images of rays."""
+    color = images["rgb"] / np.maximum(images["alpha"], 1e-6)[:, None]
+    light = to_light(np.minimum(color, 1), "srgb", np.float32) @ LUMINANCE.astype(np.float32)
+    for label, value in reflectivity.items():
+        light[images["label"] == label] = value
+    cosine = (directions.astype(np.float32) * images["normal"]) @ np.ones(3, np.float32)
+    return light * np.abs(cosine) * (images["distance_first"] > 0)
 
 
 def _pose_of(pose: Any, camera: Camera | None) -> np.ndarray:
@@ -314,11 +324,11 @@ def _returns(rays: dict[str, np.ndarray], lidar: Lidar) -> dict[str, np.ndarray]
     mean range by signal, their sum of intensities over n, and the label of the first."""
     count = lidar.rays
     if count == 1:
-        empty = np.zeros((len(lidar.returns) - 1, len(rays["range"])))
-        found = {name: np.concatenate([values.T, empty]) for name, values in rays.items()}
-        if "label" in found:
-            found["label"][1:] = -1
-        return found
+        rest = len(lidar.returns) - 1
+        return {
+            name: np.pad(values.T, ((0, rest), (0, 0)), constant_values=-1 if name == "label" else 0)
+            for name, values in rays.items()
+        }
     order = np.argsort(np.where(rays["range"] > 0, rays["range"], np.inf), axis=1, kind="stable")
     sorted_ = {name: np.take_along_axis(values, order, 1) for name, values in rays.items()}
     ranges, hit = sorted_["range"], sorted_["range"] > 0

@@ -256,6 +256,7 @@ def test_detection_falls_with_range_and_incidence(device):
 def test_presets_have_the_values_of_their_sources():
     values = json.loads(files("fidsplat.capture").joinpath("lidars.json").read_text("utf-8"))
     assert set(values) == set(presets())
+    assert Lidar.preset("os1-64").camera() is Lidar.preset("os1-64").camera()  # rays are computed once
     assert all(value["source"] for value in values.values())
     vlp, os1, livox = (Lidar.preset(name) for name in ("vlp-16", "OS1-64", "livox-mid-40"))
     np.testing.assert_allclose(np.degrees(vlp.pattern.elevations), np.arange(-15, 16, 2), atol=1e-9)

@@ -12,7 +12,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.backends.opencl.pocl_workarounds import linker, target_patch
-from fidsplat.backends.opencl.pocl_workarounds.declarations import declared
+from fidsplat.backends.opencl.pocl_workarounds.declarations import OPTION, declared
 from fidsplat.backends.opencl.program import build
 
 RENDER = """
@@ -102,6 +102,9 @@ def test_programs_are_built_with_the_declarations_that_they_need():
         found = np.empty(3, np.float32)
         cl.enqueue_copy(backend.queue, found, out)
         np.testing.assert_allclose(found, [math.gamma(values[0]), values[1], 3], rtol=1e-6)
+    version = backend.device.platform.version
+    bytes_only = "kernel void h(global uchar *a) { a[get_global_id(0)] = 0; }"
+    cl.Program(backend.context, declared(bytes_only, version)).build([OPTION])  # else PoCL prints an error
     with pytest.raises(fs.DeviceError, match="no_such_name"):
         build(backend, "kernel void g(global float *a) { a[0] = no_such_name(a[0]); }")
     assert declared(text, "OpenCL 3.0 PoCL 5.0") is None
