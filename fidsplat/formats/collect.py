@@ -1,7 +1,7 @@
-"""Conversion of a file's rows to splats, window by window.
+"""Conversion of a file's rows to splats, in windows of bounded size.
 
-Invalid rows are dropped in each window, so that memory grows with the number of valid splats, not with the
-count that the file declares.
+Invalid rows are dropped in each window, so that memory is proportional to the number of valid splats, not to
+the count that the file declares.
 """
 
 from collections.abc import Callable
@@ -15,16 +15,15 @@ from fidsplat.splats.arrays import find_defects, with_thinnest_last
 from fidsplat.util import interrupts
 
 PADDED_LOG_SCALE = np.log(1e-6)
-"""scale_2 that marks a disk, for tools that require three scales; SuperSplat writes the same"""
+"""log of the third scale that marks a disk, for tools that require three scales; as SuperSplat writes it"""
 WINDOW = 65536
-"""rows of a window; with fewer the validation takes longer than reading"""
+"""rows per window; smaller windows spend more time on validation than on reading"""
 BLOCK = 2048
-"""rows of a block within a window: records and results stay in a core's cache while the properties are
-converted one after the other"""
+"""rows per block of a window: few enough that records and arrays stay in a core's cache"""
 _INITIAL_CAPACITY = 1_000_000  # splats
 
 Progress = Callable[[str, float], Any]
-"""callback of the current task and its completed share, 0 to 1"""
+"""callback with the current task and its completed share, 0 to 1"""
 _CHECKED = ("means", "quats", "scales", "opacities", "sh", "colors")
 
 
@@ -35,10 +34,10 @@ class Rows:
     path: Path
     count: int
     columns: dict[str, tuple[tuple[int, ...], type]]
-    """shape and type of one row of each array: means, quats, scales (2 or 3), opacities, sh or colors, and
+    """shape and type per row of each array: means, quats, scales (2 or 3), opacities, sh or colors, and
     optionally labels and coplanar_groups"""
     fill: Callable[[int, dict[str, np.ndarray]], None]
-    """reads rows into arrays, from a first row on, as many as the arrays have"""
+    """fills the given arrays with rows, from a first row on"""
 
     @property
     def thick(self) -> bool:
@@ -47,7 +46,7 @@ class Rows:
 
     @property
     def splat_columns(self) -> dict[str, tuple[tuple[int, ...], type]]:
-        """Shape and type of one row of each array of the cloud."""
+        """Shape and type per row of each array of the cloud."""
         thickness: dict[str, tuple[tuple[int, ...], type]] = {"thickness": ((), np.float32)}
         return self.columns | {"scales": ((2,), np.float32)} | (thickness if self.thick else {})
 
@@ -55,8 +54,7 @@ class Rows:
 def collect(rows: Rows, progress: Progress | None = None) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     """Read all rows; returns the arrays of the valid splats and the number of dropped rows by reason.
 
-    A third scale becomes `thickness`. The thickness is 0 (a disk) if the third scale is the padding 1e-6, or
-    if one of the three scales is 0.
+    The third scale becomes the thickness: 0 (a disk) for the padding 1e-6 or if one of the scales is 0.
     """
     thick, columns = rows.thick, rows.splat_columns
     growing = _GrowingArrays(columns, rows.count)
@@ -75,7 +73,8 @@ def collect(rows: Rows, progress: Progress | None = None) -> tuple[dict[str, np.
 
 
 def window(rows: Rows, first: int, end: int) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Valid splats of rows [first, end) and the number of dropped rows by reason, for bounded memory."""
+    """Read rows [first, end), for bounded memory; returns valid splats and numbers of dropped rows by
+    reason."""
     count = end - first
     part = {name: np.empty((count, *shape), kind) for name, (shape, kind) in rows.splat_columns.items()}
     good, dropped = _read_part(rows, first, part, np.empty((count, 3), np.float32) if rows.thick else None)
@@ -89,7 +88,7 @@ def _read_part(
 
     scratch: buffer (n, 3) if the rows have three scales.
 
-    Returns which splats are valid, (n,) bool or None for all, and the number of invalid ones by reason.
+    Returns which splats are valid, (n,) bool or None for all, and the number of invalid splats by reason.
     """
     given = part if scratch is None else part | {"scales": scratch[: len(part["scales"])]}
     with np.errstate(over="ignore", invalid="ignore"):
@@ -100,8 +99,8 @@ def _read_part(
 
 
 def _split(quats: np.ndarray, three: np.ndarray, part: dict[str, np.ndarray]) -> None:
-    """Split three scales (n, 3) into two and the thickness. An axis of extent 0 becomes the third by a change
-    of the quaternions (n, 4); NaN stays in its column."""
+    """Split three scales (n, 3) into two scales and the thickness. If an axis has extent 0, the quaternions
+    (n, 4) are changed such that it is the third axis. NaN stays in its column."""
     flat = (three[:, :2] == 0).any(axis=1) & ~np.isnan(three).any(axis=1)
     if flat.any():
         quats[flat], three[flat] = with_thinnest_last(quats[flat], three[flat])
@@ -110,7 +109,7 @@ def _split(quats: np.ndarray, three: np.ndarray, part: dict[str, np.ndarray]) ->
 
 
 class _GrowingArrays:
-    """Arrays whose capacity grows with the splats appended to them."""
+    """Arrays whose capacity grows as splats are appended."""
 
     def __init__(self, columns: dict[str, tuple[tuple[int, ...], type]], maximum: int) -> None:
         self._maximum, self._count, self._capacity = maximum, 0, min(maximum, _INITIAL_CAPACITY)
@@ -119,9 +118,9 @@ class _GrowingArrays:
         }
 
     def reserve(self, count: int, rows: int) -> dict[str, np.ndarray]:
-        """Views of the arrays for the next `count` splats. rows: number of rows that were read before."""
+        """Views of the arrays for the next `count` splats. rows: number of rows read so far."""
         if self._count + count > self._capacity:
-            # if most rows so far are valid, all others are expected to be
+            # if most rows so far are valid, allocate for all remaining rows
             mostly_valid = 2 * self._count > rows
             self._capacity = self._maximum if mostly_valid else min(self._maximum, 2 * self._capacity + count)
             for name, old in self._arrays.items():
@@ -130,16 +129,14 @@ class _GrowingArrays:
         return {name: array[self._count : self._count + count] for name, array in self._arrays.items()}
 
     def append(self, part: dict[str, np.ndarray], good: np.ndarray | None) -> None:
-        """Append the reserved rows that are good, (n,) bool; None: all."""
+        """Append the reserved rows that are valid, (n,) bool; None: all."""
         count = len(part["means"]) if good is None else int(good.sum())
         for array in part.values() if good is not None else ():
             array[:count] = array[good]
         self._count += count
 
     def trimmed(self) -> dict[str, np.ndarray]:
-        """The arrays without unused capacity. Views of `reserve` are invalid afterwards."""
-        for array in self._arrays.values():
-            array.resize(
-                (self._count, *array.shape[1:]), refcheck=False
-            )  # frees the unused end without a copy
+        """Arrays without unused capacity; invalidates the views of `reserve`."""
+        for array in self._arrays.values():  # frees unused capacity without a copy
+            array.resize((self._count, *array.shape[1:]), refcheck=False)
         return self._arrays

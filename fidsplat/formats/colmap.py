@@ -1,4 +1,4 @@
-"""Reading and writing of COLMAP models, text and binary: cameras, images and points3D.
+"""Reading and writing of COLMAP models as text and binary files: cameras, images and points3D.
 
 Format: COLMAP's documentation, "Output format". Poses are world to camera with OpenCV's axes, as in fidsplat.
 """
@@ -39,16 +39,16 @@ def save_colmap(
 
     Args:
         folder: created if missing.
-        names: n file names of the images, without line breaks or blanks.
+        names: n file names of the images, without white space.
         cameras: n cameras. Equal intrinsics become one COLMAP camera (model PINHOLE).
-        points: (m, 3) float64 metres; written without tracks.
+        points: (m, 3) float64 metres, written without tracks.
         colors: (m, 3) uint8.
 
     Raises InputError for a folder that cannot be written or an invalid name.
     """
     for name in names:
         if not name or name.split() != [name]:
-            raise InputError(f"the name of a COLMAP image must have no blanks, got {name!r}; rename it")
+            raise InputError(f"the name of a COLMAP image must have no white space, got {name!r}; rename it")
     if len(names) != len(cameras) or len(points) != len(colors):
         raise InputError(
             f"a COLMAP model must have a name for each camera and a colour for each point, got {len(names)} "
@@ -95,7 +95,7 @@ def _count(items) -> bytes:
 
 
 def _lines(rows) -> str:
-    # repr of a float is the shortest text that reads back as the same number
+    # repr writes the shortest text that reads back as the same float
     return "".join(
         " ".join(repr(float(v)) if isinstance(v, float) else str(v) for v in row).replace(" \n", "\n") + "\n"
         for row in rows
@@ -124,7 +124,7 @@ class ColmapModel:
     """Images, cameras and points of a COLMAP model."""
 
     names: tuple[str, ...]
-    """names of the images, paths below the image folder, sorted"""
+    """image names, paths relative to the image folder, sorted"""
     cameras: tuple[Camera, ...]
     """camera of each image"""
     points: np.ndarray
@@ -148,7 +148,7 @@ def load_colmap(folder: Path) -> ColmapModel:
         if number not in lenses:
             raise InputError(f"{folder}: the camera of image {name} must be in cameras, got {number}")
         matrix = np.eye(4)
-        # a quaternion of about 0 becomes NaN, which Camera rejects
+        # a quaternion of length 0 becomes NaN, which Camera rejects
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             matrix[:3, :3], matrix[:3, 3] = quaternion_to_matrix(np.array(pose[:4])), pose[4:]
         try:
@@ -172,14 +172,14 @@ def byte_colors(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def image_poses(file: Path) -> list[tuple[str, tuple[float, ...]]]:
-    """Read images.bin or images.txt: sorted names, and poses world to camera (quaternion w, x, y, z and
-    translation) as stored. Raises InputError for a damaged file."""
+    """Read images.bin or images.txt: sorted pairs of a name and a world-to-camera pose (quaternion w, x, y, z
+    and translation). Raises InputError for a damaged file."""
     views = _read_file(file, _binary_images, _text_images)
     return sorted((name, pose) for name, _, pose in views)
 
 
 def has_colmap(folder: Path) -> bool:
-    """Whether a folder has a COLMAP model."""
+    """Whether a folder contains a COLMAP model."""
     return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
 
 
@@ -201,39 +201,39 @@ def _read_file(file: Path, binary, text) -> list:
     except InputError:
         raise
     except (ValueError, IndexError, KeyError, struct.error) as error:
-        raise InputError(f"cannot read {file} as COLMAP's: {error}; export the model again") from error
+        raise InputError(f"cannot read {file} as COLMAP: {error}; export the model again") from error
 
 
 class _Bytes:
     """Sequential reader of a binary file."""
 
     def __init__(self, data: bytes) -> None:
-        self._data, self._place = data, 0
+        self._data, self._offset = data, 0
 
     def take(self, form: str) -> tuple:
         """Read the next numbers. form: a format of `struct`."""
-        values = struct.unpack_from("<" + form, self._data, self._place)
-        self._place += struct.calcsize("<" + form)
+        values = struct.unpack_from("<" + form, self._data, self._offset)
+        self._offset += struct.calcsize("<" + form)
         return values
 
     def count(self) -> int:
-        """Read a number of items; it is limited by the size of the file."""
+        """Read a number of items; each item has at least one byte."""
         (count,) = self.take("Q")
         if count > len(self._data):
-            raise ValueError(f"it declares {count} items")
+            raise ValueError(f"the file is too short for {count} items")
         return count
 
     def word(self) -> str:
-        """Read a zero-terminated text."""
-        end = self._data.index(b"\0", self._place)
-        text = self._data[self._place : end].decode()
-        self._place = end + 1
+        """Read a zero-terminated string."""
+        end = self._data.index(b"\0", self._offset)
+        text = self._data[self._offset : end].decode()
+        self._offset = end + 1
         return text
 
     def skip(self, size: int) -> None:
-        if self._place + size > len(self._data):
-            raise ValueError("it is truncated")
-        self._place += size
+        if self._offset + size > len(self._data):
+            raise ValueError("the file is truncated")
+        self._offset += size
 
 
 _Intrinsics = tuple[str, int, int, tuple[float, ...]]
@@ -269,7 +269,7 @@ def _binary_images(data: _Bytes) -> Iterator[_View]:
 
 
 def _text_images(lines: list[str]) -> Iterator[_View]:
-    # every second line has the keypoints and may be empty
+    # every second line contains the keypoints and may be empty
     for line in lines[::2]:
         if line:
             words = line.split(maxsplit=9)

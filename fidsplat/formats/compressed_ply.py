@@ -1,14 +1,14 @@
-"""Reading of SuperSplat's compressed PLY, written by PlayCanvas' editor and splat-transform.
+"""Reading of SuperSplat's compressed PLY, as the PlayCanvas editor and splat-transform write it.
 
-Every 256 splats share a row of the element chunk, which holds the smallest and largest position, log scale
-and (in newer files) colour. The element vertex has four 32-bit words per splat:
+Each 256 splats share a row of the element chunk: minimum and maximum of position, log scale and (in newer
+files) colour. The element vertex has four 32-bit words per splat:
 
     packed_position, packed_scale   11, 10, 11 bits x, y, z from the top, in [min, max] of the chunk
     packed_rotation                 2 bits: index of the largest of w, x, y, z (omitted, positive);
                                     3 x 10 bits: the others in that order, in [-1, 1] / sqrt(2)
     packed_color                    8 bits each of r, g, b (in [min, max] of the chunk, or [0, 1]) and opacity
 
-An element sh holds the bands above 0, a byte per coefficient in [-4, 4], in the order of f_rest.
+An element sh contains the bands above 0, one byte per coefficient in [-4, 4], in the order of f_rest.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 
 def is_compressed(header: Header) -> bool:
-    """Whether a header has elements of a compressed PLY; `compressed_rows` validates them."""
+    """Whether a header declares a compressed PLY, which `compressed_rows` validates."""
     vertex = header.elements.get("vertex")
     return vertex is not None and any(name in vertex.properties for name in _PACKED)
 
@@ -32,7 +32,7 @@ def is_compressed(header: Header) -> bool:
 def compressed_rows(header: Header) -> Rows:
     """Rows of a compressed PLY: three scales, all arrays float32.
 
-    Raises InputError for an element or a property that is missing or of the wrong type or length.
+    Raises InputError for an element or property that is missing or has the wrong type or length.
     """
     n = header.elements["vertex"].count
     _check(header, "vertex", _PACKED, "<u4", n)
@@ -63,7 +63,7 @@ def compressed_rows(header: Header) -> Rows:
             header.rows("chunk", first // CHUNK, -(-end // CHUNK)),
         )
         bands = header.rows("sh", first, end) if rest else None
-        for start in range(0, len(rows), BLOCK):  # small float64 temporaries
+        for start in range(0, len(rows), BLOCK):  # blocks bound the size of float64 temporaries
             part = slice(start, start + BLOCK)
             owners = chunks[start // CHUNK : start // CHUNK + _CHUNKS_AT_ONCE]
             unpacked = _unpack(rows[part], owners, coloured)
@@ -77,8 +77,7 @@ def compressed_rows(header: Header) -> Rows:
 
 
 def _unpack(rows: np.ndarray, chunks: np.ndarray, coloured: bool) -> dict[str, np.ndarray]:
-    """Decode the splats of chunks to float64: means, quats, scales, opacities, and dc (k, 3), SH of degree
-    0."""
+    """Decode splats of chunks to float64: means, quats, scales, opacities, and SH of degree 0, dc (k, 3)."""
     chunk_of = np.arange(len(rows)) // CHUNK
 
     def end(which: str, axes: str) -> np.ndarray:
@@ -111,7 +110,8 @@ def _check(header: Header, name: str, properties, kind: str, count: int) -> None
     wrong = [p for p in properties if element.dtype[p] != np.dtype(kind)]
     if wrong:
         raise InputError(
-            f"{header.path}: the element {name} of a compressed PLY has a wrong type of {', '.join(wrong)}"
+            f"{header.path}: {', '.join(wrong)} of the element {name} must have the type {kind} in a "
+            f"compressed PLY, got {element.dtype[wrong[0]].str}"
         )
     if element.count != count:
         raise InputError(
@@ -120,7 +120,7 @@ def _check(header: Header, name: str, properties, kind: str, count: int) -> None
 
 
 def _unit_fractions(words: np.ndarray, *widths: int) -> np.ndarray:
-    """Decode bit fields of words (n,) to (n, len(widths)) float64 in [0, 1], the highest field first."""
+    """Decode bit fields of words (n,), the highest field first, to (n, len(widths)) float64 in [0, 1]."""
     columns, shift = [], sum(widths)
     for width in widths:
         shift -= width
@@ -142,7 +142,8 @@ def _quaternions(words: np.ndarray) -> np.ndarray:
 
 
 def _bands(rows: np.ndarray, rest: int) -> np.ndarray:
-    """Decode SH bytes to (n, rest / 3, 3) float32 in [-4, 4]: bin centres, the ends for 0 and 255."""
+    """Decode SH bytes to (n, rest / 3, 3) float32: centres of 256 bins over [-4, 4]; 0 and 255 are the
+    ends."""
     fraction = (np.arange(256) + 0.5) / 256
     fraction[[0, 255]] = 0.0, 1.0
     value = ((fraction - 0.5) * 8).astype(np.float32)

@@ -37,7 +37,7 @@ class Format:
     harmonics: bool = True
     origin: bool = False
     rounds: str = ""
-    """values stored with fewer bits than float32"""
+    """values with fewer bits than float32, for `losses`"""
 
 
 _SOG_ROUNDS = "positions to 16 bits, the rest to 8; SH above degree 0 to 65,536 sets"
@@ -72,7 +72,7 @@ NAMED = {
 
 
 def stored_bytes(path: str | os.PathLike[str]) -> int:
-    """Size of a splat file, in bytes, with the files that a JSON file (SOG, glTF) names."""
+    """Size of a splat file in bytes, including the files that a JSON file (SOG, glTF) references."""
     path = Path(path)
     size = path.stat().st_size
     if path.suffix.lower() in (".json", ".gltf"):
@@ -84,7 +84,7 @@ def stored_bytes(path: str | os.PathLike[str]) -> int:
 
 
 def format_of(path: str | os.PathLike[str]) -> Format:
-    """The format of a file by its name or suffix. Raises InputError for an unknown one."""
+    """Format of a file by its name or suffix. Raises InputError for an unknown format."""
     if (named := NAMED.get(path_of(path).name.lower())) is not None:
         return named
     suffix = path_of(path).suffix.lower()
@@ -96,7 +96,7 @@ def format_of(path: str | os.PathLike[str]) -> Format:
 def load_splats(path: str | os.PathLike[str], progress: Progress | None = None) -> SplatCloud:
     """Read a splat file: .ply, .splat, .spz, .glb, .gltf, .usda, .usdc, .usd, .sog or meta.json.
 
-    progress: callback of the current task and its completed share, 0 to 1, for PLY.
+    progress: callback with the current task and its completed share, 0 to 1; PLY only.
 
     Raises InputError for an unknown suffix or a damaged file.
     """
@@ -105,7 +105,7 @@ def load_splats(path: str | os.PathLike[str], progress: Progress | None = None) 
 
 
 def save_splats(cloud: SplatCloud, path: str | os.PathLike[str]) -> None:
-    """Write splats in the format of the file's suffix; `losses` lists the data that this format cannot store.
+    """Write splats in the format of the file's suffix; `losses` lists data that this format cannot store.
 
     Raises InputError for an unknown or read-only suffix, boxes, or a file that cannot be written.
     """
@@ -116,7 +116,7 @@ def save_splats(cloud: SplatCloud, path: str | os.PathLike[str]) -> None:
 
 
 def check_writable(path: str | os.PathLike[str]) -> Format:
-    """The format of an output file. Raises InputError for an unknown or read-only format."""
+    """Format of an output file. Raises InputError for an unknown or read-only format."""
     known = format_of(path)
     if known.save is None:
         others = ", ".join(suffix for suffix, other in FORMATS.items() if other.save is not None)
@@ -128,7 +128,7 @@ def check_writable(path: str | os.PathLike[str]) -> Format:
 
 
 def losses(cloud: SplatCloud, path: str | os.PathLike[str]) -> list[str]:
-    """Descriptions of the data of a cloud that a file's format loses; empty if the round trip is lossless."""
+    """Descriptions of the data of a cloud that a file's format loses; empty for a lossless round trip."""
     known, found = format_of(path), []
     if cloud.sh_degree > 0 and not known.harmonics:
         found.append(f"SH of degree {cloud.sh_degree}: colours do not change with the view")

@@ -1,8 +1,8 @@
-"""glTF with KHR_gaussian_splatting, as .glb and .gltf: activated values in float32, without loss.
+"""Reading and writing of glTF with KHR_gaussian_splatting (.glb, .gltf): lossless float32 values.
 
 Extension: KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting, release candidate. glTF has y up,
 z forward and x to the left: splats are written unchanged below a node that rotates them by 180 degrees about
-z, as splat-transform and nianticlabs/spz convert; reading applies the transforms of the parent nodes and the
+z, like splat-transform and nianticlabs/spz. Reading applies the transforms of all parent nodes and the
 inverse rotation.
 """
 
@@ -41,7 +41,7 @@ _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _TO_GLTF = np.diag([-1.0, -1.0, 1.0, 1.0])
 """rotation by 180 degrees about z, its own inverse"""
 _COPIES = 3
-"""copies of each value while a file is read: accessor, cloud, transformed cloud"""
+"""copies of each value in memory while a file is read: accessor, cloud, transformed cloud"""
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
@@ -49,8 +49,8 @@ def load_gltf(path: Path) -> SplatCloud:
     """Read the splats of all nodes of a .glb or .gltf file as one cloud.
 
     Raises:
-        InputError: a damaged file, no splats, a reference to a file outside of its folder, a node with
-            non-uniform scale or reflection.
+        InputError: the file is damaged, has no splats or references a file outside its folder, or a node has
+            a non-uniform scale or a reflection.
     """
     data = content(path, (b"glTF", b"{", codecs.BOM_UTF8))
     document, binary = _parts(path, data)
@@ -68,7 +68,7 @@ def load_gltf(path: Path) -> SplatCloud:
 
 def save_gltf(cloud: SplatCloud, path: Path) -> None:
     """Write a .glb file, or a .gltf file with embedded data. The application-specific attributes _LABEL and
-    _PLANE hold labels and coplanar groups.
+    _PLANE contain labels and coplanar groups.
 
     Raises InputError for boxes or a file that cannot be written.
     """
@@ -94,29 +94,11 @@ def save_gltf(cloud: SplatCloud, path: Path) -> None:
                 "use smaller ones"
             )
         arrays[f"_{name.upper()}"] = whole[:, None].astype(np.float32)
-    views, accessors, chunks, place = [], [], [], 0
-    for array in arrays.values():
-        chunk = np.ascontiguousarray(array, "<f4").tobytes()
-        views.append({"buffer": 0, "byteOffset": place, "byteLength": len(chunk)})
-        kind = {width: name for name, width in _WIDTHS.items()}[array.shape[1]]
-        accessors.append(
-            {"bufferView": len(views) - 1, "componentType": 5126, "count": len(cloud), "type": kind}
-        )
-        chunks.append(chunk)
-        place += len(chunk)
-    accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
-    document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "fidsplat, z forward"},
-        "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": [0.0, 0.0, 1.0, 0.0]}],
-        "meshes": [{"primitives": [_primitive(list(arrays))]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": place}],
-    }
-    binary = b"".join(chunks)
+    document, binary = gltf_document(
+        [(array, 5126) for array in arrays.values()], _primitive(list(arrays)), "fidsplat, z forward"
+    )
+    document |= {"extensionsUsed": [EXTENSION]}
+    document["accessors"][0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
     if path.suffix.lower() == ".gltf":
         uri = "data:application/octet-stream;base64," + base64.b64encode(binary).decode("ascii")
         document["buffers"][0]["uri"] = uri
@@ -135,8 +117,37 @@ def _primitive(names: list[str]) -> dict[str, Any]:
     }
 
 
+def gltf_document(
+    arrays: list[tuple[np.ndarray, int]], primitive: dict[str, Any], generator: str
+) -> tuple[dict[str, Any], bytes]:
+    """Document and binary data of one primitive below a rotation by 180 degrees about z.
+
+    arrays: (n, width) little-endian values of each accessor, and their component type.
+    """
+    views, accessors, chunks, offset = [], [], [], 0
+    kinds = {width: name for name, width in _WIDTHS.items()}
+    for array, component in arrays:
+        chunk = np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(chunk)})
+        accessor = {"bufferView": len(accessors), "componentType": component}
+        accessors.append(accessor | {"count": len(array), "type": kinds[array.shape[1]]})
+        chunks.append(chunk)
+        offset += len(chunk)
+    document = {
+        "asset": {"version": "2.0", "generator": generator},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": [0.0, 0.0, 1.0, 0.0]}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }
+    return document, b"".join(chunks)
+
+
 def pack_glb(document: dict[str, Any], binary: bytes) -> bytes:
-    """Content of a .glb file."""
+    """Content of a .glb file with a document and its binary data."""
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     binary += b"\0" * (-len(binary) % 4)
@@ -146,7 +157,7 @@ def pack_glb(document: dict[str, Any], binary: bytes) -> bytes:
 
 
 def _parts(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview | None]:
-    """The JSON document, and a view of the binary chunk of a .glb file."""
+    """JSON document, and a view of the binary chunk of a .glb file (None for .gltf)."""
     text, binary = data, None
     if data[:4] == b"glTF":
         try:
@@ -161,14 +172,14 @@ def _parts(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview | None]:
         if version not in (0, 2):
             raise InputError(f"{path}: the version of binary glTF must be 2, got {version}; export it again")
         if version != 2 or size > len(data) or _JSON not in chunks:
-            raise InputError(f"{path}: truncated, or not binary glTF of version 2")
+            raise InputError(f"cannot read {path} as binary glTF of version 2: truncated or damaged")
         text, binary = bytes(chunks[_JSON]), chunks.get(_BIN)
     try:
         document = from_json(text)
     except ValueError:
-        raise InputError(f"{path} is not a glTF file: it is not JSON") from None
+        raise InputError(f"cannot read {path} as glTF: not JSON") from None
     if not isinstance(document, dict):
-        raise InputError(f"{path} is not a glTF file: it is not a JSON object")
+        raise InputError(f"cannot read {path} as glTF: not a JSON object")
     return document, binary
 
 
@@ -187,11 +198,11 @@ class _Reader:
             if scenes
             else range(len(self._document.get("nodes", [])))
         )
-        # early files of fidsplat were rotated about x
+        # early versions of fidsplat wrote a rotation about x
         axes = HALF_TURN if self._document.get("asset", {}).get("generator") == "fidsplat" else _TO_GLTF
         placed = [pair for root in roots for pair in self._below(root, axes)]
         self._check_expansion([primitive for primitive, _ in placed])
-        cloud_of_primitive: dict[int, SplatCloud] = {}  # by id of the primitive: nodes may share a mesh
+        cloud_of_primitive: dict[int, SplatCloud] = {}  # by id of the primitive, since nodes may share a mesh
         for primitive, _ in placed:
             if id(primitive) not in cloud_of_primitive:
                 cloud_of_primitive[id(primitive)] = self._cloud(primitive)
@@ -229,8 +240,8 @@ class _Reader:
         attributes, prefix = primitive["attributes"], f"{EXTENSION}:"
         if primitive["extensions"][EXTENSION].get("extensions"):
             raise InputError(
-                f"{self._path}: its splats must be uncompressed, got a compression extension; "
-                "export without it, or convert the SPZ or SOG file that it was made of"
+                f"{self._path}: splats must be uncompressed, got a compression extension; export without it, "
+                "or convert the original SPZ or SOG file"
             )
         arrays = {
             name: self._array(number, plain=name == f"{prefix}SCALE")
@@ -255,7 +266,7 @@ class _Reader:
         )
 
     def _check_expansion(self, primitives: list[dict[str, Any]]) -> None:
-        """Check the memory of all primitives: nodes may share a mesh, and attributes an accessor."""
+        """Check the memory of all primitives, since nodes may share a mesh, and attributes an accessor."""
         accessors = [
             self._document["accessors"][number] for one in primitives for number in one["attributes"].values()
         ]
@@ -264,14 +275,14 @@ class _Reader:
         check_expansion(self._path, need, "its nodes with all their attributes", size)
 
     def _integers(self, arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:
-        """(n,) int32 of an optional attribute of whole numbers stored as floats."""
+        """(n,) int32 of an optional attribute that stores integers as floats."""
         if name not in arrays:
             return None
         values = arrays[name][:, 0]
         wrong = values[~(np.abs(values) < 2**24) | (values % 1 != 0)]
         if len(wrong):
             raise InputError(
-                f"{self._path}: its attribute {name} must have whole numbers below 2^24, got {wrong[0]:.9g}"
+                f"{self._path}: the attribute {name} must have whole numbers below 2^24, got {wrong[0]:.9g}"
             )
         return values.astype(np.int32)
 
@@ -320,7 +331,7 @@ class _Reader:
             raise InputError(f"files of {self._path} must be in its folder, got {uri!r}")
         views = [view for view in self._document["bufferViews"] if view["buffer"] == number]
         size = max(int(view.get("byteOffset", 0)) + int(view["byteLength"]) for view in views)
-        return read_input(file, first=max(size, 0))  # the file may be larger
+        return read_input(file, first=max(size, 0))  # only the referenced bytes of a larger file
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:

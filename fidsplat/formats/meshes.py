@@ -1,4 +1,4 @@
-"""Writing of triangle meshes: glTF, PLY, OBJ, STL, and a MuJoCo model of convex parts."""
+"""Triangle meshes, and writing of them as glTF, PLY, OBJ, STL, or a MuJoCo model of convex parts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.formats.gltf import pack_glb
+from fidsplat.formats.gltf import gltf_document, pack_glb
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import write_file
 from fidsplat.util.response import to_light
@@ -26,21 +26,21 @@ class TriangleMesh:
     faces: np.ndarray
     """(m, 3) int32 indices of vertices, counter-clockwise from outside"""
     colors: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
-    """(n, 3) RGB in display space, 0 to 1; or empty"""
+    """(n, 3) RGB in display space, 0 to 1; empty for a mesh without colours"""
 
     @property
     def area(self) -> float:
-        """Area of the surface in square metres."""
+        """Surface area in square metres."""
         return float(np.linalg.norm(self._crosses, axis=1).sum() / 2)
 
     @property
     def volume(self) -> float:
-        """Volume inside a closed mesh in cubic metres."""
+        """Enclosed volume of a closed mesh in cubic metres."""
         return float((self.vertices[self.faces[:, 0]] * self._crosses).sum() / 6)
 
     @property
     def closed(self) -> bool:
-        """Whether each edge is in exactly two triangles, once in each direction."""
+        """Whether each edge belongs to exactly two triangles, in opposite directions."""
         edges = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)
         keys = np.sort(edges[:, 0] * len(self.vertices) + edges[:, 1])
         opposite = np.sort(edges[:, 1] * len(self.vertices) + edges[:, 0])
@@ -52,11 +52,11 @@ class TriangleMesh:
         return np.cross(b - a, c - a)
 
     def simplified(self, faces: int) -> TriangleMesh:
-        """The mesh with at most this many faces, by quadric error metrics. Colours are those of the nearest
-        original vertices of the collapsed edges.
+        """Simplify to at most this many faces by quadric error metrics. A vertex gets the mean colour of the
+        vertices that were merged into it.
 
         Raises:
-            InputError: the package fast-simplification is missing; a number below 4.
+            InputError: the package fast-simplification is missing, or faces is below 4.
         """
         if faces < 4:
             raise InputError(f"--faces must be at least 4, got {faces}")
@@ -88,23 +88,23 @@ class TriangleMesh:
         coacd.set_log_level("error")
         centre = self.vertices.mean(0)
         mesh = coacd.Mesh(self.vertices - centre, self.faces)
-        preprocess = "off" if self.closed else "auto"  # remeshing takes most of the time
+        preprocess = "off" if self.closed else "auto"  # remeshing would take most of the time
         parts = coacd.run_coacd(mesh, max_convex_hull=most, preprocess_mode=preprocess, seed=0)
         return [TriangleMesh(np.asarray(v) + centre, np.asarray(f, np.int32)) for v, f in parts]
 
 
 def save_mesh(mesh: TriangleMesh, path: Path, parts: int = 32) -> list[Path]:
-    """Write a mesh in the format of the file's ending; returns the written files.
+    """Write a mesh in the format of the file's suffix; returns the written files.
 
-    .glb has colours and y up, .ply has colours; .xml is a MuJoCo model of convex parts in OBJ files next
-    to it.
+    .glb has colours and y up, .ply has colours; .xml is a MuJoCo model of convex parts, in OBJ files next to
+    it.
 
-    Raises InputError for another ending, an empty mesh, or a file that cannot be written.
+    Raises InputError for another suffix, an empty mesh, or a file that cannot be written.
     """
     suffix = check_mesh_file(path).suffix.lower()
     if not len(mesh.faces):
         raise InputError(
-            "a mesh must have at least one triangle, got none; give other cameras or a voxel size"
+            "a mesh must have at least one triangle, got none; set other cameras or another voxel size"
         )
     if suffix == ".xml":
         return _save_mujoco(mesh.convex_parts(parts), path)
@@ -114,11 +114,11 @@ def save_mesh(mesh: TriangleMesh, path: Path, parts: int = 32) -> list[Path]:
 
 
 def check_mesh_file(path: Path) -> Path:
-    """The path of a mesh, before anything is computed. Raises InputError for another ending, or a missing
+    """Validate the path of a mesh before it is computed. Raises InputError for an unknown suffix or a missing
     package."""
     suffix = path.suffix.lower()
     if suffix not in MESH_FORMATS:
-        raise InputError(f"a mesh must end in {', '.join(MESH_FORMATS)}, got {path}")
+        raise InputError(f"the suffix of a mesh must be {', '.join(MESH_FORMATS)}, got {path}")
     if suffix == ".xml":
         _package("coacd")
     return path
@@ -139,36 +139,17 @@ def _save_mujoco(parts: list[TriangleMesh], path: Path) -> list[Path]:
 
 def _glb(mesh: TriangleMesh) -> bytes:
     points, faces = mesh.vertices.astype("<f4"), mesh.faces.astype("<u4")
-    arrays = [(faces.reshape(-1, 1), 5125, "SCALAR"), (points, 5126, "VEC3")]
+    arrays = [(faces.reshape(-1, 1), 5125), (points, 5126)]
     if len(mesh.colors):
-        linear = to_light(np.clip(mesh.colors, 0, 1), "srgb")  # as glTF requires
-        arrays.append((linear.astype("<f4"), 5126, "VEC3"))
-    views, accessors, place = [], [], 0
-    for array, component, kind in arrays:
-        views.append({"buffer": 0, "byteOffset": place, "byteLength": array.nbytes})
-        accessors.append(
-            {
-                "bufferView": len(views) - 1,
-                "componentType": component,
-                "count": len(array),
-                "type": kind,
-            }
-        )
-        place += array.nbytes
-    accessors[1] |= {"min": points.min(0).tolist(), "max": points.max(0).tolist()}
+        linear = to_light(np.clip(mesh.colors, 0, 1), "srgb")  # glTF requires linear colours
+        arrays.append((linear.astype("<f4"), 5126))
     attributes = {"POSITION": 1} | ({"COLOR_0": 2} if len(mesh.colors) else {})
-    document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "fidsplat"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": [0.0, 0.0, 1.0, 0.0]}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0}]}],
-        "materials": [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": place}],
-    }
-    return pack_glb(document, b"".join(array.tobytes() for array, _, _ in arrays))
+    document, binary = gltf_document(
+        arrays, {"attributes": attributes, "indices": 0, "material": 0}, "fidsplat"
+    )
+    document["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}]
+    document["accessors"][1] |= {"min": points.min(0).tolist(), "max": points.max(0).tolist()}
+    return pack_glb(document, binary)
 
 
 def _ply(mesh: TriangleMesh) -> bytes:
@@ -211,4 +192,4 @@ def _package(module: str) -> Any:
     try:
         return import_module(module)
     except ImportError:
-        raise InputError(f"this mesh needs {module}; pip install 'fidsplat[mesh]'") from None
+        raise InputError(f"{module} must be installed for this mesh; pip install 'fidsplat[mesh]'") from None

@@ -14,7 +14,7 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import open_input, read_input
 
 PADDED = np.float32(1e-6)
-"""third scale [m] of a disk in formats that require three"""
+"""third scale in metres that marks a disk in formats that require three scales"""
 HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
 """rotation by 180 degrees about x: from y down, z forward (trained splats) to y up, z backward (glTF, USD,
 SPZ)"""
@@ -50,7 +50,7 @@ def coefficients(cloud: SplatCloud) -> np.ndarray:
 
 
 def plain_colors(cloud: SplatCloud) -> np.ndarray:
-    """RGB (n, 3) float32 of SH degree 0."""
+    """RGB (n, 3) float32 at SH degree 0."""
     return coefficients(cloud)[:, 0] * C0_SPLAT + np.float32(0.5)
 
 
@@ -65,9 +65,9 @@ def cloud_of(
     labels=None,
     coplanar_groups=None,
 ) -> SplatCloud:
-    """Make a cloud of a file's arrays, with scales (n, 3) in metres; invalid splats are dropped and counted.
+    """Cloud of a file's arrays, with scales (n, 3) in metres; invalid splats are dropped and counted.
 
-    disk: maximum third scale of a disk, apart from rounding.
+    disk: maximum third scale of a disk, before rounding.
 
     Raises InputError for invalid arrays or coplanar groups.
     """
@@ -92,8 +92,8 @@ def cloud_of(
 
 
 def content(path: Path, magic: tuple[bytes, ...]) -> bytes:
-    """Read a file; if it does not begin with one of these magic numbers, after white space, only its first
-    bytes, so that a large file of another format is not read. Raises InputError as `read_input`."""
+    """Content of a file, or only its first bytes if it does not begin with one of these magic numbers, so
+    that a large file of another format is not read. White space at the beginning is ignored."""
     with open_input(path) as stream:
         head = stream.read(64)
         while head.isspace():

@@ -1,4 +1,4 @@
-"""Reading of splats from PLY files of all layouts."""
+"""Reading and writing of splats as PLY files of all layouts."""
 
 import os
 import warnings
@@ -27,17 +27,17 @@ _NEEDED += ("rot_0", "rot_1", "rot_2", "rot_3")
 
 
 def load_ply(path: str | os.PathLike[str], progress: Progress | None = None) -> SplatCloud:
-    """Read a splat file: 2DGS layout (two scales), 3DGS layout (three), or SuperSplat's compressed PLY.
+    """Read a PLY file: 2DGS layout (two scales), 3DGS layout (three), or SuperSplat's compressed PLY.
 
-    Properties may have any order; unknown ones are ignored. Splats of three scales are 3D Gaussians
-    (`SplatCloud.thickness`; `SplatCloud.flattened` makes them disks), except that a third scale of 1e-6 marks
-    a disk. The 3D filter of Mip-Splatting's files (`filter_3D`) is applied, as the trainer rendered them
+    Properties may have any order; unknown properties are ignored. Splats with three scales are 3D Gaussians
+    (`SplatCloud.thickness`; `SplatCloud.flattened` makes them disks), unless the third scale is 1e-6, which
+    marks a disk. The 3D filter of Mip-Splatting (`filter_3D`) is applied, as its trainer rendered
     (`Quality.ellipsoid="ewa_antialiased"`). Integer properties `label` and `plane` become labels and coplanar
     groups. Colours are SH of degree 0 to 3. Invalid splats are dropped with one warning.
 
-    progress: callback of the current task and its completed share, 0 to 1.
+    progress: callback with the current task and its completed share, 0 to 1.
 
-    Raises InputError for a file that is missing, damaged, not PLY, or lacks a property.
+    Raises InputError for a file that is missing, damaged, not PLY, or without a required property.
     """
     rows, origin = ply_rows(path)
     arrays, dropped = collect(rows, progress)
@@ -49,9 +49,9 @@ def load_ply(path: str | os.PathLike[str], progress: Progress | None = None) -> 
 
 
 def ply_rows(path: str | os.PathLike[str]) -> tuple[Rows, np.ndarray | None]:
-    """The rows of a splat file, for reading in parts, and its optional origin (3,) float64.
+    """Rows of a PLY file, which can be read in windows, and its optional origin (3,) float64.
 
-    Raises InputError for a file that is missing, damaged, not PLY, or lacks a property.
+    Raises InputError for a file that is missing, damaged, not PLY, or without a required property.
     """
     header = read_header(path)
     origin = _origin(header)
@@ -61,7 +61,7 @@ def ply_rows(path: str | os.PathLike[str]) -> tuple[Rows, np.ndarray | None]:
 def _plain_rows(header: Header) -> Rows:
     element = header.elements.get("vertex")
     if element is None:
-        raise InputError(f"{header.path}: the PLY file has no element vertex")
+        raise InputError(f"{header.path}: a PLY file of splats must have the element vertex, got none")
     k = (_check_properties(header, element) + 1) ** 2
     names = element.properties
     wide = any(element.dtype[axis].itemsize == 8 for axis in "xyz")
@@ -73,26 +73,26 @@ def _plain_rows(header: Header) -> Rows:
         "opacities": ((), np.float32),
         "sh": ((k, 3), np.float32),
     }
-    # target of each property: name of an array and index
-    places: dict[str, tuple] = {axis: ("means", slice(None), i) for i, axis in enumerate("xyz")}
-    places |= {f"rot_{i}": ("quats", slice(None), i) for i in range(4)}
-    places |= {f"scale_{i}": ("scales", slice(None), i) for i in range(scales)}
-    places["opacity"] = ("opacities",)
-    places |= {f"f_dc_{c}": ("sh", slice(None), 0, c) for c in range(3)}
-    # the file has all higher bands of red, then of green, then of blue
-    places |= {
+    # array and index of each property
+    targets: dict[str, tuple] = {axis: ("means", slice(None), i) for i, axis in enumerate("xyz")}
+    targets |= {f"rot_{i}": ("quats", slice(None), i) for i in range(4)}
+    targets |= {f"scale_{i}": ("scales", slice(None), i) for i in range(scales)}
+    targets["opacity"] = ("opacities",)
+    targets |= {f"f_dc_{c}": ("sh", slice(None), 0, c) for c in range(3)}
+    # f_rest has all higher bands of red, then of green, then of blue
+    targets |= {
         f"f_rest_{c * (k - 1) + i}": ("sh", slice(None), 1 + i, c) for c in range(3) for i in range(k - 1)
     }
     filtered = scales == 3 and FILTER in names and element.dtype[FILTER].kind == "f"
     for name, array in (("label", "labels"), ("plane", "coplanar_groups")):
         if name in names and np.can_cast(element.dtype[name], np.int32):
-            columns[array], places[name] = ((), np.int32), (array,)
+            columns[array], targets[name] = ((), np.int32), (array,)
 
     def fill(first: int, arrays: dict[str, np.ndarray]) -> None:
         rows = header.rows("vertex", first, first + len(arrays["means"]))
         for start in range(0, len(rows), BLOCK):
             block = rows[start : start + BLOCK]
-            for name, (array, *index) in places.items():
+            for name, (array, *index) in targets.items():
                 arrays[array][start : start + BLOCK][*index] = block[name]
         np.exp(arrays["scales"], out=arrays["scales"])
         _sigmoid(arrays["opacities"])
@@ -108,16 +108,19 @@ def _plain_rows(header: Header) -> Rows:
 
 
 def _check_properties(header: Header, element: Element) -> int:
-    """Check the properties of the vertex element; returns the SH degree."""
+    """Validate the properties of the vertex element; returns the SH degree."""
     names = element.properties
     missing = [name for name in _NEEDED if name not in names]
     if missing:
-        raise InputError(f"{header.path}: not a splat file: the element vertex lacks {', '.join(missing)}")
+        raise InputError(
+            f"{header.path}: the element vertex of a PLY file of splats must have {', '.join(missing)}, got "
+            "none of them"
+        )
     rest = [name for name in names if name.startswith("f_rest_")]
     if len(rest) not in (0, 9, 24, 45) or any(f"f_rest_{i}" not in names for i in range(len(rest))):
         raise InputError(
-            f"{header.path}: the element vertex has {len(rest)} properties f_rest_*; "
-            "SH of degree 0, 1, 2, 3 has 0, 9, 24, 45, numbered from 0"
+            f"{header.path}: the element vertex must have 0, 9, 24 or 45 properties f_rest_*, numbered from "
+            f"0, for SH of degree 0 to 3, got {len(rest)}"
         )
     used = [name for name in (*_NEEDED, "scale_2", *rest) if name in names]
     wrong = [name for name in used if element.dtype[name].kind != "f"]
@@ -138,8 +141,8 @@ def _sigmoid(x: np.ndarray) -> None:
 def _widen(scales: np.ndarray, opacities: np.ndarray, filters: np.ndarray) -> None:
     """Apply the 3D smoothing filter of Mip-Splatting (Yu et al. 2024) in place.
 
-    Gaussians of scales (n, 3) are convolved with isotropic ones of standard deviations (n,); opacities (n,)
-    decrease with the density.
+    Gaussians with scales (n, 3) are convolved with isotropic Gaussians of standard deviations (n,); opacities
+    (n,) decrease with the density.
     """
     wide = np.hypot(scales.astype(np.float64), filters[:, None])
     opacities *= np.divide(scales, wide, out=np.ones_like(wide), where=wide > 0).prod(axis=1)
@@ -164,19 +167,19 @@ def _origin(header: Header) -> np.ndarray | None:
 
 _BLOCK = 65536
 MAX_LOGIT = 100.0
-"""logit of opacity 1, and -100 of opacity 0, whose sigmoid is 1 and 0 in float32"""
+"""logit that stands for opacity 1 (and -100 for 0): its sigmoid is 1 in float32"""
 
 
 def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool = False) -> None:
     """Write binary little-endian PLY, all float32: x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*.
 
     The third scale is the thickness of a 3D Gaussian, and log(1e-6) for a disk, so that 3DGS tools open the
-    file; `native_2dgs` omits it. Plain colours become SH of degree 0. Optional int properties are label, if
-    any label is not 0, and plane, the coplanar group. A comment has an origin other than 0; x, y, z are
-    relative to it.
+    file; `native_2dgs` omits it. Plain colours become SH of degree 0. Integer properties are added for labels
+    other than 0 (label) and coplanar groups (plane). If the origin is not 0, a comment contains it, and x, y,
+    z are relative to it.
 
     Raises InputError for a file that cannot be written, boxes, or 3D Gaussians with `native_2dgs`; an
-    existing file then stays unchanged.
+    existing file is then unchanged.
     """
     refuse_boxes(instance("cloud", cloud, SplatCloud), "a PLY file")
     if flag("native_2dgs", native_2dgs) and cloud.thickness is not None:

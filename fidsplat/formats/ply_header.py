@@ -1,4 +1,4 @@
-"""Header of a binary little-endian PLY file, validated against the file's size before data is mapped."""
+"""Header of a binary little-endian PLY file, validated against the file size before data is mapped."""
 
 import os
 import re
@@ -13,7 +13,7 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import open_input, path_of
 
 MAX_HEADER = 65536
-"""maximum bytes of a header; that of a splat file has about 2,000"""
+"""maximum size of a header in bytes; a splat file's has about 2,000"""
 
 _TYPES = {
     "char": "<i1",
@@ -37,7 +37,7 @@ _TYPES = {
 
 @dataclass(frozen=True)
 class Element:
-    """A table of the file: `count` rows of `dtype` (packed, fields in file order) from byte `offset`."""
+    """Table of a PLY file: `count` rows of `dtype` (packed, fields in file order) from byte `offset`."""
 
     name: str
     count: int
@@ -57,11 +57,10 @@ class Header:
     elements: dict[str, Element]
     comments: tuple[str, ...]
     text: bool = False
-    """whether rows are lines of text; `offset` is then that of the first element for all elements"""
+    """whether rows are text; the offset of all elements is then that of the first"""
 
     def rows(self, name: str, first: int, end: int) -> np.ndarray:
-        """Rows [first, end) of an element as a read-only structured array, memory-mapped if the file is
-        binary.
+        """Rows [first, end) of an element as a read-only structured array, memory-mapped for binary files.
 
         Raises InputError for a damaged text file.
         """
@@ -87,7 +86,7 @@ class Header:
             raise InputError(f"{self.path}: rows of {element.name} are damaged: {error}") from error
         if len(rows) != element.count:
             raise InputError(
-                f"{self.path}: cut short: its header declares {element.count} rows of {element.name}, but "
+                f"{self.path}: truncated: its header declares {element.count} rows of {element.name}, but "
                 f"the file has {len(rows)}"
             )
         return rows
@@ -96,11 +95,11 @@ class Header:
 def read_header(path: str | os.PathLike[str], text: bool = False) -> Header:
     """Read and validate the header of a PLY file.
 
-    text: whether ASCII files are accepted.
+    text: accept ASCII files.
 
     Raises InputError for a file that cannot be read, is not binary little-endian PLY, is shorter than its
-    header declares, or has a header that is damaged, longer than 64 KiB or with a list property. Warns of a
-    longer file.
+    header declares, or whose header is damaged, longer than 64 KiB or has a list property. Warns if the file
+    is longer.
     """
     file = path_of(path)
     head, size = _beginning(file)
@@ -117,15 +116,15 @@ def read_header(path: str | os.PathLike[str], text: bool = False) -> Header:
             layout = words[1] if len(words) == 3 else line
         elif keyword == "element":
             if len(words) != 3 or words[1] in counts:
-                raise InputError(f"{file}: the PLY header's line {line!r} is damaged or repeats an element")
+                raise InputError(f"{file}: a line of a PLY header must name a new element, got {line!r}")
             current = words[1]
             counts[current], fields[current] = _count(file, line, words[2]), []
         elif keyword == "property":
             if current is None:
-                raise InputError(f"{file}: the PLY header has a property before its first element")
+                raise InputError(f"{file}: a PLY header must name an element before the property {words[-1]}")
             fields[current].append(_field(file, line, words, fields[current]))
         else:
-            raise InputError(f"{file}: the PLY header's line {line[:60]!r} is unknown")
+            raise InputError(f"{file}: a line of a PLY header must be a known keyword, got {line[:60]!r}")
     if text and layout == "ascii":
         dtypes = {name: np.dtype(fields[name]) for name in counts}
         elements = {name: Element(name, counts[name], dtypes[name], start) for name in counts}
@@ -137,7 +136,7 @@ def read_header(path: str | os.PathLike[str], text: bool = False) -> Header:
         elements[name] = Element(name, count, np.dtype(fields[name]), offset)
         offset += count * elements[name].dtype.itemsize
     if size < offset:
-        raise InputError(f"{file}: cut short: its header declares {offset} bytes, but the file has {size}")
+        raise InputError(f"{file}: truncated: its header declares {offset} bytes, but the file has {size}")
     if size > offset:
         warnings.warn(f"{file}: {size - offset} bytes after the PLY data are not read", stacklevel=3)
     return Header(file, elements, tuple(comments))
@@ -149,14 +148,14 @@ def _beginning(file: Path) -> tuple[bytes, int]:
 
 
 def _lines(file: Path, head: bytes) -> tuple[list[str], int]:
-    """Header lines between `ply` and `end_header`, and the number of bytes before the data."""
+    """Header lines between `ply` and `end_header`, and the offset of the data in bytes."""
     if not head:
-        raise InputError(f"{file} is empty, not a PLY file")
+        raise InputError(f"cannot read {file} as PLY: it is empty")
     if not re.match(rb"ply\r?\n", head):
-        raise InputError(f"{file} is not a PLY file: its first line is not 'ply'")
+        raise InputError(f"cannot read {file} as PLY: its first line must be 'ply'")
     found = re.search(rb"\nend_header\r?\n", head)
     if found is None:
-        raise InputError(f"{file}: the PLY header has no end_header within {MAX_HEADER} bytes")
+        raise InputError(f"{file}: a PLY header must have end_header within {MAX_HEADER} bytes, got none")
     try:
         text = head[: found.start()].decode("utf-8")
     except UnicodeDecodeError:
@@ -175,8 +174,9 @@ def _field(file: Path, line: str, words: list[str], before: list[tuple[str, str]
         raise InputError(f"{file}: properties of the PLY header must be scalars, got the list {line[:60]!r}")
     if len(words) != 3 or words[1] not in _TYPES:
         raise InputError(
-            f"{file}: the PLY header's line {line[:60]!r} is not 'property TYPE NAME' of a known type"
+            f"{file}: a property of a PLY header must be 'property TYPE NAME' of a known type, got "
+            f"{line[:60]!r}"
         )
     if any(words[2] == name for name, _ in before):
-        raise InputError(f"{file}: the PLY header has the property {words[2]} twice in one element")
+        raise InputError(f"{file}: properties of an element of a PLY header must differ, got two {words[2]}")
     return words[2], _TYPES[words[1]]

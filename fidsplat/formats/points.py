@@ -1,4 +1,4 @@
-"""Point clouds with named fields: PCD, PLY and NumPy files."""
+"""Writing of point clouds with named fields as PCD, PLY and NumPy files."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _PLY_TYPES = {
 
 
 def check_points_file(path: str | os.PathLike[str]) -> None:
-    """Raise InputError for a name that does not end in .pcd, .ply or .npy."""
+    """Raise InputError for a suffix other than .pcd, .ply or .npy."""
     if path_of(path).suffix.lower() not in ENDINGS:
-        raise InputError(f"a file of points must end in {', '.join(ENDINGS)}, got {path}")
+        raise InputError(f"the suffix of a file of points must be {', '.join(ENDINGS)}, got {path}")
 
 
 def save_points(points: np.ndarray, path: str | os.PathLike[str]) -> None:
     """Write a structured array with one record per point: binary PCD 0.7 or little-endian PLY, or .npy.
 
     Raises:
-        InputError: not a structured array of numbers, another ending, or a file that cannot be written.
+        InputError: points are not a structured array of numbers, or the file cannot be written.
     """
     check_points_file(path)
     names = getattr(points, "dtype", np.dtype(float)).names

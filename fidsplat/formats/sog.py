@@ -1,10 +1,10 @@
-"""SOG, PlayCanvas' "Spatially Ordered Gaussians": meta.json and lossless WebP images with a pixel for each
-splat, in a folder or in a zip. Reads versions 1 and 2, writes 2. Format: developer.playcanvas.com, "The SOG
+"""SOG, PlayCanvas' "Spatially Ordered Gaussians": meta.json and lossless WebP images with one pixel per
+splat, in a folder or a zip file. Reads versions 1 and 2, writes 2. Format: developer.playcanvas.com, "The SOG
 Format".
 
-Positions have 16 bits an axis of sign(p) log(1 + |p|), rotations the three smallest of w, x, y, z in 8 bits;
-scales, colours and SH are indices of code books of 256 entries, in version 1 of equidistant values between
-limits. Axes are those of the source file.
+Positions are sign(p) log(1 + |p|) with 16 bits per axis, rotations the three smallest of w, x, y, z with 8
+bits each. Scales, colours and SH are indices into code books of 256 values, in version 1 equidistant values.
+Axes are those of the source file.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from fidsplat.util.files import atomic_write, from_json, open_input, read_input,
 from fidsplat.util.limits import check_expansion
 
 MAX_PART, MAX_META = 2**30, 2**24
-"""maximum number of bytes of an image within the zip, and of meta.json"""
+"""maximum size in bytes of an image in the zip file, and of meta.json"""
 SPARE = 2**16
-"""pixels that an image may have in addition to one for each splat: writers pad the last rows"""
+"""pixels that an image may have in addition to one per splat, since writers pad the last rows"""
 _MAX_SIDE, _ROUNDS = 16383, 20
-"""pixels of a side of a WebP image; iterations of the code books"""
+"""maximum side of a WebP image in pixels; iterations of the code book's optimisation"""
 _ROW = 64  # palette entries in a row of the image of centroids
 MAX_ENTRIES = 2**16
-"""maximum number of palette entries: labels have 16 bits"""
+"""maximum number of palette entries, since labels have 16 bits"""
 _SPLAT, _BAND = 160, 28
-"""bytes of memory for each splat while a file is read, and for each SH coefficient above degree 0"""
+"""bytes of memory per splat while a file is read, and per SH coefficient above degree 0"""
 _COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 
 
 Parts = Callable[[str, int], bytes]
-"""content of a file of a scene by its name and its maximum number of bytes"""
+"""function that returns the content of a file of a scene by its name and maximum size in bytes"""
 
 
 def load_sog(path: Path) -> SplatCloud:
@@ -49,7 +49,7 @@ def load_sog(path: Path) -> SplatCloud:
         with open_input(path) as stream, zipfile.ZipFile(stream) as archive:
             return _read(path, lambda name, maximum: _member(path, archive, name, maximum))
     except (zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError) as error:
-        raise InputError(f"{path} is not a SOG file: its zip is damaged ({error})") from None
+        raise InputError(f"cannot read {path} as SOG: its zip file is damaged ({error})") from None
 
 
 def load_sog_folder(path: Path) -> SplatCloud:
@@ -58,12 +58,12 @@ def load_sog_folder(path: Path) -> SplatCloud:
 
 
 def neighbour(path: Path, name: str) -> Path:
-    """A file in the folder of another, or below it. Raises InputError for a file elsewhere."""
+    """A file in the folder of `path` or below it. Raises InputError for a name outside it."""
     folder = path.parent.resolve()
     try:
         file = (folder / name).resolve()
         inside = file.is_relative_to(folder)
-    except (OSError, ValueError, RuntimeError):  # a NUL, a loop of links
+    except (OSError, ValueError, RuntimeError):  # a name with NUL, a loop of symbolic links
         inside = False
     if not inside:
         raise InputError(f"files of {path} must be in its folder, got {name!r}")
@@ -72,7 +72,7 @@ def neighbour(path: Path, name: str) -> Path:
 
 def _read(path: Path, part: Parts) -> SplatCloud:
     try:
-        # numbers beyond float32 become invalid splats, which are dropped
+        # numbers beyond float32 become invalid splats, which `cloud_of` drops
         with np.errstate(over="ignore", invalid="ignore"):
             return _cloud(path, part)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -103,7 +103,7 @@ def _cloud(path: Path, part: Parts) -> SplatCloud:
     check_expansion(path, count * (_SPLAT + _BAND * k), f"{count:,} splats")
 
     def pixels(name: str, number: int = 0) -> np.ndarray:
-        """Pixels (count, 4) uint8 of an image with a pixel for each splat."""
+        """Pixels (count, 4) uint8 of an image with one pixel per splat."""
         file = meta[name]["files"][number]
         found = _image(path, part, file, count).reshape(-1, 4)
         if not 0 <= count <= len(found):
@@ -136,14 +136,15 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str, maximum: int) -> by
     try:
         info = archive.getinfo(name)
     except KeyError:
-        raise InputError(f"{path}: the SOG file lacks {name}") from None
+        raise InputError(f"{path}: a SOG file must have {name}, got none") from None
     if info.file_size > maximum:
         raise InputError(f"{path}: {name} must have at most {maximum} bytes, got {info.file_size}")
     return archive.read(info)
 
 
 def _image(path: Path, part: Parts, name: str, count: int) -> np.ndarray:
-    """Read an image (h, w, 4) uint8 RGBA of about `count` pixels: a small file can expand to a huge image."""
+    """Read an image (h, w, 4) uint8 RGBA of about `count` pixels; larger ones are rejected before
+    decoding."""
     from fidsplat.images.files import declared_pixels, decode_rgba  # here, since it imports OpenCV
 
     data = part(name, MAX_PART)
@@ -154,7 +155,7 @@ def _image(path: Path, part: Parts, name: str, count: int) -> np.ndarray:
 
 
 def _between(part: dict[str, Any], bytes_: np.ndarray, columns: int) -> np.ndarray:
-    """Values of version 1 between the limits of each column."""
+    """Decode version 1: equidistant values between the limits of each column."""
     lowest, highest = (np.array(part[end], np.float64).reshape(columns) for end in ("mins", "maxs"))
     return lowest + (highest - lowest) * (bytes_ / 255.0)
 
@@ -166,7 +167,7 @@ def _book(part: dict[str, Any]) -> np.ndarray:
 def _palette(
     path: Path, part: Parts, high_sh: dict[str, Any], labels: np.ndarray, palette: np.ndarray | None
 ) -> np.ndarray:
-    """Bytes (n, k, 3) of the SH coefficients above degree 0, from the image of the palette."""
+    """SH bytes (n, k, 3) above degree 0, looked up in the palette image."""
     name, k = high_sh["files"][0], _COEFFICIENTS[high_sh["bands"]]
     palette = _image(path, part, name, MAX_ENTRIES * k) if palette is None else palette
     if palette.shape[1] != _ROW * k:
@@ -183,7 +184,7 @@ def _palette(
 
 
 def _quaternions(path: Path, pixels: np.ndarray) -> np.ndarray:
-    """Quaternions (n, 4) w, x, y, z: alpha - 252 is the index of the largest, which is omitted."""
+    """Quaternions (n, 4) w, x, y, z; alpha - 252 is the index of the largest component, which is omitted."""
     largest = pixels[:, 3].astype(np.int64) - 252
     if (largest < 0).any():
         raise InputError(f"{path}: the alpha of a rotation must be 252 to 255, got {int(pixels[:, 3].min())}")
@@ -201,20 +202,20 @@ def save_sog(cloud: SplatCloud, path: Path) -> None:
     written."""
     with atomic_write(path) as stream, zipfile.ZipFile(stream, "w") as archive:
         for name, data in sog_parts(cloud).items():
-            archive.writestr(zipfile.ZipInfo(name), data)  # a fixed time: the same cloud, the same file
+            archive.writestr(zipfile.ZipInfo(name), data)  # a fixed time makes files reproducible
 
 
 def save_sog_folder(cloud: SplatCloud, path: Path) -> None:
     """Write a meta.json and its images next to it. Raises InputError for boxes, an empty cloud, or a file
     that cannot be written."""
     parts = sog_parts(cloud)
-    parts[path.name] = parts.pop("meta.json")  # last: it marks a complete scene
+    parts[path.name] = parts.pop("meta.json")  # written last, since it marks a complete scene
     for name, data in parts.items():
         write_file(path.with_name(name), data)
 
 
 def sog_parts(cloud: SplatCloud) -> dict[str, bytes]:
-    """The files of a scene of version 2 by name."""
+    """Files of a scene of version 2 by name."""
     refuse_boxes(cloud, "a SOG file")
     if not len(cloud):
         raise InputError("a cloud in a SOG file must have at least one splat, got none")
@@ -266,7 +267,7 @@ def sog_parts(cloud: SplatCloud) -> dict[str, bytes]:
 
 
 def _pixels(n: int, values: np.ndarray, shape: tuple[int, int] | None = None) -> np.ndarray:
-    """An image (h, w, 4) uint8 whose first n pixels are values (n, 3 or 4); the others are opaque black."""
+    """Image (h, w, 4) uint8 whose first n pixels are values (n, 3 or 4); the others are opaque black."""
     width = -(-int(np.ceil(np.sqrt(n))) // 4) * 4
     height, width = shape or (-(-n // width), width)
     if max(height, width) > _MAX_SIDE:
@@ -281,12 +282,12 @@ def _pixels(n: int, values: np.ndarray, shape: tuple[int, int] | None = None) ->
 
 
 def _quantised(values: np.ndarray) -> tuple[list[float], np.ndarray]:
-    """A code book of 256 numbers, and the index (uint8) of the nearest for each value: Lloyd's algorithm in
-    one dimension."""
+    """Code book of 256 numbers, and for each value the index (uint8) of the nearest number: Lloyd's algorithm
+    in one dimension."""
     ordered = np.sort(values.astype(np.float64), axis=None)
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
     shares = np.linspace(0, len(ordered) - 1, 128).astype(int)
-    # half of the entries by frequency, half equidistant: rare large values keep a small error
+    # half of the initial entries at quantiles, half equidistant, so that rare large values have a small error
     book = np.sort(np.concatenate([ordered[shares], np.linspace(ordered[0], ordered[-1], 128)]))
     for _ in range(_ROUNDS):
         ends = np.concatenate([[0], np.searchsorted(ordered, (book[1:] + book[:-1]) / 2), [len(ordered)]])
@@ -298,8 +299,8 @@ def _quantised(values: np.ndarray) -> tuple[list[float], np.ndarray]:
 
 
 def _clustered(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At most 65,536 means of vectors (n, d) and the index of each vector's: median cut, which halves each
-    group along its coordinate of largest spread until its vectors are equal or the palette is full."""
+    """Palette of at most 65,536 vectors, and the index of each vector (n, d) in it: median cut, which halves
+    each group along its coordinate of largest variance until the palette is full."""
     distinct, inverse = np.unique(vectors, axis=0, return_inverse=True)
     if len(distinct) <= MAX_ENTRIES:
         return distinct, inverse.reshape(-1)
@@ -322,7 +323,7 @@ def _clustered(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _packed(quats: np.ndarray) -> np.ndarray:
-    """Bytes (n, 4) of quaternions w, x, y, z, the inverse of `_quaternions`."""
+    """Encode quaternions w, x, y, z as bytes (n, 4), the inverse of `_quaternions`."""
     q = quats / np.linalg.norm(quats, axis=1, keepdims=True)
     largest = np.abs(q).argmax(axis=1)
     q = q * np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)

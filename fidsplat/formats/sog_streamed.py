@@ -1,5 +1,5 @@
-"""Streamed SOG of PlayCanvas: lod-meta.json, a tree of boxes whose leaves have levels of detail, each a range
-of splats of a SOG folder. Level 0 is the scene. Format: developer.playcanvas.com, "Streamed SOG".
+"""Streamed SOG of PlayCanvas: lod-meta.json, a tree of boxes. Each leaf has levels of detail, each level a
+range of splats of a SOG folder; level 0 is the finest. Format: developer.playcanvas.com, "Streamed SOG".
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from fidsplat.util.limits import check_total
 META = "lod-meta.json"
 _MAX_META, _MAX_LEVELS = 2**26, 64
 _SPLAT = 300
-"""bytes of memory of a splat that is read"""
+"""bytes of memory per splat that is read"""
 _UNIT = 2**19
-"""splats of a SOG folder that is written, unless a leaf has more"""
+"""target number of splats per SOG folder; a larger leaf has its own folder"""
 
 
 @dataclass(frozen=True)
 class Span:
-    """A range of splats of a file, by its number."""
+    """Range of splats in a file, given by its index."""
 
     file: int
     first: int
@@ -38,13 +38,13 @@ class Span:
 
 @dataclass(frozen=True, eq=False)
 class StreamedSog:
-    """The content of a lod-meta.json."""
+    """Content of a lod-meta.json."""
 
     path: Path
     levels: int
     files: tuple[Path, ...]
     leaves: tuple[dict[int, Span], ...]
-    """spans by level of each leaf of the tree"""
+    """ranges by level, for each leaf of the tree"""
     environment: Path | None
 
     def check_memory(self) -> None:
@@ -53,7 +53,7 @@ class StreamedSog:
         check_total(f"{self.path} with {count:,} splats", count * _SPLAT, "read a scene of fewer splats")
 
     def load(self, level: int) -> Iterator[tuple[int, SplatCloud]]:
-        """The number of each leaf that has a level, and its splats, file by file."""
+        """Index and splats of each leaf that has a level, file by file."""
         of_level = [(leaf[level], number) for number, leaf in enumerate(self.leaves) if level in leaf]
         order = sorted(of_level, key=lambda pair: (pair[0].file, pair[0].first))
         for file, group in groupby(order, key=lambda pair: pair[0].file):
@@ -64,7 +64,7 @@ class StreamedSog:
     def _part(self, whole: SplatCloud, span: Span) -> SplatCloud:
         path = self.files[span.file]
         if whole.dropped:
-            raise InputError(f"{path} must have valid splats, got {sum(whole.dropped.values())} others")
+            raise InputError(f"{path} must have valid splats, got {sum(whole.dropped.values())} invalid ones")
         if span.first + span.count > len(whole):
             raise InputError(
                 f"{self.path}: a range of {path.name} must end by splat {len(whole)}, got "
@@ -132,7 +132,7 @@ def load_streamed(path: Path) -> SplatCloud:
 def save_streamed(
     path: Path, leaves: Sequence[tuple[np.ndarray, Sequence[Sequence[SplatCloud]]]], levels: int
 ) -> None:
-    """Write a streamed SOG: for each leaf its box (2, 3) and the clouds of each level, next to `path`.
+    """Write a streamed SOG next to `path`. leaves: box (2, 3) and clouds of each level, for each leaf.
 
     Raises InputError for a file that cannot be written.
     """

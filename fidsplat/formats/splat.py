@@ -1,7 +1,7 @@
-"""Reading and writing of `.splat`, the format of antimatter15's viewer: 32 bytes for each splat.
+"""Reading and writing of `.splat`, the format of antimatter15's viewer: 32 bytes per splat.
 
-Three float32 of position, three of scale in metres, then bytes: red, green, blue, opacity, and the quaternion
-w, x, y, z as 128 + 128 q. Colours do not depend on the view.
+Three float32 for the position, three for the scale in metres, then bytes for red, green, blue, opacity, and
+the quaternion w, x, y, z as 128 + 128 q. Colours do not depend on the view.
 """
 
 from __future__ import annotations
@@ -19,22 +19,21 @@ from fidsplat.util.limits import check_expansion
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 _CHECKED_ROWS = 4096
-"""rows that are validated before the rest is read, since the format has no magic number"""
+"""rows that are validated before the remaining rows are read, since the format has no magic number"""
 
 
 def load_splat(path: Path) -> SplatCloud:
-    """Read a .splat file. Raises InputError for another file."""
+    """Read a .splat file. Raises InputError for a file of another format."""
     size = regular_file(path).stat().st_size
     if not size or size % _ROW.itemsize:
         raise InputError(
-            f"{path}: the size must be a multiple of {_ROW.itemsize} bytes, got {size}; cut short, or not "
-            "a .splat file"
+            f"{path}: the size of a .splat file must be a multiple of {_ROW.itemsize} bytes, got {size}"
         )
     check_expansion(path, 4 * size, f"{size // _ROW.itemsize:,} splats")
     rows = np.memmap(path, _ROW, "r").view(np.ndarray)
     means, scales = rows["means"][:_CHECKED_ROWS], rows["scales"][:_CHECKED_ROWS]
     if not (np.isfinite(means).all(1) & np.isfinite(scales).all(1) & (scales > 0).any(1)).any():
-        raise InputError(f"{path} is not a .splat file: none of its first {len(means)} rows is a splat")
+        raise InputError(f"cannot read {path} as .splat: none of its first {len(means)} rows is a splat")
     rgba = rows["rgba"].astype(np.float32) / 255
     quats = (rows["quat"].astype(np.float32) - 128) / 128
     sh = ((rgba[:, None, :3] - 0.5) / C0).astype(np.float32)

@@ -1,10 +1,11 @@
-"""SPZ, Niantic's compressed splats: reads versions 2 to 4, writes 3 and 4. Format: nianticlabs/spz, README.
+"""Reading of SPZ, Niantic's compressed splats, in versions 2 to 4, and writing of 3 and 4. Format: README of
+nianticlabs/spz.
 
-Arrays of all splats: positions (3 x 24 bits, fixed point), opacities, colours and scales (a byte each),
-rotations (version 2: 3 bytes x, y, z; later: 4 bytes with the three smallest of x, y, z, w and the index of
-the omitted one), higher SH (a byte each). Axes: y up, z backward. Versions 2 and 3 are gzip of a header of 16
-bytes and the arrays. Version 4 has a header of 32 bytes, extensions (type, length, content), a table of
-sizes, and a Zstandard frame for each array.
+The file has one array per attribute: positions (3 x 24 bits, fixed point), opacities, colours and scales (a
+byte each), rotations (version 2: x, y, z in 3 bytes; later: the three smallest of x, y, z, w and the index of
+the largest in 4 bytes), SH above degree 0 (a byte each). Axes: y up, z backward. Versions 2 and 3 are a gzip
+stream of a header of 16 bytes and the arrays. Version 4 has a header of 32 bytes, extensions (type, length,
+content), a table of sizes, and a Zstandard frame per array.
 """
 
 from __future__ import annotations
@@ -33,18 +34,18 @@ _HAS_EXTENSIONS = 2
 _AXES = 0xADBE0003
 """type of Adobe's extension with the coordinate system"""
 _TO_RDF = {0: (1, -1, -1), 1: (-1, 1, -1), 4: (1, -1, -1), 6: (1, 1, 1), 7: (-1, -1, 1)}
-"""signs of the axes by coordinate system, for systems that are rotated: unspecified, LDB, RUB, RDF, LUF"""
+"""signs of the axes, by coordinate system that is a rotation of ours: unspecified, LDB, RUB, RDF, LUF"""
 _LABELS, _GROUPS = 0xF1D50001, 0xF1D50002
-"""types of our extensions: int32 of each splat in a Zstandard frame"""
+"""types of fidsplat's extensions: int32 per splat in a Zstandard frame"""
 _MAGIC = 0x5053474E
 _COLOR = 0.15
 _MIN_SCALE = float(np.exp(-10.0))
 """smallest scale [m] of the format; a third scale of this size marks a disk"""
 _REST = {0: 0, 1: 3, 2: 8, 3: 15, 4: 24}
 _FINEST, _BITS = 20, 23
-"""maximum number of fractional bits, and bits of a coordinate without its sign"""
+"""maximum number of fractional bits; bits per coordinate without the sign"""
 _MAX_UNCHECKED = 2**20
-"""number of splats above which a file must have at least a byte for each"""
+"""number of splats above which the file must have at least one byte per splat"""
 
 
 def load_spz(path: Path) -> SplatCloud:
@@ -58,7 +59,7 @@ def load_spz(path: Path) -> SplatCloud:
     dc = ((parts["colors"] / 255.0 - 0.5) / _COLOR).astype(np.float32)
     rest = (parts["rest"].reshape(n, _REST[degree], 3)[:, : _REST[3]].astype(np.float32) - 128) / 128
     if degree > 3:
-        warnings.warn(f"{path}: SH above degree 3 are left out, got degree {degree}", stacklevel=3)
+        warnings.warn(f"{path}: SH above degree 3 are ignored, got degree {degree}", stacklevel=3)
     sh = np.concatenate([dc[:, None], rest], axis=1)
     opacities = (parts["opacities"][:, 0] / 255.0).astype(np.float32)
     axes, labels, groups = _known(path, extensions, n)
@@ -67,7 +68,7 @@ def load_spz(path: Path) -> SplatCloud:
 
 
 def _widths(version: int, degree: int) -> dict[str, int]:
-    """Bytes of a splat in each array, in the order of the file."""
+    """Bytes per splat of each array, in the order of the file."""
     widths = {"means": 9, "opacities": 1, "colors": 3, "scales": 3, "quats": 3 if version == 2 else 4}
     return widths | {"rest": 3 * _REST[degree]}
 
@@ -86,7 +87,7 @@ def _check_head(path: Path, version: int, degree: int, point: int) -> None:
 
 
 def _gzip(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.ndarray], bytes]:
-    """Version, number of splats, SH degree, fractional bits and arrays (n, bytes) of versions 2 and 3."""
+    """Read versions 2 and 3: version, number of splats, SH degree, fractional bits, arrays (n, bytes)."""
     try:
         head = zlib.decompressobj(31).decompress(data, _HEAD.size)
         magic, version, n, degree, point, _, _ = _HEAD.unpack(head)
@@ -95,22 +96,22 @@ def _gzip(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.nda
             f"{path}: an SPZ file must begin with a gzip header or NGSP, got {data[:4]!r}"
         ) from None
     if magic != _MAGIC:
-        raise InputError(f"{path} is not an SPZ file: its magic number differs")
+        raise InputError(f"cannot read {path} as SPZ: the magic number must be {_MAGIC:#x}, got {magic:#x}")
     _check_head(path, version, degree, point)
     widths = _widths(version, degree)
     size = _HEAD.size + n * sum(widths.values())
     if max(_MAX_UNCHECKED, len(data)) < n and size <= 1040 * len(data):
         raise InputError(f"{path}: {n} splats must have at least as many bytes, got {len(data)}")
-    if size <= 1040 * len(data):  # bytes of the file and of the arrays
+    if size <= 1040 * len(data):  # else it is truncated, and has no data to expand
         _check_memory(path, n, widths)
     try:
-        # not more than the header declares, nor than gzip's maximum ratio of about 1040
+        # limited by the declared size, and by gzip's maximum ratio of about 1040
         stream = zlib.decompressobj(31)
         whole = stream.decompress(data, size + 1) if size <= 1040 * len(data) else b""
     except zlib.error as error:
         raise InputError(f"{path}: the SPZ file is damaged ({error})") from None
     if len(whole) < size or (len(whole) == size and not stream.eof):
-        raise InputError(f"{path}: cut short: its header declares {size} bytes, got {len(whole)}")
+        raise InputError(f"{path}: truncated: its header declares {size} bytes, got {len(whole)}")
     parts, place = {}, _HEAD.size
     for name, width in widths.items():
         parts[name] = np.frombuffer(whole, np.uint8, n * width, place).reshape(n, width)
@@ -123,10 +124,10 @@ def _check_memory(path: Path, n: int, widths: dict[str, int]) -> None:
 
 
 def _frames(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.ndarray], bytes]:
-    """Version, number of splats, SH degree, fractional bits, arrays (n, bytes) and extensions of version
-    4."""
+    """Read version 4: version, number of splats, SH degree, fractional bits, arrays (n, bytes),
+    extensions."""
     if len(data) < _HEAD_4.size:
-        raise InputError(f"{path}: cut short: the header must have {_HEAD_4.size} bytes, got {len(data)}")
+        raise InputError(f"{path}: truncated: the header must have {_HEAD_4.size} bytes, got {len(data)}")
     _, version, n, degree, point, flags, streams, table = _HEAD_4.unpack_from(data)
     _check_head(path, version, degree, point)
     if version != 4:
@@ -138,7 +139,7 @@ def _frames(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.n
         raise InputError(f"{path}: SPZ of degree {degree} must have {len(widths)} arrays, got {streams}")
     place = table + streams * _SIZES.size
     if table < _HEAD_4.size or place > len(data):
-        raise InputError(f"{path}: cut short: its table must end by byte {place}, got {len(data)} bytes")
+        raise InputError(f"{path}: truncated: its table must end by byte {place}, got {len(data)} bytes")
     _check_memory(path, n, _widths(version, degree))
     parts = {
         name: np.zeros((n, width), np.uint8)
@@ -165,15 +166,15 @@ def _frames(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.n
 def _known(
     path: Path, extensions: bytes, n: int
 ) -> tuple[tuple[int, int, int], np.ndarray | None, np.ndarray | None]:
-    """Read the extensions for axes (as signs), labels and coplanar groups; others are skipped."""
+    """Signs of the axes, labels and coplanar groups from extensions; other extensions are ignored."""
     axes, whole, place = _TO_RDF[0], {}, 0
     while place < len(extensions):
         if len(extensions) - place < _RECORD.size:
-            raise InputError(f"{path}: the SPZ file is damaged: an extension is cut short")
+            raise InputError(f"{path}: the SPZ file is damaged: an extension is truncated")
         kind, length = _RECORD.unpack_from(extensions, place)
         place += _RECORD.size
         if length > len(extensions) - place:
-            raise InputError(f"{path}: the SPZ file is damaged: an extension is cut short")
+            raise InputError(f"{path}: the SPZ file is damaged: an extension is truncated")
         value = extensions[place : place + length]
         place += length
         if kind == _AXES:
@@ -193,9 +194,9 @@ def _known(
 
 
 def save_spz(cloud: SplatCloud, path: Path, version: int = 4) -> None:
-    """Write an SPZ file, with as many fractional bits as the extent of the cloud allows, at most 20 (1 um).
+    """Write an SPZ file, with as many fractional bits as the cloud's extent allows, at most 20 (1 um).
 
-    version: 4, or 3 for older readers, which has no labels and coplanar groups.
+    version: 4, or 3 for older readers, without labels and coplanar groups.
 
     Raises InputError for boxes, splats further than 8388 km from the origin, or a file that cannot be
     written.
@@ -253,8 +254,8 @@ def _fixed(data: np.ndarray) -> np.ndarray:
 
 
 def _packed(quats: np.ndarray) -> bytes:
-    """Encode unit quaternions w, x, y, z: index of the largest of x, y, z, w, sign and 9 bits of the
-    others."""
+    """Encode unit quaternions w, x, y, z: index of the largest of x, y, z, w, and sign and 9 bits of each of
+    the others."""
     q = quats[:, [1, 2, 3, 0]].astype(np.float64)
     largest = np.abs(q).argmax(axis=1)
     q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)

@@ -1,7 +1,8 @@
-"""Trajectory files: TUM, KITTI, COLMAP and nerfstudio's transforms.json; cameras of the last two.
+"""Reading and writing of trajectories as TUM, KITTI, COLMAP and nerfstudio's transforms.json, and reading of
+cameras of the last two.
 
-Poses are converted to camera to world with OpenCV's axes; transforms.json has OpenGL's (y up, z backwards),
-COLMAP world to camera. Sources: the TUM RGB-D benchmark's "File Formats", KITTI's odometry
+Poses are converted to camera to world with OpenCV's axes; transforms.json has OpenGL's axes (y up, z
+backwards), COLMAP stores world to camera. Sources: the TUM RGB-D benchmark's "File Formats", KITTI's odometry
 development kit, COLMAP's "Output format", nerfstudio's "Data conventions".
 """
 
@@ -26,27 +27,27 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, path_of, read_input, read_text, write_file
 
 MAX_BYTES = 2**28
-"""maximum bytes of a file; about two million poses in TUM's format"""
+"""maximum size of a file in bytes: about two million poses in TUM's format"""
 RATE = 10.0
-"""poses a second for files without times, the rate of KITTI"""
+"""poses per second for files without times, the rate of KITTI"""
 ROUNDED = 1e-3
-"""tolerance of rotations: files often have six digits"""
+"""tolerance of rotations, since files often have six digits"""
 _SUFFIXES = ".tum and .txt (TUM), .kitti, .json (transforms.json), or a folder (COLMAP)"
 
 
 def load_trajectory(path: str | os.PathLike[str], rate: float = RATE, smooth: bool = False) -> Trajectory:
-    """Read a trajectory file: TUM (8 numbers a line), KITTI (12), transforms.json, or COLMAP's images.txt,
-    images.bin or their folder. Poses are camera to world.
+    """Read a trajectory file: TUM (8 numbers per line), KITTI (12 numbers per line), transforms.json, or
+    COLMAP's images.txt, images.bin or their folder. Poses are camera to world.
 
     Args:
-        path: the format follows from suffix and content.
-        rate: poses a second for files without times: KITTI, COLMAP (sorted by image name), and
+        path: suffix and content determine the format.
+        rate: poses per second for files without times: KITTI, COLMAP (sorted by image name), and
             transforms.json without "time".
-        smooth: whether poses are interpolated smoothly, see `Trajectory.smooth`.
+        smooth: interpolate poses smoothly (`Trajectory.smooth`).
 
     Raises:
-        InputError: an invalid file, with its line: times that do not increase, values that are not finite,
-            quaternions not of length 1 or matrices that are not rotations (within 1e-3).
+        InputError: the file is invalid; the message names the line. Times must increase, values be finite,
+            quaternions have length 1, and matrices be rotations (within 1e-3).
     """
     file = path_of(path)
     check_rate(rate)
@@ -65,7 +66,7 @@ def load_trajectory(path: str | os.PathLike[str], rate: float = RATE, smooth: bo
         else:
             times, poses = _lines(file, text)
     if not len(poses):
-        raise InputError(f"a trajectory must have a pose, got none in {file}")
+        raise InputError(f"a trajectory must have at least one pose, got none in {file}")
     try:
         return Trajectory(np.arange(len(poses)) / rate if times is None else times, np.array(poses), smooth)
     except InputError as error:
@@ -80,17 +81,17 @@ def save_trajectory(
 ) -> None:
     """Write camera-to-world poses: .tum or .txt (TUM), .kitti, .json (transforms.json), or a folder (COLMAP).
 
-    KITTI and COLMAP have no times. Of a smooth trajectory the keyframes are written.
+    KITTI and COLMAP store no times. For a smooth trajectory the keyframes are written.
 
     Args:
         trajectory: k keyframes.
         path: its suffix selects the format.
-        camera: size and focal lengths, required for transforms.json and COLMAP.
-        images: k image names for these two; default frame-000000.png and so on.
+        camera: size and intrinsics, required for transforms.json and COLMAP.
+        images: k image names for these two formats; default: frame-000000.png and so on.
 
     Raises:
-        InputError: an unknown suffix, a missing camera, a camera with a lens, a number of names other than
-            k, a file that cannot be written.
+        InputError: the suffix is unknown, the camera is missing or has a lens that the format lacks, the
+            number of names is not k, or the file cannot be written.
     """
     instance("trajectory", trajectory, Trajectory)
     file = path_of(path)
@@ -120,7 +121,7 @@ def save_trajectory(
 
 
 def check_trajectory_file(path: str | os.PathLike[str], camera: Camera | None) -> None:
-    """Raise InputError for an unknown suffix, and a camera that the format lacks, before work is done."""
+    """Raise InputError for an unknown suffix, or a camera that the format does not support."""
     file = path_of(path)
     suffix = file.suffix.lower()
     if suffix == "" or file.is_dir():
@@ -133,18 +134,18 @@ def check_trajectory_file(path: str | os.PathLike[str], camera: Camera | None) -
 
 
 def _rows(rows: np.ndarray) -> str:
-    # repr of a float is the shortest text that parses to the same number
+    # repr writes the shortest text that reads back as the same float
     return "".join(" ".join(map(repr, row)) + "\n" for row in rows.tolist())
 
 
 def _camera(camera: Camera | None, file: Path) -> Camera:
     if not isinstance(camera, Camera):
-        raise InputError(f"{file} needs a Camera for size and focal lengths, got {camera!r}; give camera=")
+        raise InputError(f"camera must be a Camera for {file}, got {camera!r}; give camera=")
     return camera
 
 
 def lens_table(lens: Lens | None) -> dict[str, Any] | None:
-    """A lens in nerfstudio's transforms.json; None if it has no such model."""
+    """A lens as values of nerfstudio's transforms.json; None for a lens that the format lacks."""
     if lens is None:
         return {"camera_model": "OPENCV"}
     values = {name: value for name, value in vars(lens).items() if name in COEFFICIENTS and value}
@@ -184,7 +185,7 @@ def _of_folder(folder: Path) -> Path:
 
 
 def _lines(file: Path, text: str) -> tuple[list[float] | None, list[np.ndarray]]:
-    """Parse lines of 8 numbers (TUM, with times) or of 12 (KITTI)."""
+    """Parse lines of 8 numbers (TUM, with times) or 12 numbers (KITTI)."""
     times: list[float] = []
     poses: list[np.ndarray] = []
     width = None
@@ -229,7 +230,7 @@ def _pose(where: str, position: Sequence[float], quaternion: Sequence[float]) ->
 
 
 def _rigid(where: str, matrix: np.ndarray) -> np.ndarray:
-    """The rigid matrix nearest to a rounded one."""
+    """The rigid matrix nearest to a rounded matrix."""
     u, sizes, v = np.linalg.svd(matrix[:3, :3])
     if np.abs(sizes - 1).max() > ROUNDED or np.linalg.det(u @ v) < 0:
         scales = ", ".join(f"{size:.7g}" for size in sizes)
@@ -277,11 +278,11 @@ _TRANSFORMS = ("transforms.json", "transforms_train.json")
 
 
 def load_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
-    """Cameras by the names of their images, from a COLMAP model (its folder, or one that contains
-    `sparse/0`) or nerfstudio's transforms.json (the file or its folder).
+    """Cameras by image name, from a COLMAP model (its folder, or a folder that contains `sparse/0`) or
+    nerfstudio's transforms.json (the file or its folder).
 
     Raises:
-        InputError: neither of them, a damaged file, or an unsupported lens.
+        InputError: the path is neither, a file is damaged, or a lens is not supported.
     """
     file = path_of(path)
     for place in (file / name for name in _MODELS):

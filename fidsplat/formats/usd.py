@@ -1,11 +1,11 @@
-"""OpenUSD splats: ParticleField with the Gaussian surflet kernel for 2D splats, ParticleField3DGaussianSplat
-for 3D Gaussians (extra `usd`). Schemas: openusd.org, usdVol.
+"""Reading and writing of OpenUSD splats (extra `usd`): ParticleField with the Gaussian surflet kernel for 2D
+splats, ParticleField3DGaussianSplat for 3D Gaussians. Schemas: openusd.org, usdVol.
 
-The stages have y up: splats are written unchanged below a rotation by 180 degrees about x. Labels and
-coplanar groups are in the attributes fidsplat:labels and fidsplat:planes.
+Written stages have y up: splats are unchanged below a rotation by 180 degrees about x. Labels and coplanar
+groups are the attributes fidsplat:labels and fidsplat:planes.
 
-Damaged files make usd-core crash, hang or use gigabytes: a child process with limits of memory and processor
-time reads them.
+Damaged files make usd-core crash, hang or allocate gigabytes. Therefore a child process with limits of memory
+and processor time reads the file.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from fidsplat.util.limits import VARIABLE, input_limit
 _SURFLET = "ParticleFieldKernelGaussianSurfletAPI"
 _KINDS = ("ParticleField", "ParticleField3DGaussianSplat")
 _SECONDS = 30
-"""seconds of processor time for a file, and one more for each MiB"""
+"""limit of processor time in seconds; one second more for each MiB of the file"""
 _REFUSED = 3
-"""exit status of the child process after it has printed an InputError"""
+"""exit status of the child process after it printed the message of an InputError"""
 _CHILD = (
     "import sys; sys.path[:] = sys.argv[4:]; from fidsplat.formats.usd import _child; _child(*sys.argv[1:4])"
 )
@@ -48,8 +48,8 @@ def load_usd(path: Path) -> SplatCloud:
     """Read all Gaussian particle fields of a .usda, .usdc or .usd file as one cloud.
 
     Raises:
-        InputError: a damaged file, no such field, or one with an unknown kernel; reading crashes or
-            exceeds `input_limit`; the extra is missing.
+        InputError: the file is damaged, has no Gaussian particle field, or has an unknown kernel; reading
+            crashed or exceeded `input_limit`; or the extra is missing.
     """
     with open_input(path) as stream:
         status = os.fstat(stream.fileno())
@@ -80,7 +80,7 @@ def load_usd(path: Path) -> SplatCloud:
 def _child(limit: str, source: str, target: str) -> None:
     """Convert a USD file to an .npz file of arrays; runs in a child process.
 
-    limit: bytes of memory, in addition to that of the libraries.
+    limit: bytes of memory in addition to the memory of the libraries.
     """
     os.environ["PXR_WORK_THREAD_LIMIT"] = "1"  # stacks of threads count towards the limit
     try:
@@ -91,14 +91,14 @@ def _child(limit: str, source: str, target: str) -> None:
     except MemoryError:
         raise
     except Exception as error:  # errors of USD, which reads arrays lazily
-        text = str(error) if isinstance(error, InputError) else "it is not a USD file that can be read"
+        text = str(error) if isinstance(error, InputError) else "not a USD file that usd-core can read"
         sys.stdout.buffer.write(text.encode("ascii", "backslashreplace"))
         sys.stdout.flush()
         os._exit(_REFUSED)  # skip USD's finalizers, which can crash on a damaged stage
 
 
 def _set_limits(limit: int, seconds: int) -> None:
-    """Limit memory (in addition to the present size) and processor time of this process, where supported."""
+    """Limit memory (in addition to its current size) and processor time of this process, where supported."""
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -111,7 +111,7 @@ def _set_limits(limit: int, seconds: int) -> None:
 
 
 def _check_layers(pxr: Any, source: str) -> None:
-    """Check that all files referenced by layers are regular files, before USD opens them."""
+    """Check that all files that layers reference are regular files, before USD opens them."""
     todo, known = [source], {source}
     while todo:
         layer = pxr.Sdf.Layer.FindOrOpen(todo.pop())
@@ -123,11 +123,11 @@ def _check_layers(pxr: Any, source: str) -> None:
 
 
 def _read(pxr: Any, name: str) -> dict[str, Any]:
-    """Arrays of each field of Gaussians; names end with the index of the field."""
+    """Arrays of each field of Gaussians; the names end with the index of the field."""
     stage = pxr.Usd.Stage.Open(name, pxr.Usd.Stage.LoadAll)
     prims = [prim for prim in stage.Traverse() if prim.GetTypeName() in _KINDS]
     if not prims:
-        raise InputError("it must have a ParticleField, got none")
+        raise InputError("the stage must have a ParticleField, got none")
     up = HALF_TURN if pxr.UsdGeom.GetStageUpAxis(stage) == "Y" else np.eye(4)
     metres = pxr.UsdGeom.GetStageMetersPerUnit(stage) if stage.HasAuthoredMetadata("metersPerUnit") else 1.0
     found = {}
@@ -187,17 +187,17 @@ def save_usd(cloud: SplatCloud, path: Path) -> None:
         except pxr.Tf.ErrorException:
             done = False
         if not done:
-            raise InputError(f"cannot write {path}: USD gives no reason; is the disk full?")
+            raise InputError(f"cannot write {path} with usd-core; check that the disk has free space")
 
 
 def _field(prim: Any) -> dict[str, np.ndarray]:
     """Arguments of `cloud_of` from a particle field."""
     surflet = _SURFLET in prim.GetAppliedSchemas()
     if prim.GetTypeName() == _KINDS[0] and not surflet:
-        raise InputError(f"the kernel of {prim.GetPath()} must be the Gaussian surflet, got another")
+        raise InputError(f"the kernel of {prim.GetPath()} must be the Gaussian surflet, got another kernel")
 
     def array(name: str, *columns: int) -> np.ndarray:
-        found = prim.GetAttribute(name).Get() or prim.GetAttribute(f"{name}h").Get()  # half precision
+        found = prim.GetAttribute(name).Get() or prim.GetAttribute(f"{name}h").Get()  # h: half precision
         if found is None:
             raise InputError(f"{prim.GetPath()} must have {name}, got none")
         values = np.array(found, np.float32)
@@ -216,7 +216,7 @@ def _field(prim: Any) -> dict[str, np.ndarray]:
     if len(sh) != n * k:
         raise InputError(f"{prim.GetPath()} must have {n * k} SH coefficients, got {len(sh)}")
     found = {"means": means, "scales": scales, "sh": sh.reshape(n, k, 3), "opacities": array("opacities")}
-    found["quats"] = array("orientations", 4)[:, [3, 0, 1, 2]]  # USD has the real part last
+    found["quats"] = array("orientations", 4)[:, [3, 0, 1, 2]]  # USD stores w last
     for name, attribute in (("labels", "labels"), ("coplanar_groups", "planes")):
         if (numbers := prim.GetAttribute(f"fidsplat:{attribute}").Get()) is not None:
             found[name] = np.array(numbers, np.int32)
@@ -233,5 +233,5 @@ def _pxr() -> Any:
         import pxr.UsdVol  # type: ignore[import-not-found]
         import pxr.Vt  # type: ignore[import-not-found]
     except ImportError:
-        raise InputError("USD files need usd-core 26.3 or newer; pip install 'fidsplat[usd]'") from None
+        raise InputError("usd-core 26.3 or newer must be installed; pip install 'fidsplat[usd]'") from None
     return pxr

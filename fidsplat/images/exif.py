@@ -1,4 +1,4 @@
-"""Orientation and focal length of photographs by their EXIF data (CIPA DC-008, "Exif 2.3")."""
+"""Orientation and focal length of photographs from EXIF data (CIPA DC-008, "Exif 2.3")."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ ORIENTATION, EXIF_TABLE, FOCAL_LENGTH, FOCAL_LENGTH_35 = 0x0112, 0x8769, 0x920A,
 
 
 class Exif(NamedTuple):
-    """The EXIF segment of a JPEG file."""
+    """EXIF segment of a JPEG file."""
 
     segment: bytes
-    """APP1 segment with its marker, empty if there is none"""
+    """APP1 segment with its marker; empty if the file has none"""
     orientation: int
-    """1 to 8; 1: rows and columns as shown"""
+    """EXIF orientation, 1 to 8; 1: pixels are stored upright"""
     focal_length: tuple[float, ...]
-    """focal length in millimetres, and as for 35 mm film, where given"""
+    """focal length in millimetres and its 35 mm equivalent, if the file has them"""
 
     @property
     def upright(self) -> bytes:
-        """The segment with orientation 1, for pixels that are rotated already."""
+        """The segment with orientation 1, for pixels that were rotated upright."""
         at = _entries(self.segment[10:], _first(self.segment[10:])).get(ORIENTATION) if self.segment else None
         if at is None:
             return self.segment
@@ -30,7 +30,7 @@ class Exif(NamedTuple):
 
 
 def read_exif(data: bytes) -> Exif:
-    """Read the EXIF segment of a JPEG file; without one, or if it is damaged, an empty one."""
+    """Read the EXIF segment of a JPEG file; an empty result if there is none or it is damaged."""
     segment = _segment(data)
     tiff = segment[10:]
     try:
@@ -45,7 +45,7 @@ def read_exif(data: bytes) -> Exif:
 
 
 def with_exif(jpeg: bytes, exif: Exif) -> bytes:
-    """A JPEG file with an EXIF segment for upright pixels."""
+    """A JPEG file with an EXIF segment added, for upright pixels."""
     return jpeg[:2] + exif.upright + jpeg[2:]
 
 
@@ -68,7 +68,7 @@ def _first(tiff: bytes) -> int:
 
 
 def _entries(tiff: bytes, at: int) -> dict[int, int]:
-    """Offsets of the entries of a table, by tag."""
+    """Offset of each entry of a table, by tag."""
     order = _order(tiff)
     (count,) = struct.unpack_from(order + "H", tiff, at)
     places = [at + 2 + 12 * i for i in range(count)]
@@ -76,12 +76,12 @@ def _entries(tiff: bytes, at: int) -> dict[int, int]:
 
 
 def _value(tiff: bytes, at: int | None) -> float:
-    """The first number of an entry, 0 without one."""
+    """First number of an entry; 0 for a missing entry."""
     if at is None:
         return 0
     order = _order(tiff)
     kind, _ = struct.unpack_from(order + "HI", tiff, at + 2)
-    if kind == 5:  # a fraction, elsewhere
+    if kind == 5:  # a fraction, stored at an offset
         (place,) = struct.unpack_from(order + "I", tiff, at + 8)
         above, below = struct.unpack_from(order + "II", tiff, place)
         return above / below

@@ -23,18 +23,18 @@ _CONTAINERS = (
     (0, b"\x1aE\xdf\xa3"),
     (8, b"AVI "),
 )
-"""(offset, bytes) that MP4 and QuickTime, Matroska and WebM, and AVI files begin with"""
+"""(offset, first bytes) of MP4 and QuickTime, Matroska and WebM, and AVI files"""
 
 _PIXEL = 8
-"""bytes of memory for each pixel while an image is decoded"""
+"""bytes of memory per pixel while an image is decoded"""
 MAX_BITS = 2**26
 """maximum number of values of a marker image: four channels of 4096 x 4096 modules"""
 
 
 def read_image(path: str | os.PathLike[str], deep: bool = False) -> np.ndarray:
-    """Read an image as (h, w, 3) RGB. Grey is repeated, alpha is dropped.
+    """Read an image as (h, w, 3) RGB; grey is converted, alpha is dropped.
 
-    deep: False returns uint8, 16 bits cut to 8; True returns uint8, uint16 or float32, as in the file.
+    deep: False returns uint8, truncating 16 bits; True returns uint8, uint16 or float32 as stored.
 
     Raises InputError when the file is missing, is not an image that OpenCV reads, or has other pixels.
     """
@@ -47,9 +47,9 @@ def read_image(path: str | os.PathLike[str], deep: bool = False) -> np.ndarray:
 
 
 def read_rgba(path: str | os.PathLike[str]) -> np.ndarray:
-    """Read an image as (h, w, 4) uint8 RGBA, opaque where the file has no alpha.
+    """Read an image as (h, w, 4) uint8 RGBA, opaque if the file has no alpha.
 
-    The EXIF orientation is ignored; 16 bits are cut to 8.
+    The EXIF orientation is ignored; 16 bits are truncated to 8.
     Raises InputError when the file is missing, or is not an image of 8 or 16 bits.
     """
     image = _read(path, cv2.IMREAD_UNCHANGED)
@@ -72,7 +72,7 @@ def read_on_background(path: str | os.PathLike[str], background: Sequence[float]
 
 
 def is_video(path: str | os.PathLike[str]) -> bool:
-    """Whether a path is a video file, by its suffix."""
+    """Whether a path is an existing file with the suffix of a video."""
     file = path_of(path)
     return file.suffix.lower() in VIDEO_SUFFIXES and file.is_file()
 
@@ -80,7 +80,7 @@ def is_video(path: str | os.PathLike[str]) -> bool:
 def read_images(path: str | os.PathLike[str]) -> Iterator[tuple[str, np.ndarray]]:
     """Names and images (h, w, 3) uint8 RGB of a file, of a folder's files sorted by name, or of a video.
 
-    Raises InputError if there is no image or one cannot be read.
+    Raises InputError if there is no image, or one cannot be read.
     """
     file = path_of(path)
     if file.is_dir():
@@ -101,8 +101,8 @@ def _frames(file: Path) -> Iterator[tuple[str, np.ndarray]]:
     """Names and frames of a video."""
     head = read_input(file, first=12)
     video = cv2.VideoCapture()
-    # FFmpeg selects the demuxer by content, and playlists and scripts open other files and addresses
-    # whatever their suffix is: only known containers are opened
+    # FFmpeg selects the demuxer by content, whatever the suffix, and playlists and scripts open other files
+    # and addresses; therefore only files of known containers are opened
     if any(word == head[at : at + len(word)] for at, word in _CONTAINERS):
         with _silent_opencv(), utf8_path(file.absolute()) as name:
             video.open(str(name), cv2.CAP_FFMPEG)
@@ -116,15 +116,14 @@ def _frames(file: Path) -> Iterator[tuple[str, np.ndarray]]:
         number += 1
     if not number:
         raise InputError(
-            f"{file} is not a video that OpenCV can read; convert it to MP4 (H.264) or to image files"
+            f"cannot read {file} as a video with OpenCV; convert it to MP4 (H.264) or to image files"
         )
 
 
 def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
     """Read an image with at most two grey levels as (h, w) uint8, 1 = dark.
 
-    Of two levels the lower one is dark; a single level is dark if it is below half. Transparent pixels are
-    white.
+    The lower of two levels is dark; a single level is dark if it is below half. Transparent pixels are white.
 
     Raises InputError when the file cannot be read or has colours or more grey levels.
     """
@@ -157,20 +156,20 @@ def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def pixels_of(image: np.ndarray) -> np.ndarray:
-    """Convert an image to an array. Raises InputError for anything but real numbers."""
+    """Convert an image to an array. Raises InputError for values other than real numbers."""
     return array_of("an image", image, "rows of real numbers")
 
 
 _BLOCK = 1 << 14
-"""number of values of a block: few enough to stay in a core's cache between the steps"""
+"""values per block: few enough that they stay in a core's cache between the operations"""
 _TASK = 16 * _BLOCK
-"""number of values of a thread's task"""
+"""values per task of a thread"""
 _MIN_TASKS, _THREADS = 8, 4
 """minimum number of tasks for which threads are faster (900 x 800 pixels); maximum number of threads"""
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
-    """Convert floats in [0, 1] to uint8, clamped and rounded; bool becomes 0 and 255, uint8 stays."""
+    """Convert floats in [0, 1] to uint8, clamped and rounded; bool becomes 0 or 255, uint8 is unchanged."""
     image = pixels_of(image)
     if image.dtype == np.uint8:
         return image
@@ -205,7 +204,7 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
         path: the file; its folder must exist.
         image: (h, w) or (h, w, 3) RGB; float in [0, 1] (clamped and rounded), uint8, or uint16 (16-bit PNG).
 
-    Raises InputError when the folder cannot be written, and for another shape.
+    Raises InputError if the folder is not writable, or for another shape.
     """
     data = encode_png(image)
     write_file(path, data)
@@ -213,14 +212,14 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Encode an image as a PNG file's content. `write_png` defines the accepted shapes and the errors."""
+    """Content of a PNG file of an image; shapes and errors as for `write_png`."""
     array = pixels_of(image)
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or array.size == 0:
         raise InputError(f"the image of a PNG must be (h, w) or (h, w, 3), got {array.shape}")
     pixels = array if array.dtype == np.uint16 else to_uint8(array)
     if pixels.ndim == 3:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    # OpenCV 5's default level makes files of flat colours four times as large
+    # the default level of OpenCV 5 makes images of few colours four times as large
     done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not done:
         raise ValueError(f"OpenCV could not encode an image of shape {array.shape} as PNG")
@@ -237,7 +236,8 @@ def encode_image(image: np.ndarray, kind: str, quality: int = 95) -> bytes:
 
 
 def declared_pixels(data: bytes) -> int:
-    """Pixels of a PNG, WebP (RFC 9649), JPEG, BMP or TIFF image by its header; 0 for another file."""
+    """Number of pixels that the header of a PNG, WebP (RFC 9649), JPEG, BMP or TIFF image declares; 0 for
+    another file."""
     head = data[:32]
     body = head[20:30]
     if head[:8] == b"\x89PNG\r\n\x1a\n":
@@ -246,10 +246,10 @@ def declared_pixels(data: bytes) -> int:
         width, height = (int.from_bytes(head[at : at + 4], "little", signed=True) for at in (18, 22))
         return abs(width * height)
     if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
-        if head[12:16] == b"VP8L":  # 14 bits each, less 1, after a byte
+        if head[12:16] == b"VP8L":  # width - 1 and height - 1 in 14 bits each
             bits = int.from_bytes(body[1:5], "little")
             return ((bits & 0x3FFF) + 1) * ((bits >> 14 & 0x3FFF) + 1)
-        if head[12:16] == b"VP8X":  # 24 bits each, less 1, after 4 bytes
+        if head[12:16] == b"VP8X":  # width - 1 and height - 1 in 24 bits each
             return (int.from_bytes(body[4:7], "little") + 1) * (int.from_bytes(body[7:10], "little") + 1)
         width, height = (int.from_bytes(body[k : k + 2], "little") & 0x3FFF for k in (6, 8))
         return width * height
@@ -281,8 +281,8 @@ def _tiff_pixels(data: bytes) -> int:
 
 
 def _check_size(data: bytes, name: str | os.PathLike[str]) -> None:
-    """Raise InputError for an image that declares more pixels than `input_limit` allows, or for a PNG with a
-    chunk longer than the file, for which libpng would allocate memory."""
+    """Raise InputError for an image that declares more pixels than `input_limit` allows, or for a PNG that
+    declares a chunk longer than the file, for which libpng would allocate memory."""
     at, png = 8, data[:8] == b"\x89PNG\r\n\x1a\n"
     while png and at + 8 <= len(data) and data[at + 4 : at + 8] != b"IEND":
         length = int.from_bytes(data[at : at + 4], "big")
@@ -314,11 +314,10 @@ def encode_webp(image: np.ndarray) -> bytes:
 
 
 def decode_rgba(data: bytes, name: str) -> np.ndarray:
-    """Decode an image file's content to (h, w, 4) uint8 RGBA, alpha 255 where it has none. name: for
-    errors."""
+    """Decode an image file's content to (h, w, 4) uint8 RGBA, alpha 255 if it has none. name: for errors."""
     image = _decode(data, name, cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype != np.uint8:
-        raise InputError(f"{name} cannot be read as an image of 8 bits")
+        raise InputError(f"{name} must be an image with 8 bits per channel, got other data")
     return _to_rgba(image, name)
 
 
@@ -348,7 +347,8 @@ def _decode(data: bytes, name: str | os.PathLike[str], flags: int) -> np.ndarray
 
 @contextlib.contextmanager
 def _silent_opencv() -> Iterator[None]:
-    """Discard messages of OpenCV, libpng and FFmpeg on stderr about a damaged file; our error reports it."""
+    """Discard messages of OpenCV, libpng and FFmpeg on stderr about a damaged file, which our error
+    reports."""
     if hasattr(cv2, "setLogLevel"):  # OpenCV 4
         read, write = cv2.getLogLevel, cv2.setLogLevel  # type: ignore[attr-defined]
     else:

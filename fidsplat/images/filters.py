@@ -1,4 +1,4 @@
-"""Filters of images: grey levels, and defocus."""
+"""Image filters: grey levels and defocus."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ def grey_of(image: np.ndarray) -> np.ndarray:
 
 
 def defocused(image: np.ndarray, radius: float) -> np.ndarray:
-    """An image blurred by a disk with a radius in pixels, which averages display values."""
+    """An image blurred by a disk with a radius in pixels, in display values."""
     if radius <= 0:
         return image
     half = math.ceil(radius)
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
-    # a pixel at the edge of the disk counts by the share of its width inside
+    # weights at the edge of the disk are the covered share of a pixel's width
     disk = np.clip(radius + 0.5 - np.hypot(x, y), 0, 1)
     return cv2.filter2D(image, -1, disk / disk.sum(), borderType=cv2.BORDER_REPLICATE)

@@ -1,4 +1,4 @@
-"""Disparity of a rectified pair of images: semi-global matching, refined by least squares.
+"""Disparity of a rectified image pair: semi-global matching with a least-squares refinement.
 
 OpenCV's StereoSGBM (Hirschmueller 2008) finds the matches. Its interpolation between whole disparities is
 biased by up to a quarter of a pixel, so each match is refined by the least squares of its block (Lucas and
@@ -17,14 +17,14 @@ STEPS = 4
 """steps of the refinement"""
 
 SMOOTH = 0.8
-"""pixels: standard deviation of the filter of images before the refinement"""
+"""standard deviation in pixels of the Gaussian filter before the refinement"""
 
 
 def disparity_of(left: np.ndarray, right: np.ndarray, most: int) -> np.ndarray:
-    """Disparities (h, w) float32 [px] of a rectified pair of grey images, (h, w) uint8; 0: no match.
+    """Disparities (h, w) float32 [px] of a rectified pair of grey images (h, w) uint8; 0: no match.
 
-    most: largest disparity in pixels, a multiple of 16. Matches must be unique, agree from left to right and
-    back, and be part of a smooth region.
+    most: largest disparity in pixels, a multiple of 16. Matches must be unique, consistent between left and
+    right, and belong to a smooth region.
     """
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
@@ -38,21 +38,21 @@ def disparity_of(left: np.ndarray, right: np.ndarray, most: int) -> np.ndarray:
         speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_HH,
     )
-    # columns on the left, so that near surfaces at the left edge of the image are searched too
+    # padding on the left, so that near surfaces at the left edge are matched too
     padded = [cv2.copyMakeBorder(image, 0, 0, most, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
     found = matcher.compute(*padded)[:, most:].astype(np.float32) / 16
     return _refined(left.astype(np.float32), right.astype(np.float32), np.maximum(found, 0))
 
 
 def _refined(left: np.ndarray, right: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Disparities that minimise the squared differences of each block."""
+    """Refine disparities by minimising the squared differences of each block."""
     left, right = (cv2.GaussianBlur(image, (0, 0), SMOOTH) for image in (left, right))
     valid, better = found > 0, found
     columns = np.arange(left.shape[1], dtype=np.float32)
     for _ in range(STEPS):
         warped, gradient = _shifted_rows(right, columns - better)
         gradient = gradient * valid
-        # one disparity for the block, of images that are linear about the disparity of each of its pixels
+        # one disparity per block, with images linearised at the disparity of each pixel
         below = cv2.boxFilter(gradient**2, -1, (BLOCK, BLOCK))
         above = cv2.boxFilter(gradient**2 * better - gradient * (left - warped), -1, (BLOCK, BLOCK))
         new = above / np.maximum(below, 1e-6)

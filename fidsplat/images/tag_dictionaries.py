@@ -12,7 +12,7 @@ from fidsplat.util.errors import InputError, did_you_mean
 
 
 class Family(NamedTuple):
-    """A tag family: modules along one edge of the code (all data and border), and the number of its ids."""
+    """Tag family: modules along an edge of the tag (data and border), and number of ids."""
 
     size: int
     count: int
@@ -30,17 +30,17 @@ BORDER = 1
 
 
 def families(kind: str | None = None) -> dict[str, Family]:
-    """All known families by name, such as {"36h11": Family(size=8, count=587), ...}. kind: "apriltag",
-    "aruco", or None for both."""
+    """Families by name, such as {"36h11": Family(size=8, count=587), ...}. kind: "apriltag", "aruco", or None
+    for both."""
     if kind is not None and kind not in _KINDS:
-        raise InputError(f"unknown kind of tag {kind!r}; known: {', '.join(_KINDS)}")
+        raise InputError(f"kind of tag must be one of {', '.join(_KINDS)}, got {kind!r}")
     kinds = _KINDS if kind is None else (kind,)
     return {name: _family(k, name) for k in kinds for name in _KINDS[k]}
 
 
 def parse_family(text: str) -> tuple[str, str]:
-    """Split "apriltag:36h11", or just "36h11", "tag36h11" or "DICT_APRILTAG_36h11", into (kind, family).
-    Raises InputError with a list of the families for an unknown name."""
+    """Split "apriltag:36h11", or "36h11", "tag36h11" or "DICT_APRILTAG_36h11", into (kind, family).
+    Raises InputError for an unknown name; the message lists the families."""
     kind, colon, name = str(text).lower().rpartition(":")
     foreign = foreign_family(name)
     if foreign is not None and kind in ("", foreign[0]):
@@ -55,7 +55,7 @@ def parse_family(text: str) -> tuple[str, str]:
 
 
 def dictionary_bits(kind: str, family: str, tag_id: int) -> np.ndarray:
-    """The modules of one tag, (size, size) uint8, 1 = dark, with its one-module black border. Row 0 is the
+    """Modules of a tag, (size, size) uint8, 1 = dark, including the black border of one module. Row 0 is the
     top of the image of ``cv2.aruco.generateImageMarker``. Missing modules of round and recursive tags are
     255."""
     kind, family = parse_family(f"{kind}:{family}")
@@ -70,8 +70,7 @@ def dictionary_bits(kind: str, family: str, tag_id: int) -> np.ndarray:
 
 @cache
 def predefined(kind: str, family: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a known family. Raises InputError for a family of AprilTag 3, which OpenCV
-    lacks."""
+    """OpenCV's dictionary of a family. Raises InputError for families of AprilTag 3, which OpenCV lacks."""
     if family in apriltag3.LAYOUTS:
         raise InputError(f"the family must be one of OpenCV's dictionaries, got {kind}:{family}; e.g. 36h11")
     prefix = "DICT_APRILTAG_" if kind == "apriltag" else "DICT_ARUCO_" if "x" not in family else "DICT_"

@@ -14,7 +14,7 @@ from fidsplat.util.files import atomic_path, ordinary_file, writable_folder
 
 
 def check_video(path: str | os.PathLike[str]) -> Path:
-    """Check that a video can be written to a path: its suffix, its folder and the package imageio-ffmpeg."""
+    """Validate the path of an output video: suffix, folder and the package imageio-ffmpeg."""
     file = ordinary_file(path)
     if file.suffix.lower() != ".mp4":
         raise InputError(
@@ -24,18 +24,18 @@ def check_video(path: str | os.PathLike[str]) -> Path:
     try:
         import imageio_ffmpeg  # type: ignore[import-not-found]  # noqa: F401
     except ImportError:
-        raise InputError("videos need imageio-ffmpeg; pip install 'fidsplat[video]'") from None
+        raise InputError("imageio-ffmpeg must be installed; pip install 'fidsplat[video]'") from None
     return file
 
 
 def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], rate: float) -> Iterator[int]:
-    """Write frames (h, w, 3) uint8 RGB of one size; yield the number of each once it is written.
+    """Write frames (h, w, 3) uint8 RGB of one size; yields the index of each written frame.
 
     The file is written atomically. H.264 requires even sizes: the last row or column of an odd size is
-    repeated.
+    duplicated.
 
     Raises:
-        InputError: as `check_video`; there is no frame; ffmpeg cannot write, for example on a full disk.
+        InputError: as `check_video`, or there is no frame, or ffmpeg cannot write, e.g. on a full disk.
     """
     file = check_video(path)
     import imageio_ffmpeg  # type: ignore[import-not-found]
@@ -59,16 +59,16 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], rate
         if not count:
             raise InputError(f"a video must have at least one frame, got none for {file}")
         if not _is_complete(part, (count - 1) / rate):
-            raise InputError(f"cannot write {file}: ffmpeg stopped before its end; is the disk full?")
+            raise InputError(f"cannot write {file}: ffmpeg stopped early; check that the disk has free space")
 
 
 def _is_complete(file: Path, seconds: float) -> bool:
-    """Whether a video can be read and lasts this long: ffmpeg reports no failure at the end of a file."""
+    """Whether a video is readable and long enough, since ffmpeg reports no error at the end of a file."""
     import imageio_ffmpeg  # type: ignore[import-not-found]
 
     reader: Any = imageio_ffmpeg.read_frames(str(file))
     try:
-        return next(reader)["duration"] > seconds - 0.02  # reported in hundredths of a second
+        return next(reader)["duration"] > seconds - 0.02  # the duration is rounded to 0.01 s
     except (OSError, RuntimeError, IndexError, StopIteration):
         return False
     finally:

@@ -14,7 +14,7 @@ KEY_WIDTH = 132  # pixels of the colour key next to the images of a sheet
 
 
 def depth_span(depths: Iterable[np.ndarray]) -> tuple[float, float]:
-    """Range [m] of the colours of depth images (h, w): percentiles 1 and 99; (0, 0) if nothing is visible."""
+    """Range [m] of the colours of depth images (h, w): percentiles 1 and 99; (0, 0) without valid depths."""
     valid = [depth[np.isfinite(depth) & (depth > 0)] for depth in depths]
     every = np.concatenate(valid) if valid else np.zeros(0)
     if not every.size:
@@ -24,9 +24,9 @@ def depth_span(depths: Iterable[np.ndarray]) -> tuple[float, float]:
 
 
 def colour_depth(depth: np.ndarray, span: tuple[float, float] | None = None) -> np.ndarray:
-    """Colour a depth image (h, w) by the turbo map, near red and far blue; black where it is 0 or not finite.
+    """Colour a depth image (h, w) with the turbo map, near red and far blue; black for 0 and not finite.
 
-    span: metres of the first and the last colour (default: `depth_span` of this image).
+    span: depths in metres of the first and the last colour; default: `depth_span` of this image.
     """
     valid = np.isfinite(depth) & (depth > 0)
     low, high = depth_span([depth]) if span is None else span
@@ -35,7 +35,7 @@ def colour_depth(depth: np.ndarray, span: tuple[float, float] | None = None) -> 
 
 
 def depth_key(span: tuple[float, float], height: int) -> np.ndarray:
-    """The colour bar of `colour_depth`, (height, KEY_WIDTH, 3), with its range in metres."""
+    """Colour bar of `colour_depth` with its range in metres, (height, KEY_WIDTH, 3)."""
     low, high = span
     digits = max(0, 2 - math.floor(math.log10(max(high, 1e-9))))
     words = [f"{low + share * (high - low):.{min(digits, 6)}f} m" for share in _TICKS]
@@ -43,20 +43,20 @@ def depth_key(span: tuple[float, float], height: int) -> np.ndarray:
 
 
 def depth_millimetres(depth: np.ndarray) -> np.ndarray:
-    """Depth (h, w) in metres as uint16 millimetres, the format of depth cameras; 0: no surface, at most
+    """Convert depth (h, w) in metres to uint16 millimetres, as depth cameras do; 0: no surface, at most
     65535."""
     clean = np.nan_to_num(depth, nan=0.0, posinf=np.inf, neginf=0.0)
     return np.rint(np.clip(clean * 1000.0, 0, 65535)).astype(np.uint16)
 
 
 def colour_normals(normal: np.ndarray) -> np.ndarray:
-    """Colour unit normals (h, w, 3) as (n + 1) / 2; black where there is none."""
+    """Colour unit normals (h, w, 3) as (n + 1) / 2; black for normals of length 0."""
     valid = (normal != 0).any(axis=2, keepdims=True)
     return np.rint(np.where(valid, np.clip((normal + 1) / 2, 0, 1), 0) * 255).astype(np.uint8)
 
 
 def normal_key(height: int) -> np.ndarray:
-    """The colour key of `colour_normals`: a sphere in the colours of its normals, (height, KEY_WIDTH, 3)."""
+    """Colour key of `colour_normals`, (height, KEY_WIDTH, 3): a sphere in the colours of its normals."""
     key = np.full((height, KEY_WIDTH, 3), _SHEET, np.uint8)
     radius, middle = 34, (KEY_WIDTH // 2, height // 2)
     y, x = (np.mgrid[-radius : radius + 1, -radius : radius + 1]) / radius
@@ -78,7 +78,7 @@ def normal_key(height: int) -> np.ndarray:
 
 
 def colour_labels(label: np.ndarray) -> np.ndarray:
-    """Colour labels or ids (h, w): black for -1, grey for 0, a distinct colour for each other one."""
+    """Colour labels or ids (h, w): black for -1, grey for 0, a distinct colour for each other label."""
     values, which = np.unique(label, return_inverse=True)
     colours = _colours(values)
     colours[values < 0], colours[values == 0] = 0, _BACKGROUND
@@ -86,12 +86,12 @@ def colour_labels(label: np.ndarray) -> np.ndarray:
 
 
 def colour_counts(count: np.ndarray) -> np.ndarray:
-    """Colour counts or errors (h, w) by the turbo map, from 0 (dark blue) to the maximum (red)."""
+    """Colour counts or errors (h, w) with the turbo map, from 0 (dark blue) to the maximum (red)."""
     return _turbo(count / (count.max(initial=0) or 1))
 
 
 def count_key(maximum: int, height: int) -> np.ndarray:
-    """The colour bar of `colour_counts` up to a maximum count, (height, KEY_WIDTH, 3)."""
+    """Colour bar of `colour_counts` up to a maximum count, (height, KEY_WIDTH, 3)."""
     return _colour_bar(height, lambda share: share, [f"{round(s * maximum)}" for s in _TICKS])
 
 
@@ -101,9 +101,9 @@ def draw_outlines(
     """Copy an image (h, w, 3) uint8 and draw quadrilaterals with captions in dark boxes below them.
 
     Args:
-        marks: (corners (4, 2), caption) each; the first corner gets a dot.
-        thickness: of the lines, pixels.
-        size: of the captions, in units of OpenCV's built-in font.
+        marks: (corners (4, 2), caption) each; a dot marks the first corner.
+        thickness: width of the lines in pixels.
+        size: size of the captions, in units of OpenCV's built-in font.
     """
     marked = np.ascontiguousarray(image).copy()
     for corners, _ in marks:
@@ -132,13 +132,11 @@ def draw_outlines(
 def write(
     image: np.ndarray, text: str, place: tuple[int, int], colour=(255, 255, 255), size: float = 0.5
 ) -> None:
-    """Write a line of text with a dark outline into an image, its lower left corner at `place` (x, y)."""
-    plain = text.encode(
-        "ascii", "replace"
-    ).decode()  # the built-in fonts of all OpenCV versions have only ASCII
+    """Write a line of text with a dark outline into an image; `place` (x, y) is its lower left corner."""
+    plain = text.encode("ascii", "replace").decode()  # OpenCV's fonts have only ASCII
     x, y = place
     width = max(1, round(2 * size))
-    # the dark outline is the same text shifted: a thicker stroke would widen the text in OpenCV 5
+    # the outline is the text shifted in four directions, since OpenCV 5 widens text of a thicker stroke
     for right, down in ((-1, 0), (1, 0), (0, -1), (0, 1), (0, 0)):
         shade = colour if (right, down) == (0, 0) else (0, 0, 0)
         at = (x + right, y + down)
@@ -157,13 +155,13 @@ def contact_sheet(
     gap: int = 6,
     key: Callable[[int, int], np.ndarray | None] | None = None,
 ) -> np.ndarray:
-    """Titled images in rows on one dark sheet, (h, w, 3) uint8.
+    """Contact sheet: titled images in rows on a dark background, (h, w, 3) uint8.
 
     Args:
         rows: each a list of (title, image (h, w, 3) uint8); the images of a sheet have one shape.
         width: of each image on the sheet, pixels.
         gap: pixels between images.
-        key: (row, height) -> the image to the right of a row, (height, KEY_WIDTH, 3), or None for nothing.
+        key: (row, height) -> image to the right of a row, (height, KEY_WIDTH, 3), or None.
     """
     title = 22
     cells = [[(name, resize_to_width(image, width)) for name, image in row] for row in rows]
@@ -188,8 +186,8 @@ _TICKS = (0.0, 0.25, 0.5, 0.75, 1.0)  # positions of a colour bar's ticks, from 
 
 
 def _colour_bar(height: int, colour: Callable[[np.ndarray], np.ndarray], words: list[str]) -> np.ndarray:
-    """A colour bar with labelled ticks. colour: maps positions, 0 at the bottom to 1, to the turbo map's [0,
-    1]."""
+    """Colour bar with labelled ticks. colour: maps positions from 0 (bottom) to 1 to [0, 1] of the turbo
+    map."""
     key = np.full((height, KEY_WIDTH, 3), _SHEET, np.uint8)
     left, right, top, foot = 10, 34, 8, height - 9
     key[top : foot + 1, left:right] = _turbo(colour(np.linspace(1, 0, foot + 1 - top)))[:, None].reshape(

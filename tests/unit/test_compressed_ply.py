@@ -192,7 +192,7 @@ def test_a_damaged_chunk_costs_only_its_splats(tmp_path):
 
 
 DAMAGES = {
-    "cut short": (lambda c: c[:-1], "cut short"),
+    "truncated": (lambda c: c[:-1], "truncated"),
     "no chunks": (lambda c: c.replace(b"element chunk", b"element bunch"), "must have the element chunk"),
     "too few chunks": (lambda c: c.replace(b"chunk 2\n", b"chunk 1\n"), "must have 2 rows of chunk, got 1"),
     "missing packed property": (
@@ -209,9 +209,12 @@ DAMAGES = {
     ),
     "wrong type": (
         lambda c: c.replace(b"uint packed_color", b"float packed_color"),
-        "wrong type of packed_color",
+        "packed_color of the element vertex must have the type",
     ),
-    "wrong type of limit": (lambda c: c.replace(b"float min_x", b"int min_x"), "wrong type of min_x"),
+    "wrong type of limit": (
+        lambda c: c.replace(b"float min_x", b"int min_x"),
+        "min_x of the element chunk must have the type",
+    ),
     "too little SH": (
         lambda c: c.replace(b"element sh 300", b"element sh 299"),
         "must have 300 rows of sh, got 299",
@@ -222,9 +225,9 @@ DAMAGES = {
     ),
     "SH of another type": (
         lambda c: c.replace(b"uchar f_rest_3", b"char f_rest_3"),
-        "wrong type of f_rest_3",
+        "f_rest_3 of the element sh must have the type",
     ),
-    "10^12 splats": (lambda c: c.replace(b"vertex 300", b"vertex 1000000000000"), "cut short"),
+    "10^12 splats": (lambda c: c.replace(b"vertex 300", b"vertex 1000000000000"), "truncated"),
 }
 
 

@@ -289,7 +289,7 @@ def test_a_script_of_ffmpeg_is_not_a_video_and_opens_no_other_file(tmp_path):
     write_avi(tmp_path / "secret.avi")
     for text in ("ffconcat version 1.0\nfile secret.avi\n", "#EXTM3U\n#EXTINF:1,\nsecret.avi\n"):
         (tmp_path / "a.mp4").write_text(text)
-        with pytest.raises(InputError, match="is not a video"):
+        with pytest.raises(InputError, match="as a video with OpenCV"):
             next(read_images(tmp_path / "a.mp4"))
 
 
@@ -347,7 +347,7 @@ def test_an_array_of_usd_that_is_damaged_is_an_input_error(tmp_path):
     assert int.from_bytes(data[count : count + 8], "little") == 50
     data[count : count + 8] = (2**60).to_bytes(8, "little")
     (tmp_path / "a.usdc").write_bytes(data)
-    with pytest.raises(InputError, match="not a USD file that can be read"):
+    with pytest.raises(InputError, match="not a USD file that usd-core can read"):
         load_splats(tmp_path / "a.usdc")
 
 

@@ -260,7 +260,7 @@ def test_a_gltf_may_begin_with_as_many_spaces_as_it_likes(tmp_path):
         path.write_bytes(spaces + path.read_bytes().lstrip())
         assert_same_bits(fs.load_splats(path), cloud)
     path.write_bytes(b" " * 100)
-    with pytest.raises(fs.InputError, match="it is not JSON"):
+    with pytest.raises(fs.InputError, match="not JSON"):
         fs.load_splats(path)
 
 
@@ -323,11 +323,11 @@ def test_an_spz_file_keeps_labels_and_coplanar_groups(tmp_path):
         ({"n": 2**32 - 1}, "expand to"),
         ({"n": 3}, "array means must expand to 27 bytes"),
         ({"streams": 5}, "must have 6 arrays, got 5"),
-        ({"table": 2**32 - 1}, "cut short: its table must end"),
+        ({"table": 2**32 - 1}, "truncated: its table must end"),
         ({"degree": 5}, "SH degree 0 to 4"),
         ({"version": 3}, "damaged"),
-        ({"extensions": b"abc"}, "extension is cut short"),
-        ({"extensions": struct.pack("<II", 1, 2**32 - 1)}, "extension is cut short"),
+        ({"extensions": b"abc"}, "extension is truncated"),
+        ({"extensions": struct.pack("<II", 1, 2**32 - 1)}, "extension is truncated"),
         ({"extensions": struct.pack("<III", 0xADBE0003, 4, 2)}, "coordinate system must be one of"),
         ({"extensions": struct.pack("<III", 0xF1D50001, 4, 2)}, "damaged"),
     ],
@@ -346,7 +346,7 @@ def test_an_spz_file_of_a_later_version(tmp_path):
 def test_an_spz_file_that_promises_more_than_gzip_can_hold(tmp_path):
     head = struct.pack("<IIIBBBB", 0x5053474E, 3, 2**32 - 1, 3, 12, 0, 0)
     (tmp_path / "a.spz").write_bytes(gzip.compress(head))
-    with pytest.raises(fs.InputError, match=r"cut short: its header declares \d+ bytes"):
+    with pytest.raises(fs.InputError, match=r"truncated: its header declares \d+ bytes"):
         fs.load_splats(tmp_path / "a.spz")
 
 

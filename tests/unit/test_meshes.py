@@ -165,7 +165,7 @@ def test_the_command_writes_a_mesh(tmp_path, capsys):
     ("words", "said"),
     [
         (["a.glb", "--voxel", "0.1"], "need --mesh"),
-        (["a.spz", "--mesh"], "a mesh must end in .glb"),
+        (["a.spz", "--mesh"], "the suffix of a mesh must be .glb"),
         (["a.glb", "--mesh", "--voxel", "-1"], "voxel must be a positive length in metres, got -1"),
         (["a.glb", "--mesh", "--voxel", "1e-9"], "voxel must be at least"),
         (["a.glb", "--mesh", "--cameras", "none.tum"], "none.tum"),

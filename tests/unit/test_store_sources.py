@@ -14,7 +14,7 @@ def test_a_file_with_a_wrong_count_is_refused(tmp_path):
     content = (tmp_path / "a.ply").read_bytes()
     liar = tmp_path / "liar.ply"
     liar.write_bytes(content.replace(b"element vertex 9000", b"element vertex 9001"))
-    with pytest.raises(fs.InputError, match="cut short"):
+    with pytest.raises(fs.InputError, match="truncated"):
         fs.build_store([liar], tmp_path / "liar.fss")
     assert set(tmp_path.iterdir()) == {liar, tmp_path / "a.ply"}
 

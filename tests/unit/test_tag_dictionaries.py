@@ -57,5 +57,5 @@ def test_a_family_is_named_with_or_without_its_kind():
     assert parse_family("36h11") == parse_family("apriltag:36h11") == ("apriltag", "36h11")
     with pytest.raises(InputError):
         parse_family("aruco:36h11")
-    with pytest.raises(InputError, match="unknown kind"):
+    with pytest.raises(InputError, match="kind of tag must be one of"):
         families("qr")

@@ -142,7 +142,7 @@ def test_points_as_text(made, tmp_path):
     np.testing.assert_allclose(found.points, made.points, atol=1e-6)
     assert found.colors.tolist() == [[1, 2, 255 - i] for i in range(6)]
     for damaged, words in (
-        (lines[:4], "cut short.* 6 rows of vertex, but the file has 4"),
+        (lines[:4], "truncated.* 6 rows of vertex, but the file has 4"),
         (["1 2\n"], "damaged"),
     ):
         (folder / "points.ply").write_text(head + "".join(damaged))
@@ -191,7 +191,7 @@ def test_cameras_of_a_model_that_cannot_be_used_are_named(folder):
     for other, words in (
         (
             f"{number} PINHOLE 24 18 20",
-            "cannot read .*cameras.txt as COLMAP's: camera 1 of model PINHOLE must have 4 parameters, got 1",
+            "cannot read .*cameras.txt as COLMAP: camera 1 of model PINHOLE must have 4 parameters, got 1",
         ),
         (
             f"{number} FOV 24 18 20 20 12 9 0.1",
@@ -350,7 +350,7 @@ def test_files_that_are_missing_or_damaged_are_named(made, folder, tmp_path):
         whole = file.read_bytes()
         for data in (whole[:-3], whole[:11], b"\xff" * 40):
             file.write_bytes(data)
-            with pytest.raises(fs.InputError, match=f"{name}.bin as COLMAP's"):
+            with pytest.raises(fs.InputError, match=f"{name}.bin as COLMAP"):
                 load_dataset(folder)
         file.write_bytes(whole)
     nerf = transforms(made, tmp_path / "nerf")
@@ -381,7 +381,7 @@ def test_files_that_are_missing_or_damaged_are_named(made, folder, tmp_path):
         (
             "cameras",
             "1 PINHOLE 64 48 50",
-            "cannot read .*cameras.txt as COLMAP's: camera 1 of model PINHOLE must have 4 parameters, got 1",
+            "cannot read .*cameras.txt as COLMAP: camera 1 of model PINHOLE must have 4 parameters, got 1",
         ),
         ("points3D", "1 0 0 0 9", "not enough"),
         ("images", "1 1 0 0 0 0", "must have 10 words, got '1 1 0 0 0 0'"),
