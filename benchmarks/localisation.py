@@ -128,7 +128,7 @@ def normalised(found: fs.Localisation, camera: fs.Camera) -> float:
     moved = camera.world_to_camera @ found.camera.camera_to_world
     turn = (moved[:3, :3] - moved[:3, :3].T) / 2
     error = np.array([turn[2, 1], turn[0, 2], turn[1, 0], *moved[:3, 3]])
-    return float(error @ np.linalg.solve(found.covariance, error))
+    return float(error @ np.linalg.lstsq(found.covariance, error, rcond=None)[0])
 
 
 if __name__ == "__main__":

@@ -65,20 +65,21 @@ class AlignmentSums:
     matrix: np.ndarray
     """(c, 8, 8) outer product of a row with itself, weighted by the second derivative of the loss"""
     right: np.ndarray
-    """(c, 8, 2) row times residual, in both columns. With a MovedFrame: row times d, and row times -d times
-    a component of the ray, with d the derivative of the rendered value by the motion"""
+    """(c, 8, 1) row times residual. With a MovedFrame (c, 8, 2): row times d, and row times -d times a
+    component of the ray, with d the derivative of the rendered value by the motion"""
     square: np.ndarray
     """(c,) squared residuals"""
     scores: np.ndarray
     """(blocks, c, 8) row times residual in each block; empty unless requested"""
     matrices: np.ndarray
     """(blocks, c, 8, 8) `matrix` of each block; empty unless requested"""
+    moments: np.ndarray
+    """(blocks, c, 6) unweighted sums of each block: image x with the exposure of the render, render y, x^2,
+    y^2, x y, and 1; empty unless requested"""
     cost: float
     """mean loss"""
     cost_before: float
     """mean loss with `AlignmentFit.noise`"""
-    inliers: float
-    """share of the pixels below the robust threshold"""
     inverse_depth: float
     """mean squared inverse depth [1 / m^2]"""
     noise: float
@@ -87,7 +88,7 @@ class AlignmentSums:
 
 HUBER, TUKEY = 1.5, 4.685
 """robust thresholds in standard deviations of the noise"""
-MIN_NOISE, MAX_NOISE = 1e-3, 0.03
+MIN_NOISE, MAX_NOISE = 1e-2, 0.03
 """limits of the noise, display values; residuals above TUKEY * MAX_NOISE never fit"""
 _MEDIAN = {1: 0.4549, 3: 2.3660}
 """median of the sum of squares of so many normal numbers"""

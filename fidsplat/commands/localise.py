@@ -24,8 +24,8 @@ class Localise:
     The scene's camera has the size, intrinsics and lens of the photographs. Each search starts at --start, at
     the pose by the scene's markers in the photograph, or at the most similar of --candidates and of the pose
     of the photograph before, in this order. It continues by direct image alignment, which exposure and white
-    balance do not change. Deviations are standard deviations. A pose is found if most of the textured pixels
-    agree with the scene.
+    balance do not change. Deviations are standard deviations. A pose is found if most of the textured blocks
+    of the image match the scene.
 
     Examples:
       fidsplat localise photo.jpg --scene scene.toml

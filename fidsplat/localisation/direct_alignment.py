@@ -42,10 +42,18 @@ MIN_SIDE = 48
 MAX_LEVELS = 4
 COARSE = 2
 """stages of the coarsest level"""
-MIN_BLOCK, BLOCKS = 4, 30
+MIN_BLOCK, BLOCKS = 6, 15
 """independent blocks of the covariance: minimum side in pixels, and number along the shorter side"""
 MIN_INLIERS = 0.6
-"""share of inliers from which a pose counts as found"""
+"""share of matching blocks from which a pose counts as found"""
+MIN_CORRELATION, MIN_CONTRAST, MIN_PIXELS = 0.7, 0.02, 12
+"""normalised correlation of a matching block; minimum contrast and textured pixels of a block that counts"""
+MIN_BLOCKS = 24
+"""minimum number of which the matching blocks are a share: twice the unknowns"""
+MIN_IMAGE_NOISE = 0.005
+"""minimum noise of an image, display values"""
+_QUARTILE = 1.1
+"""third quartile of the reduced chi-squared of blocks with noise alone"""
 GAINS = 0.05, 20.0
 """limits of the gain of the image relative to the render"""
 MIN_INFORMATION = 1e-9
@@ -57,8 +65,10 @@ _SETTLED = 0.3
 _REPEATED, _REPEATED_PIXELS = 4.0, 0.01
 """standard deviations of a last step above which it is repeated at its result; pixels, for an image without
 noise"""
-_LAST_STEPS = 5
+_LAST_STEPS = 6
 """maximum number of last steps"""
+_FULL_STEPS, _FULL_SETTLED = 12, 0.01
+"""maximum number of steps with Huber's loss at full size, and motion in pixels that ends them"""
 _DIFFERENCE = 0.01
 """motion in pixels of the finite differences"""
 
@@ -72,7 +82,7 @@ class Alignment:
     """(6, 6) of a rotation vector [rad] and a translation [m] applied after `world_to_camera`; infinite if
     the image does not determine the pose"""
     inliers: float
-    """share of the textured pixels whose residuals are below the robust threshold; 0 for a blank image"""
+    """share of the textured blocks that match the render; 0 for a blank image"""
     noise: float
     """standard deviation of the residuals of a pixel, display values"""
     gain: np.ndarray
@@ -145,7 +155,7 @@ def _align(
             at = _minimise(at, _Stage(number, stage.camera, render, kernels), steps)
     if coarse:
         return Alignment(start.with_pose(at.pose), np.full((6, 6), np.nan), 0.0, at.noise, at.fit.gain)
-    return _finish(at, _Stage(len(stages) - 1, start, render, kernels))
+    return _finish(at, _Stage(len(stages) - 1, start, render, kernels, image_noise(image)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +182,7 @@ class _Stage:
     camera: Camera
     render: Render
     kernels: AlignmentKernels
+    image_noise: float = 0.0
 
     def frame(self, pose: np.ndarray) -> Any:
         """The scene at a pose (4, 4)."""
@@ -187,7 +198,7 @@ class _Stage:
         return max(self.camera.fx, self.camera.fy) * math.sqrt(turn + shift * sums.inverse_depth)
 
 
-def _minimise(at: _State, stage: _Stage, steps: int) -> _State:
+def _minimise(at: _State, stage: _Stage, steps: int, settled: float = _SETTLED) -> _State:
     """Levenberg-Marquardt at one stage. The last step is not checked by a render."""
     damping, frame = _DAMPING, stage.frame(at.pose)
     if not at.noise:  # the exposure is unknown
@@ -198,7 +209,7 @@ def _minimise(at: _State, stage: _Stage, steps: int) -> _State:
     for number in range(steps):
         step = _solved(sums, damping)
         tried, size = at.moved(sums, step), stage.pixels(step[:6], sums)
-        if size < _SETTLED or number == steps - 1:
+        if size < settled or number == steps - 1:
             return tried
         found = stage.sums(stage.frame(tried.pose), tried, sums.noise)
         if found.cost_before <= sums.cost:
@@ -210,33 +221,69 @@ def _minimise(at: _State, stage: _Stage, steps: int) -> _State:
 
 def _finish(at: _State, stage: _Stage) -> Alignment:
     """The last steps, and if they do not converge, again after steps with Huber's loss: Tukey's ignores edges
-    that are more than a fraction of a pixel away."""
+    that are more than a fraction of a pixel away, and is not convex."""
     found, settled = _last_steps(at, stage)
-    return found if settled else _last_steps(_minimise(at, stage, _LAST_STEPS), stage)[0]
+    return found if settled else _last_steps(_minimise(at, stage, _FULL_STEPS, _FULL_SETTLED), stage)[0]
 
 
 def _last_steps(at: _State, stage: _Stage) -> tuple[Alignment, bool]:
-    """Newton's method for Tukey's loss, and the covariance; and whether the steps converged. The derivative
-    of the score is computed at the first step only. Infinite covariance if the pixels do not determine the
-    pose and its covariance."""
-    at, noise, inverse = _State(at.pose, at.fit._replace(huber=False)), 0.0, None
-    covariance, settled = np.diag(np.full(6, np.inf)), False
+    """Newton's method for Tukey's loss with a line search, and the covariance; and whether all steps
+    decreased the loss and converged. The derivative of the score is computed at the first step only. Infinite
+    covariance if the pixels do not determine the pose and its covariance."""
+    at, best, settled, rejected = _State(at.pose, at.fit._replace(huber=False)), None, False, False
+    step, inverse = np.zeros(6 + 2 * len(at.fit.gain)), None
     for _ in range(_LAST_STEPS):
         frame = stage.frame(at.pose)
-        sums = stage.sums(frame, at, noise, blocks=True)
-        inverse = _inverse(sums, _bread(at, sums, stage, frame)) if inverse is None else inverse
+        sums = stage.sums(frame, at, 0.0 if best is None else best[1].noise, blocks=True)
+        if best is None:
+            inverse = _inverse(sums, _bread(at, sums, stage, frame))
+        elif sums.cost_before > best[1].cost + 1e-6:
+            step, rejected = step / 4, True
+            at = best[0].moved(best[1], step)
+            continue
+        best = at, sums
         if settled := inverse is None:
             break
-        covariance, step = _covariance(sums, inverse), inverse @ _right(sums)
-        at, noise = at.moved(sums, step), sums.noise
-        square = step[:6] @ np.linalg.lstsq(covariance, step[:6], rcond=None)[0]
+        step, errors = inverse @ _right(sums), (_scores(sums) @ inverse.T)[:, :6]
+        at = at.moved(sums, step)
+        square = step[:6] @ np.linalg.lstsq(errors.T @ errors, step[:6], rcond=None)[0]
         exact = sums.noise > 1.001 * MIN_NOISE or stage.pixels(step[:6], sums) < _REPEATED_PIXELS
         if settled := square < _REPEATED**2 and exact:
             break
-    # an image without the scene's contrast fits a render whose contrast the smallest gain removes
-    inliers = sums.inliers if (at.fit.gain > GAINS[0]).any() else 0.0
+    assert best is not None
+    sums = best[1]
+    covariance = np.diag(np.full(6, np.inf)) if inverse is None else _covariance(sums, inverse)
+    inliers, excess = _agreement(sums, stage.image_noise / float(np.median(at.fit.gain)))
     camera = stage.camera.with_pose(at.pose)
-    return Alignment(camera, covariance, inliers, sums.noise, at.fit.gain), bool(settled)
+    found = Alignment(camera, excess * covariance, inliers, sums.noise, at.fit.gain)
+    return found, bool(settled) and not rejected
+
+
+def _agreement(sums: AlignmentSums, noise: float) -> tuple[float, float]:
+    """Share of the blocks with contrast, or of MIN_BLOCKS if these are fewer, that match: their normalised
+    correlation (NCC) of image and render is above MIN_CORRELATION. And the reduced chi-squared of the blocks
+    that match, at least 1: its third quartile relative to that of noise alone.
+
+    noise: standard deviation of the noise of the image, in units of the render.
+    """
+    count = np.maximum(sums.moments[:, :, 5], 1)
+    x, y, xx, yy, xy = np.moveaxis(sums.moments[:, :, :5] / count[:, :, None], 2, 0)
+    image, render = (xx - x * x).mean(axis=1) - noise**2, (yy - y * y).mean(axis=1)
+    used = np.maximum(image, render) > max(MIN_CONTRAST, 2 * noise) ** 2
+    used &= count[:, 0] >= MIN_PIXELS
+    correlation = (xy - x * y).mean(axis=1) / np.sqrt(np.maximum(image * render, 1e-12))
+    match = used & (correlation > MIN_CORRELATION)
+    squares = (xx + yy - 2 * xy).mean(axis=1)[match] / noise**2
+    excess = max(1.0, float(np.quantile(squares, 0.75)) / _QUARTILE) if match.any() else 1.0
+    return float(match.sum() / max(used.sum(), MIN_BLOCKS)), excess
+
+
+def image_noise(image: np.ndarray) -> float:
+    """Standard deviation of the noise of an image (h, w, c): the median of second differences along rows."""
+    rows = image[::8]
+    changes = np.abs(rows[:, 1:-1] - (rows[:, :-2] + rows[:, 2:]) / 2)
+    deviation = float(np.median(changes)) / (0.6745 * math.sqrt(1.5)) if changes.size else 0.0
+    return max(deviation, MIN_IMAGE_NOISE)
 
 
 def _bread(at: _State, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.ndarray:
@@ -263,7 +310,7 @@ def _bread(at: _State, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.nda
 def _inverse(sums: AlignmentSums, bread: np.ndarray) -> np.ndarray | None:
     """The inverse of the derivative of the score; None if the pixels do not determine the pose, or if there
     are too few blocks of pixels for a covariance."""
-    if len(sums.scores) <= len(bread):
+    if np.count_nonzero(sums.matrices.any(axis=(1, 2, 3))) <= len(bread):
         return None
     deviations = np.sqrt(np.maximum(np.diag(_assembled(sums.matrix)), 1e-15))
     scaled = bread / np.outer(deviations, deviations)
@@ -276,14 +323,21 @@ def _covariance(sums: AlignmentSums, inverse: np.ndarray) -> np.ndarray:
     """(6, 6) sandwich estimate from the scores of blocks, as the jackknife that deletes one block (CR3,
     MacKinnon and White 1985): residuals are smaller than errors where a block has leverage."""
     count, size = len(sums.scores), len(inverse)
-    scores, matrices = np.zeros((count, size)), np.zeros((count, size, size))
+    matrices = np.zeros((count, size, size))
     for channel in range(sums.scores.shape[1]):
         own = np.array(_parameters(channel))
-        scores[:, own] += sums.scores[:, channel]
         matrices[:, own[:, None], own] += sums.matrices[:, channel]
     others = 1.000001 * np.eye(size) - inverse @ matrices  # 1.000001: one block may determine the pose alone
-    errors = np.linalg.solve(others, (scores @ inverse.T)[:, :, None])[:, :6, 0]
+    errors = np.linalg.solve(others, (_scores(sums) @ inverse.T)[:, :, None])[:, :6, 0]
     return errors.T @ errors * (count - 1) / count
+
+
+def _scores(sums: AlignmentSums) -> np.ndarray:
+    """Scores (blocks, 6 + 2 c)."""
+    scores = np.zeros((len(sums.scores), 6 + 2 * sums.scores.shape[1]))
+    for channel in range(sums.scores.shape[1]):
+        scores[:, _parameters(channel)] += sums.scores[:, channel]
+    return scores
 
 
 def _solved(sums: AlignmentSums, damping: float) -> np.ndarray:

@@ -22,6 +22,7 @@ from fidsplat.render.resident import ResidentCloud
 from fidsplat.scenes import Scene
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrix_to_quaternion
+from fidsplat.store.store import Store
 from fidsplat.util.arguments import instance, invalid
 from fidsplat.util.errors import InputError
 
@@ -45,7 +46,8 @@ class Localisation:
     """(6, 6) covariance of a rotation vector [rad] and a translation [m] applied after `world_to_camera`, in
     camera axes, as the gradient `pose`; infinite if the image does not determine the pose"""
     inliers: float
-    """share of the textured pixels that agree with the scene, 0 to 1"""
+    """share of the textured blocks of the image that match the scene (normalised correlation above 0.7), 0 to
+    1"""
     noise: float
     """standard deviation of the residuals of a pixel, display values"""
     start: str
@@ -58,8 +60,7 @@ class Localisation:
 
     @property
     def found(self) -> bool:
-        """Whether the image determines the pose, and at least 0.6 of its textured pixels agree with the
-        scene."""
+        """Whether the image determines the pose, and at least 0.6 of its textured blocks match the scene."""
         return self.inliers >= MIN_INLIERS and bool(np.isfinite(self.covariance).all())
 
     @property
@@ -90,7 +91,7 @@ class Localisation:
 
 def localise(
     image: np.ndarray,
-    scene: Scene | SplatCloud | ResidentCloud,
+    scene: Scene | SplatCloud | ResidentCloud | Store,
     start: Camera | np.ndarray | Sequence[Any] | None = None,
     *,
     camera: Camera | None = None,
@@ -127,7 +128,8 @@ def localise(
         DeviceError: the device fails or lacks memory.
     """
     pixels = _pixels(image)
-    instance("scene", scene, Scene | SplatCloud | ResidentCloud, "a Scene, a SplatCloud or a ResidentCloud")  # type: ignore[arg-type]
+    kinds = Scene | SplatCloud | ResidentCloud | Store
+    instance("scene", scene, kinds, "a Scene, a SplatCloud, a Store or a ResidentCloud")  # type: ignore[arg-type]
     renderer = Renderer() if renderer is None else instance("renderer", renderer, Renderer)
     capture = scene.capture if isinstance(scene, (Scene, ResidentCloud)) else Capture()
     if camera is None:

@@ -67,11 +67,11 @@ class HostAlignment(AlignmentKernels):
             inner = np.maximum(1 - share**2, 0)
             matrix_weights = np.maximum(inner**2 - 4 * share**2 * inner / len(values), 0)
         across, down = np.concatenate([target.turning, target.shifting * inverse_depth], axis=1)
-        columns, column_weights = np.stack([residuals, residuals]), weights
+        columns, column_weights = residuals[None], weights
         if moved is not None:
             change = (_at(target.blurred(moved.frame), target.rows) - values) / np.float32(moved.size)
             columns, column_weights = np.stack([change, -target.rays[moved.axis] * change]), matrix_weights
-        matrix, right, scores, matrices = [], [], [], []
+        matrix, right, scores, matrices, moments = [], [], [], [], []
         for channel, (gx, gy) in enumerate(zip(*slopes, strict=True)):
             row = np.stack([*-(gx * across + gy * down), values[channel], np.ones_like(gx)]).astype(float)
             weighted = row * column_weights
@@ -80,15 +80,17 @@ class HostAlignment(AlignmentKernels):
             if blocks:
                 scores.append(target.by_block(weighted * columns[0, channel]))
                 matrices.append(target.by_block((row * matrix_weights)[:, None] * row))
+                x, y = (residuals + values)[channel].astype(float), values[channel].astype(float)
+                moments.append(target.by_block(np.stack([x, y, x * x, y * y, x * y, np.ones_like(x)])))
         return AlignmentSums(
             np.array(matrix),
             np.array(right),
             (residuals**2 * weights).sum(axis=1, dtype=float),
             np.stack(scores, axis=1) if blocks else np.empty((0, len(values), 8)),
             np.stack(matrices, axis=1) if blocks else np.empty((0, len(values), 8, 8)),
+            np.stack(moments, axis=1) if blocks else np.empty((0, len(values), 6)),
             float(cost.mean()),
             float(_robust(error, fit.noise or noise, fit.huber)[2].mean()),
-            float((share < 1).mean()),
             float((inverse_depth**2).mean()),
             noise,
         )

@@ -299,7 +299,7 @@ class Trainer:
         """The capture of a view at the pose at which the splats match its image; unchanged if they match it
         better at its own pose."""
         # here, since it imports detectors, which other trainings do not need
-        from fidsplat.localisation.direct_alignment import MIN_INLIERS, align
+        from fidsplat.localisation.direct_alignment import align
         from fidsplat.localisation.normal_equations import alignment_kernels
 
         def render(camera: Camera) -> Frame:
@@ -310,8 +310,6 @@ class Trainer:
         try:
             found = align(image, view.mask, view.camera, render, kernels)
         except InputError:  # the mask leaves no pixels at the coarsest level
-            return capture
-        if found.inliers < MIN_INLIERS:
             return capture
         both = capture, capture.with_(camera=found.camera)
         frames = self.renderer.render_views(resident, both)

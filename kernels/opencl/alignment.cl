@@ -5,7 +5,7 @@
 #pragma OPENCL FP_CONTRACT OFF
 #define ROW_ITEMS (ITEMS < 16 ? ITEMS : 16)
 #define BINS 256
-#define CHANNEL_ROWS 10   // rows of 8 sums of a channel: the matrix, two right sides
+#define CHANNEL_ROWS 10   // rows of 8 sums of a channel: the matrix, the right side, and a second one or moments of image and render
 #define SUMS (8 * (3 * CHANNEL_ROWS + 1))
 
 // Bin of a positive number: 16 bins per octave from 2^-14 on.
@@ -139,19 +139,18 @@ static inline float median_of(global const uint *counts) {
     return low + (high - low) * (0.5f * total - before) / fmax((float)counts[k], 1.0f);
 }
 
-// Error relative to the robust threshold; sets weight, the weight of the second derivative, and the loss.
-static inline float robust(float error, float noise, int huber, int channels, float *weight, float *curved, float *cost) {
+// Set the weight, the weight of the second derivative, and the loss of an error.
+static inline void robust(float error, float noise, int huber, int channels, float *weight, float *curved, float *cost) {
     float share = error / (huber ? HUBER * noise : TUKEY * fmin(noise, MAX_NOISE));
     if (huber) {
         *weight = *curved = 1.0f / fmax(share, 1.0f);
         *cost = share < 1.0f ? 0.5f * share * share : share - 0.5f;
-        return share;
+        return;
     }
     float inner = fmax(1.0f - share * share, 0.0f);
     *weight = inner * inner;
     *curved = fmax(inner * inner - 4.0f * share * share * inner / channels, 0.0f);
     *cost = 1.0f - inner * inner * inner;
-    return share;
 }
 
 // Inverse depth, the largest of a pixel and its neighbours; 0 for the background.
@@ -177,7 +176,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     float noise = shared_noise;
-    // others: squares of three channels, number of pixels, two losses, inliers, squared inverse depths
+    // others: squares of three channels, number of pixels, two losses, squared inverse depths
     float8 totals[CHANNEL_ROWS * 3], others = 0.0f;
     for (int k = 0; k < CHANNEL_ROWS * 3; k++) totals[k] = 0.0f;
     int across_blocks = (width + side - 1) / side, blocks = across_blocks * ((height + side - 1) / side);
@@ -191,7 +190,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                 float residual[3], weight, curved, cost, before;
                 float error = residuals_of(i, channels, image, rgb, gain, offset, residual), inverse = nearest(depth, i, width);
                 robust(error, noise_before > 0.0f ? noise_before : noise, huber, channels, &weight, &curved, &before);
-                float share = robust(error, noise, huber, channels, &weight, &curved, &cost);
+                robust(error, noise, huber, channels, &weight, &curved, &cost);
                 float3 ray = {(x + 0.5f - center_x) / focal_x, (y + 0.5f - center_y) / focal_y, 1.0f};
                 float3 by_x = {1.0f / focal_x, 0.0f, 0.0f}, by_y = {0.0f, 1.0f / focal_y, 0.0f};
                 if (lens) {
@@ -205,7 +204,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                 down /= dot(by_y, down);
                 float3 turn_x = cross(ray, across), turn_y = cross(ray, down);
                 float8 motion_x = (float8)(turn_x, across * inverse, 0.0f, 0.0f), motion_y = (float8)(turn_y, down * inverse, 0.0f, 0.0f);
-                float scale = moves ? axis == 0 ? -ray.x : axis == 1 ? -ray.y : -ray.z : 1.0f, of_column = moves ? curved : weight;
+                float scale = axis == 0 ? -ray.x : axis == 1 ? -ray.y : -ray.z, of_column = moves ? curved : weight;
                 float squares[3] = {0.0f, 0.0f, 0.0f};
                 for (int c = 0; c < channels; c++) {
                     float gx = (value_of(rgb, i + 1, c, channels) - value_of(rgb, i - 1, c, channels)) / 2.0f;
@@ -221,10 +220,11 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                     float8 weighted = curved * row, entry = of_column * column * row;
                     for (int k = 0; k < 8; k++) total[k] += ((const float *)&weighted)[k] * row;
                     total[8] += entry;
-                    total[9] += scale * entry;
+                    float own = value + residual[c];
+                    total[9] += moves ? scale * entry : (float8)(own, value, own * own, value * value, own * value, 1.0f, 0.0f, 0.0f);
                     squares[c] = weight * residual[c] * residual[c];
                 }
-                others += (float8)(squares[0], squares[1], squares[2], 1.0f, cost, before, share < 1.0f, inverse * inverse);
+                others += (float8)(squares[0], squares[1], squares[2], 1.0f, cost, before, inverse * inverse, 0.0f);
             }
     }
     local float *sums = partial[item];

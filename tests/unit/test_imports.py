@@ -36,7 +36,7 @@ MAY_IMPORT = {
     | {"store", "scenes", "markers", "effects", "backends", "render", "streaming", "images", "vision"}
     | {"formats"},
     "remote": {"render", "images", "experiments", "store"},
-    "localisation": DATA | {"scenes", "images", "vision", "render", "backends"},
+    "localisation": DATA | {"scenes", "images", "vision", "render", "backends", "store"},
     "sim": DATA | {"scenes", "effects", "images", "render"},
     "worlds": DATA | {"scenes", "markers", "formats", "store", "sim"},
     "logs": {"splats", "cameras", "effects", "images", "vision"},

@@ -120,7 +120,7 @@ class OpenCLAlignment(AlignmentKernels):
             self._by_groups("align_sums", groups, given)
             packed = np.empty((groups, _SUMS), np.float32)
             cl.enqueue_copy(self._queue, packed, made)
-        return _unpacked(packed, channels, blocks)
+        return _unpacked(packed, channels, blocks, moved is not None)
 
     @property
     def _queue(self) -> cl.CommandQueue:
@@ -164,13 +164,15 @@ class OpenCLAlignment(AlignmentKernels):
         return buffer
 
 
-def _unpacked(packed: np.ndarray, channels: int, blocks: bool) -> AlignmentSums:
-    """Sums of the work-groups: 8 matrix rows and 2 right sides for each of 3 channels, then scalars."""
+def _unpacked(packed: np.ndarray, channels: int, blocks: bool, moved: bool) -> AlignmentSums:
+    """Sums of the work-groups: 8 matrix rows, a right side, and a second one or moments, for each of 3
+    channels, then scalars."""
     rows = packed[:, :240].reshape(len(packed), 3, 10, 8)[:, :channels]
     total, others = rows.sum(axis=0, dtype=float), packed[:, 240:248].sum(axis=0, dtype=float)
-    cost, before, inliers, inverse_depth = (others[4:] / max(others[3], 1)).tolist()
+    cost, before, inverse_depth = (others[4:7] / max(others[3], 1)).tolist()
     own = rows[packed[:, 243] > 0 if blocks else slice(0)].astype(float)
     return AlignmentSums(
-        *(total[:, :8], np.moveaxis(total[:, 8:], 1, 2), others[:channels], own[:, :, 8], own[:, :, :8]),
-        *(cost, before, inliers, inverse_depth, float(packed[0, 248])),
+        *(total[:, :8], np.moveaxis(total[:, 8 : 9 + moved], 1, 2), others[:channels]),
+        *(own[:, :, 8], own[:, :, :8], own[:, :, 9, :6]),
+        *(cost, before, inverse_depth, float(packed[0, 248])),
     )
