@@ -110,6 +110,12 @@ static inline vfloat VMAX(vfloat a, vfloat b) { return VSELECT(b, a, a > b); }
 #ifndef RESERVE
 #define RESERVE(length, count) atomic_add(length, count)
 #endif
+// Increments a counter and returns its previous value. SHARES: whether neighbouring work-items may increment the same counter, so that
+// one atomic for all of them is faster.
+#ifndef INCREMENT
+#define SHARES(index) false
+#define INCREMENT(counters, index, shared) atomic_inc((counters) + (index))
+#endif
 // Within 3 ulp: for culling only, not for values that affect the image.
 #ifndef FAST_SQRT
 #define FAST_SQRT(x) sqrt(x)

@@ -139,8 +139,8 @@ typedef struct {
 
 // Next free index of a tile's list, or NO_OFFSET outside of the band. Modulo 2^32: indices within the band are right even if the
 // frame has more pairs than that.
-static inline uint next_offset(int tile, const Band *band, global uint *restrict cursors) {
-    return tile < band->first || tile >= band->end ? NO_OFFSET : atomic_inc(cursors + tile) - band->start;
+static inline uint next_offset(int tile, const Band *band, global uint *restrict cursors, bool shared) {
+    return tile < band->first || tile >= band->end ? NO_OFFSET : INCREMENT(cursors, tile, shared) - band->start;
 }
 
 typedef struct {
@@ -160,7 +160,7 @@ static inline void list_big_splat(const BigSplats *splats, uint k, const TileRec
     int before = (int)(splat / splats->count) * tiles_of(splats->width, splats->height);
     for (int cell = item; cell < rect->cells; cell += items) {
         int tile = rect_tile(rect, cell, b, splats->width, splats->height);
-        uint place = tile < 0 ? NO_OFFSET : next_offset(before + tile, band, cursors);
+        uint place = tile < 0 ? NO_OFFSET : next_offset(before + tile, band, cursors, false);
         if (place >= band->capacity) continue;
         uint key = splats->keys[splat];
 //@@ big_key
@@ -241,13 +241,15 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
     uint length = queued & QUEUED, visible = queued / ONE_VISIBLE;
     for (uint from = item; from < length; from += UNROLL * BIN_ITEMS) {
         uint places[UNROLL], owners[UNROLL];
+        bool shared = false;
         for (uint n = 0; n < UNROLL; n++) {
             uint entry = from + n * BIN_ITEMS < length ? queue[from + n * BIN_ITEMS] : NO_ENTRY;
             owners[n] = entry / WINDOW_TILES;
             places[n] = NO_OFFSET;
             if (entry != NO_ENTRY) {
-                uint2 one = (uint2)(corners[owners[n]], 1u << entry % WINDOW_TILES);
-                places[n] = next_offset(before + window_tile(one, band.tiles_x), &band, cursors);
+                int tile = before + window_tile((uint2)(corners[owners[n]], 1u << entry % WINDOW_TILES), band.tiles_x);
+                if (n == 0) shared = SHARES(tile);
+                places[n] = next_offset(tile, &band, cursors, shared);
             }
         }
         for (uint n = 0; n < UNROLL; n++)
@@ -260,15 +262,17 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
 // Index space: work-groups of SORT_ITEMS, one per tile of the band.
 // Reads: starts. Consumes: pairs. Writes: lists; tallies, zeroed for the next frame if `clear`.
 //
-// A list that fits local memory is bucket-sorted by depth. Short and long lists, and those with an overfull bucket, go through a
-// bitonic network; every comparator moves the smaller key to the front, as if the list were padded with infinities.
+// A list is bucket-sorted by depth if its pairs, or their indices within the list, fit local memory. Longer and short lists, and those
+// with an overfull bucket, go through a bitonic network; every comparator moves the smaller key to the front, as if the list were
+// padded with infinities.
 #define SORT_ITEMS 256
 #define SORT_LOCAL 2048          // pairs sorted in local memory
 #define SHORT 64                 // pairs for which the network is faster
 #define BUCKETS 1024              // buckets of the depth range
 #define BUCKET_LIMIT 128              // pairs of one bucket: larger ones are not sorted by comparing all pairs
 #define ROW 16                   // work-items whose sums are added serially; SORT_ITEMS is its square
-enum { ITEM_PAIRS = SORT_LOCAL / SORT_ITEMS, ITEM_BUCKETS = BUCKETS / SORT_ITEMS };   // per work-item
+#define SORT_INDEXED (4 * SORT_LOCAL)    // pairs with 16-bit indices in that memory
+enum { ITEM_BUCKETS = BUCKETS / SORT_ITEMS };   // per work-item
 
 // Indices i < j of comparator t of a step with partners `stride` (a power of two) apart; in the first step of a block of
 // 2 * stride elements (`mirrored`) partners are mirror images.
@@ -346,11 +350,23 @@ static inline void bucket_starts(local uint *sums, local Buckets *buckets) {
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-// Bucket sort of at most SORT_LOCAL pairs into `list`. Within its bucket, a pair's index is the number of smaller keys. Returns
-// false, for all work-items, if a bucket is overfull. items: scratch of SORT_LOCAL values.
+// Sorts each bucket into `list`: within its bucket, a pair's place is the number of smaller keys. `starts` are the buckets' ends.
+#define BUCKETED(place) (indexed ? pairs[((local ushort *)items)[place]] : items[place])
+static inline void sort_buckets(global const ulong *pairs, uint length, local ulong *items, local Buckets *buckets, float nearest,
+                              float scale, bool indexed, global uint *restrict list) {
+    for (uint k = get_local_id(0); k < length; k += SORT_ITEMS) {
+        ulong pair = BUCKETED(k);
+        uint range = bucket_of(pair, nearest, scale), place = range > 0 ? buckets->starts[range - 1] : 0;
+        for (uint other = place, end = buckets->starts[range]; other < end; other++) place += BUCKETED(other) < pair;
+        list[place] = (uint)pair;
+    }
+}
+
+// Bucket sort of at most SORT_INDEXED pairs into `list`. Returns false, for all work-items, if a bucket is overfull. items: scratch of
+// SORT_LOCAL values.
 static inline bool bucket_sort(global const ulong *pairs, uint length, local ulong *items, local Buckets *buckets,
                                global uint *restrict list) {
-    uint item = get_local_id(0), places[ITEM_PAIRS];
+    uint item = get_local_id(0);
     if (item == 0) {
         buckets->lowest = 0xFFFFFFFFu;
         buckets->highest = buckets->overfull = 0;
@@ -359,25 +375,19 @@ static inline bool bucket_sort(global const ulong *pairs, uint length, local ulo
     barrier(CLK_LOCAL_MEM_FENCE);
     find_key_range(pairs, length, (local uint2 *)items, buckets);
     float nearest = key_depth(buckets->lowest), scale = BUCKETS / (key_depth(buckets->highest) - nearest);
-    for (uint n = 0; n < ITEM_PAIRS; n++) {
-        uint k = item + n * SORT_ITEMS;
-        if (k < length) places[n] = atomic_inc(buckets->starts + bucket_of(pairs[k], nearest, scale));
-    }
+    for (uint k = item; k < length; k += SORT_ITEMS) atomic_inc(buckets->starts + bucket_of(pairs[k], nearest, scale));
     barrier(CLK_LOCAL_MEM_FENCE);
     bucket_starts((local uint *)items, buckets);
     if (buckets->overfull) return false;
-    for (uint n = 0; n < ITEM_PAIRS; n++) {
-        uint k = item + n * SORT_ITEMS;
-        if (k < length) items[buckets->starts[bucket_of(pairs[k], nearest, scale)] + places[n]] = pairs[k];
+    for (uint k = item; k < length; k += SORT_ITEMS) {
+        ulong pair = pairs[k];
+        uint place = atomic_inc(buckets->starts + bucket_of(pair, nearest, scale));      // starts of buckets become their ends
+        if (length > SORT_LOCAL) ((local ushort *)items)[place] = (ushort)k;
+        else items[place] = pair;
     }
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (uint k = item; k < length; k += SORT_ITEMS) {
-        ulong pair = items[k];
-        uint range = bucket_of(pair, nearest, scale), start = buckets->starts[range], place = start;
-        uint end = range + 1 < BUCKETS ? buckets->starts[range + 1] : length;
-        for (uint other = start; other < end; other++) place += items[other] < pair;
-        list[place] = (uint)pair;
-    }
+    if (length > SORT_LOCAL) sort_buckets(pairs, length, items, buckets, nearest, scale, true, list);
+    else sort_buckets(pairs, length, items, buckets, nearest, scale, false, list);
     return true;
 }
 
@@ -393,7 +403,7 @@ kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
         tallies[TALLIES + tile] = 0;
         if (tile == 0) tallies[TALLY_BIG] = 0;
     }
-    if (length > SHORT && length <= SORT_LOCAL && bucket_sort(list, length, items, &buckets, lists + start)) return;
+    if (length > SHORT && length <= SORT_INDEXED && bucket_sort(list, length, items, &buckets, lists + start)) return;
     uint padded = 1;
     while (padded < length) padded *= 2;
 

@@ -118,7 +118,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
             int tile = before + window_tile(window, tiles_x);
             if (tile < band.first || tile >= band.end) continue;
             // modulo 2^32, see next_offset
-            uint place = counted ? atomic_inc(pair_counts + area_index(&area, window)) - band.start : next_offset(tile, &band, cursors);
+            uint place = counted ? atomic_inc(pair_counts + area_index(&area, window)) - band.start : next_offset(tile, &band, cursors, false);
             if (place < band.capacity) pairs[place] = (uint2)(splat, key);
         }
     }

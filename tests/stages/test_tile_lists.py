@@ -161,12 +161,16 @@ def test_a_capacity_of_exactly_the_pairs_of_a_frame(backend, spare):
         assert np.array_equal(rendered[0].read(name), rendered[1].read(name)), name
 
 
-def test_a_list_longer_than_local_memory_is_sorted(backend):
-    """tile_lists.cl sorts 2048 pairs at once in local memory, longer lists in global memory as well."""
-    cloud = random_splats(11000, seed=8, depth=(1.0, 9.0), scale=(0.2, 0.3), across=0.1)
+@pytest.mark.parametrize(("splats", "longest"), [(4000, 2048), (11000, 8192)])
+def test_a_list_longer_than_local_memory_is_sorted(backend, splats, longest):
+    """tile_lists.cl sorts 2048 pairs or the indices of 8192 at once in local memory, longer lists in global
+    memory as well."""
+    cloud = random_splats(splats, seed=8, depth=(1.0, 9.0), scale=(0.2, 0.3), across=0.1)
     trace, _ = traced(backend, cloud, fs.Quality(), shape=backend.shapes("schedule")["groups"])
     visible = np.flatnonzero(trace["keys"] != CULLED)
-    assert max(np.diff(trace["starts"].astype(int))) > 8192
+    lengths = np.diff(trace["starts"].astype(int))
+    assert max(lengths) > longest
+    assert splats > 8192 or max(lengths) <= 8192
     assert out_of_order(trace, visible[np.argsort(trace["keys"][visible], kind="stable")]) == 0
 
 

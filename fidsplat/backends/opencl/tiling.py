@@ -283,4 +283,4 @@ def launch_local(frame: DeviceFrame, kernel: str, **given: Any) -> None:
 
 def _big_groups(frame: DeviceFrame) -> int:
     """Number of work-groups for the splats that touch many tiles."""
-    return 4 * frame.workspace.device.max_compute_units
+    return 8 * frame.workspace.device.max_compute_units

@@ -46,3 +46,28 @@ static inline uint ptx_reserve(local uint *length, uint count) {
     return first + sum - count;
 }
 #define RESERVE(length, count) ptx_reserve(length, count)
+
+// Active work-items of the warp with the same value, as bits.
+static inline uint ptx_same(uint value, uint *active) {
+    uint same;
+    asm volatile("activemask.b32 %0;" : "=r"(*active));
+    asm volatile("match.any.sync.b32 %0, %1, %2;" : "=r"(same) : "r"(value), "r"(*active));
+    return same;
+}
+static inline bool ptx_shares(uint value) {
+    uint active, same = ptx_same(value, &active), shared;
+    asm volatile("{.reg .pred p; setp.ne.u32 p, %1, 0; vote.sync.ballot.b32 %0, p, %2;}"
+                 : "=r"(shared) : "r"(same & (same - 1)), "r"(active));
+    return shared != 0;
+}
+#define SHARES(value) ptx_shares(value)
+
+static inline uint ptx_increment(global uint *counters, uint index) {
+    uint active, same = ptx_same(index, &active), before, place = 0;
+    asm("mov.u32 %0, %%lanemask_lt;" : "=r"(before));
+    before &= same;
+    if (before == 0) place = atomic_add(counters + index, popcount(same));
+    asm volatile("shfl.sync.idx.b32 %0, %0, %1, 31, %2;" : "+r"(place) : "r"(31 - clz(same & -same)), "r"(same));
+    return place + popcount(before);
+}
+#define INCREMENT(counters, index, shared) ((shared) ? ptx_increment(counters, index) : atomic_inc((counters) + (index)))

@@ -3,5 +3,6 @@
 //@ list
     int tiles_x = (width + TILE_W - 1) / TILE_W;
     tallies += number * (uint)(tiles_x * ((height + TILE_H - 1) / TILE_H));
+    bool shared = window != 0 && SHARES(window_tile((uint2)(corner, window), tiles_x));
     for (uint mask = window; mask != 0; mask &= mask - 1)
-        atomic_inc(tallies + TALLIES + window_tile((uint2)(corner, mask), tiles_x));
+        INCREMENT(tallies + TALLIES, window_tile((uint2)(corner, mask), tiles_x), shared);

@@ -7,6 +7,10 @@
 // Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, for complete
 // tiles.
 
+// Whether pixels consist of colours and transmittance. A fragment outside of the mask then has weight 0: without a branch for it, the
+// instructions of the rows overlap.
+#define COLOURS_ONLY (sizeof(Pixel) <= 4 * sizeof(vfloat))
+
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
 //@@ arguments blend
 ) {
@@ -77,7 +81,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
                 wide screen;
                 int mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
 //@@ mask
-                if (!VANY(mask & pixel_transmits(&pixels[row], &constants))) continue;
+                if (!COLOURS_ONLY && !VANY(mask & pixel_transmits(&pixels[row], &constants))) continue;
                 pixel_blend(&pixels[row], &s, c, mask, screen, &constants
 //@@ blend_arguments
                 );
