@@ -1,6 +1,6 @@
-"""The command line: parses arguments, runs a command, returns its exit status.
+"""The command line: parse arguments, run a command, return its exit status.
 
-0: done. 1: the run failed. 2: unusable arguments or input. Errors are one line on stderr.
+Exit status 0: done; 1: the run failed; 2: invalid arguments or input. Errors are one line on stderr.
 """
 
 import contextlib
@@ -106,11 +106,11 @@ _SHORTAGES = {
     errno.ENFILE: "the system's limit on open files is reached",
     errno.EIO: "the disk or the terminal failed",
 }
-"""remedies for shortages of the machine and paths without permission, which any command may meet"""
+"""remedies for errors of the operating system, which any command may raise"""
 
 
 def _parse(words: list[str]):
-    """The command object of the arguments. Raises InputError, or SystemExit after help or the version."""
+    """Parse arguments to a command object. Raises InputError, or SystemExit after help or the version."""
     from fidsplat import __version__
     from fidsplat.util.errors import InputError, unknown
 
@@ -158,7 +158,7 @@ def _parse(words: list[str]):
 
 
 def _group_help(program: str, about: str, commands: Mapping[str, type]) -> str:
-    """The help of a group: its description and the first docstring lines of its commands."""
+    """Help of a command group: its description, and the first docstring line of each of its commands."""
     width = max(map(len, commands)) + 2
     lines = [f"usage: {program} COMMAND ...", "", about, "", "Commands:"]
     for name in commands:
@@ -175,7 +175,7 @@ _NOT_A_NUMBER = re.compile(r"Error parsing (\S+): .*(int\(\) with base 10|string
 
 
 def _one_line(box: str) -> str:
-    """tyro's boxed message as one line: the error and the nearest option."""
+    """Convert tyro's boxed message to one line: the error and the most similar option."""
     lines = [line.strip(" │") for line in box.splitlines()]
     parts: list[list[str]] = [[]]
     for line in lines:

@@ -1,8 +1,8 @@
-"""Commands: one dataclass of options each, whose method `run` does the work and returns the exit status.
+"""Commands: a dataclass of options for each, whose method `run` executes it and returns the exit status.
 
 The docstring of a command is its help. Its options are its fields and those of the settings dataclasses that
-it nests or inherits. A group of commands has PARTS: its commands by name. A module is imported when its
-command is requested, so that `fidsplat --help` and errors come at once.
+it nests or inherits. A command group has PARTS: its commands by name. Command modules are imported on demand,
+so that `fidsplat --help` and errors are printed without delay.
 """
 
 import ast
@@ -12,24 +12,24 @@ from pathlib import Path
 
 
 class CommandTable(Mapping[str, type]):
-    """Command classes by name, imported on access. Names have hyphens for underscores."""
+    """Command classes by name, imported on access. Underscores of names become hyphens."""
 
-    def __init__(self, **places: str) -> None:
-        self._places = {name.replace("_", "-"): place for name, place in places.items()}
+    def __init__(self, **classes: str) -> None:
+        self._classes = {name.replace("_", "-"): path for name, path in classes.items()}
 
     def __getitem__(self, name: str) -> type:
-        module, _, kind = self._places[name].partition(".")
+        module, _, kind = self._classes[name].partition(".")
         return getattr(import_module(f"{__name__}.{module}"), kind)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._places)
+        return iter(self._classes)
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._classes)
 
     def summary(self, name: str) -> str:
         """First docstring line of a command, read from its source without importing it."""
-        module, _, kind = self._places[name].partition(".")
+        module, _, kind = self._classes[name].partition(".")
         tree = ast.parse(Path(__file__).with_name(f"{module}.py").read_text("utf-8"))
         found = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == kind)
         return (ast.get_docstring(found) or "").partition("\n")[0]
@@ -62,4 +62,4 @@ COMMANDS = CommandTable(
     store="store.Store",
     source="source.Source",
 )
-"""Every command, in the order of the help."""
+"""all commands, in the order of the help"""

@@ -73,7 +73,7 @@ class Bench:
     cameras: Cameras = None
     device: Devices = ()
     repeats: int = 20
-    """N: timed frames of each scene on each device; of your own, 3 or as many as start in a minute"""
+    """N: timed frames per scene and device; for --scene 3, or as many as start within a minute"""
     json: str | None = None
     """FILE: also write all figures to a file after each scene; - for stdout only"""
     plot: str | None = None
@@ -190,7 +190,7 @@ def _record(results: "list[Result]", scenes: tuple[str, ...], interrupted: bool)
 
 
 def _print(results: "list[Result]", where: "Console", about: dict[str, str]) -> None:
-    """Print a table for each scene with one column per device. about: descriptions of scenes by name."""
+    """Print a table per scene with one column per device. about: descriptions of scenes by name."""
     from fidsplat.experiments.bench.table import LEGEND, scene_table
 
     for scene in dict.fromkeys(result.scene for result in results):

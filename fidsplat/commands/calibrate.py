@@ -13,11 +13,11 @@ from fidsplat.experiments.tags import TagSettings
 
 @dataclass
 class Calibrate:
-    """Calibration of a camera with known intrinsics by OpenCV, and the number of views for 0.1 pixels.
+    """Calibrate a camera with known intrinsics by OpenCV, and find the number of views for 0.1 pixels.
 
-    Renders views of a ChArUco board by a lens model, with shot noise, detects its corners and calibrates from
-    random choices of 3, 4, 6, 8 ... views. The error of the projection is the root mean square over the
-    image, after the best rotation, which poses absorb. Writes DIR/calibrate.json and DIR/calibrate.svg.
+    Renders views of a ChArUco board with a lens model and shot noise, detects the corners, and calibrates
+    from random subsets of 3, 4, 6, 8 ... views. The projection error is the RMS over the image after the best
+    rotation, which the poses absorb. Writes DIR/calibrate.json and DIR/calibrate.svg.
 
     Examples:
       fidsplat experiment calibrate
@@ -86,11 +86,11 @@ class Calibrate:
 @repeatable
 @dataclass(frozen=True)
 class Tags(TagSettings):
-    """Which cause breaks which tag detector: rates and errors by cause, severity, family and scene.
+    """Measure which cause breaks which tag detector, by severity, family and scene.
 
-    Renders markers in a greenhouse and in a captured scene, in equal poses for all causes, and reads them
+    Renders markers in a greenhouse and in a captured scene, in the same poses for all causes, and reads them
     with OpenCV's aruco, the AprilTag library, locus-tag, zxing-cpp, OpenCV's QR detector and `detect`.
-    Writes tags.jsonl, tags.csv with intervals of 95 %, and a page with failure curves. An interrupted run
+    Writes tags.jsonl, tags.csv with 95 % intervals, and a page with failure curves. An interrupted run
     resumes. Several machines share the work by --shard, and `merge` joins their results; the same command
     then writes the page.
 
@@ -102,7 +102,7 @@ class Tags(TagSettings):
     """
 
     page: Path | None = None
-    """FILE.md|DIR: where the page and its charts are written (default: the folder for results)"""
+    """FILE.md|DIR: page with its charts (default: the folder for results)"""
     labels: Path | None = None
     """DIR: write the images with COCO and BOP annotations instead of measuring"""
     json: Json = False
@@ -129,7 +129,7 @@ class Tags(TagSettings):
             return report(self.json, {"files": {"tags": file}}, file)
         from fidsplat.experiments.tags_report import compact, write_report
 
-        # earlier points of the file are included, e.g. of other detectors
+        # the file also has earlier points, e.g. of other detectors
         files, breaks = write_report(
             list(sweep.results.done.values()), self.folder, self.page or self.folder, self.seed
         )

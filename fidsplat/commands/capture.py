@@ -22,9 +22,9 @@ class Capture:
     """Make a metric scene from photographs or a video (extra: capture).
 
     DIR becomes a data set for `fidsplat train`: undistorted images, masks, COLMAP's model in sparse/0, and
-    scene.toml. Tags of known size determine the scale. In the scene exact markers replace them, and training
-    ignores their pixels. z is up; the first tag, or the tag of --up, is at the origin. The same command
-    resumes, and repeats only the last steps if tags, --up or --scale change.
+    scene.toml. Tags of known size determine the scale. The scene has exact markers instead of them, and
+    training ignores their pixels. z is up; the first tag, or the tag of --up, is at the origin. The same
+    command resumes; if tags, --up or --scale change, it repeats only the last steps.
 
     Examples:
       fidsplat capture photos -o bench --tag apriltag:36h11:5=0.16

@@ -29,15 +29,15 @@ class Check:
     """Test a device with the hard cases of splat rendering.
 
     Renders scenes that are known to break renderers, compares every pixel with a float64 reference,
-    measures the device's arithmetic, and reports what fails. Takes about half a minute on two cores.
-    Writes an image of the worst case to DIR/worst.png. The exit status is 1 if anything fails.
+    measures the device's arithmetic, and lists failures. Takes about half a minute on two cores. Writes an
+    image of the worst case to DIR/worst.png. The exit status is 1 if a check fails.
 
-    --fuzz renders random scenes of up to 200 splats instead, until they add up to N splats. An interrupted
+    --fuzz renders random scenes of up to 200 splats instead, until their splats add up to N. An interrupted
     run resumes (DIR/fuzz.json).
 
-    --digests renders 200 random scenes instead and compares the SHA-256 of each with those of the repository:
-    every device with float64 and fused multiply-adds renders the same bits. --json has the digest of each
-    scene, and of one that differs those of its outputs and of the results between the stages.
+    --digests renders 200 random scenes instead and compares the SHA-256 of each with the repository's: all
+    devices with float64 and fused multiply-adds render bit-identical images. --json prints the digest of each
+    scene; for a scene that differs also those of its outputs and of the results between the stages.
 
     Examples:
       fidsplat check
@@ -50,7 +50,7 @@ class Check:
     out: str = "fidsplat-check"
     """DIR: folder for the image and the fuzzer's state"""
     fuzz: int | None = None
-    """N: render random scenes until they add up to N splats"""
+    """N: render random scenes until their splats add up to N"""
     digests: bool = False
     """compare the digests of 200 random scenes"""
     json: Json = False

@@ -21,13 +21,13 @@ class MeshOptions:
     mesh: bool = False
     """write a triangle mesh: .glb, .ply, .obj, .stl, or .xml for MuJoCo"""
     voxel: float | None = None
-    """M: voxel of the mesh in metres (default: a 200th of the longest side)"""
+    """M: voxel size of the mesh in metres (default: a 200th of the longest side)"""
     cameras: str | None = None
-    """FILE: views of the mesh: COLMAP, transforms.json, a trajectory (default: from outside)"""
+    """FILE: cameras whose depth images are fused: COLMAP, transforms.json, a trajectory (default: around)"""
     faces: int | None = None
-    """N: largest number of triangles (extra: mesh)"""
+    """N: maximum number of triangles (extra: mesh)"""
     parts: int = 32
-    """N: largest number of convex parts in .xml (extra: mesh)"""
+    """N: maximum number of convex parts in .xml (extra: mesh)"""
 
     def __post_init__(self) -> None:
         if not self.mesh and (self.voxel, self.cameras, self.faces, self.parts) != (None, None, None, 32):
@@ -38,12 +38,12 @@ class MeshOptions:
 
 @dataclass
 class Convert:
-    """Convert splats to another format, and measure the loss; or to a triangle mesh.
+    """Convert splats to another format and measure the loss, or convert them to a triangle mesh.
 
-    Formats by ending: .ply, .splat, .spz, .glb and .gltf (KHR_gaussian_splatting), .usda, .usdc and .usd
-    (OpenUSD's ParticleField; extra usd), .sog and meta.json (SOG). The command lists what the format of OUT
-    cannot store, renders both files from the camera of `fidsplat render IN`, and prints the largest and mean
-    difference of the images and their PSNR.
+    Formats by suffix: .ply, .splat, .spz, .glb and .gltf (KHR_gaussian_splatting), .usda, .usdc and .usd
+    (OpenUSD's ParticleField; extra usd), .sog and meta.json (SOG). The command lists data that the format of
+    OUT cannot store, renders both files from the camera of `fidsplat render IN`, and prints the maximum and
+    mean difference of the images and their PSNR.
 
     Examples:
       fidsplat convert room.ply room.spz
@@ -150,8 +150,8 @@ class Convert:
 
 
 def image_error(before, after, device: str | None) -> dict[str, float]:
-    """Largest and mean difference of rgb (0 to 1) and PSNR [dB] of two clouds, from a camera that frames the
-    first; PSNR is infinite for bit-identical images."""
+    """Maximum and mean difference of rgb (0 to 1) and PSNR [dB] of two clouds, from a camera that frames the
+    first; the PSNR of bit-identical images is infinite."""
     import numpy as np
 
     import fidsplat as fs

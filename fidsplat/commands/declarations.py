@@ -1,10 +1,10 @@
-"""Options from dataclasses: rules for tyro, which parses the command line.
+"""Command-line options from dataclasses: rules for tyro, which parses the command line.
 
-The fields of a command and of the settings that it nests are its options. The docstring of a field is the
-help of its option, with a placeholder for the value as in `FILE.mp4: also write a video`; a type that several
-commands use has its help as a string in `Annotated`. Another string there, which begins with --, is a second
-name of the option. `-o` is short for a field `out`. The help states a default that is computed; other
-defaults are appended.
+The options of a command are its fields and those of the settings that it nests. The docstring of a field is
+the help of its option and may begin with a placeholder, as in `FILE.mp4: also write a video`. A type that
+several commands share has its help as a string in `Annotated`; a string that begins with -- is a second name
+of the option. `-o` is short for a field `out`. Help texts state computed defaults; other defaults are
+appended.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from fidsplat.util.arguments import Bytes, Names
 from fidsplat.util.errors import InputError
 
 rules = ConstructorRegistry()
-"""tyro's rules, with those of this module"""
+"""rules of tyro and of this module"""
 _UNSET = "unset"
 _PLACEHOLDERS = {int: "N", float: "X", str: "TEXT", Path: "DIR"}
-"""placeholders of values in help, by type; settings have no paths but folders"""
+"""placeholders in help by type of value; all paths in settings are folders"""
 _VALUE = r"[A-Z][A-Z0-9,=]*(?:\.[a-z0-9.]+)?|\d"
 _PLACEHOLDER = re.compile(rf"(?:{_VALUE})(?:[| ](?:{_VALUE}))*|[a-z]+(?:\|[a-z]+)+")
-"""placeholders in docstrings: FILE.mp4|BAG, WIDTH HEIGHT, NX,NY,NZ, jpeg|png"""
+"""form of placeholders in docstrings: FILE.mp4|BAG, WIDTH HEIGHT, NX,NY,NZ, jpeg|png"""
 
 
 def _shown_default(value: str) -> str:
@@ -51,7 +51,7 @@ def _shown_default(value: str) -> str:
 
 @rules.primitive_rule
 def _optional_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """tyro's rule for options of type `T | None`: help shows neither `{None}` nor a default of None."""
+    """Rule for options of type `T | None`: help omits `{None}` and a default of None."""
     kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
     if get_origin(info.type) not in (Union, UnionType) or len(kinds) != 1:
         return None
@@ -69,7 +69,7 @@ _UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "m
 
 
 def parse_bytes(option: str, text: str) -> int:
-    """A number of bytes, with or without a unit. Raises InputError."""
+    """Parse a number of bytes with or without a unit."""
     found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([a-z]*)\s*", text.lower())
     size = int(float(found[1]) * _UNITS.get(found[2], 0)) if found else 0
     if size <= 0:
@@ -80,7 +80,7 @@ def parse_bytes(option: str, text: str) -> int:
 
 
 def _spec(metavar: str, parse: Callable[[str], Any], shown: Callable[[Any], str]) -> PrimitiveConstructorSpec:
-    """A value that is one word on the command line."""
+    """Specification of a value that is one word on the command line."""
     return PrimitiveConstructorSpec(
         1,
         metavar,
@@ -101,7 +101,7 @@ def _parse_names(text: str) -> tuple[str, ...]:
 
 @rules.struct_rule
 def describe_fields(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """tyro's description of a dataclass; the docstrings of its fields are their help."""
+    """Rule for dataclasses: the docstrings of fields are the help of their options."""
     if not dataclasses.is_dataclass(info.type):
         return None
     hints, texts = get_type_hints(info.type, include_extras=True), _field_docstrings(info.type)
@@ -116,7 +116,7 @@ def describe_fields(info: StructTypeInfo) -> StructConstructorSpec | None:
 
 
 def _described(name: str, kind: Any, text: str | None, repeated: bool, negated: bool) -> Any:
-    """The type of a field, with tyro's description of its option."""
+    """Type of a field with the description of its option for tyro."""
     base, *marks = get_args(kind) if get_origin(kind) is Annotated else (kind,)
     if dataclasses.is_dataclass(base):
         return kind
@@ -129,7 +129,7 @@ def _described(name: str, kind: Any, text: str | None, repeated: bool, negated: 
         kind = Annotated[base, _spec("SIZE", parse, _shown_bytes), *marks]
     elif Names in kinds:
         kind = Annotated[base, _spec("A,B,...", _parse_names, ",".join), *marks]
-    if base is bool:  # a default of True has the option --no-NAME
+    if base is bool:  # a field that is True by default has the option --no-NAME
         text = f"do not {text}" if negated else text
         return Annotated[kind, tyro.conf.arg(help=text, aliases=aliases, help_behavior_hint="")]
     placeholder, _, rest = (text or "").partition(": ")
@@ -142,7 +142,7 @@ def _described(name: str, kind: Any, text: str | None, repeated: bool, negated: 
 
 
 def _placeholder(kind: Any, repeated: bool) -> str:
-    """The placeholder of a type's values."""
+    """Placeholder for the values of a type."""
     if get_origin(kind) is Annotated:
         spec = next((mark for mark in get_args(kind) if isinstance(mark, PrimitiveConstructorSpec)), None)
         return spec.metavar if spec else _placeholder(get_args(kind)[0], repeated)
@@ -154,7 +154,7 @@ def _placeholder(kind: Any, repeated: bool) -> str:
 
 
 def _default_of(field: dataclasses.Field, parent: Any) -> Any:
-    """The default of a field, from an instance of its class if there is one."""
+    """Default of a field, or its value in an instance of its class if there is one."""
     if parent is MISSING:
         return MISSING
     if parent is not MISSING_NONPROP and parent is not None:
@@ -166,7 +166,8 @@ def _default_of(field: dataclasses.Field, parent: Any) -> Any:
 
 @cache
 def _field_docstrings(kind: type) -> dict[str, str]:
-    """Docstrings of a dataclass's fields, also inherited ones, as help: without a capital and a full stop."""
+    """Docstrings of a dataclass's fields, including inherited ones, as help texts: without a capital and a
+    full stop."""
     found: dict[str, str] = {}
     for each in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(each):

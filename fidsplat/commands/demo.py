@@ -51,9 +51,10 @@ class Demo:
     """Make markers, render them in a scene and detect them, with images and a table.
 
     Makes an AprilTag, an ArUco tag and a QR code of splats, places them in a yard of ten thousand splats,
-    renders three views with colour, depth, normals and labels, and detects the markers in them. Then it does
-    so in a captured scene: biker (PlayCanvas, MIT, 2.5 MB), if its download ends while the other views are
-    rendered. The exit status is 1 if a completely visible marker is not located within 1 % of its distance.
+    renders three views with colour, depth, normals and labels, and detects the markers in them. Then it adds
+    views of a captured scene, biker (PlayCanvas, MIT, 2.5 MB), if the download ends before the other views
+    are rendered. The exit status is 1 if a completely visible marker is not located within 1 % of its
+    distance.
 
     Examples:
       fidsplat demo
@@ -66,12 +67,12 @@ class Demo:
     PARTS: ClassVar[dict[str, type]] = {"views": DemoViews}
 
     out: str = "fidsplat-demo"
-    """DIR: folder for images, scene and figures"""
+    """DIR: folder for images, scene and table"""
     device: Device = None
     mixture: str = "exact"
     """NAME: mixture of the markers: exact, fitted, facets or paper"""
     captured: str | None = None
-    """NAME: captured scene of `fidsplat fetch`: biker or playbot, whose download is waited for, or none"""
+    """NAME: captured scene of `fidsplat fetch`: biker or playbot, after its download, or none"""
     json: Json = False
 
     def run(self) -> int:

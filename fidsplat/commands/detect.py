@@ -28,9 +28,9 @@ class Detect:
 
     Prints the content and the corners of each code, in pixels: top left, top right, bottom right, bottom left
     as printed; the centre of the first pixel is (0.5, 0.5). --scene adds the pose of each marker and board of
-    that scene, its errors against the true pose, and their means. The true pose of a moving scene is that at
-    its shutter's time, when the middle row is exposed; in the folder or log of a flight it is that of each
-    frame. A board, and the markers of one bundle, have one pose.
+    that scene, its errors against the true pose, and their means. If the scene moves, true poses are those at
+    the shutter's time, when the middle row is exposed; in the folder or log of a flight, those of each frame.
+    A board or a bundle of markers has one pose.
 
     Examples:
       fidsplat detect photo.jpg
@@ -81,13 +81,13 @@ class Detect:
             rows += [("", *_mean_row(mean["means"]))] if len(readings) > 1 else []
             errors = ("distance [m]", "position [mm]", "angle [deg]", "corners [px]")
             heads = ("image", "marker", "found", *errors)
-            first = int(len(results) == 1)  # without a column for the image
+            first = int(len(results) == 1)  # a single image needs no column for its name
             rows = [row[first:] for row in rows]
             print_table(console(False), f"Distances and errors, {self.scene}", heads[first:], rows)
         return 0
 
     def _images(self, path: str, scene: "Scene | None") -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
-        """Names, images, and the scene at the time of each."""
+        """Name, image, and scene at the time of the image."""
         from fidsplat.images.files import is_video, read_images
         from fidsplat.render.flight import RECORD, scene_of_frame
 
@@ -125,7 +125,7 @@ class Detect:
     def _detect(
         self, name: str, image: "np.ndarray", scene: "Scene | None"
     ) -> tuple[dict[str, Any], list["Reading"], list["BundleReading"]]:
-        """The codes of an image for JSON, and the readings of the scene's markers and bundles."""
+        """Codes of an image for JSON, and readings of the scene's markers and bundles."""
         from fidsplat.vision.bundles import read_bundles
         from fidsplat.vision.detect import detect
         from fidsplat.vision.readback import read_back

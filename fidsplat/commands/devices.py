@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 @dataclass
 class Devices:
-    """List the devices that can render on this machine, and why others cannot.
+    """List the devices that can render on this machine, and the reasons why others cannot.
 
-    The first column is the value for --device.
+    The first column contains the values for --device.
 
     Examples:
       fidsplat devices
@@ -49,12 +49,12 @@ def _row(info: DeviceInfo) -> tuple[str, ...]:
 
 @dataclass
 class Warm:
-    """Compile the kernels of common scenes, so that first frames are fast.
+    """Compile the kernels of common scenes in advance, so that first frames are fast.
 
     The kernels of a scene are compiled when it is first rendered, which takes a second or more, and cached by
     pyopencl, Warp and the driver. This command fills these caches: markers, 2D splats and captures of 3D
     Gaussians, separate and combined, with the usual outputs. Run it once after an installation, an update or
-    a change of the driver. Cached kernels take no time.
+    a change of the driver. Cached kernels are skipped.
 
     Examples:
       fidsplat warm
@@ -77,7 +77,7 @@ class Warm:
                 "sets of kernels", steps, len(sets), label=lambda step: step[0].text
             ):
                 compiled.append((recipe.text, seconds))
-        finally:  # an interrupted run reports what it has compiled
+        finally:  # an interrupted run reports its compiled kernels
             device, took = renderer.device, time.perf_counter() - begun
             facts: dict = {"device": device.name, "title": device.title, "version": device.version}
             facts["sets"] = [{"set": name, "seconds": seconds} for name, seconds in compiled]

@@ -21,7 +21,6 @@ from fidsplat.commands.output import (
     print_lines,
     report,
     run_sweeps,
-    show_progress,
 )
 from fidsplat.experiments.settings import (
     AngleSettings,
@@ -29,7 +28,6 @@ from fidsplat.experiments.settings import (
     ImageSettings,
     MarkerSettings,
     MeasureSettings,
-    RenderSettings,
     ViewSettings,
 )
 from fidsplat.util.errors import InputError
@@ -55,7 +53,7 @@ def measure(names: tuple[str, ...], options: MeasureSettings, as_json: bool) -> 
 @repeatable
 @dataclass(frozen=True)
 class Angles(Command, AngleSettings):
-    """The largest tilt at which each detector finds and reads each marker (table 3).
+    """Measure the largest tilt at which each detector finds and reads each marker (table 3).
 
     Every tilt from 0 to 89.8 degrees in steps of 0.2 is rendered and read by every detector: for tags
     OpenCV's aruco and the AprilTag library (if pupil-apriltags is installed), for QR codes OpenCV, zxing-cpp,
@@ -64,7 +62,7 @@ class Angles(Command, AngleSettings):
 
     Examples:
       fidsplat experiment angles --quick
-      fidsplat experiment angles --ideal                     only the ceiling of the detectors; no device
+      fidsplat experiment angles --ideal                     only the upper limit of the detectors; no device
       fidsplat experiment angles --protocol fixed-plane --category small --tilts 60:89.8:0.2
       fidsplat experiment angles --shard 1/4 --device opencl:nvidia
     """
@@ -76,11 +74,11 @@ class Angles(Command, AngleSettings):
 @repeatable
 @dataclass(frozen=True)
 class Views(Command, ViewSettings):
-    """PSNR, SSIM, FLIP and LPIPS of 20 random views of each marker (table 4).
+    """Measure PSNR, SSIM, FLIP and LPIPS of 20 random views of each marker (table 4).
 
-    Ground truth: the exact renderer (a pixel is the mean over its square), the same in linear light, and
-    Blender's images of `fidsplat experiment blender`. FLIP needs flip-evaluator, LPIPS needs weights. An
-    interrupted run resumes.
+    Ground truths: the exact renderer (a pixel is the mean over its square), the exact renderer in linear
+    light, and Blender's images of `fidsplat experiment blender`. FLIP needs flip-evaluator, LPIPS needs
+    lpips. An interrupted run resumes.
 
     Examples:
       fidsplat experiment views --quick
@@ -95,10 +93,10 @@ class Views(Command, ViewSettings):
 @repeatable
 @dataclass(frozen=True)
 class Counts(Command, MeasureSettings):
-    """Components, rectangles, Gaussians and seconds of each marker (table 2, figure).
+    """Count components, rectangles and Gaussians of each marker, and time its making (table 2, figure).
 
-    Compares single modules, runs of rows and the minimum partition, for every mixture. The time is that from
-    text to splats in a process that has made the marker before; keep the machine idle.
+    Compares single modules, runs of rows and the minimum partition, for every mixture. The time from text to
+    splats is measured in a process that has made the marker before; keep the machine idle.
 
     Examples:
       fidsplat experiment counts
@@ -112,10 +110,11 @@ class Counts(Command, MeasureSettings):
 @repeatable
 @dataclass(frozen=True)
 class Localisation(Command, ImageSettings):
-    """Pose errors of AprilTags and small QR codes by distance and tilt.
+    """Measure pose errors of AprilTags and small QR codes by distance and tilt.
 
-    Codes of 0.16 m in images of 1280 x 720, 60 degrees wide, at 0.5 to 4 m and 0 to 70 degrees; corners of
-    `fidsplat detect`. All methods and the ideal texture have the same cameras. An interrupted run resumes.
+    Codes of 0.16 m in images of 1280 x 720, 60 degrees wide, at 0.5 to 4 m and 0 to 70 degrees; corners are
+    those of `fidsplat detect`. All methods and the ideal texture have the same cameras. An interrupted run
+    resumes.
 
     Examples:
       fidsplat experiment localisation --quick
@@ -128,37 +127,6 @@ class Localisation(Command, ImageSettings):
         if self.category and not set(self.category) & set(LOCATED):
             raise InputError(f"--category must be {' or '.join(LOCATED)}, got {', '.join(self.category)}")
         return measure(("localisation",), self, self.json)
-
-
-@repeatable
-@dataclass(frozen=True)
-class Pictures(Command, RenderSettings):
-    """Render marker 0 of each category by every method, at tilts of 0, 45 and 70 degrees.
-
-    The report includes these images.
-
-    Examples:
-      fidsplat experiment pictures
-      fidsplat experiment pictures --category huge --mixture fitted
-    """
-
-    def run(self) -> int:
-        files = render_sheets(self)
-        return report(self.json, {"files": files}, *files)
-
-
-def render_sheets(options: RenderSettings) -> list[str]:
-    """Render the sheets of images; returns their files."""
-    from fidsplat.experiments.methods import MarkerRenderer
-    from fidsplat.experiments.setup import chosen_categories
-    from fidsplat.experiments.sheets import write_sheets
-    from fidsplat.render.renderer import Renderer
-
-    options.check()
-    categories = chosen_categories(options.category)
-    markers = MarkerRenderer(Renderer(options.device), options.trained)
-    sheets = write_sheets(categories, options.methods, markers, options.seed, options.folder)
-    return [str(file) for file in show_progress("sheets", sheets, len(categories))]
 
 
 @repeatable
@@ -184,7 +152,6 @@ class All(Command, ExperimentSettings):
         status = measure(NAMES, self, self.json)
         if self.shard is not None:
             return status
-        render_sheets(self)
         print_lines(console(True), f"report in {write_report([self.folder], self.folder)[0]}")
         return status
 
@@ -198,7 +165,7 @@ class Experiment:
     Examples:
       fidsplat experiment all --quick                   all experiments, roughly, in minutes
       fidsplat experiment angles --category small       one experiment, one category
-      fidsplat experiment report                        tables, charts and images from the results
+      fidsplat experiment report                        tables and charts of the results
       fidsplat experiment angles --help                 an experiment and its options
     """
 
@@ -211,7 +178,6 @@ class Experiment:
         "localise": Localise,
         "calibrate": Calibrate,
         "tags": Tags,
-        "pictures": Pictures,
         "dataset": Dataset,
         "blender": Blender,
         "plants": Plants,

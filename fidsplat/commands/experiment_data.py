@@ -33,7 +33,7 @@ class Dataset(DatasetSettings):
     """Write the paper's data set: 100 scenes in COLMAP's layout, 25 markers x 4 numbers of views.
 
     Each scene has training views (3, 5, 9 or 17), 20 test views, and models as text and binary. Existing
-    scenes are kept. About 300 MB.
+    scenes are unchanged. About 300 MB.
 
     Examples:
       fidsplat experiment dataset -o dataset
@@ -99,11 +99,11 @@ class Blender(BlenderSettings):
 @repeatable
 @dataclass
 class Plants:
-    """Make plants: meshes, rendered by Blender from many poses, and splats trained on these images.
+    """Make plants: meshes, images of them by Blender, and splats trained on these images.
 
-    DIR/KIND-NUMBER.ply are for `fidsplat greenhouse --plants-from DIR`; their images remain as data sets.
-    Existing plants are kept, and an interrupted run resumes. `fidsplat experiment blender --install` installs
-    Blender. With --iterations 0 plants are disks on the meshes, and Blender is not needed.
+    `fidsplat greenhouse --plants-from DIR` uses DIR/KIND-NUMBER.ply; the images remain as data sets.
+    Existing plants are unchanged, and an interrupted run resumes. `fidsplat experiment blender --install`
+    installs Blender. With --iterations 0 plants are disks on the meshes, and Blender is not needed.
 
     Examples:
       fidsplat experiment blender --install
@@ -135,8 +135,8 @@ class Plants:
 class Merge:
     """Join results of shards: NAME-1-of-4.jsonl and so on in the folders become NAME.jsonl.
 
-    Other results in NAME.jsonl are kept. The command warns of missing shards, and of results that differ in
-    device, version or code.
+    Other results in NAME.jsonl are kept. Missing shards, and results that differ in device, version or code,
+    cause warnings.
 
     Examples:
       fidsplat experiment merge shards -o results
@@ -178,8 +178,8 @@ class Merge:
 class Report:
     """Write report.md: the paper's tables with our results next to the paper's.
 
-    Charts, images and small tables of all results are written to its folder, or for FILE.md to a folder of
-    that name; the report can be made again from these tables. It lists what was not measured.
+    Its folder, or for FILE.md a folder of that name, receives charts and small tables of all results, from
+    which the report can be made again. The report lists missing measurements.
 
     Examples:
       fidsplat experiment report
@@ -198,7 +198,7 @@ class Report:
 
 
 def write_report(folders: list[Path], out: Path) -> list[str]:
-    """Write the report; returns its files, the page first."""
+    """Write the report; returns its files, first the page."""
     require_packages()
     from fidsplat.experiments.report import make_report
 

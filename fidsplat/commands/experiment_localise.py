@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 
 @dataclass
 class Localise:
-    """Localisation of a robot by tags and a LiDAR in a greenhouse, with ideal and simulated sensors.
+    """Localise a robot by tags and a LiDAR in a greenhouse, with ideal and simulated sensors.
 
     MuJoCo drives the robot up one aisle and down the next; an error-state filter fuses wheels, gyroscope,
-    tags and matches of LiDAR scans, which it reads from logs of ROS 2 messages (MCAP). Variants: odometry
-    only, ideal corners, an ideal texture, mixtures of the markers, lens, blur, rolling shutter, noise,
-    speeds, the largest distance of tags, and a LiDAR with each sensor left out. Results: absolute and
-    relative trajectory errors, corner errors by distance, logs, trajectories as TUM for evo, a page. An
-    interrupted run resumes. Needs the extras `sim` and `logs`.
+    tags and matches of LiDAR scans from logs of ROS 2 messages (MCAP). Variants: odometry only, ideal
+    corners, an ideal texture, mixtures of the markers, lens, blur, rolling shutter, noise, speeds, the
+    largest distance of tags, and a LiDAR with each sensor left out. Results: absolute and relative trajectory
+    errors, corner errors by distance, logs, trajectories as TUM for evo, a page. An interrupted run resumes.
+    Needs the extras `sim` and `logs`.
 
     Examples:
       fidsplat experiment localise --quick
@@ -67,7 +67,7 @@ class Localise:
         names = list(self.variant) or names
         if self.video is not None:
             check_video(self.video)
-        _ = drive.house  # check it before a device is opened
+        _ = drive.house  # validates the settings before a device is opened
         renderer = fs.Renderer(self.device)
         log_is_complete, source = False, digest_of((drive, renderer.device.title, fs.__version__))
         if self.log is not None:
@@ -99,7 +99,7 @@ class Localise:
         )
 
     def _record(self, drive: Drive, renderer: Renderer, source: str | None) -> None:
-        """Write the video and the log; a source of None means that the log is complete."""
+        """Write the video, and the log unless source is None (the log is complete)."""
         from fidsplat.experiments.localise import RATE, VARIANTS, write_log
         from fidsplat.images.video import write_video
 

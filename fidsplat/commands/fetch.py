@@ -14,9 +14,9 @@ from fidsplat.commands.output import console, delayed_progress, print_lines, rep
 class Fetch:
     """Download a captured scene into the user's cache, and print its path.
 
-    The files are public captures of other authors; each has a size and a SHA-256 that are checked. Without a
-    name the command lists the scenes with author, licence and source. FIDSPLAT_SCENES names a folder or URL
-    to read the files from instead.
+    The files are public captures of other authors, checked by size and SHA-256. Without a name the command
+    lists the scenes with author, licence and source. FIDSPLAT_SCENES is a folder or URL from which the files
+    are read instead.
 
     Examples:
       fidsplat fetch

@@ -33,13 +33,12 @@ class Fly(RenderInput):
     """Render a scene along a trajectory to images, a contact sheet and a video.
 
     DIR/rgb/000000.png and so on are the frames, likewise for other outputs. DIR/trajectory.tum and
-    DIR/transforms.json hold their poses, so that the folder is also a data set. An interrupted run resumes.
-    Moving parts of the scene follow the trajectory's clock, and a shutter of the scene includes the motion of
-    the camera.
+    DIR/transforms.json contain their poses, so that the folder is also a data set. An interrupted run
+    resumes. Motions of the scene use the times of the trajectory, and a shutter of the scene includes the
+    motion of the camera.
 
-    Trajectory files hold camera-to-world poses (docs/formats.md#trajectories): TUM, KITTI, COLMAP's
-    images.txt or folder, nerfstudio's transforms.json. Without --trajectory the scene's [[camera.motion]] is
-    used.
+    Trajectory files contain camera-to-world poses (docs/formats.md#trajectories): TUM, KITTI, COLMAP's
+    images.txt or folder, nerfstudio's transforms.json. The default is the scene's [[camera.motion]].
 
     Examples:
       fidsplat fly scene.toml --trajectory flight.tum -o flight --video flight.mp4
@@ -56,7 +55,7 @@ class Fly(RenderInput):
     rate: float = 30.0
     """HZ: frames per second, also of the video"""
     times: str | None = None
-    """T,T,...: seconds on the trajectory's clock instead of --rate"""
+    """T,T,...: times of frames in seconds, instead of --rate"""
     file_rate: float = 10.0
     """HZ: poses per second of a file without times"""
     smooth: bool = False
@@ -130,7 +129,7 @@ class Fly(RenderInput):
 
     @staticmethod
     def _open_bop(path: str, flight: Flight) -> BopScene:
-        """The BOP scene to write; raises InputError for flights that it cannot represent."""
+        """The BOP scene to write; raises InputError for an unsupported camera or missing outputs."""
         from fidsplat.vision.bop import BopScene, check_bop_camera
 
         camera, outputs = flight.capture.camera, flight.capture.outputs
@@ -182,7 +181,7 @@ class Fly(RenderInput):
 
 
 def _camera_motion(source: str, scene: Scene, smooth: bool) -> Trajectory:
-    """The scene's [[camera.motion]] as camera-to-world poses."""
+    """Camera-to-world poses of the scene's [[camera.motion]]."""
     from fidsplat.cameras import Trajectory
 
     if not isinstance(scene.camera_motion, Trajectory):
@@ -203,7 +202,7 @@ def _parse_times(text: str) -> list[float]:
 
 
 def write_log(folder: FlightFolder, path: str, overwrite: bool, compress: str | None = None) -> Iterator[int]:
-    """Write rgb, outputs that are arrays, intrinsics and poses to a log; yields the number of each frame."""
+    """Write rgb, array outputs, intrinsics and poses to a log; yields the index of each frame."""
     from fidsplat.logs import RobotLog
     from fidsplat.scenes.up import scene_up
 
@@ -227,7 +226,7 @@ def write_log(folder: FlightFolder, path: str, overwrite: bool, compress: str | 
 def write_truth(
     folder: FlightFolder, add: Callable[[str, Mapping[str, np.ndarray], Truth], object]
 ) -> Iterator[int]:
-    """Call `add` with file, images and truth of each frame; yields its number."""
+    """Call `add` with the file, images and ground truth of each frame; yields the frame's index."""
     from fidsplat.images.files import read_image
     from fidsplat.render.output_files import suffixes_of
     from fidsplat.vision.truth import truth_of
@@ -245,7 +244,7 @@ def write_truth(
 
 
 def _load_images(folder: FlightFolder, k: int) -> dict[str, np.ndarray]:
-    """The lossless outputs of a frame: rgb, and outputs that are written as arrays."""
+    """Lossless outputs of a frame: rgb, and outputs that are stored as arrays."""
     from fidsplat.images.files import read_image
     from fidsplat.render.output_files import load_output, suffixes_of
 

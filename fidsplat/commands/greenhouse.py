@@ -46,7 +46,7 @@ class Greenhouse:
         scene = made.scene
         writable_folder(folder)
         write_file(model, made.mjcf())
-        scene.save(scene_file)  # last, since the scene file marks a complete greenhouse
+        scene.save(scene_file)  # written last, since the scene file marks a complete greenhouse
         plants, splats, markers = settings.rows * settings.plants, len(scene.cloud()), len(made.markers)
         facts = {"scene": str(scene_file), "model": str(model), "splats": splats, "markers": markers}
         facts |= {"rows": settings.rows, "plants": plants, "length_m": made.length}

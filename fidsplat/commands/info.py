@@ -16,10 +16,9 @@ from fidsplat.commands.output import delayed_progress, report
 class Info:
     """Describe a splat file: number, kind and bounds of its splats.
 
-    Bounds enclose all splats, and the middle 99 % of their centres along each axis, as captures have
-    strays far away. The up axis is a guess: away from the level areas, or along a side that is by far the
-    longest. The command suggests size and pose of a first marker that faces the camera of `fidsplat render
-    FILE.ply`.
+    Bounds enclose all splats, and the middle 99 % of their centres along each axis, since captures have
+    outliers. The up axis is a guess from level surfaces, or from a side that is by far the longest. The
+    command suggests size and pose of a first marker that faces the camera of `fidsplat render FILE.ply`.
 
     Examples:
       fidsplat info scene.ply

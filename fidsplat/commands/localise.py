@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 class Localise:
     """Find the poses of photographs in a scene, with covariance.
 
-    The scene's camera has the size, intrinsics and lens of the photographs. Each search starts at --start, at
-    the pose by the scene's markers in the photograph, or at the most similar of --candidates and of the pose
-    of the photograph before, in this order. It continues by direct image alignment, which exposure and white
-    balance do not change. Deviations are standard deviations. A pose is found if most of the textured blocks
-    of the image match the scene.
+    The scene's camera has the size, intrinsics and lens of the photographs. The initial pose is --start, else
+    the pose from the scene's markers in the photograph, else the most similar view of --candidates and of the
+    previous photograph. Direct image alignment refines it, independently of exposure and white balance.
+    Deviations are standard deviations. A pose is found if most of the textured blocks of the image match the
+    scene.
 
     Examples:
       fidsplat localise photo.jpg --scene scene.toml
@@ -40,7 +40,7 @@ class Localise:
     start: str | None = None
     """X,Y,Z,QW,QX,QY,QZ: initial pose of the camera in the world, metres and a unit quaternion"""
     candidates: str | None = None
-    """FILE: poses where a search may start: COLMAP, transforms.json or a trajectory, e.g. of training"""
+    """FILE: candidates of the initial pose: COLMAP, transforms.json or a trajectory, e.g. of training"""
     out: str | None = None
     """FILE: also write the found poses: .tum, .kitti, .json (transforms.json) or a folder (COLMAP)"""
     device: Device = None
@@ -134,7 +134,7 @@ def _pose(text: str) -> tuple[list[float], list[float]]:
 
 
 def _write(out: str, results: dict[str, Localisation | None], camera: Camera) -> str:
-    """Write the found poses as a trajectory, one a second; returns the name of the file."""
+    """Write the found poses as a trajectory, one per second; returns the file's name."""
     import numpy as np
 
     from fidsplat.cameras import Trajectory

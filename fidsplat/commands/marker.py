@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Placing:
-    """Place of a marker in a scene."""
+    """Placement of a marker in a scene."""
 
     scene: str | None = None
     """SCENE.toml|FILE.ply|STORE.fss: scene to place the marker in; prints its table"""
@@ -49,7 +49,7 @@ class Placing:
             raise InputError(f"--append must have a scene file (.toml), got {self.scene}")
 
     def placed(self, marker: fs.Marker, device: str | None) -> tuple[dict[str, Any], str]:
-        """Facts of the surface, and the [[markers]] table."""
+        """Facts of the surface, and the [[markers]] table of the placed marker."""
         import fidsplat as fs
         from fidsplat.scenes.lights import Lighting
         from fidsplat.scenes.sources import load_source
@@ -101,15 +101,15 @@ class Marker:
       aprilgrid:CxR:FAMILY the same with corner squares     aprilgrid:6x6:36h11
 
     Mixtures: exact (default) renders every rectangle as one box with sharp edges; PLY files have no boxes, so
-    -o writes the Gaussians of fitted. facets are Gaussians for renderers that composite by depth per pixel;
-    only there are they opaque and sharp. refined optimises the Gaussians of marker.template=121 (or of
-    --quality) by gradient descent, half a minute for a tag.
+    -o writes the Gaussians of fitted. facets are Gaussians for renderers that composite by depth per pixel,
+    where they are opaque and sharp. refined optimises the Gaussians of marker.template=121 (or of --quality)
+    by gradient descent, half a minute for a tag.
 
     Settings of the mixtures (fs.MarkerQuality) are part of a quality: marker.levels (1 to 8) and
     marker.density (1 to 100) of paper, marker.template of fitted (Gaussians per rectangle: 1, 5, 9, 13, 25,
     41, 121 or 562), and marker.growth (modules).
 
-    An image of noise can become tens of millions of splats; --max-splats raises the limit of one million.
+    An image of noise can require tens of millions of splats; --max-splats raises the limit of one million.
 
     --shape bends the sheet: cylinder (radius, axis x or y), cone (radius, taper), bent (radius, length,
     axis), edge (radius, offset, axis) or crumpled (height, length, seed), lengths in metres; deviation is the
@@ -145,7 +145,7 @@ class Marker:
     wear: str | None = None
     """KEY=VALUE: print defects and wear, e.g. fading=0.4,dirt=0.2,seed=3"""
     native_2dgs: bool = False
-    """leave the third scale out of the file, as 2DGS does"""
+    """omit the third scale from the file, as 2DGS does"""
     max_splats: int | None = None
     """N: maximum number of splats (default: 1000000)"""
     placing: Placing = field(default_factory=Placing)
@@ -226,7 +226,7 @@ class Marker:
         return report(self.json, facts, *lines, table=(made.spec, ("", ""), rows))
 
     def _refine(self, made: fs.Marker, progress: Callable[[str, float], None]) -> fs.Marker:
-        """The marker with Gaussians optimised on a device."""
+        """The marker with Gaussians that are optimised on a device."""
         import fidsplat as fs
         from fidsplat.train.refining import ITERATIONS, refine
 

@@ -1,4 +1,4 @@
-"""Options that several commands share, and parsers of their values."""
+"""Options that several commands share, and validation of their values."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import ordinary_file, path_of, writable_folder
 
 repeatable = tyro.conf.configure(tyro.conf.UseAppendAction)
-"""Decorator of a command whose options with several values are repeated, one value each time."""
+"""decorator of a command whose options with several values are repeated, with one value each"""
 
 
 Device = Annotated[str | None, "D: device; see `fidsplat devices` (default: FIDSPLAT_DEVICE, or auto)"]
@@ -24,8 +24,8 @@ Devices = Annotated[
 ]
 Json = Annotated[bool, "print one JSON object on stdout and nothing else there"]
 Overwrite = Annotated[bool, "replace existing files"]
-"""Commands whose output may be a user's own file or cost hours refuse to replace it without this option.
-Images, charts and tables replace earlier ones without asking."""
+"""Commands whose output may be a user's own file or cost hours do not replace files without this option.
+Images, charts and tables replace earlier ones."""
 MemoryBudget = Annotated[
     Bytes | None, "SIZE: device memory for an image and its splats, e.g. 2GiB (default: nine tenths of it)"
 ]
@@ -37,7 +37,7 @@ BlenderEnvironment = Annotated[
 
 
 def check_request(outputs: tuple[str, ...] | None, quality: str | None) -> None:
-    """Raise InputError for outputs or a quality that no scene can have, before anything is opened."""
+    """Raise InputError for outputs or a quality that no scene supports, before a device is opened."""
     import fidsplat as fs
     from fidsplat.effects import select
 
@@ -45,7 +45,7 @@ def check_request(outputs: tuple[str, ...] | None, quality: str | None) -> None:
 
 
 def writable_file(path: str | Path) -> Path:
-    """The path of a file that can be written. Raises InputError."""
+    """The path of a file that can be written. Raises InputError if it cannot."""
     file = path_of(path)
     if file.is_dir():
         raise InputError(f"the output must be a file, got the folder {file}; name a file in it")
@@ -54,7 +54,7 @@ def writable_file(path: str | Path) -> Path:
 
 
 def new_file(path: str | Path, overwrite: bool) -> Path:
-    """The path of a writable file that does not exist, unless it may be replaced. Raises InputError."""
+    """The path of a writable file that does not exist yet or may be replaced. Raises InputError otherwise."""
     file = writable_file(path)
     if file.exists() and not overwrite:
         raise InputError(f"{file} already exists; give another name, or --overwrite")
@@ -66,17 +66,16 @@ def require_packages(
     packages: Sequence[str] = ("pandas", "matplotlib", "jinja2"),
     extra: str = "experiments",
 ) -> None:
-    """Raise InputError where packages of an extra are missing."""
+    """Raise InputError if packages of an extra are missing."""
     missing = [name for name in packages if find_spec(name) is None]
     if missing:
         raise InputError(f"{what} needs {' and '.join(missing)}; pip install 'fidsplat[{extra}]'")
 
 
 def check_plot(name: str, *packages: str) -> None:
-    """Raise InputError for a chart that cannot be written, before anything is measured.
+    """Raise InputError for a chart that cannot be written, before measuring.
 
-    Args:
-        packages: packages that the chart needs in addition to matplotlib.
+    packages: required packages in addition to matplotlib.
     """
     if Path(name).suffix.lower() not in (".svg", ".png"):
         raise InputError(f"--plot must be a file that ends in .svg or .png, got {name}")

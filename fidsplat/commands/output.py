@@ -1,4 +1,4 @@
-"""Printing and progress of commands. With --json one object goes to stdout and everything else to stderr."""
+"""Printing and progress of commands. With --json, stdout has one JSON object and stderr everything else."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def print_table(where: Console, title: str, heads: Sequence[str], rows: Iterable
 
 
 def progress_bar(where: Console, *columns: Any) -> Any:
-    """A progress bar that disappears when it is done; for files and pipes, a line on stderr every 30 s."""
+    """Progress bar that disappears at its end; for files and pipes, a line on stderr every 30 s."""
     if not where.is_interactive:
         from fidsplat.commands.progress_lines import ProgressLines
 
@@ -88,7 +88,7 @@ def progress_bar(where: Console, *columns: Any) -> Any:
 
 @contextmanager
 def steps_shown(where: Console, first: str) -> Iterator[Callable[[str], None]]:
-    """A callback that shows the current step of work of unknown length."""
+    """Progress callback that shows the current step of work of unknown length."""
     from rich.progress import SpinnerColumn, TextColumn
 
     with progress_bar(where, SpinnerColumn(), TextColumn("{task.description}")) as bar:
@@ -98,9 +98,9 @@ def steps_shown(where: Console, first: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def delayed_progress(after: float = 1.0) -> Iterator[Callable[[str, float], None]]:
-    """A progress callback (description, share done) whose bar appears on stderr after some seconds.
+    """Progress callback (description, completed share) whose bar appears on stderr after some seconds.
 
-    A thread watches the time, so that long work between two calls also shows the bar.
+    A timer thread shows the bar, so that it also appears during long work between two calls.
     """
     bar = progress_bar(console(True))
     task = bar.add_task("", total=1.0)
@@ -123,7 +123,7 @@ def delayed_progress(after: float = 1.0) -> Iterator[Callable[[str, float], None
 def show_progress(
     name: str, steps: Iterable[T], total: int, done: int = 0, label: Callable[[T], str] = lambda step: ""
 ) -> Iterator[T]:
-    """Yield each finished step while a bar on stderr counts the steps and shows the label of the last."""
+    """Yield each finished step; a progress bar on stderr counts the steps and shows the last one's label."""
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -147,7 +147,7 @@ def _plain(value: Any) -> Any:
 
 
 def run_sweeps(sweeps: Iterable[Sweep]) -> list[Record]:
-    """Measure the missing points of one sweep after the other; returns their records."""
+    """Measure the missing points of the sweeps, one sweep after the other; returns their records."""
     found = []
     for sweep in sweeps:
         total, left = len(sweep.points), len(sweep.left)
@@ -156,5 +156,5 @@ def run_sweeps(sweeps: Iterable[Sweep]) -> list[Record]:
 
 
 def point_label(key: Key) -> str:
-    """Label of a point: the texts of its key, without numbers and settings."""
+    """Label of a point: the strings of its key, without numbers and settings."""
     return " ".join(value for value in key.values() if isinstance(value, str))

@@ -15,14 +15,14 @@ from fidsplat.util.files import writable_folder
 
 @dataclass
 class PlanTags:
-    """Plan where to hang tags, for a camera that moves along a trajectory.
+    """Plan the positions of tags for a camera that moves along a trajectory.
 
-    Candidates are flat surfaces that the camera sees. Each has the Fisher information of its four corners at
+    Candidates are flat surfaces in view of the camera. Each has the Fisher information of its four corners at
     every pose that can read it: not occluded, modules of at least 2.5 pixels, incidence below 70 degrees,
     with the motion blur and the noise of the scene's shutter and sensor. Greedy selection and local search
-    maximise the information about the trajectory. Tags that the scene has count as well.
+    maximise the information about the trajectory. Existing tags of the scene contribute too.
 
-    Written are DIR/scene.toml, the scene with the tags; plan.json; map.svg. Needs the extra `experiments`.
+    Writes DIR/scene.toml, the scene with the tags; plan.json; map.svg. Needs the extra `experiments`.
 
     Examples:
       fidsplat plan-tags scene.toml --trajectory flight.tum --count 10

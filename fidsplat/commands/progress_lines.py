@@ -15,18 +15,18 @@ PERIOD = 30.0
 
 
 class ProgressLines(Progress):
-    """rich's Progress that prints a line per task every 30 seconds instead of bars."""
+    """rich's Progress with a line per task every 30 seconds instead of bars."""
 
     def __init__(self) -> None:
         super().__init__(console=Console(stderr=True))
         self._ended = threading.Event()
 
     def add_task(self, *words: Any, completed: int = 0, **options: Any) -> TaskID:
-        """Add a task, of which an earlier run may have completed a part."""
+        """Add a task. completed: amount that an earlier run has completed."""
         return super().add_task(*words, completed=completed, first=completed, **options)
 
     def start(self) -> None:
-        """Start printing, by a thread, so that long work between two updates is also reported."""
+        """Start a thread that prints, so that long work between two updates is reported too."""
         threading.Thread(target=self._print, name="progress", daemon=True).start()
 
     def stop(self) -> None:
@@ -40,7 +40,7 @@ class ProgressLines(Progress):
 
 
 def line_of(task: Task) -> str:
-    """Description, amount done and time left, for example `training: 200 of 700, 1 min 20 s left`."""
+    """Description, completed amount and remaining time, as in `training: 200 of 700, 1 min 20 s left`."""
     elapsed, done = task.elapsed or 0.0, task.completed - task.fields["first"]
     if task.total is None:
         amount = f"{duration(elapsed)} so far"
@@ -56,7 +56,7 @@ def line_of(task: Task) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A time in words: `45 s`, `12 min 5 s`, `3 h 20 min`."""
+    """A duration as text: `45 s`, `12 min 5 s`, `3 h 20 min`."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"

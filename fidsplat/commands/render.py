@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from textwrap import indent
 from typing import TYPE_CHECKING
@@ -38,11 +37,11 @@ _OTHER_IMAGES = (".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".gi
 class Render(RenderInput):
     """Render a scene file, a splat file or a store (a folder .fss with splats on disk) to images.
 
-    A splat file has no camera: it is framed as a whole, with the up axis that `fidsplat info` guesses.
-    --up, --position, --look-at and --size set the camera of any scene. With -o OUT.png the colour image is
-    OUT.png and other outputs are OUT-depth.png and so on. Any other OUT is a folder for rgb.png, depth.png
-    and so on. Depth is written as .npy (metres), .png (16-bit millimetres) and -turbo.png (colours), labels,
-    ids and counts as .npy and .png (colours).
+    A splat file has no camera: the default camera frames all of it, with the up axis that `fidsplat info`
+    guesses. --up, --position, --look-at and --size set the camera of any scene. With -o OUT.png the colour
+    image is OUT.png and other outputs are OUT-depth.png and so on. Any other OUT is a folder for rgb.png,
+    depth.png and so on. Depth is written as .npy (metres), .png (16-bit millimetres) and -turbo.png
+    (colours), labels, ids and counts as .npy and .png (colours).
 
     Outputs:
     {outputs}
@@ -50,14 +49,14 @@ class Render(RenderInput):
     Quality: standard, fast, reference, gsplat or surfel, then settings of fs.Quality as key=value; settings
     without a preset change standard: fast,samples=2,alpha_cutoff=1e-3. On NVIDIA's GPUs through OpenCL,
     arithmetic=approximate and blend_precision=float16 save time, and add errors of up to 1e-6 and 0.01.
-    Markers of a scene file use marker.mixture, marker.levels, marker.density, marker.growth and
-    marker.template of the quality where the file does not state them.
+    For markers of a scene file without their own settings, the quality's marker.mixture, marker.levels,
+    marker.density, marker.growth and marker.template apply.
 
     Lenses, shutters and motion, fog, backgrounds and sensors are tables of a scene file
     (docs/scene-files.md) and can be combined.
 
-    --depth-camera writes the depth that a device measures at the camera's position, with its own field of
-    view, errors and holes, as NAME.npy, NAME.png and NAME-turbo.png.
+    --depth-camera writes the measured depth of a device at the camera's position, with its own field of view,
+    errors and holes, as NAME.npy, NAME.png and NAME-turbo.png.
 
     Examples:
       fidsplat render scene.toml
@@ -71,15 +70,15 @@ class Render(RenderInput):
     """
 
     out: str | None = None
-    """OUT: PNG file or folder (default: the source's name with .png, here)"""
+    """OUT: PNG file or folder (default: the source's name with .png, in the current folder)"""
     max_error: float | None = None
-    """E: use the cheapest quality whose error of rgb is certified to be at most E"""
+    """E: use the fastest quality whose error of rgb is certified to be at most E"""
     max_ms: float | None = None
     """T: use the most accurate quality that takes at most T milliseconds per frame"""
     every: int | None = None
     """N: render every Nth pixel in both directions as a smaller image (device reference only)"""
     depth_camera: str | None = None
-    """NAME: also write what a depth camera measures there: d435, azure-kinect or kinect-v1"""
+    """NAME: also write the depth of a depth camera: d435, azure-kinect or kinect-v1"""
     pose: StartPose = field(default_factory=StartPose)
     size: Size = None
     json: Json = False
@@ -110,8 +109,7 @@ class Render(RenderInput):
         bits = None if scene.sensor is None else scene.sensor.bits
         files = [str(file) for name in images for file in save_output(name, images[name], name_of, bits)]
         for name, depth in measured.items():
-            own = partial(_named, name_of, name)
-            files += [str(file) for file in save_output("depth", depth, own)]
+            files += [str(file) for file in save_output("depth", depth, lambda _, s, n=name: name_of(n, s))]
         height, width = images[frame.outputs[0]].shape[:2]
         facts = {
             "source": self.source,
@@ -173,7 +171,7 @@ Render.__doc__ = (Render.__doc__ or "").replace("    {outputs}", indent(outputs_
 
 @contextmanager
 def _scene_key(source: str, key: str, from_scene: bool) -> Iterator[None]:
-    """Prefix errors with the scene file and its key if the value comes from there."""
+    """Prefix errors with the scene file and the key if the scene file has the value."""
     try:
         yield
     except FidsplatError as error:
@@ -192,12 +190,8 @@ def _option_names() -> Iterator[None]:
         raise InputError(re.sub(r"try (error|ms)=", r"try --max-\1 ", text)) from error
 
 
-def _named(name_of: Callable[[str, str], Path], name: str, _: str, suffix: str) -> Path:
-    return name_of(name, suffix)
-
-
 def _file_names(out: str | None, source: Path) -> Callable[[str, str], Path]:
-    """A function (output, suffix) -> file in a writable folder."""
+    """Function from output and suffix to a file in a writable folder."""
     if not source.name:
         raise InputError(f"the source must be a scene file (.toml) or a splat file, got the folder {source}")
     if out == "":

@@ -15,7 +15,7 @@ from fidsplat.scenes.sources import StartPose
 
 @dataclass
 class Scan:
-    """Scan a scene by a simulated LiDAR and write its points.
+    """Scan a scene with a simulated LiDAR and write its points.
 
     The sensor is at the scene's camera, or at --position and --look-at: x forward, y left, z up. The file
     has one point per return: x, y, z in metres, intensity, ring, time in seconds, and echo.

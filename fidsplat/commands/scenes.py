@@ -38,7 +38,7 @@ class SceneInput:
     quality: SceneQuality = None
 
     def load(self, pose: StartPose = OWN_POSE, size: tuple[int, int] | None = None) -> Scene:
-        """The scene, with a progress bar when loading takes long. Raises InputError.
+        """Load the scene, with a progress bar. Raises InputError.
 
         pose, size: of the camera, instead of the scene's.
         """
@@ -50,7 +50,7 @@ class SceneInput:
 
 @dataclass
 class RenderInput(SceneInput):
-    """A scene and the device that renders it."""
+    """A scene, and the device that renders it."""
 
     device: SceneDevice = None
     memory_budget: MemoryBudget = None

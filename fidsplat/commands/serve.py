@@ -26,23 +26,23 @@ if TYPE_CHECKING:
     from fidsplat.logs.live import LiveLog
 
 CAMERA, LIDAR = "camera", "lidar"
-"""names of frames and topics"""
+"""names of the frames and topics"""
 TIMEOUT = 0.5
-"""seconds after which the robot stops without a new /cmd_vel"""
+"""seconds without a new /cmd_vel after which the robot stops"""
 FAR = 1e9
-"""metres: largest coordinate of the robot; farther poses of other programs are ignored"""
+"""largest coordinate of the robot in metres; poses of other programs beyond it are ignored"""
 
 
 @dataclass
 class Serve(RenderInput):
     """Send live images, poses and LiDAR points of a scene as ROS 2 messages.
 
-    Without options, open ws://127.0.0.1:8765 in Foxglove. --ros2 publishes ROS 2 topics, by rclpy where it is
-    installed, else by Cyclone DDS; nodes need ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST. The camera
-    follows --trajectory or the scene's [[camera.motion]], again and again. Otherwise it does not move, or
-    with --ros2 by /cmd_vel (Twist) and /pose (PoseStamped in the frame map, scene or base_link) of its robot.
-    Topics: /camera/image_raw, /camera/camera_info, /tf, /clock, and with --lidar /lidar/points. Frames that
-    would be late are dropped and counted. Ctrl-C ends it. Needs the extra `live`.
+    Without options, open ws://127.0.0.1:8765 in Foxglove. --ros2 publishes ROS 2 topics, by rclpy if it is
+    installed, else by Cyclone DDS; nodes need ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST. The camera repeats
+    --trajectory or the scene's [[camera.motion]]. Without these it is static; with --ros2, /cmd_vel (Twist)
+    and /pose (PoseStamped in the frame map, scene or base_link) move its robot. Topics: /camera/image_raw,
+    /camera/camera_info, /tf, /clock, and with --lidar /lidar/points. Late frames are dropped and counted.
+    Ctrl-C ends it. Needs the extra `live`.
 
     Examples:
       fidsplat serve scene.toml
@@ -67,9 +67,9 @@ class Serve(RenderInput):
     host: str = "127.0.0.1"
     """ADDRESS: address to listen on; the default is this machine only, 0.0.0.0 opens it to the network"""
     port: int = 8765
-    """N: port of Foxglove's protocol, 0 for any free one"""
+    """N: port of Foxglove's protocol; 0 for any free port"""
     duration: float | None = None
-    """S: seconds after which it ends (default: never)"""
+    """S: seconds after which the server ends (default: never)"""
     size: Size = None
     json: Json = False
 
@@ -127,7 +127,7 @@ class Serve(RenderInput):
 
 @dataclass
 class _Sender:
-    """Renders and sends the messages of a moment."""
+    """Sender of the rendered messages of one time."""
 
     renderer: Any
     resident: Any
@@ -138,7 +138,7 @@ class _Sender:
     driver: _Driver | None
 
     def send(self, step: int, moment: float) -> None:
-        """Send the images, the pose and the points at a moment of the scene's clock."""
+        """Send images, pose and points at a time of the scene in seconds."""
         import fidsplat as fs
         from fidsplat.render.scan import LINK_FROM_OPTICAL
 
@@ -174,7 +174,7 @@ class _Sender:
 
 
 class _Driver:
-    """Pose of a robot from ROS 2's /cmd_vel and /pose. Its frame base_link is at the camera, upright."""
+    """Robot that ROS 2's /cmd_vel and /pose move. Its frame base_link is at the camera, upright."""
 
     def __init__(self, log: LiveLog, camera: Camera) -> None:
         self._log, self._twist, self._time, self._until = log, np.zeros(6), 0.0, 0.0
@@ -184,13 +184,13 @@ class _Driver:
         self._mount = np.linalg.inv(self._base) @ there
 
     def base_at(self, time: float) -> np.ndarray:
-        """Pose of base_link in the world (4, 4) at a time, which must not decrease."""
+        """Pose of base_link in the world (4, 4) at a time; times must not decrease."""
         self._place(self._base @ exponential(self._twist * max(0.0, min(time, self._until) - self._time)))
         self._time = time
         for stamped in self._log.received("/pose", "geometry_msgs/msg/PoseStamped"):
             at, turn = stamped.pose.position, stamped.pose.orientation
             frames = {self._log.world: np.eye(4), SCENE: self._log.world_from_scene, "base_link": self._base}
-            # a wrong frame or an invalid pose of another program must not end the server
+            # a wrong frame or an invalid pose from another program must not end the server
             with suppress(InputError, KeyError):
                 frame = frames[stamped.header.frame_id or self._log.world]
                 self._place(frame @ rigid_matrix((at.x, at.y, at.z), (turn.w, turn.x, turn.y, turn.z)))
@@ -200,7 +200,7 @@ class _Driver:
         return self._base
 
     def _place(self, pose: np.ndarray) -> None:
-        """Move base_link to a pose, unless it is not finite or farther away than `FAR`."""
+        """Move base_link to a pose; ignored if the pose is not finite or farther away than `FAR`."""
         if (np.abs(pose) <= FAR).all():
             self._base = pose
 
@@ -211,7 +211,7 @@ class _Driver:
 
 
 class _Clock:
-    """Steps at a rate: a step whose time has passed by a period is dropped."""
+    """Steps at a fixed rate; a step that is late by a period or more is dropped."""
 
     def __init__(self, rate: float, duration: float | None) -> None:
         self._rate, self._duration = rate, duration

@@ -26,9 +26,9 @@ StorePath = Annotated[tyro.conf.Positional[str], "STORE.fss: store to read"]
 class Build:
     """Build a store of splat files of any size: spatially sorted chunks with levels of detail.
 
-    PLY files are read in parts, so that memory is limited by --memory and not by the files; other formats are
-    loaded completely. The same command resumes an interrupted build. Splats that cannot be rendered are left
-    out and counted. While it is built, a store needs twice its size on the disk.
+    PLY files are read in windows, so that --memory limits the memory; files of other formats are loaded
+    completely. The same command resumes an interrupted build. Splats that cannot be rendered are dropped and
+    counted. During the build the disk needs twice the size of the store.
 
     Examples:
       fidsplat store build street.ply -o street.fss
@@ -64,10 +64,10 @@ class Build:
 
 @dataclass
 class Place:
-    """Place instances of a store: the new store holds only poses and the path of the other.
+    """Place instances of a store: the new store contains only poses and the path of the original.
 
     Poses come from a file (camera to world, as for `fidsplat fly`) or form a grid that starts at the pose of
-    the store itself.
+    the original.
 
     Examples:
       fidsplat store place house.fss -o street.fss --grid 10,1,2 --pitch 12,0,30
@@ -137,7 +137,7 @@ class StoreInfo:
 
 
 def report_store(path: str, as_json: bool) -> int:
-    """Describe a store; returns the exit status 0. Raises InputError for another kind of folder."""
+    """Describe a store; returns the exit status 0. Raises InputError for another folder."""
     import fidsplat as fs
 
     facts = fs.Store(path).facts()
@@ -170,10 +170,10 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
 class Measure:
     """Measure the error of levels of detail against exact images.
 
-    Renders random views around and inside the store at 320 x 180 pixels. The store keeps the errors, so that
-    Quality.detail_error can select levels, with the same cut-off: fidsplat render city.fss --quality
+    Renders random views around and inside the store at 320 x 180 pixels. The errors are saved in the store,
+    so that Quality.detail_error can select levels, with the same cut-off: fidsplat render city.fss --quality
     lowpass=pixel,alpha_cutoff=1e-8,detail_error=0.004
-    The error holds on the measured views with a margin of 3. Other views may exceed it, the fewer the more
+    The error holds on the measured views with a margin of 3. Other views may exceed it, but fewer if more
     views are measured.
 
     Examples:
@@ -210,7 +210,7 @@ class StoreDemo:
     """Make a city of 20 million splats with measured levels of detail.
 
     DIR/city.fss is the store, DIR/city.toml a scene with a flight through a street and over the roofs.
-    --markers places ArUco markers of 0.8 m on the walls of the houses, in the scene and not in the store.
+    --markers places ArUco markers of 0.8 m on the walls of houses in the scene; the store has no markers.
 
     Examples:
       fidsplat store demo -o city
@@ -239,7 +239,7 @@ class StoreDemo:
 
 @dataclass
 class Verify:
-    """Compare every chunk of a store with its checksum; the exit status is 1 if one is damaged.
+    """Compare every chunk of a store with its checksum; the exit status is 1 if a chunk is damaged.
 
     Examples:
       fidsplat store verify city.fss

@@ -72,7 +72,7 @@ class Tradeoff:
         own = user_views(load_user_scenes(self.scene, self.cameras, self.measurement.scenes or (), most))
         folders = [folder / name.replace(":", "-") for name in devices] if len(devices) > 1 else [folder]
         with ExitStack() as stack:
-            # open all devices first, so that a missing one is reported before another is measured
+            # open all devices first, so that a missing device is reported before others are measured
             sweeps = [
                 stack.enter_context(prepared(self.measurement, out, device, own))
                 for out, device in zip(folders, devices, strict=True)
@@ -106,7 +106,7 @@ class Tradeoff:
 
 
 def _print_estimate(sweep: Sweep) -> None:
-    """Print the number of missing points and the estimated time on stderr."""
+    """Print the number of missing points and their estimated time on stderr."""
     if sweep.estimate is None or not (left := len(sweep.left)):
         return
     seconds = sweep.estimate()
@@ -117,7 +117,7 @@ def _print_estimate(sweep: Sweep) -> None:
 
 
 def _print_results(sweeps: Sequence[Sweep], as_json: bool) -> None:
-    """Print the measured points of each device: time relative to the baseline and largest error."""
+    """Print each setting's time relative to the baseline and largest error, for each device."""
     for sweep in sweeps:
         found: dict[tuple[str, str], list[dict[str, Any]]] = {}
         for record in sweep.records:

@@ -30,7 +30,7 @@ class Train:
     transforms.json, or a folder of `fidsplat demo views` or `fidsplat experiment dataset`. Views in its
     folder test are held out and evaluated at the end; without that folder every eighth view of 16 or more.
 
-    The same command writes a bit-identical file on the same device. A checkpoint, FILE.training.npz next to
+    The same command on the same device writes a bit-identical file. A checkpoint, FILE.training.npz next to
     FILE.ply, is written every half minute and at Ctrl-C. The same command resumes from it, also with more
     iterations; --overwrite restarts.
 
@@ -48,7 +48,7 @@ class Train:
     device: Device = None
     training: TrainSettings = field(default_factory=TrainSettings)
     within_memory: float | None = None
-    """GIB: memory of splats and images while training; reduces the number of splats"""
+    """GIB: memory of splats and images during training; reduces the number of splats"""
     hold_out: int | None = None
     """N: hold out every Nth view, 0 for none (default: see above)"""
     random_points: int = 0
@@ -56,13 +56,13 @@ class Train:
     masks: str | None = None
     """DIR: masks NAME.png of the images, 0 for ignored pixels (default: those of the data set)"""
     alpha_masks: bool = False
-    """ignore transparent pixels, instead of showing the background there"""
+    """ignore transparent pixels instead of blending them with the background"""
     start: str | None = None
-    """FILE: splats to refine, instead of one at each point"""
+    """FILE: initial splats to refine (default: one at each point)"""
     report: str | None = None
     """DIR|FILE.md: write a page with curves and images of the held-out views"""
     overwrite: bool = False
-    """restart; the old checkpoint stays until the new run writes its first"""
+    """restart; the old checkpoint is kept until the new run writes its first"""
     json: Json = False
 
     def run(self) -> int:
@@ -77,7 +77,7 @@ class Train:
         settings = self.training
         file = writable_file(self.out)
         checkpoint = file.with_suffix(".training.npz")
-        if file.exists() and not checkpoint.exists():  # from something else than this training
+        if file.exists() and not checkpoint.exists():  # the file is not from this training
             new_file(file, self.overwrite)
         where = console(self.json)
         with delayed_progress() as progress:
@@ -148,7 +148,7 @@ def _bytes(gibibytes: float) -> int:
 
 @contextmanager
 def _bar(trainer: Trainer) -> Iterator:
-    """A progress bar, as a callback for each step."""
+    """Progress bar, as a callback for each step."""
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
     columns = (
@@ -162,7 +162,7 @@ def _bar(trainer: Trainer) -> Iterator:
         mean = {"loss": 0.0, "psnr": 0.0}
 
         def show(step: Step) -> None:
-            share = max(0.02, 1 / (step.iteration - first))  # weight of the last step in the running mean
+            share = max(0.02, 1 / (step.iteration - first))  # weight of this step in the running mean
             mean["loss"] += share * (step.loss - mean["loss"])
             mean["psnr"] += share * (min(step.psnr, 100.0) - mean["psnr"])
             rate = (step.iteration - first) / (time.perf_counter() - begun)

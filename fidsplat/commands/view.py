@@ -29,16 +29,16 @@ CHECKPOINT = ".training.npz"
 class View:
     """Show a scene in a browser, rendered by fidsplat from any viewpoint.
 
-    Small images while the view moves, an exact image at rest, none while nothing changes. Neither this
-    machine nor the browser's needs a GPU. Drag to rotate, right-drag to pan, wheel to approach; click a pixel
-    to read its outputs. Controls set device, quality, lens, fog and sensor. A gizmo moves a marker or a splat
-    file and writes its pose into the scene file, which is reloaded when it is edited. Keyframes become a
-    trajectory for `fidsplat fly`. Needs pip install 'fidsplat[viewer]'.
+    Renders small images while the view moves, then one exact image; no GPU is needed. Drag to rotate,
+    right-drag to pan, wheel to approach; click a pixel to read its outputs. Controls set device, quality,
+    lens, fog and sensor. A gizmo moves a marker or a splat file and writes its pose into the scene file,
+    which is reloaded after edits. Keyframes become a trajectory for `fidsplat fly`. Needs pip install
+    'fidsplat[viewer]'.
 
     Only this machine can open the page. From elsewhere: ssh -L 8080:localhost:8080 THAT_MACHINE
 
     A RUN is a folder of `fidsplat fly`, whose poses become keyframes, or a folder or checkpoint of `fidsplat
-    train`, whose splats are shown as they grow.
+    train`, whose splats are updated during the training.
 
     Examples:
       fidsplat view                                                      the demo's scene
@@ -105,16 +105,16 @@ class View:
 
 @dataclass(frozen=True)
 class Target:
-    """The scene, flight or training run to show."""
+    """Scene, flight or training run to show."""
 
     source: str
-    """file; empty for the demo"""
+    """scene or splat file; empty for the demo's scene"""
     trajectory: str | None
-    """file of the poses shown as keyframes"""
+    """trajectory file whose poses are shown as keyframes"""
     training: Training | None = None
 
     def scene(self, quality: str | None, progress: Progress, pose: StartPose = OWN_POSE) -> Scene:
-        """The scene, with a given quality and pose instead of those of its file."""
+        """Load the scene; quality and pose replace the file's."""
         from fidsplat.scenes.sources import load_source
         from fidsplat.worlds.yard import demo_scene
 
@@ -127,10 +127,10 @@ class Target:
 
 
 def find_checkpoint(source: Path) -> Path | None:
-    """The checkpoint in a training run's folder, or the source if it is one; None where it is neither.
+    """Checkpoint of a training run's folder, or the source if it is a checkpoint; None otherwise.
 
     Raises:
-        InputError: the folder holds several checkpoints.
+        InputError: the folder contains several checkpoints.
     """
     if source.name.endswith(CHECKPOINT):
         return source
@@ -142,10 +142,10 @@ def find_checkpoint(source: Path) -> Path | None:
 
 
 def flight_source(folder: Path) -> tuple[str, str]:
-    """The scene of a flight's folder and the file of its poses.
+    """Scene file and pose file of a flight's folder.
 
     Raises:
-        InputError: not a folder of `fidsplat fly`, or its scene no longer exists.
+        InputError: the folder is not of `fidsplat fly`, or its scene no longer exists.
     """
     from fidsplat.render.flight import POSES, RECORD
 
@@ -167,7 +167,7 @@ def flight_source(folder: Path) -> tuple[str, str]:
 
 
 class Training:
-    """The splats of a training run, by its checkpoint, which changes while the run continues."""
+    """Splats of a training run, read from its checkpoint, which changes during the training."""
 
     def __init__(self, file: Path, quality: str | None = None) -> None:
         self.file, self._quality = file, quality
@@ -175,7 +175,7 @@ class Training:
         self.scene = self._load()
 
     def reload(self) -> Scene | None:
-        """The current splats, from the first camera, if the checkpoint has changed; None otherwise."""
+        """Reload the splats with the same camera if the checkpoint has changed; None otherwise."""
         stamp = self._stamp()
         if stamp is None or stamp == self._loaded:
             return None

@@ -14,12 +14,10 @@ from fidsplat.experiments.charts import bars, chart, legend_above
 from fidsplat.experiments.methods import FILTERS, IDEAL, mixtures, with_linear_light
 from fidsplat.experiments.pages import NOTHING, fixed, number, page_and_folder, write_page
 from fidsplat.experiments.setup import CATEGORIES, COLLECTIONS, PROTOCOLS
-from fidsplat.experiments.sheets import sheet_files
 from fidsplat.experiments.summary import Frame, Row, Summary, join, provenance, read_summary, summarise
 from fidsplat.experiments.sweep import Record, folder_records
 from fidsplat.experiments.views import LINEAR, TRUTHS
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import read_input, write_file
 
 _READERS = {"apriltag": ("pupil", "aruco"), "qr": ("zxing-tall", "zxing", "cv2")}
 """detectors of each kind by limit on the ideal texture; the first available one is shown"""
@@ -30,11 +28,11 @@ _NAN = float("nan")
 
 
 def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
-    """Write a report in Markdown with its charts, summaries and sheets; returns the files, the report first.
+    """Write a report in Markdown with its charts and summaries; returns the files, the report first.
     The summaries suffice to make the same report again.
 
     Args:
-        folders: folders with results, see `load`, and sheets of images.
+        folders: folders with results, see `load`.
         out: folder for report.md and its files; or a name that ends in .md, whose files are written to a
             folder of that name without .md.
 
@@ -53,12 +51,8 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
     context: dict[str, Any] = {
         name: section(rows[name], folder) if name in rows else None for name, section in sections.items()
     }
-    sheets = next((found for place in (*folders, folder) if (found := sheet_files(place))), [])
-    for sheet in sheets:
-        if sheet.parent.resolve() != folder.resolve():
-            write_file(folder / sheet.name, read_input(sheet))
     context |= {
-        "sheets": [sheet.name for sheet in sheets],
+        "sheets": sorted(sheet.name for sheet in folder.glob("sheet-*.png")),
         "runs": provenance({f"`{name}`": summary for name, summary in summaries.items()}),
         "training_seconds": TRAINING_SECONDS,
         "notes": list(dict.fromkeys(note for summary in summaries.values() for note in summary.notes)),

@@ -50,20 +50,6 @@ class MarkerSettings(FolderSettings):
     category: tuple[str, ...] = ()
     """Category of markers: apriltag, small, medium, large or huge. By default all; repeat for several."""
 
-    @property
-    def marker_count(self) -> int:
-        """Number of markers of each category."""
-        return MARKERS
-
-    def check(self) -> None:
-        """Raise InputError for settings that cannot be used."""
-        chosen_categories(self.category)
-
-
-@dataclass(frozen=True)
-class CountedSettings(MarkerSettings):
-    """Number of markers of each category."""
-
     markers: int | None = None
     """Number of markers of each category, 1 to 5. By default 5, in a quick run 1."""
 
@@ -72,13 +58,14 @@ class CountedSettings(MarkerSettings):
         return MARKERS if self.markers is None else self.markers
 
     def check(self) -> None:
-        super().check()
+        """Raise InputError for settings that cannot be used."""
+        chosen_categories(self.category)
         if not 1 <= self.marker_count <= MARKERS:
             raise InputError(f"--markers must be 1 to {MARKERS}, got {self.markers}")
 
 
 @dataclass(frozen=True)
-class DatasetSettings(CountedSettings):
+class DatasetSettings(MarkerSettings):
     """Markers and images of the data set."""
 
     out: Path = Path("fidsplat-dataset")
@@ -89,7 +76,6 @@ class DatasetSettings(CountedSettings):
     """Folder with Blender's images."""
 
     def check(self) -> None:
-        """Raise InputError for settings that cannot be used."""
         from fidsplat.experiments.views import TRUTHS
 
         super().check()
@@ -100,7 +86,7 @@ class DatasetSettings(CountedSettings):
 
 
 @dataclass(frozen=True)
-class BlenderSettings(CountedSettings):
+class BlenderSettings(MarkerSettings):
     """Markers and images that Blender renders."""
 
     out: Path = Path("fidsplat-experiments/blender")
@@ -115,7 +101,6 @@ class BlenderSettings(CountedSettings):
     """Threads of Cycles (default: one per core)."""
 
     def check(self) -> None:
-        """Raise InputError for settings that cannot be used."""
         super().check()
         for name in ("samples", "threads"):
             if (number := getattr(self, name)) is not None and number < 1:
@@ -131,7 +116,7 @@ class BlenderSettings(CountedSettings):
 
 
 @dataclass(frozen=True)
-class MeasureSettings(ShardSettings, CountedSettings):
+class MeasureSettings(ShardSettings, MarkerSettings):
     """Settings of every experiment that measures."""
 
     quick: bool = False
@@ -148,8 +133,8 @@ class MeasureSettings(ShardSettings, CountedSettings):
 
 
 @dataclass(frozen=True)
-class RenderSettings(MarkerSettings):
-    """Device and rendering methods of an experiment."""
+class ImageSettings(MeasureSettings):
+    """Settings of experiments that evaluate rendered images."""
 
     device: str | None = None
     """D: device; see `fidsplat devices` (default: FIDSPLAT_DEVICE, or auto)"""
@@ -157,6 +142,8 @@ class RenderSettings(MarkerSettings):
     """Mixture of Gaussians. By default all; repeat for several."""
     trained: Path | None = None
     """Folder with trained models for the 2DGS columns, such as 2dgs-17/small-0.ply."""
+    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
+    """Number of threads that evaluate images. By default one per core."""
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -165,6 +152,8 @@ class RenderSettings(MarkerSettings):
 
     def check(self) -> None:
         super().check()
+        if self.workers < 1:
+            raise InputError(f"--workers must be at least 1 thread, got {self.workers}")
         method_names(self.mixture)
         folder = self.trained
         if folder is None or self.methods == (IDEAL,):
@@ -188,19 +177,6 @@ class RenderSettings(MarkerSettings):
 
 
 @dataclass(frozen=True)
-class ImageSettings(RenderSettings, MeasureSettings):
-    """Settings of experiments that evaluate rendered images."""
-
-    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
-    """Number of threads that evaluate images. By default one per core."""
-
-    def check(self) -> None:
-        super().check()
-        if self.workers < 1:
-            raise InputError(f"--workers must be at least 1 thread, got {self.workers}")
-
-
-@dataclass(frozen=True)
 class AngleSettings(ImageSettings):
     """Settings of the experiment on tilts."""
 
@@ -209,7 +185,7 @@ class AngleSettings(ImageSettings):
     tilts: str | None = None
     """Tilts in degrees as first:last:step, joined by commas. By default 0:89.8:0.2."""
     ideal: bool = False
-    """Measure only the ideal texture, the ceiling of the detectors; no device is opened."""
+    """Measure only the ideal texture, the upper limit of the detectors; no device is opened."""
 
     @property
     def methods(self) -> tuple[str, ...]:

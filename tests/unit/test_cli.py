@@ -353,7 +353,7 @@ def test_detect_in_folders_and_videos(capsys, image_file, tmp_path):
     (tmp_path / "empty").mkdir()
     assert "must contain an image file" in fails(capsys, "detect", tmp_path / "empty")[1]
     (tmp_path / "broken.mp4").write_bytes(b"no film")
-    assert "not a video" in fails(capsys, "detect", tmp_path / "broken.mp4")[1]
+    assert "as a video" in fails(capsys, "detect", tmp_path / "broken.mp4")[1]
 
 
 def test_detect_where_nothing_is(capsys, tmp_path):
