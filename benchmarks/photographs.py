@@ -286,7 +286,7 @@ def train_all(options: argparse.Namespace, truth: dict) -> None:
         facts, *_ = camera_errors({view.name: view.camera for view in trainer.views}, truth)
         drift = 0.0
         if refine:  # of the refined cameras as they are optimised
-            drift = 1 / np.cbrt(np.linalg.det(trainer._refinement.to_given()[:3, :3])) - 1
+            drift = 1 / np.cbrt(np.linalg.det(trainer._refinement.to_dataset()[:3, :3])) - 1
         row += [facts["scale_percent"], 100 * drift, facts["ate_mm"], facts["angle_deg"]]
         one, exact = trainer.views[0].camera, true.views[0].camera
         row += [100 * (one.fx / exact.fx - 1), math.hypot(one.cx - exact.cx, one.cy - exact.cy)]

@@ -233,7 +233,7 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     ),
     "splats_within": lambda _: (splats_within, {"settings": SETTINGS, "budget": 2**30, "dataset": DATASET}, None),
     "refine": lambda _: (
-        partial(refine, iterations=1), {"made": TAG, "renderer": RENDERER, "leak": 0.05, "seed": 0, "progress": None}, None
+        partial(refine, iterations=1), {"marker": TAG, "renderer": RENDERER, "leak": 0.05, "seed": 0, "progress": None}, None
     ),
     "RigCamera": lambda _: (
         RigCamera, {"camera": CAMERA, "body": None, "sensor": None, "outputs": ("rgb",), "rate": 30.0},

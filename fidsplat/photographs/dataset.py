@@ -19,7 +19,7 @@ from fidsplat.photographs.mapping import Progress
 from fidsplat.photographs.tags import box_of, module_colors
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.scenes.scene import Scene
-from fidsplat.train.boxes import EDGE, front_of, outside_boxes
+from fidsplat.train.boxes import EDGE, marker_mask, outside_boxes
 from fidsplat.util.files import atomic_write
 from fidsplat.vision.undistort import undistort_masked
 
@@ -60,7 +60,7 @@ def write_images(
         for tag, colors in zip(tags, inks, strict=True):
             if (measured := module_colors(tag, image, small)) is not None:
                 colors.append(measured)
-            inside &= ~front_of(box_of(tag), small, EDGE)
+            inside &= ~marker_mask(box_of(tag), small, EDGE)
         target = folder / "images" / _image_name(name)
         kind = "png" if target.suffix == ".png" else "jpeg"
         with atomic_write(target) as stream:

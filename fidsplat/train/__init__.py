@@ -1,4 +1,4 @@
-"""Training: splats from images with known cameras, on any device with gradients."""
+"""Training of splats from images with known cameras, on any device with gradients."""
 
 from fidsplat.train.checkpoint import splats_of
 from fidsplat.train.dataset import Dataset, TrainingView

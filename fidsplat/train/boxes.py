@@ -1,7 +1,7 @@
-"""Boxes of markers in a data set: training leaves no splats in them and none in front of them.
+"""Boxes around the markers of a data set: training leaves no splats in them and none in front of them.
 
-Where a marker is visible in a view, its image has the background's colour instead, and views have backgrounds
-of different colours, so that splats there must be transparent.
+In the training images, the background colour replaces visible markers. The views have different background
+colours, so that only transparent splats match all images.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from fidsplat.train.dataset import TrainingView
 from fidsplat.util.errors import InputError
 
 GREYS = (0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0)
-"""backgrounds of views in turn: black and white, without a period of two views"""
+"""background display values, cycled through by view index: black and white, without a period of two views"""
 EDGE = 1.5
-"""pixels: width of the marker's rim that stays in the image, so that no gap remains around the marker"""
+"""width [px] of the marker's rim that stays in the image, so that no gap remains around the marker"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class MarkerBox:
 
 
 def read_boxes(file: Path, given: Any) -> tuple[MarkerBox, ...]:
-    """Boxes of the field `boxes` of a data set's notes: a list of {"matrix": 4 x 4, "visible": names}.
+    """Parse the field `boxes` of a data set's metadata: a list of {"matrix": 4 x 4, "visible": view names}.
 
     Raises InputError.
     """
@@ -47,8 +47,8 @@ def read_boxes(file: Path, given: Any) -> tuple[MarkerBox, ...]:
             raise ValueError
     except (ValueError, TypeError, KeyError):
         raise InputError(
-            f"boxes of {file} must be a list of an invertible matrix (4 x 4 numbers) and the names of views, "
-            "got others; run the capture again"
+            f'boxes of {file} must be a list of {{"matrix": invertible, 4 x 4, "visible": view names}}, got '
+            f"{str(given)[:80]!r}; run the capture again"
         ) from None
     return boxes
 
@@ -62,8 +62,8 @@ def outside_boxes(points: np.ndarray, matrices: Sequence[np.ndarray]) -> np.ndar
     return outside
 
 
-def front_of(box: np.ndarray, camera: Camera, margin: float) -> np.ndarray:
-    """Pixels (h, w) bool of a box's marker, if it faces the camera, and `margin` pixels around it."""
+def marker_mask(box: np.ndarray, camera: Camera, margin: float) -> np.ndarray:
+    """Mask (h, w) bool of the marker in a box, dilated by `margin` pixels; all False if it faces away."""
     size = (camera.height, camera.width)
     if not box[:3, 2] @ (box[:3, 3] - camera.position) > 0:
         return np.zeros(size, bool)
@@ -80,21 +80,18 @@ def front_of(box: np.ndarray, camera: Camera, margin: float) -> np.ndarray:
 
 
 def without_markers(views: Sequence[TrainingView], boxes: Sequence[MarkerBox]) -> list[TrainingView]:
-    """Views whose images have the background's colour in place of visible markers; markers that may be
-    occluded are ignored."""
+    """Replace visible markers in the images by the background colour; mask markers that may be occluded."""
     if not boxes:
         return list(views)
     found = []
     for number, view in enumerate(views):
         grey = GREYS[number % len(GREYS)]
-        image, mask = (
-            view.image.copy(),
-            np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask.copy(),
-        )
+        image = view.image.copy()
+        mask = np.ones(image.shape[:2], bool) if view.mask is None else view.mask.copy()
         for box in boxes:
-            region = front_of(box.matrix, view.camera, EDGE)
+            region = marker_mask(box.matrix, view.camera, EDGE)
             if view.name in box.visible:
-                image[front_of(box.matrix, view.camera, -EDGE)] = round(255 * grey)
+                image[marker_mask(box.matrix, view.camera, -EDGE)] = round(255 * grey)
                 mask |= region
             else:
                 mask &= ~region

@@ -50,7 +50,7 @@ class TrainingState:
 
 
 def save_checkpoint(
-    file: Path, made: TrainingState, settings: TrainSettings, dataset: Dataset, device: str
+    file: Path, state: TrainingState, settings: TrainSettings, dataset: Dataset, device: str
 ) -> None:
     """Write a checkpoint.
 
@@ -58,26 +58,27 @@ def save_checkpoint(
         dataset: the data set of the run; the checkpoint holds its digest, origin and background.
         device: title of the device that renders.
 
-    Raises InputError when the file cannot be written, as when the disk is full; an older one then stays.
+    Raises InputError if the file cannot be written, for instance on a full disk; an older checkpoint is kept.
     """
     facts = {
         "format": _FORMAT,
-        "iteration": made.iteration,
+        "iteration": state.iteration,
         "settings": asdict(settings),
         "dataset": dataset.digest,
         "origin": dataset.origin.tolist(),
         "background": list(dataset.background),
         "by": _made_by(device),
     }
-    arrays = {f"{group}.{name}": getattr(made.splats, group)[name] for group in _GROUPS for name in NAMES}
-    arrays |= {"gradients": made.splats.gradient_sums, "seen": made.splats.visible_counts, **made.history}
-    arrays |= {_VIEWS + name: array for name, array in made.views.items()}
+    splats = state.splats
+    arrays = {f"{group}.{name}": getattr(splats, group)[name] for group in _GROUPS for name in NAMES}
+    arrays |= {"gradients": splats.gradient_sums, "seen": splats.visible_counts, **state.history}
+    arrays |= {_VIEWS + name: array for name, array in state.views.items()}
     with atomic_write(file, durable=True) as stream:
         np.savez(stream, facts=np.frombuffer(json.dumps(facts).encode(), np.uint8), **arrays)
 
 
 def splats_of(file: Path) -> tuple[SplatCloud, tuple[float, float, float]]:
-    """The splats of a checkpoint, activated, and the background of its data set.
+    """Read the splats of a checkpoint as a cloud, and the background (display values) of its data set.
 
     Raises InputError for a file that is damaged or of another version.
     """
@@ -108,14 +109,14 @@ def load_checkpoint(
     """Read a checkpoint of the same run. Every array is checked before a device uses it.
 
     Args:
-        digest: of the data set.
-        device: title of the device that renders from now on.
+        digest: digest of the data set.
+        device: title of the device of the resumed run.
 
     Returns:
-        the progress of the run, and descriptions of a different device or sources that made the checkpoint:
+        the progress of the run, and a description of a changed device or version of fidsplat, for instance
         "another device (PoCL, not H100)".
 
-    Raises InputError for a file that is damaged or of another run; the message names the difference.
+    Raises InputError for a damaged file or a checkpoint of another run; the message names the difference.
     """
     try:
         arrays = load_npz(file)
@@ -124,30 +125,30 @@ def load_checkpoint(
         before = [str(facts["by"][name]) for name in _made_by(device)]
         differ = _differences(facts, settings, digest)
         views = {name.removeprefix(_VIEWS): arrays.pop(name) for name in [*arrays] if name.startswith(_VIEWS)}
-        made = None if differ else TrainingState(iteration, *_state(arrays, settings, iteration), views)
+        state = None if differ else TrainingState(iteration, *_state(arrays, settings, iteration), views)
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise InputError(
             f"cannot read {file} as a checkpoint: {error}; remove it, or give --overwrite to start again"
         ) from error
-    if made is None:
+    if state is None:
         raise InputError(
             f"checkpoint {file} must belong to the same run, got another {' and another '.join(differ)}; "
             "give another name with -o, or --overwrite to start again"
         )
     now = zip(_made_by(device).items(), before, strict=True)
-    return made, [f"another {name} ({was}, not {here})" for (name, here), was in now if was != here]
+    return state, [f"another {name} ({was}, not {here})" for (name, here), was in now if was != here]
 
 
 def _facts(arrays: Arrays) -> dict[str, Any]:
     facts = from_json(arrays["facts"].tobytes())
     if not isinstance(facts, dict) or facts.get("format") != _FORMAT:
-        raise ValueError("its format is of another version of fidsplat")
+        raise ValueError(f"its format must be {_FORMAT}, got that of another version of fidsplat")
     return facts
 
 
 def _state(arrays: Arrays, settings: TrainSettings, iteration: int) -> tuple[Splats, Arrays]:
-    """Take the splats and the history out of a checkpoint's `arrays`. Raises ValueError if they contradict
-    the settings."""
+    """Pop the splats and the history from a checkpoint's `arrays`; raise ValueError if they contradict the
+    settings."""
     count = len(arrays["values.means"])
     if count > settings.max_splats:
         raise ValueError(f"its splats must be at most max_splats, {settings.max_splats}, got {count}")
@@ -168,7 +169,7 @@ def _group(arrays: Arrays, group: str, count: int, degree: int, axes: int) -> Ar
 
 
 def _checked(arrays: Arrays, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
-    """Take an array out of `arrays`: check it and return a writable copy."""
+    """Pop an array from `arrays`, check it, and return a writable copy."""
     array = arrays.pop(name)
     if array.dtype != dtype or array.shape != shape:
         expected = f"{np.dtype(dtype)} of the shape {shape}"
@@ -179,7 +180,7 @@ def _checked(arrays: Arrays, name: str, shape: tuple[int, ...], dtype: type = np
 
 
 def _made_by(device: str) -> dict[str, str]:
-    """Device and digest of the sources: results depend on them in addition to settings and data."""
+    """Device and version of the code; results depend on them in addition to settings and data."""
     return {"device": device, "fidsplat": f"{__version__}, sources {code_hash()}"}
 
 

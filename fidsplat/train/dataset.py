@@ -18,13 +18,14 @@ from fidsplat.util.errors import InputError
 
 FAR = 1e4
 """distance from the world origin, in scene extents, beyond which means are stored relative to a nearer
-origin, to avoid rounding in float32"""
-_FACING, _RANDOM_DEPTH = 0.5, 3.0
-"""minimum cosine between optical axis and direction to the common point, for cameras that face it; and depth
-of random points if most cameras do not, in scene extents"""
+origin, to avoid rounding errors of float32"""
+_FACING = 0.5
+"""minimum cosine between the optical axis of a camera and the direction to a point that the camera faces"""
+_RANDOM_DEPTH = 3.0
+"""maximum depth of random points in frustums, in scene extents"""
 MAX_POINTS = 2**31 - 1
 _MIN_EXTENT = 1e-9
-"""minimum scene extent relative to the distance from the world origin; a smaller one may be rounding error"""
+"""minimum scene extent relative to the distance from the world origin; below, it may be rounding error"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +76,7 @@ class Dataset:
     """
 
     name: str
-    """source, for messages"""
+    """source, shown in messages"""
     views: tuple[TrainingView, ...]
     held_out: tuple[TrainingView, ...]
     """views for evaluation only"""
@@ -86,8 +87,7 @@ class Dataset:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """background colour, display values"""
     boxes: tuple[np.ndarray, ...] = ()
-    """(4, 4) matrices from the cube [-1, 1]^3 to boxes of markers: trained splats with centres in them are
-    removed"""
+    """(4, 4) matrices from the cube [-1, 1]^3 to boxes of markers, in which trained splats are removed"""
 
     def __post_init__(self) -> None:
         text("the name of a data set", self.name)
@@ -121,7 +121,7 @@ class Dataset:
                 f"the points of {self.name} must be finite, got {wrong:,} others; export the model again"
             )
         for view in self.views if len(self.points) else ():
-            if not (_depths(view.camera, self.points) > view.camera.near).any():
+            if not (depths(view.camera, self.points) > view.camera.near).any():
                 raise InputError(
                     f"points of {self.name} must be in front of the camera of {view.name}, got all "
                     f"{len(self.points)} behind it; check that poses and points are of one model, and the "
@@ -147,9 +147,8 @@ class Dataset:
         found = hashlib.sha256(json.dumps(self.background).encode())
 
         def update(*arrays: np.ndarray | None) -> None:
-            for (
-                array
-            ) in arrays:  # hash types and shapes too, so that a mask differs from equal bytes of an image
+            for array in arrays:
+                # with type and shape, so that a mask and an image of equal bytes differ
                 found.update(b"-" if array is None else f"{array.dtype.str} {array.shape}".encode())
                 found.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
 
@@ -164,8 +163,8 @@ class Dataset:
         return found.hexdigest()
 
     def with_random_points(self, count: int, seed: int) -> Dataset:
-        """The data set with random points of random colours: in the cube that the cameras face, or, without a
-        common point, in each camera's frustum up to a depth of three scene extents."""
+        """The data set with random points of random colours, in the cube that most cameras face, or else in
+        the cameras' frustums up to a depth of three scene extents."""
         count = whole_number("the number of random points", count, 0, MAX_POINTS)
         seed = whole_number("the seed", seed, 0, 2**63 - 1)
         cameras, draws = [view.camera for view in self.views], uniform(seed, Purpose.POINTS, 0, count)
@@ -179,8 +178,10 @@ class Dataset:
 
 
 def viewed_cube(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Cube around the point nearest to all optical axes, as large as the field of view there: its corners
-    (3,), (3,), and whether most cameras face it."""
+    """Cube around the point nearest to all optical axes, as large as the field of view there.
+
+    Returns its minimum and maximum corners (3,), and whether most cameras face it.
+    """
     centers = np.array([camera.position for camera in cameras])
     axes = np.array([camera.world_to_camera[2, :3] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -200,7 +201,10 @@ def viewed_cube(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, bool
 
 
 def _points_in_frustums(cameras: Sequence[Camera], draws: np.ndarray, depth: float) -> np.ndarray:
-    """Points (n, 3) in the frustums of the cameras, round robin, up to a depth; draws: (n, 3) in (0, 1)."""
+    """Points (n, 3) in the frustums of the cameras, round robin, up to a depth [m].
+
+    draws: (n, 3) random numbers in (0, 1).
+    """
     points = np.empty(draws.shape)
     for number, camera in enumerate(cameras):
         mine = draws[number :: len(cameras)]
@@ -209,5 +213,6 @@ def _points_in_frustums(cameras: Sequence[Camera], draws: np.ndarray, depth: flo
     return points
 
 
-def _depths(camera: Camera, points: np.ndarray) -> np.ndarray:
+def depths(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Depths (n,) [m] of world points (n, 3) along the optical axis."""
     return (points - camera.position) @ camera.world_to_camera[2, :3]

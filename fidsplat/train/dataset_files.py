@@ -1,5 +1,5 @@
-"""Reader of data sets: COLMAP, nerfstudio's transforms.json, and COLMAP's layout with fidsplat's
-marker.json."""
+"""Reader of data sets: COLMAP's layout, with fidsplat's marker.json if present, and nerfstudio's
+transforms.json."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fidsplat.util.arguments import callback, flag, whole_number
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, path_of, read_text
 
-NOTES = ("dataset.json", "marker.json")
+METADATA = ("dataset.json", "marker.json")
 """files of fidsplat's data sets with the fields `background`, one display value or three, and `boxes`"""
 _MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 """folders of COLMAP's model in a data set"""
@@ -43,13 +43,13 @@ def load_dataset(
     Args:
         path: a folder with COLMAP's model in `sparse/0` and images in `images`, or with `transforms.json` or
             `transforms_train.json`; or one of these files.
-        hold_out: n holds out every n-th view in the order of names, 0 none. By default views in the folder
-            `test` or in `transforms_test.json`, otherwise every eighth of 16 and more views.
-        random_points: number of random initial points that replace those of the data set.
+        hold_out: n holds out every n-th view in the order of names, 0 none. None holds out the views in the
+            folder `test` or in `transforms_test.json`; without them, every eighth of 16 or more views.
+        random_points: number of random initial points that replace those of the data set; 0 keeps these.
         seed: seed of the random points.
-        progress: called with the item that is read and the share done.
-        masks: folder of masks `NAME.png`, 0 for ignored pixels, instead of those of the data set.
-        alpha_masks: whether transparent pixels are ignored, instead of showing the background.
+        progress: called with a description of the file and the share done, 0 to 1.
+        masks: folder of masks `NAME.png`, 0 for ignored pixels; None: the masks of the data set.
+        alpha_masks: whether the loss ignores transparent pixels; otherwise they show the background.
 
     Raises:
         InputError: no data set, no mask in the folder, an image that is missing or of another size than its
@@ -100,7 +100,7 @@ def _load_colmap(folder: Path, progress: Progress, masks: Masks) -> DatasetConte
             f"{folder} must be a data set of COLMAP (sparse/0/cameras.bin and images/) or nerfstudio "
             "(transforms.json), got neither"
         )
-    background, boxes = _notes(folder)
+    background, boxes = _metadata(folder)
     views, points, colors = _model(folder, model, background, progress, "images", masks)
     held_out: list[TrainingView] = []
     if has_colmap(folder / "test" / "sparse" / "0"):
@@ -112,13 +112,13 @@ def _load_colmap(folder: Path, progress: Progress, masks: Masks) -> DatasetConte
 
 
 def _model(
-    folder: Path, place: Path, background: Background, progress: Progress, words: str, masks: Masks
+    folder: Path, model_folder: Path, background: Background, progress: Progress, label: str, masks: Masks
 ) -> tuple[list[TrainingView], np.ndarray, np.ndarray]:
-    model = load_colmap(place)
+    model = load_colmap(model_folder)
     views: list[TrainingView] = []
     others: set[tuple[int, int]] = set()
     for i, (name, camera) in enumerate(zip(model.names, model.cameras, strict=True)):
-        progress(words, i / len(model.names))
+        progress(label, i / len(model.names))
         file = folder / "images" / name
         check_other_image(file, others)
         mask = masks.of(file, name, mask_file(folder / "masks", name))
@@ -126,20 +126,20 @@ def _model(
     return views, model.points, model.colors
 
 
-def _notes(folder: Path) -> tuple[Background, tuple[MarkerBox, ...]]:
-    """Background and boxes of the folder's notes."""
-    for name in NOTES:
+def _metadata(folder: Path) -> tuple[Background, tuple[MarkerBox, ...]]:
+    """Background and boxes of the first metadata file in the folder."""
+    for name in METADATA:
         file = folder / name
         if file.exists():
             text = read_text(file, "replace")
             try:
-                notes = from_json(text)
+                values = from_json(text)
                 red, green, blue = np.broadcast_to(
-                    np.asarray(notes.get("background", 0.0), float), 3
+                    np.asarray(values.get("background", 0.0), float), 3
                 ).tolist()
             except (ValueError, AttributeError, TypeError, OverflowError):
                 raise InputError(
-                    f"background of {file} must be one number or three, got another value"
+                    f"background of {file} must be one number or three, got {text[:80]!r}"
                 ) from None
-            return (red, green, blue), read_boxes(file, notes.get("boxes", ()))
+            return (red, green, blue), read_boxes(file, values.get("boxes", ()))
     return (0.0, 0.0, 0.0), ()

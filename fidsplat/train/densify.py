@@ -1,8 +1,7 @@
 """Densification of 3DGS and 2DGS (Kerbl et al. 2023, section 5.2): clone, split and prune splats.
 
-A splat is cloned or split if its mean screen gradient is large.
-
-Remaining splats keep their order and new ones are appended, so that a run is reproducible.
+A splat with a large mean screen gradient is cloned or split. Other splats keep their order and new ones are
+appended, so that a run is reproducible.
 """
 
 from __future__ import annotations
@@ -24,21 +23,21 @@ _SHRINK = 0.8 * COPIES
 
 
 class Densification(NamedTuple):
-    """A round of cloning, splitting and pruning, as indices into the earlier splats."""
+    """Result of one densification, with splats as indices into the earlier ones."""
 
     rows: np.ndarray
-    """(m,) uint32: source of each splat: first the remaining ones in their order, then clones, then splits"""
+    """(m,) uint32: source of each splat: remaining splats in their order, then clones, then split copies"""
     remaining: int
-    """number of remaining splats; the moments of the others start at 0"""
+    """number of remaining splats; Adam's moments of the others start at 0"""
     first_split: int
-    """index of the first split splat; split splats have new means and scales"""
+    """index of the first split copy; split copies have new means and scales"""
     means: np.ndarray
     """(m - first_split, 3) float32"""
     log_scales: np.ndarray
     """(m - first_split, 2) or (m - first_split, 3) float32"""
 
     def apply(self, splats: Splats) -> Splats:
-        """The splats after the round."""
+        """The splats after densification."""
         made = splats.select(self.rows)
         made.values["means"][self.first_split :] = self.means
         made.values["log_scales"][self.first_split :] = self.log_scales
@@ -52,8 +51,8 @@ def densification(splats: Splats, settings: TrainSettings, iteration: int, exten
     """Choose the splats to clone, split and prune.
 
     Args:
-        splats: harmonics and moments may be missing.
-        extent: of the scene [m], the unit of size thresholds.
+        splats: the splats; harmonics and moments may be missing.
+        extent: scene extent [m], the unit of size thresholds.
 
     Raises:
         TrainingError: no splat would remain.
@@ -71,16 +70,16 @@ def densification(splats: Splats, settings: TrainSettings, iteration: int, exten
     unsplit = np.ones(len(splats), bool)
     unsplit[splits] = False
     means, log_scales = _split_values(splats, splits, settings, iteration)
-    parts = np.concatenate([splits] * COPIES)
+    copies = np.concatenate([splits] * COPIES)
     unpruned = sigmoid(splats.values["logits"]) >= settings.prune_opacity
-    unpruned_parts = unpruned[parts]
+    unpruned_copies = unpruned[copies]
     if iteration > settings.reset_every:
         limit = settings.prune_scale * extent
         unpruned &= sizes <= limit
-        unpruned_parts &= _largest_scales(np.exp(log_scales)) <= limit
+        unpruned_copies &= _largest_scales(np.exp(log_scales)) <= limit
     remaining = np.flatnonzero(unsplit & unpruned)
-    cloned, parts = clones[unpruned[clones]], parts[unpruned_parts]
-    rows = np.concatenate([remaining, cloned, parts]).astype(np.uint32)
+    cloned, copies = clones[unpruned[clones]], copies[unpruned_copies]
+    rows = np.concatenate([remaining, cloned, copies]).astype(np.uint32)
     if not len(rows):
         raise TrainingError(
             f"all splats were pruned after iteration {iteration}: their opacities are below "
@@ -88,11 +87,12 @@ def densification(splats: Splats, settings: TrainSettings, iteration: int, exten
             "the data set's cameras and points"
         )
     first_split = len(remaining) + len(cloned)
-    return Densification(rows, len(remaining), first_split, means[unpruned_parts], log_scales[unpruned_parts])
+    split_values = means[unpruned_copies], log_scales[unpruned_copies]
+    return Densification(rows, len(remaining), first_split, *split_values)
 
 
 def limited_logits(logits: np.ndarray, settings: TrainSettings) -> np.ndarray:
-    """Logits after an opacity reset, which limits opacities to `reset_opacity`."""
+    """Logits clamped so that opacities are at most `reset_opacity`."""
     return np.minimum(logits, np.float32(logit(settings.reset_opacity)))
 
 
@@ -109,7 +109,7 @@ def _largest_scales(scales: np.ndarray) -> np.ndarray:
 
 
 def _within_limit(mean: np.ndarray, mask: np.ndarray, limit: int) -> np.ndarray:
-    """The mask reduced to the `limit` splats of the largest mean gradients, then the smallest indices."""
+    """The mask restricted to the `limit` splats with the largest mean gradients; ties: the smallest index."""
     rows = np.flatnonzero(mask)
     if len(rows) > limit:
         rows = rows[np.argsort(-mean[rows], kind="stable")[: max(0, limit)]]
@@ -121,8 +121,8 @@ def _within_limit(mean: np.ndarray, mask: np.ndarray, limit: int) -> np.ndarray:
 def _split_values(
     splats: Splats, splits: np.ndarray, settings: TrainSettings, iteration: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Means and log_scales of the copies of split splats, all first copies before all second ones: sampled
-    from each splat, and smaller."""
+    """Means, sampled from each split splat, and reduced log_scales of the copies: all first copies, then all
+    second ones."""
     values = {name: splats.values[name][splits] for name in ("means", "quats", "log_scales")}
     scales = np.exp(values["log_scales"]).astype(np.float64)
     axes = scales.shape[1]

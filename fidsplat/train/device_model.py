@@ -1,4 +1,4 @@
-"""Splat model in device memory: parameters, loss and Adam by the training kernels of the device."""
+"""Splat model in device memory, with loss and Adam in the device's training kernels."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class DeviceModel:
         )
 
     def densify(self, made: Densification) -> None:
-        """Clone, split and prune splats; only the new values come from the host."""
+        """Clone, split and prune splats; only new values are copied from the host."""
         self._kernels.gather_rows(made.rows, made.remaining)
         self._kernels.write({"means": made.means, "log_scales": made.log_scales}, made.first_split)
         self._kernels.clear(_STATISTICS)
@@ -91,16 +91,16 @@ class DeviceModel:
         return self._kernels.normal_loss_gradients(images, view, camera, weight)
 
     def backward_to_tiles(self, pipeline: Any, images: Images, gradients: Mapping[str, Any]) -> Any:
-        """The backward pass up to the sums over tiles, for `accumulate_statistics` and `step`."""
+        """The backward pass up to the gradients by tile, for `accumulate_statistics` and `step`."""
         return pipeline.backward_to_tiles(images, gradients)
 
-    def accumulate_statistics(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
+    def accumulate_statistics(self, by_tiles: Any, camera: Camera, origin: np.ndarray) -> None:
         """Add screen gradients and visibility to the densification statistics."""
-        self._kernels.accumulate_statistics(taken, camera, origin)
+        self._kernels.accumulate_statistics(by_tiles, camera, origin)
 
     def step(
         self,
-        taken: Any,
+        by_tiles: Any,
         rate: Mapping[str, float],
         step: int,
         camera: Camera | None,
@@ -109,15 +109,8 @@ class DeviceModel:
         """Apply one step of Adam. camera: if given, statistics are accumulated first. Returns a function that
         waits for the gradient (10,) of the camera, pose and intrinsics, if it is refined."""
         settings, count = self._settings, max(1, self._number)
-        by_names = {
-            "means": "means",
-            "scales": "log_scales",
-            "quats": "quats",
-            "logits": "logits",
-            "sh": "sh",
-        }
-        share = 1 / (1 - settings.beta1**step)
-        sizes = {name: share * rate[of] for name, of in by_names.items()}
+        correction = 1 / (1 - settings.beta1**step)
+        sizes = {name.removeprefix("log_"): correction * value for name, value in rate.items()}
         sizes["rest"] = HIGHER_SH_RATE * sizes["sh"]
         mcmc = settings.strategy == "mcmc"
         numbers = {
@@ -127,7 +120,7 @@ class DeviceModel:
             "scale_penalty": settings.scale_penalty / (settings.axes * count) if mcmc else 0.0,
             "opacity_penalty": settings.opacity_penalty / count if mcmc else 0.0,
         }
-        return self._kernels.step(taken, sizes, numbers, camera, origin, settings.refines_cameras)
+        return self._kernels.step(by_tiles, sizes, numbers, camera, origin, settings.refines_cameras)
 
     def add_noise(self, iteration: int, rate: float) -> None:
         """Add MCMC noise to the means. rate: learning rate of the means [m]."""

@@ -1,4 +1,4 @@
-"""Splat model in host memory: parameters, loss and Adam in NumPy, for devices without training kernels."""
+"""Splat model in host memory, with loss and Adam in NumPy, for devices without training kernels."""
 
 from __future__ import annotations
 
@@ -66,19 +66,18 @@ class HostModel:
         self, images: Images, view: int, exposure: np.ndarray | None = None
     ) -> tuple[Callable[[], Loss], np.ndarray]:
         """A function that returns the loss of a rendered view, and the gradient (h, w, 3)."""
-        of = self._views[view]
-        target = of.image * np.float32(1 / 255)
-        weight = self._settings.dssim_weight
-        loss, gradient = exposed_loss(images.read("rgb", 0), target, of.mask, weight, exposure)
+        image, mask = self._views[view].image, self._views[view].mask
+        target, weight = image * np.float32(1 / 255), self._settings.dssim_weight
+        loss, gradient = exposed_loss(images.read("rgb", 0), target, mask, weight, exposure)
         return lambda: loss, gradient
 
     def normal_loss_gradients(
         self, images: Images, view: int, camera: Camera, weight: float
     ) -> dict[str, np.ndarray]:
         """Gradients of the weighted normal loss with respect to `depth` and `normal`."""
-        of, weights = self._views[view], np.float32(weight) * images.read("alpha", 0)
-        if of.mask is not None:
-            weights *= of.mask
+        mask, weights = self._views[view].mask, np.float32(weight) * images.read("alpha", 0)
+        if mask is not None:
+            weights *= mask
         lens = (camera.fx, camera.fy), (camera.cx, camera.cy)
         depth, normal = images.read("depth", 0), images.read("normal", 0)
         _, by_depth, by_normal = normal_loss(depth, normal, weights, *lens)

@@ -1,7 +1,7 @@
 """Image loss of 3DGS and 2DGS, (1 - w) L1 + w (1 - SSIM), normal consistency, and their gradients.
 
-SSIM (Wang et al. 2004) has a Gaussian window of 11 pixels and sigma 1.5 for each channel and zero padding,
-and is the mean over all pixels. Masked pixels have the value of the ground truth in both images: they add no
+SSIM (Wang et al. 2004) is the mean over all pixels and channels, with a Gaussian window of 11 pixels and
+sigma 1.5, and zero padding. Ignored pixels have the value of the ground truth in both images: they add no
 loss, and their gradient is 0. The kernel version is kernels/opencl/train/loss.cl.
 """
 
@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 RADIUS, SIGMA = 5, 1.5
-"""width of the window in pixels"""
+"""radius and standard deviation of the SSIM window [px]"""
 C1, C2 = 0.01**2, 0.03**2
+"""stabilising constants of SSIM"""
 
 
 class Loss(NamedTuple):
@@ -25,11 +26,11 @@ class Loss(NamedTuple):
     mse: float
     """mean squared error, for the PSNR"""
     by_exposure: np.ndarray | None = None
-    """(2, 3) gradient by logarithms of gains, and offsets; None without an exposure"""
+    """(2, 3) gradients with respect to logarithms of gains, and to offsets; None without an exposure"""
 
     @property
     def psnr(self) -> float:
-        """dB; infinite for equal images."""
+        """PSNR [dB]; infinite for equal images."""
         return math.inf if self.mse == 0 else -10 * math.log10(self.mse)
 
 
@@ -87,9 +88,9 @@ def exposed_loss(
     dssim_weight: float,
     exposure: np.ndarray | None,
 ) -> tuple[Loss, np.ndarray]:
-    """`image_loss` of an image with another exposure, and the gradient with respect to the image.
+    """`image_loss` after a gain and an offset of each channel, and the gradient with respect to the image.
 
-    exposure: (2, 3) logarithms of gains, and offsets, by channel; None: as rendered.
+    exposure: (2, 3) logarithms of gains, and offsets, by channel; None: gains of 1 and offsets of 0.
     """
     if exposure is None:
         return image_loss(image, truth, mask, dssim_weight)

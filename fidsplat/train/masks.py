@@ -1,4 +1,4 @@
-"""Masks of training images (files of a folder, the alpha channel, the edges of undistorted images)."""
+"""Masks of training images: from files, from the alpha channel, and at the edges of undistorted images."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fidsplat.train.dataset import TrainingView
 from fidsplat.vision.undistort import undistort_masked
 
 _OPAQUE = 128
-"""alpha from which a pixel counts, with `alpha`"""
+"""minimum alpha (uint8) of pixels in the loss, with `Masks.alpha`"""
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,9 @@ class Masks:
     """Sources of masks, (h, w) bool, False for ignored pixels."""
 
     folder: Path | None = None
-    """folder of masks, instead of those of the data set; None: those of the data set"""
+    """folder of masks; None: the masks of the data set"""
     alpha: bool = False
-    """whether transparent pixels are ignored, instead of showing the background"""
+    """whether the loss ignores transparent pixels; otherwise they show the background"""
 
     def of(self, image: Path, name: str, given: Path | None) -> np.ndarray | None:
         """The mask of an image file; None if it has none.
@@ -43,8 +43,8 @@ class Masks:
 
 
 def mask_file(folder: Path, name: str) -> Path | None:
-    """The mask of an image in a folder: COLMAP appends .png to the name of the image, others replace its
-    suffix."""
+    """Path of the mask of an image in a folder, or None: COLMAP appends .png to the name of the image, other
+    programs replace its suffix."""
     image = folder / name
     candidates = (image.with_name(f"{image.name}.png"), image.with_suffix(".png"))
     return next((one for one in candidates if one.is_file()), None)

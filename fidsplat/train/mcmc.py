@@ -22,8 +22,8 @@ NOISE_SLOPE, NOISE_CUTOFF = 100.0, 0.995
 
 
 def relocate_and_grow(splats: Splats, settings: TrainSettings, iteration: int) -> Splats:
-    """The splats after relocation and growth. Copies of a splat share its opacity and scale so that the
-    rendered image stays the same.
+    """The splats after relocation and growth. The opacity and the scales of a splat are divided among its
+    copies such that the rendered image stays the same.
 
     Raises:
         TrainingError: every splat is dead.
@@ -53,7 +53,7 @@ def relocate_and_grow(splats: Splats, settings: TrainSettings, iteration: int) -
 
 
 def add_noise(splats: Splats, settings: TrainSettings, iteration: int, rate: float) -> None:
-    """Add noise with the covariance of each splat to its mean, more to transparent splats.
+    """Add noise with each splat's covariance to the means, with less noise for opaque splats.
 
     rate: learning rate of the means [m].
     """
@@ -71,8 +71,8 @@ def _sample(
 ) -> np.ndarray:
     """Random indices (count,), with probabilities proportional to the weights."""
     sums = np.cumsum(weights, dtype=np.float64)
-    places = uniform(settings.seed, purpose, iteration, count)[:, 0] * sums[-1]
-    return np.minimum(np.searchsorted(sums, places, side="right"), len(weights) - 1)
+    draws = uniform(settings.seed, purpose, iteration, count)[:, 0] * sums[-1]
+    return np.minimum(np.searchsorted(sums, draws, side="right"), len(weights) - 1)
 
 
 def _share_among_copies(splats: Splats, sources: np.ndarray, settings: TrainSettings) -> None:

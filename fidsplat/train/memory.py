@@ -15,7 +15,7 @@ and activated values, and one copy during densification"""
 _WORK = 256
 """bytes per splat: its record and its entries in tile lists"""
 _FLOATS_PER_PIXEL = 60
-"""number of images in the loss: the images and their blurred products"""
+"""float32 values per pixel in the loss: images and their blurred products"""
 
 
 def splats_within(settings: TrainSettings, budget: int, dataset: Dataset) -> TrainSettings:

@@ -1,4 +1,4 @@
-"""Mean distance of points to their three nearest neighbours, by k-d tree boxes."""
+"""Mean squared distance of points to their three nearest neighbours, by the leaves of a k-d tree."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 _LEAF = 256
 _NEAREST = 3
 _PAIRS = 1 << 22
-"""pairs of points compared at once"""
+"""maximum number of pairs of points in one array operation"""
 
 
 def mean_square_distances(points: np.ndarray) -> np.ndarray:

@@ -65,7 +65,7 @@ def parameter_gradients(
 
 
 def contributing(gradients: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Mask (n,) of the splats that contribute to a frame, which have a gradient."""
+    """Mask (n,) of the splats that contribute to a frame: those with a gradient."""
     color = gradients["sh"][:, 0] if "sh" in gradients else gradients["colors"]
     return (gradients["opacities"] != 0) | gradients["means"].any(axis=1) | color.any(axis=1)
 
@@ -90,7 +90,7 @@ def sparse_adam_step(
 def adam_step(
     splats: Splats, gradients: Arrays, rate: Mapping[str, float], settings: TrainSettings, step: int
 ) -> None:
-    """One Adam step of all values, including those with a gradient of 0, as in the authors' trainer.
+    """One Adam step of all values, including those with a gradient of 0, as in 2DGS.
 
     Args:
         gradients: result of `parameter_gradients`.

@@ -1,4 +1,4 @@
-"""Counter-based random numbers, which depend only on seed, iteration, purpose and the splat's index.
+"""Counter-based random numbers: functions of seed, iteration, purpose and splat index alone.
 
 Philox 4x32-10: Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011. The kernel version is
 in kernels/opencl/train/position_noise.cl.
@@ -67,5 +67,5 @@ def normal(seed: int, purpose: Purpose, iteration: int, of: int | np.ndarray, dr
 
 
 def permutation(seed: int, purpose: Purpose, iteration: int, count: int) -> np.ndarray:
-    """A random permutation of the numbers below count."""
+    """A random permutation of 0 to count - 1."""
     return np.argsort(uniform(seed, purpose, iteration, count)[:, 0], kind="stable")

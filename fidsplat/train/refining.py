@@ -1,9 +1,9 @@
 """Marker refinement: optimise all Gaussians of a marker together, for sharp and opaque modules.
 
-A template (`fidsplat.markers`) is a fixed set of Gaussians for one rectangle. Here all splats of a marker
-are optimised together in position (within its plane), scale, opacity and colour. Each iteration renders the
+A template (`fidsplat.markers`) is a fixed set of Gaussians for one rectangle. Refinement optimises all splats
+of a marker together in position (within its plane), scale, opacity and colour. Each iteration renders the
 marker with splats sorted by their centres, as other renderers do, with a random tilt axis (which changes the
-order), a random sub-pixel shift and a random grey background. The loss compares the image with the
+depth order), a random sub-pixel shift and a random grey background. The loss compares the image with the
 printed marker and penalises transmitted light.
 """
 
@@ -29,13 +29,13 @@ from fidsplat.util.errors import InputError
 
 ITERATIONS = 1000
 PIXELS = 12
-"""pixels per module; images are shifted, so that no detail falls between pixels"""
+"""pixels per module; random sub-pixel shifts cover details smaller than a pixel"""
 MARGIN = 1
 """width of the empty border around the sheet, in modules"""
 TILT = math.radians(3)
-"""tilt; it changes the order of centres but hardly the image"""
+"""tilt [rad]; it changes the depth order of the splats but hardly the image"""
 DISTANCE = 100.0
-"""camera distance in edge lengths of the sheet; far, for almost no perspective"""
+"""camera distance in edge lengths of the sheet; large, for almost no perspective"""
 QUALITY = Quality(order="centre", lowpass="none", alpha_cutoff=1 / 255, transmittance_stop=1e-6)
 OPAQUE = 8.0
 """optical depth from which there is no penalty (a transmittance of 3e-4)"""
@@ -45,7 +45,7 @@ RATES = {"positions": 0.003, "log_scales": 0.01, "logits": 0.1, "colors": 0.01}
 """learning rates, in modules, natural logarithms, logits and colours"""
 BETA1, BETA2 = 0.9, 0.99
 MIN_SCALE, MAX_SCALE = 0.008, 3.0
-"""modules"""
+"""limits of the scales, in modules"""
 SLOW = 0.15
 """scale in modules below which the learning rate of the position is proportional to the scale"""
 MAX_LOGIT = 7.0
@@ -57,13 +57,13 @@ class RefineStep(NamedTuple):
     iteration: int
     """number of the iteration, from 1"""
     psnr: float
-    """PSNR of the sheet and a module around it [dB]"""
+    """PSNR of the sheet with a border of one module [dB]"""
     transmittance: float
     """maximum transmittance on the sheet"""
 
 
 def refine(
-    made: Marker,
+    marker: Marker,
     renderer: Renderer | None = None,
     iterations: int = ITERATIONS,
     leak: float = LEAK,
@@ -75,7 +75,7 @@ def refine(
     The number of splats stays the same; start with `template=121`. Bit-identical on every run of a device.
 
     Args:
-        made: a marker of `fs.marker`, flat, without wear and slanted edges.
+        marker: a marker of `fs.marker`, flat, without wear and slanted edges.
         renderer: device to optimise on; None: the default device.
         iterations: number of frames, 1 to 100,000.
         leak: weight of transmitted light, 0 to 1: squared missing optical depth relative to squared colour
@@ -90,7 +90,7 @@ def refine(
             Gaussians than the marker's ``max_splats``.
     """
     start = time.perf_counter()
-    instance("made", made, Marker, "what fs.marker returns")
+    instance("marker", marker, Marker, "what fs.marker returns")
     if renderer is not None and not hasattr(renderer, "backend"):
         raise invalid("renderer", "an fs.Renderer or None", renderer)
     callback("progress", progress)
@@ -98,13 +98,15 @@ def refine(
     if not 0 <= as_float(leak) <= 1:
         raise InputError(f"leak must be a number from 0 to 1, got {leak!r}")
     seed = whole_number("the seed", seed, 0, 2**63 - 1)
-    if made.regions is not None:
-        raise InputError(f"made must be a marker of modules, got {made.spec} with edges across its modules")
-    if made.shape is not None or made.wear is not None:
-        raise InputError(f"made must be flat and not worn, got {made.spec}; leave out shape and wear")
+    if marker.regions is not None:
+        raise InputError(
+            f"marker must be a marker of modules, got {marker.spec} with edges across its modules"
+        )
+    if marker.shape is not None or marker.wear is not None:
+        raise InputError(f"marker must be flat and not worn, got {marker.spec}; leave out shape and wear")
     renderer = Renderer() if renderer is None else renderer
-    sheet = _Sheet(made, float(leak))
-    splats = _Parameters.of(made)
+    sheet = _Sheet(marker, float(leak))
+    splats = _Parameters.of(marker)
     rng = np.random.default_rng(seed)
     for iteration in range(1, iterations + 1):
         camera, grey = sheet.camera(rng), np.full(3, rng.random())
@@ -115,10 +117,10 @@ def refine(
         if progress is not None:
             progress(RefineStep(iteration, psnr, through))
     return replace(
-        made,
+        marker,
         mixture="refined",
-        cloud=splats.cloud(made.module).with_coplanar_groups(0),
-        seconds=made.seconds + time.perf_counter() - start,
+        cloud=splats.cloud(marker.module).with_coplanar_groups(0),
+        seconds=marker.seconds + time.perf_counter() - start,
     )
 
 
@@ -128,13 +130,13 @@ def _share(done: float) -> float:
 
 
 class _Sheet:
-    """Image of the printed marker, which is the ground truth; coordinates are modules from its centre."""
+    """Printed marker, the ground truth of the images, in modules from its centre."""
 
-    def __init__(self, made: Marker, leak: float) -> None:
-        self._leak, self._shape = leak, np.array(made.grid.shape)
-        self._inside = np.pad(made.grid != HOLE, 1)
-        values = np.where(made.grid == HOLE, 0, made.grid)
-        self._colors = np.pad(made.palette[values].astype(np.float64), ((1, 1), (1, 1), (0, 0)))
+    def __init__(self, marker: Marker, leak: float) -> None:
+        self._leak, self._shape = leak, np.array(marker.grid.shape)
+        self._inside = np.pad(marker.grid != HOLE, 1)
+        values = np.where(marker.grid == HOLE, 0, marker.grid)
+        self._colors = np.pad(marker.palette[values].astype(np.float64), ((1, 1), (1, 1), (0, 0)))
 
     def camera(self, rng: np.random.Generator) -> Camera:
         """A camera with a random tilt axis and a random sub-pixel shift."""
@@ -191,15 +193,15 @@ class _Parameters:
         self._second = {name: np.zeros_like(array) for name, array in values.items()}
 
     @classmethod
-    def of(cls, made: Marker) -> _Parameters:
-        cloud = made.gaussians
+    def of(cls, marker: Marker) -> _Parameters:
+        cloud = marker.gaussians
         assert cloud.colors is not None  # a marker has no harmonics
         opacities = np.clip(cloud.opacities.astype(np.float64), 0.02, 0.9999)
         return cls(
             cloud.quats,
             {
-                "positions": cloud.means[:, :2].astype(np.float64) / made.module,
-                "log_scales": np.log(cloud.scales.astype(np.float64) / made.module),
+                "positions": cloud.means[:, :2].astype(np.float64) / marker.module,
+                "log_scales": np.log(cloud.scales.astype(np.float64) / marker.module),
                 "logits": np.minimum(np.log(opacities / (1 - opacities)), MAX_LOGIT),
                 "colors": cloud.colors.astype(np.float64),
             },

@@ -17,9 +17,9 @@ class ViewScore:
 
     name: str
     psnr: float
-    """dB, of 8-bit images"""
+    """PSNR of the 8-bit images [dB]"""
     ssim: float
-    """mean over the channels, of whole windows (`fidsplat.vision.metrics.ssim`)"""
+    """SSIM, mean over the channels, without border pixels (`fidsplat.vision.metrics.ssim`)"""
     image: np.ndarray
     """(h, w, 3) uint8, rendered"""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Any
 
 from fidsplat.capture.quality import Quality
 from fidsplat.splats.harmonics import MAX_DEGREE
@@ -35,28 +34,29 @@ _COUNTS = {
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Settings of a training run. Defaults are the constants of the 2DGS authors' trainer (hbb1,
-    2d-gaussian-splatting, commit 1920a23), and those of gsplat for `mcmc` (`strategy/mcmc.py`, after
-    Kheradmand et al. 2024) except for `mcmc_scale`; thresholds and rates have the same meaning.
+    """Settings of a training run.
+
+    The defaults are the constants of the 2DGS authors' trainer (hbb1, 2d-gaussian-splatting, commit 1920a23),
+    and for `mcmc` those of gsplat (`strategy/mcmc.py`, after Kheradmand et al. 2024) except for `mcmc_scale`.
 
     Raises:
         InputError: a value is outside its range; the message names the range.
     """
 
     iterations: int = 7000
-    """number of steps, one view each; the authors' trainer has 30,000 by default"""
+    """number of steps, one view each; 30,000 in 2DGS"""
     seed: int = 0
     """seed of all random numbers: order of views, initial rotations, means of split splats"""
     primitive: str = "2d"
     """`2d`: disks, as 2DGS; `3d`: 3D Gaussians, as 3DGS, in the projection of `quality`"""
     strategy: str = "default"
-    """`default`: clone, split and prune by screen gradients, as the authors; `mcmc`: relocation of dead
-    splats, growth up to `max_splats`, and noise"""
+    """`default`: clone, split and prune by screen gradients, as 2DGS; `mcmc`: relocation of dead splats,
+    growth up to `max_splats`, and noise"""
     max_splats: int = 1_000_000
-    """limit of the number of splats; the default strategy prefers those of the largest gradients"""
+    """maximum number of splats; the default strategy then clones and splits those of the largest gradients"""
     quality: str = "surfel"
-    """render quality during training, as text for `fs.Quality`; `surfel` are the authors' constants. Without
-    `arithmetic`, CPUs use the fast one, which changes colours by less than 1e-6"""
+    """render quality during training, as text for `fs.Quality`; `surfel` has the constants of 2DGS. Without
+    `arithmetic` in the text, CPUs use `arithmetic=fast`, which changes colours by less than 1e-6"""
 
     sh_degree: int = 3
     """final degree of the spherical harmonics, 0 to 3"""
@@ -67,7 +67,7 @@ class TrainSettings:
     """share of 1 - SSIM in the loss; the rest is the mean absolute difference"""
 
     distortion_weight: float = 0.0
-    """weight of the mean depth distortion after `distortion_from` iterations; the authors use 100 to 1000 for
+    """weight of the mean depth distortion after `distortion_from` iterations; 2DGS uses 100 to 1000 for
     bounded scenes"""
     distortion_from: int = 3000
     """iteration after which `distortion_weight` applies"""
@@ -100,11 +100,10 @@ class TrainSettings:
     """refine the camera pose of each training view; held-out views are then localised before they are
     evaluated"""
     refine_intrinsics: bool = False
-    """refine fx, fy, cx and cy of each camera; views and held-out views with equal intrinsics share them.
-    Distortion is not refined"""
+    """refine fx, fy, cx and cy; all views with equal intrinsics share them. Distortion is not refined"""
     pose_rate: float = 1e-4
-    """initial learning rate of poses and intrinsics: radians, metres per metre of depth, and pixels per pixel
-    of focal length"""
+    """initial learning rate of poses (radians, and metres per metre of depth) and of intrinsics (pixels per
+    pixel of focal length)"""
     pose_rate_end: float = 1e-6
     """learning rate of poses and intrinsics at the last iteration"""
     fit_exposures: bool = False
@@ -115,8 +114,7 @@ class TrainSettings:
     exposure_rate_end: float = 0.001
     """learning rate of exposures at the last iteration"""
     sparse_adam: bool = False
-    """update only splats that contribute to the frame; otherwise moments update all splats, as with the
-    authors"""
+    """update only splats that contribute to the frame; otherwise all splats, as in 2DGS"""
 
     densify_from: int = 500
     """first iteration of densification"""
@@ -137,7 +135,7 @@ class TrainSettings:
     reset_opacity: float = 0.01
     """maximum opacity after a reset"""
     initial_opacity: float = 0.1
-    """opacity of the first splats; for mcmc it is `mcmc_opacity`"""
+    """initial opacity; for mcmc it is `mcmc_opacity`"""
 
     relocate_until: int = 25_000
     """mcmc: last iteration of relocation and growth, which start at `densify_from`"""
@@ -154,13 +152,13 @@ class TrainSettings:
     mcmc_opacity: float = 0.5
     """mcmc: initial opacity"""
     mcmc_scale: float = 0.5
-    """mcmc: initial scales, relative to the default strategy. gsplat has 0.1, for 3D Gaussians blurred by the
-    low-pass filter; with the low-pass of 2DGS, `screen`, scales far below a pixel have no gradient and never
-    grow"""
+    """mcmc: initial scales, relative to the default strategy. gsplat has 0.1 for 3D Gaussians with a low-pass
+    filter. With that of 2DGS, `screen`, scales far below a pixel have no gradient and do not grow"""
 
     def __post_init__(self) -> None:
         for name, (minimum, maximum) in _COUNTS.items():
-            _put(self, name, whole_number(f"training: {name}", getattr(self, name), minimum, maximum))
+            number = whole_number(f"training: {name}", getattr(self, name), minimum, maximum)
+            object.__setattr__(self, name, number)
         if not isinstance(self.strategy, str) or self.strategy not in STRATEGIES:
             raise InputError(
                 f"training: strategy must be one of {', '.join(STRATEGIES)}, got {self.strategy!r}"
@@ -180,7 +178,7 @@ class TrainSettings:
             if field.type == "float":
                 if not 0 <= as_float(value) < math.inf:
                     raise InputError(f"training: {field.name} must be a number of at least 0, got {value!r}")
-                _put(self, field.name, float(value))
+                object.__setattr__(self, field.name, float(value))
         cameras, exposures = ("refine_poses", "refine_intrinsics"), ("fit_exposures",)
         for switches, rate in ((cameras, "pose_rate"), (exposures, "exposure_rate")):
             for name in (rate, f"{rate}_end"):
@@ -232,8 +230,7 @@ class TrainSettings:
         return self.densify_from < iteration < until and iteration % self.densify_every == 0
 
     def adam_steps(self, iteration: int) -> int:
-        """Number of Adam steps up to an iteration. The default strategy has none at iterations that
-        densification follows."""
+        """Number of Adam steps up to an iteration; the default strategy has none before a densification."""
         iteration = whole_number("iteration", iteration, 0, 2**63 - 1)
         if self.strategy == "mcmc":
             return iteration
@@ -241,7 +238,7 @@ class TrainSettings:
         return iteration - max(0, last // every - self.densify_from // every)
 
     def changes_after(self, iteration: int) -> int | None:
-        """The next iteration that needs other kernels: the SH degree grows, or a loss starts."""
+        """The next iteration that needs other kernels, for a higher SH degree or an additional loss."""
         degree = self.degree_at(iteration) + 1
         every = [degree * self.sh_every] if degree <= self.sh_degree else []
         every += [self.normal_from + 1] if self.normal_weight else []
@@ -268,8 +265,3 @@ def _decayed(iteration: int, first: float, last: float, steps: int) -> float:
     """Exponential decay from `first` to `last` in a number of steps."""
     share = min(whole_number("iteration", iteration, 0, 2**63 - 1) / steps, 1.0)
     return first ** (1 - share) * last**share
-
-
-def _put(settings: TrainSettings, name: str, value: Any) -> None:
-    """Set a field of frozen settings during their creation."""
-    object.__setattr__(settings, name, value)

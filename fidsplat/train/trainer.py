@@ -1,4 +1,4 @@
-"""Trainer: optimise splats to reproduce the images of a data set; bit-identical on every run of a device."""
+"""Trainer of splats on the images of a data set; bit-identical on every run of a device."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ from fidsplat.util.files import ordinary_file, writable_folder
 _SURFACE = ("rgb", "alpha", "depth", "normal")
 """outputs of frames with normal consistency in the loss"""
 _READ_SECONDS = 0.1
-"""maximum number of iterations between two readbacks of pending losses"""
+"""time between two readbacks of pending losses [s]"""
 CHECKPOINT_SECONDS = 30.0
-"""time between checkpoints of a run"""
+"""time between checkpoints of a run [s]"""
 
 
 class Step(NamedTuple):
@@ -91,7 +91,7 @@ class Trainer:
         settings: settings of the run; None: the defaults. `changes` are settings by name.
         checkpoint: file from which the run resumes if it exists, and which `run` writes.
         restart: start again even if a checkpoint exists; the first new checkpoint replaces it.
-        start: initial splats, instead of one at each point of the data set; the SH degree still grows from 0.
+        start: initial splats; None: one at each point of the data set. The SH degree grows from 0.
 
     Raises:
         DeviceError: the device has no gradients.
@@ -140,11 +140,11 @@ class Trainer:
         self._pending: deque[tuple[int, int, Callable[[], Loss]]] = deque()
         """iterations and indices of views whose losses are not read yet"""
         self._camera_gradients: deque[tuple[int, int, Callable[[], np.ndarray]]] = deque()
-        """the same for gradients of cameras"""
+        """iterations and indices of views whose camera gradients are not applied yet"""
         self._unreported: deque[tuple[int, str, Loss]] = deque()
-        """unreported losses"""
+        """iterations, names of views and losses of steps that are not reported yet"""
         self._failure: TrainingError | None = None
-        """error of an earlier iteration whose loss was read later"""
+        """error that every later step raises"""
         self._features: FeatureSet | None = None
         """features of the last frame"""
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
@@ -181,11 +181,11 @@ class Trainer:
         """Run all remaining iterations, with regular checkpoints if the trainer has a file for them.
 
         progress: called after each iteration.
-        prompt: whether to call `progress` before the next iteration; False: a few iterations later, so that a
-            GPU does not wait.
+        prompt: True: call `progress` before the next iteration; False: a few iterations later, which is
+            faster on a GPU.
 
         Raises:
-            InputError: all iterations are completed, or a checkpoint cannot be written (the last one stays).
+            InputError: a checkpoint cannot be written (the last one is kept).
             TrainingError: the loss is not finite, all splats are pruned, or densification was interrupted.
         """
         callback("progress", progress)
@@ -223,7 +223,7 @@ class Trainer:
 
     @property
     def exposures(self) -> np.ndarray:
-        """(views, 2, 3): gains, and offsets in display values, by channel, from the splats' colours to each
+        """(views, 2, 3): gains, and offsets in display values, by channel, that map rendered colours to each
         training image."""
         self._read_losses()
         if self._refinement is None:
@@ -232,13 +232,15 @@ class Trainer:
         return np.concatenate([gains, self._refinement.exposures[:, 1:]], axis=1)
 
     def cloud(self) -> SplatCloud:
-        """The current splats, without those in the data set's boxes. If poses are refined, they are moved by
-        the similarity that aligns the refined poses with the given ones. Raises TrainingError if a value is
-        not finite."""
+        """The current splats, without those in the data set's boxes. If poses are refined, the splats are
+        transformed by the similarity that aligns the refined poses with those of the data set.
+
+        Raises TrainingError if a value is not finite.
+        """
         splats, origin, matrix = self._checked_splats(), self.dataset.origin, np.eye(4)
         if self._refinement is not None and self.settings.refine_poses:
             self._refine_cameras()
-            matrix = self._refinement.to_given()
+            matrix = self._refinement.to_dataset()
         if self.dataset.boxes:
             means = (splats.values["means"] + origin) @ matrix[:3, :3].T + matrix[:3, 3]
             splats = splats.select(outside_boxes(means, self.dataset.boxes))
@@ -254,7 +256,7 @@ class Trainer:
         """Write the checkpoint, if the trainer has a file for it.
 
         Raises:
-            InputError: it cannot be written; the last one stays.
+            InputError: the file cannot be written; the last checkpoint is kept.
             TrainingError: a value of the splats is not finite.
         """
         if self.checkpoint is None:
@@ -269,8 +271,10 @@ class Trainer:
     def evaluate(
         self, views: tuple[TrainingView, ...] | None = None, progress: Progress | None = None
     ) -> list[ViewScore]:
-        """Metrics of views, by default of the held-out views. If poses are refined, each view is localised
-        first, starting at its own pose; if exposures are fitted, so are its gains and offsets.
+        """Metrics of views, by default of the held-out views.
+
+        If poses are refined, each view is first localised, starting at its pose in the data set. If exposures
+        are fitted, gains and offsets are fitted to each view.
 
         Args:
             progress: called with a description and the share of views done, 0 to 1.
@@ -296,9 +300,8 @@ class Trainer:
         return scores
 
     def _localised(self, view: TrainingView, capture: Capture, resident: ResidentCloud) -> Capture:
-        """The capture of a view at the pose at which the splats match its image; unchanged if they match it
-        better at its own pose."""
-        # here, since it imports detectors, which other trainings do not need
+        """The capture of a view at its localised pose; unchanged if its own pose matches the image better."""
+        # lazy, since these modules import marker detectors
         from fidsplat.localisation.direct_alignment import align
         from fidsplat.localisation.normal_equations import alignment_kernels
 
@@ -309,7 +312,7 @@ class Trainer:
         kernels = alignment_kernels(self.renderer, resident)
         try:
             found = align(image, view.mask, view.camera, render, kernels)
-        except InputError:  # the mask leaves no pixels at the coarsest level
+        except InputError:  # all pixels of the coarsest level are masked
             return capture
         both = capture, capture.with_(camera=found.camera)
         frames = self.renderer.render_views(resident, both)
@@ -317,7 +320,7 @@ class Trainer:
         return both[psnr[1] > psnr[0]]
 
     def _advance(self, late: bool) -> None:
-        """Run one iteration. late: its loss may be read after later iterations."""
+        """Run one iteration. late: whether its loss may be read after later iterations."""
         interrupts.check()
         state, settings = self._state, self.settings
         if self._failure is not None:
@@ -350,7 +353,7 @@ class Trainer:
         self._pending.append((iteration, number, loss))
         full = len(self._pending) > self._model.max_pending_losses
         if not late or full or settings.densifies_after(iteration):
-            self._read_losses()  # read late, so that the device is busy meanwhile
+            self._read_losses()
         by_camera = self._update(gradients, iteration, self._camera(number))
         if by_camera is not None:
             self._camera_gradients.append((iteration, number, by_camera))
@@ -386,10 +389,10 @@ class Trainer:
             raise self._failure
 
     def _refine_cameras(self, of: int | None = None) -> None:
-        """Apply the gradients of cameras that are not applied yet. A view is rendered with the pose after all
-        its earlier iterations, whenever their gradients are read.
+        """Apply pending camera gradients. They are applied before their view is rendered again, so that
+        results do not depend on when gradients are read.
 
-        of: only if one of them is of this view.
+        of: index of a view; does nothing without pending gradients of this view.
         """
         refinement = self._refinement
         if refinement is None or (
@@ -414,24 +417,26 @@ class Trainer:
         return self.dataset.views[number].camera if refined is None else refined.cameras[number]
 
     def _use_camera(self, number: int) -> None:
-        """Render a training view with its current camera from now on."""
+        """Set the current camera in the captures of a training view."""
         camera = self._camera(number)
         if self._captures[number].camera is not camera:
             self._captures[number] = replace(self._captures[number], camera=camera)
             self._surface_captures[number] = replace(self._surface_captures[number], camera=camera)
 
     def _steps(self) -> Iterator[Step]:
-        """Unreported steps."""
+        """Yield the unreported steps, and remove them."""
         while self._unreported:
             iteration, view, loss = self._unreported.popleft()
             count = int(self._state.history["counts"][iteration - 1])
             yield Step(iteration, view, loss.value, loss.psnr, count)
 
     def _differentiated(self, iteration: int, number: int, waits: bool) -> tuple[Callable[[], Loss], Any]:
-        """Render a view and differentiate its loss. Returns a function that reads the loss, and the gradients
-        for `_update`.
+        """Render a view and differentiate its loss.
 
-        waits: whether to wait until the frame's buffers are known to be large enough.
+        waits: whether to wait for the device and enlarge buffers that are too small; False raises
+            CapacityExceeded for these.
+
+        Returns a function that reads the loss, and the gradients for `_update`.
         """
         resident = self._model.resident(self.settings.degree_at(iteration), self.dataset.origin)
         by_normals, by_distortions = self.settings.surface_weights_at(iteration)
@@ -457,8 +462,7 @@ class Trainer:
         return loss, self._model.backward_to_tiles(pipeline, images, by_images)
 
     def _compile_next(self, iteration: int, plain: Capture, surface: Capture) -> None:
-        """Compile the kernels after the next change, a higher SH degree or another loss, in the
-        background."""
+        """Compile in the background the kernels for the next SH degree or the next additional loss."""
         if (change := self.settings.changes_after(iteration)) is None:
             return
         by_normals, by_distortions = self.settings.surface_weights_at(change)
@@ -510,7 +514,7 @@ class Trainer:
         return state
 
     def _view_at(self, iteration: int) -> int:
-        """The index of a view: a new random order in every epoch."""
+        """Index of the view of an iteration; each epoch has a new random order."""
         count = len(self.dataset.views)
         epoch, index = divmod(iteration - 1, count)
         if self._order[0] != epoch:
@@ -518,8 +522,8 @@ class Trainer:
         return int(self._order[1][index])
 
     def _densify(self) -> None:
-        """Densify by the default strategy. This happens before the next iteration, not after the last one:
-        the splats of a completed run are optimised and not reset, as in the authors' trainer."""
+        """Densify by the default strategy, before an iteration and not after the last one: the splats of a
+        completed run are optimised and not reset, as in 2DGS."""
         settings, iteration = self.settings, self.iteration
         if settings.strategy == "mcmc" or not settings.densifies_after(iteration):
             return
@@ -531,9 +535,8 @@ class Trainer:
                 self._model.reset_opacities()
 
     def _update(self, gradients: Any, iteration: int, camera: Camera) -> Callable[[], np.ndarray] | None:
-        """Update the splats by Adam, unless densification by the default strategy follows, as in the authors'
-        trainer (whose new splats have no gradient yet). Returns a function that reads the gradient of the
-        camera, if it is refined."""
+        """Update the splats by Adam, unless densification by the default strategy follows, as in 2DGS (whose
+        new splats have no gradient yet). Returns a function that reads the gradient of a refined camera."""
         settings, mcmc_runs = self.settings, self.settings.strategy == "mcmc"
         origin = self.dataset.origin
         if not mcmc_runs and settings.densifies_after(iteration):
@@ -551,8 +554,8 @@ class Trainer:
 
     @contextmanager
     def _all_or_failed(self) -> Iterator[None]:
-        """A context that forbids further steps if densification does not finish (too little memory, an
-        interrupt), as arrays may then have different lengths."""
+        """Context manager that makes later steps fail if densification is interrupted (for instance by too
+        little memory), as arrays may then have different lengths."""
         try:
             yield
         except BaseException:

@@ -1,4 +1,4 @@
-"""Reader of nerfstudio's transforms.json (docs.nerf.studio, "Data conventions"), and of the NeRF authors'
+"""Reader of nerfstudio's transforms.json (docs.nerf.studio, "Data conventions") and NeRF's
 transforms_train.json and transforms_test.json. Poses are camera to world with OpenGL's axes."""
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from fidsplat.util.files import from_json, path_of, read_text
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")
-"""suffixes of image files; the NeRF authors' files omit them"""
+"""suffixes of image files; NeRF's transforms_train.json omits them"""
 _BLACK = (0.0, 0.0, 0.0)
 
 
 class DatasetContents(NamedTuple):
-    """Contents of the files of a data set, before they are checked together."""
+    """Views, points and background of a data set, before `Dataset` checks them."""
 
     views: list[TrainingView]
     held_out: list[TrainingView]
@@ -42,10 +42,9 @@ def has_transforms(path: Path) -> bool:
 
 
 def load_transforms(path: Path, progress: Callable[[str, float], None], masks: Masks) -> DatasetContents:
-    """Read the views and points of transforms.json. Views in its val_filenames and test_filenames, and in
-    transforms_test.json next to it, are held out.
+    """Read the views and points of transforms.json; images with alpha are composited over black.
 
-    Images with alpha are composited over black.
+    Views in its val_filenames and test_filenames, and in transforms_test.json next to it, are held out.
 
     Raises InputError for a damaged file, a missing image, or an unsupported lens.
     """
@@ -73,12 +72,12 @@ def _table(file: Path) -> dict[str, Any]:
 
 
 def _views(
-    file: Path, table: dict, progress: Callable[[str, float], None], words: str, masks: Masks
+    file: Path, table: dict, progress: Callable[[str, float], None], label: str, masks: Masks
 ) -> list[TrainingView]:
     views: list[TrainingView] = []
     others: set[tuple[int, int]] = set()
     for number, frame in enumerate(table["frames"]):
-        progress(words, number / len(table["frames"]))
+        progress(label, number / len(table["frames"]))
         try:
             name, _ = str(frame["file_path"]), frame["transform_matrix"]
         except (KeyError, TypeError):
@@ -86,9 +85,9 @@ def _views(
                 f"{file}: frame {number} must have a file_path and a transform_matrix of 4 x 4 finite "
                 f"numbers, got {str(frame)[:80]!r}"
             ) from None
-        place = _image_file(file, name, others)
+        source = _image_file(file, name, others)
         given = file.parent / str(frame["mask_path"]) if "mask_path" in frame else None
-        image, mask = read_on_background(place, _BLACK), masks.of(place, name, given)
+        image, mask = read_on_background(source, _BLACK), masks.of(source, name, given)
         views.append(undistorted_view(name, _camera(f"{file}: {name}", table, number, image), image, mask))
     return sorted(views, key=lambda view: view.name)
 
@@ -122,8 +121,11 @@ def _image_file(file: Path, name: str, others: set[tuple[int, int]]) -> Path:
 
 
 def check_other_image(image: Path, others: set[tuple[int, int]]) -> None:
-    """Raise InputError if two views have the same image file, as a short list could load one file any number
-    of times. others: device and inode of earlier images; extended by this one."""
+    """Raise InputError if two views have the same image file; otherwise a small file could fill the memory
+    with copies of one image.
+
+    others: device and inode of the images before; receives those of this one.
+    """
     if not path_of(image).is_file():
         return  # the error is reported when the image is read
     status = image.stat()

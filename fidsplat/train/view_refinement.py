@@ -1,10 +1,9 @@
-"""Refinement of the training views: camera poses, intrinsics, and exposures (a gain and an offset of each
-channel).
+"""Refinement of the training views by Adam: poses, intrinsics, and exposures (a gain and an offset of each
+channel). Views with equal intrinsics share them.
 
-Views have their own poses and exposures; views with equal intrinsics share theirs. Adam optimises them. A
-rotation is about a point in front of the camera, at the
-median depth of the data set's points, and a translation is in units of this depth. So the six numbers move
-the image by similar amounts and are hardly coupled.
+A rotation of a camera is about the point on its optical axis at the median depth of the data set's points,
+and a translation is in units of this depth. Then the six numbers move the image by similar amounts and are
+nearly independent.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.cameras.pose_offset import offset_camera
-from fidsplat.train.dataset import Dataset, TrainingView
+from fidsplat.train.dataset import Dataset, TrainingView, depths
 from fidsplat.train.settings import TrainSettings
 from fidsplat.vision.pose import pose_error
 
 _EPSILON = 1e-12
-"""relative to gradients, which are means over pixels"""
+"""epsilon of Adam, small against gradients, which are means over pixels"""
 _AT_ORIGIN = Camera.pinhole(4, 4, 4, 4, 2, 2)
 INTRINSICS_EVERY = 10
 """iterations between two steps of the intrinsics, by the sums of their gradients: views of one camera need
@@ -30,8 +29,8 @@ the gradients of each other, for which a GPU would have to wait in each iteratio
 
 
 class _Adam:
-    """Adam's moments of `size` numbers of each row, in two groups. The numbers of a group have one step size,
-    so that the direction of a step does not depend on axes."""
+    """Adam for rows of `size` numbers in two groups; a group shares a mean square, so that the direction of
+    a step does not depend on the choice of axes."""
 
     def __init__(self, rows: int, size: int, settings: TrainSettings) -> None:
         self._betas = settings.beta1, settings.beta2
@@ -54,24 +53,24 @@ class ViewRefinement:
 
     def __init__(self, dataset: Dataset, settings: TrainSettings) -> None:
         self._settings = settings
-        self._given = [view.camera for view in dataset.views]
-        self.cameras = list(self._given)
+        self._initial = [view.camera for view in dataset.views]
+        self.cameras = list(self._initial)
         """current cameras"""
-        self.exposures = np.zeros((len(self._given), 2, 3))
+        self.exposures = np.zeros((len(self._initial), 2, 3))
         """logarithms of gains, and offsets, by channel; their means over the views are 0"""
         self._depths = [_median_depth(view, dataset) for view in dataset.views]
-        intrinsics = [camera_intrinsics(camera) for camera in self._given]
-        self._kinds = {numbers: row for row, numbers in enumerate(dict.fromkeys(intrinsics))}
-        """rows of `intrinsics` by the given ones"""
-        self.intrinsics = np.array([*self._kinds])[:, 2:]
+        intrinsics = [camera_intrinsics(camera) for camera in self._initial]
+        self._rows = {numbers: row for row, numbers in enumerate(dict.fromkeys(intrinsics))}
+        """rows of `intrinsics` by the size and intrinsics in the data set"""
+        self.intrinsics = np.array([*self._rows])[:, 2:]
         """(cameras, 4): fx, fy, cx, cy"""
         self._intrinsics_sums = np.zeros(self.intrinsics.shape)
         """sums of the gradients since the last step"""
-        self._pose_adam, self._exposure_adam = (_Adam(len(self._given), 6, settings) for _ in range(2))
+        self._pose_adam, self._exposure_adam = (_Adam(len(self._initial), 6, settings) for _ in range(2))
         self._intrinsics_adam = _Adam(len(self.intrinsics), 4, settings)
 
     def move(self, view: int, by_pose: np.ndarray, iteration: int) -> None:
-        """Apply a step to the camera of a view. by_pose: (6,) gradient `pose` of the loss at an iteration."""
+        """Apply a step to the pose of a view. by_pose: (6,) gradient `pose` of the loss."""
         depth, gradient = self._depths[view], by_pose.astype(np.float64)
         pivot = np.array([0.0, 0.0, depth])
         gradient[:3] -= np.cross(pivot, gradient[3:])
@@ -79,16 +78,16 @@ class ViewRefinement:
         motion = self._settings.pose_rate_at(iteration) * self._pose_adam.direction(view, gradient)
         motion[3:] *= depth
         # the rotation about the camera moves the pivot; move it back
-        turned = offset_camera(_AT_ORIGIN, np.concatenate([motion[:3], np.zeros(3)]))
-        motion[3:] += pivot - turned.world_to_camera[:3, :3] @ pivot
+        rotated = offset_camera(_AT_ORIGIN, np.concatenate([motion[:3], np.zeros(3)]))
+        motion[3:] += pivot - rotated.world_to_camera[:3, :3] @ pivot
         self.cameras[view] = offset_camera(self.cameras[view], motion)
 
     def add_intrinsics(self, view: int, by_intrinsics: np.ndarray) -> None:
-        """Add the gradient (4,) `intrinsics` of the loss of a view."""
-        self._intrinsics_sums[self._kinds[camera_intrinsics(self._given[view])]] += by_intrinsics
+        """Add the gradient `intrinsics` (4,) of the loss of a view to the sums."""
+        self._intrinsics_sums[self._rows[camera_intrinsics(self._initial[view])]] += by_intrinsics
 
     def change_intrinsics(self, iteration: int) -> None:
-        """Apply a step to the intrinsics, in units of the focal lengths, and clear the sums."""
+        """Apply a step, in units of the focal lengths, to the intrinsics, and clear the sums."""
         rate = self._settings.pose_rate_at(iteration)
         for row, sums in enumerate(self._intrinsics_sums):
             if sums.any():
@@ -96,41 +95,41 @@ class ViewRefinement:
                 self.intrinsics[row] += rate * focal * self._intrinsics_adam.direction(row, sums * focal)
         self._intrinsics_sums[:] = 0
         self.cameras = [
-            self.with_intrinsics(camera, given)
-            for camera, given in zip(self.cameras, self._given, strict=True)
+            self.with_intrinsics(camera, initial)
+            for camera, initial in zip(self.cameras, self._initial, strict=True)
         ]
 
-    def with_intrinsics(self, camera: Camera, given: Camera) -> Camera:
-        """The camera with the refined intrinsics of the training views that have the given ones; unchanged
-        without such views."""
-        row = self._kinds.get(camera_intrinsics(given))
+    def with_intrinsics(self, camera: Camera, initial: Camera) -> Camera:
+        """The camera with the refined intrinsics of the training views that had the intrinsics of `initial`;
+        unchanged without such views."""
+        row = self._rows.get(camera_intrinsics(initial))
         if row is None:
             return camera
         fx, fy, cx, cy = self.intrinsics[row].tolist()
         return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def expose(self, view: int, by_exposure: np.ndarray, iteration: int) -> None:
-        """Apply a step to the exposure of a view. by_exposure: (2, 3) gradient at an iteration."""
+        """Apply a step to the exposure of a view. by_exposure: (2, 3) gradient of the loss."""
         direction = self._exposure_adam.direction(view, by_exposure.ravel()).reshape(2, 3)
         self.exposures[view] += self._settings.exposure_rate_at(iteration) * direction
 
     def centre_exposures(self) -> None:
-        """Set the means of the exposures over the views to 0; the splats' colours include them."""
+        """Set the means of the exposures over the views to 0; the splats' colours then compensate."""
         self.exposures -= self.exposures.mean(axis=0)
 
-    def to_given(self) -> np.ndarray:
-        """(4, 4) similarity that aligns the refined cameras with the given ones. Images determine a scene up
-        to a similarity, along which refinement drifts."""
-        return alignment(self.cameras, self._given)
+    def to_dataset(self) -> np.ndarray:
+        """(4, 4) similarity that aligns the refined cameras with those of the data set. Images determine a
+        scene only up to a similarity, along which refinement drifts."""
+        return alignment(self.cameras, self._initial)
 
     def aligned(self) -> list[Camera]:
-        """The refined cameras, aligned with the given ones."""
-        matrix = self.to_given()
+        """The refined cameras, aligned with those of the data set."""
+        matrix = self.to_dataset()
         return [moved(camera, matrix) for camera in self.cameras]
 
     def pose_changes(self) -> np.ndarray:
-        """(views, 2): metres and degrees between the given and the refined cameras."""
-        pairs = zip(self._given, self.aligned(), strict=True)
+        """(views, 2): metres and degrees between the cameras of the data set and the aligned ones."""
+        pairs = zip(self._initial, self.aligned(), strict=True)
         apart = [pose_error(a.camera_to_world, b.camera_to_world) for a, b in pairs]
         return np.array(apart) * (1, 180 / math.pi)
 
@@ -150,7 +149,7 @@ class ViewRefinement:
         }
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Set the state of a checkpoint. Raises ValueError or LookupError if it does not fit the views."""
+        """Restore the state of a checkpoint; raise ValueError or LookupError if it does not fit the views."""
         for name, own in self.arrays().items():
             array = arrays[name]
             if array.shape != own.shape or array.dtype != own.dtype or not np.isfinite(array).all():
@@ -162,7 +161,7 @@ class ViewRefinement:
             self.with_intrinsics(
                 camera if (pose == camera.world_to_camera).all() else camera.with_pose(pose), camera
             )
-            for camera, pose in zip(self._given, arrays["poses"], strict=True)
+            for camera, pose in zip(self._initial, arrays["poses"], strict=True)
         ]
         adams = self._pose_adam, self._intrinsics_adam, self._exposure_adam
         for name, adam in zip(("pose", "intrinsics", "exposure"), adams, strict=True):
@@ -174,16 +173,16 @@ def camera_intrinsics(camera: Camera) -> tuple[float, ...]:
     return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
 
 
-def alignment(cameras: Sequence[Camera], given: Sequence[Camera]) -> np.ndarray:
-    """(4, 4) similarity that moves cameras to given ones, as near as possible: the mean rotation, and the
-    scale and translation of their centres."""
+def alignment(cameras: Sequence[Camera], targets: Sequence[Camera]) -> np.ndarray:
+    """(4, 4) similarity that aligns cameras with target cameras: the mean rotation, and the scale and
+    translation of least squares between their centres."""
     pairs = [
         (one.world_to_camera[:3, :3], other.world_to_camera[:3, :3])
-        for one, other in zip(cameras, given, strict=True)
+        for one, other in zip(cameras, targets, strict=True)
     ]
     left, _, right = np.linalg.svd(np.sum([other.T @ one for one, other in pairs], axis=0))
     rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    centres, goals = (np.array([camera.position for camera in each]) for each in (cameras, given))
+    centres, goals = (np.array([camera.position for camera in each]) for each in (cameras, targets))
     spread = (centres - centres.mean(axis=0)) @ rotation.T
     overlap = float((spread * (goals - goals.mean(axis=0))).sum())
     scale = overlap / float((spread**2).sum()) if overlap > 0 else 1.0
@@ -194,7 +193,7 @@ def alignment(cameras: Sequence[Camera], given: Sequence[Camera]) -> np.ndarray:
 
 
 def moved(camera: Camera, matrix: np.ndarray) -> Camera:
-    """The camera moved by a similarity (4, 4) of the world."""
+    """The camera after a similarity (4, 4) of the world."""
     pose = np.eye(4)
     pose[:3, :3] = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3])) @ camera.world_to_camera[:3, :3].T
     pose[:3, 3] = matrix[:3, :3] @ camera.position + matrix[:3, 3]
@@ -202,7 +201,7 @@ def moved(camera: Camera, matrix: np.ndarray) -> Camera:
 
 
 def with_exposure_of(rendered: np.ndarray, view: TrainingView) -> np.ndarray:
-    """A rendered image (h, w, 3) with the gain and offset of each channel that fit the image of a view."""
+    """Fit the gain and offset of each channel of a rendered image (h, w, 3) to the image of a view."""
     target = view.image.astype(np.float64) / 255
     inside = np.ones(target.shape[:2], bool) if view.mask is None else view.mask
     corrected = np.empty_like(rendered)
@@ -216,7 +215,6 @@ def with_exposure_of(rendered: np.ndarray, view: TrainingView) -> np.ndarray:
 
 def _median_depth(view: TrainingView, dataset: Dataset) -> float:
     """Median depth of the points in front of a camera; the scene extent without any."""
-    camera = view.camera
-    depths = (dataset.points - camera.position) @ camera.world_to_camera[2, :3]
-    depths = depths[depths > camera.near]
-    return float(np.median(depths)) if len(depths) else dataset.extent
+    found = depths(view.camera, dataset.points)
+    found = found[found > view.camera.near]
+    return float(np.median(found)) if len(found) else dataset.extent

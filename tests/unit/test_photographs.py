@@ -22,7 +22,7 @@ from fidsplat.photographs.steps import parse_scale, photographs_to_scene, scale_
 from fidsplat.photographs.tags import box_of, module_colors, parse_tags, same_tag
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import quaternion_to_matrix, rigid_matrix
-from fidsplat.train.boxes import front_of
+from fidsplat.train.boxes import marker_mask
 from fidsplat.vision.video_frames import choose_frames, measure_frames
 
 SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
@@ -135,12 +135,12 @@ def test_the_region_of_a_tag_is_masked_and_its_inks_are_measured():
     tag = PlacedMarker(fs.marker("apriltag:36h11:5", 0.16, black=(0.2, 0.1, 0.1), white=(0.8, 0.9, 0.7)))
     camera = fs.Camera.look_at(121, 91, 0.4, (0.1, 0.05, -0.6), (0, 0, 0))
     frame = fs.Renderer("reference").render(tag.cloud(), fs.Capture(camera, outputs=("rgb", "alpha")))
-    region = front_of(box_of(tag), camera, 1.0)
+    region = marker_mask(box_of(tag), camera, 1.0)
     assert region[frame["alpha"] > 0.01].all()
     rim = cv2.dilate((frame["alpha"] > 0.5).astype(np.uint8), np.ones((7, 7))) == 0
     assert not region[rim].any()
     behind = camera.with_pose(position=(0, 0, 0.6), target=(0, 0, 0))
-    assert not front_of(box_of(tag), behind, 1.0).any()
+    assert not marker_mask(box_of(tag), behind, 1.0).any()
     dark, light = module_colors(tag, (255 * frame["rgb"]).round().astype(np.uint8), camera)
     np.testing.assert_allclose(dark, (0.2, 0.1, 0.1), atol=0.02)
     np.testing.assert_allclose(light, (0.8, 0.9, 0.7), atol=0.02)

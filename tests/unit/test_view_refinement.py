@@ -145,7 +145,7 @@ def test_refinement_does_not_drift_by_a_similarity(given):
     drift = 1.03 * rigid_matrix((0.2, -0.1, 0.4), (0.98, 0.1, -0.1, 0.15))
     drift[3, 3] = 1.0
     refinement.cameras = [moved(view.camera, drift) for view in given.views]
-    np.testing.assert_allclose(refinement.to_given() @ drift, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(refinement.to_dataset() @ drift, np.eye(4), atol=1e-12)
     assert refinement.pose_changes().max() < 1e-10
 
 
