@@ -26,6 +26,8 @@ from fidsplat.splats.cloud import SplatCloud
 
 NORM, COSINE = 1e-4, 1e-6
 """largest error of a device, as in `Difference`, where the derivatives are not worse conditioned"""
+_ROUNDINGS = 8
+"""float32 roundings of a moment (a fragment's term and the sums over a tile), as many as 64 random ones"""
 _BEHIND = (0.3, 0.6, 0.1)
 _ORIGIN = (40.0, -25.0, 7.0)
 """of the clouds, metres: a derivative by a world position instead of one relative to it shows"""
@@ -178,14 +180,36 @@ def conditioning(
     ]
 
 
-def differences(found: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> Iterator[Difference]:
+def rotation_floor(cloud: SplatCloud, truth: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Absolute error of the quaternions' derivative by rounding of moments, for `differences`.
+
+    A rotation exchanges covariance between two axes: its derivative is a difference of terms as large as the
+    derivatives by their ln(scales), and 0 for spheres. Moments are float32, with an error of 2^-24 of these
+    terms for each rounding. A quaternion of length 1 turns by twice its change.
+    """
+    if cloud.thickness is None:
+        return {}
+    third = truth["thickness"] * cloud.thickness
+    by_log = np.column_stack([truth["scales"] * cloud.scales, third])
+    terms = 2 * np.linalg.norm(by_log, axis=1) / np.linalg.norm(cloud.quats, axis=1)
+    return {"quats": 2.0**-24 * _ROUNDINGS * float(np.linalg.norm(terms[cloud.thickness > 0]))}
+
+
+def differences(
+    found: Mapping[str, np.ndarray],
+    truth: Mapping[str, np.ndarray],
+    floors: Mapping[str, float] | None = None,
+) -> Iterator[Difference]:
     """How far each array of `found` is from the reference's; where that is 0 all over, anything else is
-    infinitely far."""
+    infinitely far. floors: absolute errors that count as 0, by parameter."""
     for name, expected in truth.items():
         got, length = found[name].astype(np.float64), float(np.linalg.norm(expected))
         off = float(np.linalg.norm(got - expected))
+        if off <= (floors or {}).get(name, 0.0):
+            yield Difference(name, 0.0, 0.0)
+            continue
         if length == 0 or not np.any(got):
-            yield Difference(name, 0.0 if off == 0 else np.inf, 0.0)
+            yield Difference(name, np.inf, 0.0)
             continue
         cosine = float((got * expected).sum() / (length * np.linalg.norm(got)))
         yield Difference(name, off / length, 1 - cosine)

@@ -162,9 +162,10 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         by_bulge = float(0.0)
         if wp.static(thick):
             if s.bulge > 0.0 and ahead:
-                half_rho = c.q * inverse_d * inverse_d
-                rest = wp.max(1.0 - s.bulge * half_rho, 1.0e-6)  # 1 / (1 + t)
-                t, slant = s.bulge * half_rho / rest, half_rho * c.d  # q / D
+                slant = c.q * inverse_d  # q / D: finite for the thinnest needles, whose half_rho overflows
+                share = s.bulge * inverse_d * slant
+                rest = wp.max(1.0 - share, 1.0e-6)  # 1 / (1 + t)
+                t = share / rest
                 by_d = by_record[2] - center * by_record[0]
                 by_bulge = slant * fma(slant, by_dot[0], by_d)
                 by_record[2] = by_record[2] - t * fma(2.0 * slant, by_dot[0], by_d)

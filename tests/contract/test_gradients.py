@@ -10,13 +10,16 @@ import pytest
 from derivative_errors import (
     COSINE,
     NORM,
+    arrays_of,
     certain_loss,
+    colors_of,
     conditioning,
     derivatives,
     differences,
     random_loss,
     random_picture,
     reference_derivatives,
+    rotation_floor,
 )
 
 import fidsplat as fs
@@ -35,7 +38,7 @@ def assert_same(backend, cloud, capture, by_images=None, **build):
     assert found.keys() == expected.keys()
     for name, array in found.items():
         assert array.shape == expected[name].shape, name
-    off = list(differences(found, expected))
+    off = list(differences(found, expected, rotation_floor(cloud, expected)))
     if not all(one.norm <= NORM and one.turned <= COSINE for one in off):  # also for NaN
         for one, known in zip(off, conditioning(cloud, capture, by_images), strict=True):
             assert one.norm <= NORM or one.norm <= known.norm < math.inf, (one, known)
@@ -73,6 +76,13 @@ def test_derivatives_of_random_scenes_are_the_references(backend, seeds):
         assert_same(backend, *random_picture(seed))
 
 
+def spheres(cloud, capture):
+    """3D Gaussians whose scales are equal: no derivative by rotation is left but rounding."""
+    means, quats, scales, opacities = arrays_of(cloud)
+    scales = np.repeat(scales[:, :1], 3, axis=1)
+    return fs.SplatCloud(means, quats, scales, opacities, origin=cloud.origin, **colors_of(cloud)), capture
+
+
 @pytest.mark.parametrize(
     ("projection", "solid"), [("ewa_antialiased", 1.0), ("exact", 0.7)], ids=["EWA", "exact, and disks"]
 )
@@ -82,6 +92,7 @@ def test_derivatives_of_3d_gaussians_are_the_references(backend, projection, sol
         random_picture(0, solid=solid, quality=quality),
         random_picture(1, solid=solid, quality=quality, scale=(3e-3, 0.03), depth=(1.0, 5.0)),
         random_picture(2, solid=solid, quality=quality, scale=(1e-2, 1.0), depth=(-0.5, 1.5), across=0.5),
+        spheres(*random_picture(1, solid=1.0, quality=quality)),
     ]
     for cloud, capture in scenes:
         loss = certain_loss(cloud, capture)
@@ -131,15 +142,22 @@ def test_opaque_splats_have_derivatives(backend):
     assert all(np.isfinite(array).all() for array in found.values())
 
 
-def test_scales_below_the_smallest_have_no_derivative_and_leave_others_theirs(backend):
-    """Splats with a tiny first scale, a tiny second one, both and none."""
-    cloud, capture = random_picture(5, count=40, scale=(0.05, 0.3), depth=(1.5, 4.0))
-    tiny = np.arange(40)[:, None] // [1, 2] % 2 == 1
-    scales = np.where(tiny, np.float32(1e-25), cloud.scales)
-    thin = fs.SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, sh=cloud.sh, origin=cloud.origin)
-    found = assert_same(backend, thin, capture)["scales"]
-    assert not found[tiny].any()
-    assert all(found[~tiny[:, axis], axis].any() for axis in (0, 1))
+@pytest.mark.parametrize("solid", [0.0, 1.0], ids=["disks", "exact 3D Gaussians"])
+def test_scales_below_the_smallest_have_no_derivative_and_leave_others_theirs(backend, solid):
+    """Splats with every combination of tiny scales, from none to all."""
+    quality = fs.Quality(ellipsoid="exact") if solid else None
+    shape = {"scale": (0.05, 0.3), "depth": (1.5, 4.0), "solid": solid, "quality": quality}
+    cloud, capture = random_picture(5, count=40, **shape)
+    third = [] if cloud.thickness is None else [cloud.thickness]
+    scales = np.column_stack([cloud.scales, *third])
+    tiny = np.arange(40)[:, None] // [1, 2, 4][: scales.shape[1]] % 2 == 1
+    means, quats, _, opacities = arrays_of(cloud)
+    scales = np.where(tiny, np.float32(1e-25), scales)
+    thin = fs.SplatCloud(means, quats, scales, opacities, sh=cloud.sh, origin=cloud.origin)
+    found = assert_same(backend, thin, capture)
+    for axis, by in enumerate([*found["scales"].T, *([found["thickness"]] if solid else [])]):
+        assert not by[tiny[:, axis]].any()
+        assert by[~tiny[:, axis]].any()
 
 
 def long_lists():

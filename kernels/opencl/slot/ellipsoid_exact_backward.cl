@@ -1,5 +1,9 @@
 // Backward pass of exact 3D Gaussians. With `bulge` b and h = q / (D^2 + b q), D and q of the disk: the sums of blend_backward.cl
 // are the gradients with respect to n_u, n_v and D of h, which is the rho / 2 of the fragment.
+//@ geometry
+    vfloat slant;           // h d: finite for the thinnest needles, whose h overflows
+//@ geometry_make
+    g.slant = c.q * g.inverse_d;
 //@ sums
     vfloat bulge;
 //@ fragment_backward
@@ -10,9 +14,9 @@
     {
         // by_d: gradient with respect to d = D (1 + t); by_q: twice that with respect to q (1 + t); with t = b q / D^2 = b h / (1 - b h)
         vint ahead = VMASK(g->inverse_d > 0.0f);
-        vfloat half_rho = VSELECT((vfloat)0.0f, g->half_rho, ahead), d = VSELECT((vfloat)0.0f, g->d, ahead);
-        vfloat bh = s->bulge * half_rho, rest = max(1.0f - bh, (vfloat)1e-6f), t = bh / rest, hd = half_rho * d;
-        vfloat by_both = 2.0f * FMA(by_q, t, by_d * s->bulge * VSELECT((vfloat)0.0f, g->inverse_d, ahead) / rest);
+        vfloat inverse_d = VSELECT((vfloat)0.0f, g->inverse_d, ahead), hd = VSELECT((vfloat)0.0f, g->slant, ahead);
+        vfloat bh = s->bulge * inverse_d * hd, rest = max(1.0f - bh, (vfloat)1e-6f), t = bh / rest;
+        vfloat by_both = 2.0f * FMA(by_q, t, by_d * s->bulge * inverse_d / rest);
         *by_nu = FMA(by_both, g->nu, *by_nu);
         *by_nv = FMA(by_both, g->nv, *by_nv);
         sums->bulge = FMA(hd, FMA(0.5f * hd, by_q, by_d), sums->bulge);
