@@ -410,7 +410,11 @@ def look_at_matrix(position, target, up=(0.0, -1.0, 0.0)) -> np.ndarray:
         raise InputError("camera up must not be zero, got (0, 0, 0)")
     right = np.cross(forward, upward / length)
     if np.linalg.norm(right) < 1e-9:
-        raise InputError(f"camera up must not be parallel to the optical axis, got {tuple(upward.tolist())}")
+        other = " ".join(f"{x:g}" for x in np.eye(3)[np.abs(forward).argmin()])
+        raise InputError(
+            f"camera up must not be parallel to the optical axis, got {tuple(upward.tolist())}; give another "
+            f"direction, such as {other}, or move position or look_at"
+        )
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     matrix = np.eye(4)

@@ -12,6 +12,7 @@ import tyro
 from fidsplat.commands.options import Device, Json, Overwrite, new_file
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.util.errors import InputError
+from fidsplat.util.files import existing
 
 
 @dataclass
@@ -74,6 +75,7 @@ class Convert:
         from fidsplat.formats.spz import save_spz
         from fidsplat.store.layout import SUFFIX
 
+        existing(self.source)  # before complaints about the target
         if self.mesh.mesh:
             return self._mesh()
         if Path(self.source).suffix == SUFFIX and Path(self.target).name == META:
@@ -82,7 +84,7 @@ class Convert:
             return self._page()
         known = check_writable(self.target)
         source, target = Path(self.source), Path(self.target)
-        if source.exists() and target.exists() and source.samefile(target):
+        if target.exists() and source.samefile(target):
             raise InputError(f"OUT must be another file than IN, got {self.target}")
         new_file(self.target, self.overwrite)
         with delayed_progress() as progress:

@@ -26,8 +26,8 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import write_file
 from fidsplat.util.limits import check_expansion
 
-_HEAD = struct.Struct("<IIIBBBB")
-_HEAD_4 = struct.Struct("<IIIBBBBI12x")
+_HEAD = struct.Struct("<4sIIBBBB")
+_HEAD_4 = struct.Struct("<4sIIBBBBI12x")
 _SIZES, _RECORD = struct.Struct("<QQ"), struct.Struct("<II")
 _HAS_EXTENSIONS = 2
 """flag of version 4: the file has extensions"""
@@ -37,7 +37,7 @@ _TO_RDF = {0: (1, -1, -1), 1: (-1, 1, -1), 4: (1, -1, -1), 6: (1, 1, 1), 7: (-1,
 """signs of the axes, by coordinate system that is a rotation of ours: unspecified, LDB, RUB, RDF, LUF"""
 _LABELS, _GROUPS = 0xF1D50001, 0xF1D50002
 """types of fidsplat's extensions: int32 per splat in a Zstandard frame"""
-_MAGIC = 0x5053474E
+_MAGIC = b"NGSP"
 _COLOR = 0.15
 _MIN_SCALE = float(np.exp(-10.0))
 """smallest scale [m] of the format; a third scale of this size marks a disk"""
@@ -51,8 +51,8 @@ _MAX_UNCHECKED = 2**20
 def load_spz(path: Path) -> SplatCloud:
     """Read an SPZ file. Raises InputError for a damaged file or another version."""
     data = content(path, (b"\x1f\x8b", b"NGSP"))
-    current = data[:4] == _MAGIC.to_bytes(4, "little")
-    version, n, degree, point, parts, extensions = (_frames if current else _gzip)(path, data)
+    read = _frames if data[:4] == _MAGIC else _gzip
+    version, n, degree, point, parts, extensions = read(path, data)
     means = _fixed(parts["means"]) / 2.0**point
     quats = _first_three(parts["quats"]) if version == 2 else _smallest_three(parts["quats"])
     scales = np.exp(parts["scales"] / 16.0 - 10.0)
@@ -73,12 +73,19 @@ def _widths(version: int, degree: int) -> dict[str, int]:
     return widths | {"rest": 3 * _REST[degree]}
 
 
-def _check_head(path: Path, version: int, degree: int, point: int) -> None:
-    if version not in (2, 3, 4):
+def _check_start(path: Path, data: bytes, size: int) -> None:
+    """Refuse an unknown version, also of a file that is truncated after it; then a truncated header."""
+    version = int.from_bytes(data[4:8], "little")
+    if len(data) >= 8 and version not in (2, 3, 4):
         raise InputError(
             f"{path}: the version of SPZ must be 2, 3 or 4, got {version}; convert it by spz_to_ply of "
             "nianticlabs/spz"
         )
+    if len(data) < size:
+        raise InputError(f"{path}: truncated: the header must have {size} bytes, got {len(data)}")
+
+
+def _check_head(path: Path, degree: int, point: int) -> None:
     if degree not in _REST or point > _BITS:
         raise InputError(
             f"{path}: SPZ must have SH degree 0 to 4 and at most {_BITS} fractional bits, "
@@ -90,14 +97,15 @@ def _gzip(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.nda
     """Read versions 2 and 3: version, number of splats, SH degree, fractional bits, arrays (n, bytes)."""
     try:
         head = zlib.decompressobj(31).decompress(data, _HEAD.size)
-        magic, version, n, degree, point, _, _ = _HEAD.unpack(head)
-    except (zlib.error, struct.error):
+    except zlib.error:
         raise InputError(
             f"{path}: an SPZ file must begin with a gzip header or NGSP, got {data[:4]!r}"
         ) from None
-    if magic != _MAGIC:
-        raise InputError(f"cannot read {path} as SPZ: the magic number must be {_MAGIC:#x}, got {magic:#x}")
-    _check_head(path, version, degree, point)
+    if len(head) >= 4 and head[:4] != _MAGIC:
+        raise InputError(f"cannot read {path} as SPZ: the magic number must be {_MAGIC!r}, got {head[:4]!r}")
+    _check_start(path, head, _HEAD.size)
+    _, version, n, degree, point, _, _ = _HEAD.unpack(head)
+    _check_head(path, degree, point)
     widths = _widths(version, degree)
     size = _HEAD.size + n * sum(widths.values())
     if max(_MAX_UNCHECKED, len(data)) < n and size <= 1040 * len(data):
@@ -126,10 +134,9 @@ def _check_memory(path: Path, n: int, widths: dict[str, int]) -> None:
 def _frames(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.ndarray], bytes]:
     """Read version 4: version, number of splats, SH degree, fractional bits, arrays (n, bytes),
     extensions."""
-    if len(data) < _HEAD_4.size:
-        raise InputError(f"{path}: truncated: the header must have {_HEAD_4.size} bytes, got {len(data)}")
+    _check_start(path, data, _HEAD_4.size)
     _, version, n, degree, point, flags, streams, table = _HEAD_4.unpack_from(data)
-    _check_head(path, version, degree, point)
+    _check_head(path, degree, point)
     if version != 4:
         raise InputError(f"{path}: an NGSP file must have SPZ version 4, got {version}; it is damaged")
     widths = {name: width for name, width in _widths(version, degree).items() if width}

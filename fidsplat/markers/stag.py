@@ -54,7 +54,10 @@ def codes() -> dict[str, np.ndarray]:
 def _parse(text: str, head: str, rest: str) -> Spec:
     library, _, number = rest.lower().partition(":")
     if library not in codes() or not re.fullmatch("[0-9]{1,9}", number):
-        raise InputError(f"the spec of an STag must be stag:LIBRARY:ID, {', '.join(codes())}, got {text!r}")
+        raise InputError(
+            f"an STag must be stag:LIBRARY:ID with the library {', '.join(codes())}, got {text!r}; "
+            "write for example stag:hd21:3"
+        )
     if int(number) >= len(codes()[library]):
         raise InputError(f"stag:{library} ids must be 0 to {len(codes()[library]) - 1}, got {number}")
     return Spec(text=text, kind="stag", family=library, id=int(number))

@@ -106,7 +106,12 @@ class Renderer:
         if isinstance(cloud, ChunkedSplats):
             return ResidentCloud(self.backend, Residency(cloud, self.backend), capture)
         if not isinstance(cloud, SplatCloud):
-            raise InputError(f"scene must be a Scene, a SplatCloud or a Store, got {type(scene).__name__}")
+            raise invalid(
+                "scene",
+                "a Scene, a SplatCloud or a Store",
+                scene,
+                "Scene.load reads a file; marker.cloud are splats",
+            )
         with self._lock:
             return ResidentCloud(self.backend, self.backend.upload(cloud), capture, cloud.labels)
 

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from os import PathLike
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -211,6 +212,14 @@ class _MarkerMotion:
 
 
 T = TypeVar("T")
+_INSTEAD = {
+    "Marker": "write markers=[PlacedMarker(marker, pose)], from fidsplat.scenes, or clouds=[marker.cloud]",
+    "PlacedMarker": "write markers=[...]",
+    "SplatCloud": "write clouds=[...]",
+    "Store": "write stores=[...]",
+    "str": "Scene.load reads a scene file, load_splats a splat file, Store a store; marker makes a marker",
+}
+"""remedies for values of the wrong class, by its name"""
 
 
 def _all_of(values: Iterable, kind: type[T], name: str) -> tuple[T, ...]:
@@ -218,11 +227,11 @@ def _all_of(values: Iterable, kind: type[T], name: str) -> tuple[T, ...]:
     if isinstance(values, kind):
         raise invalid(name, f"a list of {kind.__name__}", values, "put it into a list")
     try:
-        found = tuple(values)
+        found = (values,) if isinstance(values, str) else tuple(values)
     except TypeError:
-        raise invalid(name, f"a list of {kind.__name__}", values) from None
+        found = (values,)
     for value in found:
         if not isinstance(value, kind):
-            hint = "PlacedMarker(marker) places a marker" if kind is PlacedMarker else ""
+            hint = _INSTEAD.get("str" if isinstance(value, PathLike) else type(value).__name__, "")
             raise invalid(name, f"a list of {kind.__name__}", value, hint)
     return found

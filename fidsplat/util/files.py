@@ -69,15 +69,21 @@ _KINDS = {
 }
 
 
+def existing(path: str | os.PathLike[str]) -> Path:
+    """The path of a file or folder that exists. Raises InputError."""
+    file = path_of(path)
+    try:
+        file.stat()
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
+    return file
+
+
 def regular_file(path: str | os.PathLike[str]) -> Path:
     """Check that a path is a regular file, for libraries that open files themselves. Raises InputError for a
     folder, and for a pipe or a device, whose reading may block."""
-    file = path_of(path)
-    try:
-        mode = file.stat().st_mode
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
-    if not stat.S_ISREG(mode):
+    file = existing(path)
+    if not file.is_file():
         raise InputError(f"{file} must be a regular file, got {kind_of(file)}; give the name of a file")
     return file
 

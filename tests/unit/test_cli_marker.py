@@ -37,7 +37,7 @@ def test_splats_that_are_there_are_replaced_on_request(capsys, tmp_path):
         (("marker", "qr:a", "-o", mine), f"{mine} already exists; give another name, or --overwrite"),
         (("convert", other, mine), f"{mine} already exists; give another name, or --overwrite"),
         (("train", tmp_path, "-o", mine), f"{mine} already exists; give another name, or --overwrite"),
-        (("convert", tmp_path / "nowhere.ply", mine), f"{mine} already exists"),
+        (("convert", tmp_path / "nowhere/lod-meta.json", mine), "cannot read"),
         (("convert", tmp_path / "nowhere.ply", mine, "--overwrite"), "cannot read"),
         (("convert", mine, mine), f"OUT must be another file than IN, got {mine}"),
         (("convert", mine, tmp_path / "the same.ply", "--overwrite"), "OUT must be another file than IN"),

@@ -337,9 +337,21 @@ def test_a_damaged_spz_file_of_version_4(tmp_path, fields, words):
         fs.load_splats(spz_4(tmp_path / "a.spz", **fields))
 
 
-def test_an_spz_file_of_a_later_version(tmp_path):
-    (tmp_path / "a.spz").write_bytes(struct.pack("<4sI", b"NGSP", 5) + bytes(24))
-    with pytest.raises(fs.InputError, match=r"a\.spz: the version of SPZ must be 2, 3 or 4, got 5; convert"):
+@pytest.mark.parametrize("version", [1, 5])
+def test_an_spz_file_of_another_version(tmp_path, version):
+    """Also one that is cut short after its version."""
+    head = struct.pack("<4sI", b"NGSP", version)
+    words = rf"a\.spz: the version of SPZ must be 2, 3 or 4, got {version}; convert it by spz_to_ply"
+    for data in (head, head + bytes(24), gzip.compress(head), gzip.compress(head + bytes(8))):
+        (tmp_path / "a.spz").write_bytes(data)
+        with pytest.raises(fs.InputError, match=words):
+            fs.load_splats(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize("wrap", [bytes, gzip.compress])
+def test_an_spz_file_whose_header_is_cut_short(tmp_path, wrap):
+    (tmp_path / "a.spz").write_bytes(wrap(struct.pack("<4sIH", b"NGSP", 3, 0)))
+    with pytest.raises(fs.InputError, match=r"truncated: the header must have \d+ bytes, got 10"):
         fs.load_splats(tmp_path / "a.spz")
 
 

@@ -366,7 +366,15 @@ def test_a_folder_that_cannot_be_written(tmp_path):
             {"clouds": cloud_of()},
             r"a list of SplatCloud, got SplatCloud\(.*; put it into a list",
         ),
-        ({"markers": [fake_marker("qr:x")]}, r"PlacedMarker, got .*; PlacedMarker\(marker\) places a marker"),
+        (
+            {"markers": [fs.marker("apriltag:36h11:5", 0.1)]},
+            r"PlacedMarker, got .*; write markers=\[PlacedMarker\(marker",
+        ),
+        (
+            {"clouds": fs.marker("apriltag:36h11:5", 0.1)},
+            r"SplatCloud, got .*; write markers=\[PlacedMarker\(marker",
+        ),
+        ({"clouds": "room.toml"}, "SplatCloud, got 'room.toml'; Scene.load reads a scene file"),
         ({"camera": "front"}, "camera must be a Camera"),
         ({"background": (0, 0)}, "background must be three"),
         ({"background": (0, 0, math.nan)}, "background must be three"),

@@ -91,7 +91,11 @@ CHANGES = [
         "[0.0, 0.0, 0.0]",
         "camera.look_at: camera position and look_at must be diff",
     ),
-    ("near = 0.1", "up = [0.0, 0.0, 1.0]", "must not be parallel to the optical axis"),
+    (
+        "near = 0.1",
+        "up = [0.0, 0.0, 1.0]",
+        "must not be parallel to the optical axis, got (0.0, 0.0, 1.0); give another direction",
+    ),
     ("near = 0.1", "near = 0.0", "camera near must be above 0"),
     ("near = 0.1", "far = 0.001", "camera far must be above near"),
     ("near = 0.1", "far = nan", "camera.far must be a finite number"),

@@ -35,7 +35,11 @@ def test_libraries_have_the_published_numbers_of_distinct_codes():
 
 @pytest.mark.parametrize(
     ("spec", "says"),
-    [("stag:hd21:12", "ids must be 0 to 11"), ("stag:hd12:1", "hd13, hd15"), ("stag:hd21:x", "LIBRARY:ID")],
+    [
+        ("stag:hd21:12", "ids must be 0 to 11"),
+        ("stag:3", "hd23, got 'stag:3'; write for example stag:hd21:3"),
+        ("stag:hd21:x", "LIBRARY:ID"),
+    ],
 )
 def test_specs_that_do_not_exist(spec, says, capsys):
     assert main(["marker", spec]) == 2
