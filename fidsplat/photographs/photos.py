@@ -49,6 +49,7 @@ def source_files(source: Path) -> list[Path]:
 
 def copy_photos(files: Sequence[Path], folder: Path, progress: Progress) -> None:
     """Copy photographs into a folder, rotated upright by their EXIF orientation, under names without blanks.
+    Files other than JPEG become PNG, since COLMAP reads no WebP.
 
     Raises InputError for an image that cannot be read, or two names that differ by the suffix only.
     """
@@ -59,17 +60,18 @@ def copy_photos(files: Sequence[Path], folder: Path, progress: Progress) -> None
         if not declared_pixels(data):
             raise InputError(f"cannot read {file} as an image; give a PNG, JPEG, BMP, TIFF or WebP file")
         name = "_".join(file.stem.split())
-        exif = read_exif(data)
-        if file.suffix.lower() in (".jpg", ".jpeg") and exif.orientation != 1:
+        exif, suffix = read_exif(data), file.suffix.lower()
+        if suffix not in (".jpg", ".jpeg"):
+            data, suffix = encode_image(read_image(file), "png"), ".png"
+        elif exif.orientation != 1:
             data = with_exif(encode_image(read_image(file), "jpeg", _QUALITY), exif)
-        target = folder / f"{name}{file.suffix.lower()}"
         if name in names:  # their undistorted images would replace each other
             raise InputError(
                 "photographs must have names that differ before the suffix, got "
                 f"{names[name]} and {file.name}; rename or remove one"
             )
         names[name] = file.name
-        target.write_bytes(data)
+        (folder / f"{name}{suffix}").write_bytes(data)
 
 
 def copy_frames(video: Path, folder: Path, count: int, progress: Progress) -> tuple[int, int]:

@@ -1,5 +1,6 @@
 """Photographs to a metric data set: adjustment of tags, world frame, EXIF, frames of a video."""
 
+import importlib
 import math
 import sys
 from itertools import pairwise
@@ -10,7 +11,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat import InputError
-from fidsplat.images.exif import read_exif, with_exif
+from fidsplat.images.exif import ORIENTATION, read_exif, with_exif
 from fidsplat.images.files import read_image
 from fidsplat.photographs.adjustment import TagView, adjust
 from fidsplat.photographs.frame import camera_up, world_frame
@@ -265,6 +266,24 @@ def test_exif_is_kept_with_upright_pixels(order, tmp_path):
     assert camera_groups(tmp_path / "upright copies") == [["a.jpg"], ["b.jpg"]]
     for damaged in (rotated[:40], jpeg, b"", rotated.replace(b"II", b"XX").replace(b"MM", b"XX")):
         assert read_exif(damaged).orientation in (1, 6)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
+@pytest.mark.parametrize("orientation", [3, 6, 7])
+def test_copies_are_upright_for_colmap_too(suffix, orientation, tmp_path):
+    """COLMAP ignores the orientation; Pillow's `exif_transpose` applies it."""
+    images = pytest.importorskip("PIL.Image", reason="Pillow rotates by EXIF; pip install pillow")
+    tags, values = images.Exif(), np.zeros((16, 32, 3), np.uint8)
+    tags[ORIENTATION], values[:4], values[:, :6, 0] = orientation, 255, 90
+    source, folder = tmp_path / f"a.{suffix}", tmp_path / "copies"
+    images.fromarray(values).save(source, exif=tags)
+    folder.mkdir()
+    copy_photos([source], folder, lambda words, share: None)
+    (copy,) = folder.iterdir()
+    with images.open(source) as given, images.open(copy) as made:
+        upright = importlib.import_module("PIL.ImageOps").exif_transpose(given)
+        assert made.size == upright.size
+        assert np.abs(np.asarray(made, int) - np.asarray(upright, int)).mean() < 12
 
 
 def test_sharp_frames_at_equal_steps_are_chosen():
