@@ -165,7 +165,7 @@ def plan_tags(
     if not visible:
         raise InputError(
             "the trajectory must see a flat surface of the size of a tag at less than 70 degrees, got none; "
-            "give smaller tags or another trajectory"
+            "give smaller tags, or poses of the camera (z forward, y down)"
         )
     seen, poses = [seen[k] for k in visible], poses[visible]
     conflicts = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2) < 2.2 * tag.radius

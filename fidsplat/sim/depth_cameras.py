@@ -87,8 +87,7 @@ class ActiveStereo(DepthCamera):
 
     The images of both cameras are rendered, lit by ambient light and the pattern, and matched by OpenCV's
     semi-global matching. The defaults are those of an Intel RealSense D435: its error is about 0.08 pixels of
-    disparity, z^2 0.08 / (f baseline) in depth (Grunnet-Jepsen, Sweetser, Woodfill: Tuning depth cameras for
-    best performance).
+    disparity, z^2 0.08 / (f baseline) in depth (Grunnet-Jepsen, librealsense issue 3904).
     """
 
     baseline: float = 0.05

@@ -21,6 +21,7 @@ _FROM_ROS = {"world": OPTICAL, "ros": IDENTITY, "opengl": OPENGL}
 """(7,) axes of the convention from OpenCV axes"""
 _OUTPUTS = {
     "rgb": "rgb",
+    "rgba": "rgb",
     "depth": "depth",
     "distance_to_image_plane": "depth",
     "distance_to_camera": "distance",
@@ -35,8 +36,8 @@ class CameraData:
     """Data of the cameras of all environments as torch tensors, by the names of Isaac Lab.
 
     Poses (N, 3) and (N, 4) are in the world of the simulation, with axes x forward, z up (world), z forward,
-    y down (ros) or -z forward, y up (opengl). `output` has images (N, h, w, channels) by data type: rgb
-    uint8, semantic_segmentation int32, else float32.
+    y down (ros) or -z forward, y up (opengl). `output` has images (N, h, w, channels) by data type: rgb and
+    rgba uint8, semantic_segmentation int32, else float32; `info` has None for each.
     """
 
     image_shape: tuple[int, int]
@@ -46,6 +47,7 @@ class CameraData:
     quat_w_ros: Any
     quat_w_opengl: Any
     output: dict[str, Any]
+    info: dict[str, Any]
 
 
 class TiledCamera:
@@ -56,7 +58,7 @@ class TiledCamera:
     Args:
         rig: splats, markers and one camera.
         num_instances: N, number of environments.
-        data_types: rgb, depth, distance_to_image_plane, distance_to_camera (infinite for empty pixels),
+        data_types: rgb, rgba, depth, distance_to_image_plane, distance_to_camera (infinite for empty pixels),
             normals (world axes) and semantic_segmentation (labels of splats, -1 for none).
         bodies: function that returns the current poses {name: (N, 7)} of the rig's bodies in the world of the
             simulation, for example of `RigidObject.data.root_pose_w`; arrays of torch, Warp or NumPy.
@@ -119,7 +121,8 @@ class TiledCamera:
         world, ros, opengl = (tensor(compose(poses, inverse(axes))[:, order]) for axes in _FROM_ROS.values())
         matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
         intrinsics, images = tensor([matrix] * len(poses)), dict(self._tensors)
-        return CameraData(self.image_shape, intrinsics, tensor(poses[:, :3]), world, ros, opengl, images)
+        position, info = tensor(poses[:, :3]), dict.fromkeys(images)
+        return CameraData(self.image_shape, intrinsics, position, world, ros, opengl, images, info)
 
     def update(self, dt: float, force_recompute: bool = False) -> None:
         """Advance the time; images of environments whose period has passed are rendered when `data` is read,
@@ -130,9 +133,10 @@ class TiledCamera:
             self._outdated[:] = True
             _ = self.data
 
-    def reset(self, env_ids: Any = None) -> None:
-        """Set the time and the number of images of environments to 0; their images become outdated."""
-        which = self._which(env_ids)
+    def reset(self, env_ids: Any = None, env_mask: Any = None) -> None:
+        """Set the time and the number of images of environments to 0; their images become outdated.
+        env_mask: (N,) bool, instead of env_ids."""
+        which = self._which(env_ids if env_mask is None else env_mask)
         self.frame[which] = self._times[which] = self._taken[which] = 0
         self._outdated[which] = True
 
@@ -192,7 +196,7 @@ class TiledCamera:
             self._rig,
             {name: compose(back, each) for name, each in bodies.items()},
             {self._name: compose(back, poses)},
-            outputs=[_OUTPUTS[name] for name in self._types],
+            outputs=[*(_OUTPUTS[name] for name in self._types), *["alpha"] * ("rgba" in self._types)],
             mask=mask,
         ).of(self._name)
         rest = np.flatnonzero(~mask).tolist()
@@ -208,7 +212,11 @@ class TiledCamera:
     def _tensor(self, name: str, images: Any) -> Any:
         """The tensor (N, h, w, channels) of a data type."""
         image = images.to_torch(_OUTPUTS[name])
-        if name == "rgb":
+        if name == "rgba":
+            from torch import cat
+
+            image = cat([image, images.to_torch("alpha").unsqueeze(-1)], -1)
+        if _OUTPUTS[name] == "rgb":
             return (image.clamp(0, 1) * 255).round().byte()
         if _OUTPUTS[name] in ("depth", "distance"):
             image = image.masked_fill(image == 0, float("inf"))

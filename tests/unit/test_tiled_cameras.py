@@ -1,5 +1,7 @@
 """Cameras of all worlds of mujoco_warp and Newton, against rays of MuJoCo in C; Isaac Lab's interface."""
 
+import inspect
+
 import numpy as np
 import pytest
 
@@ -119,6 +121,70 @@ def test_newtons_shapes_are_composited_in_all_worlds(states, scene):
         NewtonRig(builder.finalize(device="cpu"), scene, {1: "box"}, CAMERAS, **given)
 
 
+# `supported_output_types` of Isaac Lab's renderers, `Camera` and `CameraData` of isaac-sim/IsaacLab, 00b36b75
+ISAAC_LAB = {
+    "rgb": (3, "uint8"),
+    "rgba": (4, "uint8"),
+    "depth": (1, "float32"),
+    "distance_to_image_plane": (1, "float32"),
+    "distance_to_camera": (1, "float32"),
+    "normals": (3, "float32"),
+    "semantic_segmentation": (1, "int32"),  # without colorize_semantic_segmentation
+}
+ISAAC_LAB_METHODS = {
+    "update": ["dt", "force_recompute"],
+    "reset": ["env_ids", "env_mask"],
+    "set_world_poses": ["positions", "orientations", "env_ids", "convention"],
+    "set_world_poses_from_view": ["eyes", "targets", "env_ids"],
+}
+ISAAC_LAB_DATA = {
+    "pos_w": 3,
+    "quat_w_world": 4,
+    "quat_w_ros": 4,
+    "quat_w_opengl": 4,
+    "intrinsic_matrices": (3, 3),
+}
+
+
+def test_the_interface_is_that_of_isaac_labs_source(scene):
+    """Names, shapes, types and the device of every output."""
+    torch = pytest.importorskip("torch", reason="pip install torch")
+    from fidsplat.sim.isaaclab import TiledCamera
+
+    for device in ("reference", *(info.name for info in fs.devices() if info.name.startswith("warp:cuda"))):
+        rig = Rig(scene, cameras=CAMERAS | {"eye": RigCamera(PINHOLE)}, renderer=fs.Renderer(device))
+        tiled = TiledCamera(rig, 2, list(ISAAC_LAB))
+        data = tiled.data
+        assert (tiled.num_instances, tiled.image_shape, data.image_shape) == (
+            2,
+            (HEIGHT, WIDTH),
+            (HEIGHT, WIDTH),
+        )
+        assert data.info == dict.fromkeys(data.output)
+        assert list(data.output) == list(ISAAC_LAB)
+        place = torch.device("cuda" if "cuda" in device else "cpu").type
+        for name, (channels, kind) in ISAAC_LAB.items():
+            image = data.output[name]
+            assert image.shape == (2, HEIGHT, WIDTH, channels)
+            assert (image.dtype, image.device.type) == (getattr(torch, kind), place)
+        for name, shape in ISAAC_LAB_DATA.items():
+            value = getattr(data, name)
+            assert value.shape == (2, *np.atleast_1d(shape))
+            assert (value.dtype, value.device.type) == (torch.float32, place)
+        assert data.output["rgba"][..., :3].equal(data.output["rgb"])
+        seen = data.output["semantic_segmentation"][..., 0] == 1
+        assert (data.output["rgba"][..., 3][seen] > 127).all()
+        assert data.output["rgba"][0, 0, 0, 3] == 0
+
+
+@pytest.mark.parametrize("name", ISAAC_LAB_METHODS)
+def test_methods_have_the_parameters_of_isaac_labs_source(name):
+    from fidsplat.sim.isaaclab import TiledCamera
+
+    parameters = list(inspect.signature(getattr(TiledCamera, name)).parameters)
+    assert parameters[1:] == ISAAC_LAB_METHODS[name]
+
+
 def test_isaac_labs_cameras(scene):
     """Environments apart from each other have equal images; shapes, types and conventions of Isaac Lab."""
     torch = pytest.importorskip("torch", reason="pip install torch")
@@ -132,10 +198,6 @@ def test_isaac_labs_cameras(scene):
     kinds = "rgb", "depth", "distance_to_camera", "normals", "semantic_segmentation"
     tiled = TiledCamera(rig, 2, kinds, bodies=lambda: poses, origins=origins, update_period=0.1)
     data = tiled.data
-    assert {name: each.shape[1:] for name, each in data.output.items()} == {
-        name: (HEIGHT, WIDTH, channels) for name, channels in zip(kinds, (3, 1, 1, 3, 1), strict=True)
-    }
-    assert data.output["rgb"].dtype == torch.uint8
     middle = HEIGHT // 2, WIDTH // 2
     assert data.output["depth"][:, *middle, 0].tolist() == pytest.approx([1.4, 1.4], abs=1e-5)
     assert torch.isinf(data.output["depth"][0, 0, 0, 0])
@@ -158,7 +220,7 @@ def test_isaac_labs_cameras(scene):
     assert tiled.frame.tolist() == [2, 1]
     tiled.set_world_poses_from_view([[0.2, 0, 0.5]], [[1.0, 0, 0.5]], torch.tensor([0]))
     assert tiled.data.output["depth"][0, *middle, 0].item() == pytest.approx(1.2, abs=1e-5)
-    tiled.reset(torch.tensor([False, True]))
+    tiled.reset(env_mask=torch.tensor([False, True]))
     assert tiled.frame.tolist() == [3, 0]
     with pytest.raises(fs.InputError, match=r"origins must have the shape \(2, 3\), got \(1, 3\)"):
         TiledCamera(rig, 2, bodies=lambda: poses, origins=origins[:1])
