@@ -1,4 +1,4 @@
-"""Where to hang tags: a camera drives along an aisle of a greenhouse without tags, and four are planned for it.
+"""Where to hang tags: four tags planned for a camera that moves along an aisle of a greenhouse.
 
     pip install 'fidsplat[experiments]'
     python examples/plan_tags.py                       half a minute on two cores; look at plan/map.svg

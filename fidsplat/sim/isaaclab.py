@@ -213,9 +213,8 @@ class TiledCamera:
         """The tensor (N, h, w, channels) of a data type."""
         image = images.to_torch(_OUTPUTS[name])
         if name == "rgba":
-            from torch import cat
-
-            image = cat([image, images.to_torch("alpha").unsqueeze(-1)], -1)
+            rgb, image = image, image.new_empty((*image.shape[:3], 4))
+            image[..., :3], image[..., 3] = rgb, images.to_torch("alpha")
         if _OUTPUTS[name] == "rgb":
             return (image.clamp(0, 1) * 255).round().byte()
         if _OUTPUTS[name] in ("depth", "distance"):
