@@ -69,6 +69,13 @@ NAMED = {
     META: Format("streamed SOG", load_streamed, None),
 }
 """formats by file name"""
+_CONVERTERS = dict.fromkeys((".ksplat", ".lcc", ".lcc2"), "splat-transform") | {
+    ".ckpt": "ns-export gaussian-splat of nerfstudio",
+    ".pt": "gsplat.export_splats",
+    ".spx": "gsbox",
+    ".usdz": "unzip",
+}
+"""tools that convert formats which are not read, by suffix"""
 
 
 def stored_bytes(path: str | os.PathLike[str]) -> int:
@@ -83,13 +90,19 @@ def stored_bytes(path: str | os.PathLike[str]) -> int:
     return size
 
 
-def format_of(path: str | os.PathLike[str]) -> Format:
+def converter(suffix: str) -> str:
+    """The end of a message about an unknown suffix: the tool that converts such files, or nothing."""
+    tool = _CONVERTERS.get(suffix.lower())
+    return f"; convert it by {tool}" if tool else ""
+
+
+def format_of(path: str | os.PathLike[str], remedy: str = "") -> Format:
     """Format of a file by its name or suffix. Raises InputError for an unknown format."""
     if (named := NAMED.get(path_of(path).name.lower())) is not None:
         return named
     suffix = path_of(path).suffix.lower()
     if suffix not in FORMATS:
-        raise InputError(f"{path}: {unknown('suffix of a splat file', suffix, FORMATS)}")
+        raise InputError(f"{path}: {unknown('suffix of a splat file', suffix, FORMATS)}{remedy}")
     return FORMATS[suffix]
 
 
@@ -100,7 +113,7 @@ def load_splats(path: str | os.PathLike[str], progress: Progress | None = None) 
 
     Raises InputError for an unknown suffix or a damaged file.
     """
-    known = format_of(path)
+    known = format_of(path, converter(path_of(path).suffix))
     return load_ply(path, progress) if known.load is load_ply else known.load(path_of(path))
 
 

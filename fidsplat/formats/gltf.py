@@ -62,7 +62,11 @@ def load_gltf(path: Path) -> SplatCloud:
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError) as error:
         raise InputError(f"{path}: the glTF file is damaged ({type(error).__name__}: {error})") from None
     if not clouds:
-        raise InputError(f"{path} must have splats, got no primitive with {EXTENSION}")
+        used = ", ".join(map(str, document.get("extensionsUsed") or ["none"]))
+        raise InputError(
+            f"{path} must have splats, got no primitive with {EXTENSION} (extensions: {used}); export them "
+            "again by splat-transform"
+        )
     return clouds[0] if len(clouds) == 1 else SplatCloud.concatenate(clouds)
 
 
@@ -156,22 +160,27 @@ def pack_glb(document: dict[str, Any], binary: bytes) -> bytes:
     return head + text + struct.pack("<II", len(binary), _BIN) + binary
 
 
+def _check_version(path: Path, version: str) -> None:
+    if version.partition(".")[0] != "2":
+        raise InputError(
+            f"{path}: the version of glTF must be 2, got {version}; convert it by gltf-pipeline, or export "
+            "it again by splat-transform"
+        )
+
+
 def _parts(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview | None]:
     """JSON document, and a view of the binary chunk of a .glb file (None for .gltf)."""
     text, binary = data, None
     if data[:4] == b"glTF":
-        try:
-            _, version, size = struct.unpack_from("<III", data)
-            chunks, place = {}, 12
-            while place + 8 <= min(size, len(data)):
-                length, kind = struct.unpack_from("<II", data, place)
-                chunks.setdefault(kind, memoryview(data)[place + 8 : place + 8 + length])
-                place += 8 + length
-        except struct.error:
-            version, size, chunks = 0, 0, {}
-        if version not in (0, 2):
-            raise InputError(f"{path}: the version of binary glTF must be 2, got {version}; export it again")
-        if version != 2 or size > len(data) or _JSON not in chunks:
+        version, size = (int.from_bytes(data[at : at + 4], "little") for at in (4, 8))
+        if len(data) >= 8:
+            _check_version(path, str(version))
+        chunks, place = {}, 12
+        while place + 8 <= min(size, len(data)):
+            length, kind = struct.unpack_from("<II", data, place)
+            chunks.setdefault(kind, memoryview(data)[place + 8 : place + 8 + length])
+            place += 8 + length
+        if size > len(data) or _JSON not in chunks:
             raise InputError(f"cannot read {path} as binary glTF of version 2: truncated or damaged")
         text, binary = bytes(chunks[_JSON]), chunks.get(_BIN)
     try:
@@ -192,6 +201,7 @@ class _Reader:
         self._visited: set[int] = set()
 
     def clouds(self) -> list[SplatCloud]:
+        _check_version(self._path, str(self._document.get("asset", {}).get("version", "2.0")))
         scenes = self._document.get("scenes")
         roots = (
             scenes[self._document.get("scene", 0)].get("nodes", [])
@@ -271,7 +281,7 @@ class _Reader:
             self._document["accessors"][number] for one in primitives for number in one["attributes"].values()
         ]
         need = sum(_COPIES * 4 * _WIDTHS[each["type"]] * int(each["count"]) for each in accessors)
-        size = sum(len(self._buffer(number)) for number in range(len(self._document["buffers"])))
+        size = sum(len(self._buffer(number)) for number in range(len(self._document.get("buffers", []))))
         check_expansion(self._path, need, "its nodes with all their attributes", size)
 
     def _integers(self, arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:

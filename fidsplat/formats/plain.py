@@ -96,6 +96,8 @@ def content(path: Path, magic: tuple[bytes, ...]) -> bytes:
     that a large file of another format is not read. White space at the beginning is ignored."""
     with open_input(path) as stream:
         head = stream.read(64)
+        if not head:
+            raise InputError(f"cannot read {path}: it is empty")
         while head.isspace():
             head = stream.read(1 << 16)
     return read_input(path) if head.lstrip().startswith(magic) else head

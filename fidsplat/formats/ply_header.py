@@ -113,7 +113,7 @@ def read_header(path: str | os.PathLike[str], text: bool = False) -> Header:
         if keyword in ("comment", "obj_info"):
             comments.append(line.partition(" ")[2].strip())
         elif keyword == "format":
-            layout = words[1] if len(words) == 3 else line
+            layout = " ".join(words[1:])
         elif keyword == "element":
             if len(words) != 3 or words[1] in counts:
                 raise InputError(f"{file}: a line of a PLY header must name a new element, got {line!r}")
@@ -125,12 +125,15 @@ def read_header(path: str | os.PathLike[str], text: bool = False) -> Header:
             fields[current].append(_field(file, line, words, fields[current]))
         else:
             raise InputError(f"{file}: a line of a PLY header must be a known keyword, got {line[:60]!r}")
-    if text and layout == "ascii":
+    if text and layout == "ascii 1.0":
         dtypes = {name: np.dtype(fields[name]) for name in counts}
         elements = {name: Element(name, counts[name], dtypes[name], start) for name in counts}
         return Header(file, elements, tuple(comments), True)
-    if layout != "binary_little_endian":
-        raise InputError(f"{file}: the PLY format must be binary_little_endian, got {layout}; convert it")
+    if layout != "binary_little_endian 1.0":
+        raise InputError(
+            f"{file}: the PLY format must be binary_little_endian 1.0, got {layout}; convert it by plyfile: "
+            "PlyData(PlyData.read(IN).elements, byte_order='<').write(OUT)"
+        )
     elements, offset = {}, start
     for name, count in counts.items():
         elements[name] = Element(name, count, np.dtype(fields[name]), offset)

@@ -27,7 +27,8 @@ def load_splat(path: Path) -> SplatCloud:
     size = regular_file(path).stat().st_size
     if not size or size % _ROW.itemsize:
         raise InputError(
-            f"{path}: the size of a .splat file must be a multiple of {_ROW.itemsize} bytes, got {size}"
+            f"{path}: the size of a .splat file must be a positive multiple of {_ROW.itemsize} bytes, got "
+            f"{size}"
         )
     check_expansion(path, 4 * size, f"{size // _ROW.itemsize:,} splats")
     rows = np.memmap(path, _ROW, "r").view(np.ndarray)

@@ -91,10 +91,19 @@ def _child(limit: str, source: str, target: str) -> None:
     except MemoryError:
         raise
     except Exception as error:  # errors of USD, which reads arrays lazily
-        text = str(error) if isinstance(error, InputError) else "not a USD file that usd-core can read"
+        text = str(error) if isinstance(error, InputError) else _unreadable(source)
         sys.stdout.buffer.write(text.encode("ascii", "backslashreplace"))
         sys.stdout.flush()
         os._exit(_REFUSED)  # skip USD's finalizers, which can crash on a damaged stage
+
+
+def _unreadable(source: str) -> str:
+    with open(source, "rb") as stream:
+        head = stream.read(16)
+    version = head.partition(b"\n")[0].decode("latin-1")
+    if head.startswith(b"PXR-USDC"):
+        version = "PXR-USDC " + ".".join(map(str, head[8:11]))
+    return f"not a USD file that usd-core can read, got {version!r}; convert a later version by usdcat"
 
 
 def _set_limits(limit: int, seconds: int) -> None:

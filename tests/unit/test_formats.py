@@ -264,6 +264,33 @@ def test_a_gltf_may_begin_with_as_many_spaces_as_it_likes(tmp_path):
         fs.load_splats(path)
 
 
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        (
+            "a.glb",
+            struct.pack("<4sI", b"glTF", 3),
+            "the version of glTF must be 2, got 3; .* by splat-transform",
+        ),
+        ("a.gltf", b'{"asset": {"version": "1.0"}}', "must be 2, got 1.0; convert it by gltf-pipeline"),
+        (
+            "a.gltf",
+            b'{"extensionsUsed": ["OLD"]}',
+            r"must have splats, .* \(extensions: OLD\); .* splat-trans",
+        ),
+        ("a.usda", b"#usda 2.0\n", "usd-core can read, got '#usda 2.0'; convert a later version by usdcat"),
+        ("a.ksplat", b"", "unknown suffix of a splat file '.ksplat'.*; convert it by splat-transform"),
+        ("a.spz", b"", "cannot read .*a.spz: it is empty"),
+    ],
+)
+def test_files_that_are_not_read_name_their_version_and_a_tool(tmp_path, name, data, words):
+    """PLY: test_ply_damaged.py; SPZ: below; SOG: test_formats_sog*.py."""
+    need(Path(name).suffix)
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(fs.InputError, match=words):
+        fs.load_splats(tmp_path / name)
+
+
 @pytest.mark.sweep
 @pytest.mark.parametrize("suffix", [".spz", ".splat", ".glb", ".gltf", *USD[:2]])
 def test_files_that_are_cut_short_or_something_else(tmp_path, suffix):

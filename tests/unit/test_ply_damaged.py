@@ -59,14 +59,18 @@ DAMAGES = {
     "text": (lambda c: b"hello\n", "as PLY: its first line must be"),
     "zeros": (lambda c: bytes(5000), "as PLY: its first line must be"),
     "begins like one": (lambda c: b"plywood\n" + c, "as PLY: its first line must be"),
-    "ascii": (swap(b"binary_little_endian", b"ascii"), "format must be binary_little_endian, got ascii"),
+    "ascii": (
+        swap(b"binary_little_endian", b"ascii"),
+        "format must be binary_little_endian 1.0, got ascii 1.0; convert it by plyfile",
+    ),
     "big-endian": (
         swap(b"binary_little_endian", b"binary_big_endian"),
-        "the PLY format must be binary_little_endian, got binary_big_endian;",
+        "the PLY format must be binary_little_endian 1.0, got binary_big_endian 1.0;",
     ),
+    "version 2": (swap(b"endian 1.0", b"endian 2.0"), "got binary_little_endian 2.0; convert it by plyfile"),
     "no format": (
         swap(b"format binary_little_endian 1.0\n", b""),
-        "the PLY format must be binary_little_endian, got None; convert it",
+        "the PLY format must be binary_little_endian 1.0, got None; convert it",
     ),
     "no end_header": (swap(b"end_header\n", b""), "must have end_header within"),
     "endless header": (lambda c: HEAD + b"comment x\n" * 10**6, "must have end_header within 65536 bytes"),

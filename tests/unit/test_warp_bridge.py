@@ -113,7 +113,7 @@ def test_what_a_tape_cannot_record_is_an_error(renderer, render):
         render(tape, renderer, capture, **arrays, sh=arrays["colors"])
     with pytest.raises(fs.InputError, match=r"pose must be 6 numbers, got the shape \(7,\)"):
         render(tape, renderer, capture, **arrays, pose=np.zeros(7))
-    with pytest.raises(fs.InputError, match="samples=1"):
+    with pytest.raises(fs.InputError, match="samples must be 1"):
         render(tape, renderer, capture.with_(quality="surfel,samples=2"), **arrays)
     images = render(tape, renderer, capture, **arrays)
     renderer.render(cloud, capture)
