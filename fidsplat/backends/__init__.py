@@ -1,4 +1,4 @@
-"""Backends: implementations of the renderer for a kind of device. `registry` opens a device by its name."""
+"""Backends: implementations of the renderer for families of devices. `registry` opens a device by name."""
 
 from fidsplat.backends.registry import devices, open_backend
 

@@ -16,7 +16,7 @@ BINS, SHIFT, LOWEST = 256, 19, 113 << 4
 
 
 class AlignmentStage(NamedTuple):
-    """One level of the image pyramid with one blur."""
+    """One level of the image pyramid, and a blur filter for it."""
 
     camera: Camera
     """size, intrinsics and lens of the level"""
@@ -37,14 +37,14 @@ class AlignmentFit(NamedTuple):
     offset: np.ndarray
     """(c,)"""
     huber: bool
-    """True: Huber's loss, gradients averaged between rendered frame and image; False: Tukey's, gradients of
-    the frame"""
+    """True: Huber's loss, with the mean of the gradients of rendered frame and image; False: Tukey's loss,
+    with the gradients of the frame"""
     noise: float = 0.0
     """standard deviation of the residuals at the previous pose; 0: from the median of the residuals"""
 
 
 class MovedFrame(NamedTuple):
-    """A second frame of the same scene after a motion of the camera, for derivatives by differences."""
+    """Frame of the same scene after a small camera motion, for derivatives by finite differences."""
 
     frame: Any
     size: float
@@ -91,16 +91,16 @@ HUBER, TUKEY = 1.5, 4.685
 MIN_NOISE, MAX_NOISE = 1e-2, 0.03
 """limits of the noise, display values; residuals above TUKEY * MAX_NOISE never fit"""
 _MEDIAN = {1: 0.4549, 3: 2.3660}
-"""median of the sum of squares of so many normal numbers"""
+"""median of the chi-squared distribution, by degrees of freedom"""
 
 
 def noise_factor(channels: int) -> float:
-    """Ratio of the residuals' standard deviation to the median over pixels of their root mean square."""
+    """Standard deviation of the residuals divided by the median over pixels of their RMS over channels."""
     return (channels / _MEDIAN[channels]) ** 0.5
 
 
 class AlignmentKernels(ABC):
-    """Computation of the residuals between an image and rendered frames, and of sums over them."""
+    """Kernels for the residuals between an image and rendered frames, and for sums over these residuals."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -119,12 +119,12 @@ class AlignmentKernels(ABC):
 
 
 def bins_of(values: np.ndarray) -> np.ndarray:
-    """Bins of positive values, 1 to 255; 0 is for pixels that are not used."""
+    """Histogram bins, 1 to 255, of positive values. Bin 0 is for unused pixels."""
     upper = np.ascontiguousarray(values, np.float32).view(np.uint32) >> SHIFT
     return np.clip(upper.astype(np.int64) - LOWEST, 1, BINS - 1)
 
 
-def least_bin(counts: np.ndarray, most: int) -> int:
-    """The bin from which on there are about `most` values, or all values if there are fewer."""
+def lowest_bin(counts: np.ndarray, most: int) -> int:
+    """Lowest bin to use, so that this and the higher bins contain about `most` values of a histogram."""
     above = np.cumsum(counts[:0:-1])[::-1]
     return 1 + int(np.flatnonzero(above >= min(most, above[0]))[-1])

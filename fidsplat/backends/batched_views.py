@@ -122,7 +122,7 @@ class ViewBatch:
         return ViewBatch(view, *arrays, batch_indices=batch_indices, total=total)
 
     def part(self, first: int, end: int) -> ViewBatch:
-        """The rendered views [first, end) as a batch; a single view if their uniforms are not stacked."""
+        """Sub-batch of the rendered views [first, end)."""
         indices = self.batch_indices[first:end].copy()
         if end - first == 1:
             return replace(ViewBatch.single(self.one(first)), batch_indices=indices, total=self.total)

@@ -1,4 +1,4 @@
-"""Other folders for compiled kernels if those of PoCL, pyopencl and Warp are not writable."""
+"""Temporary folders for compiled kernels if the caches of PoCL, pyopencl or Warp are not writable."""
 
 from __future__ import annotations
 

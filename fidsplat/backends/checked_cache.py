@@ -30,27 +30,29 @@ Entry = list[int]
 changed"""
 
 
-def check_once(folder: Path, is_loaded: Callable[[str], bool], is_whole: Callable[[Path], bool]) -> None:
+def check_once(folder: Path, is_loaded: Callable[[str], bool], is_complete: Callable[[Path], bool]) -> None:
     """Check a folder once per process, and record the checksums of its new files when the process ends."""
     folder = folder.absolute()
     if folder in _watched:
         return
     _watched.add(folder)
-    remove_damaged(folder, is_loaded, is_whole)
+    remove_damaged(folder, is_loaded, is_complete)
     process = os.getpid()
     atexit.register(lambda: os.getpid() == process and record_new(folder, is_loaded))
 
 
-def remove_damaged(folder: Path, is_loaded: Callable[[str], bool], is_whole: Callable[[Path], bool]) -> int:
+def remove_damaged(
+    folder: Path, is_loaded: Callable[[str], bool], is_complete: Callable[[Path], bool]
+) -> int:
     """Remove files that differ from their checksum, and entries that are not regular files; returns their
     number. Files that the driver does not load (`is_loaded`) are not touched. A file without a checksum is
-    removed unless `is_whole` finds it complete."""
+    removed unless `is_complete` returns True."""
     record, valid, removed = _read(folder), {}, 0
     known = record or {}
     for file in _loaded(folder, is_loaded):
         with suppress(OSError):  # another process may remove files too
             key, state, entry = file.path[len(str(folder)) + 1 :], file.stat(follow_symlinks=False), None
-            trusted = key in known or (record is not None and is_whole(Path(file)))
+            trusted = key in known or (record is not None and is_complete(Path(file)))
             if stat.S_ISREG(state.st_mode) and trusted:
                 entry = _current(file.path, state, known.get(key))
             if entry is not None:

@@ -19,7 +19,7 @@ NOT_THE_LAST = (
 
 
 class CapacityExceeded(Exception):
-    """Error: a frame that was submitted without waiting for its counts had too many pairs for its buffers."""
+    """Error: a frame was submitted without waiting for its counts, and its pairs exceeded its buffers."""
 
 
 class DifferentiableImages:
@@ -52,7 +52,7 @@ class DifferentiableImages:
 
 
 def gradient_shape(name: str, view: View) -> tuple[int, ...]:
-    """Shape of the gradient with respect to an output: that of its image."""
+    """Shape of the gradient with respect to an output, equal to the shape of its image."""
     channels = IMAGES[name].channels
     return (view.height, view.width) if channels == 1 else (view.height, view.width, channels)
 

@@ -1,4 +1,4 @@
-"""The interface of a device: base classes, whose optional methods raise an error by default."""
+"""Interface of a device: base classes whose optional methods raise an error by default."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class ResidentData(ABC):
     def color_range(self) -> tuple[float, float]:
         """Lower and upper bound of every channel of every splat, from any direction."""
         raise InputError(
-            "the output 'error' needs splat colours in host memory, got adopted device arrays; render "
+            "the splats must be in host memory for the output 'error', got adopted device arrays; render "
             "a SplatCloud, or leave out the output 'error'"
         )
 
@@ -136,8 +136,8 @@ class Images(ABC):
     def device_array(self, name: str, index: int | None = None) -> Any:
         """The images as a device array in the shape of `read`, without a copy."""
         raise InputError(
-            f"device_array({name!r}) needs a device that shares its arrays, such as a Warp device; "
-            "render with device='warp:cuda' or 'warp:cpu', or take frame[name], which is copied to the host"
+            f"device_array({name!r}) must be called on a device that shares its arrays, got another one; "
+            f"render with device='warp:cuda' or 'warp:cpu', or copy to the host with frame[{name!r}]"
         )
 
     def wait(self) -> None:  # noqa: B027 (optional)

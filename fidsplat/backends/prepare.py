@@ -1,4 +1,4 @@
-"""Preparation of a frame from a cloud and a capture: the features to compile, and the view's uniforms."""
+"""Preparation of a frame from a cloud and a capture: features to compile, and uniforms of the view."""
 
 from __future__ import annotations
 

@@ -52,14 +52,15 @@ class Devices(list[DeviceInfo]):
 
 
 def devices() -> Devices:
-    """List all devices, also unusable ones with the reason. Raises DeviceError in some forks."""
+    """List all devices, and why some are unusable. Raises DeviceError in a fork of a process that used a
+    driver."""
     for family in FAMILIES:
         _prepare(family)
     return Devices(info for module in FAMILIES.values() for info in import_module(module).devices())
 
 
 def _open_first() -> Backend:
-    """Open the best device of the first family in `ORDER` that has a usable one; warn of skipped families."""
+    """Open the best device of the first family in `ORDER` with a usable device; warn of skipped families."""
     reasons = []
     for family in ORDER:
         _prepare(family)

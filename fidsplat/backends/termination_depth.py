@@ -1,6 +1,6 @@
 """Termination depths: the depth at which blending of each tile stopped, for occlusion culling.
 
-Blending walks a tile's list in depth order until all pixels of the tile are opaque. The device stores the
+Blending processes a tile's list in depth order until all pixels of the tile are opaque. The device stores the
 depth key of the last splat (part/termination_depth_*.cl). A splat with a larger key in every tile that it can
 touch does not change the frame, so it can be left out. This holds for every output and depth order.
 """

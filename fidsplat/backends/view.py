@@ -85,7 +85,7 @@ class View:
 
     @property
     def lens(self) -> Lens | None:
-        """The lens; None for a pinhole."""
+        """Lens of the camera; None for a pinhole."""
         if self.raster is not None:
             return self.raster.lens
         return Orthographic() if self.parallel else None

@@ -20,7 +20,7 @@ from fidsplat.backends.alignment import (
     AlignmentSums,
     MovedFrame,
     bins_of,
-    least_bin,
+    lowest_bin,
     noise_factor,
 )
 from fidsplat.render.renderer import Renderer
@@ -116,7 +116,7 @@ class _Target:
         bins[1:-1, 1:-1] = bins_of(np.sqrt((across * across + down * down).sum(axis=2)) / 2)
         if stage.ignored is not None:
             bins[stage.ignored] = 0
-        self.rows = rows = np.flatnonzero(bins >= least_bin(np.bincount(bins.ravel(), minlength=BINS), most))
+        self.rows = rows = np.flatnonzero(bins >= lowest_bin(np.bincount(bins.ravel(), minlength=BINS), most))
         self.values, self.slopes = _at(values, rows), _slopes(values, rows)
         y, x = np.divmod(rows, width)
         blocks = y // stage.side * width + x // stage.side

@@ -179,7 +179,7 @@ def test_many_big_splats_in_chunks(opencl):
 
 @pytest.mark.parametrize(("budget", "words"), [(2**20, "1 MiB"), (200_000, "195 KiB")])
 def test_a_budget_below_the_image_is_an_error_with_a_remedy(opencl, cloud, budget, words):
-    with pytest.raises(fs.DeviceError, match=rf"budget of {words} is too small.*raise memory_budget"):
+    with pytest.raises(fs.DeviceError, match=rf"memory_budget must exceed .*, got {words}; raise it"):
         own_device(opencl, budget).render(cloud, CAMERA, ALL_OUTPUTS)
 
 
@@ -279,9 +279,11 @@ def test_a_plan_counts_all_memory_of_a_frame(opencl, monkeypatch, machine, mebib
     """Everything that is new on the device, the cloud and a lens's rays included."""
     own = machine(opencl, mebibytes * 2**20)
     pool, taken, planned = own.backend.pool, [], []
-    fresh, make_way = pool.fresh, pool.make_way
+    fresh, release_others = pool.fresh, pool.release_others
     monkeypatch.setattr(pool, "fresh", lambda what, size: taken.append((what, size)) or fresh(what, size))
-    monkeypatch.setattr(pool, "make_way", lambda kind, *way: planned.append(way[0]) or make_way(kind, *way))
+    monkeypatch.setattr(
+        pool, "release_others", lambda kind, *way: planned.append(way[0]) or release_others(kind, *way)
+    )
     some = random_splats(60000, seed=3, depth=(1.0, 6.0), scale=(1e-3, 1e-2), sh_degree=1)
     some = some.with_boxes(np.arange(60000) < 30000) if name == "boxes before a lens" else some
     quality = fs.Quality(alpha_cutoff=1 / 255)

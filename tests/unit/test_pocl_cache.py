@@ -9,7 +9,7 @@ import pytest
 
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.checked_cache import record_new, remove_damaged
-from fidsplat.backends.opencl.pocl_workarounds.kernel_cache import is_loaded, is_whole
+from fidsplat.backends.opencl.pocl_workarounds.kernel_cache import is_complete, is_loaded
 
 DRAW = """
 import numpy as np, fidsplat as fs
@@ -54,11 +54,11 @@ def compiled(folder):
 def test_what_is_damaged_is_found(full_cache, tmp_path, damage):
     files = compiled(full_cache[0])
     assert {path.suffix for path in files} == {".so", ".bc"}
-    assert all(map(is_whole, files))
+    assert all(map(is_complete, files))
     for path in files:
         broken = tmp_path / f"broken{path.suffix}"
         broken.write_bytes(DAMAGES[damage](path.read_bytes()))
-        assert not is_whole(broken), path
+        assert not is_complete(broken), path
 
 
 def test_a_damaged_cache_is_compiled_again(full_cache, tmp_path):
@@ -68,7 +68,7 @@ def test_a_damaged_cache_is_compiled_again(full_cache, tmp_path):
         path.write_bytes(damage(path.read_bytes()))
     done = draw(folder)
     assert (done.returncode, done.stdout) == (0, full_cache[1]), done.stderr
-    assert all(map(is_whole, compiled(folder)))
+    assert all(map(is_complete, compiled(folder)))
 
 
 def test_a_program_without_kernels_is_built_again(monkeypatch):
@@ -125,7 +125,7 @@ def test_what_a_checksum_or_the_kind_of_file_shows_is_compiled_again(full_cache,
     shutil.copytree(full_cache[0], folder)
     files = compiled(folder)
     names = [path.relative_to(folder) for path in files]
-    assert remove_damaged(folder, is_loaded, is_whole) == 0
+    assert remove_damaged(folder, is_loaded, is_complete) == 0
     for path in files:
         damage(path)
     if damage is not flip_a_bit:
@@ -173,10 +173,10 @@ def test_files_of_a_damaged_record_of_checksums_are_removed(full_cache, tmp_path
     shutil.copytree(full_cache[0], folder)
     count = sum(is_loaded(path.name) for path in folder.rglob("*"))
     damage(folder / "fidsplat-checksums.json")
-    assert remove_damaged(folder, is_loaded, is_whole) == count
+    assert remove_damaged(folder, is_loaded, is_complete) == count
     assert compiled(folder) == []
     assert (folder / "fidsplat-checksums.json").read_text().startswith('{"crc"')
-    assert remove_damaged(folder, is_loaded, is_whole) == 0
+    assert remove_damaged(folder, is_loaded, is_complete) == 0
 
 
 def test_new_files_get_a_checksum_when_the_process_ends(tmp_path):
@@ -188,13 +188,13 @@ def test_new_files_get_a_checksum_when_the_process_ends(tmp_path):
     assert not program.exists()
 
 
-def test_what_is_whole_stays(full_cache, tmp_path):
+def test_what_is_complete_stays(full_cache, tmp_path):
     folder = tmp_path / "cache"
     shutil.copytree(full_cache[0], folder)
     before = compiled(folder)
-    assert remove_damaged(folder, is_loaded, is_whole) == 0
+    assert remove_damaged(folder, is_loaded, is_complete) == 0
     assert compiled(folder) == before
-    assert remove_damaged(tmp_path / "nowhere", is_loaded, is_whole) == 0
+    assert remove_damaged(tmp_path / "nowhere", is_loaded, is_complete) == 0
 
 
 def test_the_cache_is_where_pocl_looks(monkeypatch, tmp_path):
@@ -209,6 +209,6 @@ def test_what_another_process_is_about_to_finish_is_unchanged(tmp_path):
     unfinished, broken = tmp_path / "tempfile_ab12cd.so", tmp_path / "blend.so"
     for file in (unfinished, broken):
         file.write_bytes(b"")
-    assert remove_damaged(tmp_path, is_loaded, is_whole) == 1
+    assert remove_damaged(tmp_path, is_loaded, is_complete) == 1
     assert unfinished.exists()
     assert not broken.exists()

@@ -196,13 +196,13 @@ def test_frames_and_cached_chunks_keep_the_budget(stores, monkeypatch):
 def test_smaller_frames_reuse_buffers():
     pool = fs.Renderer("opencl").backend.pool
     pool.clear()
-    pool.make_way("stores", 1 << 30, 100)
+    pool.release_others("stores", 1 << 30, 100)
     for splats, kept in ((90, True), (100, True), (101, False)):
         pool.scratch("records", 1 << 20)
-        pool.make_way("stores", 0, splats)
+        pool.release_others("stores", 0, splats)
         assert bool(pool.memory_bytes) == kept
     pool.scratch("records", 1 << 20)
-    pool.make_way("others", 0, 1)
+    pool.release_others("others", 0, 1)
     assert not pool.memory_bytes
 
 

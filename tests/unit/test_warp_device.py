@@ -359,7 +359,7 @@ def test_a_memory_budget_renders_in_bands_bit_identically():
     assert own.backend.pool._arrays["tile_totals", wp.int32].size == 300, "it was drawn in bands"
     assert frame.stats == expected.stats
     assert all(np.array_equal(frame[name], expected[name]) for name in ALL_OUTPUTS)
-    with pytest.raises(fs.DeviceError, match=r"budget of 1 MiB is too small .* raise memory_budget"):
+    with pytest.raises(fs.DeviceError, match=r"memory_budget must exceed .*, got 1 MiB; raise it"):
         fs.Renderer("warp:cpu", memory_budget=2**20).render(cloud, view, ALL_OUTPUTS)
 
 
@@ -377,7 +377,7 @@ def test_a_memory_budget_counts_rays_and_the_planes_of_all_poses():
     assert all(np.array_equal(frame[name], expected[name]) for name in ("rgb", "depth"))
     small = fs.Renderer("warp:cpu", memory_budget=5_500_000)
     small.render(cloud, view, ("rgb", "depth"))
-    with pytest.raises(fs.DeviceError, match=r"too small .* raise memory_budget"):
+    with pytest.raises(fs.DeviceError, match=r"memory_budget must exceed .*; raise it"):
         small.render(cloud, view, ("rgb", "depth"), **exposed)
 
 
@@ -396,5 +396,7 @@ def test_poison_reaches_every_array(renderer, monkeypatch):
 
 @pytest.mark.parametrize("size", [2**46, 2**31])
 def test_an_array_that_the_device_cannot_give_is_an_error_with_a_remedy(renderer, size):
-    with pytest.raises(fs.DeviceError, match=r"lists needs \d+ MiB, more than \S+ has; use fewer splats"):
+    with pytest.raises(
+        fs.DeviceError, match=r"lists must fit the memory of \S+, got \d+ MiB; use fewer splats"
+    ):
         renderer.backend.pool.fresh("lists", size, wp.int32)

@@ -14,7 +14,7 @@ from fidsplat.backends.alignment import (
     AlignmentStage,
     AlignmentSums,
     MovedFrame,
-    least_bin,
+    lowest_bin,
     noise_factor,
 )
 from fidsplat.backends.opencl.assemble import assemble_alignment
@@ -24,9 +24,9 @@ from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.cameras.raster import raster_of
 
 _GROUPS = {1: 32, 32: 256}
-"""maximum number of work-groups of a sum, by their size"""
+"""maximum number of work-groups of a sum, by the size of a work-group"""
 _SUMS = 249
-"""numbers of a work-group"""
+"""numbers that a work-group writes"""
 _Image: TypeAlias = tuple[cl.Buffer, tuple[int, ...]]
 
 
@@ -52,7 +52,7 @@ class OpenCLAlignment(AlignmentKernels):
             cl.enqueue_copy(self._queue, counts, counted)
         found = []
         for given, own in zip(self._stages, counts.astype(np.int64), strict=True):
-            given["least"] = least = least_bin(own, most)
+            given["least"] = least = lowest_bin(own, most)
             found.append(int(own[least:].sum()))
         return found
 
@@ -156,7 +156,7 @@ class OpenCLAlignment(AlignmentKernels):
         return self._workspace.pool.scratch(f"alignment: {name}", size)
 
     def _put(self, name: str, array: np.ndarray) -> cl.Buffer:
-        """A copy of an array; a read-only array is not copied again."""
+        """Copy an array to the device, a read-only array only once."""
         name, array = f"alignment: {name}", np.ascontiguousarray(array)
         buffer, event = self._workspace.pool.put(self._queue, name, array)
         if event is not None:
@@ -165,8 +165,8 @@ class OpenCLAlignment(AlignmentKernels):
 
 
 def _unpacked(packed: np.ndarray, channels: int, blocks: bool, moved: bool) -> AlignmentSums:
-    """Sums of the work-groups: 8 matrix rows, a right side, and a second one or moments, for each of 3
-    channels, then scalars."""
+    """Unpack the sums of the work-groups: 8 matrix rows, a right side, and a second right side or moments,
+    for each of 3 channels, then scalars."""
     rows = packed[:, :240].reshape(len(packed), 3, 10, 8)[:, :channels]
     total, others = rows.sum(axis=0, dtype=float), packed[:, 240:248].sum(axis=0, dtype=float)
     cost, before, inverse_depth = (others[4:7] / max(others[3], 1)).tolist()

@@ -44,7 +44,7 @@ _LISTS = {
     "local": ("tile_lists", "tile_lists_local"),
 }
 """stages of the program `lists`, by tile-binning strategy"""
-_DRAWN = (
+_FRAME = (
     "prelude",
     "math",
     "splat",
@@ -86,9 +86,9 @@ _EFFECT_ARGUMENTS = {
 @dataclass(frozen=True)
 class Text:
     listing: str
-    """with comments, for readers"""
+    """text with comments"""
     compiled: str
-    """without comments, with the same line numbers"""
+    """text without comments, with the same line numbers"""
 
 
 @dataclass
@@ -158,7 +158,7 @@ def layouts_of(features: FeatureSet) -> dict[str, Layout]:
 
 
 def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
-    """The source for these features. Raises DeviceError if a file fills an unknown hook."""
+    """Assemble the source of a feature set. Raises DeviceError if a file fills an unknown hook."""
     layouts = layouts_of(features)
     # blend and resolve are fused if a pixel has one sample and one pose, and no other pass adds to it
     separate = {"rays", "shutter_exposure", "shutter_rows"}
@@ -201,7 +201,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         "lists": ("prelude", "math", *(("splat",) if keys_by_tile else ()), "bounds", *_LISTS[shape.lists]),
         "frame": [
             stage.format(shape.schedule)
-            for stage in _DRAWN
+            for stage in _FRAME
             if not (stage == "pack" and shape.lists != "ordered") and not (stage == "resolve" and fused)
         ],
     }
@@ -215,8 +215,8 @@ def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
 
 
 def assemble_step(features: FeatureSet, shape: DeviceShape, camera: bool = False) -> Source:
-    """The source of a training step: the last stage of the backward pass, fused with Adam. camera: also sums
-    the gradient with respect to the camera."""
+    """Assemble a training step: the last stage of the backward pass, fused with Adam. camera: also sum the
+    gradient with respect to the camera."""
     return _assemble_backward("step", _STEP, features, shape, ("step_camera",) if camera else ())
 
 
@@ -239,7 +239,7 @@ def _assemble_backward(
 
 
 def _dialect(shape: DeviceShape, scalars: Scalars, slots: Iterable[str] = ()) -> list[str]:
-    """Files with a vendor's instructions, for fragments in float32: one for all frames, then those of
+    """Files with a vendor's instructions for float32 fragments: one for all frames, then the files of
     slots."""
     if not shape.dialect or scalars.wide != "float":
         return []
@@ -254,7 +254,7 @@ def kernels_of(shape: DeviceShape) -> Mapping[str, tuple[Argument, ...]]:
 
 @cache
 def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> Source:
-    """The source of the kernels of loss, regularisation and optimiser, for vectors of `lanes` floats."""
+    """Assemble the kernels of loss, regularisation and optimiser, for vectors of `lanes` floats."""
     files = ("loss_values", "loss" if lanes == 1 else "loss_strips", *_TRAINING)
     numbers = {"LANES": lanes, "FAST_FMA": int(fast_fma and lanes > 1), "SETUP_FP64": int(float64)}
     declared = Declarations(Scalars("double" if float64 else "float", "float"))
@@ -264,7 +264,7 @@ def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> Source:
 
 @cache
 def assemble_alignment(items: int) -> Source:
-    """Source of the kernels of direct image alignment, for work-groups of so many items."""
+    """Assemble the kernels of direct image alignment, for work-groups of `items` work-items."""
     numbers: dict[str, int | str] = {"ITEMS": items, "LOWEST": alignment.LOWEST}
     for name in ("HUBER", "TUKEY", "MIN_NOISE", "MAX_NOISE"):
         numbers[name] = f"{getattr(alignment, name)}f"
@@ -273,8 +273,8 @@ def assemble_alignment(items: int) -> Source:
 
 
 def assemble_check(file: str, shape: DeviceShape, float64: bool, effects: Iterable[str] = ()) -> str:
-    """The text of a test kernel file below kernels/opencl/ (empty: none), after prelude.cl and math.cl.
-    effects: files whose sections fill the hooks."""
+    """Text of prelude.cl, math.cl and a file of test kernels below kernels/opencl/ (empty: no file). effects:
+    files whose sections fill the hooks."""
     numbers = {"LANES": shape.lanes, "FAST_FMA": int(shape.fast_fma), "SETUP_FP64": int(float64)}
     scalars = Scalars("double" if float64 else "float", "float")
     stages = ("prelude", "math", *([file.removesuffix(".cl")] if file else ()))
@@ -466,8 +466,8 @@ def with_constants(text: str, constants: Mapping[str, str]) -> str:
 
 
 def with_packed(text: str, packed: Mapping[str, str]) -> str:
-    """Replace packed fields of `Splat` in kernel text: writes go to variables `unpacked_NAME`, reads use an
-    expression of the record `{}`."""
+    """Replace packed fields of `Splat` in kernel text: a write goes to a variable `unpacked_NAME`; a read
+    becomes the expression of the field, with the record in place of `{}`."""
     if not packed:
         return text
     names = "|".join(packed)
@@ -477,14 +477,16 @@ def with_packed(text: str, packed: Mapping[str, str]) -> str:
 
 def _refuse_unknown_hooks(files: list[str]) -> None:
     """Raise DeviceError if a file fills a hook that neither a stage nor an effect has."""
-    stages = [stage.format(schedule) for stage in _DRAWN for schedule in ("lanes", "group")]
+    stages = [stage.format(schedule) for stage in _FRAME for schedule in ("lanes", "group")]
     everywhere = {f"{stage}.cl" for stage in chain(stages, *_LISTS.values())}
     everywhere |= {layout.file for layout in LAYOUTS.values() if layout.file}
     everywhere |= {f"part/{path.name}" for path in (kernels_folder() / "opencl/part").glob("*.cl")}
     known = set(chain.from_iterable(map(_hooks, everywhere)))
     for file in files:
         if unknown := set(sections_of(file)) - known:
-            raise DeviceError(f"kernel file {file} fills hooks that no file has: {sorted(unknown)}")
+            raise DeviceError(
+                f"hooks filled by {file} must exist, got {sorted(unknown)}; correct their names"
+            )
 
 
 def kernel_text(path: str) -> str:

@@ -47,7 +47,7 @@ class BufferPool:
         self._contents: dict[str, weakref.ref[np.ndarray]] = {}
         self._spare: dict[str, list[cl.Buffer]] = {}
         self._zeroed: set[str] = set()
-        self._kind: Hashable = None
+        self._key: Hashable = None
         self._splats = 0
         self.state = object()
         """a new object whenever a scratch buffer is replaced or released"""
@@ -62,12 +62,12 @@ class BufferPool:
 
     def lease(self, name: str, size: int, larger: bool = False) -> cl.Buffer:
         """A buffer that belongs to the caller until `give_back`. larger: whether it may have more bytes."""
-        # removed from the list first: the garbage collector may give back other buffers at any time
+        # remove the buffer before the check: the garbage collector may give back other buffers at any time
         spare = self._spare.get(name, [])
         while spare:
             buffer = spare.pop()
             if buffer.size == max(size, _MINIMUM) or (larger and buffer.size > size):
-                return buffer  # a buffer of another size belonged to frames of another size, and is released
+                return buffer  # any other buffer belonged to frames of another size, and is released
         return self.fresh(name, size)
 
     def give_back(self, buffers: Iterable[tuple[str, cl.Buffer]]) -> None:
@@ -86,16 +86,16 @@ class BufferPool:
                 size += buffer.size
         return size
 
-    def make_way(self, kind: Hashable, size: int, splats: int = 0) -> None:
-        """Before a frame: release all buffers if they belong to frames of another kind and exceed `size`
-        bytes. Frames of one kind have buffers of equal sizes, or smaller ones for fewer splats."""
-        if kind == self._kind and splats <= self._splats:
+    def release_others(self, key: Hashable, size: int, splats: int = 0) -> None:
+        """Release all buffers before a frame if they belong to frames with another key and exceed `size`
+        bytes. Frames with the same key have buffers of equal size, or smaller buffers for fewer splats."""
+        if key == self._key and splats <= self._splats:
             return
         if self.memory_bytes > size:
             self.clear()
-        self._kind, self._splats = kind, splats
+        self._key, self._splats = key, splats
 
-    def forget_zeros(self) -> None:
+    def invalidate_zeros(self) -> None:
         """Mark the contents of zero-filled buffers as unknown, after a failure."""
         self._zeroed.clear()
         self.state = object()
@@ -167,7 +167,9 @@ class BufferPool:
                 self._request_large_pages(buffer)
             return buffer
         except cl.Error as error:
-            raise DeviceError(f"no memory for {name} ({bytes_words(size)}): {error}") from error
+            raise DeviceError(
+                f"no memory for {name} ({bytes_words(size)}): {error}; use fewer splats"
+            ) from error
 
     def _request_large_pages(self, buffer: cl.Buffer) -> None:
         """Advise the system to use large pages for the memory of a buffer."""

@@ -91,7 +91,7 @@ class OpenCLChunkCache:
 
     def prefetch(self, chunks: Sequence[Chunk]) -> None:
         """Load chunks of the next frame from another thread, as far as there are free slots."""
-        requested = {chunk.key for chunk in chunks}  # requested chunks must not evict each other
+        requested = {chunk.key for chunk in chunks}  # pinned: requested chunks must not evict each other
         for chunk in chunks:
             with self._lock:
                 if chunk.key in self._slots or not self.widths:
@@ -212,7 +212,7 @@ class OpenCLChunkCache:
 
     @property
     def _slot_bytes(self) -> int:
-        """Bytes of a slot, with the widest array twice, as it exists twice while the cache grows."""
+        """Bytes of a slot. The widest array counts twice, as it exists twice while the cache grows."""
         return self._rows * (sum(self.widths.values()) + max(self.widths.values()))
 
     @property
@@ -258,7 +258,8 @@ class GatheredChunks(Resident):
         )
 
     def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
-        """See `Resident.bytes_for`; the bytes that stay on the device include the full cache."""
+        """Bytes of these arrays and of the full cache on the device, and bytes per splat copied for each
+        frame."""
         read, stays = {*names, *self._buffers}, self._cache.reserved_bytes
         each = sum(self._width(name) for name in read)
         return (stays, each) if self.streamed else (stays + self.capacity * each, 0)

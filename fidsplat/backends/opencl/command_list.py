@@ -11,7 +11,7 @@ from fidsplat.backends.opencl.buffers import token_of
 from fidsplat.backends.opencl.program import Program
 
 _UNKNOWN = object()
-"""mark of an argument that is not bound, or whose binding was interrupted"""
+"""value of an argument that is not bound, or whose binding was interrupted"""
 
 
 class Command:
@@ -37,7 +37,7 @@ class Command:
         self._marks[index] = _UNKNOWN  # an interrupt between the next two lines leaves the argument unknown
         if scalar is None:
             self.kernel.set_arg(index, value)
-        else:  # set_arg takes 20 times as long to find the type of a number
+        else:  # faster than set_arg, which takes 20 times as long to find the type of a number
             self.kernel._set_arg_buf(index, scalar(value))  # pyright: ignore[reportAttributeAccessIssue]
         self._marks[index] = mark
 
@@ -125,7 +125,7 @@ class CommandList:
         for name, value in values.items():
             argument = self._named.get(name)
             if argument is None:
-                argument = self._named[name] = _NamedArgument(self._places(name))
+                argument = self._named[name] = _NamedArgument(self._positions(name))
             mark = token_of(value) if isinstance(value, cl.Buffer) else value
             if mark is argument.mark or (type(mark) is type(argument.mark) and mark == argument.mark):
                 continue
@@ -141,7 +141,7 @@ class CommandList:
             for command in self._commands[first:end]
         ]
 
-    def _places(self, name: str) -> list[tuple[Command, int]]:
+    def _positions(self, name: str) -> list[tuple[Command, int]]:
         arguments = self.program.source.arguments
         return [
             (command, index)

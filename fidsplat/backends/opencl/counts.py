@@ -32,7 +32,7 @@ class Counts:
 
     @staticmethod
     def of_tallies(words: np.ndarray) -> Counts:
-        """Counts of a frame from the buffer `tallies` (views, TALLIES). `big` is that of the first view."""
+        """Counts of a frame from the buffer `tallies` (views, TALLIES); `big` of the first view only."""
         pairs = int(words[0, PAIRS]) | int(words[0, PAIRS + 1]) << 32
         return Counts(int(words[0, BIG]), pairs, int(words[:, VISIBLE].sum(dtype=np.int64)))
 

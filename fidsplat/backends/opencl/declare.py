@@ -27,7 +27,7 @@ class Member:
 
     ctype: str
     names: tuple[tuple[str, int], ...]
-    """names with lengths; 1: not an array"""
+    """(name, number of elements); 1: not an array"""
     note: str = ""
 
     @property

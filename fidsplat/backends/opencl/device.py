@@ -93,7 +93,7 @@ class OpenCLBackend(Workspace, Backend):
             linker.provide_linker()
             if _needs_patch(device):
                 target_patch.announce_once(pocl_folder(), _PATCHED)
-            check_once(pocl_folder(), kernel_cache.is_loaded, kernel_cache.is_whole)
+            check_once(pocl_folder(), kernel_cache.is_loaded, kernel_cache.is_complete)
         else:  # pyopencl caches programs for drivers without a cache of their own
             check_once(user_cache() / "pyopencl", _PYOPENCL_FILES.__contains__, lambda _: True)
         super().__init__(device, _describe(device, _name_of(device)), _shape(device))
@@ -139,8 +139,9 @@ class OpenCLBackend(Workspace, Backend):
         key = self._key(features, shape)
         if key[1].blend_items > self.device.max_work_group_size:
             raise DeviceError(
-                f"{self.info.title} has work-groups of at most {self.device.max_work_group_size}, and "
-                f"tiles of {key[1].tile_width} x {key[1].tile_height} need {key[1].blend_items}"
+                f"tiles must need at most {self.device.max_work_group_size} work-items on "
+                f"{self.info.title}, got {key[1].blend_items} for {key[1].tile_width} x "
+                f"{key[1].tile_height} samples; use another device"
             )
         if key not in self._pipelines:
             self._pipelines[key] = OpenCLPipeline(self, assemble(*key), *key, self.pipeline)
@@ -148,8 +149,8 @@ class OpenCLBackend(Workspace, Backend):
         return self._pipelines[key]
 
     def frame_shape(self, view: View, count: int = 1) -> DeviceShape | None:
-        """Small tiles for frames with too few tiles to occupy a GPU (devlog/tuning.md); not with a small
-        memory budget, as small tiles have more pairs."""
+        """Smaller tiles for frames with too few tiles to occupy a GPU (devlog/tuning.md), except with a small
+        memory budget, as smaller tiles have more pairs."""
         if self.shape.schedule != "group" or self.memory_budget < self.info.memory_bytes // 2:
             return None
         samples = count * view.width * view.height
@@ -184,7 +185,7 @@ class OpenCLBackend(Workspace, Backend):
         return features, shape or shape_for(features, self.shape)
 
     def source(self, features: FeatureSet) -> Source:
-        """The program for these features on this device, not compiled."""
+        """Kernel source of these features for this device."""
         return assemble(*self._key(features, None))
 
     @property
@@ -209,7 +210,7 @@ def _all_devices() -> Iterator[cl.Device]:
     try:
         with intel_registered():
             platforms = cl.get_platforms()
-    except cl.Error:  # raised by the loader if there is no platform
+    except cl.Error:  # the loader found no platform
         return
     for platform in platforms:
         try:

@@ -1,4 +1,4 @@
-"""The device state of one frame: its buffers, kernel arguments and launches."""
+"""State of one frame on the device: buffers, kernel arguments and launches."""
 
 from __future__ import annotations
 
@@ -74,9 +74,9 @@ class Rendered:
     """output images and counts by name"""
     stats: Callable[[], dict[str, int]]
     events: list[cl.Event]
-    """of the launches"""
+    """events of the launches"""
     stages: list[str] | None = None
-    """of the launches; None on a queue without profiling"""
+    """stages of the launches; None on a queue without profiling"""
     uploads: list[cl.Event] | None = None
     """keeps the cloud's arrays alive until the device has read them"""
 
@@ -130,18 +130,18 @@ class DeviceFrame:
             self.end_tile = -(-view.band[1] // shape.tile_height) * self.tiles_x
         self.buffers = FrameBuffers()
         self.named: dict[str, cl.Buffer] = vars(self.buffers)
-        """these buffers and those of effects and outputs, by the names of the kernel arguments"""
+        """all buffers, including those of effects and outputs, by the names of the kernel arguments"""
         self.numbers: dict[str, Any] = numbers_of(view, self.source)
         """numbers by the names of the kernel arguments"""
         self.numbers |= {"width": view.width, "height": view.height, "stride": self.stride}
         self.numbers["channel_stride"] = self.views * self.rows * self.stride
         self.samples = RAW, *self.source.samples
-        """buffers of values per sample, which the blend stage writes"""
+        """sample buffers, which the blend stage writes"""
         self.is_sub_frame = False
         """whether this is one pose of a frame with a shutter; the complete frame resolves its samples"""
         self.events: list[cl.Event] = []
         self.stages: list[str] = []
-        """of the launches"""
+        """stages of the launches"""
         self.arrays: dict[str, np.ndarray] = {}
         """arrays copied to the device for this view"""
         self.uploads: list[cl.Event] = []
@@ -149,9 +149,9 @@ class DeviceFrame:
         self.counted_launches = 0
         """number of launches after which the counts are complete"""
         self.counted: cl.Event | None = None
-        """completes when the device has counted the pairs, if the host did not wait"""
+        """event after which the pairs are counted, if the host did not wait"""
         self.in_bands = False
-        """whether its lists exceeded the pair budget, so that it was rendered in bands of tiles"""
+        """whether the lists exceeded the pair budget, so that the frame was rendered in bands of tiles"""
         self.pairs = 0
         """number of listed pairs; the capacity of the lists if the host did not wait"""
         self.stats: Callable[[], dict[str, int]] = dict
@@ -209,7 +209,7 @@ class DeviceFrame:
         for values in (self.named, self.numbers):
             if name in values:
                 return values[name]
-        if argument.source == "uniform":  # of derivatives
+        if argument.source == "uniform":  # only kernels of gradients
             group, index = argument.uniform
             return self.view.uniform(group)[index]
         return self.put(name, self.view.array(name))
@@ -232,7 +232,7 @@ class DeviceFrame:
         return self.bind(name, buffer)
 
     def bind(self, name: str, buffer: cl.Buffer) -> cl.Buffer:
-        """Use a buffer as the kernel argument of this name."""
+        """Bind a buffer to the kernel argument of this name."""
         self.named[name] = buffer
         return buffer
 
@@ -251,7 +251,7 @@ class DeviceFrame:
         self.put("batch_indices", self.batch.batch_indices)
 
     def bind_images(self, images: dict[str, cl.Buffer]) -> None:
-        """Bind the output images of the complete batch; these views render into their part of them."""
+        """Bind the output images of the complete batch, of which these views fill a part."""
         self.named |= images
         self.put("batch_indices", self.batch.batch_indices)
 

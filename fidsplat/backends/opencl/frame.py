@@ -52,7 +52,7 @@ def allocate_samples(frame: DeviceFrame) -> None:
 
 
 def render_sorted(frame: DeviceFrame) -> None:
-    """CPU: the host waits for the number of pairs before it allocates the lists."""
+    """Render on a CPU: wait for the number of pairs, then allocate the lists."""
     count, big = frame.resident.count, 0
     frame.put_view(0, frame.rows)
     while True:
@@ -72,8 +72,8 @@ def render_sorted(frame: DeviceFrame) -> None:
 
 
 def render_tiled(frame: DeviceFrame) -> None:
-    """GPU: submit all stages with the list capacity of previous frames; again if the capacity was too
-    small."""
+    """Render on a GPU: submit all stages with the list capacity of previous frames, and again with larger
+    lists if they exceeded it."""
     frame.put_view(0, frame.rows)
     frame.lease("counts", 4 * COUNTS)
     capacity = tiling.pair_capacity(frame.workspace)
@@ -117,8 +117,8 @@ def complete_tiled(frame: DeviceFrame, counted: cl.Event, capacity: int) -> None
 
 
 def render_in_chunks(frame: DeviceFrame) -> None:
-    """Small memory budget: project the cloud in chunks, and store only visible splats; if these exceed the
-    capacity, project again for each band of tile rows."""
+    """Render with a small memory budget: project the cloud in chunks, and store only visible splats; if these
+    exceed the capacity, project again for each band of tile rows."""
     rows = [(frame.first_tile // frame.tiles_x, frame.end_tile // frame.tiles_x)]
     visible = pairs = 0
     while rows:
@@ -164,7 +164,7 @@ def _launch_grid(frame: DeviceFrame, stage: str, kernel: str, width: int, height
 
 
 def render_exposure(frame: DeviceFrame) -> None:
-    """Blend the sub-frames of a shutter one after another, and resolve their samples together."""
+    """Blend the sub-frames of a shutter one after another, and resolve their mean."""
     for one in frame.samples:
         size = 4 * frame.rows * frame.stride * one.channels
         frame.bind(one.name, frame.pool.scratch(f"exposed {one.name}", size))

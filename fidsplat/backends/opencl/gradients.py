@@ -62,9 +62,8 @@ class OpenCLDifferentiable(DifferentiableImages):
 
 
 class OpenCLGradients(GradientPipeline):
-    """Compiled stages with their gradients. Frames of a training run differ only in numeric arguments, so
-    that command lists are replayed: those of frames, and those of the backward pass while its buffers stay
-    the same."""
+    """Compiled stages with their gradients. Frames of a training run differ only in numeric arguments: their
+    command lists are replayed, also of the backward pass while its buffers are the same."""
 
     def __init__(self, pipeline: OpenCLPipeline) -> None:
         self._pipeline, self.features = pipeline, pipeline.features
@@ -84,7 +83,8 @@ class OpenCLGradients(GradientPipeline):
         """command lists of a step by whether it sums the gradient of the camera"""
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
-        """Render one frame. waits: whether to wait for its counts; GPUs need not after the first frame."""
+        """Render one frame. waits: whether to wait for its counts, which a GPU needs only for the first
+        frame."""
         pipeline = self._pipeline
         with pipeline.workspace.lock:
             if waits or not self._pair_limit:
@@ -183,7 +183,9 @@ class OpenCLGradients(GradientPipeline):
         """Raise CapacityExceeded if the lists were too small."""
         if (pairs := frame.count_pairs()) is None:
             raise CapacityExceeded
-        if self._pair_limit < pairs * 9 // 8:  # changed seldom: frames with another limit are recorded again
+        if (
+            self._pair_limit < pairs * 9 // 8
+        ):  # change the limit seldom, as frames with another limit are recorded again
             self._pair_limit = pairs * 5 // 4
 
     def _bind_gradients(self, frame: DeviceFrame, gradients: Mapping[str, Any]) -> None:

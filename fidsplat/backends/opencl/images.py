@@ -128,7 +128,7 @@ class OpenCLImages(Images):
         into, count = workspace.host_memory.empty(shape, np.uint8), math.prod(shape)
         with workspace.failing(f"rendering {name}"):
             after = self._done()
-            with workspace.lock:  # the kernel's arguments are shared by all images
+            with workspace.lock:  # all images share the kernel object with its arguments
                 kernel, values = _kernel(workspace)
                 made = workspace.pool.lease(label, count)
                 items = -(-count // (values * _UINT8_GROUP)) * _UINT8_GROUP

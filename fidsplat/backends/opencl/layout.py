@@ -64,7 +64,7 @@ MOMENTS = Record(
         member("float log_opacity"),
         member("float r g b"),
     ),
-    alignment=16,  # so that a record spans few cache lines
+    alignment=16,  # a record spans few cache lines
 )
 """Contribution of a tile to the gradient of a splat's record."""
 
@@ -129,7 +129,7 @@ _SURFACE = takes(
     _IMAGE_SIZE,
     "float inverse_x inverse_y middle_x middle_y  // 1 / focal lengths, and the principal point [px]",
 )
-_DRAWN_SH = takes("uint count rendered all", "int plain")
+_RENDERED_SH = takes("uint count rendered all", "int plain")
 
 _ROTATION = "float " + " ".join(f"rotation_{row}{column}" for row in range(3) for column in range(3))
 
@@ -313,7 +313,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "in float quats log_scales logits",
         "out float activated_quats activated_scales activated_thickness activated_opacities",
     ),
-    "activate_sh": takes(_DRAWN_SH, "in float sh", "out float activated_sh"),
+    "activate_sh": takes(_RENDERED_SH, "in float sh", "out float activated_sh"),
     "gather_rows": takes("uint count row copied", "in uint rows", "in float source", "out float gathered"),
     "count_visible": takes(
         "uint count",

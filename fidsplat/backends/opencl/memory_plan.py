@@ -26,10 +26,10 @@ from fidsplat.util.errors import DeviceError, bytes_words
 CHUNK = 1 << 20
 """maximum splats of a chunk; a power of two, so that parts of every array start at aligned addresses"""
 _LARGE = 1 << 23
-"""maximum splats of a chunk that takes a small part of the memory; larger than above, for fewer launches"""
+"""maximum splats of a chunk if it needs little of the memory: larger chunks have fewer launches"""
 _MINIMUM = 1 << 10
 KEYS, WINDOWS, SORTED = 4, 8, 16
-"""bytes per splat: of sort keys; of tile windows; of keys and indices during the sort"""
+"""bytes per splat of sort keys, of tile windows, and of keys and indices during the sort"""
 MIN_BIG = 1 << 12
 """initial capacity for big splats"""
 SMALL = 1 << 14
@@ -39,7 +39,7 @@ PART_BYTES = {"cpu": 1 << 28}
 OTHER_PART_BYTES = 1 << 31
 _PART_SAMPLES = 1 << 30
 """maximum samples of a part of a batch; kernels use 32-bit indices for several channels of samples"""
-_OF_CAMERAS = {"ray", "vignette_center"}
+_CAMERA_UNIFORMS = {"ray", "vignette_center"}
 """groups of uniforms that differ between cameras"""
 
 
@@ -48,9 +48,9 @@ class MemoryPlan:
     """Division of a frame, or of a part of a batch, and the bytes of its buffers."""
 
     chunk: int
-    """splats that are projected at once; 0: all, without packing the visible ones"""
+    """splats that are projected at once; 0: all, without packing visible splats"""
     capacity: int
-    """visible splats of one band that are stored, if in chunks"""
+    """maximum visible splats of one band, if the cloud is projected in chunks"""
     total: int
     """total bytes including the cloud; exceeded only with more than `MIN_BIG` big splats"""
 
@@ -67,7 +67,7 @@ class MemoryPlanner:
     def __init__(self, device: Workspace, source: Source, features: FeatureSet, shape: DeviceShape) -> None:
         self._device, self._source, self._shape = device, source, shape
         self._slopes = source.takes("blend", "ray_slopes")
-        self._of_cameras = not _OF_CAMERAS.isdisjoint(source.uniform_groups)
+        self._by_camera = not _CAMERA_UNIFORMS.isdisjoint(source.uniform_groups)
         self._channels = RAW.channels
         for samples in source.samples:
             self._channels += samples.channels
@@ -110,7 +110,7 @@ class MemoryPlanner:
         external = views.view.external_depth
         together = views.stacked and not (resident.streamed or self._separate)
         together = together and not (external and external.stacked)
-        if plan.chunk or not together or (views.numbers and self._of_cameras):
+        if plan.chunk or not together or (views.numbers and self._by_camera):
             for k in range(count):
                 yield Part(k, k + 1, self.frame(resident, views.one(k), others))
             return
@@ -127,7 +127,7 @@ class MemoryPlanner:
         return 4 * self._image_channels * (view.width * view.height // view.samples**2)
 
     def _samples_and_tables(self, view: View) -> tuple[int, int]:
-        """Samples of whole tiles, and bytes of the tables of tile binning."""
+        """Number of samples in complete tiles, and bytes of the tables of tile binning."""
         shape, tiles = self._shape, self.tiles(view)
         samples = tiles * shape.tile_width * shape.tile_height
         if shape.lists != "ordered":
@@ -142,9 +142,10 @@ def plan_of(
     """Plan a frame of `count` splats.
 
     Args:
-        record_bytes: of a splat's struct. upload_bytes: per splat, copied for each frame; 0 if the cloud
+        record_bytes: bytes of the struct `Splat`. upload_bytes: bytes per splat copied for each frame; 0 if
+        the cloud
             stays.
-        fixed_bytes: of sample buffers, outputs, tables, and the cloud if it stays on the device.
+        fixed_bytes: bytes of sample buffers, outputs, tables, and the cloud if it stays on the device.
         budget: maximum total bytes. largest: maximum bytes of one buffer.
     """
     direct = count * (record_bytes + KEYS + WINDOWS + (SORTED if lists == "ordered" else 0))
@@ -163,9 +164,8 @@ def plan_of(
     capacity = min(capacity, largest // record_bytes, count)
     if capacity < min(_MINIMUM, count):
         raise DeviceError(
-            f"a memory budget of {bytes_words(budget)} is too small: the frame and the cloud take "
-            f"{bytes_words(fixed_bytes)} without lists; raise memory_budget, or render a smaller frame or "
-            "fewer outputs"
+            f"memory_budget must exceed the {bytes_words(fixed_bytes)} of the frame and the cloud without "
+            f"lists, got {bytes_words(budget)}; raise it, or render a smaller frame or fewer outputs"
         )
     total = fixed_bytes + pairs + chunk * (each + upload_bytes) + capacity * (each + SORTED)
     return MemoryPlan(chunk, capacity, total)

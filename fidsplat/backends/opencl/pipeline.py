@@ -31,21 +31,21 @@ from fidsplat.util.errors import DeviceError
 
 MIN_BATCHED = 1 << 14
 """minimum splats of clouds whose set-up is vectorised on CPUs"""
-_KINDS = 32
-"""maximum number of kinds of frames that are cached for a cloud"""
-_RASTERS = 4
-"""maximum number of different lenses among them: as many as `raster_of` caches"""
+_MAX_FRAMES = 32
+"""maximum number of cached frames of a cloud"""
+_MAX_RASTERS = 4
+"""maximum number of lenses of cached frames: as many as `raster_of` caches"""
 
 
 @dataclass
 class CachedFrame:
-    """Cache entry: a kind of frame of a cloud that was rendered before."""
+    """Cached memory plan and command list of a rendered frame."""
 
     plan: MemoryPlan
-    kind: tuple[Any, ...]
+    buffer_key: tuple[Any, ...]
     """key of frames with equal buffer sizes"""
     raster: RayRaster | None
-    """raster of the lens; it keeps the lens's rays on the device"""
+    """raster of the lens, referenced to keep its rays on the device"""
     recorded: RecordedFrame | None = None
 
 
@@ -86,11 +86,11 @@ class OpenCLPipeline(Pipeline):
             if cached is not None and (images := self._replay(resident, view, cached)) is not None:
                 return images
             if resident.coherent and self.shape.lists == "tiled":
-                return self._listing("local").render_view(resident, view)
+                return self._with_lists("local").render_view(resident, view)
             plan = self._planner.frame(resident, view)
             if plan.chunk and self.shape.lists != "ordered":
-                # frames in chunks use only this strategy, which is fastest with little memory
-                return self._listing("ordered").render_view(resident, view)
+                # frames in chunks use only this strategy; it is the fastest with little memory
+                return self._with_lists("ordered").render_view(resident, view)
             frame = self._render_planned(resident, view, plan)
             complete = not (plan.chunk or frame.in_bands or view.sub_frames or view.band)
             if complete and resident.count and not resident.streamed:
@@ -110,8 +110,8 @@ class OpenCLPipeline(Pipeline):
             for first, end, plan in self._planner.parts(resident, views):
                 part = views.part(first, end)
                 pipeline = self._for_part(resident, plan, part)
-                kind = pipeline, "views", resident.capacity, plan
-                workspace.pool.make_way(kind, workspace.memory_budget - plan.total)
+                buffers = pipeline, "views", resident.capacity, plan
+                workspace.pool.release_others(buffers, workspace.memory_budget - plan.total)
                 frame = DeviceFrame(workspace, pipeline._commands, pipeline.shape, resident, part, plan)
                 frame.bind_images(images)
                 render(frame)
@@ -157,14 +157,14 @@ class OpenCLPipeline(Pipeline):
                 recorded.render(frame)
                 return frame
             plan = self._planner.frame(resident, view)
-            kind = self._buffer_kind(resident, view, plan)
-            workspace.pool.make_way(kind, workspace.memory_budget - plan.total, resident.capacity)
+            buffers = self._buffer_key(resident, view, plan)
+            workspace.pool.release_others(buffers, workspace.memory_budget - plan.total, resident.capacity)
             if plan.chunk or not tiling.pair_capacity(workspace):
                 return self.render_complete(resident, view)
             resident.cached_frames.pop(key, None)  # after an interrupt the recording may be incomplete
             commands = CommandList(self.program) if recorded is None else recorded.commands
             frame = self._render_frame(resident, view, plan, commands, queue, pair_limit)
-            resident.cached_frames[key] = CachedFrame(plan, kind, None, RecordedFrame(frame))
+            resident.cached_frames[key] = CachedFrame(plan, buffers, None, RecordedFrame(frame))
             return frame
 
     def images_of(self, frame: DeviceFrame) -> OpenCLImages:
@@ -178,7 +178,9 @@ class OpenCLPipeline(Pipeline):
     def _replay(self, resident: Resident, view: View, cached: CachedFrame) -> OpenCLImages | None:
         """Replay a cached frame for another view; None if its buffers are too small or were replaced."""
         workspace, recorded, waits = self.workspace, cached.recorded, self.shape.lists == "ordered"
-        workspace.pool.make_way(cached.kind, workspace.memory_budget - cached.plan.total, resident.capacity)
+        workspace.pool.release_others(
+            cached.buffer_key, workspace.memory_budget - cached.plan.total, resident.capacity
+        )
         if not waits and not tiling.pair_capacity(workspace):
             return None
         queue = workspace.switch_to(workspace.queue if waits else workspace.replay_queue)
@@ -221,34 +223,34 @@ class OpenCLPipeline(Pipeline):
         return frame
 
     def _render_planned(self, resident: Resident, view: View, plan: MemoryPlan) -> DeviceFrame:
-        # release the buffers of other kinds of frames; buffers of this kind are part of the plan
+        # release the buffers of frames with other sizes; buffers of this size are part of the plan
         free = self.workspace.memory_budget - plan.total
-        self.workspace.pool.make_way(self._buffer_kind(resident, view, plan), free, resident.capacity)
+        self.workspace.pool.release_others(self._buffer_key(resident, view, plan), free, resident.capacity)
         return self._render_frame(resident, view, plan)
 
-    def _buffer_kind(self, resident: Resident, view: View, plan: MemoryPlan) -> tuple[Any, ...]:
-        """Key of frames that have buffers of the same sizes."""
+    def _buffer_key(self, resident: Resident, view: View, plan: MemoryPlan) -> tuple[Any, ...]:
+        """Key of frames with equal buffer sizes."""
         alike = resident.buffer_key if not plan.chunk else None
         return self, view.width, view.height, alike or (resident.capacity, plan)
 
     def _cache(self, resident: Resident, key: tuple[Any, ...], frame: DeviceFrame) -> None:
-        """Cache the command list of a frame, so that the next one of its kind is replayed."""
+        """Cache the plan of a frame; the next frame with this key is recorded."""
         cached, raster = resident.cached_frames, frame.view.raster
         if raster is not None:
             rasters = {each.raster for each in cached.values()} - {None, raster}
-            if len(rasters) >= _RASTERS:
+            if len(rasters) >= _MAX_RASTERS:
                 cached.clear()
-        if len(cached) >= _KINDS:
+        if len(cached) >= _MAX_FRAMES:
             cached.clear()
-        kind = self._buffer_kind(resident, frame.view, frame.plan)
-        cached[key] = CachedFrame(frame.plan, kind, raster)
+        buffers = self._buffer_key(resident, frame.view, frame.plan)
+        cached[key] = CachedFrame(frame.plan, buffers, raster)
 
     def _key(self, view: View) -> tuple[Any, ...]:
         """Key of frames with the same command list, which differ only in numeric arguments."""
         labels, budgets = tuple(dict(view.groups)), (self.workspace.memory_budget, self.workspace.pair_budget)
         return self, view.width, view.height, view.raster, labels, budgets
 
-    def _listing(self, lists: str) -> OpenCLPipeline:
+    def _with_lists(self, lists: str) -> OpenCLPipeline:
         """The pipeline with another tile-binning strategy."""
         return self._other(self.features, replace(self.shape, lists=lists))
 
@@ -263,14 +265,14 @@ class OpenCLPipeline(Pipeline):
         if self.shape.lists != "tiled":
             return self
         if plan.chunk:
-            return self._listing("ordered")  # the only strategy of frames in chunks
+            return self._with_lists("ordered")  # the only strategy of frames in chunks
         few = len(views) > 1 and self._planner.tiles(views.view) <= tiling.LOCAL_TILES
-        return self._listing("local") if few or resident.coherent else self
+        return self._with_lists("local") if few or resident.coherent else self
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
-        """See `Pipeline.trace`. keys (n,) uint32; starts (tiles + 1,) uint32; lists (pairs,) uint32, of the
-        last band; records (n,) of the struct `Splat`; raw (4, rows, columns) float32: r, g, b, transmittance;
-        output images by name."""
+        """Render one view, and return the data between the stages: keys (n,) uint32; starts (tiles + 1,)
+        uint32; lists (pairs,) uint32, of the last band; records (n,) of the struct `Splat`; raw (4, rows,
+        columns) float32: r, g, b, transmittance; output images by name."""
         with self.workspace.rendering():
             frame = self._render_frame(resident, view, MemoryPlan(0, resident.count, 0))
         images = self.images_of(frame)

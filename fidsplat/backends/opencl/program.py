@@ -33,7 +33,7 @@ class _InvokerCache(dict[Any, Any]):
 
 @cache
 def load_invoker() -> None:
-    """Import the part of pyopencl that sets arguments, without its database."""
+    """Import pyopencl's code for kernel arguments without its database."""
     before, cl._PYOPENCL_NO_CACHE = cl._PYOPENCL_NO_CACHE, True
     invoker = importlib.import_module("pyopencl.invoker")
     cl._PYOPENCL_NO_CACHE = before

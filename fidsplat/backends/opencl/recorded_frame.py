@@ -1,7 +1,6 @@
-"""Frame replay: the command list of a frame is submitted again for another view of the same cloud.
-
-Only output images and numbers of the view differ, which takes the host much less time than planning a frame.
-On a CPU the host reads the counts before the lists are written, as in `render_sorted`.
+"""Frame replay: the command list of a frame is submitted again for another view of the same cloud. Only
+output images and numbers of the view are set, which is much faster than planning a frame. On a CPU the host
+reads the counts before the lists are written, as in `render_sorted`.
 """
 
 from __future__ import annotations
@@ -32,8 +31,8 @@ _ZERO = np.zeros(1, np.uint32)
 
 
 class RecordedFrame:
-    """The command list of a frame, and the arguments that differ between views. Cached by the cloud, so that
-    it must not reference the cloud."""
+    """The command list of a frame, and the arguments that differ between views. It must not reference the
+    cloud, which caches it."""
 
     def __init__(self, frame: DeviceFrame) -> None:
         self.workspace, self.commands, self.capacity = frame.workspace, frame.commands, frame.capacity
@@ -64,15 +63,15 @@ class RecordedFrame:
         if pool.state is not self.state:
             return False
         if view is not self._view:
-            _, arrays, numbers = self._views.get(id(view)) or self._learn(view)
+            _, arrays, numbers = self._views.get(id(view)) or self._cache_view(view)
             self.commands.set(numbers)
             self._view, self._arrays = view, arrays
         for name, array in self._arrays.items():
             _, event = pool.put(queue, name, array)
-            if event is not None:  # the buffer was overwritten by frames of other kinds
+            if event is not None:  # other frames have overwritten the buffer
                 self._uploads.append(event)
         if not self._waits:
-            pool.zeroed("tallies", self._tallies, queue)  # frames of other kinds do not clear it
+            pool.zeroed("tallies", self._tallies, queue)  # other frames do not clear it
         return pool.state is self.state
 
     def submit(self, queue: cl.CommandQueue, splats: int) -> Rendered | None:
@@ -121,7 +120,7 @@ class RecordedFrame:
         frame.events, frame.stages = events, self._stages.copy()
         frame.counted, frame.stats = events[self._counted - 1], rendered.stats
 
-    def _learn(self, view: View) -> tuple[View, dict[str, np.ndarray], dict[str, Any]]:
+    def _cache_view(self, view: View) -> tuple[View, dict[str, np.ndarray], dict[str, Any]]:
         own = projection_arrays(ViewBatch.single(view), self._source, 0, self._rows)
         for name in self._source.view_arrays:
             own[name] = view.array(name)
@@ -131,10 +130,10 @@ class RecordedFrame:
             self._views.clear()
             self._bytes = 0
         self._bytes += size
-        # keep the view alive, so that no other view has its id
-        learned = view, self._arrays | own, numbers_of(view, self._source)
-        self._views[id(view)] = learned
-        return learned
+        # a reference to the view, so that no other view has its id
+        cached = view, self._arrays | own, numbers_of(view, self._source)
+        self._views[id(view)] = cached
+        return cached
 
 
 class Replay:

@@ -24,7 +24,7 @@ _VECTOR = 16
 
 
 class Resident(ResidentData):
-    """Base of the clouds on an OpenCL device."""
+    """Base class of clouds on an OpenCL device."""
 
     streamed = False
     """whether every frame copies the cloud to the device, a chunk at a time"""
@@ -62,8 +62,8 @@ class Resident(ResidentData):
 
 
 class UploadedCloud(Resident):
-    """A SplatCloud on the device. A CPU reads the host's arrays. Other devices have copies, of labels and
-    colours from their first use on; a cloud of more than half of the memory budget is `streamed`."""
+    """A SplatCloud on the device. A CPU reads the host's arrays. Other devices have copies; labels and
+    colours are copied on first use. A cloud of more than half of the memory budget is `streamed`."""
 
     def __init__(self, workspace: Workspace, cloud: SplatCloud) -> None:
         super().__init__(len(cloud))
@@ -96,7 +96,7 @@ class UploadedCloud(Resident):
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes on the device; 0 where it reads the host's arrays."""
+        """Bytes on the device; 0 if it reads the host's arrays."""
         return 0 if self._shared else super().memory_bytes
 
     def color_range(self) -> tuple[float, float]:
@@ -111,7 +111,7 @@ class UploadedCloud(Resident):
         return self._region(self._whole(name), first, end, self._array(name).nbytes // max(self.count, 1))
 
     def _array(self, name: str) -> np.ndarray:
-        """The array on the host; splat ids are made when a frame first reads them."""
+        """The array on the host; splat ids are created on first use."""
         if name == "splat_ids" and name not in self._arrays:
             self._arrays[name] = np.arange(self.count, dtype=np.int32)
         return self._arrays[name]

@@ -20,7 +20,7 @@ class DeviceShape:
     tile_width: int
     tile_height: int
     chunks: int
-    """number of pieces into which the counting sorts divide their input (`ordered`)"""
+    """number of blocks into which the counting sorts divide their input (`ordered`)"""
     radix_bits: int
     """bits per pass of the depth sort (`ordered`)"""
     scan_items: int
@@ -28,11 +28,12 @@ class DeviceShape:
     k_buffer_size: int
     """fragments of a pixel that the k-buffer sorts by depth at once; at most 254, or 31 in `group`"""
     rows: int = 2
-    """pixels that a work-item blends, one below the other (`group`)"""
+    """pixels in a column that a work-item blends (`group`)"""
     tape: int = 1024
-    """fragments of a tile stored for the backward pass (`lanes`), 2 KiB each; others are computed twice"""
+    """splats of a tile whose fragments are stored for the backward pass (`lanes`), 2 KiB each; other
+    fragments are computed twice"""
     batch: int = 1
-    """splats that a work-item of the project stage sets up: more than one are vectorised (`lanes`)"""
+    """splats that a work-item of the project stage sets up, vectorised if more than 1 (`lanes`)"""
     dialect: str = ""
     """file of kernels/opencl/dialect/ with a vendor's instructions; empty: portable, bit-identical kernels"""
 
@@ -84,7 +85,7 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
     if kind == "schedule":
         return {"groups": _groups(own, 16 if own.schedule == "lanes" else 8)}
     if kind == "k_buffer":
-        # a little more than the fragments that groups keep in registers
+        # slightly more fragments than groups keep in registers
         few = replace(_groups(own, 8), k_buffer_size=1), replace(_groups(own, 8), k_buffer_size=4)
         return {
             **{f"own, k-buffer of {size}": replace(own, k_buffer_size=size) for size in (1, 3)},
@@ -113,7 +114,7 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
 
 
 def _groups(own: DeviceShape, side: int) -> DeviceShape:
-    """The schedule of a GPU with tiles of side x side pixels, those of 8 for small frames."""
+    """Shape with the schedule of a GPU and tiles of side x side pixels; side 8 as for small frames."""
     groups = replace(own, schedule="group", lists="tiled", lanes=1, scan_items=64, k_buffer_size=8, batch=1)
     if side == 8:
         return small_frame_shape(groups)

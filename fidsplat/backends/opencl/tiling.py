@@ -1,7 +1,7 @@
 """Tile binning: the splats of each tile, in depth order.
 
 `ordered` (CPU): all visible splats are sorted by depth, then appended to tile lists in that order, by
-counting sorts over a few contiguous pieces: long sequential loops, no atomics. `tiled` (GPU): the projection
+counting sorts over a few contiguous blocks: long sequential loops, no atomics. `tiled` (GPU): the projection
 counts the splats of each tile, (splat, tile) pairs are written in any order, and each tile's list is sorted
 in local memory. `local`: like `tiled`, with counters in local memory, for many small views and for stores,
 where atomics of neighbouring splats on one tile's counter would serialise.
@@ -30,7 +30,8 @@ _GROUP_SPLATS = 4096
 _ITEMS = 256
 """work-group size: BIN_ITEMS and SORT_ITEMS of the kernels"""
 _START_TILES, _START_SHARES = 512, 32
-"""tiles of a work-group of tile_starts, and maximum number of work-groups: each reads all list lengths"""
+"""tiles per work-group of the kernel `tile_starts`, and maximum number of work-groups, each of which reads
+all list lengths"""
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 
 
@@ -153,9 +154,9 @@ class Packed(NamedTuple):
     """Splats of a band of rows, projected in chunks."""
 
     count: int
-    """number of splats; an estimate if it exceeds the capacity"""
+    """number of stored splats; an estimate if it exceeds the capacity"""
     visible: int
-    """counts of the complete frame over the chunks projected so far"""
+    """visible splats of the complete frame in the chunks projected so far"""
 
 
 def pack_visible(frame: DeviceFrame, top: int, end: int) -> Packed:
@@ -178,7 +179,8 @@ def pack_visible(frame: DeviceFrame, top: int, end: int) -> Packed:
 
 
 def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[Packed, int]:
-    """Project and pack chunks until a capacity is exceeded; returns the numbers of (big) splats."""
+    """Project and pack chunks until a capacity is exceeded. Returns the packed splats, and the number of big
+    splats if it exceeded the capacity, else 0."""
     count, chunk, chunks = frame.resident.count, frame.plan.chunk, frame.shape.chunks
     out: dict[str, Any] = {f"{name}_out": buffer for name, buffer in packed.items()}
     total = visible = 0

@@ -27,7 +27,7 @@ _PANEL, _STRIP = 128, 64
 _SUMS, _SUMMED = 512, 128
 """work-groups of the loss sums, and their work-items (SUM_ITEMS of kernels/opencl/train/loss.cl)"""
 _EXPOSURE_GROUPS = 64
-"""work-groups of the sums by the exposure"""
+"""work-groups of the sums for the gradient of the exposure"""
 _EACH_ROWS = 4
 """rows per work-item of the vertical passes (EACH_ROWS of kernels/opencl/train/loss.cl)"""
 _MOMENTS = ("first_", "second_")
@@ -76,7 +76,7 @@ class ResidentArrays(Resident):
 
 
 class LossReadback:
-    """Ring buffer for the sums of the last losses, so that the host need not read each before the next."""
+    """Ring buffer for the sums of the last losses, which the host reads several at a time."""
 
     def __init__(self, workspace: Workspace, groups: int) -> None:
         """groups: number of work-groups, each with three sums."""
@@ -209,7 +209,7 @@ class OpenCLTraining:
         return found
 
     def resident(self, degree: int, origin: np.ndarray) -> ResidentArrays:
-        """The splats as a cloud to render, with SH up to `degree`; it changes with the training."""
+        """The splats in training as a cloud, with SH up to `degree`; it shares and changes with the state."""
         if self._resident is None or self._resident[0] != degree:
             count, rendered, every = self._count, (degree + 1) ** 2, self._shapes["sh"][1]
             shared = degree > 0 and rendered == every  # the coefficients are rendered as they are

@@ -71,7 +71,7 @@ def _numbers(view: View, row: int, end: int, record: np.dtype) -> list[float]:
         **{"log_cut": view.log_cut, "width": view.width, "height": view.height},
         **{"filter": 1.0 / view.samples**2, "band": row, "band_end": end, "slopes": view.slopes},
     }
-    # members of a lens and its map follow the common members
+    # then the members of a lens and its ray map
     lens = iter(() if view.raster is None else view.raster.uniforms)
     flat: list[float] = []
     for name in record.names or ():

@@ -66,7 +66,7 @@ class Workspace:
             try:
                 yield
             except BaseException as error:
-                self.pool.forget_zeros()
+                self.pool.invalidate_zeros()
                 for queue in (self.queue, self.replay_queue):
                     with suppress(cl.Error):
                         queue.finish()

@@ -1,7 +1,8 @@
 """Reference backend: NumPy in float64, each sample of the frame against each splat, without tiles.
 
-It has the float32 inputs of other backends and makes the same decisions (docs/correctness.md). In addition to
-the outputs it returns certificates: upper bounds of the error of each pixel for rendering in float32.
+It reads the same float32 inputs as the other backends and applies the same thresholds (docs/correctness.md).
+In addition to the outputs it returns certificates: upper bounds of the error of each pixel for rendering in
+float32.
 """
 
 from fidsplat.backends.reference.backend import ReferenceBackend, devices, open_device

@@ -30,7 +30,7 @@ _BLOCK = (
 )  # (sample, splat) pairs that are evaluated at once: arrays of half a megabyte, which fit the cache
 _TILE = 16  # samples along a side of a tile, for which splats are culled together
 _WIDEST = 128  # maximum side of a tile, for samples that are far apart
-_FEW = 16  # tiles with fewer samples are widened: culling once more would take longer than extra splats
+_FEW = 16  # tiles with fewer samples are enlarged: another culling would take longer than the extra splats
 
 
 def devices() -> list[DeviceInfo]:
@@ -116,7 +116,7 @@ class ReferencePipeline(Pipeline):
         ]
         start = time.perf_counter()
         self._progress = _Progress(progress, rows.size * view.samples**2)
-        # the tiles of the complete frame, so that sums have the same order
+        # tiles as in the complete frame, so that sums have the same order
         flat = self.pixels(resident, view, rows.ravel(), columns.ravel(), widest=_TILE)
         images = {name: image.reshape(1, *rows.shape, *image.shape[1:]) for name, image in flat.items()}
         took = (time.perf_counter() - start) * 1e3
@@ -124,7 +124,7 @@ class ReferencePipeline(Pipeline):
         return HostImages(images, {"reference": took}, {"splats": count, "visible": count, "pairs": 0})
 
     def trace(self, resident: ReferenceCloud, view: View) -> dict[str, np.ndarray]:
-        """The depth order, the float32 keys, and the finished images with the certificate."""
+        """Render one view; returns the depth order, the float32 keys, and the images with the certificate."""
         splats = Setup(resident.cloud, view, self.features)
         images = self.render_view(resident, view).arrays_of(0)
         return {"order": splats.order, "keys": splats.key, **images}
@@ -171,8 +171,8 @@ class ReferencePipeline(Pipeline):
     def _exposed(
         self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray, widest: int
     ) -> dict[str, np.ndarray]:
-        """Combine the samples of several sub-frames: colour, fog and transmittance are averaged, other
-        outputs are from the middle sub-frame, as is `certificate_middle`."""
+        """Combine the samples of several sub-frames: colour, fog and transmittance are averaged; other
+        outputs and `certificate_middle` are from the middle sub-frame."""
         out: dict[str, np.ndarray] = {}
         rows_of = [
             (y > sub_frame.top) & (y < sub_frame.top + sub_frame.view.height) for sub_frame in view.sub_frames
@@ -191,8 +191,8 @@ class ReferencePipeline(Pipeline):
 
 
 def _by_tile(view: View, x: np.ndarray, y: np.ndarray, widest: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sort samples by tile: their indices (k,), and the start of each tile except the first. Tiles are up to
-    `widest` samples wide where samples are far apart."""
+    """Sort samples by tile; returns their indices (k,), and the start of each tile except the first. Tiles
+    are up to `widest` samples wide where samples are far apart."""
     side = _TILE
     while True:
         tile = y // side * view.width + x // side

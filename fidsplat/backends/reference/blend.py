@@ -1,4 +1,4 @@
-"""Blending: compositing of fragments and coplanar layers, with the same decisions as on devices."""
+"""Blending: compositing of fragments and coplanar layers, with the same thresholds as on devices."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ SPREAD_NEAR = 0.2
 MIN_ALPHA = 1 / 255
 """minimum alpha of a sample with a label, depth or normal, at any cut-off"""
 _ROUND = 2.0**-24  # relative rounding error of a transmittance per composited fragment
-_SURE = 5e-5
-"""relative error of a depth up to which it is compared with a device: half of the tolerance"""
+_EXACT_DEPTH = 5e-5
+"""maximum relative error of a depth that is compared with a device: half of the tolerance"""
 
 
 def composite(
@@ -75,14 +75,14 @@ def composite(
         last, found, may_flip = median_of(before, alpha, contributes, span)
         out["depth_median"] = _pick(z, last, found, 0.0)
         out["depth_median_may_flip"] = may_flip | (
-            _pick(span.z_high - span.z_low, last, found, 0.0) > _SURE * out["depth_median"]
+            _pick(span.z_high - span.z_low, last, found, 0.0) > _EXACT_DEPTH * out["depth_median"]
         )
         first = contributes & (before * (1 - alpha) <= view.first_light)
         out["depth_first"] = _pick(z, _first(first), np.asarray(first.any(1)), 0.0)
         out["depth_first_may_flip"] = error_bounds.of_first(span, view.first_light)
         out["depth_first_may_flip"] |= (
             _pick(span.z_high - span.z_low, _first(first), np.asarray(first.any(1)), 0.0)
-            > _SURE * out["depth_first"]
+            > _EXACT_DEPTH * out["depth_first"]
         )
     if "normal" in features.names:
         out["normal"] = _sum(weight, ordered.normal)
@@ -126,7 +126,7 @@ def transmittance(
 
 
 def _first(values: np.ndarray) -> np.ndarray:
-    """Index (k,) of the first maximum of each row (k, n)."""
+    """Index (k,) of the first maximum in each row (k, n)."""
     return np.argmax(values, axis=1) if values.shape[1] else np.zeros(len(values), int)
 
 
@@ -140,13 +140,14 @@ def median_of(
     before: np.ndarray, alpha: np.ndarray, contributes: np.ndarray, span: error_bounds.Span
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the fragment or layer of the median depth: the last with a transmittance above 0.5 in front of it.
-    Consecutive fragments that together absorb less than `MIN_ALPHA` count as the last of them.
+    A run of fragments that together absorb less than `MIN_ALPHA` is represented by its last fragment.
 
     before, alpha: (k, m) transmittance in front of m fragments or layers, and their opacity. contributes: (k,
-    m) bool. Returns (k,) index; whether there is one; whether rounding to float32 may choose another.
+    m) bool. Returns (k,) index; whether there is a median; whether rounding to float32 may select another
+    fragment.
     """
     k = len(before)
-    last, left = np.full(k, -1), np.ones(k)  # left: transmittance behind the last fragment that counted
+    last, left = np.full(k, -1), np.ones(k)  # left: transmittance behind the last represented fragment
     may_flip, slack = np.zeros(k, bool), np.zeros(k)
     may = (span.high > 0) & (span.front_high > 0.5 * (1 - error_bounds.STOP))
     must = (span.low > 0) & (span.front_low > 0.5 * (1 + error_bounds.STOP))

@@ -33,7 +33,7 @@ class Axes:
     area: np.ndarray
     """|a x b|"""
     third: np.ndarray
-    """half axis of the ellipsoid conjugate to a and b; 0 for disks"""
+    """semi-axis of the ellipsoid conjugate to a and b; 0 for disks"""
     inverse_m2: np.ndarray
     """1 / |W p|^2; 0 for disks"""
     faint: np.ndarray
@@ -57,7 +57,7 @@ def exact(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View) -> Ax
     m = np.linalg.norm(white, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         e3 = white / m[:, None]
-        # perpendicular to the longest axis, to avoid cancellation
+        # cross product with the longest axis, to avoid cancellation
         e2 = np.cross(e3, np.eye(3)[np.argmax(scales, axis=1)])
         length = np.linalg.norm(e2, axis=1)
         e2 = np.where((length > 0)[:, None], e2 / length[:, None], np.roll(e3, 1, axis=1))

@@ -19,7 +19,7 @@ from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
 
 _ROUND = ROUND
-_WEIGHT = 2 * _ROUND  # relative error of half rho and of an opacity: a division, two products, exp
+_WEIGHT = 2 * _ROUND  # relative error of rho / 2 and of an opacity: a division, two products, exp
 _DEPTH = _ROUND  # relative error of a depth in addition to its denominator's: numerator, division, product
 STOP = 5e-5
 """relative error of a transmittance that is compared with a threshold"""
@@ -150,7 +150,7 @@ def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np
 
 
 def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Error bound (k,) of colour and alpha. moved (k, m): that of each fragment's own colour."""
+    """Error bound (k,) of colour and alpha. moved (k, m): error bound of each fragment's own colour."""
     bound = (before * (span.high - span.low)).sum(1)
     t_low = span.front_low * (1 - span.high) * (1 - STOP)
     t_high = span.front_high * (1 - span.low) * (1 + STOP)
@@ -169,8 +169,8 @@ def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.nda
 
 
 def of_layer_color(thin: np.ndarray, thick: np.ndarray) -> np.ndarray:
-    """Error bound (k, 1) of a layer's colour, per unit of light in front of it; its n splats have optical
-    depths (k, n) between `thin` and `thick`."""
+    """Error bound (k, 1) of the colour of a layer of n splats, per unit of transmittance in front of it. The
+    splats have optical depths (k, n) between `thin` and `thick`."""
     lowest = thin.sum(1, keepdims=True)
     others = thick.sum(1, keepdims=True) - thick
     # maximum derivative of the layer's colour with respect to one splat's optical depth
@@ -209,7 +209,7 @@ def of_layer_depth(
 
 
 def first_column(mask: np.ndarray, start: int) -> np.ndarray:
-    """First column (k,) from `start` on where mask (k, m) is set; start + m if none."""
+    """Index (k,), plus `start`, of the first column where mask (k, m) is set; start + m if none is set."""
     k, m = mask.shape
     return start + np.where(mask.any(1), np.argmax(mask, axis=1), m) if m else np.full(k, start)
 
@@ -239,11 +239,10 @@ def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
 
 
 def of_layers(span: Span, lift: np.ndarray, place: np.ndarray) -> tuple[Span, np.ndarray]:
-    """The same as `of_order` for fragments in the order of the splats' centres between layers sorted by
-    depth.
+    """Bounds as in `of_order`, for fragments in the order of the splats' centres and layers sorted by depth.
 
-    Two fragments may also swap where rounding decides whether a layer is between them. place (k, m): position
-    in the order of centres; negative for layers.
+    Two fragments may also swap if rounding decides whether a layer is between them. place (k, m): position in
+    the order of centres; negative for layers.
     """
     near, far = _sort_depths(span, lift)
     may, layered = span.high > 0, place < 0
@@ -255,7 +254,7 @@ def of_layers(span: Span, lift: np.ndarray, place: np.ndarray) -> tuple[Span, np
     unsure = np.zeros(len(may), bool)
     for exists, surely, low, high in zip(*(each.T[:, :, None] for each in own), strict=True):
         meets = may & (far >= low) & (near <= high)
-        unsure |= exists[:, 0] & (~surely[:, 0] | (meets.sum(1) > 1))  # it meets itself
+        unsure |= exists[:, 0] & (~surely[:, 0] | (meets.sum(1) > 1))  # a layer overlaps itself
     rows = np.flatnonzero(unsure)
     if len(rows) == 0:
         return span, bound
@@ -312,7 +311,8 @@ def of_depth(span: Span, weight: np.ndarray, z: np.ndarray) -> dict[str, np.ndar
 
 
 def of_first(span: Span, light: float) -> np.ndarray:
-    """(k,) bool: whether rounding may change the first fragment behind `light` transmittance."""
+    """(k,) bool: whether rounding may change the first fragment behind which transmittance is below
+    `light`."""
     high, low = span.high, span.low
     may = (high > 0) & (span.front_low * (1 - high) * (1 - STOP) <= light)
     sure = (low > 0) & (span.front_high * (1 - low) * (1 + STOP) <= light)
@@ -329,7 +329,7 @@ def of_count(span: Span, count: np.ndarray, bound: np.ndarray, stop: float) -> n
 
 
 def of_label(span: Span, labels: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """Whether rounding may give samples another label (k,), or none."""
+    """(k,) bool: whether rounding may change the label of a sample."""
     own = labels == label[:, None]
     heaviest = np.where(own, span.front_low * span.low, 0.0).max(1, initial=0.0)
     other = np.where(own, 0.0, span.front_high * span.high).max(1, initial=0.0)

@@ -30,8 +30,8 @@ class Surface:
         return np.isfinite(self.z)
 
     def occlude(self, f: Fragments, span: Span) -> Span:
-        """Remove fragments at the surface or behind it. The opacity interval of a fragment that rounding may
-        move behind the surface starts at 0."""
+        """Remove fragments at or behind the surface. If rounding may move a fragment behind the surface, its
+        opacity interval starts at 0."""
         z = self.z[:, None]
         f.alpha = np.where(f.z < z, f.alpha, 0.0)
         return Span.of(

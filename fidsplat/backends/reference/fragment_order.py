@@ -12,7 +12,8 @@ from fidsplat.backends.reference.fragments import Fragments, optical_depth
 from fidsplat.backends.reference.setup import Setup
 
 COPLANAR_BIAS = 2.0**-16
-"""share of its depth by which a coplanar layer counts as nearer: more than rounding errors, but invisible"""
+"""fraction of its depth by which a coplanar layer is sorted nearer: more than rounding errors, but
+invisible"""
 
 
 @dataclass
@@ -20,21 +21,21 @@ class OrderedFragments:
     """Fragments and layers of k samples, m each, in compositing order."""
 
     alpha: np.ndarray
-    """(k, m), as are z [m], labels, moved, label_may_flip"""
+    """(k, m); also z [m], labels, moved, label_may_flip"""
     z: np.ndarray
     span: Span
     colors: np.ndarray
-    """(m, 3) or (k, m, 3), as is normal"""
+    """(m, 3) or (k, m, 3); also normal"""
     normal: np.ndarray
     labels: np.ndarray
     ids: np.ndarray
-    """index in the depth order; for a layer, of the splat with the largest weight"""
+    """index in the depth order; for a layer, the index of the splat with the largest weight"""
     count: np.ndarray
     """number of splats blended in each fragment or layer"""
     count_bound: np.ndarray
     """error bound of this number, if the fragment contributes"""
     moved: np.ndarray
-    """error bound of a layer's mean colour, per unit of light in front of it"""
+    """error bound of a layer's mean colour, per unit of transmittance in front of it"""
     label_may_flip: np.ndarray
     """bool: whether rounding may change the layer's label"""
     id_may_flip: np.ndarray
@@ -107,8 +108,8 @@ def by_layers(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
 
 
 def _with_layers(s: Setup, f: Fragments, span: Span) -> tuple[OrderedFragments, np.ndarray, np.ndarray]:
-    """Fragments (k, n) of splats without a group, then layers (k, p); the length by which each counts as
-    nearer; and the order of ties (n + p,), negative for layers."""
+    """Fragments (k, n) of splats without a group, then layers (k, p); the depth bias of each [m]; and the
+    order of ties (n + p,), negative for layers."""
     groups = np.full(f.alpha.shape[1], -1) if s.coplanar_groups is None else s.coplanar_groups
     plain = np.flatnonzero(groups < 0)
     members = [np.flatnonzero(groups == group) for group in np.unique(groups[groups >= 0])]
@@ -151,7 +152,7 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> OrderedFra
     """Layer (k, 1) of the splats (indices) of a coplanar group."""
     alpha, z, z_low, z_high = (each[:, splats] for each in (f.alpha, f.z, span.z_low, span.z_high))
     low, high = span.low[:, splats], span.high[:, splats]
-    boxes = bool(s.box[splats[0]])  # a plane has one footprint
+    boxes = bool(s.box[splats[0]])  # all splats of a group have one footprint
     tau = alpha if boxes else optical_depth(alpha)
     total = tau.sum(1, keepdims=True)
     share = tau / np.where(total > 0, total, 1)

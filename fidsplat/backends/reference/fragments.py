@@ -13,7 +13,7 @@ from fidsplat.backends.view import View
 
 _NO_EDGES = np.zeros((4, 0))
 HALF_RHO_OF_RANGE = math.log(255)
-"""where a splat is 1/255 of its opacity"""
+"""rho / 2 at which a splat is 1/255 of its opacity"""
 MAX_OPTICAL_DEPTH = 24 * math.log(2)
 """optical depth at which the transmittance is 0 in float32"""
 
@@ -37,7 +37,7 @@ class Fragments:
     alpha: np.ndarray
     z: np.ndarray
     edges: np.ndarray
-    """results of `edges_of`, if there are boxes"""
+    """results of `edges_of` for clouds with boxes"""
     edge_terms: np.ndarray
 
 
@@ -76,8 +76,8 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
 
 
 def bulged(inverse_m2: np.ndarray, d: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert D and q = n_u^2 + n_v^2 (k, n) of equivalent disks to those of 3D Gaussians: both grow so that
-    rho = q / D^2 is divided by 1 + rho / m^2. inverse_m2 (n,): 0 for disks."""
+    """Convert D and q = n_u^2 + n_v^2 (k, n) of equivalent disks to D and q of 3D Gaussians: rho = q / D^2 is
+    divided by 1 + rho / m^2. inverse_m2 (n,): 0 for disks."""
     if not inverse_m2.any():
         return d, q
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -103,6 +103,7 @@ def optical_depth(alpha: np.ndarray) -> np.ndarray:
 
 
 def shifted(after: np.ndarray, last: bool = False) -> np.ndarray:
-    """Transmittance in front of each fragment (k, n) from that behind it. last: append the final."""
+    """Transmittance in front of each fragment (k, n), from the transmittance behind it. last: append the
+    final transmittance."""
     before = np.concatenate([np.ones((len(after), 1)), after], axis=1)
     return before if last else before[:, :-1]

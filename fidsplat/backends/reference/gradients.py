@@ -61,7 +61,8 @@ class FrozenFrame:
         return {name: image.reshape(height, width, *image.shape[1:]) for name, image in whole.items()}
 
     def backward(self, gradients: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Gradients with respect to the parameters, and `screen`, from those with respect to the images."""
+        """Gradients with respect to the parameters, and `screen`, from gradients with respect to the
+        images."""
         view, parameters = self._view, self.parameters
         flat = {}
         for name in GRADIENT_OUTPUTS:

@@ -1,4 +1,5 @@
-"""Samples as functions of placed splats, with the frame's decisions held constant, and their derivatives."""
+"""Samples as functions of splats in the camera frame, with thresholds and order held constant, and their
+derivatives."""
 
 from __future__ import annotations
 
@@ -28,19 +29,21 @@ class Decisions:
     order: np.ndarray
     """(m,) int: the cloud's splats, nearest first"""
     contributes: np.ndarray
-    """above the cut-off, and blended before the stop"""
+    """whether alpha is above the cut-off and blended before the stop"""
     by_disc: np.ndarray
-    """the low-pass disc has the larger weight"""
+    """whether the low-pass disc has the larger weight"""
     clamped: np.ndarray
-    """clamped to the maximum alpha"""
+    """whether alpha is clamped to its maximum"""
     missed: np.ndarray
-    """the ray does not meet the plane beyond `near`: the fragment has the depth of the centre"""
+    """whether the ray does not meet the plane beyond `near`, so that the fragment has the depth of the
+    centre"""
     mirrored: np.ndarray
-    """the depth is mirrored at a circle"""
+    """whether the depth is mirrored at a circle"""
     wide: np.ndarray
-    """mirrored at the disc's circle, not at the circle where the splat is 1/255 of its opacity"""
+    """whether it is mirrored at the disc's circle instead of the circle where the splat is 1/255 of its
+    opacity"""
     covered: np.ndarray
-    """(k,): the coverage suffices for depths and normals"""
+    """(k,): whether the coverage suffices for depths and normals"""
 
 
 def decide(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
@@ -78,7 +81,7 @@ class Samples:
     inverse: np.ndarray
     """sum of weights times inverse depths (`inverse_depth`)"""
     squares: np.ndarray
-    """sum of weights times their squares"""
+    """sum of weights times squared inverse depths"""
 
 
 class Blend:
@@ -103,7 +106,7 @@ class Blend:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             disc = self._disc_x**2 + self._disc_y**2
             half_rho = np.where(made.by_disc, disc, plane)
-            # share of the way from the centre's depth to the depth on the plane
+            # interpolation factor from the centre's depth to the depth on the plane
             circle = np.where(made.wide, disc, HALF_RHO_OF_RANGE)
             self._share = np.where(made.mirrored, circle / plane, 1.0)
             z = self._pz + self._share * (z_plane - self._pz)
@@ -128,7 +131,7 @@ class Blend:
         )
 
     def backward(self, by: Samples) -> Placed:
-        """Derivatives of a loss by the placed splats, from its derivatives by the samples."""
+        """Derivatives of a loss with respect to the splats, from derivatives with respect to the samples."""
         made = self._made
         by_inverse = by.inverse[:, None] + 2 * by.squares[:, None] * self._inverse
         by_inverse = np.where(self._z > SPREAD_NEAR, by_inverse, 0.0)
@@ -164,8 +167,8 @@ class Blend:
         return out
 
     def _by_opacity(self, by: Samples) -> np.ndarray:
-        """Derivatives (k, m) with respect to the fragments' opacities: the value of a fragment's own colour
-        minus that of the colour behind it, from back to front."""
+        """Derivatives (k, m) with respect to the fragments' opacities: the term of a fragment's own colour
+        minus the term of the colour behind it, from back to front."""
         worth = by.rgb @ self._rgb.T + by.normal @ self._facing.T + by.depth[:, None] * self._z
         worth = worth + by.weight[:, None] + by.inverse[:, None] * self._inverse
         worth = worth + by.squares[:, None] * self._inverse**2

@@ -73,7 +73,7 @@ class Placed:
     log_opacity: np.ndarray
     rgb: np.ndarray
     intrinsics: np.ndarray
-    """(n, 4), of derivatives: those with respect to fx, fy, cx, cy by splat, except through `center`"""
+    """(n, 4), only for derivatives: with respect to fx, fy, cx, cy by splat, except through `center`"""
 
     @classmethod
     def zeros(cls, n: int) -> Placed:
@@ -86,7 +86,7 @@ class Placed:
 
 
 def motion_of(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (3, 3) and translation (3,) of a motion given as rotation vector and translation (6,)."""
+    """Convert a rotation vector and translation (6,) to a rotation matrix (3, 3) and a translation (3,)."""
     angle = np.linalg.norm(pose[:3])
     if angle == 0:
         return np.eye(3), pose[3:]
@@ -123,13 +123,13 @@ def place(parameters: Parameters, view: View) -> Placed:
 
 
 def place_backward(parameters: Parameters, view: View, placed: Placed, slopes: Placed) -> dict:
-    """Derivatives with respect to the parameters from those of the placed splats."""
+    """Derivatives with respect to the parameters, from derivatives with respect to the transformed splats."""
     rotation = view.rotation
     by_color, by_ray = _rgb_backward(parameters, _eye(parameters, view), slopes.rgb)
     by_p = slopes.p + center_backward(view, placed.p, slopes.center)
     pairs = [(slopes.unit_a, placed.unit_a), (slopes.unit_b, placed.unit_b), (by_p, placed.p)]
     turned = sum(np.cross(at, slope).sum(0) for slope, at in pairs)
-    # moving the camera by t moves its centre by -t; the rotation is about the centre
+    # a translation by t moves the camera centre by -t; the rotation is about the centre
     moved = by_p.sum(0) + by_ray.sum(0) @ rotation.T
     with np.errstate(divide="ignore", invalid="ignore"):
         by_opacity = slopes.log_opacity / parameters.opacities
@@ -151,7 +151,8 @@ def place_backward(parameters: Parameters, view: View, placed: Placed, slopes: P
 
 
 def center_backward(view: View, p: np.ndarray, by_center: np.ndarray) -> np.ndarray:
-    """Derivatives (n, 3) with respect to centres, from those (n, 2) with respect to their projections."""
+    """Derivatives (n, 3) with respect to centres, from derivatives (n, 2) with respect to their
+    projections."""
     with np.errstate(divide="ignore", invalid="ignore"):
         across = by_center * (view.focal_x, view.focal_y) / p[:, 2:]
         by_p = np.column_stack([across, -(across * p[:, :2]).sum(1) / p[:, 2]])

@@ -1,7 +1,7 @@
 """Weights and depths of splats along rays, with their derivatives: disks, and 3D Gaussians exact and by EWA.
 
-The formulas differ from those of set-up and devices, so that each finds mistakes of the other: ray-plane
-intersection, maximum of a Gaussian along a ray, inverse of a projected covariance.
+The formulas differ from the formulas of setup.py and devices, so that a comparison finds mistakes in either:
+ray-plane intersection, maximum of a Gaussian along a ray, inverse of a projected covariance.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from fidsplat.effects import FeatureSet
 
 
 class Shapes(Protocol):
-    """n splats of one kind along the rays of k samples."""
+    """n splats of one primitive along the rays of k samples."""
 
     half_rho: np.ndarray
     """(k, n) half the squared distance, in standard deviations"""
@@ -38,7 +38,7 @@ class Shapes(Protocol):
         by_facing: np.ndarray,
         by_faint: np.ndarray,
     ) -> None:
-        """Add derivatives of a loss with respect to the splats to `out`, from those with respect to the
+        """Add derivatives of a loss with respect to the splats to `out`, from derivatives with respect to the
         attributes. used: (k, n) where half_rho or z counts; elsewhere they may be infinite."""
         ...
 
@@ -46,7 +46,7 @@ class Shapes(Protocol):
 def shapes_of(
     placed: Placed, view: View, features: FeatureSet, x: np.ndarray, y: np.ndarray
 ) -> list[tuple[np.ndarray, Shapes]]:
-    """Indices of the splats of each kind, and the splats."""
+    """Indices of the splats of each primitive, and their shapes."""
     thick = placed.scales[:, 2] > 0
     flat, solid = np.flatnonzero(~thick), np.flatnonzero(thick)
     rays = rays_of(view, x, y)[0][:, None, :]
@@ -60,7 +60,7 @@ def shapes_of(
 
 
 def _by_intrinsics(by_rays: np.ndarray, rays: np.ndarray, view: View) -> np.ndarray:
-    """Derivatives (n, 4) with respect to fx, fy, cx, cy, from those (k, n, 3) with respect to rays."""
+    """Derivatives (n, 4) with respect to fx, fy, cx, cy, from derivatives (k, n, 3) with respect to rays."""
     across = -by_rays[..., :2] / (view.focal_x, view.focal_y)
     return np.concatenate([(across * rays[..., :2]).sum(0), across.sum(0)], axis=1)
 
@@ -108,7 +108,7 @@ class _Solid:
         third = np.cross(placed.unit_a, placed.unit_b)
         self._axes = np.stack([placed.unit_a, placed.unit_b, third], axis=1)
         """(n, 3, 3), in rows"""
-        # relative to the shortest axis, which changes no direction
+        # relative to the shortest axis, which does not change the direction
         self._shares = (placed.scales.min(axis=1)[:, None] / placed.scales) ** 2
         self._along = np.einsum("nkc,nc->nk", self._axes, placed.p)
         normal = np.einsum("nk,nkc->nc", self._along * self._shares, self._axes)
@@ -116,7 +116,7 @@ class _Solid:
         self.facing = -normal / self._length
 
     def _finish(self, out: Placed, by_axes: np.ndarray, by_facing: np.ndarray) -> None:
-        """Add the derivatives by the normals, and those by all axes (n, 3, 3)."""
+        """Add the derivatives with respect to the normals and to all axes (n, 3, 3)."""
         across = by_facing - self.facing * (self.facing * by_facing).sum(1, keepdims=True)
         by_normal = -across / self._length
         by_share = np.einsum("nkc,nc->nk", self._axes, by_normal)
@@ -132,8 +132,8 @@ class _Solid:
 
 
 class _Ellipsoids(_Solid):
-    """The maximum along each ray: with y the centre and r the ray after whitening, at the distance |y x r| /
-    |r|."""
+    """3D Gaussians by their maximum along each ray: after whitening, at distance |y x r| / |r| from the ray r
+    to the centre y."""
 
     def __init__(self, placed: Placed, rays: np.ndarray, view: View) -> None:
         super().__init__(placed)
@@ -162,8 +162,7 @@ class _Ellipsoids(_Solid):
 
 
 class _Projected(_Solid):
-    """3D Gaussians by EWA: their covariance in the image by the Jacobian at the centre, plus 0.3 square
-    pixels."""
+    """3D Gaussians by EWA: image covariance by the Jacobian at the centre, plus 0.3 square pixels."""
 
     def __init__(self, placed: Placed, view: View, antialiased: bool, x: np.ndarray, y: np.ndarray) -> None:
         super().__init__(placed)
@@ -176,7 +175,7 @@ class _Projected(_Solid):
         scaled = self._axes * placed.scales[..., None]
         self._flat = scaled[..., :2] - scaled[..., 2:] * self._slopes[:, None]
         self._images = self._flat * self._per[:, None]
-        """(n, 3, 2) of the scaled axes [samples]"""
+        """(n, 3, 2) projections of the scaled axes [samples]"""
         across, down = self._images[..., 0], self._images[..., 1]
         self._crossed = np.cross(across, down)
         self._own = (self._crossed**2).sum(1)
@@ -194,7 +193,7 @@ class _Projected(_Solid):
     def backward(self, out, by_half_rho, by_z, used, by_facing, by_faint) -> None:
         pz, per, scales = self._p[:, 2:], self._per, self._scales
         out.center -= np.einsum("kn,kni->ni", by_half_rho, self._pull)
-        # by the covariance C: half_rho has -(C^-1 d)(C^-1 d)^T / 2
+        # with respect to the covariance C: half_rho has -(C^-1 d)(C^-1 d)^T / 2
         by_covariance = -0.5 * np.einsum("kn,kni,knj->nij", by_half_rho, self._pull, self._pull)
         by_images = np.zeros_like(self._images)
         if self._antialiased:

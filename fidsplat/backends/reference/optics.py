@@ -15,7 +15,7 @@ from fidsplat.backends.view import View
 ROUND = 4 * 2.0**-24
 """rounding error of a form relative to its terms, from its coefficients and sums"""
 ROUND_OF_RAYS = 6 * 2.0**-24
-"""the same for a lens: one more term, and the rounding of the distance from the anchor"""
+"""the same for a lens, with one more term and the rounding of the distance from the anchor"""
 
 
 @dataclass
@@ -31,7 +31,7 @@ class Samples:
 
 
 def samples_of(view: View, x: np.ndarray, y: np.ndarray) -> Samples:
-    """The samples at grid positions x, y (k,)."""
+    """Samples at grid positions x, y (k,)."""
     if view.raster is None:
         one = np.ones_like(x)
         return Samples(x[:, None], y[:, None], np.stack([one, x, y])[:, :, None], one[:, None] > 0)

@@ -1,4 +1,4 @@
-"""Post-processing of rgb after blending: background, and the steps of the sensor model."""
+"""Post-processing of rgb: background, and the steps of the sensor model."""
 
 from __future__ import annotations
 
@@ -52,8 +52,7 @@ def _panorama_at(panorama: Panorama, rays: np.ndarray) -> tuple[np.ndarray, np.n
 
     right, bottom = (u - left)[:, None], (v - top)[:, None]
     above, below = at(0, 0) * (1 - right) + at(1, 0) * right, at(0, 1) * (1 - right) + at(1, 1) * right
-    # directions are rounded by a few 1e-7 of a circle; near the poles this changes the longitude by any
-    # amount
+    # directions are rounded by a few 1e-7 of a circle, which changes the longitude near the poles arbitrarily
     near = np.stack([at(dx, dy) for dx in (-1, 0, 1, 2) for dy in (-1, 0, 1, 2)])
     contrast = (near.max(0) - near.min(0)).max(1)
     off = 1e-6 * (width * np.linalg.norm(rays, axis=1) / np.maximum(flat, 1e-12) + height)

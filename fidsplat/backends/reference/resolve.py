@@ -18,8 +18,8 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
     """Images of pixels (k, ...) from their sample buffers (k, n * n, ...), which include grid positions `x`,
     `y`.
 
-    Also their certificates, upper bounds of the error in float32: `certificate` of alpha, and of rgb per unit
-    of colour; `certificate_depth`, `certificate_distance` [m]; `certificate_normal` of unit vectors;
+    The result includes certificates, upper bounds of the error in float32: `certificate` of alpha, and of rgb
+    per unit of colour; `certificate_depth`, `certificate_distance` [m]; `certificate_normal` of unit vectors;
     `label_may_flip` and so on (bool); `blended_bound` in splats.
     """
     t, bound = samples["t"].mean(1), samples["certificate"]
@@ -35,7 +35,7 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
             unsure = unsure + samples["behind_bound"].mean(1)
         columns, rows = (np.floor(center / view.samples).astype(int) for center in (center_x, center_y))
         out["rgb"], out["certificate_rgb"] = apply_sensor(out["rgb"], unsure, steps, view, columns, rows)
-    bound = samples.get("certificate_middle", bound)  # the other outputs show one sub-frame
+    bound = samples.get("certificate_middle", bound)  # the other outputs are from one sub-frame
     if "alpha" in features.names:
         out["alpha"] = 1 - t
     if "distortion" in features.names:
@@ -51,8 +51,7 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
                 np.where(covered, samples[key], 0.0) for key in ("depth", "depth_moved", "weight")
             )
             out[name] = _ratio((depth * along).sum(1), weight.sum(1), 0.0)
-            # weight that may move from the nearest to the furthest fragment, in a mean with a weight of at
-            # least `minimum`
+            # weight that may shift from the nearest to the furthest fragment, if the sum exceeds `minimum`
             spread = np.where(covered, samples["furthest"] * along, -math.inf).max(1)
             spread -= np.where(covered, samples["nearest"] * along, math.inf).min(1)
             moved = bound_covered * np.where(bound_covered > 0, np.maximum(spread, 0), 0)

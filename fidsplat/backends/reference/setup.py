@@ -71,7 +71,7 @@ class Setup:
             further = reach * radius / np.where(box, 1.0, np.sqrt(2 * half_r2))
         within = np.where((groups >= 0) | self.by_depth, further, within)
         z_low, z_high = depth - within, depth + within
-        behind = depth < view.near  # fragments lie beyond `near`
+        behind = depth < view.near  # fragments are beyond `near`
         z_low, z_high = (
             np.where(behind, view.near, z_low),
             np.where(behind, np.maximum(view.near, z_high), z_high),
@@ -86,7 +86,7 @@ class Setup:
 
         normal, self.turned = shape.normal[order], shape.turned[order]
         self.inverse_m2 = shape.inverse_m2[order]
-        """above 0 for 3D Gaussians with `ellipsoid_exact`"""
+        """1 / |W p|^2 (ellipsoids.py); above 0 for 3D Gaussians with `ellipsoid_exact`"""
         a, b, p, area = a[order], b[order], p[order], area[order]
         self.log_opacity, self.half_r2 = log_opacity[order], half_r2[order]
         self.z_low, self.z_high = z_low[order], z_high[order]
@@ -143,9 +143,9 @@ class Setup:
 
 
 DEPTH_SHARE = 1 / 8
-"""standard deviation along the ray of the low-pass `pixel`, per metre of depth"""
+"""standard deviation of the low-pass filter `pixel` along the ray, per metre of depth"""
 _RANGE_RADIUS = math.sqrt(2 * math.log(255))
-"""radius in standard deviations of the part of a splat that limits the depths of its fragments"""
+"""radius in standard deviations of the disk that limits the depths of a splat's fragments"""
 _PLANE_RADIUS = 64.0
 """the same for splats of a coplanar group, larger than any cut-off, so that culling a splat does not move the
 layer"""
@@ -178,8 +178,8 @@ def _shapes(
     view: View,
     features: FeatureSet,
 ) -> ellipsoids.Axes:
-    """Equivalent disks of the splats: a disk with the same image for each 3D Gaussian. unit_a, unit_b, p (n,
-    3) in the camera frame, scale (n, 2)."""
+    """Disks with the same images as the splats. unit_a, unit_b, p (n, 3) in the camera frame, scale (n,
+    2)."""
     found = ellipsoids.disks(unit_a, unit_b, scale)
     if cloud.thickness is None:
         return found

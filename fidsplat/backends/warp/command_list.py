@@ -17,9 +17,9 @@ from fidsplat.backends.warp.workspace import Workspace
 BLOCK = 256
 """default threads per block on a GPU"""
 _MIN_PIECE = 2048
-"""minimum threads of a piece of a CPU launch; smaller pieces cost more than they save"""
+"""minimum threads of one part of a CPU launch; smaller parts cost more time than they save"""
 _MIN_TILES = 4
-"""minimum tiles of a piece of a CPU launch"""
+"""minimum tiles of one part of a CPU launch"""
 
 
 @cache
@@ -28,7 +28,7 @@ def _parameters(kernel: Any) -> tuple[str, ...]:
 
 
 def _arguments(kernel: Any, given: Mapping[str, Any], first: int = 0) -> list[Any]:
-    """List the arguments of a kernel, from parameter number `first` on, by the names of its parameters."""
+    """Arguments of a kernel in the order of its parameters, from parameter number `first` on."""
     return [given[name] for name in _parameters(kernel)[first:]]
 
 
@@ -59,7 +59,7 @@ class LaunchCache:
             for index, value in enumerate(args):
                 if value is not before[index]:
                     command.set_param_at_index(index, value)
-                    before[index] = value  # kept alive, as the command stores only its address
+                    before[index] = value  # a reference to the value, as the command stores only its address
             if dim[0] != count:
                 command.set_dim(count)
                 dim[0] = count
@@ -74,7 +74,7 @@ class Launcher:
         self._wp, self.timed = load(), timed
         self._device, self._workers, self._cache = cache.device, cache.workers, cache
         self.pieces = 8 * cache.threads if divided else 1
-        """number of pieces of a CPU launch: several per thread, as work is uneven"""
+        """number of parts of a CPU launch: several per thread, for load balancing"""
         self._stream = None if self._workers else self._device.stream  # the caller may switch it later
         self._marks: list[tuple[str | None, Any]] = []
 
@@ -88,13 +88,13 @@ class Launcher:
         cuts = [count * k // pieces for k in range(pieces + 1)]
         self._run(kernel, [(end - first, [first, *args]) for first, end in pairwise(cuts)])
 
-    def launch_whole(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
-        """Launch `count` threads in one piece on every device, with all arguments from `given`."""
+    def launch_undivided(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
+        """Launch `count` threads undivided on every device, with all arguments from `given`."""
         self._cache.launch(kernel, count, _arguments(kernel, given), block)
 
     def launch_tiles(self, kernel: Any, first: int, end: int, area: int, given: Mapping[str, Any]) -> None:
-        """Launch a CPU thread per tile. The kernel's first parameter is the first tile of a piece, its last
-        the offset of the piece's `area` samples of state."""
+        """Launch a CPU thread per tile. The kernel's first parameter is the first tile of a part of the
+        launch, its last parameter the offset of the `area` samples of state of this part."""
         pieces = min(self.pieces, -(-(end - first) // _MIN_TILES))
         cuts = [first + (end - first) * k // pieces for k in range(pieces + 1)]
         args = _arguments(kernel, {**given, "state_first": 0}, 1)[:-1]
@@ -102,7 +102,7 @@ class Launcher:
         self._run(kernel, [(b - a, [a, *args, k * area]) for k, (a, b) in spans])
 
     def _run(self, kernel: Any, pieces: list[tuple[int, list[Any]]]) -> None:
-        """Launch pieces of a kernel, each with its number of threads and arguments."""
+        """Launch the parts of a kernel launch, each with its number of threads and arguments."""
         wp, device = self._wp, self._device
 
         def run(piece: tuple[int, list[Any]]) -> None:
@@ -111,7 +111,7 @@ class Launcher:
         if len(pieces) == 1:
             self._cache.launch(kernel, *pieces[0])
         elif self._workers is not None:
-            list(self._workers.map(run, pieces))  # raises the exception of a piece
+            list(self._workers.map(run, pieces))  # raises the exception of a part
 
     def read_back(self, totals: Any, host: Any) -> list[int]:
         """Copy a few integers from the device through the array `host` of the same length, and wait."""

@@ -44,7 +44,7 @@ def open_device(selector: str = "") -> WarpBackend:
     if not matching:
         if requested.split(":")[0] == "cuda" and not any(device.is_cuda for device in found):
             raise DeviceError(
-                "Warp finds no CUDA device (no NVIDIA driver, or no GPU); use device='warp:cpu'"
+                "Warp found no CUDA device (no NVIDIA driver, or no GPU); use device='warp:cpu'"
             )
         known = ", ".join(f"warp:{device.alias}" for device in found)
         raise UnknownDeviceError(f"no Warp device matches {selector!r}; there are: {known}")
@@ -65,7 +65,8 @@ class WarpBackend(Workspace, Backend):
         self._gradients: dict[tuple[FeatureSet, WarpShape], WarpGradients] = {}
 
     def limit_memory(self, budget: int) -> None:
-        """A frame with longer lists is rendered in bands of tiles; a cloud that does not fit is an error."""
+        """Limit a frame and its cloud to `budget` bytes: longer lists are split into bands of tiles, a larger
+        cloud is an error."""
         self.memory_budget = budget
 
     def upload(self, cloud: SplatCloud) -> Resident:

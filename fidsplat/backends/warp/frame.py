@@ -33,7 +33,7 @@ class ImageArrays:
     arrays: Mapping[str, Any]
     """by the names of the outputs"""
     indices: Any
-    """(views) int32 on the device: batch index of each view in these arrays"""
+    """(views,) int32 on the device: batch index of each view in these arrays"""
     reserved: int
     """size in bytes of the images of all views of the batch"""
 
@@ -58,7 +58,7 @@ class DeviceFrame:
         capacity: Capacity | None = None,
         inputs: ArrayPool | None = None,
     ) -> None:
-        """reserved: bytes of the frame or batch of which this one is a part. capacity: capacity of the lists;
+        """reserved: bytes of the frame or batch that contains this frame. capacity: capacity of the lists;
         None: the host waits for their sizes. inputs: pool of the arrays that the host fills for the views."""
         self.program, self.planner, self.workspace = program, planner, planner.workspace
         self.pool = self.workspace.pool
@@ -80,7 +80,7 @@ class DeviceFrame:
         self.set_views(stack)
 
     def set_views(self, stack: ViewBatch) -> None:
-        """Fill the input arrays and structs for other views of the same kind."""
+        """Fill the input arrays and structs for other views with the same size and effects."""
         program, inputs, view = self.program, self.inputs, stack.view
         self.stack, self.view = stack, view
         if view.sub_frames:
@@ -99,7 +99,7 @@ class DeviceFrame:
         self.named["views"] = self.inputs.filled("views", numbers, kernels("common").View)
 
     def render(self) -> None:
-        """Run all stages except resolve; the result is in `samples`."""
+        """Run all stages except resolve; results are in `samples`."""
         self.samples = self._render_exposure() if self.view.sub_frames else self._render_pose()
 
     def _render_exposure(self) -> Any:
@@ -150,7 +150,7 @@ class DeviceFrame:
             self.launcher.stage("blend")
             self._blend(first, end, samples)
         if program.backdrop:
-            # prepared here, as sub-frames may have different directions
+            # set here, as sub-frames may have other directions
             self.launcher.stage("resolve")
             # rays without derivatives: another struct type than for blending
             rays = rays_of(self.view, self.workspace, self.inputs)
@@ -167,14 +167,14 @@ class DeviceFrame:
         self._take("keys", n, wp.uint32)
         counts, ends = self._exact("counts", n, wp.int64), self._exact("ends_by_index", n, wp.int64)
         visible, offsets = self._exact("visible", n, wp.int32), self._exact("offsets", n, wp.int32)
-        # not read if all splats are of one kind, so any array will do
+        # placeholders, which kernels do not read if all splats have one primitive
         cloud = {"boxes": visible, "coplanar_groups": visible, "thickness": self.resident.arrays["opacities"]}
         cloud |= self.resident.arrays
         self._launch(self.program.project, n, block=self.program.project_block, **cloud)
         wp.utils.array_scan(visible, offsets, inclusive=True)
         wp.utils.array_scan(counts, ends, inclusive=True)
         totals = self._take("totals", 2, wp.int64)
-        self.launcher.launch_whole(sort.sum_up, 1, {**self.named, "splats": n})
+        self.launcher.launch_undivided(sort.sum_up, 1, {**self.named, "splats": n})
         if self.capacity:
             return self.capacity.visible, self.capacity.pairs
         visible, pairs = self.launcher.read_back(totals, self.pool.host("totals", 2, wp.int64))
@@ -196,8 +196,8 @@ class DeviceFrame:
         totals = self._take("tile_totals", self.tiles, self.wp.int32)
         totals.zero_()
         self.program.load_banding()
-        # in one piece, as its atomic additions on the CPU are ordinary additions
-        self.launcher.launch_whole(self.program.lists.histogram, visible, {**self.named, "first": 0})
+        # undivided, as atomic additions on the CPU are ordinary additions
+        self.launcher.launch_undivided(self.program.lists.histogram, visible, {**self.named, "first": 0})
         return split_by_cost(totals.numpy()[: self.tiles], limit)
 
     def fits(self, capacity: Capacity) -> bool:
@@ -209,7 +209,7 @@ class DeviceFrame:
         return capacity.pairs <= limit
 
     def _bin(self, visible: int, first: int, end: int, pairs: int, complete: bool) -> None:
-        """Make the tile lists of one band, each in depth order. complete: whether the band has all tiles."""
+        """Write the tile lists of one band in depth order. complete: whether the band has all tiles."""
         wp, lists, sort = self.wp, self.program.lists, self.program.sort
         tiles = self._take("tiles", 2 * pairs, wp.int32)
         listed = self._take("lists", 2 * pairs, wp.int32)
@@ -232,13 +232,13 @@ class DeviceFrame:
 
     def _blend(self, first: int, end: int, samples: Any) -> None:
         program, shape = self.program, self.program.shape
-        # the placeholder is not read
+        # a placeholder, which kernels do not read
         groups = self.resident.arrays.get("coplanar_groups", self.named["lists"])
         given = {**self.named, "rays": self._rays, "samples": samples, "coplanar_groups": groups}
         area = shape.tile_width * shape.tile_height
         if shape.schedule == "group":
             count = (end - first) * program.blend_block
-            self.launcher.launch_whole(
+            self.launcher.launch_undivided(
                 program.blend, count, given | {"band_first": first}, program.blend_block
             )
             return
@@ -246,7 +246,7 @@ class DeviceFrame:
         self.launcher.launch_tiles(program.blend, first, end, area, given)
 
     def resolve(self, into: ImageArrays, launcher: Launcher) -> None:
-        """Run the resolve stage: make images from samples."""
+        """Run the resolve stage: images from samples."""
         launcher.stage("resolve")
         view, wp, program = self.view, self.wp, self.program
         width, pixels = view.width // view.samples, view.width * view.height // view.samples**2

@@ -22,7 +22,7 @@ from fidsplat.effects.differentiable import check_gradients
 from fidsplat.util.errors import DeviceError, InputError
 
 _SHARES = 2048
-"""number of threads of a sum over all pixels or splats; it determines the order of additions"""
+"""threads of a sum over all pixels or splats; the number determines the order of additions"""
 
 
 class WarpDifferentiable(DifferentiableImages):
@@ -70,7 +70,7 @@ class _Backward:
         self._frame, self._made, self._wp = frame, made, load()
         self._launcher: Launcher = frame.launcher
         self._count, self._pairs = frame.resident.count, frame.stats["pairs"]
-        # not read if all splats are disks, so any array will do
+        # a placeholder, which kernels do not read if all splats are disks
         self._given = {**frame.named, "thickness": frame.resident.arrays["opacities"]}
         self._given |= frame.resident.arrays | {"by": self._by(gradients)}
         self._given |= {
@@ -104,7 +104,7 @@ class _Backward:
         return found
 
     def _blend(self) -> None:
-        """Sum gradient moments over the samples of each pair of a splat and a tile."""
+        """Sum gradient moments over the samples of each (splat, tile) pair."""
         wp, frame, made, pairs = self._wp, self._frame, self._made, self._pairs
         if not pairs:
             return
@@ -120,7 +120,7 @@ class _Backward:
         kernel, tiles = made.blend.kernel, frame.tiles
         if shape.schedule == "group":
             given = self._given | {"band_first": 0}
-            self._launcher.launch_whole(kernel, tiles * area, given, area)
+            self._launcher.launch_undivided(kernel, tiles * area, given, area)
             return
         states = self._launcher.pieces * area
         self._given["lights"] = self._take("lights", states, wp.float32)
@@ -139,7 +139,7 @@ class _Backward:
         self._launcher.launch(made.as_single, columns, {"sums": total, "singles": result})
 
     def _by(self, gradients: Mapping[str, Any]) -> Any:
-        """The kernels' struct of the gradients with respect to the images; missing gradients are 0."""
+        """Struct of the gradients with respect to the images for the kernels; missing gradients are 0."""
         by = self._made.blend.By()
         for name in self._made.losses:
             view, given = self._frame.view, gradients.get(name)
@@ -159,15 +159,17 @@ class _Backward:
         if hasattr(given, "__dlpack__") and not isinstance(given, (np.ndarray, wp.array)):
             try:
                 given = wp.from_dlpack(given)
-            except Exception as error:  # of the library that exports it, such as BufferError of torch
-                raise InputError(f"the gradient of {name} must be detached, got {error}") from None
+            except Exception as error:  # raised by the library of the array, for example torch's BufferError
+                raise InputError(
+                    f"the gradient of {name} must be detached, got {error}; detach it first"
+                ) from None
         if not isinstance(given, wp.array):
             return pool.filled(f"by {name}", np.ascontiguousarray(given, np.float32).ravel(), wp.float32)
         scalar = getattr(given.dtype, "_wp_scalar_type_", given.dtype)
         if scalar is not wp.float32 or not given.is_contiguous or given.device != pool.device:
             raise InputError(
                 f"the gradient of {name} must be a contiguous float32 array on {pool.device}, got "
-                f"{wp.types.type_repr(given.dtype)} on {given.device}"
+                f"{wp.types.type_repr(given.dtype)} on {given.device}; copy it first"
             )
         return flat_of(given)
 
@@ -205,7 +207,7 @@ def flat_of(array: Any) -> Any:
     scalar = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
     size = math.prod(_shape_of(array))
     flat = wp.array(ptr=array.ptr, dtype=scalar, shape=(size,), device=array.device)
-    flat._ref = array  # keeps the memory alive
+    flat._ref = array  # a reference to the memory
     return flat
 
 
@@ -218,11 +220,11 @@ def add_to(sums: Any, values: Any) -> None:
 
 
 def _components_of(array: Any) -> Any:
-    """View an array of float32 numbers or vectors, which may lie apart, as (elements, components)."""
+    """View a strided array of float32 numbers or vectors as (elements, components)."""
     wp = load()
     shape, strides = (array.size, wp.types.type_size(array.dtype)), (array.strides[-1], 4)
     view = wp.array(ptr=array.ptr, dtype=wp.float32, shape=shape, strides=strides, device=array.device)
-    view._ref = array  # keeps the memory alive
+    view._ref = array  # a reference to the memory
     return view
 
 

@@ -25,7 +25,7 @@ class Rendered:
 
     launcher: Launcher
     counts: dict[str, int]
-    """number of splats, visible splats and pairs; final after `settle`"""
+    """numbers of splats, of visible splats and of pairs; final after `settle`"""
     complete: Callable[[], Rendered | None] | None = None
     """for a frame with unknown counts: waits for it, and renders it again if it exceeded its capacity"""
     profile: Callable[[], Mapping[str, float]] | None = None
@@ -62,7 +62,7 @@ class WarpImages(Images):
         self._outputs, self._size, self.views, self._splats = outputs, size, views, splats
         self.nbytes, pixels = 0, views * size[0] * size[1]
         self.arrays: dict[str, Any] = {}
-        """arrays by the names of the outputs; possibly not complete yet"""
+        """arrays by output; complete after `wait`"""
         for name, output in outputs.items():
             self.nbytes += 4 * pixels * output.channels
             if views > 1:  # single frames include images in their plan
@@ -89,7 +89,7 @@ class WarpImages(Images):
         return array.reshape(shape)
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
-        # copied, as on the CPU numpy() shares the memory of `device_array`
+        # a copy, as numpy() on the CPU shares the memory of `device_array`
         return np.array(self.device_array(name, index).numpy())
 
     def read_uint8(self, name: str, index: int = 0) -> np.ndarray:
@@ -97,7 +97,7 @@ class WarpImages(Images):
         made = load().empty(image.size, dtype=load().uint8, device=image.device)
         given = [image.flatten(), made]
         with _CONVERTING, quiet():  # images are read in any thread, and the first read compiles
-            # not by a LaunchCache, which would keep the image alive
+            # without a LaunchCache, which would keep the image alive
             load().launch(
                 kernels("uint8").to_uint8, image.size, given, device=image.device, record_tape=False
             )

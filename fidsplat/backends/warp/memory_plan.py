@@ -16,11 +16,11 @@ from fidsplat.util.errors import DeviceError, bytes_words
 
 _BOUNDS = 44
 _PROJECTED = 36
-"""bytes of its rectangle of tiles, its sort key, counts and sums"""
+"""bytes per splat of rectangle of tiles, sort key, counts and sums"""
 _VISIBLE = 40
 """bytes of a visible splat in the sort and in the lists"""
 _PAIR = 24
-"""bytes of a pair of splat and tile, including scratch memory of the sort"""
+"""bytes of a (splat, tile) pair, including scratch memory of the sort"""
 _MAX_PART_BYTES = {True: 1 << 31, False: 1 << 28}
 """maximum bytes of a part of a batch on CUDA and on the CPU; larger parts are not faster"""
 _MAX_NUMBERED = 1 << 30
@@ -55,9 +55,9 @@ class MemoryPlanner:
         pairs = (workspace.memory_budget - fixed) // _PAIR
         if pairs < 1:
             raise DeviceError(
-                f"a memory budget of {bytes_words(workspace.memory_budget)} is too small for "
-                f"a frame of {resident.count} splats, which takes {bytes_words(fixed)} and the lists "
-                "of the tiles; raise memory_budget, or use an OpenCL device, which renders a cloud in chunks"
+                f"memory_budget must exceed the {bytes_words(fixed)} of the frame and its {resident.count:,} "
+                f"splats without lists, got {bytes_words(workspace.memory_budget)}; raise it, or use an "
+                "OpenCL device, which renders a cloud in chunks"
             )
         return min(workspace.pair_budget, pairs)
 

@@ -1,9 +1,9 @@
 """The stages compiled for one FeatureSet on one Warp device, and the replay of frames.
 
-The second frame of a cloud, image size and number of views does not wait for its counts: its lists have the
-largest capacity that earlier frames needed, plus an eighth, and it is rendered again when read if that was
-exceeded. From the third frame on, all stages except resolve are one captured CUDA graph with constant
-arguments; values that differ between views are in input arrays.
+The second frame with the same cloud, image size and number of views does not wait for its counts: its lists
+have the largest capacity that earlier frames needed, plus an eighth. If its counts exceed the capacity, it is
+rendered again when it is read. From the third frame on, all stages except resolve are one captured CUDA graph
+with constant arguments; values that differ between views are in input arrays.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from fidsplat.backends.warp.workspace import ArrayPool, Workspace
 _SPARE = 256
 """constant added to a capacity, in addition to an eighth"""
 _MAX_KINDS = 8
-"""maximum number of kinds of frames that are cached for a cloud"""
+"""maximum number of cached frames of a cloud"""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class RecordedFrame:
 
 @dataclass(eq=False)
 class _CachedFrame:
-    """Cache entry: a kind of frame of a cloud, with one image size and number of views."""
+    """Cached frame of a cloud, for one image size and number of views."""
 
     inputs: ArrayPool
     """pool of the input arrays that the host fills for the views"""
@@ -93,7 +93,8 @@ class WarpPipeline(Pipeline):
             return images
 
     def render_counted(self, resident: Resident, view: View) -> tuple[DeviceFrame, WarpImages]:
-        """Render one view and wait; returns the frame, valid until the next one, and the images."""
+        """Render one view and wait. Returns the images, and the frame, which is valid until the next
+        frame."""
         with self.workspace.working("while rendering"):
             views = ViewBatch.single(view)
             images, into = self._new_images(resident, views)
@@ -106,9 +107,9 @@ class WarpPipeline(Pipeline):
         return images, ImageArrays(images.arrays, self.workspace.first_index, images.nbytes)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
-        """See `Pipeline.trace`. keys (n,) uint32; order (visible,), splat indices by depth; starts (tiles +
-        1,); lists (pairs,), of the last band; records (n, words) float32; raw (4, rows, columns) float32: r,
-        g, b, transmittance; output images by name."""
+        """Render one view, and return the data between the stages: keys (n,) uint32; order (visible,), splat
+        indices by depth; starts (tiles + 1,); lists (pairs,), of the last band; records (n, words) float32;
+        raw (4, rows, columns) float32: r, g, b, transmittance; output images by name."""
         frame, images = self.render_counted(resident, view)
         named, stats, n = frame.named, images.stats, resident.count
         rows, stride = frame.grid
@@ -137,15 +138,15 @@ class WarpPipeline(Pipeline):
         return frame, Rendered(launcher, frame.stats)
 
     def _render(self, resident: Resident, views: ViewBatch, into: ImageArrays) -> Rendered:
-        """Render views; without waiting if a frame of their kind was rendered before."""
+        """Render views, without waiting if a frame with the same key is cached."""
         workspace, view = self.workspace, views.view
-        # adopted arrays may change before a frame is rendered again, so these frames must wait
+        # frames of adopted arrays must wait, as the arrays may change before a frame is rendered again
         if not workspace.asynchronous or view.sub_frames or resident.adopted or not resident.count:
             return self._render_counted(resident, views, into)[1]
         cached = self._cached.get(resident, {}).get((view.width, view.height, len(views)))
         if cached is None:
             return self._render_counted(resident, views, into)[1]
-        # after a failure or another kind of frame the inputs are undefined
+        # after a failure or another frame the inputs are undefined
         capacity, recorded, cached.recorded = cached.capacity, cached.recorded, None
         if recorded is not None and cached.token == self._token(cached, view, into.reserved):
             recorded.replay(views)
@@ -179,9 +180,9 @@ class WarpPipeline(Pipeline):
         load().copy(counts, frame.named["totals"])
         frame.resolve(into, launcher)
         rendered = Rendered(launcher, {"splats": resident.count, "visible": 0, "pairs": 0})
-        # give the array back; a later frame may then use it
+        # return the array to the pool for later frames
         weakref.finalize(rendered, pool.give_back, "totals", counts)
-        stats = rendered.counts  # capture only the counts, so that the object can be released
+        stats = rendered.counts  # the closure references only the counts, so that the object can be released
 
         def complete() -> Rendered | None:
             with workspace.failing("while rendering"):
@@ -209,13 +210,13 @@ class WarpPipeline(Pipeline):
         return rendered
 
     def _record(self, cached: _CachedFrame, frame: DeviceFrame, reserved: int) -> None:
-        """Record a frame if its launches equal those of the previous frame of its kind."""
+        """Record a frame if its launches equal the launches of the previous frame."""
         token, before = self._token(cached, frame.view, reserved), frame.launcher
         if self.workspace.replays and token == cached.token:
             frame.launcher = Launcher(self._launches, timed=False, divided=False)
             graph = capture(self.workspace, frame.render)
             frame.launcher = before
-            # the cloud caches its recorded frames, so they must not keep it alive
+            # recorded frames must not reference the cloud, which caches them
             frame.resident = weakref.proxy(frame.resident)
             cached.recorded = None if graph is None else RecordedFrame(frame, graph)
             self.workspace.pool.holders.add(cached)

@@ -69,9 +69,9 @@ class _Needs:
     outputs: tuple[str, ...]
     """files of kernels/warp/output, dependencies included"""
     blending: tuple[str, ...]
-    """outputs of `outputs` that take part in blending"""
+    """outputs that are blended"""
     steps: tuple[str, ...]
-    """files of kernels/warp/post, in their order"""
+    """files of kernels/warp/post, in the order of the steps"""
 
     @classmethod
     def of(cls, features: FeatureSet) -> _Needs:
@@ -97,7 +97,7 @@ class _Needs:
         return cls(frozenset(effects), outputs, blending, steps)
 
     def among(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """The named effects that the program requires."""
+        """Effects among `names` that the program requires."""
         return tuple(name for name in names if name in self.effects)
 
 
@@ -109,7 +109,7 @@ class Program:
     """Compiled kernels of all stages, and their struct types."""
 
     def __init__(self, device: Any, name: str, features: FeatureSet, shape: WarpShape) -> None:
-        """name: of the device, for errors. Raises DeviceError for an effect that is not supported."""
+        """name: name of the device, for errors. Raises DeviceError for an effect that is not supported."""
         if why := unsupported(features, name):
             raise DeviceError(why)
         self.device, self.shape, self.features, self._name = device, shape, features, name
@@ -164,16 +164,16 @@ class Program:
         output, behind = kernels("output"), kernels("background")
         kinds = [kind for kind in behind.KINDS if f"background_{kind}" in needs.effects]
         self.backdrop = behind.make_backdrop(kinds[0], "rays" in needs.effects) if kinds else None
-        """the kernel of the background; None for a constant one"""
+        """kernel of the background; None for a constant background"""
         images = tuple((image.name, getattr(load(), image.dtype)) for image in self.images)
         self.images_type = kernels("buffers").make_images(images, needs.outputs)
         self.cloud_arrays = output.fields(needs.outputs, "cloud_arrays")
         self.view_arrays = output.fields(needs.outputs, "view_arrays")
-        """element type of each further array that resolving reads"""
+        """element type of each additional array that the resolve stage reads"""
         self.stretched = "camera_brown_conrady" in needs.effects and bool(
             output.having(features.outputs, "length")
         )
-        """whether resolving reads the lengths of a lens's rays"""
+        """whether the resolve stage reads the lengths of a lens's rays"""
         self.resolve = kernels("resolve").make_resolve(
             images, needs.outputs, self.stretched, features.samples
         )
@@ -187,10 +187,10 @@ class Program:
         except Exception as error:
             raise DeviceError(f"{self._name} cannot compile {kernel.key}: {error}") from error
         if loaded is None:
-            raise DeviceError(f"{self._name} cannot compile {kernel.key}; see Warp's messages on stderr")
+            raise DeviceError(f"{self._name} cannot compile {kernel.key}; read Warp's messages on stderr")
 
     def load_banding(self) -> None:
-        """Compile the kernels of frames with several bands."""
+        """Compile the kernels for frames with several bands."""
         with _MAKING, quiet():
             self.compile(self.lists.histogram)
             self.compile(self.lists.count)

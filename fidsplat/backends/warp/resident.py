@@ -123,8 +123,8 @@ def _uploaded(name: str, array: np.ndarray, pool: ArrayPool, dtype: Any = None) 
         return wp.array(np.ascontiguousarray(array), dtype=dtype, device=pool.device).flatten()
     except (RuntimeError, MemoryError) as error:
         raise DeviceError(
-            f"the cloud's {name} need {bytes_words(array.nbytes)}, more than {pool.device} has; use fewer "
-            "splats"
+            f"the cloud's {name} must fit the memory of {pool.device}, got "
+            f"{bytes_words(array.nbytes)}; use fewer splats"
         ) from error
 
 

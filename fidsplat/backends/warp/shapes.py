@@ -16,7 +16,7 @@ class WarpShape:
     k_buffer_size: int = 8
     """size of the k-buffer: fragments of a pixel that are sorted by depth at once"""
     chunks: int = 1
-    """number of pieces into which the sorts divide their input"""
+    """number of blocks into which the sorts divide their input"""
 
 
 def shape_for(device: Any) -> WarpShape:

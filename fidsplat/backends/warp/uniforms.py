@@ -84,7 +84,7 @@ def rays_of(
 
 
 def array_of(stack: ViewBatch, name: str) -> np.ndarray:
-    """An array of an effect: shared by all views, or their rows concatenated."""
+    """Array of an effect: one array for all views, or the arrays of the views concatenated."""
     view = stack.view
     if name != "row_rotations" or len(stack) == 1:
         return view.array(name)
@@ -109,7 +109,7 @@ def lens_of(view: View, workspace: Workspace) -> Any:
 
 
 def moving_of(resident: Resident, stack: ViewBatch, inputs: ArrayPool) -> Any:
-    """The struct `Moving` of a frame; empty if nothing moves. inputs: pool for its arrays."""
+    """Struct `Moving` of a frame; empty without moving groups. inputs: pool for its arrays."""
     declared, groups = kernels("motion"), stack.view.groups
     kind = declared.make_motion(bool(groups)).Moving
     if not groups:
@@ -127,7 +127,7 @@ def moving_of(resident: Resident, stack: ViewBatch, inputs: ArrayPool) -> Any:
 
 @cache
 def _empty(kind: Any) -> Any:
-    """An empty struct, shared by all frames so that it is packed only once."""
+    """Empty struct, which all frames share so that it is packed only once."""
     return kind()
 
 
@@ -181,7 +181,7 @@ def _panorama(panorama: Panorama, workspace: Workspace) -> Any:
             cached[panorama] = wp.array(image, dtype=wp.vec3, device=workspace.device)
         except (RuntimeError, MemoryError) as error:
             raise DeviceError(
-                f"the panorama needs {bytes_words(image.nbytes)}, more than {workspace.device} has; use a "
-                "smaller one"
+                f"the panorama must fit the memory of {workspace.device}, got "
+                f"{bytes_words(image.nbytes)}; use a smaller panorama"
             ) from error
     return cached[panorama]

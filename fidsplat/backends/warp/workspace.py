@@ -29,7 +29,7 @@ class ArrayPool:
         self._hosts: dict[str, Any] = {}
         self._spare: dict[str, list[Any]] = {}
         self.state = object()
-        """identity of the set of scratch arrays: a new object whenever one is replaced"""
+        """a new object whenever a scratch array is replaced"""
         self.holders: WeakSet[Any] = WeakSet()
         """caches that reference scratch arrays; their `release_arrays` is called when an array is replaced"""
 
@@ -87,7 +87,7 @@ class ArrayPool:
         )
 
     def give_back(self, name: str, array: Any) -> None:
-        """Return an array of `lend` that is no longer used."""
+        """Return an array of `lend` to the pool."""
         self._spare[name].append(array)
 
     def fresh(self, name: str, size: int, dtype: Any) -> Any:
@@ -96,9 +96,10 @@ class ArrayPool:
         try:
             return wp.empty(max(size, 1), dtype=dtype, device=self.device)
         except (RuntimeError, MemoryError, ValueError) as error:  # ValueError: 2^31 elements and more
+            size *= wp.types.type_size_in_bytes(dtype)
             raise DeviceError(
-                f"{name} needs {bytes_words(size * wp.types.type_size_in_bytes(dtype))}, more "
-                f"than {self.device} has; use fewer splats or a smaller image"
+                f"{name} must fit the memory of {self.device}, got {bytes_words(size)}; use fewer splats or "
+                "a smaller image"
             ) from error
 
 
@@ -110,9 +111,9 @@ class Workspace:
         self.memory_budget = memory_budget
         """maximum device memory in bytes of a frame and its cloud"""
         self.pair_budget = 2**30 - 1
-        """maximum number of pairs of a splat and a tile in the lists at once; tests lower it"""
+        """maximum number of (splat, tile) pairs in the lists at once; tests lower it"""
         self.asynchronous = device.is_cuda
-        """whether frames of a kind that was rendered before are submitted without waiting for their counts"""
+        """whether frames with a cached capacity are submitted without waiting for their counts"""
         self.replays = device.is_cuda
         """whether such frames are recorded as command lists and replayed"""
         self.frames = 0

@@ -23,16 +23,16 @@ def is_loaded(name: str) -> bool:
     return name.endswith((".so", ".bc", "last_accessed")) and not name.startswith(_UNFINISHED)
 
 
-def is_whole(path: Path) -> bool:
+def is_complete(path: Path) -> bool:
     """Whether a bitcode file or a shared object has the length that its headers state."""
     if path.suffix not in (".so", ".bc"):
         return True
     with path.open("rb") as stream:
         size = os.fstat(stream.fileno()).st_size
-        return _is_whole_elf(stream, size) if path.suffix == ".so" else _is_whole_bitcode(stream, size)
+        return _is_complete_elf(stream, size) if path.suffix == ".so" else _is_complete_bitcode(stream, size)
 
 
-def _is_whole_elf(stream: BinaryIO, size: int) -> bool:
+def _is_complete_elf(stream: BinaryIO, size: int) -> bool:
     """Whether the file contains the section table and every section; GNU ld writes the table last."""
     head = stream.read(64)
     if len(head) < 64 or not head.startswith(_ELF):
@@ -46,7 +46,7 @@ def _is_whole_elf(stream: BinaryIO, size: int) -> bool:
     return all(kind == _NO_BITS or offset + length <= size for kind, offset, length in sections)
 
 
-def _is_whole_bitcode(stream: BinaryIO, size: int) -> bool:
+def _is_complete_bitcode(stream: BinaryIO, size: int) -> bool:
     """Whether the top-level blocks of an LLVM bitstream, whose headers state their lengths, fill the file."""
     if stream.read(4) != _BITCODE or size % 4:
         return False

@@ -1,6 +1,6 @@
 """Correction of PoCL 3.0's target processor in memory: the last resort; FIDSPLAT_NO_POCL_PATCH forbids it.
 
-PoCL 3.0 asks its LLVM 14 for the processor's name. LLVM calls a newer processor (AMD Zen 5) "generic", with
+PoCL 3.0 gets the processor's name from LLVM 14. For a newer processor (AMD Zen 5) the name is "generic", with
 which every build fails ("unknown target CPU", pocl issues #512, #1049), and Zen 4 "znver3" (without AVX-512),
 with which builds crash. PoCL 3.1 reads POCL_LLVM_CPU_NAME; 3.0 has no such setting. The name is replaced in
 the field `llvm_cpu` of PoCL's device record by the name for which PoCL built its kernel library.
@@ -50,20 +50,24 @@ def why_not(device_address: int, device_version: str) -> str:
     if device_address in _corrected:
         return ""
     try:
-        return "" if _place(device_address, device_version) else "its record is not that of PoCL 3.0"
+        return "" if _field_address(device_address, device_version) else "its record is not that of PoCL 3.0"
     except OSError as error:
         return f"/proc/self/mem cannot be read ({error.strerror or error})"
 
 
 def correct_target(device_address: int, device_version: str) -> str:
-    """Correct the processor name of a PoCL device; returns the name."""
+    """Correct the processor name of a PoCL device unless `why_not` forbids it; returns the name."""
     if device_address not in _corrected:
-        place = None if why_not(device_address, device_version) else _place(device_address, device_version)
-        if place is None:
+        address = (
+            None
+            if why_not(device_address, device_version)
+            else _field_address(device_address, device_version)
+        )
+        if address is None:
             return _name_of_llvm(device_version)
         name = ctypes.create_string_buffer(_processor_name().encode())
         _corrected[device_address] = name
-        ctypes.c_uint64.from_address(place).value = ctypes.addressof(name)
+        ctypes.c_uint64.from_address(address).value = ctypes.addressof(name)
     return _corrected[device_address].value.decode()
 
 
@@ -78,21 +82,21 @@ def announce_once(cache: Path, text: str) -> None:
     warnings.warn(text, stacklevel=4)
 
 
-def _place(device_address: int, device_version: str) -> int | None:
+def _field_address(device_address: int, device_version: str) -> int | None:
     """The address of the field `llvm_cpu` of a device's record; None if the record is not as expected."""
     wrong = _name_of_llvm(device_version).encode()
     memory = os.open("/proc/self/mem", os.O_RDONLY)
     try:
         record = _read(memory, device_address, _RECORD_BYTES)
         words = struct.unpack(f"<{len(record) // 8}Q", record[: len(record) // 8 * 8])
-        places = [
+        fields = [
             index + 1
             for index in range(len(words) - 1)
             if _text(memory, words[index]).startswith(b"x86_64-") and _text(memory, words[index + 1]) == wrong
         ]
     finally:
         os.close(memory)
-    return device_address + 8 * places[0] if len(places) == 1 else None
+    return device_address + 8 * fields[0] if len(fields) == 1 else None
 
 
 def _name_of_llvm(device_version: str) -> str:
