@@ -40,7 +40,7 @@ def check_differentiable(features: FeatureSet) -> None:
             remedy = _REMEDIES[name.partition("_")[0]]
             raise InputError(f"effects must be differentiable, got {name}; use {remedy}")
     if features.samples > 1:
-        raise InputError(f"samples must be 1 in a differentiable frame, got {features.samples}")
+        raise InputError(f"samples must be 1 for gradients, got {features.samples}; use samples=1")
     if features.posts:
         raise InputError(
             f"a differentiable frame must have no fog or sensor, got {features.posts[0]}; use a capture "

@@ -165,7 +165,7 @@ def test_what_has_no_gradient_is_refused_by_name():
     cases = {
         "lowpass_pixel": fs.Capture(CAMERA, quality=fs.Quality(lowpass="pixel")),
         "compose_pixel": fs.Capture(CAMERA, quality=fs.Quality(order="pixel")),
-        "2 x 2 samples": fs.Capture(CAMERA, quality=fs.Quality(samples=2)),
+        "samples must be 1": fs.Capture(CAMERA, quality=fs.Quality(samples=2)),
         "exposure": fs.Capture(CAMERA, sensor=fs.Sensor(exposure=2.0)),
         "camera_equirectangular": fs.Capture(fs.Camera.equirectangular(32, 16)),
         "background_gradient": fs.Capture(CAMERA, background=fs.Gradient((1, 1, 1), (0, 0, 0))),
