@@ -1,1 +1,1 @@
-"""Rendering scenes: the renderer, frames, batches, several devices."""
+"""Rendering of scenes: renderer, frames, batches, several devices."""

@@ -1,4 +1,4 @@
-"""Images by name: copies on the host, and export to torch, JAX, CuPy and Warp by the array protocols."""
+"""Images by name: copies on the host, and export to torch, JAX, CuPy and Warp by array protocols."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class ImageMapping(Mapping[str, np.ndarray]):
     @property
     def timings(self) -> Mapping[str, float]:
         """Milliseconds on the device by stage, for all views together: project, sort, bin, blend, resolve;
-        error: all stages of the second rendering for the output `error`.
+        `error`: all stages of the second rendering for the output `error`.
 
         On a GPU a replayed frame is rendered again to measure them, since timing each launch would slow down
         all frames. Empty if its cloud has been released.
@@ -85,8 +85,8 @@ class ImageMapping(Mapping[str, np.ndarray]):
 
     @property
     def stats(self) -> Mapping[str, int]:
-        """Number of splats in the cloud, of visible (not culled) splats, and of pairs of a splat and a tile;
-        for all views together."""
+        """Numbers of splats in the cloud, of visible (not culled) splats, and of (splat, tile) pairs, summed
+        over views."""
         return self._images.stats
 
     def wait(self) -> Self:
@@ -124,7 +124,7 @@ class ImageMapping(Mapping[str, np.ndarray]):
         try:
             import torch  # type: ignore[import-not-found]
         except ImportError:
-            raise InputError("to_torch needs torch, which is not installed; pip install torch") from None
+            raise InputError("torch must be installed for to_torch, got none; pip install torch") from None
         if self._is_shared(name):
             return torch.from_dlpack(self.device_array(name))
         return torch.from_numpy(self[name].copy())  # torch has no read-only tensors
@@ -157,7 +157,7 @@ class ImageMapping(Mapping[str, np.ndarray]):
         name = self._only_output()
         if self._is_shared(name):
             return self.device_array(name)
-        return self[name].copy()  # NumPy exports no read-only arrays by DLPack
+        return self[name].copy()  # NumPy does not export read-only arrays by DLPack
 
     def _only_output(self) -> str:
         """The name of the only output."""
@@ -170,7 +170,7 @@ class ImageMapping(Mapping[str, np.ndarray]):
 
 
 def with_scene_ids(name: str, image: np.ndarray, ids: SceneIds) -> np.ndarray:
-    """An output image; `splat_id` with device indices replaced by scene indices. -1 is unchanged."""
+    """The output image; in `splat_id`, scene indices replace device indices, except -1."""
     if name != "splat_id" or ids is None:
         return image
     return np.append(ids(), np.int32(-1))[image]
@@ -186,8 +186,8 @@ def check_process(opened_by: int, what: str) -> None:
 
 
 def host_array(what: str, value: Any) -> Any:
-    """An array of another library on the host, as a NumPy array on the same memory (DLPack). Other values are
-    returned as they are.
+    """Convert an array of another library on the host to a NumPy array that shares its memory (DLPack). Other
+    values are returned unchanged.
 
     Raises:
         InputError: an array on another device, or one that requires gradients.

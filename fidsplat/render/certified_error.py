@@ -86,11 +86,11 @@ _OPTIONS = {
 }
 """option that requests an effect, and the supported alternative, by the prefix of the effect's name"""
 _SENSOR = {"noise": "full_well", "quantise": "bits", "response": "response"}
-"""arguments of `Sensor` that are not named like their step, by the prefix of the step"""
+"""arguments of `Sensor` whose names differ from the names of their steps, by the prefix of the step"""
 
 
 def cutoff_of(splats: int) -> float:
-    """The alpha cut-off at which the opacities of the omitted fragments have at most the sum `OMITTED`."""
+    """Alpha cut-off for which the opacities of omitted fragments have a sum of at most `OMITTED`."""
     return OMITTED / max(splats, 1)
 
 
@@ -113,9 +113,9 @@ class Ideal:
     features: FeatureSet
     view: View
     color_bound: float
-    """range of all colours, or the largest absolute colour if that is larger"""
+    """maximum of the range of all colours and the largest absolute colour"""
     relative_bound: float
-    """error bound per unit of colour, without that of the output `rounding`"""
+    """error bound per unit of colour, without the bound of the output `rounding`"""
 
 
 @dataclass(frozen=True)
@@ -148,8 +148,8 @@ def ideal_of(data: Any, capture: Capture, backend: Backend) -> Ideal:
     _refuse_unbounded(capture)
     if not isinstance(data, ResidentData):
         raise InputError(
-            "the output 'error' needs splats in memory, got a store; render store.cloud() if it fits "
-            "into memory, or leave out the output 'error'"
+            "the splats must be in memory for the output 'error', got a store; render store.cloud() if "
+            "it fits into memory, or leave out the output 'error'"
         )
     quality = ideal_quality(capture.quality, cutoff_of(data.count))
     features, view = _prepared(data, capture, quality, backend)

@@ -11,7 +11,7 @@ from fidsplat.render.renderer import Renderer
 MESH = -2
 """label of surface 0 of a simulator; surface i has MESH - i"""
 MESH_OFFSET = 2e-3
-"""metres by which surfaces of simulators are moved away from the camera"""
+"""metres by which surfaces of simulators are offset away from the camera"""
 
 
 def device_surface(

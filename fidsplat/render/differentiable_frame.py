@@ -18,7 +18,7 @@ from fidsplat.util.arguments import flag, instance, real_array
 
 
 class DifferentiableFrame(Frame):
-    """A frame of `Renderer.render_differentiable`: a Frame with `backward`."""
+    """A Frame with `backward`, from `Renderer.render_differentiable`."""
 
     def __init__(
         self,

@@ -51,7 +51,7 @@ class Flight:
     trajectory: Trajectory
     """camera to world"""
     times: Sequence[float] | np.ndarray
-    """(n,) seconds on the trajectory's clock, increasing: one frame each"""
+    """(n,) seconds on the trajectory's clock, increasing; one frame per time"""
     capture: Capture
     """capture of every frame; the camera's motion and the shutter's time are replaced"""
 
@@ -80,8 +80,7 @@ class Flight:
         ]
 
     def key(self, device: str) -> str:
-        """Hash of everything that its frames depend on: splats, captures, device, version; 16 hexadecimal
-        digits."""
+        """Hash of splats, captures, device and version, on which the frames depend; 16 hexadecimal digits."""
         content = (self.scene.content, self.capture, self.trajectory, self.path, device, __version__)
         try:
             return digest_of(content)
@@ -221,7 +220,7 @@ class FlightFolder:
 
 
 def scene_of_frame(scene: Scene, image: Path) -> Scene:
-    """The scene with the pose and time of the flight's frame with this image file; unchanged for other
+    """The scene with the camera pose and time of the flight's frame in this image file; unchanged for other
     files."""
     folder = image.parent.parent
     if not image.stem.isdigit() or not (folder / RECORD).is_file():

@@ -1,4 +1,4 @@
-"""Frame: the images of one view, and FrameBatch: those of many views."""
+"""Frame: the images of one view. FrameBatch: the images of many views."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ class Frame(ImageMapping):
         error: ErrorImage | None = None,
         index: int = 0,
     ) -> None:
-        """error: the output `error`, if it is requested. Other arguments: as `ImageMapping`."""
+        """error: the output `error`, if it is requested. Other arguments: see `ImageMapping`."""
         super().__init__(images, capture.outputs, ids, index)
         self._error, self.capture = error, capture
         """The capture of this frame. `read_back` and `truth_of` use its camera, shutter and motion."""
 
     @property
     def images(self) -> Images:
-        """The backend's images, of which this frame is the first, for kernels of the backend."""
+        """The backend's images, for kernels of the backend; this frame is the first of them."""
         return self._images
 
     def to_uint8(self) -> np.ndarray:
         """`rgb` as 8-bit colours, (h, w, 3) uint8: clamped to [0, 1], times 255, rounded to the nearest; NaN
-        becomes 0. It is converted on the device if possible, so that a quarter of the bytes is copied, and is
-        bit-identical to a conversion of `frame["rgb"]` on the host.
+        becomes 0. The device converts the image if it can, so that a quarter of the bytes is copied. The
+        result is bit-identical to a conversion of `frame["rgb"]` on the host.
 
         Raises:
             InputError: `rgb` was not requested.
@@ -80,7 +80,7 @@ class Frame(ImageMapping):
         return encode_png(visualisation_of(name, self[name]))
 
     def __reduce__(self):
-        """Pickled and copied as NumPy arrays: arrays of `device_array` are not included."""
+        """Pickle and copy as NumPy arrays; arrays of `device_array` are not included."""
         return _host_frame, (dict(self), dict(self.timings), dict(self.stats), self.capture.picklable())
 
     def read_rows(self, name: str, first: int, end: int, into: np.ndarray | None = None) -> np.ndarray:
@@ -155,7 +155,7 @@ class FrameBatch(ImageMapping):
         return Frame(self._images, self._views.capture(number), self._ids, index=number)
 
     def __reduce__(self):
-        """Pickled and copied as NumPy arrays."""
+        """Pickle and copy as NumPy arrays."""
         views = replace(self._views, captures=tuple(one.picklable() for one in self._views.captures))
         return _host_batch, (dict(self), dict(self.timings), dict(self.stats), views)
 

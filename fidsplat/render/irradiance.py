@@ -30,7 +30,8 @@ def cosine_weights(normal: np.ndarray, directions: np.ndarray, angles: np.ndarra
 
 
 def neighbours(x: np.ndarray, y: np.ndarray) -> Iterator[Neighbour]:
-    """Indices (row, column) and weights of the four cells around positions, for bilinear interpolation."""
+    """Indices (row, column) and weights of the four cells around each position, for bilinear
+    interpolation."""
     left, top = np.floor(x).astype(int), np.floor(y).astype(int)
     for dy in (0, 1):
         for dx in (0, 1):
@@ -62,10 +63,11 @@ class LightField:
         normal: np.ndarray,
         step: float,
     ) -> LightField:
-        """Measure until interpolated irradiance differs by at most `step` of its maximum.
+        """Refine the grid until the error of interpolated irradiance is at most `step` times its maximum.
 
-        levels: numbers of panoramas along a side; the last is not checked. places: (m, 2) on the marker.
-        radiance_at: called with (k, 2) places, returns (k, d, 3). normal: (3,) for the compared irradiance.
+        levels: numbers of panoramas along a side; the last level is used without a check. places: (m, 2) on
+        the marker. radiance_at: function of places (k, 2) that returns (k, d, 3). normal: (3,) for the
+        compared irradiance.
         """
         field = LightField(*panorama_directions(rows))
         field.low, field.high = places.min(axis=0), places.max(axis=0)
@@ -86,7 +88,7 @@ class LightField:
                 _difference(found[::2, 1::2], (halved[:, 1:] + halved[:, :-1]) / 2),
                 _difference(found[1::2, ::2], (halved[1:] + halved[:-1]) / 2),
             )
-            # the error of a grid of twice the spacing, which is at least twice as large
+            # the error of the coarser grid, at least twice the error of this grid
             if error <= 2 * step * found.max():
                 break
         return field

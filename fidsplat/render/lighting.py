@@ -1,7 +1,5 @@
-"""Lighting of markers: colours of their splats from the light of the scene.
-
-The light around a marker is measured in panoramas, that of explicit lights by shadow maps. Boxes are split
-where the light changes.
+"""Lighting of markers: colours of their splats from the light of the scene. Panoramas measure the light
+around a marker, and shadow maps the visibility of explicit lights. Boxes are split where the light changes.
 """
 
 from __future__ import annotations
@@ -28,20 +26,20 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.response import to_light
 
 FINEST = 8
-"""number of the smallest parts of a box per module, each with its own measurement of light"""
+"""maximum number of parts per module and axis into which boxes are split"""
 MOST = 256
 """maximum number of measured points along a side of a square marker"""
 SMOOTHEST = 0.5
 """smallest roughness whose reflections harmonics of degree 3 represent (docs/effects.md)"""
 MEASURING = "fast,lowpass=none,samples=2"
-"""quality of panoramas: a low-pass filter would enlarge splats that are smaller than the coarse pixels"""
+"""quality of panoramas; their coarse pixels would enlarge small splats with a low-pass filter"""
 _DARK = 1e-6
 """radiance below which a panorama is black"""
 _CHUNK = 256
 _SAME = 0.03
-"""radians between normals of a bent marker that share the reflection of a panorama"""
+"""maximum angle [rad] between normals of a bent marker for which reflections are computed once"""
 _WALL = 0.1
-"""metres: a light with splats on all sides within this distance is inside an object"""
+"""metres: a light is inside an object if splats are within this distance on all sides"""
 
 
 def lit_scene(scene: Scene, renderer: Any) -> Scene:
@@ -57,7 +55,7 @@ def lit_scene(scene: Scene, renderer: Any) -> Scene:
 
 
 class _Surroundings:
-    """Surroundings of the lit markers: splats, background and lights, and panoramas of them."""
+    """Splats, background and lights around the lit markers, and their panoramas."""
 
     def __init__(self, scene: Scene, renderer: Any) -> None:
         self.renderer, self.lights, self.camera = renderer, scene.lights, scene.camera
@@ -71,7 +69,7 @@ class _Surroundings:
             cloud_motions=scene.cloud_motions,
         )
         self.arrived: set[int] = set()
-        """numbers of the lights that reach a marker"""
+        """indices of the lights that reach a marker"""
 
     @cached_property
     def resident(self) -> Any:
@@ -79,7 +77,7 @@ class _Surroundings:
 
     @cached_property
     def black(self) -> tuple[Any, np.ndarray, np.ndarray]:
-        """The splats on the device in black, for shadow maps, and their bounding box."""
+        """Black splats on the device, for shadow maps, and their bounding box."""
         cloud = self.scene.cloud()
         black = _rebuilt(cloud, colors=np.zeros((len(cloud), 3), np.float32))
         low, high = cloud.bounds() if len(cloud) else (np.zeros(3), np.zeros(3))
@@ -91,7 +89,7 @@ class _Surroundings:
         return float(min(np.linalg.norm(np.maximum(high - point, point - low)) + 1e-3, 1e3))
 
     def panoramas(self, points: np.ndarray, rows: int, near: float, **parts: Any) -> list[Any]:
-        """Frames of panoramas at points (k, 3) in the axes of the world, with `alpha`."""
+        """Render panoramas with `alpha` at points (k, 3), in the axes of the world."""
         cameras = []
         for point in points:
             pose = np.eye(4)
@@ -166,14 +164,14 @@ def _lit(placed: PlacedMarker, around: _Surroundings) -> PlacedMarker:
     else:
         shown = [(point, np.bincount(part, one) / count) for point, one in arriving.points]
         sh = _from_anywhere(placed, light, cloud, owner, means, mean, arriving._replace(points=shown))
-        # the scene rotates harmonics from the marker's frame to the world
+        # back to the marker's frame, from which the scene rotates harmonics to the world
         colors["sh"] = rotation_of_coefficients(3, placed.pose[:3, :3].T) @ sh
     lit = _rebuilt(cloud, owner, means, scales, **colors)
     return replace(placed, marker=replace(placed.marker, cloud=lit), light=None)
 
 
 def _check_gloss(light: Lighting, around: _Surroundings) -> None:
-    """Raise InputError for gloss that cannot be represented."""
+    """Raise InputError if harmonics cannot represent the gloss, or there is no camera for it."""
     if light.roughness is None:
         return
     if light.view == "any" and light.roughness < SMOOTHEST:
@@ -237,7 +235,7 @@ def _field(placed: PlacedMarker, light: Lighting, points: _Points, around: _Surr
     def radiance_at(wanted: np.ndarray) -> np.ndarray:
         nearest = np.array([np.argmin(((places - place) ** 2).sum(axis=1)) for place in wanted])
         local = points.local[nearest].copy()
-        local[:, :2] = wanted  # places between splats are on the sheet too
+        local[:, :2] = wanted  # grid points between splats are on the marker's sheet
         at = local @ placed.pose[:3, :3].T + placed.pose[:3, 3]
         at = at + max(surface.clearance, 1e-6) * surface.normals[nearest]
         parts: dict[str, Any] = {"outputs": ("rgb", "alpha")}
@@ -260,7 +258,7 @@ def _field(placed: PlacedMarker, light: Lighting, points: _Points, around: _Surr
     field = LightField.measured(light.rows, levels, places, radiance_at, normal, light.step)
     if light.ambient is None and field.radiance.max() < _DARK:
         raise InputError(
-            f"the panorama at marker {placed.label}, {placed.marker.spec}, must show something, got black; "
+            f"the panorama at marker {placed.label}, {placed.marker.spec}, must not be black, got no light; "
             "add splats or a background, set ambient light (ambient = [0.5, 0.5, 0.5]), or use light = "
             "'lights'"
         )
@@ -268,7 +266,7 @@ def _field(placed: PlacedMarker, light: Lighting, points: _Points, around: _Surr
 
 
 def _by_normal(normals: np.ndarray, within: float = 1e-4) -> Iterator[np.ndarray]:
-    """Indices of the rows with each normal, which are equal within an angle in radians."""
+    """Groups of row indices whose normals are equal within an angle [rad]."""
     _, group = np.unique(np.rint(normals / within), axis=0, return_inverse=True)
     order = np.argsort(group.ravel(), kind="stable")
     yield from np.split(order, np.flatnonzero(np.diff(group.ravel()[order])) + 1)
@@ -277,8 +275,8 @@ def _by_normal(normals: np.ndarray, within: float = 1e-4) -> Iterator[np.ndarray
 def _split(
     points: _Points, colors: np.ndarray, step: float, largest: int | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Parts of the splats in which colours (m, 3) at the points differ by at most `step`. largest: largest
-    number of points along a side of a part.
+    """Split splats into parts in which the colours (m, 3) of points differ by at most `step`. largest:
+    maximum number of points along a side of a part.
 
     Returns the splat (p,) of each part; its columns and rows [x0, x1) x [y0, y1) on the splat's grid, (p, 4)
     x0, y0, x1, y1; and the part (m,) of each point.
@@ -369,7 +367,7 @@ def _from_anywhere(
     diffuse: np.ndarray,
     arriving: _Light,
 ) -> np.ndarray:
-    """Harmonics (p, 16, 3) in the world of the colours of parts."""
+    """Spherical harmonics (p, 16, 3), in the axes of the world, of the colours of parts."""
     assert light.roughness is not None
     shiny, rotation = Gloss(light.roughness, light.reflectance), placed.pose[:3, :3]
     places = (means + cloud.origin) @ rotation.T + placed.pose[:3, 3]
@@ -410,7 +408,7 @@ def _rebuilt(
     scales: np.ndarray | None = None,
     **colors: np.ndarray,
 ) -> SplatCloud:
-    """A cloud of parts of splats, or of all splats, in other colours. owner: (p,) splat of each part."""
+    """Cloud of parts of splats, or of all splats, with other colours. owner: (p,) splat of each part."""
     rows = np.arange(len(cloud)) if owner is None else owner
     scales = cloud.scales[rows] if scales is None else scales
     if cloud.thickness is not None:

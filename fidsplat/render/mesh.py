@@ -1,4 +1,4 @@
-"""Mesh of a scene: depth images of many views, fused into a distance field."""
+"""Mesh of a scene, from depth images of many views that are fused into a distance field."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RESOLUTION = 200
 """voxels along the longest side of a scene"""
 _TINY = 1e-300
 MOST_VOXELS = 1 << 20
-"""largest number of voxels per side"""
+"""maximum number of voxels per side"""
 
 
 def scene_mesh(
@@ -41,10 +41,9 @@ def scene_mesh(
     below one half are empty. Surfaces that are thinner than two voxels and visible from both sides are lost.
 
     Args:
-        cameras: views; by default 64 on a sphere around the scene, which looks from outside.
-        voxel: metres; by default a 200th of the longest side of the scene.
-        renderer: by default one on the scene's device.
-        progress: called with the current step and its share done.
+        cameras: views; by default 64 views from a sphere around the scene. voxel: metres; by default a 200th
+        of the longest side of the scene. renderer: by default one on the scene's device. progress: called
+        with the name of the current step and its completed fraction.
 
     Raises:
         InputError: no splats; a voxel size that is not positive or too small.
@@ -94,7 +93,7 @@ def _cosine(normal: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def views_around(scene: Scene, low: np.ndarray, high: np.ndarray) -> list[Camera]:
-    """Cameras on a sphere around a box, evenly by the golden angle. Those below level ground are left out."""
+    """Cameras on a sphere around a box, spaced by the golden angle, without cameras below level ground."""
     guess = guess_up(scene.cloud())
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     away = radius / math.sin(FOV / 2)
@@ -113,7 +112,7 @@ def views_around(scene: Scene, low: np.ndarray, high: np.ndarray) -> list[Camera
 
 
 def _bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Box of the middle 99 % of the centres along each axis."""
+    """Corners of the box with the middle 99 % of the centres along each axis."""
     cloud = scene.cloud()
     if not len(cloud):
         raise InputError("the scene of a mesh must have at least one splat, got none")

@@ -30,14 +30,14 @@ from fidsplat.util.arguments import invalid, items
 from fidsplat.util.errors import InputError
 
 _MAX_IMBALANCE = 1.1
-"""ratio of the slowest band's time to the mean above which bands are balanced again"""
+"""maximum ratio of the slowest band's time to the mean; above it, bands are balanced"""
 
 _IN_FLIGHT = 3
 """frames in flight per device: one is copied to the host, one rendered, and one has its chunks prefetched"""
 
 
 class SeveralDevices:
-    """Several devices of one kind that share each frame: every device renders a band of rows.
+    """Several devices of one model that share each frame: every device renders a band of rows.
 
     Frames are bit-identical to those of one device. Bands are balanced by the times of the previous frame. A
     cloud in memory is copied to every device; a store's chunks are cached only where their band needs them.
@@ -48,8 +48,8 @@ class SeveralDevices:
         memory_budget: bytes per device.
 
     Raises:
-        InputError: no device, or devices of different kinds, whose frames may differ.
-        DeviceError: as `fs.Renderer`.
+        InputError: no device, or devices of different models, whose frames may differ. DeviceError: a device
+        cannot be used.
     """
 
     def __init__(self, devices: Iterable[str], memory_budget: int | None = None) -> None:
@@ -60,8 +60,8 @@ class SeveralDevices:
         titles = {renderer.device.title for renderer in self.renderers}
         if len(titles) > 1:
             raise InputError(
-                "devices must be of one kind, so that their frames are bit-identical, got "
-                f"{', '.join(sorted(titles))}; name devices of one kind"
+                "devices must be of one model, so that their frames are bit-identical, got "
+                f"{', '.join(sorted(titles))}; name devices of one model"
             )
         self._shares = np.linspace(0.0, 1.0, len(names) + 1)
         """borders of the bands as fractions of the frame's height, 0 and 1 included"""
@@ -81,8 +81,8 @@ class SeveralDevices:
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
     ) -> Frame:
-        """Render one frame. scene: as `Renderer.render`, or the result of `upload`. The other
-        arguments and errors are the same as in `Renderer.render`."""
+        """Render one frame. scene: a scene, or the result of `upload`. Other arguments and errors: see
+        `Renderer.render`."""
         if capture is not None and not isinstance(capture, Capture | Camera):
             raise invalid("capture", "a Capture or a Camera", capture)
         resident = self._uploaded(scene)
@@ -112,9 +112,9 @@ class SeveralDevices:
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
     ) -> Iterator[Frame]:
-        """Render many frames in their order, each by one device, round robin. A frame is copied to the host
-        while its device renders the next. Arguments and errors: as `render`; an error, also of `captures`, is
-        raised after the frames of the captures before it."""
+        """Render many frames in order, each on one device, round robin. A frame is copied to the host while
+        its device renders the next. Arguments and errors: see `render`. An error, also in `captures`, is
+        raised after all frames before it."""
         resident = self._uploaded(scene)
         names = None if outputs is None else output_names(outputs)
         try:
@@ -195,7 +195,7 @@ class _Worker:
         self._thread.start()
 
     def submit(self, capture: Any) -> None:
-        """Queue a capture. `result` raises the error of an invalid one."""
+        """Queue a capture. `result` raises the error of an invalid capture."""
         self._captures.put(capture)
 
     def end(self) -> None:
@@ -203,7 +203,7 @@ class _Worker:
         self._captures.put(self._END)
 
     def result(self) -> Frame:
-        """Wait for the next frame and return it, copied to the host. Raises the error of its rendering."""
+        """Wait for the next frame; returns it, copied to the host. Raises the error of its rendering."""
         frame = self._frames.get()
         if isinstance(frame, BaseException):
             raise frame
@@ -240,7 +240,7 @@ class _BandImages(Images):
     pool: ThreadPoolExecutor
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
-        """The rows of all bands, one below the other."""
+        """Read the rows of all bands and stack them."""
         image = self.frames[0].read_rows(name, 0, 0)
         list(self.pool.map(lambda frame, band: frame.read_rows(name, *band, image), self.frames, self.bands))
         return image[None] if index is None else image

@@ -1,4 +1,4 @@
-"""The output images of a frame as files."""
+"""Files of a frame's output images."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -15,7 +15,7 @@ from fidsplat.util.directions import perpendicular, sphere
 
 _DIRECTIONS = 256
 _GRAZING = 0.05
-"""smallest cosine of a fitted direction from the normal: markers are not legible beyond 87 degrees"""
+"""minimum cosine between normal and fitted directions: markers are not legible beyond 87 degrees"""
 _LOBE = 64
 _BELOW = 1e-6
 
@@ -29,7 +29,7 @@ class Gloss(NamedTuple):
 
     @property
     def alpha(self) -> float:
-        """Width of the distribution of microfacet normals."""
+        """GGX width of the distribution of microfacet normals."""
         return self.roughness**2
 
 
@@ -46,9 +46,8 @@ def fresnel(cosine: np.ndarray, reflectance: float) -> np.ndarray:
 def gloss(
     cosine: np.ndarray, to_viewer: np.ndarray, to_light: np.ndarray, normal: np.ndarray, surface: Gloss
 ) -> np.ndarray:
-    """Radiance towards viewers (n, v, 3) per irradiance that a surface facing the light would receive, (n,
-    v): the BRDF times the cosine of the light. cosine: (n, v) of viewer and normal (n, 3); to_light: (n,
-    3)."""
+    """Reflected radiance (n, v) towards viewers (n, v, 3) per irradiance of a surface that faces the light:
+    the BRDF times the cosine of the light. cosine: (n, v) of viewer and normal (n, 3); to_light: (n, 3)."""
     square = surface.alpha**2
     light = np.einsum("nc,nc->n", to_light, normal)[:, None]
     above = (cosine > _BELOW) & (light > _BELOW)
@@ -64,9 +63,9 @@ def gloss(
 
 
 def lobe(to_viewer: np.ndarray, normal: np.ndarray, surface: Gloss) -> tuple[np.ndarray, np.ndarray]:
-    """Directions (n, v, k, 3) from which reflected light comes, and their weights (n, v, k): the sum of
-    weights times radiance is the radiance towards viewers (n, v, 3). Visible normals are sampled (Heitz
-    2018)."""
+    """Importance samples of the reflection: directions (n, v, k, 3) towards incoming light, and weights (n,
+    v, k). The sum of weights times radiance is the radiance towards viewers (n, v, 3). Visible normals are
+    sampled (Heitz 2018)."""
     square, i = surface.alpha**2, np.arange(_LOBE)
     radius, angle = np.sqrt((i + 0.5) / _LOBE), 2 * np.pi * _van_der_corput(_LOBE)
     axes = np.concatenate([perpendicular(normal), normal[:, None]], 1)
@@ -100,7 +99,7 @@ def _slope(cosine: np.ndarray, square: float) -> np.ndarray:
 
 
 def _van_der_corput(count: int) -> np.ndarray:
-    """The first numbers of the sequence in base 2, (count,)."""
+    """First numbers (count,) of the van der Corput sequence in base 2."""
     bits = np.arange(count)[:, None] >> np.arange(16) & 1
     return bits @ 0.5 ** np.arange(1, 17)
 
@@ -111,9 +110,9 @@ def view_directions(normal: np.ndarray) -> np.ndarray:
 
 
 def fit_harmonics(to_viewer: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """Harmonics (n, 16, 3) of degree 3 for colours (n, v, 3) in directions (v, 3), by least squares; the
-    smallest coefficients, as only one hemisphere is given."""
-    basis = sh_basis(MAX_DEGREE, -to_viewer)  # harmonics have the direction from camera to splat
+    """Fit harmonics (n, 16, 3) of degree 3 to colours (n, v, 3) in directions (v, 3), by least squares with
+    minimum norm, as only one hemisphere is given."""
+    basis = sh_basis(MAX_DEGREE, -to_viewer)  # harmonics are functions of the direction from camera to splat
     base = colors.mean(axis=1, keepdims=True)
     fitted = np.einsum("kv,nvc->nkc", np.linalg.pinv(basis, rcond=1e-3), colors - base)
     fitted[:, 0] += (base[:, 0] - 0.5) / C0

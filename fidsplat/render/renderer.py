@@ -1,4 +1,4 @@
-"""Renderer: the public interface to rendering."""
+"""Renderer: public interface to rendering."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from fidsplat.util.errors import InputError, unknown
 
 _DEFAULT_CAPTURE = Capture()
 METERED = 96
-"""width in pixels of the small frame in which light is measured for a sensor"""
+"""width [pixels] of the small frame in which exposure is metered for a sensor"""
 
 
 def default_device() -> str:
@@ -170,13 +170,12 @@ class Renderer:
         quality: Quality | str | None = None,
         **parts: Unpack[CaptureFields],
     ) -> Frame:
-        """Render one frame: `render(scene, Capture(camera, ...))`, or the parts of a capture as arguments.
+        """Render one frame: `render(scene, Capture(camera, ...))`, or the fields of a capture as arguments.
 
         Args:
-            scene: splats to render.
-            capture: camera and settings, or only a camera. Without a Capture the scene's own is used, which
-                its ResidentCloud has too.
-            outputs, quality, and by name the other fields (`CaptureFields`): replace those of the capture.
+            scene: splats to render. capture: camera and settings, or only a camera; by default the capture of
+            the scene or of its ResidentCloud. outputs, quality, and by name the other fields
+            (`CaptureFields`): replace fields of the capture.
 
         Raises:
             InputError: no camera, an unknown output or preset, a frame that is too large, a cloud
@@ -239,7 +238,7 @@ class Renderer:
         quality: Quality | str | None = None,
         progress: Callable[[float], object] | None = None,
     ) -> Frame:
-        """Render every step-th pixel in both directions, bit-identical to those pixels of `render`.
+        """Render every step-th pixel in both directions, bit-identical to `render`.
 
         Only the device "reference" supports this.
 
@@ -268,7 +267,7 @@ class Renderer:
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
     ) -> Frame:
-        """Render rows of pixels [first, end), bit-identical to those of `render`.
+        """Render rows of pixels [first, end), bit-identical to `render`.
 
         The other rows of the frame are undefined. `fs.SeveralDevices` combines bands of several devices.
 
@@ -280,7 +279,7 @@ class Renderer:
         try:
             first, end = band
         except (TypeError, ValueError):
-            raise InputError(f"band must be two rows, the first and the end, got {band!r}") from None
+            raise InputError(f"band must be two rows (first, end), got {band!r}") from None
         whole_number("the first row of a band", first, 0, rows - 1)
         whole_number("the end of a band", end, first + 1, rows)
         return self._render(self._resident(scene), requested, band=band)
@@ -293,13 +292,13 @@ class Renderer:
         quality: Quality | str | None = None,
         **parts: Unpack[CaptureFields],
     ) -> Iterator[Frame]:
-        """Render one cloud many times, one Frame for each capture or camera, in their order.
+        """Render one cloud many times: one Frame for each capture or camera, in order.
 
         The cloud is uploaded once, kernels and buffers are reused, and an asynchronous device renders the
-        next frame while the caller uses the previous one. Arguments and errors: as `render` (a motion of the
-        camera replaces each camera's pose); an error is raised after the frames of the captures before it.
+        next frame while the caller uses the previous one. Arguments and errors: see `render` (a motion of the
+        camera replaces each camera's pose). An error is raised after all frames before it.
         """
-        # once for all frames: the first would exhaust an iterator
+        # converted once, as the first frame would exhaust an iterator
         outputs = None if outputs is None else output_names(outputs)
         background = parts.get("background")
         if background is not None:
@@ -325,19 +324,19 @@ class Renderer:
     ) -> FrameBatch:
         """Render many views of one cloud at once. View i is bit-identical to `render` of that view.
 
-        Stores with `Quality.detail_error` above 0 are the exception: all views use the levels of detail of
-        the view that needs the finest.
+        Exception: with stores and `Quality.detail_error` above 0, all views use the finest level of detail
+        that a view needs.
 
         Args:
-            scene: splats to render; a ResidentCloud is not uploaded again.
-            captures: one Capture or Camera for each view, of one size and the same effects; or one for all
-                views. A Camera is used with the scene's own capture, as in `render`.
-            poses: (views, 7) float64, camera to world: x y z in metres and a quaternion w x y z of any length
+            scene: splats to render; a ResidentCloud is not uploaded again. captures: one Capture or Camera
+            for each view, with equal size and effects; or one for all views. A Camera replaces the camera of
+            the scene's capture, as in `render`. poses: (views, 7) float64, camera to world: x y z in metres
+            and a quaternion w x y z of any length
                 but 0. They replace the cameras' own poses.
             groups: {label: (views, 7)}: motion of the splats of that label in the world, relative to their
                 positions in the cloud (`Motion.groups`).
-            mask: (views,) bool: a view that is False is not rendered; its images are 0, and -1 in `label`
-                and `splat_id`.
+            mask: (views,) bool: views with False are not rendered; their images are 0, and -1 in `label` and
+            `splat_id`.
 
         Raises:
             InputError: as `render`; numbers of views, sizes, outputs or effects that differ; arrays of
@@ -384,12 +383,12 @@ class Renderer:
         check_process(self._process, "Renderer")
         if resident.backend is not self.backend:
             raise InputError(
-                "this cloud was uploaded by another Renderer; render it with that one, or upload it again"
+                "the cloud must be uploaded by this Renderer, got one of another Renderer; upload it again"
             )
         return resident
 
     def _metered(self, resident: ResidentCloud, capture: Capture) -> Capture:
-        """The capture with the sensor settings that are measured, from a small frame."""
+        """The capture with sensor settings metered in a small frame."""
         camera = capture.camera
         if not capture.sensor.meters or camera is None:
             return capture
@@ -446,7 +445,7 @@ def _banded(view: View, band: tuple[int, int]) -> View:
 
 
 def _capture_of(scene: Any, capture: Capture | Camera | None, **parts: Any) -> Capture:
-    """The given capture, or by default the scene's, with the given parts replaced."""
+    """The given capture, or by default the scene's capture, with the given fields replaced."""
     if not isinstance(capture, Capture):
         if capture is not None:
             parts["camera"] = capture

@@ -19,7 +19,7 @@ from fidsplat.util.errors import InputError
 
 
 class ResidentCloud:
-    """A cloud on a renderer's device, which is rendered without another upload. Of a store, only the chunks
+    """A cloud on a renderer's device, which is rendered without another upload. For a store, only the chunks
     that a view needs are uploaded and cached."""
 
     def __init__(
@@ -31,7 +31,7 @@ class ResidentCloud:
     ) -> None:
         self.backend, self.data, self._labels = backend, data, labels
         self.complete: Any = data.scene if isinstance(data, Residency) else data
-        """the complete scene: splats on the device, or those of stores that are only partly on the device"""
+        """the complete scene: splats on the device, or stores that are only partly on the device"""
         self.capture = capture
         """capture of the uploaded scene, the default of `render`"""
 

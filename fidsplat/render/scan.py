@@ -1,4 +1,4 @@
-"""Scans of a scene by a LiDAR: ranges, intensities, labels and times of its beams."""
+"""LiDAR scans of a scene: ranges, intensities, labels and times of beams."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ LINK_FROM_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0,
 """the lidar's axes (x forward, y left, z up) from those of a camera (z forward, y down)"""
 _REFERENCE = 0.1  # reflectivity for which `Lidar.detection_range` is stated
 _ODDS = 9  # odds of a detection at that range: a probability of 90 %
-# the odds grow with the fourth power of the signal: a third of the signal is detected with 10 %
-_CUTOFF = 1e-3  # minimum alpha of a fragment; fainter ones hardly move the surface at `Lidar.opacity`
+# the odds grow with the fourth power of the signal: a third of the signal has a probability of 10 %
+_CUTOFF = 1e-3  # minimum alpha of a fragment; fainter fragments hardly move the surface at `Lidar.opacity`
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A scan: arrays of its beams in the order of firing. r: number of `Lidar.returns`."""
+    """A LiDAR scan: arrays of beams in the order of firing; r = `Lidar.returns` per beam."""
 
     lidar: Lidar
     start: float
@@ -128,7 +128,7 @@ class Scan:
 
 
 def check_frame(frame: str) -> None:
-    """Raise InputError for anything but lidar and world."""
+    """Raise InputError for a frame other than lidar and world."""
     if frame not in ("lidar", "world"):
         raise invalid("frame", "lidar or world", frame)
 
@@ -154,9 +154,8 @@ def scan(
         renderer: None: one for the scene's device.
         motion: `Motion(camera=...)` has the pose lidar_from_world at a time, instead of `pose`; `groups`
             moves splats. None: the scene's groups move as its motion states.
-        start: seconds, start of the scan; None: the time of the scene's shutter.
-        label: whether the labels of the splats are requested.
-        index: number of the scan: scans with other numbers have other noise.
+        start: seconds, start of the scan; None: the time of the scene's shutter. label: whether the labels of
+        the splats are requested. index: number of the scan, which selects its random noise.
 
     Raises:
         InputError: no pose, or a pose that is not rigid; as `Renderer.render`.
@@ -206,7 +205,9 @@ def _resident(scene: Any, renderer: Renderer | None) -> tuple[Renderer, Any]:
 
     if isinstance(scene, ResidentCloud):
         if renderer is None:
-            raise InputError("renderer must be the one that uploaded the cloud, got None")
+            raise InputError(
+                "renderer must be the renderer that uploaded the cloud, got None; pass renderer="
+            )
         return renderer, scene
     if renderer is None:
         renderer = Renderer(getattr(scene, "device", None))
@@ -247,7 +248,7 @@ class ScanRequest:
         if self.motion.camera is None:
             camera = camera.with_pose(camera_to_world=_pose_of(pose, self.base.camera))
         elif pose is not None:
-            raise InputError("pose and motion.camera both move the lidar; leave one out")
+            raise InputError("the lidar must have either pose or motion.camera, got both; leave one out")
         quality = replace(
             self.base.quality,
             samples=1,
@@ -274,7 +275,7 @@ class ScanRequest:
         )
 
     def decoded(self, images: Mapping[str, np.ndarray], poses: np.ndarray, number_of_scan: int) -> Scan:
-        """The scan of rendered images. poses: (bands, 4, 4) world_from_lidar."""
+        """Convert rendered images to a scan. poses: (bands, 4, 4) world_from_lidar."""
         lidar, pixels = self.lidar, self.lidar.pixels(self.start, self.moving)
 
         def of_rays(image: np.ndarray) -> np.ndarray:
@@ -309,10 +310,10 @@ def _intensity(
 
 
 def _pose_of(pose: Any, camera: Camera | None) -> np.ndarray:
-    """world_from_lidar (4, 4); by default at the camera."""
+    """Pose world_from_lidar (4, 4); by default at the camera."""
     if pose is None:
         if camera is None:
-            raise InputError("pose must be given for a scene without a camera, got None")
+            raise InputError("pose must be given for a scene without a camera, got None; pass pose=")
         return camera.camera_to_world @ np.linalg.inv(LINK_FROM_OPTICAL)
     matrix = pose_matrix(pose, "the pose of a lidar")
     check_similarity(matrix, "the pose of a lidar", rigid=True)
@@ -370,7 +371,7 @@ def _measure(found: dict[str, np.ndarray], lidar: Lidar, random: np.random.Gener
     ranges = found["range"]
     kept = (ranges >= lidar.near) & (ranges <= lidar.far)
     if math.isfinite(lidar.detection_range):
-        # ratio of the signal to that at the detection range
+        # signal relative to the signal at the detection range
         signal = (
             found["intensity"] / _REFERENCE * (lidar.detection_range / np.maximum(ranges, lidar.near)) ** 2
         )

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 MAX_PIXELS = 512
 """pixels of a shadow map along a side"""
 _MARGIN = 4
-"""width of the border around the marker [pixels]"""
+"""width [pixels] of the border around the marker"""
 _WIDEST = np.tan(np.radians(80))
-"""tangent of the largest half field of view of a shadow map; beyond it there are no shadows"""
+"""tangent of half the maximum field of view of a shadow map; there are no shadows beyond it"""
 
 
 class ReceiverPoints(NamedTuple):
@@ -33,7 +33,7 @@ class ReceiverPoints(NamedTuple):
     pitch: float
     """metres between neighbours"""
     clearance: float
-    """metres in front of the marker in which splats do not occlude"""
+    """metres in front of the marker within which splats cast no shadow"""
 
 
 class LightPoint(NamedTuple):
@@ -41,7 +41,7 @@ class LightPoint(NamedTuple):
 
     light: Light
     place: np.ndarray
-    """(3,) its position; of a sun the direction of its light"""
+    """(3,) position; for a sun the direction of its light"""
     share: float
 
     def arriving(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -60,7 +60,7 @@ class LightPoint(NamedTuple):
 
 
 def light_points(light: Light, middle: np.ndarray) -> list[LightPoint]:
-    """Points of the disk that a light shows at a place (3,)."""
+    """Sample points of a light, seen as a disk from the position `middle` (3,)."""
     size = light.angle if isinstance(light, Sun) else getattr(light, "radius", 0.0)
     count = light.samples if size > 0 else 1
     share, places = np.full(count, 1 / count), disk(count) * (count > 1)
@@ -88,9 +88,9 @@ def visibility(
     """Transmittance (m,) float32 between the surface's points and a point of a light; 0 where the surface
     faces away.
 
-    The marker is an opaque white surface in an external depth image and other splats are black, so that the
-    image from the light is the transmittance. black: the other splats with the colour 0, which `motion`
-    moves. extent: largest distance of a splat from the marker.
+    The marker is an opaque white surface in an external depth image, and other splats are black, so that the
+    image rendered from the light is the transmittance. black: the other splats in black, moved by `motion`.
+    extent: largest distance of a splat from the marker.
     """
     towards, irradiance = point.arriving(surface.points)
     found = np.zeros(len(towards), np.float32)
@@ -106,7 +106,7 @@ def visibility(
 
 
 def _camera(point: LightPoint, points: np.ndarray, pitch: float, extent: float) -> Camera:
-    """Camera of a shadow map: at the point of the light; of a sun beyond all splats."""
+    """Camera of a shadow map, at the light's point; for a sun, beyond all splats."""
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     reach = max(float(np.linalg.norm(points - middle, axis=1).max()), pitch)
     inner = int(np.clip(np.ceil(2 * reach / pitch), 8, MAX_PIXELS))
@@ -124,7 +124,7 @@ def _camera(point: LightPoint, points: np.ndarray, pitch: float, extent: float) 
 
 
 def _depth_image(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Depth (h, w) of the surface through points (m, 3): their plane, and their distances from it."""
+    """Depth (h, w) of a surface: the plane through points (m, 3), plus their distances from it."""
     pixels = camera.project(points)
     z = (points - camera.position) @ camera.world_to_camera[2, :3]
     inverse = not isinstance(camera.lens, Orthographic)
@@ -140,7 +140,7 @@ def _depth_image(camera: Camera, points: np.ndarray) -> np.ndarray:
         total, count = np.zeros((height, width)), np.zeros((height, width))
         np.add.at(total, (row, column), off)
         np.add.at(count, (row, column), 1)
-        for dy in (-1, 0, 1):  # also next to the pixels of points
+        for dy in (-1, 0, 1):  # also in the neighbours of the points' pixels
             for dx in (-1, 0, 1):
                 if dx or dy:
                     total += 1e-6 * np.roll(total, (dy, dx), (0, 1))

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 SAMPLES = 32
 """samples per side of the rendered patch"""
 SHARE, LEAST = 0.02, 8.0
-"""default radius of the patch: a share of the width of the image, and at least some pixels"""
+"""default radius of the patch: fraction of the image width, and minimum in pixels"""
 MEDIAN = 0.5
 """opacity in front of the median depth; more transparent pixels are empty"""
 _RAY = 0.1
-"""field of view of a ray's camera in radians"""
+"""field of view [rad] of the camera that renders a ray"""
 
 
 def surface_at(
@@ -41,8 +41,8 @@ def surface_at(
 ) -> Surface:
     """The surface of a scene at a pixel or along a ray.
 
-    A plane is fitted to the median depth of a round patch. Outliers, such as leaves in front of a wall, may
-    be up to half of it.
+    A plane is fitted to the median depth of a round patch. Up to half of the patch may be outliers, such as
+    leaves in front of a wall.
 
     Args:
         scene: splats and markers, at the time of the scene's shutter.
@@ -63,7 +63,7 @@ def surface_at(
     if radius is not None:
         radius = number("radius", radius, "a positive length in metres", 1e-9)
     if renderer is None:
-        from fidsplat.render.renderer import Renderer  # here, as most callers have one
+        from fidsplat.render.renderer import Renderer  # imported here, as most callers pass a renderer
 
         renderer = Renderer(scene.device)
     uploaded = renderer.upload(scene) if resident is None else resident
@@ -101,7 +101,7 @@ def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = 
     left, top = max(x - reach, 0), max(y - reach, 0)
     patch = depth[top : y + reach + 1 : step, left : x + reach + 1 : step]
     metres = _radius(camera, pixel, pixels, _middle_depth(patch))
-    window = replace(  # pixel centres of every step-th row and column
+    window = replace(  # centres of the pixels in every step-th row and column
         camera,
         width=patch.shape[1],
         height=patch.shape[0],
@@ -115,8 +115,8 @@ def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = 
 
 
 def median_depth(capture: Capture, *outputs: str) -> Capture:
-    """The capture that renders the median depth `depth_first` at the time of the shutter, and more outputs,
-    without effects of the camera and the air."""
+    """Capture of the median depth `depth_first` and other outputs at the time of the shutter, without effects
+    of sensor and air."""
     quality = replace(capture.quality, samples=1, first_hit=MEDIAN)
     motion, shutter = Motion(None, capture.motion.groups), Shutter(time=capture.shutter.time)
     still = capture.with_(outputs=("depth_first", *outputs), quality=quality, motion=motion, shutter=shutter)
@@ -131,11 +131,11 @@ def default_radius(camera: Camera) -> float:
 def _viewpoint(camera: Camera | None, pixel, ray) -> tuple[Camera, tuple[float, float]]:
     if (pixel is None) == (ray is None):
         given = "neither" if pixel is None else "both"
-        raise InputError(f"the place of a surface must be a pixel or a ray, got {given}; give one of them")
+        raise InputError(f"exactly one of pixel and ray must be given, got {given}; leave one out")
     if ray is not None:
         return _ray_camera(ray), (SAMPLES / 2, SAMPLES / 2)
     if camera is None:
-        raise InputError("the camera of a pixel must be given for a scene without one, got None")
+        raise InputError("camera must be given for a scene without a camera, got None; pass camera=")
     at = real_array("pixel", pixel, "two numbers")
     if at.shape != (2,) or not (0 <= at[0] <= camera.width and 0 <= at[1] <= camera.height):
         raise InputError(
@@ -174,7 +174,7 @@ def _middle_depth(depth: np.ndarray) -> float:
 
 
 def _radius(camera: Camera, pixel: tuple[float, float], pixels: float, depth: float) -> float:
-    """Metres of a radius in pixels at a depth."""
+    """Convert a radius in pixels at a depth to metres."""
     sides = np.array([pixel, (pixel[0] + pixels, pixel[1]), (pixel[0] - pixels, pixel[1])])
     middle, *others = camera.unproject(sides, np.full(3, depth))
     return float(np.nanmax(np.linalg.norm(others - middle, axis=1)))

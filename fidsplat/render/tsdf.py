@@ -18,7 +18,7 @@ SIDE = 8
 TRUNCATION = 2.0
 """voxels"""
 GRAZING = 0.2
-"""smallest cosine between ray and normal of a pixel that is used: at silhouettes depths are of no surface"""
+"""minimum cosine between ray and normal of a used pixel: depths at silhouettes belong to no surface"""
 EMPTY = 0.05
 """weight of an observation in front of the truncation band"""
 CHUNK = 1024
@@ -35,7 +35,7 @@ class DistanceField:
         self.voxel, self.origin = voxel, np.asarray(origin, np.float64)
         self.keys = np.empty(0, np.int64)
         """sorted keys of the blocks"""
-        self._sums = np.empty((0, SIDE**3, 6), np.float32)  # weight, distance, colour, weight of the colour
+        self._sums = np.empty((0, SIDE**3, 6), np.float32)  # weight, distance, colour, colour weight
 
     def allocate(self, depth: np.ndarray, camera: Camera) -> None:
         """Add the blocks around the surface of a depth image (h, w), 0 where empty."""

@@ -293,7 +293,9 @@ def test_batches_and_stores_are_refused(renderer, tmp_path):
     fs.save_ply(haze(3, 0.5), tmp_path / "few.ply")
     fs.build_store([tmp_path / "few.ply"], tmp_path / "few.fss")
     store = fs.Store(tmp_path / "few.fss")
-    with pytest.raises(InputError, match=r"'error' needs splats in memory, got a store; render store\.cloud"):
+    with pytest.raises(
+        InputError, match=r"splats must be in memory for the output 'error', got a store; render store\.cloud"
+    ):
         renderer.render(store, SMALL, OUTPUTS)
 
 

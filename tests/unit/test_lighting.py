@@ -384,7 +384,7 @@ def test_errors_of_values(make, words):
 
 def test_errors_of_light_that_cannot_be_computed():
     dark = fs.Scene(markers=[PlacedMarker(TAG, light="scene")])
-    with pytest.raises(fs.InputError, match=r"must show something, got black; .*ambient"):
+    with pytest.raises(fs.InputError, match=r"must not be black, got no light; .*ambient"):
         lit(dark)
     named = fs.Lighting(ambient=(0.5, 0.5, 0.5))
     light, _ = lit(replace(dark, markers=[PlacedMarker(TAG, light=named)]))
