@@ -1,6 +1,6 @@
 """Train the paper's baseline: 2DGS on 3, 5, 9 and 17 views of each marker.
 
-    fidsplat experiment dataset -o DATASET
+    python benchmarks/paper_dataset.py -o DATASET
     python benchmarks/baseline.py DATASET -o DIR [--device opencl] [--iterations 7000] [--seed 0]
     fidsplat experiment views --trained DIR -o DIR
     fidsplat experiment angles --trained DIR -o DIR
@@ -40,7 +40,7 @@ def train(scene: Path, file: Path, renderer: fs.Renderer, iterations: int, seed:
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("dataset", type=Path, help="folder of `fidsplat experiment dataset`")
+    parser.add_argument("dataset", type=Path, help="folder of benchmarks/paper_dataset.py")
     parser.add_argument("-o", "--out", type=Path, default=Path("fidsplat-baseline"))
     parser.add_argument("--iterations", type=int, default=7000)
     parser.add_argument("--seed", type=int, default=0)

@@ -77,7 +77,6 @@ COMMANDS = {
     "counts": Command("experiment counts --quick --category small --category medium -o .", 57, 10),
     "compiling": Command(RENDER, 12, 4, own_cache=True),
     "demo": Command("demo --out .", 51, 2),
-    "dataset": Command("experiment dataset --category apriltag --markers 1 -o .", 8, 2),
     "tradeoff": Command("tradeoff --quick --scenes apriltag --settings transmittance_stop -o .", 51, 2),
     "convert": Command("convert ../splats.ply splats.spz --overwrite", 60, 4),
     "fly": Command("fly ../scene.toml --trajectory ../flight.tum --rate 5 -o run.mcap", 60, 4),

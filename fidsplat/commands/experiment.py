@@ -8,7 +8,6 @@ from typing import ClassVar
 from fidsplat.commands.calibrate import Calibrate, Tags
 from fidsplat.commands.experiment_data import (
     Blender,
-    Dataset,
     Merge,
     Plants,
     Report,
@@ -178,7 +177,6 @@ class Experiment:
         "localise": Localise,
         "calibrate": Calibrate,
         "tags": Tags,
-        "dataset": Dataset,
         "blender": Blender,
         "plants": Plants,
         "merge": Merge,

@@ -1,4 +1,4 @@
-"""`fidsplat experiment`: data sets, Blender's images, results of shards, reports."""
+"""`fidsplat experiment`: Blender's images, plants, results of shards, reports."""
 
 from __future__ import annotations
 
@@ -23,36 +23,8 @@ from fidsplat.commands.output import (
     steps_shown,
 )
 from fidsplat.experiments.plants import PlantSettings
-from fidsplat.experiments.settings import BlenderSettings, DatasetSettings
+from fidsplat.experiments.settings import BlenderSettings
 from fidsplat.util.errors import InputError
-
-
-@repeatable
-@dataclass(frozen=True)
-class Dataset(DatasetSettings):
-    """Write the paper's data set: 100 scenes in COLMAP's layout, 25 markers x 4 numbers of views.
-
-    Each scene has training views (3, 5, 9 or 17), 20 test views, and models as text and binary. Existing
-    scenes are unchanged. About 300 MB.
-
-    Examples:
-      fidsplat experiment dataset -o dataset
-      fidsplat experiment dataset --truth blender-standard --blender fidsplat-experiments/blender
-    """
-
-    json: Json = False
-
-    def run(self) -> int:
-        from fidsplat.experiments.dataset import dataset_scenes, write_scene
-        from fidsplat.experiments.setup import chosen_categories
-        from fidsplat.util.files import writable_folder
-
-        self.check()
-        folder = writable_folder(self.out)
-        parts = dataset_scenes(chosen_categories(self.category), self.marker_count)
-        scenes = (write_scene(part, folder, self.seed, self.truth, self.blender) for part in parts)
-        names = [scene.name for scene in show_progress("scenes", scenes, len(parts))]
-        return report(self.json, {"folder": str(folder), "scenes": names}, f"{len(names)} scenes in {folder}")
 
 
 @repeatable

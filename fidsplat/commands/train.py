@@ -27,8 +27,8 @@ class Train:
     """Train splats on images with known cameras.
 
     DATASET is a folder with COLMAP's model (sparse/0) and images (images), one with nerfstudio's
-    transforms.json, or a folder of `fidsplat demo views` or `fidsplat experiment dataset`. Views in its
-    folder test are held out and evaluated at the end; without that folder every eighth view of 16 or more.
+    transforms.json, or a folder of `fidsplat demo views`. Views in its folder test are held out and evaluated
+    at the end; without that folder every eighth view of 16 or more.
 
     The same command on the same device writes a bit-identical file. A checkpoint, FILE.training.npz next to
     FILE.ply, is written every half minute and at Ctrl-C. The same command resumes from it, also with more

@@ -1,4 +1,4 @@
-"""Table 3 of the paper: largest tilts at which markers are found and read, with missed tilts below them."""
+"""Table 3 of the paper: largest tilts at which markers are found and read, and missed tilts below them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ QUICK_TILTS = "0:60:20,64:88:2"
 
 
 def parse_tilts(text: str) -> list[float]:
-    """Ascending degrees of "first:last:step[,first:last:step...]". Raises InputError for another format."""
+    """Ascending degrees for "first:last:step[,first:last:step...]". Raises InputError for another format."""
     found: set[float] = set()
     for span in text.split(","):
         try:
@@ -42,10 +42,10 @@ def parse_tilts(text: str) -> list[float]:
 
 
 def measure_angles(point: dict, markers: MarkerRenderer, seed: int, pool: Executor, workers: int) -> dict:
-    """Scan a marker over tilts with every detector.
+    """Read a marker at every tilt with every detector.
 
-    Returns two strings of 0 and 1 per detector, one digit per tilt: whether the code was `found` (its outline
-    overlaps the code by half), and `read` exactly.
+    Returns two strings of 0 and 1 per detector, with one digit per tilt: whether the code was `found` (the
+    detected outline overlaps half of the code), and `read` correctly.
     """
     category, protocol = CATEGORIES[point["category"]], PROTOCOLS[point["protocol"]]
     spec = category.spec(point["index"], seed)
@@ -54,7 +54,7 @@ def measure_angles(point: dict, markers: MarkerRenderer, seed: int, pool: Execut
     render = markers.prepare(point["method"], f"{category.name}-{point['index']}", spec, module)
     names = readers(category.kind)
     outline = made.corners / made.module * module
-    in_pool = point["method"] == IDEAL  # a renderer is not shared by threads
+    in_pool = point["method"] == IDEAL  # threads cannot share a renderer
 
     def detect(image: np.ndarray, camera: Camera) -> list[Attempt]:
         corners = camera.project(outline)
@@ -83,6 +83,6 @@ def measure_angles(point: dict, markers: MarkerRenderer, seed: int, pool: Execut
 
 
 def largest(tilts: Sequence[float], hits: str) -> tuple[float | None, float | None]:
-    """Largest tilt with a hit, and largest tilt without a miss up to it; None if there is none."""
+    """Largest tilt with a hit, and largest tilt below the first miss; None if there is none."""
     last, first_miss = hits.rfind("1"), len(hits) - len(hits.lstrip("1"))
     return tilts[last] if last >= 0 else None, tilts[first_miss - 1] if first_miss else None

@@ -1,6 +1,7 @@
 """Ground truth from Blender as in the paper: Cycles renders a textured plane.
 
-`bpy` runs in a separate process and environment: it needs Python 3.11 and NumPy below 2, and has the GPL.
+`bpy` runs in a separate process and environment, since it requires Python 3.11 and NumPy below 2, and has the
+GPL.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from fidsplat.util.files import from_json, read_text, user_cache, writable_folde
 
 BPY = "bpy==5.0.1"
 VIEW_NAMES = ("standard", "raw")
-"""`standard`: sRGB texture and the view transform 'Standard', so that pixels average linear light (probably
-as in the paper); `raw`: pixels average display values"""
+"""`standard`: sRGB texture and the view transform 'Standard', so that pixels average linear light, probably
+as in the paper; `raw`: pixels average display values"""
 FULL_SAMPLES = 64
 WORKER = Path(__file__).with_name("blender_worker.py")
 TEST, TRAINING = "test", "view"
-"""kinds of images in file names"""
+"""prefixes of image files of test and training views"""
 
 
 def image_file(folder: Path, view: str, category: str, index: int, kind: str, number: int) -> Path:
@@ -37,7 +38,7 @@ def image_file(folder: Path, view: str, category: str, index: int, kind: str, nu
 
 
 def check_images(folder: Path, view: str, seed: int, samples: int | None = None) -> dict:
-    """Settings of the images of a view; {} if unknown.
+    """Recorded settings of the images of a view transform; {} if unknown.
 
     Raises InputError for another seed or number of samples (None: any).
     """
@@ -51,14 +52,14 @@ def check_images(folder: Path, view: str, seed: int, samples: int | None = None)
     for name, expected in (("seed", seed), ("samples", samples)):
         if expected is not None and settings.get(name) != expected:
             raise InputError(
-                f"{folder / view} holds images of {name} {settings.get(name)}, not {expected}; give another "
-                "folder"
+                f"images in {folder / view} must have {name} {expected}, got {settings.get(name)}; give "
+                "another folder"
             )
     return settings
 
 
 def record_images(folder: Path, view: str, seed: int, samples: int) -> None:
-    """Record the settings of the images of a view. Raises InputError for other settings."""
+    """Record the settings of the images of a view transform. Raises InputError if others are recorded."""
     check_images(folder, view, seed, samples)
     writable_folder(folder / view)
     write_json(_settings_file(folder, view), {"seed": seed, "samples": samples})
@@ -74,13 +75,13 @@ def default_environment() -> Path:
 
 
 def install(environment: Path, progress: Callable[[str], None] = lambda text: None) -> Path:
-    """Make a virtual environment with bpy, about 1 GB; returns its Python.
+    """Make a virtual environment with bpy, about 1 GB; returns its Python interpreter.
 
-    Raises InputError when there is no Python 3.11, DeviceError when pip fails.
+    Raises InputError without Python 3.11, DeviceError if pip fails.
     """
     python = sys.executable if sys.version_info[:2] == (3, 11) else shutil.which("python3.11")
     if python is None:
-        raise InputError(f"{BPY} needs Python 3.11, and python3.11 is not on the path; install it first")
+        raise InputError(f"python3.11 must be on the path for {BPY}, got none; install Python 3.11")
     writable_folder(environment.parent)
     own = environment_python(environment)
     for text, command in (
@@ -106,7 +107,7 @@ def _call(command: list[str]) -> None:
 
 
 def marker_job(category: Category, index: int, seed: int, folder: Path, view: str, training: bool) -> dict:
-    """Worker job for the test images of a marker, and optionally its training images."""
+    """Worker job for a marker's test images, and optionally its training images."""
     grid = marker(category.spec(index, seed)).grid
     cameras = {TEST: novel_cameras(category, index, seed), TRAINING: training_cameras() if training else []}
     return {
@@ -122,7 +123,7 @@ def marker_job(category: Category, index: int, seed: int, folder: Path, view: st
 
 
 def image_job(file: Path, camera: Camera) -> dict:
-    """File and camera of an image. Raises InputError unless the pixels of the camera are square."""
+    """File and camera of an image for a worker. Raises InputError unless the pixels are square."""
     if camera.fx != camera.fy:
         raise InputError(
             f"fx and fy of a Blender camera must be equal, got {camera.fx:g} and {camera.fy:g}; use "
@@ -133,13 +134,13 @@ def image_job(file: Path, camera: Camera) -> dict:
 
 
 def ready(view: str, environment: Path) -> Path:
-    """Python interpreter with Blender. Raises InputError for an unknown view or without Blender."""
+    """Python interpreter with Blender. Raises InputError for an unknown view, or if Blender is missing."""
     if view not in VIEW_NAMES:
         raise InputError(unknown("view", view, VIEW_NAMES))
     python = environment_python(environment)
     if not python.is_file():
         raise InputError(
-            f"Blender is not installed in {environment}; run fidsplat experiment blender --install"
+            f"Blender must be installed in {environment}, got none; run fidsplat experiment blender --install"
         )
     return python
 
@@ -152,7 +153,7 @@ def render(
     pixel_filter: str = "BOX",
     threads: int | None = None,
 ) -> Iterator[Path]:
-    """Render missing images; yields each file when it is complete, existing ones first.
+    """Render missing images; yields each complete file, existing files first.
 
     Args:
         markers: jobs of `marker_job`.
@@ -162,7 +163,7 @@ def render(
         pixel_filter: "BOX" (1 px, a mean over the pixel) or "BLACKMAN_HARRIS" (Blender's default, 1.5 px).
         threads: threads of Cycles; by default one per core.
 
-    Raises InputError when Blender is not installed, DeviceError if it fails; complete images stay.
+    Raises InputError if Blender is not installed, DeviceError if it fails; complete images remain.
     """
     job = {"view": view, "samples": samples, "filter": pixel_filter, "background": BACKGROUND}
     yield from run_worker(ready(view, environment), WORKER, markers, job, threads)
@@ -171,9 +172,9 @@ def render(
 def run_worker(
     python: Path, worker: Path, objects: Iterable[dict], job: dict, threads: int | None = None
 ) -> Iterator[Path]:
-    """Render the missing images of objects with a worker; yields each file, existing ones first.
+    """Render missing images of objects with a worker; yields each complete file, existing files first.
 
-    Raises DeviceError if Blender fails; complete images stay.
+    Raises DeviceError if Blender fails; complete images remain.
     """
     missing = []
     for one in objects:
@@ -199,7 +200,7 @@ def run_worker(
             try:
                 assert process.stdout is not None
                 for line in interrupts.lines_of(process.stdout):
-                    if line.startswith("done "):  # Blender prints other lines
+                    if line.startswith("done "):  # skip Blender's own lines
                         yield Path(line.removeprefix("done "))
                 status = process.wait()
             finally:

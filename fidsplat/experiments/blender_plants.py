@@ -1,4 +1,4 @@
-"""Blender worker: renders plants from meshes. Runs in Blender's Python without fidsplat.
+"""Blender worker that renders plants from meshes, in Blender's Python without fidsplat.
 
     python blender_plants.py JOB.json
 
@@ -22,11 +22,11 @@ def main(job: dict) -> None:
 
 
 def light(scene) -> None:
-    """Soft light from above, and a transparent background."""
+    """Set soft light from above, and a transparent background."""
     scene.cycles.max_bounces = 4
     scene.cycles.use_denoising = True
     scene.render.film_transparent = True
-    scene.render.use_persistent_data = True  # only the camera moves between images
+    scene.render.use_persistent_data = True  # between images only the camera moves
     scene.render.image_settings.color_mode = "RGBA"
     sun = bpy.data.lights.new("sun", "SUN")
     sun.energy, sun.angle = 3.0, math.radians(60)
@@ -34,7 +34,7 @@ def light(scene) -> None:
 
 
 def build(one: dict):
-    """Smooth mesh with vertex colours."""
+    """Make a smooth mesh with vertex colours."""
     vertices, colors = np.array(one["vertices"]), np.array(one["colors"])
     mesh = bpy.data.meshes.new(one["name"])
     mesh.from_pydata(vertices.tolist(), [], one["quads"])
@@ -49,7 +49,7 @@ def build(one: dict):
 
 
 def material():
-    """Translucent material with the vertex colours."""
+    """Make a translucent material with the vertex colours."""
     made = bpy.data.materials.new("leaf")
     made.use_nodes = True
     tree = made.node_tree

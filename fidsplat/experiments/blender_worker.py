@@ -1,4 +1,4 @@
-"""Blender worker: renders the textured planes of a job. Runs in Blender's Python without fidsplat.
+"""Blender worker that renders the textured planes of a job, in Blender's Python without fidsplat.
 
     python blender_worker.py JOB.json
 
@@ -26,7 +26,7 @@ def render(scene, objects: list[dict], build) -> None:
         built = build(one)
         for image in one["images"]:
             aim(scene, image)
-            # a worker of a killed run may still be writing the same image
+            # the worker of a killed run may still write the same image
             part = f"{image['file']}.{os.getpid()}.part.png"
             scene.render.filepath = part
             bpy.ops.render.render(write_still=True)
@@ -36,7 +36,7 @@ def render(scene, objects: list[dict], build) -> None:
 
 
 def prepare(job: dict):
-    """An empty scene: Cycles on the CPU, no bounce, no denoising, no dither."""
+    """Make an empty scene: Cycles on the CPU, without bounces, denoising and dithering."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
@@ -52,7 +52,7 @@ def prepare(job: dict):
         cycles.filter_width = 1.5
     render = scene.render
     render.threads_mode, render.threads = "FIXED", job["threads"]
-    render.dither_intensity = 0.0  # the default turns level 123 into a mixture of 123 and 124
+    render.dither_intensity = 0.0  # the default dithers level 123 to a mixture of 123 and 124
     render.image_settings.file_format = "PNG"
     render.image_settings.color_mode = "RGB"
     render.image_settings.color_depth = "8"
@@ -76,7 +76,7 @@ def prepare(job: dict):
 
 
 def build(marker: dict, view: str):
-    """Textured plane z = 0, x right, y down, one texture pixel per module."""
+    """Make a textured plane z = 0, x right, y down, with one texture pixel per module."""
     grid = np.array(marker["grid"])
     rows, columns = grid.shape
     x, y = columns * marker["module"] / 2, rows * marker["module"] / 2
@@ -88,7 +88,7 @@ def build(marker: dict, view: str):
     bitmap = bpy.data.images.new(marker["name"], columns, rows)
     bitmap.colorspace_settings.name = "sRGB" if view == "standard" else "Non-Color"
     pixels = np.ones((rows, columns, 4), np.float32)
-    pixels[:, :, :3] = 1 - grid[::-1, :, None]  # Blender's first row is the lowest
+    pixels[:, :, :3] = 1 - grid[::-1, :, None]  # Blender's first row is at the bottom
     bitmap.pixels.foreach_set(pixels.ravel())
     bitmap.update()
     material = bpy.data.materials.new(marker["name"])
@@ -108,7 +108,7 @@ def build(marker: dict, view: str):
 
 
 def aim(scene, image: dict) -> None:
-    """Set the camera. Blender's camera looks along -z with y up, ours along z with y down."""
+    """Set the camera. Blender's camera looks along -z with y up, fidsplat's along z with y down."""
     width, height = image["width"], image["height"]
     scene.render.resolution_x, scene.render.resolution_y = width, height
     data = scene.camera.data

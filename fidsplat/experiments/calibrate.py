@@ -1,4 +1,4 @@
-"""Calibration of a simulated camera with known intrinsics: errors of OpenCV by the number of views."""
+"""Calibration of a simulated camera with known intrinsics: errors of OpenCV by number of views."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ LENSES = {
 COUNTS = (3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 """numbers of views that are compared"""
 DRAWS = 15
-"""random choices of views for each number"""
+"""random subsets of views for each number of views"""
 TARGET = 0.1
-"""pixels: error of the projection that `needed` refers to"""
+"""error of the projection in pixels to which `needed` refers"""
 TILT = 45.0
 """largest tilt of the board in degrees"""
 SHARE = 0.45, 0.9
-"""range of the board's width, relative to the image's"""
+"""range of the board's width relative to the image's width"""
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,9 @@ class CalibrationSettings:
     board: str = "charuco:9x6:5x5_100"
     """SPEC: ChArUco board, 0.3 m wide"""
     views: int = 64
-    """N: number of images"""
+    """N: number of images of the board"""
     electrons: float = 10_000.0
-    """N: electrons of white, for shot noise; inf: no noise"""
+    """N: electrons at white, for shot noise; inf: no noise"""
     seed: int = 0
     """N: seed of poses and noise"""
 
@@ -70,7 +70,7 @@ class CalibrationSettings:
 
     @cached_property
     def truth(self) -> Camera:
-        """The camera, with its principal point off the middle and pixels that are not square."""
+        """The camera, with an off-centre principal point and pixels that are not square."""
         width, height = self.size
         f = width / 2 / math.tan(math.radians(self.fov) / 2)
         return Camera.pinhole(
@@ -83,14 +83,14 @@ class CalibrationSettings:
         return marker(self.board, size=0.3)
 
     def camera(self, rng: np.random.Generator) -> Camera:
-        """The camera at a random pose that views the board."""
+        """The camera at a random pose from which the board is visible."""
         share, tilt, around, roll = rng.uniform((*SHARE[:1], 0, 0, -0.5), (*SHARE[1:], 1, 2 * math.pi, 0.5))
         distance = self.made.size * self.truth.fx / (share * self.truth.width)
         tilt = math.radians(TILT) * math.sqrt(tilt)
         back = np.array(
             [math.sin(tilt) * math.cos(around), math.sin(tilt) * math.sin(around), -math.cos(tilt)]
         )
-        # the board reaches the corners of the image, where distortion is largest; up to half of it is outside
+        # the board reaches the corners of the image, where distortion is largest; half of it may be outside
         edges = np.array([1.0, self.truth.height / self.truth.width])
         aside = rng.uniform(-0.5, 0.5, 2) * edges / share * self.made.size
         target = np.array([*aside, 0.0])
@@ -109,7 +109,7 @@ class Found(NamedTuple):
 
 
 def rendered_views(settings: CalibrationSettings, renderer: Renderer) -> Iterator[Found | None]:
-    """Render views of the board and detect its corners; None where too few are found."""
+    """Render views of the board and detect its corners; yields None if too few corners are found."""
     rng, scene = np.random.default_rng(settings.seed), Scene(markers=(PlacedMarker(settings.made),))
     resident = renderer.upload(scene)
     cameras = [settings.camera(rng) for _ in range(settings.views)]
@@ -125,10 +125,10 @@ def rendered_views(settings: CalibrationSettings, renderer: Renderer) -> Iterato
 
 
 def errors_by_count(settings: CalibrationSettings, views: list[BoardView]) -> Iterator[dict[str, Any]]:
-    """Calibrate from random choices of each number of views.
+    """Calibrate from random subsets of each number of views.
 
-    Yields `views`; `projection_px`, the root mean square error of the projection after removal of a rotation
-    (median of the choices, and its quartiles); and `errors`, the median absolute error of each parameter.
+    Yields `views`; `projection_px`, the RMS error of the projection after removal of a rotation (median of
+    the subsets, with quartiles); and `errors`, the median absolute error of each parameter.
     """
     rng, true = np.random.default_rng(settings.seed), parameters(settings.truth)
     counts = [count for count in COUNTS if count < len(views)] + [len(views)]
@@ -138,12 +138,12 @@ def errors_by_count(settings: CalibrationSettings, views: list[BoardView]) -> It
             chosen = rng.choice(len(views), count, replace=False)
             try:
                 found = calibrate([views[k] for k in chosen], settings.truth)
-            except InputError:  # OpenCV fails for some choices of few views
+            except InputError:  # OpenCV fails for some subsets of few views
                 projection.append(math.inf)
                 continue
             projection.append(float(np.sqrt((projection_errors(found, settings.truth) ** 2).mean())))
             each.append([abs(value - true[name]) for name, value in parameters(found).items()])
-        # the median without interpolation, as failures are infinite
+        # the median without interpolation, since failures are infinite
         low, middle, high = np.percentile(projection, (25, 50, 75), method="nearest").tolist()
         errors = np.median(each, axis=0).tolist() if each else [math.inf] * len(true)
         yield {
@@ -155,8 +155,8 @@ def errors_by_count(settings: CalibrationSettings, views: list[BoardView]) -> It
 
 
 def needed(rows: list[dict[str, Any]]) -> int | None:
-    """The smallest number of views from which on three of four calibrations are within `TARGET`; None if no
-    number is."""
+    """The smallest number of views from which on three of four calibrations are within `TARGET`; None if
+    there is none."""
     found = None
     for row in reversed(rows):
         if row["quartiles_px"][1] > TARGET:
@@ -166,7 +166,7 @@ def needed(rows: list[dict[str, Any]]) -> int | None:
 
 
 def write_chart(rows: list[dict[str, Any]], file: Path) -> None:
-    """Write the error of the projection by the number of views, with quartiles."""
+    """Write a chart of the projection error by number of views, with quartiles."""
     from fidsplat.experiments.charts import chart  # here, since it imports matplotlib
 
     rows = [row for row in rows if math.isfinite(row["quartiles_px"][1])]

@@ -1,4 +1,4 @@
-"""Charts by matplotlib as SVG or PNG: grouped bars, and points with labels that do not overlap."""
+"""Charts by matplotlib as SVG or PNG: grouped bars, and point labels that do not overlap."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from fidsplat.util.files import atomic_write, printable
 Values = Sequence[float]
 _STYLE: dict[Any, Any] = {
     "svg.hashsalt": "fidsplat",  # files are reproducible
-    "figure.dpi": 72,  # the resolution of SVG, so that measured text sizes are correct
+    "figure.dpi": 72,  # SVG's resolution, so that measured text sizes are correct
     "font.size": 10,
     "axes.grid": True,
     "axes.axisbelow": True,
@@ -43,13 +43,13 @@ COLOURS = (
 def chart(
     file: Path, panels: int = 1, size: tuple[float, float] = (9.0, 4.2), one_scale: bool = True, rows: int = 1
 ):
-    """Figure and its axes side by side; the file is written at the end unless an error is raised.
+    """Figure and its axes in a row; the file is written on exit unless an error is raised.
 
-    size: inches. one_scale: whether all axes share the vertical scale. rows: of `panels` axes each.
+    size: inches. one_scale: share the vertical scale among all axes. rows: number of rows of `panels` axes.
     """
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=size, layout="constrained")
-        FigureCanvasAgg(figure)  # to measure texts
+        FigureCanvasAgg(figure)  # required to measure texts
         axes = figure.subplots(rows, panels, squeeze=False, sharey=one_scale).ravel()
         yield figure, axes
         with atomic_write(file) as stream:
@@ -60,7 +60,7 @@ def chart(
 
 
 def _write_png(figure: Figure, stream: IO[bytes]) -> None:
-    """Write a PNG file with a palette, a quarter of the size of one without."""
+    """Write a PNG file with a palette, which has a quarter of the size."""
     from PIL import Image  # matplotlib requires it
 
     with io.BytesIO() as content:
@@ -69,7 +69,7 @@ def _write_png(figure: Figure, stream: IO[bytes]) -> None:
 
 
 def bars(axes: Axes, groups: Sequence[str], series: Mapping[str, Values], logarithmic: bool = False) -> None:
-    """Grouped bars of series; NaN leaves a gap."""
+    """Draw grouped bars of series; NaN leaves a gap."""
     width = 0.84 / max(1, len(series))
     for number, (name, values) in enumerate(series.items()):
         places = np.arange(len(groups)) - 0.42 + width * (number + 0.5)
@@ -81,7 +81,7 @@ def bars(axes: Axes, groups: Sequence[str], series: Mapping[str, Values], logari
 
 
 def legend_above(figure: Figure, axes: Axes) -> None:
-    """One legend above all panels, in as few rows as fit."""
+    """Add one legend above all panels, with as few rows as fit."""
     handles, names = axes.get_legend_handles_labels()
     for columns in range(min(len(names), 6), 0, -1):
         legend = figure.legend(handles, names, loc="outside upper center", ncols=columns, frameon=False)
@@ -96,14 +96,14 @@ def literal(text: str) -> str:
 
 
 def plain_ticks(axis) -> None:
-    """Ticks of a logarithmic axis at 1, 2 and 5, as plain numbers."""
+    """Set ticks of a logarithmic axis at 1, 2 and 5, as plain numbers."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
 
 def label_points(figure: Figure, axes: Axes, points: Sequence[tuple[float, float, str]]) -> None:
-    """Label points without overlaps with other labels, labelled points, texts and horizontal lines."""
+    """Label points without overlaps with other labels, points, texts and horizontal lines."""
     figure.canvas.draw()
     inside = axes.get_window_extent()
     dots = [axes.transData.transform((x, y)) for x, y, _ in points]
@@ -125,7 +125,7 @@ def label_points(figure: Figure, axes: Axes, points: Sequence[tuple[float, float
             )
             label.set_in_layout(False)
             label.update_positions(figure.canvas.get_renderer())  # type: ignore[attr-defined]
-            box = Text.get_window_extent(label).padded(2)  # of the text, without the line to the point
+            box = Text.get_window_extent(label).padded(2)  # the text without the line to its point
             if _contains(inside, box) and not any(box.overlaps(other) for other in taken):
                 taken.append(box)
                 break

@@ -1,4 +1,4 @@
-"""The city of `fidsplat store demo`: a store with measured levels of detail, and a scene with a flight."""
+"""City of `fidsplat store demo`: a store with measured levels of detail, and a scene with a flight."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fidsplat.util.files import writable_folder
 from fidsplat.worlds.city import City, flight
 
 IMAGE_ERROR = 1 / 255
-"""allowed error of the images: one 8-bit level"""
+"""allowed error of images: one 8-bit level"""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class CityDemoSettings(City):
     markers: int = 0
     """markers on the walls, 0 to 1,000"""
     views: int = 24
-    """viewpoints of the measurement, 0 for none"""
+    """viewpoints of the measurement of errors, 0 for none"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -46,7 +46,7 @@ def write_city(
     overwrite: bool = False,
     progress: Callable[[str, float], None] = lambda words, share: None,
 ) -> tuple[Store, Path]:
-    """Write city.fss, and city.toml with a flight and markers; returns the store and the scene's file."""
+    """Write city.fss, and city.toml with a flight and markers; returns the store and the scene file."""
     from fidsplat.accuracy.detail_errors import measure_detail
     from fidsplat.accuracy.error import REFERENCE_CUTOFF
     from fidsplat.render.renderer import Renderer

@@ -17,9 +17,9 @@ FULL_REPEATS, QUICK_REPEATS = 15, 3
 def measure_counts(point: dict, seed: int) -> dict:
     """Sizes of a marker and times of its construction.
 
-    Returns dark and light (quiet zone included) numbers of `cells`, `runs` (of one colour in each row) and
-    `rectangles` of the minimum partition, `components`, `gaussians` by mixture and partition, and `seconds`
-    by mixture: one for each repeat, from the text to the splats, after a warm-up.
+    Returns dark and light (including the quiet zone) numbers of `cells`, `runs` (of one colour in each row)
+    and `rectangles` of the minimum partition, `components`, `gaussians` by mixture and partition, and
+    `seconds` by mixture: one number per repeat, from text to splats, after a warm-up.
     """
     spec = CATEGORIES[point["category"]].spec(point["index"], seed)
     plain = marker(spec)
@@ -54,7 +54,7 @@ def _by_colour(grid: np.ndarray, boxes: np.ndarray) -> dict[str, int]:
 
 
 def _gaussians(mixture: str, boxes: np.ndarray) -> int | None:
-    """Number of Gaussians of a mixture for other rectangles; None for mixtures of modules."""
+    """Number of Gaussians of a mixture for other rectangles; None for mixtures that are made from modules."""
     if mixture == "exact":
         return len(boxes)
     if mixture == "paper":

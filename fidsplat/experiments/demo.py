@@ -1,4 +1,4 @@
-"""Demo: markers from text to splats, three rendered views, detection and comparison with ground truth; and an
+"""Demo: make markers, render three views, detect the markers and compare them with ground truth; also for an
 AprilTag and a QR code in a captured scene."""
 
 from __future__ import annotations
@@ -37,23 +37,23 @@ from fidsplat.vision.readback import Reading, read_back
 from fidsplat.worlds.yard import OUTPUTS, demo_scene, demo_views, sunlit
 
 COMPLETE = 0.98
-"""minimum visible share of a completely visible marker; the rest is the soft edge of its quiet zone"""
+"""visible share above which a marker counts as completely visible: its quiet zone has soft edges"""
 MAX_POSITION_ERROR = 0.01
 """maximum position error relative to the distance"""
 _FRAMES = 3
-"""timed frames after the one that compiles kernels"""
+"""number of timed frames after the frame that compiles kernels"""
 
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A marker in a view."""
+    """Readout of a marker in a view."""
 
     view: str
     reading: Reading
 
     @property
     def passed(self) -> bool | None:
-        """Whether the marker was found at its position; None for a marker that is not completely visible."""
+        """Whether the marker was located; None for a marker that is not completely visible."""
         if self.reading.visible < COMPLETE:
             return None
         error = self.reading.position_error
@@ -71,18 +71,18 @@ class DemoResult:
     unexpected: list[str]
     """detected codes that are not in the scene"""
     frame_ms: dict[str, float]
-    """by view: device time of a frame with all outputs, in milliseconds"""
+    """device time of a frame with all outputs by view, in milliseconds"""
     visible_splats: dict[str, int]
-    """by view: number of splats after culling"""
+    """number of splats after culling by view"""
     captured: str
-    """title, author and licence of the captured scene, or why there is none"""
+    """title, author and licence of the captured scene, or the reason why it is missing"""
     seconds: float
     """duration of the run in seconds"""
     files: list[Path]
 
     @property
     def passed(self) -> bool:
-        """Whether all completely visible markers, at least one, were located, and nothing else."""
+        """Whether all completely visible markers were located, at least one, and no other code was found."""
         decided = [s.passed for s in self.sightings if s.passed is not None]
         return bool(decided) and all(decided) and not self.unexpected
 
@@ -101,7 +101,7 @@ def run_demo(
     mixture: str = "exact",
     captured: str | None = None,
 ) -> DemoResult:
-    """Run the demo and write its images, scene and results into the folder ``out``.
+    """Run the demo; writes its images, scene and results into the folder ``out``.
 
     Args:
         out: folder, created if missing; existing files are overwritten.
@@ -109,10 +109,10 @@ def run_demo(
         progress: called with the name of each step.
         mixture: mixture of the markers; scene.ply has `fitted` instead of `exact`, since PLY files have no
             boxes.
-        captured: name of a captured scene that is rendered with markers too, see `fetch_scene`, or "none". By
+        captured: name of a captured scene (`fetch_scene`) that is rendered with markers too, or "none". By
             default biker, if its download ends while the other views are rendered.
 
-    Raises InputError when the folder cannot be written or for an unknown mixture, DeviceError when the device
+    Raises InputError if the folder cannot be written or the mixture is unknown, DeviceError if the device
     cannot be used.
     """
     begun = time.perf_counter()
@@ -121,7 +121,7 @@ def run_demo(
     missing = fetch_meanwhile(name) if captured is None else None
     if captured not in (None, "none"):
         progress(f"fetching the captured scene {captured}")
-        fetch_scene(captured)  # first, since it may fail
+        fetch_scene(captured)  # before other work, since it may fail
     progress("making three markers and their scene")
     scene = sunlit(demo_scene(mixture=mixture))
     progress("opening the device")
@@ -131,7 +131,7 @@ def run_demo(
     files += sorted(folder.glob("scene-splats-*.ply"))
     gaussians = scene if mixture != "exact" else sunlit(demo_scene(mixture="fitted"))
     save_ply(renderer.lit(gaussians).cloud(), files[1])
-    # files round logarithms and logits to float32: render the splats of the file
+    # files round logarithms and logits to float32: render the file's splats
     scene = Scene.load(files[0])
     resident = renderer.upload(scene)
 
@@ -148,7 +148,7 @@ def run_demo(
     marker_splats = {placed.marker.spec: len(placed.marker.cloud) for placed in scene.markers}
     reason = missing() if missing else "not requested" if captured == "none" else ""
     if not reason:
-        # light by panoramas takes 3 s on the first run
+        # light from panoramas would take 3 s in the first run
         shown, splats = run_captured(name, renderer, "lights" if captured is None else "scene", progress)
         views += shown
         marker_splats = splats | marker_splats
@@ -173,26 +173,26 @@ def run_demo(
 
 @dataclass(frozen=True, eq=False)
 class DemoView:
-    """A rendered view with the markers that were read in it."""
+    """Rendered view with the detected markers."""
 
     name: str
     images: dict[str, np.ndarray]
     """output images by name"""
     outlined: np.ndarray
-    """(h, w, 3) uint8, the image with the outlines of detected markers"""
+    """(h, w, 3) uint8 image with the outlines of detected markers"""
     readings: list[Reading]
     others: list[str]
     """names of detected codes that are not in the scene"""
     frame_ms: float
     """device time of a warm frame in milliseconds"""
     visible: int
-    """splats after culling"""
+    """number of splats after culling"""
 
 
 def render_view(
     renderer: Renderer, resident: Any, scene: Scene, name: str, camera: Camera, outputs: Any = OUTPUTS
 ) -> DemoView:
-    """Render a view, detect its markers and time warm frames."""
+    """Render a view, detect its markers, and time warm frames."""
     frame, frame_ms = _render(renderer, resident, scene, camera, outputs)
     images = {output: frame[output] for output in frame.outputs}
     readings, others = read_back(images, scene, camera)
@@ -214,7 +214,7 @@ def _render(
 
 
 def _sheet(views: list[DemoView]) -> np.ndarray:
-    """Contact sheet with a column per view: detections, depth and normals, with keys."""
+    """Contact sheet with one column per view: detections, depth and normals, with colour keys."""
     span = depth_span(view.images["depth"] for view in views)
     rows = [
         [(f"{view.name}: what was read", view.outlined) for view in views],
@@ -227,12 +227,12 @@ def _sheet(views: list[DemoView]) -> np.ndarray:
 
 _WIDTH, _HEIGHT, _FOV_X = 800, 450, math.radians(50.0)
 _ANGLES = (-10.0, 30.0)
-"""degrees of the views about the vertical, from the front"""
+"""azimuths of the views in degrees, relative to the front"""
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Positions of markers and cameras in a captured scene [m], y down."""
+    """Positions of markers and cameras in a captured scene in metres, y down."""
 
     tag: tuple[float, float, float]
     code: tuple[float, float, float]
@@ -241,7 +241,7 @@ class _Layout:
     distance: float
     background: tuple[float, float, float]
     ambient: tuple[float, float, float]
-    """light of the studio, which the background does not show"""
+    """ambient light of the studio, which is not visible in the background"""
 
 
 _LAYOUTS = {
@@ -267,8 +267,8 @@ _LAYOUTS = {
 
 
 def captured_scene(name: str, light: str) -> Scene:
-    """A captured scene with an AprilTag and a QR code. light: see `Lighting.source`. Raises InputError as
-    `fetch_scene`."""
+    """Captured scene with an AprilTag and a QR code. light: a value of `Lighting.source`. Raises InputError
+    as `fetch_scene`."""
     path, layout = fetch_scene(name), _LAYOUTS[name]
     specs = (("apriltag:36h11:5", layout.tag), ("qr:fidsplat", layout.code))
     placed = tuple(
@@ -283,7 +283,7 @@ def captured_scene(name: str, light: str) -> Scene:
 
 
 def captured_views(name: str) -> dict[str, Camera]:
-    """Cameras on a circle around the front of a captured scene, slightly above."""
+    """Cameras on an arc in front of a captured scene, slightly above it."""
     layout, views = _LAYOUTS[name], {}
     for degrees in _ANGLES:
         turn = math.radians(degrees)
@@ -296,7 +296,7 @@ def captured_views(name: str) -> dict[str, Camera]:
 def run_captured(
     name: str, renderer: Renderer, light: str, progress: Callable[[str], None] = lambda _: None
 ) -> tuple[list[DemoView], dict[str, int]]:
-    """Render and detect the markers of a captured scene; returns its views, and the splats of each marker."""
+    """Render and detect the markers of a captured scene; returns its views and the marker's splat counts."""
     progress(f"reading the captured scene {name}")
     scene, title, views = captured_scene(name, light), captured_scenes()[name].title, []
     resident = renderer.upload(scene)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,7 +54,7 @@ def write_demo_views(
     device: str | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Path:
-    """Render the demo scene from many poses and write the data set (`fidsplat.train.load_dataset`).
+    """Render the demo scene from many poses and write a data set for training.
 
     Raises:
         InputError: the folder cannot be written; DeviceError: the device cannot be used.
@@ -70,24 +70,39 @@ def write_demo_views(
         (folder, "view", _cameras(views, width, 0.0)),
         (folder / "test", "test", _cameras(test, width, 0.5)),
     ):
-        writable_folder(out / "images")
-        names = [f"{stem}-{i:02d}.png" for i in range(len(cameras))]
         frames = renderer.render_views(resident, cameras, outputs="rgb", quality="standard,samples=3")
-        for name, frame in zip(names, frames, strict=True):
-            write_png(out / "images" / name, frame["rgb"])
+        for _ in write_views(out, stem, cameras, (frame["rgb"] for frame in frames), *_points(scene, seed)):
             done += 1
             if progress is not None:
                 progress("images", done / (views + test))
-        save_colmap(out / "sparse" / "0", names, cameras, *_points(scene, seed))
     # written last, since it marks a complete data set
     write_json(folder / "dataset.json", {"background": scene.background, "seed": seed})
     return folder
 
 
-def _cameras(count: int, width: int, shift: float) -> list[Camera]:
-    """Cameras on an arc with alternating distances and heights.
+def write_views(
+    folder: Path,
+    stem: str,
+    cameras: Sequence[Camera],
+    images: Iterable[np.ndarray],
+    points: np.ndarray,
+    colors: np.ndarray,
+) -> Iterator[Path]:
+    """Write images and their COLMAP model for training; yields the file of each image.
 
-    shift: 0.5 places cameras between those of 0.
+    points: (n, 3) metres, with colors (n, 3) uint8.
+    """
+    names = [f"{stem}-{i:02d}.png" for i in range(len(cameras))]
+    writable_folder(folder / "images")
+    for name, image in zip(names, images, strict=True):
+        yield write_png(folder / "images" / name, image)
+    save_colmap(folder / "sparse" / "0", names, cameras, points, colors)
+
+
+def _cameras(count: int, width: int, shift: float) -> list[Camera]:
+    """Cameras on an arc with varying distances and heights.
+
+    shift: 0.5 shifts the cameras by half of their spacing.
     """
     height = round(width * 9 / 16)
     cameras = []

@@ -1,4 +1,4 @@
-"""Ideal images of printed tags among splats: exact mean of the texture per pixel."""
+"""Ideal images of printed tags among splats: exact mean of the texture in each pixel."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from fidsplat.experiments.plane import plane_image
 from fidsplat.scenes import PlacedMarker
 
 _MIN_COVERAGE = 1 / 512
-"""minimum share of a pixel that a tag covers"""
+"""minimum covered share of a pixel that belongs to a tag"""
 
 
 def tag_depth_image(tags: Iterable[PlacedMarker], camera: Camera, behind: np.ndarray) -> ExternalDepth:
-    """External depth image of printed tags for a frame without them.
+    """External depth image of printed tags, for a frame without the tags.
 
-    A partly covered pixel is mixed with the frame, at the depth of the tag.
+    A partly covered pixel is blended with the frame, and has the depth of the tag.
 
     Args:
         tags: black and white markers; tags that face away or reach behind the camera are skipped.
-        camera: a pinhole.
+        camera: a pinhole camera.
         behind: (h, w, 3) frame without the tags.
     """
     rgb, depth = np.array(behind, np.float64), np.zeros(behind.shape[:2])
@@ -53,7 +53,8 @@ def tag_depth_image(tags: Iterable[PlacedMarker], camera: Camera, behind: np.nda
 
 
 def _window(pose: np.ndarray, tag: PlacedMarker, camera: Camera) -> tuple[int, int, int, int] | None:
-    """Bounding box (left, top, right, bottom) of a tag at `pose`, camera from marker; None if not visible."""
+    """Bounding box (left, top, right, bottom) of a tag; None if it is not visible. pose: camera from
+    marker."""
     height, width = np.array(tag.marker.grid.shape) * tag.marker.module / 2
     corners = np.array([(x, y, 0.0) for x in (-width, width) for y in (-height, height)])
     points = corners @ pose[:3, :3].T + pose[:3, 3]
@@ -66,7 +67,7 @@ def _window(pose: np.ndarray, tag: PlacedMarker, camera: Camera) -> tuple[int, i
 
 
 def _depth(pose: np.ndarray, camera: Camera) -> np.ndarray:
-    """Depth along z of the plane of a marker at each pixel, (h, w) metres."""
+    """Depth along z of a marker's plane at each pixel, (h, w) metres."""
     rays = camera.rays(camera.pixel_centres.reshape(-1, 2)).reshape(camera.height, camera.width, 3)
     with np.errstate(divide="ignore"):
         return pose[:3, 2] @ pose[:3, 3] / (rays @ pose[:3, 2])

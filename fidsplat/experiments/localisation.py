@@ -29,11 +29,11 @@ QUICK = (0.5, 1.0, 2.0), (0.0, 40.0, 60.0)
 def measure_localisation(point: dict, markers: MarkerRenderer, seed: int, pool: Executor) -> dict:
     """Pose errors of a marker at every distance and tilt.
 
-    Roll and aim of the cameras are random, so that modules are not aligned with pixels; they are the same for
-    every method.
+    Roll and aim of the cameras are random, so that modules are not aligned with pixels, and the same for all
+    methods.
 
-    Returns `views`: distance_m, tilt_deg, and position_mm, angle_deg, corners_px (root mean square), all None
-    where the marker was not read.
+    Returns `views`: distance_m, tilt_deg, position_mm, angle_deg, corners_px (RMS); the errors are None if
+    the marker was not read.
     """
     category = CATEGORIES[point["category"]]
     name = f"{category.name}-{point['index']}"
@@ -61,7 +61,7 @@ def _errors(plain: Marker, camera: Camera, image: np.ndarray) -> dict[str, float
 def camera_at(distance: float, tilt: float, seed: str) -> Camera:
     """Camera at a distance in metres and a tilt in degrees from the marker's normal.
 
-    Azimuth, a roll of up to 20 degrees, and an aim of up to 3 degrees beside the marker are random.
+    Azimuth, a roll of up to 20 degrees, and an aim of up to 3 degrees off the marker are random.
     """
     generator = random.Random(seed)
     a, b = math.radians(tilt), generator.uniform(0, 2 * math.pi)

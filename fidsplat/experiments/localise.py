@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from fidsplat.logs import RobotLog
 
 RATE = 4.0
-"""images per second"""
+"""images per second of the robot's camera"""
 DISTANCES = 1.0, 2.0, 3.0
 """distance bins of corner errors in metres"""
 FAMILY = "apriltag:36h11"
@@ -65,23 +65,24 @@ class Variant:
     readout: float = 0.0
     sensor: Sensor | None = None
     ideal: bool = False
-    """use the detected tags with ideal corners"""
+    """replace the corners of detected tags by ideal corners"""
     texture: bool = False
-    """replace tag splats by the exact mean of the texture per pixel (pinhole camera, no exposure time)"""
+    """render tags as the exact mean of their texture per pixel instead of splats (pinhole, no exposure
+    time)"""
     reach: float = math.inf
     """maximum distance of tags in metres"""
     speed: float | None = None
-    """metres per second; None: that of the experiment"""
+    """metres per second; None: the drive's speed"""
     lidar: bool = False
     """scan with a LiDAR at the times of the images"""
     without: str = ""
-    """sensor that the filter does not use: wheels, gyroscope, tags or lidar"""
+    """sensor that the filter ignores: wheels, gyroscope, tags or lidar"""
     spacing: float = 0.0
-    """metres between the used tags of a side of a bench, at least"""
+    """minimum distance in metres between the used tags on a side of a bench"""
 
     @property
     def rendering(self) -> Variant:
-        """The variant with the same measurements and default values of all other settings."""
+        """The variant with only the settings that change the logged measurements."""
         return replace(self, ideal=False, reach=math.inf, without="", spacing=0.0)
 
 
@@ -129,7 +130,7 @@ class Drive:
     seed: int = 0
     """Seed of the greenhouse and of the sensors' errors."""
     speed: float = 0.5
-    """Speed in metres per second."""
+    """Speed of the robot in metres per second."""
 
     @cached_property
     def house(self) -> Greenhouse:
@@ -150,7 +151,7 @@ class Drive:
         return replace(self.house, mixture=mixture).scene
 
     def run(self, speed: float | None = None) -> Run:
-        """Drive up one aisle and down the next, at a given or the default speed."""
+        """Drive up one aisle and down the next; speed: None for the drive's speed."""
         ends, path = (-0.8, self.house.length + 0.8), []
         for aisle in range(self.rows + 1):
             y = (aisle - 0.5) * AISLE
@@ -158,7 +159,7 @@ class Drive:
         return robot.drive(self.house.mjcf(BODY), np.array(path), speed or self.speed, Errors(seed=self.seed))
 
     def image_indices(self, run: Run) -> np.ndarray:
-        """Indices of the poses with images."""
+        """Indices of the poses at which images are rendered."""
         return np.unique(np.searchsorted(run.times, np.arange(1 / RATE, run.times[-1], 1 / RATE)))
 
     def images(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[np.ndarray]:
@@ -190,7 +191,7 @@ class Drive:
     def frames(
         self, variant: Variant, run: Run, renderer: Renderer
     ) -> Iterator[tuple[np.ndarray, list[Detection]]]:
-        """Images and their detected tags; detection overlaps with rendering."""
+        """Images and their detected tags. Detection runs in threads during rendering."""
         workers = os.cpu_count() or 1
         pending = deque()
         with ThreadPoolExecutor(workers) as pool:
@@ -225,13 +226,13 @@ class Drive:
         scans: list[np.ndarray] | None = None,
         variant: Variant | None = None,
     ) -> tuple[Trajectory, dict[str, Any]]:
-        """Estimated poses and their errors.
+        """Estimate poses by the filter; returns them with their errors.
 
         Args:
             detections: detected tags of each image; None: no camera.
             noise: standard deviation of corners in pixels.
             scans: points (n, 3) of each scan; None: no LiDAR.
-            variant: its reach, spacing of tags, and sensor that is not used.
+            variant: its maximum distance and spacing of tags, and the ignored sensor.
         """
         variant = variant or Variant()
         without, tags = variant.without, self._spaced(variant.spacing)
@@ -240,7 +241,7 @@ class Drive:
             np.array([*first[:2, 3], math.atan2(first[1, 0], first[0, 0])]),
             noise,
             drift=0.1 if without == "wheels" else 0.0,
-            # wheels of different size turn the robot by its speed
+            # wheels of different size rotate the robot in proportion to its speed
             **({"bias": 0.05, "bias_walk": 0.02} if without == "gyroscope" else {}),
         )
         used_codes = None if without == "tags" else detections
@@ -263,7 +264,7 @@ class Drive:
                     used += localiser.correct(code.corners, tag.corners, partial(camera_at, camera))
             if k in clouds:
                 matched += matcher.correct(localiser, clouds[k])
-                # without wheels, the speed is that since the last scan
+                # without wheels, the speed is estimated from the last scan
                 ahead = np.linalg.inv(poses[last]) @ localiser.pose
                 speed, last = float(ahead[0, 3] / (run.times[k] - run.times[last])), k
             poses.append(localiser.pose)
@@ -272,7 +273,7 @@ class Drive:
         return Trajectory(run.times, np.array(poses)), facts
 
     def _spaced(self, spacing: float) -> set[int]:
-        """Ids of tags at least that far apart on each side of a bench."""
+        """Ids of tags with at least this distance from each other on each side of a bench."""
         ids, last = set(), {}
         for number, tag in sorted(self.tags.items(), key=lambda each: each[1].pose[0, 3]):
             x, side = tag.pose[0, 3], round(tag.pose[1, 3], 3)
@@ -289,7 +290,7 @@ class Drive:
             yield k, [(code, self.tags[code.id]) for code in codes if code.id in self.tags], run.poses[k]
 
     def ideal_corners(self, run: Run, detections: list[list[Detection]]) -> list[list[Detection]]:
-        """The detected tags with ideal corners."""
+        """Detected tags with ideal instead of detected corners."""
         return [
             [replace(code, corners=camera_at(self.camera, pose).project(tag.corners)) for code, tag in pairs]
             for _, pairs, pose in self._known(run, detections)
@@ -298,9 +299,9 @@ class Drive:
     def corner_errors(
         self, run: Run, detections: list[list[Detection]], camera: Camera
     ) -> list[dict[str, Any]]:
-        """Number of detected tags and median corner error in pixels by bin of `DISTANCES`.
+        """Number of detected tags and median corner error in pixels, by bin of `DISTANCES`.
 
-        The corner error of a tag is a root mean square.
+        The corner error of a tag is the RMS over its corners.
         """
         errors: list[list[float]] = [[] for _ in range(len(DISTANCES) + 1)]
         for _, pairs, pose in self._known(run, detections):
@@ -315,7 +316,7 @@ class Drive:
 def errors_of(run: Run, poses: np.ndarray) -> dict[str, float]:
     """Errors of estimated poses (n, 4, 4): metres on the floor, heading in degrees.
 
-    ATE without alignment (root mean square and worst), RPE over a metre (root mean square).
+    ATE without alignment (RMS and maximum), RPE over one metre (RMS).
     """
     distance = np.linalg.norm(poses[:, :2, 3] - run.poses[:, :2, 3], axis=1)
     rotation = np.einsum("nji,njk->nik", run.poses[:, :3, :3], poses[:, :3, :3])
@@ -339,8 +340,8 @@ def record(
 ) -> Iterator[tuple[np.ndarray, list[Detection]]]:
     """Log the measurements of a drive as ROS 2 messages; yields images and detected tags.
 
-    Logged are wheels, gyroscope, intrinsics, detections, points, camera poses (/tf), and if requested images
-    as JPEG.
+    The messages are wheels, gyroscope, intrinsics, detections, points, camera poses (/tf), and if requested
+    images as JPEG.
     """
     has_images = variant.mixture is not None
     frames = drive.frames(variant, run, renderer) if has_images else iter(())
@@ -364,10 +365,10 @@ def record(
 
 
 def recorded(path: str | os.PathLike[str], truth: Run) -> tuple[Run, list[list[Detection]], list[np.ndarray]]:
-    """Measurements of a log: wheels and gyroscope with the true poses, detected tags, and points (n, 3).
+    """Read a log: wheels and gyroscope with the true poses, detected tags, and points (n, 3).
 
     Raises:
-        InputError: not a log.
+        InputError: the file is not a log.
     """
     from fidsplat.logs import messages
     from fidsplat.logs.reader import detections_of, points_of
@@ -392,7 +393,7 @@ def write_log(
     """Write the drive of a variant as a log with images and estimated poses (/odom); yields the images.
 
     Raises:
-        InputError: a variant without images, or if the log cannot be written.
+        InputError: the variant has no images, or the log cannot be written.
     """
     from fidsplat.logs import RobotLog
 

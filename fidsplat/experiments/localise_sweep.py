@@ -29,7 +29,7 @@ RESULTS, REPORT, CHART = "localise.jsonl", "localise.md", "localise.svg"
 Found = Mapping[str, Mapping[str, Any]]
 """results by variant"""
 Progress = Callable[[str, float], object]
-"""called with the name of a variant and the completed share of its images"""
+"""callback with the name of a variant and the completed share of its images"""
 _PLOTTED = ("odometry", "paper", "exact", "no tags", "no wheels")
 """variants with a plotted trajectory"""
 _SPANS = (
@@ -50,8 +50,8 @@ def drive_sweep(
     """Sweep over variants by name.
 
     Raises:
-        InputError: an unknown name; the folder holds results of another greenhouse, device or code, or cannot
-            be written.
+        InputError: a name is unknown, or the folder has results of another greenhouse, device or code or
+            cannot be written.
     """
     for name in names:
         if name not in VARIANTS:
@@ -62,14 +62,14 @@ def drive_sweep(
 
     @cache
     def run_at(speed: float | None) -> Run:
-        """A drive; its ground truth is saved with the results."""
+        """The drive at a speed; its ground truth is saved with the results."""
         run = drive.run(speed)
         save_trajectory(Trajectory(run.times, run.poses), out / _tum(_truth(speed)))
         return run
 
     @cache
     def log_of(rendering: Variant, name: str) -> Path:
-        """The log of the measurements of variants, which an interrupted sweep reads again."""
+        """Log of the measurements that variants share; an interrupted sweep reads existing logs."""
         path, run = out / f"{_stem(name)}.mcap", run_at(rendering.speed)
         source = digest_of((drive, rendering, facts["code"], facts["device"]))
         if not check_log(path, overwrite, source):
@@ -80,7 +80,7 @@ def drive_sweep(
         return path
 
     def begin(key: Key) -> Work:
-        """Log the measurements for a variant; returns the estimation."""
+        """Log the measurements of a variant; returns the function that estimates poses."""
         name = key["variant"]
         variant = VARIANTS[name]
         first = next(each for each in VARIANTS if VARIANTS[each].rendering == variant.rendering)
@@ -91,7 +91,7 @@ def drive_sweep(
 
 
 def _estimate(file: Path, drive: Drive, variant: Variant, truth: Run, log: Path) -> dict[str, Any]:
-    """Write the trajectory of a variant estimated from a log; returns its errors."""
+    """Estimate a variant's trajectory from a log and write it; returns its errors."""
     camera = replace(drive.camera, lens=variant.lens)
     run, detections, scans = recorded(log, truth)
     if variant.ideal:
@@ -116,7 +116,7 @@ def found_of(results: Results) -> dict[str, dict[str, Any]]:
 
 
 def table_of(found: Found) -> Frame:
-    """Table row of each variant: errors in centimetres, degrees and pixels, and tags."""
+    """Table with a row per variant: errors in centimetres, degrees and pixels, and numbers of tags."""
     no_corners = [{"median_px": None}] * len(_SPANS)
     return pd.DataFrame(
         {
@@ -152,14 +152,14 @@ def write_report(folder: Path, drive: Drive, device: str, found: Found) -> Path:
 
 
 def _write_chart(folder: Path, found: Found) -> None:
-    """Chart of true and estimated trajectories, and of the errors of all variants."""
+    """Write a chart of true and estimated trajectories, and of the errors of all variants."""
     errors = {name: 100 * facts["ate_m"] for name, facts in found.items()}
     shown = [name for name in _PLOTTED if name in errors]
     with chart(folder / CHART, panels=2, size=(11.0, 4.6), one_scale=False) as (figure, axes):
         # show the drive at the default speed, else at the speed of the first measured variant
         speeds = [VARIANTS[name].speed for name in found]
         for number, name in enumerate([_truth(None if None in speeds else speeds[0]), *shown]):
-            path = load_trajectory(folder / _tum(name)).poses[::10, :2, 3]  # every fifth of a second
+            path = load_trajectory(folder / _tum(name)).poses[::10, :2, 3]  # every 0.2 s
             width, colour = (3.0, "#bbbbbb") if number == 0 else (1.0, COLOURS[number % len(COLOURS)])
             axes[0].plot(path[:, 0], path[:, 1], label=name, color=colour, linewidth=width)
         axes[0].set_aspect("equal")

@@ -1,4 +1,4 @@
-"""Methods of the tables: ways to render a marker."""
+"""Rendering methods of markers that the tables compare."""
 
 from __future__ import annotations
 
@@ -23,30 +23,29 @@ FILTERS = {
     "screen": Quality(alpha_cutoff=_CUT),
     "best": Quality(alpha_cutoff=_CUT, lowpass="none", samples=3),
 }
-"""filters: the low-pass of 2DGS, and 3 x 3 samples without a low-pass; both with the cut-off of other
-renderers"""
+"""filters: the low-pass of 2DGS, and 3 x 3 samples without a low-pass; with the cut-off of other renderers"""
 _LIGHT = "light"
-"""the filter "best", blended in linear light and then encoded by the sensor's sRGB curve"""
+"""the filter "best", blended in linear light and encoded by the sensor's sRGB response"""
 _TRAINED_QUALITY = "surfel"
 """the paper's settings for trained models"""
 
 Render = Callable[[Camera], np.ndarray]
-"""camera -> (height, width) float grey, display values, not clamped"""
+"""function from a camera to an image (h, w) of float grey display values, not clamped"""
 
 
 def mixtures() -> tuple[str, ...]:
-    """Names of all mixtures, the paper's first, then `fitted`."""
+    """Names of all mixtures, first the paper's, then `fitted`."""
     from fidsplat.capture.quality import MIXTURES
 
     return tuple(dict.fromkeys(("paper", "fitted", *MIXTURES)))
 
 
 def method_names(chosen: tuple[str, ...] = (), trained: Path | None = None) -> tuple[str, ...]:
-    """Names of methods: "ideal" (the exact image of the printed texture), "MIXTURE/FILTER" for each mixture
-    of splats, and "2dgs-N" for each trained model that exists, N being its number of training views.
+    """Names of methods: "ideal" (the exact image of the printed texture), "MIXTURE/FILTER" for each mixture,
+    and "2dgs-N" for each existing trained model with N training views.
 
     Args:
-        chosen: mixtures; by default all except `facets`, which is opaque only with order by depth per pixel.
+        chosen: mixtures; by default all except `facets`, which is opaque only if ordered by depth per pixel.
         trained: folder with trained models, see `MarkerRenderer`.
 
     Raises InputError for an unknown mixture.
@@ -61,7 +60,7 @@ def method_names(chosen: tuple[str, ...] = (), trained: Path | None = None) -> t
 
 
 def with_linear_light(methods: Iterable[str]) -> list[str]:
-    """Methods, with a variant in linear light after each "MIXTURE/best"."""
+    """Insert a variant in linear light after each method "MIXTURE/best"."""
     return list(dict.fromkeys(name for m in methods for name in (m, m.replace("/best", f"/{_LIGHT}"))))
 
 
@@ -74,11 +73,11 @@ def in_linear_light(method: str) -> bool:
 class MarkerRenderer:
     """Renderer of markers by any method.
 
-    Trained models are read from ``trained``/2dgs-17/small-0.ply: collection, marker.
+    Trained models are files such as ``trained``/2dgs-17/small-0.ply: collection and marker.
     """
 
     renderer: Renderer | None
-    """None if only the ideal is rendered"""
+    """None: only the method "ideal" is rendered"""
     trained: Path | None = None
 
     def prepare(self, method: str, name: str, spec: str, module: float) -> Render:
@@ -89,14 +88,14 @@ class MarkerRenderer:
             name, spec: name such as "small-0" and spec of the marker.
             module: edge of a module in metres.
 
-        Raises InputError for an unknown method or a trained model that is missing.
+        Raises InputError for an unknown method or a missing trained model.
         """
         plain = marker(spec)
         if method == IDEAL:
             return lambda camera: plane_image(plain.grid, module, camera, background=BACKGROUND)
         renderer = self.renderer
         if renderer is None:
-            raise InputError(f"the method {method} needs a renderer")
+            raise InputError(f"a renderer must be given for the method {method}, got none")
         head, _, filtered = method.partition("/")
         if filtered:
             cloud = marker(spec, module * plain.bits.shape[1], mixture=head).cloud
@@ -108,7 +107,7 @@ class MarkerRenderer:
             cloud = load_ply(self.trained / method / f"{name}.ply").transformed(scale)
             quality = Quality.named(_TRAINED_QUALITY)
         else:
-            raise InputError(f"the method {method} needs a folder of trained models")
+            raise InputError(f"a folder of trained models must be given for the method {method}, got none")
         resident = renderer.upload(cloud)
         linear = in_linear_light(method)
         ground = from_srgb(BACKGROUND) if linear else BACKGROUND

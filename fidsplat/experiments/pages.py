@@ -21,10 +21,10 @@ TEMPLATES = Path(__file__).with_name("templates")
 
 
 def page_and_folder(out: Path, template: str) -> tuple[Path, Path]:
-    """Report file, and folder of its charts and tables.
+    """File of a report, and folder of its charts and tables.
 
-    These are report.md in a folder, or a name that ends in .md and a folder of that name without .md. Raises
-    InputError when the folder cannot be written, or the file exists and is not a report of the template.
+    For a folder, report.md in it; for a name that ends in .md, this file and a folder of that name without
+    .md. Raises InputError if the folder cannot be written, or the file is not a report of this template.
     """
     if out.suffix != ".md":
         return writable_folder(out) / "report.md", out
@@ -38,20 +38,20 @@ def page_and_folder(out: Path, template: str) -> tuple[Path, Path]:
 
 
 def write_page(page: Path, folder: Path, template: str, context: Mapping[str, Any]) -> None:
-    """Fill a template and write the report. Arguments: see `fill_template`."""
+    """Fill a template and write the report; arguments as of `fill_template`."""
     write_file(page, printable(fill_template(page, folder, template, context)))
 
 
 def fill_template(
     page: Path, folder: Path, template: str, context: Mapping[str, Any], templates: Path = TEMPLATES
 ) -> str:
-    """Text of a template.
+    """Fill a template and return its text.
 
     Args:
         page: file of the text.
-        folder: folder of charts; its name relative to the page is the variable `folder`.
-        context: variables of the template; pandas tables have the filter `table`. Text except a `Markup` is
-            escaped, since names of data sets and files may contain HTML.
+        folder: folder of charts; its path relative to the page is the variable `folder`.
+        context: variables of the template; the filter `table` formats pandas tables. Text that is not a
+            `Markup` is escaped, since names of data sets and files may contain HTML.
         templates: folder of the template.
     """
     environment = jinja2.Environment(
@@ -69,23 +69,23 @@ def fill_template(
 
 
 def markdown_table(frame: Frame) -> Markup:
-    """A table; all columns except the first are right-aligned."""
+    """Format a table as Markdown, with all columns right-aligned except the first."""
     rows = [frame.columns, ["---", *["---:"] * (len(frame.columns) - 1)], *frame.itertuples(index=False)]
     return Markup("\n".join("| " + " | ".join(map(_cell, row)) + " |" for row in rows))
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """A number to some significant digits."""
+    """Format a number with some significant digits."""
     return NOTHING if value is None or pd.isna(value) else f"{value:.{digits}g}"
 
 
 def fixed(value: float | None, digits: int = 1) -> str:
-    """A number to some digits behind the point."""
+    """Format a number with some decimal places."""
     return NOTHING if value is None or pd.isna(value) else f"{value:.{digits}f}"
 
 
 def percent(ratio: float | None) -> str:
-    """Relative change of a ratio from 1, such as +12 %."""
+    """Format a ratio as a relative change from 1, such as +12 %."""
     if ratio is None or pd.isna(ratio):
         return NOTHING
     change = 100 * (ratio - 1)
@@ -93,7 +93,7 @@ def percent(ratio: float | None) -> str:
 
 
 def listed(names: list[str]) -> str:
-    """Names in a sentence, which may contain commas; "none" if empty."""
+    """Join names, which may contain commas, for a sentence; "none" if there are none."""
     return "; ".join(names) if names else "none"
 
 

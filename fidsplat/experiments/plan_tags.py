@@ -1,4 +1,4 @@
-"""Places for tags on the surfaces of a scene that help most to localise a camera along a trajectory."""
+"""Planning of tag positions on surfaces of a scene, for the localisation of a camera along a trajectory."""
 
 from __future__ import annotations
 
@@ -38,23 +38,23 @@ from fidsplat.vision.tag_placement import (
 )
 
 WIDEST = 640
-"""pixels: largest width of the depth images"""
+"""maximum width of the depth images in pixels"""
 STEPS, ROWS = 16, 12
-"""candidates per image, in x and y"""
+"""number of candidates per image along x and y"""
 MODULE = 2.5
-"""pixels: smallest module of a readable tag"""
+"""minimum size in pixels of a module of a readable tag"""
 INCIDENCE = math.cos(math.radians(70))
-"""smallest cosine between the normal of a readable tag and the ray"""
+"""minimum cosine of the angle between the normal of a readable tag and the ray"""
 TAGS = ("apriltag", "aruco")
-"""kinds of markers of a scene that a camera localises by"""
+"""kinds of markers from which a camera localises itself"""
 STEEP = math.sqrt(0.5)
-"""largest cosine between the normal of a wall and the vertical"""
+"""maximum cosine of the angle between the normal of a wall and the vertical"""
 FLAT = 0.1
-"""largest roughness of a candidate, as a share of the size of the tag"""
+"""maximum roughness of a candidate, relative to the size of the tag"""
 SHARE = 0.9
-"""smallest share of the tag's area that is in the plane"""
+"""minimum share of the tag's area that is in the plane"""
 _DEPTH = 0.02, 0.01
-"""metres and share of the distance: a tag is occluded where the depth image is nearer than this"""
+"""tolerance of the occlusion test in metres and as a share of the distance: nearer depths occlude a tag"""
 
 
 OBJECTIVES: dict[str, Objective] = {"information": gain, "error": error_gain}
@@ -73,24 +73,25 @@ class PlanSettings:
     size: float = 0.16
     """M: edge of a tag in metres"""
     family: str = "36h11"
-    """TEXT: AprilTag family; ids that the scene has are left out"""
+    """TEXT: AprilTag family; ids of existing tags are skipped"""
     target: float | None = None
     """M: place tags, at most N, until the predicted RMS error of positions is below this"""
     walls: bool = False
     """use walls only, no floors and ceilings"""
     objective: Literal["information", "error"] = "information"
-    """information|error: maximise the information, with a bound, or minimise the predicted error of the
-    positions"""
+    """information|error: maximise the information, with an upper bound of the optimum, or minimise the
+    predicted error of the positions"""
     planar: bool = False
-    """the camera moves on a floor: height, roll and pitch do not drift, and err by 3 mm and 0.3 degrees"""
+    """the camera moves on a floor: height, roll and pitch do not drift, with errors of 3 mm and 0.3
+    degrees"""
     poses: int = 150
-    """N: poses of the trajectory, evenly in time, that are evaluated"""
+    """N: number of evaluated poses of the trajectory, equidistant in time"""
     views: int = 30
-    """N: poses whose images are searched for surfaces"""
+    """N: number of poses whose depth images are searched for surfaces"""
     drift: tuple[float, float] = (0.01, 0.5)
     """M DEG: standard deviation of the odometry after one metre"""
     corner_noise: float = 0.05
-    """PX: error of a detected corner that blur and noise of the sensor do not explain"""
+    """PX: error of a detected corner in addition to the effects of blur and sensor noise"""
 
     def __post_init__(self) -> None:
         for name in ("count", "poses", "views"):
@@ -107,19 +108,19 @@ class PlanSettings:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A scene with planned tags."""
+    """Scene with planned tags."""
 
     scene: Scene
-    """the scene with the tags after its own markers"""
+    """scene with the tags after its own markers"""
     tags: tuple[PlacedMarker, ...]
     """planned tags, in the order of the greedy selection"""
     sightings: tuple[int, ...]
-    """number of evaluated poses that see each tag"""
+    """number of evaluated poses from which each tag is readable"""
     errors: tuple[float, ...]
-    """predicted RMS error of the positions in metres without planned tags, with the first, ..."""
+    """predicted RMS error of the positions in metres, without planned tags, with the first tag, ..."""
     selection: Selection
     candidates: int
-    """number of candidates that a pose sees"""
+    """number of candidates that are visible from a pose"""
     path: np.ndarray
     """(p, 4, 4) evaluated camera-to-world poses"""
 
@@ -142,19 +143,19 @@ def plan_tags(
     renderer: Renderer,
     progress: Progress | None = None,
 ) -> Plan:
-    """Places of tags on surfaces of a scene for a camera on a trajectory.
+    """Plan tags on surfaces of a scene for a camera on a trajectory.
 
-    Candidates are flat surfaces that the trajectory sees. A pose sees a tag if its depth image shows no
-    occlusion, its modules are large enough and its incidence is below 70 degrees. The information of the
-    corners depends on incidence, distance, motion blur and noise. Tags that the scene has count as well.
+    Candidates are flat surfaces in view of the trajectory. A tag is readable from a pose if its depth image
+    has no occlusion, its modules are large enough and its incidence is below 70 degrees. The information of
+    the corners depends on incidence, distance, motion blur and noise. Existing tags of the scene contribute.
 
     Args:
         path: camera-to-world poses.
-        progress: called with the current step and its share done.
+        progress: called with the current step and its completed share.
 
     Raises:
-        InputError: a scene without a camera, no flat surface in view of the trajectory, or too many tags
-            for the family.
+        InputError: the scene has no camera, no flat surface is in view of the trajectory, or the family has
+            too few ids.
     """
     ids = _free_ids(scene, settings)
     survey = Survey(scene, path, settings, renderer, progress)
@@ -164,7 +165,7 @@ def plan_tags(
     visible = [k for k, one in enumerate(seen) if len(one.poses)]
     if not visible:
         raise InputError(
-            "the trajectory must see a flat surface of the size of a tag at less than 70 degrees, got none; "
+            "the trajectory must have a flat surface of a tag's size in view below 70 degrees, got none; "
             "give smaller tags, or poses of the camera (z forward, y down)"
         )
     seen, poses = [seen[k] for k in visible], poses[visible]
@@ -228,7 +229,7 @@ class Survey:
         self.covariance = self.with_tags(existing)
 
     def candidate_poses(self) -> np.ndarray:
-        """Poses (n, 4, 4) of tags on flat surfaces, apart from the scene's markers."""
+        """Poses (n, 4, 4) of tags on flat surfaces, except at the scene's markers."""
         settings, found = self._settings, []
         every = range(0, len(self.cameras), max(1, -(-len(self.cameras) // settings.views)))
         for n, k in enumerate(every):
@@ -236,13 +237,13 @@ class Survey:
             found += [one for one in seen if not settings.walls or abs(one[0].normal @ self.up) < STEEP]
             self.report("searching surfaces", 0.3 + 0.4 * (n + 1) / len(every))
         poses = spread_out(found, self.tag)
-        for one in self._scene.markers:  # markers are flat, too
+        for one in self._scene.markers:  # markers are flat surfaces too
             apart = np.linalg.norm(poses[:, :3, 3] - one.pose[:3, 3], axis=1)
             poses = poses[apart > self.tag.radius + one.marker.radius]
         return poses
 
     def sightings(self, tags: Sequence[PlacedMarker]) -> list[Sightings]:
-        """The images of each tag in which it is readable."""
+        """Images in which each tag is readable."""
         noise = corner_noise(self._scene.sensor or Sensor(), self._settings.corner_noise)
         seen = sightings_of(tags, self.cameras, self._depths, noise, self._exposed)
         if not self._settings.planar:
@@ -253,7 +254,7 @@ class Survey:
         ]
 
     def with_tags(self, tags: Sequence[PlacedMarker]) -> np.ndarray:
-        """The covariance (6 p, 6 p) of the trajectory with tags."""
+        """Covariance (6 p, 6 p) of the trajectory, updated by tags."""
         covariance = self.covariance
         for one in self.sightings(tags):
             covariance = updated(covariance, one)
@@ -261,7 +262,7 @@ class Survey:
 
 
 def corner_noise(sensor: Sensor, floor: float) -> CornerNoise:
-    """The noise of corners for a sensor, at half of its full well."""
+    """Corner noise for a sensor, at half of its full well."""
     steps = 2.0 ** (sensor.bits or 8) - 1
     noise = (1 / steps) ** 2 / 12
     if math.isfinite(sensor.full_well):
@@ -272,7 +273,7 @@ def corner_noise(sensor: Sensor, floor: float) -> CornerNoise:
 def surface_candidates(
     depth: np.ndarray, camera: Camera, tag: Marker, up: np.ndarray
 ) -> list[tuple[Surface, np.ndarray]]:
-    """Flat surfaces of the size of a tag in a depth image, with the pose (4, 4) of a tag on each."""
+    """Flat surfaces of a tag's size in a depth image, each with the pose (4, 4) of a tag on it."""
     found = []
     view = camera.world_to_camera
     for y in (np.arange(ROWS) + 0.5) * camera.height / ROWS:
@@ -293,7 +294,7 @@ def surface_candidates(
 
 
 def spread_out(found: Sequence[tuple[Surface, np.ndarray]], tag: Marker) -> np.ndarray:
-    """Poses (n, 4, 4) of the candidates, of near ones only the one with the largest share of inliers."""
+    """Poses (n, 4, 4) of candidates; of nearby ones only that with the largest inlier share remains."""
     order = sorted(range(len(found)), key=lambda k: (-found[k][0].inlier_share, found[k][0].roughness))
     kept: list[np.ndarray] = []
     for k in order:
@@ -311,11 +312,11 @@ def sightings_of(
     noise: CornerNoise,
     exposed: Sequence[tuple[Camera, Camera]] | None = None,
 ) -> list[Sightings]:
-    """The images of each tag in which it is readable.
+    """Images in which each tag is readable.
 
     Args:
         depths: (h, w) median depth of each camera, at most 640 pixels wide.
-        exposed: each camera at the begin and the end of the exposure; None: an instantaneous shutter.
+        exposed: each camera at the start and the end of the exposure; None: an instantaneous shutter.
     """
     if not tags:
         return []
@@ -363,7 +364,7 @@ def sightings_of(
 
 
 def _unoccluded(camera: Camera, depth: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    """Whether no sample (n, m, 3) of a tag is behind the depth image."""
+    """Whether all samples (n, m, 3) of a tag are in front of the depth image, within the tolerance."""
     image = _smaller(camera)
     flat = samples.reshape(-1, 3)
     x, y = np.clip(image.project(flat).astype(int), 0, (image.width - 1, image.height - 1)).T
@@ -382,7 +383,7 @@ def _camera(scene: Scene) -> Camera:
 
 
 def _smaller(camera: Camera) -> Camera:
-    """The camera of the depth images."""
+    """The camera of the depth images, at most `WIDEST` pixels wide."""
     if camera.width <= WIDEST:
         return camera
     return camera.with_size(WIDEST, max(1, round(camera.height * WIDEST / camera.width)))
@@ -410,7 +411,7 @@ def _exposed(
 
 
 def _free_ids(scene: Scene, settings: PlanSettings) -> list[int]:
-    """Ids of the family that no marker of the scene has. Raises InputError for too few."""
+    """Ids of the family that the scene does not use. Raises InputError if there are too few."""
     kind, family = parse_family(f"apriltag:{settings.family}")
     used = {placed.marker.id for placed in scene.markers if placed.marker.family == family}
     free = [number for number in range(families(kind)[family].count) if number not in used]
@@ -423,7 +424,7 @@ def _free_ids(scene: Scene, settings: PlanSettings) -> list[int]:
 
 
 def write_plan(plan: Plan, folder: Path, size: float) -> list[Path]:
-    """Write scene.toml, plan.json and map.svg into a folder; returns the files."""
+    """Write scene.toml, plan.json and map.svg into a folder; returns these files."""
 
     plan.scene.save(folder / "scene.toml")
     write_json(folder / "plan.json", plan.facts(), indent=2)
@@ -432,7 +433,8 @@ def write_plan(plan: Plan, folder: Path, size: float) -> list[Path]:
 
 
 def _write_map(plan: Plan, file: Path, size: float) -> None:
-    """Map from above: trajectory and tags with their ids; and the predicted error by the number of tags."""
+    """Write a map of trajectory and tags from above, with a chart of the predicted error by number of
+    tags."""
     from fidsplat.experiments.charts import COLOURS, chart, plain_ticks
     from fidsplat.splats.statistics import level_rotation
 

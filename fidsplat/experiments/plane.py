@@ -1,10 +1,10 @@
 """Ideal image of a printed plane: each pixel is the exact mean of the texture over its square.
 
-Analytic antialiasing, as in font rasterisers. A texture of square modules is constant except for jumps
-across module edges, which are straight segments in a pinhole image. By Green's theorem the mean of a pixel is
-a sum over the segments that cross it or pass on its left: segments are cut at pixel borders, and each piece
-adds its jump times its height times the share of the pixel to its right. Nothing is sampled; the result is
-exact up to rounding in float64.
+Analytic antialiasing, as in font rasterisers. A texture of square modules is constant except for jumps at
+module edges, which are straight segments in a pinhole image. By Green's theorem the mean of a pixel is a sum
+over segments that cross it or pass on its left: segments are cut at pixel borders, and each part contributes
+its jump times its height times the share of the pixel on its right. The result is exact up to float64
+rounding.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ def plane_image(
     light: float = 1.0,
     background: float = 0.5,
 ) -> np.ndarray:
-    """Ideal image of a plane with square modules, centred on the world origin in z = 0, x right, y down.
+    """Ideal image of a plane of square modules, centred at the world origin in z = 0, x right, y down.
 
     Args:
-        grid: (h, w) uint8, 1 = dark, quiet zone included.
+        grid: (h, w) uint8, 1 = dark, including the quiet zone.
         module: edge of a module in metres.
         camera: the complete plane must be beyond its near distance.
         dark, light, background: values of dark modules, light modules and the background, as display values
@@ -35,23 +35,21 @@ def plane_image(
 
     Returns (height, width) float64.
 
-    Raises InputError if a part of the plane is nearer than the near distance.
+    Raises InputError if the plane reaches nearer than the near distance.
     """
     start, stop, jump = _edges(grid, light - dark, light - background)
     offset = np.array([grid.shape[1], grid.shape[0]]) / 2
     begin, end = (_project((points - offset) * module, camera) for points in (start, stop))
-    # from behind, right and left are swapped
+    # seen from behind, right and left are swapped
     side = np.sign(np.linalg.det(camera.world_to_camera[:3, [0, 1, 3]]))
     return background + _accumulate(begin, end, jump * side, (camera.height, camera.width))
 
 
 def _edges(grid: np.ndarray, contrast: float, paper: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the edges between modules of different value: start and end points (n, 2), in modules, and jumps
-    (n,).
+    """Edges between modules of different value: start and end points (n, 2) in modules, and jumps (n,).
 
-    A jump is the value on the right of the direction (y down) minus that on the left.
-
-    Segments point down on vertical lines and left on horizontal ones; runs of equal jumps are one segment.
+    A jump is the value on the right of the segment's direction (y down) minus the value on the left.
+    Segments point down on vertical lines and left on horizontal lines; a run of equal jumps is one segment.
     """
     value = np.pad(paper - contrast * np.asarray(grid, np.float64), 1)  # background: 0
     across = np.diff(value, axis=1)[1:-1]  # at vertical lines, from left to right
@@ -62,14 +60,14 @@ def _edges(grid: np.ndarray, contrast: float, paper: float) -> tuple[np.ndarray,
         found = runs(jumps.T)
         line, first, last, size = (each[found[3] != 0] for each in found)
         a, b = np.stack([line, first], 1), np.stack([line, last], 1)
-        # the right of a segment that points down is the left of one that points right
+        # the right side of a segment that points down is the left side of one that points right
         parts.append((a[:, ::-1], b[:, ::-1], -size) if swapped else (a, b, size))
     start, stop, jump = (np.concatenate(column) for column in zip(*parts, strict=True))
     return start.astype(np.float64), stop.astype(np.float64), jump
 
 
 def runs(values: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Runs of equal values in the rows of an array: row, first, last + 1, value."""
+    """Runs of equal values in the rows of an array: row, first column, end column, value."""
     ends = np.ones((values.shape[0], values.shape[1] + 1), bool)
     ends[:, 1:-1] = values[:, 1:] != values[:, :-1]
     row, first = np.nonzero(ends[:, :-1])
@@ -88,7 +86,7 @@ def _project(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def _accumulate(begin: np.ndarray, end: np.ndarray, jump: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Image (h, w): for each pixel the sum over segments of jump * (share of the pixel to their right).
+    """Image (h, w): for each pixel the sum over segments of jump times the share of the pixel on their right.
 
     begin, end: (n, 2) pixels. jump: (n,).
     """
@@ -97,11 +95,11 @@ def _accumulate(begin: np.ndarray, end: np.ndarray, jump: np.ndarray, shape: tup
     step = (end - begin)[which]
     a, b = begin[which] + step * t0[:, None], begin[which] + step * t1[:, None]
     middle = (a + b) / 2
-    rise = (b[:, 1] - a[:, 1]) * jump[which]  # y grows downwards: positive on the way down
+    rise = (b[:, 1] - a[:, 1]) * jump[which]  # positive for segments that point down, since y points down
     row, column = np.floor(middle[:, 1]), np.floor(middle[:, 0])
     keep = (row >= 0) & (row < h) & (column < w) & (rise != 0)
     row, column, rise, x = row[keep].astype(int), column[keep], rise[keep], middle[keep, 0]
-    # segments left of the image count fully from the first column on
+    # segments left of the image count completely from the first column on
     share = np.where(column >= 0, column + 1 - x, 1.0)
     column = np.maximum(column, 0).astype(int)
     flat = row * (w + 1) + column
@@ -111,8 +109,8 @@ def _accumulate(begin: np.ndarray, end: np.ndarray, jump: np.ndarray, shape: tup
 
 
 def _pieces(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Segments cut at the borders of pixels: for each piece the number of its segment, and the positions of
-    its ends along the segment, 0 to 1."""
+    """Cut segments at pixel borders: for each part the index of its segment, and the positions of its ends
+    along the segment, 0 to 1."""
     n = len(begin)
     owner, cut = [np.arange(n), np.arange(n)], [np.zeros(n), np.ones(n)]
     for axis in (0, 1):
@@ -131,7 +129,7 @@ def _pieces(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 
 def srgb(light: np.ndarray) -> np.ndarray:
-    """Linear light in [0, 1] to display values (IEC 61966-2-1)."""
+    """Convert linear light in [0, 1] to display values (IEC 61966-2-1)."""
     return to_colors(np.clip(light, 0.0, 1.0), "srgb")
 
 

@@ -1,4 +1,4 @@
-"""Plants from Blender: meshes rendered by Cycles, and splats trained on the images."""
+"""Plants from Blender: meshes rendered by Cycles, and splats trained on these images."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from fidsplat.util.provenance import code_hash
 from fidsplat.worlds.plants import GOLDEN, KINDS, Mesh
 
 BACKGROUND = (0.9, 0.2, 0.9)
-"""background colour of training; no plant has it, so that holes are visible"""
+"""background colour of training, which no plant has, so that holes are visible"""
 WORKER = Path(__file__).with_name("blender_plants.py")
 SETTINGS = "plants.json"
 HEIGHT, FOCAL = 320, 480.0
@@ -33,7 +33,7 @@ _LOW, _HIGH = math.radians(-15), math.radians(60)
 _MIN_OPACITY = 0.05
 """minimum opacity of trained splats"""
 Progress = Callable[[str, float], None]
-"""called with the name of a step and the completed share"""
+"""callback with the current step and its completed share"""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class PlantSettings:
 
     @property
     def names(self) -> list[tuple[str, int]]:
-        """Kind and number of each plant, one of each kind first."""
+        """Kind and number of each plant, starting with one of each kind."""
         return [(kind, number) for number in range(self.each) for kind in self.kind or KINDS]
 
     def mesh(self, kind: str, number: int) -> Mesh:
@@ -80,14 +80,14 @@ class PlantSettings:
 
 
 def cameras_around(mesh: Mesh, count: int, shift: float = 0.0) -> list[Camera]:
-    """Cameras on a spiral around a mesh, from below to far above.
+    """Cameras on a spiral around a mesh, from below it to far above.
 
-    shift: 0.5 places cameras between those of 0.
+    shift: 0.5 shifts the cameras by half of their spacing.
     """
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     offsets = mesh.vertices - middle
     radius, side = (float(np.linalg.norm(part, axis=1).max()) for part in (offsets, offsets[:, :2]))
-    distance = 1.01 * radius * math.hypot(1, 2 * FOCAL / HEIGHT)  # the bounding sphere fills the height
+    distance = 1.01 * radius * math.hypot(1, 2 * FOCAL / HEIGHT)  # the bounding sphere fills the image height
     width = min(HEIGHT, 2 * math.ceil(FOCAL * side / (distance - radius)))
     fov = 2 * math.atan(width / 2 / FOCAL)
     found = []
@@ -106,15 +106,15 @@ def write_plants(
     device: str | None = None,
     progress: Progress = lambda step, share: None,
 ) -> Iterator[tuple[Path, float | None]]:
-    """Make missing plants: yields each PLY file, and the mean PSNR of held-out views if it was trained now.
+    """Make missing plants; yields each PLY file, and the mean PSNR of held-out views if it was trained now.
 
     Args:
         folder: folder for KIND-NUMBER.ply, and for KIND-NUMBER with the images.
         environment: folder of `fidsplat.experiments.blender.install`.
 
     Raises:
-        InputError: Blender is not installed, or the folder holds plants of other settings or sources.
-        DeviceError: Blender fails; complete images stay.
+        InputError: Blender is not installed, or the folder has plants of other settings or sources.
+        DeviceError: Blender fails; complete images remain.
     """
     python = ready("standard", environment) if settings.iterations else None
     _record(settings, writable_folder(folder))
@@ -138,9 +138,9 @@ def write_plants(
 
 
 def _record(settings: PlantSettings, folder: Path) -> None:
-    """Check a folder's recorded settings, or record them."""
+    """Record the settings in the folder. Raises InputError if other settings are recorded there."""
     file = folder / SETTINGS
-    # plants may be added later
+    # the numbers of plants may be increased later
     own = {name: value for name, value in asdict(settings).items() if name not in ("kind", "each")}
     own["sources"] = code_hash()
     try:
@@ -148,12 +148,14 @@ def _record(settings: PlantSettings, folder: Path) -> None:
     except ValueError as error:
         raise InputError(f"cannot read {file}: {error}") from error
     if before != own:
-        raise InputError(f"{folder} holds plants of {before}, not {own}; give another folder")
+        raise InputError(
+            f"plants in {folder} must be of the settings {own}, got {before}; give another folder"
+        )
     write_json(file, own)
 
 
 def _render(settings: PlantSettings, mesh: Mesh, out: Path, python: Path, progress: Progress) -> None:
-    """Write the data set of a mesh; existing images stay."""
+    """Write the data set of a mesh; existing images are unchanged."""
     sets, images = [], []
     for folder, stem, cameras in (
         (out, "view", cameras_around(mesh, settings.views)),
@@ -178,11 +180,11 @@ def _render(settings: PlantSettings, mesh: Mesh, out: Path, python: Path, progre
 def _train(
     settings: PlantSettings, mesh: Mesh, folder: Path, file: Path, renderer: Renderer, progress: Progress
 ) -> float:
-    """Train disks on the mesh and write the visible splats; returns the mean test PSNR."""
+    """Train splats from disks on the mesh and write the visible ones; returns the mean PSNR of test views."""
     training = TrainSettings(
         iterations=settings.iterations,
         seed=settings.seed,
-        sh_degree=0,  # copies of plants are rotated, so colours must not depend on the direction
+        sh_degree=0,  # copies of plants are rotated, so their colours must not depend on the view
         densify_until=0,
         position_steps=settings.iterations,
     )
@@ -195,7 +197,7 @@ def _train(
     trainer.run(report)
     score = float(np.mean([view.psnr for view in trainer.evaluate()]))
     cloud = trainer.cloud()
-    assert cloud.sh is not None  # trainers make SH
+    assert cloud.sh is not None  # trainers produce SH
     rows = cloud.opacities > _MIN_OPACITY
     arrays = (getattr(cloud, name)[rows] for name in ("means", "quats", "scales", "opacities"))
     save_ply(SplatCloud(*arrays, sh=cloud.sh[rows], origin=cloud.origin), file)

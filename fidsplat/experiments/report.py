@@ -1,4 +1,4 @@
-"""Report of the paper's experiments: tables of the paper and ours, and charts."""
+"""Report of the paper's experiments: tables of the paper and of fidsplat, and charts."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from fidsplat.experiments.views import LINEAR, TRUTHS
 from fidsplat.util.errors import InputError
 
 _READERS = {"apriltag": ("pupil", "aruco"), "qr": ("zxing-tall", "zxing", "cv2")}
-"""detectors of each kind by limit on the ideal texture; the first available one is shown"""
+"""detectors of each kind, sorted by their limit on the ideal texture; the first available one is reported"""
 _TRUTHS = (("exact", "blender-raw"), ("blender-standard", "exact-linear"))
-"""ground truths of display values and of linear light; the first available one is shown"""
+"""ground truths of display values and of linear light; the first available one is reported"""
 PAPER, TRAINED = "paper, its own", "paper, 2DGS 17 views"
 _NAN = float("nan")
 
@@ -62,13 +62,13 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
 
 
 def category_order(names: Iterable[str]) -> list[str]:
-    """Occurring categories in the paper's order."""
+    """Occurring categories in the order of the paper."""
     names = set(names)
     return [name for name in CATEGORIES if name in names]
 
 
 def method_order(names: Iterable[str]) -> list[str]:
-    """Occurring methods that are shown: the ideal, mixtures without a low-pass, trained models."""
+    """Occurring methods of the report: the ideal, mixtures without a low-pass, trained models."""
     own = with_linear_light(f"{mixture}/{name}" for mixture in mixtures() for name in FILTERS)
     own = [name for name in own if not name.endswith("/screen")]
     names = set(names)
@@ -80,7 +80,7 @@ def _titles(categories: Iterable[str]) -> list[str]:
 
 
 def _counts(rows: Frame, folder: Path) -> dict[str, Frame]:
-    """Tables 1 and 2, and the chart of each."""
+    """Tables 1 and 2, and their charts."""
     categories = category_order(rows["category"])
     made = [name for name in mixtures() if name in set(rows["mixture"])]
     means = rows.pivot_table(["gaussians", "seconds"], "category", "mixture", sort=False).reindex(categories)
@@ -121,7 +121,7 @@ def _counts(rows: Frame, folder: Path) -> dict[str, Frame]:
 
 
 def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
-    """Table 3 by protocol, and its chart."""
+    """Table 3 for each protocol, and its chart."""
     rows = _best_reader(rows)
     categories, methods = category_order(rows["category"]), method_order(rows["method"])
     paper = {
@@ -136,7 +136,7 @@ def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
             key: f"{_angle(group['found'])}/{_angle(group['read'])}"
             for key, group in own.groupby(["category", "method"])
         }
-        # the protocol of the paper
+        # only this protocol is the paper's
         theirs = paper if protocol == "fixed-plane" else {}
         tables[protocol] = _table(categories, method_order(own["method"]), cells, theirs)
         means = own.groupby(["category", "method"])["read"].mean()
@@ -146,7 +146,7 @@ def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
 
 
 def _best_reader(rows: Frame) -> Frame:
-    """Rows of the detector with the largest limit for each method."""
+    """Rows of the best detector of each method."""
     ranks = {name: rank for names in _READERS.values() for rank, name in enumerate(names)}
     rank = rows["reader"].map(ranks)
     by_method = rank.groupby([rows["protocol"], rows["category"], rows["method"]])
@@ -162,7 +162,7 @@ def _angle(values: Row) -> str:
 
 
 def _views(rows: Frame, folder: Path) -> dict:
-    """Table 4 relative to ground truth of display values and of linear light, and its chart."""
+    """Table 4 for ground truth of display values and of linear light, and its chart."""
     categories, measured = category_order(rows["category"]), set(rows["truth"])
     paper_psnr = {name: {key: value[0] for key, value in row.items()} for name, row in VIEWS.items()}
     tables, series = {}, {}
@@ -175,10 +175,10 @@ def _views(rows: Frame, folder: Path) -> dict:
         paper = {
             name: {key: f"{value[0]:.1f}/{value[1]:.2f}" for key, value in row.items()}
             for name, row in VIEWS.items()
-            if linear  # like the paper's, which is Blender's
+            if linear  # as in the paper, whose ground truth is Blender's
         }
         tables[truth] = {"title": TRUTHS[truth], "rows": _table(categories, methods, cells, paper)}
-        # methods that blend in the same light (linear or display) in which the ground truth averages
+        # compare methods that blend in the light (linear or display) in which the ground truth averages
         ending = "light" if linear else "best"
         shown = [method for method in methods if "/" not in method or method.endswith(f"/{ending}")]
         title = f"mixtures rendered as `{ending}` against\n{TRUTHS[truth]}"
@@ -189,7 +189,7 @@ def _views(rows: Frame, folder: Path) -> dict:
 
 
 def _localisation(rows: Frame) -> Frame:
-    """Median position error by every other distance, and number of views read."""
+    """Median position error by every second distance, and number of views that were read."""
     methods = method_order(rows["method"])
     rows = rows[rows["distance_m"].isin(sorted(set(rows["distance_m"]))[::2])]
     table = []
@@ -210,7 +210,7 @@ def _table(
     cells: Mapping[tuple[str, str], str],
     paper: Mapping[str, Mapping],
 ) -> Frame:
-    """Table by category: figures of the paper if any, then cells of ours by category and method."""
+    """Table by category: the paper's figures if any, then fidsplat's by category and method."""
     theirs = {PAPER: "ours", TRAINED: 17} if paper else {}
     return pd.DataFrame(
         [
@@ -225,7 +225,7 @@ def _table(
 def _series(
     categories: Sequence[str], methods: Sequence[str], values: Row, paper: Mapping[str, Mapping]
 ) -> dict[str, list[float]]:
-    """Our figures by method, then the paper's, for `_panels`."""
+    """Figures of fidsplat by method, then the paper's, for `_panels`."""
     names = {m: f"mixture {m.partition('/')[0]}" if "/" in m else m for m in methods}
     own = {name: [values.get((c, method), _NAN) for c in categories] for method, name in names.items()}
     theirs = ((PAPER, "ours"), (TRAINED, 17))
@@ -235,7 +235,7 @@ def _series(
 def _panels(
     file: Path, categories: Sequence[str], panels: dict[str, dict[str, list[float]]], unit: str
 ) -> None:
-    """Panels of bars by category with one legend."""
+    """Write panels of bars by category with one legend."""
     names = list(dict.fromkeys(name for series in panels.values() for name in series))
     names.sort(key=lambda name: (name in (PAPER, TRAINED), name != IDEAL))
     missing = [_NAN] * len(categories)
@@ -249,9 +249,9 @@ def _panels(
 
 
 TRAINING_SECONDS = {3: 423.0, 5: 392.0, 9: 386.0, 17: 371.0}
-"""table 2: mean training time of 2DGS by number of views"""
+"""table 2: mean training time of 2DGS in seconds by number of views"""
 CONSTRUCTION_SECONDS = 1.04
-"""table 2: mean of the paper's method over all categories"""
+"""table 2: mean time of the paper's method in seconds over all categories"""
 
 ANGLES = {
     "small": {"ours": (80.0, 80.0), 3: (73.8, 60.0), 5: (79.4, 68.2), 9: (81.6, 75.4), 17: (81.0, 79.0)},
@@ -259,7 +259,7 @@ ANGLES = {
     "large": {"ours": (82.0, 81.8), 3: (77.8, 58.0), 5: (80.0, 67.2), 9: (82.0, 77.8), 17: (82.2, 76.6)},
     "huge": {"ours": (84.0, 82.2), 3: (77.8, 56.8), 5: (79.4, 65.4), 9: (82.2, 72.0), 17: (82.6, 75.4)},
 }
-"""table 3: degrees at which a code is detected and decoded; it has no row for AprilTags"""
+"""table 3: degrees up to which a code is detected and decoded; the table has no AprilTags"""
 
 VIEWS = {
     "apriltag": {
@@ -290,7 +290,7 @@ Rows = Iterator[dict[str, Any]]
 
 
 class Kind(NamedTuple):
-    """Conversion of the results of an experiment to rows."""
+    """Conversion of an experiment's results to rows."""
 
     keys: tuple[str, ...]
     """columns that identify a row"""
@@ -301,9 +301,9 @@ class Kind(NamedTuple):
 def load(folders: Sequence[Path]) -> dict[str, Summary]:
     """Results of folders by experiment, raw (NAME.jsonl) or summarised (NAME.csv).
 
-    Of two measurements the larger one is used.
+    For a point that was measured twice, the result with more measurements is used.
 
-    Raises InputError when there are none, or they are from another version.
+    Raises InputError if there are no results, or they are from another version.
     """
     where, found = ", ".join(map(str, folders)), {}
     for name, kind in KINDS.items():
@@ -354,7 +354,7 @@ def _angles_rows(record: Record) -> Rows:
 def _views_rows(record: Record) -> Rows:
     key = record.key
     row = {name: key[name] for name in ("truth", "category", "method")} | {"marker": key["index"]}
-    # prefer records with more views, then with more metrics
+    # prefer records with more views, and among these records with more metrics
     row["amount"] = key["views"] + 0.1 * bool(key["flip"]) + 0.2 * bool(key["lpips"])
     for name in ("psnr", "ssim", "flip", "lpips"):
         values = [value for value in record.result[name] or () if value is not None]
@@ -363,7 +363,7 @@ def _views_rows(record: Record) -> Rows:
 
 
 def _localisation_rows(record: Record) -> Rows:
-    """Rows by distance: medians over the tilts at which the marker was read."""
+    """Rows by distance, with medians over the tilts at which the marker was read."""
     key = record.key
     for distance in key["distances"]:
         every = [view for view in record.result["views"] if view["distance_m"] == distance]

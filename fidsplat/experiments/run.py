@@ -1,4 +1,4 @@
-"""The paper's experiments as sweeps: the points of each and the file of its results."""
+"""The paper's experiments as sweeps: points and results file of each."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from fidsplat.vision.metrics import load_lpips, metric_versions
 from fidsplat.vision.readers import reader_versions
 
 NAMES = (counts.NAME, localisation.NAME, views.NAME, angles.NAME)
-"""measuring experiments, fastest first"""
+"""measuring experiments, starting with the fastest"""
 QUICK_VIEWS = 1
 
 
 @contextmanager
 def prepared(names: Iterable[str], options: MeasureSettings) -> Iterator[list[Sweep]]:
-    """Prepared sweeps of experiments by name.
+    """Sweeps of experiments by name.
 
-    All are prepared before the first one runs, so errors of the last appear at once.
+    All sweeps are prepared before the first one runs, so that errors are reported immediately.
 
-    Raises InputError for options that cannot be used, DeviceError when the device cannot be opened.
+    Raises InputError for invalid options, DeviceError if the device cannot be opened.
     """
     options.check()
     points = {name: points_of(name, options) for name in names}
@@ -43,7 +43,7 @@ def prepared(names: Iterable[str], options: MeasureSettings) -> Iterator[list[Sw
         markers, workers = MarkerRenderer(renderer, options.trained), options.workers
     device = None if renderer is None else device_name(renderer)
     with thread_pool(workers) as pool:
-        # first, so that --overwrite deletes nothing if the files of a run cannot be read
+        # before `results_of`, so that --overwrite deletes no results if the measurement cannot start
         measures = {name: _measure(name, options, markers, pool) for name in points}
         yield [
             Sweep(
@@ -62,13 +62,13 @@ def device_name(renderer: Renderer) -> str:
 
 
 def results_of(name: str, options: ShardSettings, device: str | None) -> Results:
-    """Results file of an experiment; device: `device_name` of the renderer, or None."""
+    """Results file of an experiment. device: `device_name` of the renderer, or None."""
     versions = reader_versions() | (metric_versions() if name == views.NAME else {})
     return Results(options.file(name), run_facts(device, options.seed, versions), options.overwrite)
 
 
 def points_of(name: str, options: MeasureSettings) -> list[Key]:
-    """Points of an experiment, or of the shard of a run."""
+    """Points of an experiment, restricted to the shard of the run."""
     return shard(_points(name, options), options.shard)
 
 
@@ -76,7 +76,7 @@ def _points(name: str, options: Any) -> list[Key]:
     categories, count = chosen_categories(options.category), options.marker_count
     if name == counts.NAME:
         repeats = counts.QUICK_REPEATS if options.quick else counts.FULL_REPEATS
-        count = MARKERS if options.markers is None else count  # all five markers take a second
+        count = MARKERS if options.markers is None else count  # all five markers take only a second
         return [{**one, "repeats": repeats} for one in _markers(categories, count)]
     if name == views.NAME:
         number = QUICK_VIEWS if options.quick else TEST_VIEWS

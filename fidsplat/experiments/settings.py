@@ -1,4 +1,4 @@
-"""Settings of the paper's experiments. Their fields are the options of `fidsplat experiment`."""
+"""Settings of the paper's experiments, whose fields are the options of `fidsplat experiment`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fidsplat.util.errors import InputError, unknown
 
 @dataclass(frozen=True)
 class FolderSettings:
-    """Folder of the results of an experiment, and seed."""
+    """Folder of an experiment's results, and seed."""
 
     out: Path | None = None
     """Folder for results. By default fidsplat-experiments, with --quick fidsplat-experiments-quick."""
@@ -30,7 +30,7 @@ class FolderSettings:
 
 @dataclass(frozen=True)
 class ShardSettings(FolderSettings):
-    """Part of a sweep that one machine measures."""
+    """Share of a sweep that one machine measures."""
 
     shard: str | None = None
     """Share of the work to measure, as i/n; `fidsplat experiment merge` joins the shares."""
@@ -65,27 +65,6 @@ class MarkerSettings(FolderSettings):
 
 
 @dataclass(frozen=True)
-class DatasetSettings(MarkerSettings):
-    """Markers and images of the data set."""
-
-    out: Path = Path("fidsplat-dataset")
-    """Folder for the scenes."""
-    truth: str = "exact"
-    """Renderer: exact, exact-linear, blender-standard or blender-raw."""
-    blender: Path = Path("fidsplat-experiments/blender")
-    """Folder with Blender's images."""
-
-    def check(self) -> None:
-        from fidsplat.experiments.views import TRUTHS
-
-        super().check()
-        if self.truth not in TRUTHS:
-            raise InputError(unknown("truth", self.truth, TRUTHS))
-        if self.truth.startswith("blender-"):
-            check_images(self.blender, self.truth.removeprefix("blender-"), self.seed)
-
-
-@dataclass(frozen=True)
 class BlenderSettings(MarkerSettings):
     """Markers and images that Blender renders."""
 
@@ -117,14 +96,14 @@ class BlenderSettings(MarkerSettings):
 
 @dataclass(frozen=True)
 class MeasureSettings(ShardSettings, MarkerSettings):
-    """Settings of every experiment that measures."""
+    """Settings of all experiments that measure."""
 
     quick: bool = False
     """Measure one marker of each category with few tilts and views, in minutes."""
 
     @property
     def folder(self) -> Path:
-        """Folder for results; quick results and complete ones never share a file."""
+        """Folder for results; quick and complete results never share a file."""
         return self.out or Path("fidsplat-experiments" + ("-quick" if self.quick else ""))
 
     @property
@@ -147,7 +126,7 @@ class ImageSettings(MeasureSettings):
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Names of the compared methods, a row of the tables each."""
+        """Names of the compared methods, each a row of the tables."""
         return method_names(self.mixture, self.trained)
 
     def check(self) -> None:
@@ -173,7 +152,9 @@ class ImageSettings(MeasureSettings):
         ):
             file = folder / model / f"{category.name}-{index}.ply"
             if not file.is_file():
-                raise InputError(f"{file} is missing; --category and --markers leave out untrained markers")
+                raise InputError(
+                    f"{file} must exist, got none; --category and --markers skip untrained markers"
+                )
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Markers, planes and viewpoints of the paper's section 4.1, and two protocols for tilts."""
+"""Markers, planes and viewpoints of the paper's section 4.1, and two protocols of tilts."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ SEED = 0
 MARKERS = 5
 """markers of each category"""
 PLANE = 2.0
-"""edge of the plane of a marker with its quiet zone, metres"""
+"""edge in metres of a marker's plane, including the quiet zone"""
 BACKGROUND = 128 / 255
-"""grey background, a display value that 8 bits represent exactly"""
+"""grey background: a display value that 8 bits represent exactly"""
 
 
 @dataclass(frozen=True)
 class Category:
-    """Marker category, a row of the paper's tables."""
+    """Category of markers, a row of the paper's tables."""
 
     name: str
     title: str
     kind: str
     length: int | None = None
-    """characters of a QR code's text"""
+    """number of characters of the QR code's text"""
     version: int | None = None
     """version of the QR code"""
 
     def spec(self, index: int, seed: int = SEED) -> str:
-        """Marker spec of marker 0 to 4: a tag of 36h11, or a QR code of seeded random characters."""
+        """Spec of marker 0 to 4: a tag of 36h11, or a QR code of random characters."""
         if self.kind == "apriltag":
             return f"apriltag:36h11:{index}"
         letters = string.ascii_letters + string.digits
@@ -64,7 +64,7 @@ def chosen_categories(names: tuple[str, ...]) -> tuple[Category, ...]:
 
 @dataclass(frozen=True)
 class Protocol:
-    """Camera of a tilt scan: azimuth 0, aimed at the middle of the marker."""
+    """Camera of a scan over tilts: azimuth 0, aimed at the centre of the marker."""
 
     title: str
     pixels: int
@@ -74,16 +74,17 @@ class Protocol:
     fov: float
     """degrees"""
     module_px: float | None
-    """pixels per frontal module; None: the plane is always `PLANE` wide"""
+    """pixels per module in a frontal view; None: the plane is always `PLANE` wide"""
 
     def module(self, cells: int) -> float:
-        """Metres per module of a marker with ``cells`` modules a side, quiet zone included."""
+        """Edge in metres of a module of a marker with ``cells`` modules per side, including the quiet
+        zone."""
         if self.module_px is None:
             return PLANE / cells
         return self.module_px * self.distance / self.camera(0.0).fx
 
     def camera(self, tilt: float) -> Camera:
-        """Camera at ``tilt`` degrees from the normal of the marker, above it."""
+        """Camera above the marker, at ``tilt`` degrees from its normal."""
         a = math.radians(tilt)
         position = (0.0, -self.distance * math.sin(a), -self.distance * math.cos(a))
         return Camera.look_at(self.pixels, self.pixels, math.radians(self.fov), position, (0.0, 0.0, 0.0))
@@ -93,15 +94,15 @@ PROTOCOLS = {
     "fixed-plane": Protocol("2 x 2 plane, 800 x 800, 4 m, 50 degrees", 800, 4.0, 50.0, None),
     "fixed-module": Protocol("P*: 8 px a module, 1600 x 1600, 12 m, 17.7 degrees", 1600, 12.0, 17.7, 8.0),
 }
-"""the plane of the paper (whose camera is unknown), and planes with modules of equal size for all codes"""
+"""the paper's plane (the paper's camera is unknown), and planes with equal modules for all codes"""
 
 COLLECTIONS = (3, 5, 9, 17)
 """numbers of training views; each collection contains the smaller ones"""
 TEST_VIEWS = 20
 MAX_TEST_TILT = 60.0
-"""degrees; test views are inside the ring of the densest collection"""
+"""maximum tilt of test views in degrees, which is inside the ring of the densest collection"""
 
-# tilt and azimuth in degrees: the front, to the sides, above and below, diagonals, a wide ring
+# tilt and azimuth in degrees: front, sides, above and below, diagonals, a wide ring
 _VIEWS = (
     (0, 0), (15, 0), (15, 180),
     (30, 90), (30, 270),
@@ -111,14 +112,14 @@ _VIEWS = (
 
 
 def training_cameras(views: int = COLLECTIONS[-1]) -> list[Camera]:
-    """Cameras of a collection. Raises InputError for a number that is not in `COLLECTIONS`."""
+    """Cameras of a collection. Raises InputError for a number outside `COLLECTIONS`."""
     if views not in COLLECTIONS:
         raise InputError(f"number of training views must be 3, 5, 9 or 17, got {views}")
     return [_around(tilt, azimuth) for tilt, azimuth in _VIEWS[:views]]
 
 
 def novel_cameras(category: Category, index: int, seed: int = SEED) -> list[Camera]:
-    """20 random cameras of a marker, uniform over directions up to 60 degrees from its normal."""
+    """Random cameras of a marker, uniform over directions up to 60 degrees from its normal."""
     generator = random.Random(f"{seed} views {category.name} {index}")
     lowest = math.cos(math.radians(MAX_TEST_TILT))
     views = []

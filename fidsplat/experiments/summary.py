@@ -1,7 +1,7 @@
-"""Results as small CSV tables, preceded by lines with facts of the runs.
+"""Results as small CSV tables, which begin with lines that contain facts of the runs.
 
-A summary has a row for each result, with the `amount` of measurements in it and the number of its `run`.
-Lines that begin with "# " hold the facts of the runs, and notes.
+A table has a row per result, with the `amount` of its measurements and the index of its `run`. Lines that
+begin with "# " contain facts of the runs, and notes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from fidsplat.util.files import from_json, read_text, write_file
 
 _MARK = "# "
 Frame: TypeAlias = Any
-"""a `pandas.DataFrame`; the types of its cells are unknown"""
+"""a `pandas.DataFrame` with cells of unknown type"""
 Row: TypeAlias = Any
 """a `pandas.Series`"""
 
@@ -35,14 +35,14 @@ class Summary:
     runs: list[dict[str, Any]]
     """facts of each run (`fidsplat.util.provenance.run_facts`), and its number of `points`"""
     notes: list[str] = field(default_factory=list)
-    """notes for readers of the numbers"""
+    """notes for readers of the table"""
 
     def write(self, file: Path) -> Summary:
-        """Write the table, with numbers to four digits; returns it as read from the file.
+        """Write the table with numbers rounded to four digits; returns the table as read from the file.
 
-        Reading back the rounded numbers makes reports of raw results and of summaries equal.
+        Therefore reports of raw results and of summaries are equal.
 
-        Raises InputError when the file cannot be written.
+        Raises InputError if the file cannot be written.
         """
         lines = [{"run": run} for run in self.runs] + [{"note": note} for note in self.notes]
         text = "".join(f"{_MARK}{json.dumps(line)}\n" for line in lines)
@@ -56,7 +56,7 @@ def summarise(
     rows_of: Callable[[Record], Iterable[dict[str, Any]]],
     columns: Iterable[str],
 ) -> Summary:
-    """Table of the rows of records."""
+    """Table with the rows of all records."""
     runs: dict[str, dict[str, Any]] = {}
     rows = []
     for record in records:
@@ -69,7 +69,7 @@ def summarise(
 
 
 def read_summary(file: Path) -> Summary:
-    """Read a file of `Summary.write`. Raises InputError for another file."""
+    """Read a file of `Summary.write`. Raises InputError for a file of another format."""
     try:
         lines = read_text(file).splitlines()
         facts = [from_json(line.removeprefix(_MARK)) for line in lines if line.startswith(_MARK)]
@@ -79,19 +79,20 @@ def read_summary(file: Path) -> Summary:
             raise ValueError(
                 "its format is of an earlier version; make the report again from the .jsonl files"
             )
-        # only empty cells are missing values: "None" is text
+        # only empty cells are missing values: "None" is a string
         table = io.StringIO("\n".join(lines[len(facts) :]))
         rows = pd.read_csv(table, keep_default_na=False, na_values=[""])
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read {file}: {error}") from error
     runs = [one["run"] for one in facts if "run" in one]
     if "run" not in rows or not runs:
-        raise InputError(f"{file} holds no summary of results of fidsplat; give another folder")
+        raise InputError(f"{file} must be a summary of fidsplat's results, got another file; give its folder")
     return Summary(rows, runs, [one["note"] for one in facts if "note" in one])
 
 
 def join(summaries: Sequence[Summary], keys: Sequence[str]) -> Summary:
-    """Join tables of one kind. Of rows with equal keys, the first one with the largest `amount` remains."""
+    """Join tables of one kind. Among rows with equal keys, the first row with the largest `amount`
+    remains."""
     frames, runs = [], []
     for summary in summaries:
         frames.append(summary.rows.assign(run=summary.rows["run"] + len(runs)))
@@ -99,7 +100,7 @@ def join(summaries: Sequence[Summary], keys: Sequence[str]) -> Summary:
     rows = pd.concat(frames, ignore_index=True)
     chosen = rows.sort_values("amount", ascending=False, kind="stable").drop_duplicates(list(keys))
     rows = rows.loc[sorted(chosen.index)].reset_index(drop=True)
-    # a repeated report reads its own earlier tables, which may contribute no row
+    # when a report is made again, its own earlier tables may contribute no row
     used = sorted(set(rows["run"]))
     rows["run"] = rows["run"].map({number: place for place, number in enumerate(used)})
     notes = list(dict.fromkeys(note for summary in summaries for note in summary.notes))

@@ -1,7 +1,7 @@
-"""Resumable sweeps over points, with shards and merging of shards.
+"""Resumable sweeps over points, with shards that can be merged.
 
-Results are JSON lines. A line {"run": ...} holds the facts of a run (`fidsplat.util.provenance.run_facts`)
-for the following lines {"key": ..., "result": ...}.
+Results are JSON lines. A line {"run": ...} contains facts of a run (`fidsplat.util.provenance.run_facts`)
+that apply to the following lines {"key": ..., "result": ...}.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from fidsplat.util.files import atomic_write, from_json, ordinary_file, read_tex
 Key = dict[str, Any]
 """parameters of a point of a sweep: names and plain values"""
 Work = Callable[[], dict[str, Any]]
-"""function that evaluates the images of a point and returns its result"""
+"""function that evaluates the images of a point; returns its result"""
 
 
 class Record(NamedTuple):
-    """A measured point."""
+    """Result of a measured point."""
 
     key: Key
     result: dict[str, Any]
     run: dict[str, Any]
-    """facts of its run"""
+    """facts of the run"""
 
     @property
     def name(self) -> str:
@@ -41,24 +41,24 @@ class Record(NamedTuple):
 
     @property
     def failed(self) -> bool:
-        """Whether the device refused the point; the result has the reason as `error`."""
+        """Whether the device failed for this point; the result has the reason as `error`."""
         return "error" in self.result
 
 
 def name_of(key: Key) -> str:
-    """Key as a string that is independent of order."""
+    """Key as a string that does not depend on the order of its items."""
     return json.dumps(key, sort_keys=True)
 
 
 class Results:
-    """Results file of a sweep, written point by point.
+    """Results file of a sweep, written after each point.
 
     Args:
         file: created with its folder if missing.
         run: facts of this run.
         overwrite: delete existing results.
 
-    Raises InputError when the file cannot be written, has another format, or holds results of another device,
+    Raises InputError if the file cannot be written, has another format, or has results of another device,
     version, code or seed.
     """
 
@@ -72,20 +72,20 @@ class Results:
                     f"{file} holds results of another {' and '.join(differ)}; give another folder with -o, "
                     "or --overwrite to measure again"
                 )
-        # failed points are measured again, as the device may work now
+        # failed points are measured again, since the device may work now
         self.done = {record.name: record for record in records if not record.failed}
-        if overwrite or file.exists():  # discards an incomplete line of a killed run
+        if overwrite or file.exists():  # discards the incomplete last line of a killed run
             _write(file, self.done.values())
         self._last_run = next((record.run for record in reversed(self.done.values())), None)
 
     def left(self, points: Iterable[Key]) -> list[Key]:
-        """Missing points, in their order."""
+        """Missing points, in the order of `points`."""
         return [key for key in points if name_of(key) not in self.done]
 
     def append(self, key: Key, result: dict[str, Any]) -> Record:
         """Append a result, with numbers rounded to six digits.
 
-        Raises ValueError for a result that JSON cannot hold, such as NaN, InputError if the file cannot grow.
+        Raises ValueError for NaN and other values that JSON lacks, InputError if the file cannot grow.
         """
         record = Record(key, rounded(result), self.run)
         text = _line(record) if self.run == self._last_run else _header(self.run) + _line(record)
@@ -105,14 +105,15 @@ class Results:
 
 
 class TimeLimit:
-    """Time limit of a run: no batch begins that would exceed it if it took as long as the longest so far."""
+    """Time limit of a run. A batch may start if the run stays within the limit even if the batch takes as
+    long as the longest one so far."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds, self._longest = seconds, 0.0
         self._begun: float | None = None
 
     def allows(self) -> bool:
-        """Whether another batch may begin. The first call starts the time."""
+        """Whether another batch may start. The clock starts at the first call."""
         now = time.monotonic()
         self._begun = now if self._begun is None else self._begun
         return now - self._begun + self._longest < self.seconds
@@ -126,27 +127,27 @@ class TimeLimit:
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """A parameter sweep: its points, their measurement, and the file of the results."""
+    """Parameter sweep: points, their measurement, and the results file."""
 
     name: str
     results: Results
     points: list[Key]
     begin: Callable[[Key], Work]
-    """renders the images of a point on the device, and returns the function that evaluates them"""
+    """renders the images of a point on the device; returns the function that evaluates them"""
     batch: int = 1
-    """number of points that are rendered before they are evaluated, so that evaluation disturbs no timing"""
+    """number of points that are rendered before their evaluation, so that evaluation disturbs no timing"""
     pool: Executor | None = None
-    """evaluates the points of a batch in parallel"""
+    """executor that evaluates the points of a batch in parallel"""
     record_errors: bool = False
-    """whether a FidsplatError of `begin` becomes the result of the point, as `error`"""
+    """whether a FidsplatError of `begin` is stored as the result of the point, as `error`"""
     limit: TimeLimit | None = None
-    """limit of a run, which leaves the other points to the next run"""
+    """time limit of a run; the next run measures the remaining points"""
     estimate: Callable[[], float] | None = None
-    """estimates the seconds of the missing points"""
+    """function that estimates the seconds of the missing points"""
 
     @property
     def records(self) -> list[Record]:
-        """Records of the sweep's points, also those of earlier runs."""
+        """Records of the sweep's points, including those of earlier runs."""
         done = self.results.done
         return [done[name] for name in map(name_of, self.points) if name in done]
 
@@ -155,7 +156,7 @@ class Sweep:
         return self.results.left(self.points)
 
     def run(self) -> Iterator[Record]:
-        """Measure the missing points; yields each record when it is in the file.
+        """Measure the missing points; yields each record after it is written to the file.
 
         An interrupt loses at most one batch.
         """
@@ -182,7 +183,7 @@ class Sweep:
 
 @contextmanager
 def thread_pool(workers: int) -> Iterator[ThreadPoolExecutor]:
-    """Threads that evaluate points of sweeps; an interrupt cancels pending calls."""
+    """Threads that evaluate points of sweeps; an interrupt cancels waiting tasks."""
     pool = ThreadPoolExecutor(workers)
     try:
         yield pool
@@ -191,7 +192,7 @@ def thread_pool(workers: int) -> Iterator[ThreadPoolExecutor]:
 
 
 def read_records(file: Path) -> list[Record]:
-    """Records of a file, none if it is missing; an incomplete last line is skipped.
+    """Records of a file; empty if the file is missing. An incomplete last line is skipped.
 
     Raises InputError for a file of another format.
     """
@@ -221,13 +222,13 @@ def read_records(file: Path) -> list[Record]:
 
 
 def folder_records(folder: Path, name: str) -> list[Record]:
-    """Records of an experiment in a folder, unmerged shards included."""
+    """Records of an experiment in a folder, including shards that are not merged."""
     files = [folder / f"{name}.jsonl", *sorted(folder.glob(f"{name}-*-of-*.jsonl"))]
     return [record for file in files for record in read_records(file)]
 
 
 def shard(points: list[Key], text: str | None) -> list[Key]:
-    """Every n-th point, starting with the i-th, for "i/n"; all points for None.
+    """Every n-th point from the i-th on, for "i/n"; all points for None.
 
     Raises InputError unless 1 <= i <= n.
     """
@@ -246,11 +247,11 @@ class Merged(NamedTuple):
     repeated: int
     """number of points in more than one file"""
     differ: tuple[str, ...]
-    """facts that affect results and differ between runs"""
+    """facts that affect results and differ between the runs"""
 
 
 def merge(files: Sequence[Path], target: Path) -> Merged:
-    """Merge files of shards into one. The first record of a point wins; other points of the target stay.
+    """Merge files of shards into one. The first record of a point is used; other points of the target remain.
 
     Raises InputError for a missing file or another format.
     """
@@ -265,7 +266,7 @@ def merge(files: Sequence[Path], target: Path) -> Merged:
     for record in read_records(target):
         found.setdefault(record.name, record)
     runs = [record.run for record in found.values()]
-    # a run without rendering has no device
+    # runs without rendering have no device
     first = next((run for run in runs if run.get("device")), runs[0] if runs else {})
     differ = {name for run in runs for name in differences(run, first)}
     writable_folder(target.parent)
@@ -274,13 +275,13 @@ def merge(files: Sequence[Path], target: Path) -> Merged:
 
 
 def result_files(folders: Sequence[Path], name: str) -> list[Path]:
-    """Files with results of an experiment in folders, shards first."""
+    """Files with results of an experiment in folders, starting with shards."""
     files = [file for folder in folders for file in sorted(folder.glob(f"{name}-*-of-*.jsonl"))]
     return files + [file for folder in folders for file in [folder / f"{name}.jsonl"] if file.is_file()]
 
 
 def missing_shards(files: Iterable[Path]) -> list[str]:
-    """Missing shards "i/n", by the file names of `--shard i/n`."""
+    """Missing shards as "i/n", by the file names of existing shards."""
     existing: dict[int, set[int]] = {}
     for file in files:
         if match := re.fullmatch(r".*-(\d+)-of-(\d+)\.jsonl", file.name):
@@ -289,7 +290,8 @@ def missing_shards(files: Iterable[Path]) -> list[str]:
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Facts that affect results and differ; runs without rendering have no device."""
+    """Names of facts that affect results and differ; a missing device, of runs without rendering, is
+    equal."""
     names = [name for name in ("versions", "code", "seed", "scene") if old.get(name) != new.get(name)]
     devices = (old.get("device"), new.get("device"))
     return names + (["device"] if None not in devices and devices[0] != devices[1] else [])

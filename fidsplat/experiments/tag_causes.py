@@ -1,5 +1,4 @@
-"""Causes of failed tag detections, each with a severity from 0 to 1, applied to views of a marker in a
-scene."""
+"""Causes of failed tag detection, with severities from 0 to 1, applied to views of a marker in a scene."""
 
 from __future__ import annotations
 
@@ -29,11 +28,11 @@ from fidsplat.worlds.greenhouse import AISLE, Greenhouse, facing
 
 WIDTH, HEIGHT, FOV = 640, 480, math.radians(60.0)
 EDGES = 6.0
-"""distance of the camera without a cause, in edges of the code: about 90 pixels per edge"""
+"""distance of the camera without a cause, in edges of the code: an edge has about 90 pixels"""
 INK, PAPER = Lighting.ink, Lighting.paper
 """reflectance of ink and paper"""
 VARIANTS = 4
-"""number of seeds of planks, wear and crumpled sheets; views share them, since each is computed"""
+"""number of seeds of planks, wear and crumpled sheets, which views share to save time"""
 _PRINT = tuple((float(to_colors(np.array(light), "srgb")),) * 3 for light in (INK, PAPER))
 """display colours of ink and paper"""
 _COVER = 0.16, 0.3, 0.09
@@ -41,7 +40,7 @@ _COVER = 0.16, 0.3, 0.09
 
 
 class Place(NamedTuple):
-    """A captured scene, and where its marker is: in front of the figure, facing -z; y points down."""
+    """Captured scene with the position of its marker, in front of the figure and facing -z; y points down."""
 
     position: tuple[float, float, float]
     size: float
@@ -60,7 +59,7 @@ SCENES = (GREENHOUSE, *CAPTURED)
 
 @cache
 def scene_of(name: str) -> tuple[Scene, np.ndarray, float]:
-    """A scene without markers, and the pose and size of its marker.
+    """A scene without markers, and pose and size of its marker.
 
     Raises InputError as `fetch_scene`.
     """
@@ -108,36 +107,36 @@ def _assembled(
     lights: tuple[Light, ...],
     camera: Camera | None,
 ) -> Scene:
-    """The scene with a placed marker and other parts; cached, so that its light is computed once."""
+    """Scene with a placed marker, cover and lights; cached, so that its light is computed only once."""
     clouds = base.clouds if cover is None else (*base.clouds, cover.transformed(placed.pose))
     return replace(base, clouds=clouds, markers=(placed,), lights=lights, camera=camera)
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A marker in a scene, and how a camera captures it."""
+    """A marker in a scene, and the capture by a camera."""
 
     scene: Scene
-    """without the marker"""
+    """scene without the marker"""
     placed: PlacedMarker
     seed: int
-    """seed of noise, wear and the position of objects in front"""
+    """seed of noise, wear and covers"""
     edges: float
     """distance in edges of the code"""
     tilt: float
     """radians between the marker's normal and the direction to the camera"""
     azimuth: float
-    """radians of the tilt's axis: 0 tilts about the vertical"""
+    """direction of the tilt in radians; 0 rotates about the vertical"""
     roll: float
     aim: tuple[float, float]
-    """point of the marker's plane in the middle of the image, in units of the distance"""
+    """point of the marker's plane at the centre of the image, relative to the distance"""
     capture: Capture
-    """without the camera's pose"""
+    """capture without the camera's pose"""
     cover: SplatCloud | None = None
-    """object in front of the marker, in its frame"""
+    """object in front of the marker, in the marker's frame"""
     lights: tuple[Light, ...] = ()
     defocus: float = 0.0
-    """radius in pixels of the disk that blurs the image"""
+    """radius in pixels of the disk of defocus"""
 
     @property
     def camera(self) -> Camera:
@@ -165,16 +164,16 @@ class View:
         return self.capture.with_(camera=self.camera)
 
     def changed(self, **parts: Any) -> View:
-        """The view with parts of its capture replaced."""
+        """The view with changed fields of its capture."""
         return replace(self, capture=self.capture.with_(**parts))
 
     def exposed(self, **parts: Any) -> View:
-        """The view with a sensor that gathers linear light, and whose response is sRGB."""
+        """The view with a sensor that integrates linear light and has an sRGB response."""
         return self.changed(sensor=Sensor(decode="srgb", response="srgb", seed=self.seed, **parts))
 
     def moving(self, pixels: float, shutter: Shutter) -> View:
         """The view with a camera that moves sideways, so that the marker moves by this number of pixels per
-        second at the time 0."""
+        second at time 0."""
         camera = self.camera
         speed = pixels * self.edges * self.placed.marker.size / camera.fx
         angle = 2 * math.pi * self.rng.random()
@@ -191,9 +190,9 @@ class View:
 
 
 def view_of(scene: str, spec: str, seed: str) -> View:
-    """A view without a cause; distance, tilt, roll and aim are random.
+    """A view without a cause, with random distance, tilt, roll and aim.
 
-    Views of equal seeds have equal poses for all specs, causes and severities.
+    Views with equal seeds have equal poses for all specs, causes and severities.
     """
     base, _, _ = scene_of(scene)
     rng = np.random.default_rng([*seed.encode()])
@@ -215,26 +214,26 @@ def view_of(scene: str, spec: str, seed: str) -> View:
 
 @dataclass(frozen=True)
 class Cause:
-    """A cause of failed detections: severity -> amount -> changed view."""
+    """Cause of failed detection: maps a severity to a physical amount and applies it to a view."""
 
     title: str
     group: str
-    """figure that has the cause"""
+    """figure that contains the cause"""
     amount: Callable[[float], float]
     """physical amount of a severity from 0 to 1"""
     form: str
     """format of the amount, e.g. "{:.0f}" """
     unit: str
     change: Callable[[View, float], View]
-    """the view with an amount"""
+    """function from a view and an amount to the changed view"""
 
     def apply(self, view: View, severity: float) -> View:
-        """The view with a severity. Raises InputError for a severity outside 0 to 1."""
+        """Apply the cause to a view. Raises InputError for a severity outside 0 to 1."""
         number("severity", severity, "a number from 0 to 1", 0, 1)
         return self.change(view, self.amount(severity))
 
     def text(self, severity: float) -> str:
-        """The amount of a severity, without its unit."""
+        """Amount of a severity as text, without unit."""
         return self.form.format(self.amount(severity))
 
 
@@ -255,7 +254,7 @@ def _angle(view: View, degrees: float) -> View:
 
 
 def _lens(view: View, k1: float) -> View:
-    """Strong distortion is far from the axis: the marker is near a corner of the image."""
+    """Distort the image strongly; the marker is near a corner, where distortion is large."""
     signs = view.rng.choice((-1.0, 1.0), 2)
     view = replace(view, aim=(float(0.36 * signs[0]), float(0.24 * signs[1])), tilt=view.tilt / 4)
     return view.changed(camera=replace(view.camera, lens=BrownConrady(k1=-k1)))
@@ -287,7 +286,7 @@ def _fog(view: View, transmittance: float) -> View:
 
 
 def _covered(view: View, share: float) -> View:
-    """A dark leaf across one side of the code, at random."""
+    """Cover one side of the code by a dark leaf, at random."""
     size, rng = view.placed.marker.size, view.rng
     angle = math.pi / 2 * int(rng.integers(4)) + rng.uniform(-0.2, 0.2)
     middle = size * (0.5 - share + 1.0)  # the leaf is two edges wide and ends at the share
@@ -317,14 +316,14 @@ def _direction(placed: PlacedMarker, vector: tuple[float, float, float]) -> tupl
 
 
 def _backlight(view: View, share: float) -> View:
-    """The marker is darker than its surroundings, to which the camera is exposed."""
+    """Make the marker darker than its surroundings, to which the camera is exposed."""
     return replace(view, placed=_lit(view.placed, Lighting(exposure=share)))
 
 
 def _shadow(view: View, ratio: float) -> View:
-    """Shadows of planks in the sun; the camera is exposed to the sunlit parts."""
+    """Cast shadows of planks in the sun; the camera is exposed for sunlit areas."""
     cover, sun = _planks(view.placed.marker.size, view.seed % VARIANTS)
-    # paper in the sun is as bright as without a cause
+    # paper in the sun is as bright as paper without a cause
     light = Lighting(source="lights", exposure=1 / (1 + ratio))
     facing = sun[2] / math.hypot(*sun)
     lights = (
@@ -336,7 +335,7 @@ def _shadow(view: View, ratio: float) -> View:
 
 @cache
 def _planks(size: float, number: int) -> tuple[SplatCloud, tuple[float, float, float]]:
-    """Planks above and in front of a marker, out of the camera's way, and the direction of the sunlight
+    """Planks above and in front of a marker, outside the camera's view, and the direction of the sunlight
     through them, in the marker's frame."""
     sun = np.array([0.35, 0.75, 0.56])
     rng = np.random.default_rng(number)
@@ -354,7 +353,7 @@ def _planks(size: float, number: int) -> tuple[SplatCloud, tuple[float, float, f
 
 
 def _glare(view: View, ratio: float) -> View:
-    """A lamp that a laminated marker mirrors into the camera."""
+    """Add a lamp that a laminated marker reflects into the camera."""
     placed = _lit(view.placed, Lighting("lights", roughness=0.25, view="camera"))
     distance = view.edges * placed.marker.size
     towards = placed.pose[:3, :3].T @ (view.camera.position - placed.pose[:3, 3])
@@ -367,12 +366,12 @@ def _glare(view: View, ratio: float) -> View:
 
 
 def _dusk(view: View, share: float) -> View:
-    """Less light, and a gain that makes up for it."""
+    """Reduce the light, and compensate it by gain."""
     return view.exposed(exposure=share, full_well=10_000.0, read_noise=5.0, gain=1 / share)
 
 
 def _flare(view: View, share: float) -> View:
-    """Light that the lens scatters over the image, from a window outside of it."""
+    """Add veiling glare from a window outside of the image."""
     return view.exposed(veiling_glare=share, glare_light=(0.6,) * 3)
 
 
@@ -398,7 +397,7 @@ def _faded(view: View, contrast: float) -> View:
 
 
 def _worn(name: str) -> Callable[[View, float], View]:
-    """The change by a field of `Wear`."""
+    """Function that changes one field of `Wear`."""
     return lambda view, severity: replace(
         view, placed=_changed(view.placed, wear=Wear(**{name: severity}, seed=view.seed % VARIANTS))
     )

@@ -85,19 +85,19 @@ class TagSettings(ShardSettings):
 
 NAME = "tags"
 NONE = "none"
-"""name of the point without a cause, severity 0 of all causes"""
+"""name of the point without a cause, which is severity 0 of all causes"""
 FAMILIES = {"apriltag:36h11": "apriltag:36h11:5", "aruco:4x4_50": "aruco:4x4_50:7", "qr": "qr:fidsplat"}
-"""families with the marker that is rendered"""
+"""spec of the rendered marker by family"""
 OWN = "fidsplat"
-"""name of our `detect` among the detectors"""
+"""name of fidsplat's `detect` among the detectors"""
 SLOW = "zxing-tall"
-"""detector that is measured only on request: it takes a second for an image that it cannot read"""
+"""detector that is measured only on request, since it takes a second for an unreadable image"""
 Errors = list[float] | None
 """corner error [pixels, RMS], rotation [degrees], translation [% of the distance]; None: not read"""
 
 
 def check(options: TagSettings) -> None:
-    """Raise InputError for settings that cannot be used."""
+    """Raise InputError for invalid settings."""
     for name, known in (("scene", SCENES), ("cause", CAUSES), ("family", FAMILIES)):
         for text in getattr(options, name):
             if text not in known:
@@ -107,7 +107,7 @@ def check(options: TagSettings) -> None:
 
 
 def points_of(options: TagSettings) -> list[Key]:
-    """Points of the shard of a run: first without a cause, then cause by cause.
+    """Points of the run's shard, starting with the points without a cause.
 
     Raises InputError for detectors that cannot be used.
     """
@@ -139,10 +139,9 @@ def points_of(options: TagSettings) -> list[Key]:
 def detectors_of(
     family: str, names: Sequence[str] = ()
 ) -> dict[str, Callable[[np.ndarray, Target], Attempt]]:
-    """Detectors of a family by name, for a grey image and its target.
+    """Detectors of a family by name, as functions of a grey image and its target.
 
-    names: those to use, in which module:function is the user's own; by default all installed ones except
-    `SLOW`.
+    names: detectors to use; module:function is the user's own. By default all installed ones except `SLOW`.
 
     Raises InputError for an unknown name, a missing package, or a function that cannot be imported.
     """
@@ -171,8 +170,8 @@ def detectors_of(
 
 
 def own_detector(text: str) -> Detector:
-    """The function module:function, of a module on the path or in the working folder: (h, w) uint8 -> pairs
-    of the spec and the corners (4, 2) of each detected code. Raises InputError if it cannot be imported."""
+    """Import the function module:function from the path or the working folder. It maps (h, w) uint8 to pairs
+    of spec and corners (4, 2) of each detected code. Raises InputError if it cannot be imported."""
     module, _, name = text.partition(":")
     if "" not in sys.path:
         sys.path.insert(0, "")
@@ -188,7 +187,7 @@ def own_detector(text: str) -> Detector:
 
 
 def attempt_by(function: Detector, grey: np.ndarray, target: Target) -> Attempt:
-    """The result of a detector that returns specs and corners."""
+    """Attempt of a detector that returns pairs of spec and corners."""
     own = target.payload if target.id is None else target.id
     spec = f"{target.kind}:{own if target.id is None else f'{target.family}:{own}'}"
     pairs = ((own if name == spec else None, np.asarray(quad, np.float64)) for name, quad in function(grey))
@@ -197,14 +196,14 @@ def attempt_by(function: Detector, grey: np.ndarray, target: Target) -> Attempt:
 
 @contextmanager
 def tag_sweep(options: TagSettings) -> Iterator[Sweep]:
-    """The sweep of the test bench.
+    """Sweep of the test bench.
 
-    Raises InputError for options that cannot be used, DeviceError when the device cannot be opened.
+    Raises InputError for invalid options, DeviceError if the device cannot be opened.
     """
     check(options)
     points = points_of(options)
     for scene in {point["scene"] for point in points}:
-        scene_of(scene)  # errors of a download appear before a device is opened
+        scene_of(scene)  # reports download errors before a device is opened
     renderer = Renderer(options.device)
     results = results_of(NAME, options, device_name(renderer))
     begin = partial(begin_point, renderer=renderer, seed=options.seed, own=options.detector)
@@ -213,14 +212,14 @@ def tag_sweep(options: TagSettings) -> Iterator[Sweep]:
 
 
 def views_of(key: Key, seed: int) -> list[View]:
-    """Views of a point, with its cause."""
+    """Views of a point, with its cause applied."""
     spec, cause = FAMILIES[key["family"]], key["cause"]
     views = [view_of(key["scene"], spec, f"{seed} {key['scene']} {k}") for k in range(key["views"])]
     return views if cause == NONE else [CAUSES[cause].apply(view, key["severity"]) for view in views]
 
 
 def begin_point(key: Key, renderer: Renderer, seed: int, own: Sequence[str] = ()) -> Work:
-    """Render the views of a point; returns their detection."""
+    """Render the views of a point; returns the function that detects their markers."""
     shots = []
     for view in views_of(key, seed):
         frame = renderer.render(view.complete_scene, view.complete_capture)
@@ -233,7 +232,7 @@ def _detect(
     shots: Iterable[tuple[View, np.ndarray]],
     detectors: dict[str, Callable[[np.ndarray, Target], Attempt]],
 ) -> dict[str, Any]:
-    """Errors of each view by detector, see `Errors`."""
+    """Errors of each view by detector, as `Errors`."""
     found: dict[str, list[Errors]] = {name: [] for name in key["detectors"]}
     for view, grey in shots:
         made, camera = view.placed.marker, view.camera
@@ -245,7 +244,7 @@ def _detect(
 
 
 def errors_of(corners: np.ndarray | None, view: View) -> Errors:
-    """Errors of detected corners (4, 2); None for corners of None, or without a pose."""
+    """Errors of detected corners (4, 2); None without corners or pose."""
     if corners is None:
         return None
     camera, placed = view.camera, view.placed
@@ -261,8 +260,8 @@ def errors_of(corners: np.ndarray | None, view: View) -> Errors:
 def write_labels(options: TagSettings, folder: Path) -> Iterator[Path]:
     """Write images and ground truth of all points; yields the folder of each point.
 
-    FOLDER/train/000000 and so on are scenes of a BOP data set with a `coco.json` each; a lens, which BOP
-    lacks, leaves only COCO. Existing ones are kept.
+    FOLDER/train/000000 and so on are scenes of a BOP data set, each with a `coco.json`; with a lens, which
+    BOP lacks, only COCO annotations are written. Existing folders are unchanged.
     """
     renderer = Renderer(options.device)
     for number, key in enumerate(points_of(options)):
@@ -295,7 +294,7 @@ def _write_point(key: Key, folder: Path, renderer: Renderer, seed: int) -> Path:
 
 
 def rows_of(record: Record) -> Iterator[dict[str, Any]]:
-    """A row for each view and detector of a record."""
+    """Rows of a record, one per view and detector."""
     key = record.key
     for name, views in record.result["errors"].items():
         for errors in views:

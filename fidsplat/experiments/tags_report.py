@@ -1,4 +1,4 @@
-"""Report of the test bench of tag detectors: failure curves, tables, and a CSV table of all measurements."""
+"""Report of the test bench of tag detectors: failure curves, tables, and a CSV file of all measurements."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from fidsplat.vision.readers import TITLES
 _ERRORS = ("corner_px", "rotation_deg", "translation_percent")
 _GROUP = ("scene", "family", "detector", "cause", "severity")
 PRECISE = 1.0
-"""pixels: largest RMS error of the corners of a precise reading"""
+"""maximum RMS error in pixels of the corners of a precise detection"""
 NEVER = "never"
-"""cell of a detector that reads at least half of the views at every severity"""
+"""cell of a detector that reads at least half of the views at all severities"""
 _COLUMNS = 4
-"""panels next to each other"""
+"""panels per row"""
 
 
 def view_table(records: Sequence[Record]) -> Summary:
-    """Table with a row for each view and detector."""
+    """Table with one row per view and detector."""
     return summarise(records, rows_of, (*_GROUP, "read", *_ERRORS))
 
 
 def statistics_of(rows: Frame, seed: int, by: Sequence[str] = _GROUP) -> Frame:
-    """Detection rates and errors of groups of views, with intervals of 95 %."""
+    """Detection rates and errors of groups of views, with 95 % intervals."""
     return pd.DataFrame(
         dict(zip(by, names, strict=True)) | _statistics(group, seed)
         for names, group in rows.groupby(list(by), sort=False)
@@ -60,7 +60,7 @@ def _statistics(group: Frame, seed: int) -> dict[str, Any]:
 
 
 def breaking_severity(severities: Sequence[float], rates: Sequence[float]) -> float | None:
-    """Severity at which a rate falls below one half, interpolated; None if it does not."""
+    """Severity at which a rate falls below one half, by interpolation; None if it does not."""
     points = sorted(zip(severities, rates, strict=True))
     if not points or points[0][1] < 0.5:
         return points[0][0] if points else None
@@ -71,7 +71,7 @@ def breaking_severity(severities: Sequence[float], rates: Sequence[float]) -> fl
 
 
 def breaks_of(rates: Frame) -> Frame:
-    """Table of causes and families: the amount at which each detector reads half of the views.
+    """Table of causes and families with the amount at which each detector reads half of the views.
 
     rates: `statistics_of` by family, detector, cause and severity.
     """
@@ -91,7 +91,7 @@ def breaks_of(rates: Frame) -> Frame:
 
 
 def compact(breaks: Frame) -> Frame:
-    """The table of `breaks_of` with a row for each cause and a column for each family."""
+    """Table of `breaks_of` with one row per cause and one column per family."""
     detectors = list(breaks.columns[3:])
     names = {
         family: [name for name in detectors if (rows[name] != NOTHING).any()]
@@ -114,7 +114,7 @@ def _detectors(rates: Frame) -> list[str]:
 
 
 def _errors(statistics: Frame) -> Frame:
-    """Errors of each detector, with intervals."""
+    """Table of the errors of each detector, with intervals."""
 
     def cell(row: Any, name: str) -> str:
         if math.isnan(row[name]):
@@ -140,9 +140,9 @@ def _errors(statistics: Frame) -> Frame:
 def write_report(records: Sequence[Record], folder: Path, out: Path, seed: int) -> tuple[list[Path], Frame]:
     """Write tags.csv into the folder of results, and the page with its charts.
 
-    out: folder for report.md and its charts, or FILE.md, whose charts are written into a folder of that name.
+    out: folder for report.md and its charts, or FILE.md, with a folder of that name for its charts.
 
-    Returns the files, the page first, and the table of `breaks_of`.
+    Returns the files, starting with the page, and the table of `breaks_of`.
     """
     summary, (page, charts) = view_table(records), page_and_folder(out, "tags.md.j2")
     views = summary.rows
@@ -179,7 +179,7 @@ def write_report(records: Sequence[Record], folder: Path, out: Path, seed: int) 
 
 
 def _curves(rates: Frame, causes: Sequence[str], file: Path) -> None:
-    """Rates of detection by severity with Wilson's intervals: a row for each family, a column for each
+    """Write a chart of detection rates by severity with Wilson intervals: a row per family, a column per
     cause."""
     families = [name for name in FAMILIES if name in set(rates["family"])]
     detectors = _detectors(rates)
@@ -213,18 +213,18 @@ def _curves(rates: Frame, causes: Sequence[str], file: Path) -> None:
 
 
 NORMAL = 1.959963984540054
-"""quantile 0.975 of the normal distribution"""
+"""quantile 0.975 of the standard normal distribution"""
 RESAMPLES = 1000
 
 
 def wilson(hits: int, count: int) -> tuple[float, float]:
-    """Wilson's score interval of a share (Wilson 1927); (0, 1) without measurements."""
+    """Wilson score interval of a share (Wilson 1927); (0, 1) without measurements."""
     if count == 0:
         return 0.0, 1.0
     share, square = hits / count, NORMAL**2 / count
     middle = (share + square / 2) / (1 + square)
     half = NORMAL / (1 + square) * math.sqrt(share * (1 - share) / count + square / (4 * count))
-    # the ends are exact for no hit and for hits only
+    # exact ends if there are no hits or only hits
     return 0.0 if hits == 0 else middle - half, 1.0 if hits == count else middle + half
 
 
@@ -244,7 +244,7 @@ def bootstrap(
 
 
 def percentile(percent: float) -> Callable[[np.ndarray], np.ndarray]:
-    """The percentile along the last axis, as a statistic."""
+    """Statistic that computes a percentile along the last axis."""
     return lambda values: np.percentile(values, percent, axis=-1)
 
 

@@ -1,4 +1,4 @@
-"""Report of a training: curves, held-out views, settings."""
+"""Report of a training run: curves, held-out views, settings."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from fidsplat.train import Trainer, TrainingView, ViewScore
 from fidsplat.util.provenance import run_facts
 
 MAX_VIEWS = 4
-"""maximum number of images"""
+"""maximum number of images of held-out views"""
 _POINTS = 200
-"""number of points of a curve, means of equal parts of the run"""
+"""points per curve, each the mean of an equal share of the run"""
 
 
 def write_training_page(
     trainer: Trainer, scores: Sequence[ViewScore], facts: Mapping[str, Any], out: Path
 ) -> list[Path]:
-    """Write the report, its chart and images; returns the files, the report first.
+    """Write the report, its chart and images; returns the files, starting with the report.
 
     facts: output of `fidsplat train --json`.
 
-    Raises InputError when they cannot be written.
+    Raises InputError if a file cannot be written.
     """
     page, folder = page_and_folder(out, "training.md.j2")
     files = [page, folder / "training.svg"]
@@ -56,7 +56,7 @@ def write_training_page(
 
 
 def draw_curves(history: Mapping[str, np.ndarray], file: Path) -> None:
-    """Charts of loss, training PSNR and number of splats over the iterations."""
+    """Write charts of loss, training PSNR and number of splats over the iterations."""
     panels = (("losses", "loss"), ("psnrs", "PSNR of the view, dB"), ("counts", "splats"))
     with chart(file, panels=len(panels), size=(9.0, 3.0), one_scale=False) as (_, axes):
         for (name, title), axis, colour in zip(panels, axes, COLOURS[1:], strict=False):
@@ -65,13 +65,13 @@ def draw_curves(history: Mapping[str, np.ndarray], file: Path) -> None:
 
 
 def side_by_side(view: TrainingView, score: ViewScore) -> np.ndarray:
-    """Ground truth, rendering, and their difference times four around grey, side by side."""
+    """Ground truth, rendered image, and their difference times four around grey, side by side."""
     difference = 4 * (score.image.astype(float) - view.image) + 128
     return np.hstack([view.image, score.image, np.clip(difference, 0, 255).astype(np.uint8)])
 
 
 def _means(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres and means of equal parts of a curve, without infinite values."""
+    """Centres and means of equal shares of a curve, without infinite values."""
     parts = [part for part in np.array_split(np.arange(len(values)), _POINTS) if len(part)]
     finite = [values[part][np.isfinite(values[part])] for part in parts]
     means = [float(np.mean(part)) if len(part) else np.nan for part in finite]

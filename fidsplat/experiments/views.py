@@ -34,7 +34,7 @@ TRUTHS = {
     "blender-raw": "Blender, view 'Raw' on display values",
 }
 LINEAR = ("exact-linear", "blender-standard")
-"""ground truths that average linear light; methods in linear light are compared only with these"""
+"""ground truths that average linear light, with which methods in linear light are compared"""
 Perceptual = Callable[[np.ndarray, np.ndarray], float]
 
 
@@ -46,7 +46,7 @@ def views_points(
     views: int = TEST_VIEWS,
     lpips: bool = False,
 ) -> list[dict]:
-    """Points of the experiment: a marker, a method and a ground truth.
+    """Points of the experiment: combinations of marker, method and ground truth.
 
     Args:
         blender: folder of `fidsplat experiment blender`; used for markers with all images.
@@ -71,7 +71,7 @@ def views_points(
     return points
 
 
-@lru_cache(1)  # points with the same method follow each other
+@lru_cache(1)  # consecutive points have the same method
 def _images_of(
     markers: MarkerRenderer, method: str, category: str, index: int, seed: int, count: int
 ) -> list[np.ndarray]:
@@ -82,7 +82,7 @@ def _images_of(
     return [to_uint8(render(camera)) for camera in novel_cameras(CATEGORIES[category], index, seed)[:count]]
 
 
-@lru_cache(2 * TEST_VIEWS)  # the exact images of a marker, for all methods
+@lru_cache(2 * TEST_VIEWS)  # the exact images of a marker are shared by all methods
 def _exact_image(category: str, index: int, seed: int, number: int, linear: bool) -> np.ndarray:
     camera = novel_cameras(CATEGORIES[category], index, seed)[number]
     return to_uint8(exact_view(CATEGORIES[category].spec(index, seed), camera, linear))
@@ -98,8 +98,8 @@ def measure_views(
 ) -> dict:
     """Compare the 8-bit images of a marker with the ground truth.
 
-    Returns `psnr` (dB), `ssim`, `flip` and `lpips`: a number for each view; None for an unavailable
-    metric, and for the PSNR of equal images.
+    Returns `psnr` (dB), `ssim`, `flip` and `lpips` with a number per view; None for an unavailable metric,
+    and for the PSNR of equal images.
     """
     category, index, truth = point["category"], point["index"], point["truth"]
 
@@ -111,7 +111,9 @@ def measure_views(
             file = image_file(blender, view, category, index, TEST, number)
             reference = to_uint8(read_image(file)[:, :, 0])
         if reference.shape != image.shape:
-            raise InputError(f"the Blender images in {blender} have another size; render them again")
+            raise InputError(
+                f"images in {blender} must have the shape {image.shape}, got {reference.shape}; render again"
+            )
         ours, theirs = image / 255.0, reference / 255.0
         ratio = psnr(ours, theirs)
         found = {"psnr": None if np.isinf(ratio) else ratio, "ssim": ssim(ours, theirs)}
@@ -131,7 +133,7 @@ def measure_views(
 def exact_view(spec: str, camera: Camera, linear: bool) -> np.ndarray:
     """Ground truth of a view, (h, w) display values.
 
-    linear: average linear light and encode the mean, as in Blender's 'Standard' view.
+    linear: average linear light and encode the mean, as Blender's view transform 'Standard' does.
     """
     grid = marker(spec).grid
     module = PROTOCOLS["fixed-plane"].module(grid.shape[0])

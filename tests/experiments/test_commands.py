@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 import fidsplat as fs
@@ -15,7 +14,6 @@ from fidsplat.experiments.blender import check_images, record_images
 from fidsplat.experiments.settings import ExperimentSettings
 from fidsplat.experiments.setup import PROTOCOLS
 from fidsplat.experiments.sweep import read_records
-from fidsplat.images.files import write_png
 
 SMALL = ["--category", "apriltag", "--markers", "1"]
 
@@ -128,20 +126,6 @@ def test_everything_quick_and_its_report(capsys, tmp_path, monkeypatch):
     assert {file: file.read_bytes() for file in tmp_path.glob("*.jsonl")} == before
 
 
-def test_scenes_for_trainers(capsys, tmp_path):
-    folder = tmp_path / "blender" / "raw" / "apriltag-0"
-    folder.mkdir(parents=True)
-    for stem, count in (("view", 17), ("test", 20)):
-        for i in range(count):
-            write_png(folder / f"{stem}-{i:02d}.png", np.zeros((8, 8), np.uint8))
-    words = ("dataset", *SMALL, "--truth", "blender-raw", "--blender", tmp_path / "blender")
-    status, out, _ = run(capsys, *words, "-o", tmp_path / "out", "--json")
-    assert status == 0
-    names = [f"apriltag-0-views-{n}" for n in (3, 5, 9, 17)]
-    assert json.loads(out)["scenes"] == names
-    assert [len(list((tmp_path / "out" / name / "images").iterdir())) for name in names] == [3, 5, 9, 17]
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -157,8 +141,6 @@ def test_scenes_for_trainers(capsys, tmp_path):
             "--trained must be a folder with models such as 2dgs-17/small-0.ply",
         ),
         (["counts", "--category", "huge", "--markers", "0"], "--markers must be 1 to 5, got 0"),
-        (["dataset", "--truth", "photo"], "unknown truth 'photo'; known: exact"),
-        (["dataset", "--markers", "9"], "--markers must be 1 to 5, got 9"),
         (["blender", "--environment", "nowhere"], "fidsplat experiment blender --install"),
         (["blender", "--samples", "0"], "--samples must be at least 1, got 0"),
         (["blender", "--threads", "0"], "--threads must be at least 1, got 0"),
@@ -209,7 +191,7 @@ def test_trained_models_that_are_missing_are_shown_before_the_work(capsys, tmp_p
     words = ("all", "--quick", "--trained", tmp_path, "-o", tmp_path / "out")
     status, _, err = run(capsys, *words)
     assert status == 2
-    assert "small-0.ply is missing; --category and --markers leave out" in err
+    assert "small-0.ply must exist, got none; --category and --markers skip" in err
     ExperimentSettings(tmp_path, category=("apriltag",), markers=1, trained=tmp_path).check()
 
 
@@ -225,24 +207,11 @@ def test_merge_names_shards_that_are_missing(capsys, tmp_path):
 def test_images_of_another_seed_are_not_the_truth(capsys, tmp_path):
     """Blender's images are found by their names, which do not include the seed."""
     record_images(tmp_path / "b", "raw", 0, 16)
-    for words in (
-        ("views", "--quick", *SMALL, "--blender", tmp_path / "b", "--seed", "1", "-o", tmp_path / "out"),
-        (
-            "dataset",
-            "--truth",
-            "blender-raw",
-            "--blender",
-            tmp_path / "b",
-            "--seed",
-            "1",
-            "-o",
-            tmp_path / "d",
-        ),
-    ):
-        status, _, err = run(capsys, *words)
-        assert status == 2
-        assert "holds images of seed 0, not 1" in err
-    with pytest.raises(fs.InputError, match="images of samples 16, not 64; give another folder"):
+    words = ("views", "--quick", *SMALL, "--blender", tmp_path / "b", "--seed", "1", "-o", tmp_path / "out")
+    status, _, err = run(capsys, *words)
+    assert status == 2
+    assert "must have seed 1, got 0" in err
+    with pytest.raises(fs.InputError, match="must have samples 64, got 16; give another folder"):
         record_images(tmp_path / "b", "raw", 0, 64)
     assert check_images(tmp_path / "b", "raw", 0) == {"seed": 0, "samples": 16}
     assert check_images(tmp_path / "b", "standard", 3) == {}

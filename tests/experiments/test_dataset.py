@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from paper_dataset import POINTS, dataset_scenes, scene_name, write_dataset, write_scene
 
 import fidsplat as fs
-from fidsplat.experiments.dataset import POINTS, dataset_scenes, scene_name, write_scene
+from fidsplat.experiments.blender import record_images
 from fidsplat.experiments.setup import CATEGORIES, novel_cameras, training_cameras
 from fidsplat.experiments.views import exact_view
 from fidsplat.formats.colmap import save_colmap
@@ -140,3 +141,19 @@ def test_models_with_several_lenses_and_names_that_cannot_be(tmp_path):
             save_colmap(tmp_path / "n", [bad], cameras[:1], np.zeros((0, 3)), np.zeros((0, 3)))
     with pytest.raises(fs.InputError, match="a name for each camera"):
         save_colmap(tmp_path / "n", names, cameras[:2], np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+def test_all_scenes_of_a_category(tmp_path, monkeypatch):
+    folder = tmp_path / "blender" / "raw" / "apriltag-0"
+    folder.mkdir(parents=True)
+    for stem, count in (("view", 17), ("test", 20)):
+        for i in range(count):
+            write_png(folder / f"{stem}-{i:02d}.png", np.zeros((8, 8), np.uint8))
+    monkeypatch.setattr("paper_dataset.dataset_scenes", lambda categories: dataset_scenes(categories, 1))
+    words = tmp_path / "out", "blender-raw", tmp_path / "blender"
+    write_dataset(*words, categories=[CATEGORIES["apriltag"]])
+    names = [f"apriltag-0-views-{n}" for n in (3, 5, 9, 17)]
+    assert [len(list((tmp_path / "out" / name / "images").iterdir())) for name in names] == [3, 5, 9, 17]
+    record_images(tmp_path / "blender", "raw", 0, 16)
+    with pytest.raises(fs.InputError, match="must have seed 1, got 0"):
+        write_dataset(*words, seed=1)

@@ -140,9 +140,9 @@ def test_trained_models_are_rows_where_they_are(renderer, tmp_path):
         assert psnr(trained, own) > 20
     with pytest.raises(fs.InputError, match="apriltag-0"):
         markers.prepare("2dgs-9", "apriltag-0", spec, 0.2)
-    with pytest.raises(fs.InputError, match="needs a folder of trained models"):
+    with pytest.raises(fs.InputError, match="a folder of trained models must be given"):
         MarkerRenderer(renderer).prepare("2dgs-9", "apriltag-2", spec, 0.2)
-    with pytest.raises(fs.InputError, match="needs a renderer"):
+    with pytest.raises(fs.InputError, match="a renderer must be given"):
         CEILING.prepare("fitted/best", "apriltag-2", spec, 0.2)
 
 
@@ -218,7 +218,7 @@ def test_blenders_images_take_part_where_a_marker_has_all_of_them(pool, tmp_path
     assert found["psnr"][0] is None  # the first view is in its place, the second is another view's image
     assert found["psnr"][1] < 20
     write_png(views.image_file(tmp_path, "raw", "small", 0, "test", 1), np.zeros((10, 10), np.uint8))
-    with pytest.raises(fs.InputError, match="have another size"):
+    with pytest.raises(fs.InputError, match="must have the shape"):
         views.measure_views(point, CEILING, 0, tmp_path, pool)
 
 

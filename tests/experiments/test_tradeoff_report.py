@@ -240,7 +240,9 @@ def test_devices_are_side_by_side_in_one_chart(tmp_path):
     assert {"hard on A processor", "hard on A card", "half an 8-bit level"} <= set(comments)
     assert comments.count("gsplat") == 2
     write(tmp_path / "other", plain_records("r100k_720p", **GPU))
-    with pytest.raises(fs.InputError, match="A processor and A card have no scene in common to plot"):
+    with pytest.raises(
+        fs.InputError, match="must have a common scene to plot, got none of A processor and A card"
+    ):
         plot.write_plot([tmp_path / "cpu", tmp_path / "other"], tmp_path / "none.svg")
     assert not (tmp_path / "none.svg").exists()
 
@@ -305,11 +307,11 @@ def test_a_few_results_are_enough(tmp_path):
 
 def test_other_results_are_refused_by_name(tmp_path):
     write(tmp_path / "a", [Record({"category": "small"}, {}, {"device": "x"})])
-    with pytest.raises(fs.InputError, match="must contain results of fidsplat tradeoff, got other ones"):
+    with pytest.raises(fs.InputError, match="must be of fidsplat tradeoff, got another command"):
         load([tmp_path / "a"])
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "notes.csv").write_text("milk,bread\n1,2\n")
-    with pytest.raises(fs.InputError, match=r"notes.csv holds no summary"):
+    with pytest.raises(fs.InputError, match=r"notes.csv must be a summary"):
         load([tmp_path / "b"])
     for head in ("[1]", "[" * 100_000):
         (tmp_path / "b" / "notes.csv").write_text(f"# {head}\nmilk,bread\n1,2\n")

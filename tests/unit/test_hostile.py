@@ -643,7 +643,7 @@ SLOW = [
     "bench --scenes nothing --json out.json",
     "tradeoff --scenes nothing -o out",
     "experiment nothing -o out",
-    "experiment dataset --markers 9 -o out",
+    "experiment counts --markers 9 -o out",
     "experiment merge nowhere -o out",
     "experiment report nowhere -o out",
     "demo --out /proc/nowhere",

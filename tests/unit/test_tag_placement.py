@@ -339,7 +339,7 @@ def test_the_command_writes_a_scene_and_a_map(hall, few_candidates, tmp_path, ca
         (["--count", "31", "--family", "tag16h5"], "--count must be at most 30, the free ids of 16h5"),
         (["--size", "-1"], "--size must be above 0"),
         (["--target", "0"], "--target must be a positive length"),
-        (["--size", "9"], "the trajectory must see a flat surface of the size of a tag"),
+        (["--size", "9"], "the trajectory must have a flat surface of a tag"),
     ],
 )
 def test_impossible_plans_are_reported(hall, few_candidates, tmp_path, capsys, words, said):

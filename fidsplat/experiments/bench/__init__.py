@@ -1,1 +1,1 @@
-"""Benchmark of frame times, kernel compilation in advance, scenes, and the roofline model of a frame."""
+"""Benchmark of frame times: scenes, roofline model, suite of renderers, and kernel compilation in advance."""

@@ -1,10 +1,10 @@
-"""Process of one renderer of `fidsplat bench --suite`.
+"""Process of one renderer in `fidsplat bench --suite`.
 
     python -P adapter.py FILE.py [DEVICE]
 
 FILE.py defines a class `Adapter` (benchmarks/adapters/README.md). This file imports only NumPy, so that the
-environment of another renderer does not need fidsplat. Requests are JSON lines on stdin, answers JSON lines
-on stdout; what libraries print goes to stderr. An answer has `error` if the renderer failed.
+environment of another renderer does not need fidsplat. Requests are JSON lines on stdin, responses JSON lines
+on stdout; other output of libraries is redirected to stderr. A response has `error` if the renderer failed.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from typing import Any
 import numpy as np
 
 WARM_UP = 0.01
-"""seconds of untimed submissions before a timed one"""
+"""seconds of untimed submissions before a timed submission"""
 
 
 class Server:
-    """Answers requests by an adapter. A request is a dict with the name of a method as `do`."""
+    """Executes requests with an adapter. A request is a dict with the name of a method as `do`."""
 
     def __init__(self, adapter: Any) -> None:
         self.adapter = adapter
         self.rendered: Any = None
 
     def load(self, file: str) -> dict:
-        """Read a scene; the adapter moves it to the device."""
+        """Load a scene into the adapter, which copies it to the device."""
         with np.load(file) as arrays:
             scene = {name: arrays[name] for name in arrays.files}
         self.rendered = None
@@ -41,8 +41,8 @@ class Server:
         return {"load_ms": 1e3 * (time.perf_counter() - begun)}
 
     def frame(self, setting: str, views: list[int], before: list[list[int]] | None = None) -> dict:
-        """Render views as one submission, after untimed submissions `before`, repeated for WARM_UP seconds;
-        milliseconds until they are complete, and processor time."""
+        """Render views as one submission, after untimed submissions `before`, which are repeated for WARM_UP
+        seconds. Returns milliseconds until completion, and processor time."""
         if before:
             self._repeat(setting, before, WARM_UP)
         begun, busy = time.perf_counter(), time.process_time()
@@ -52,7 +52,7 @@ class Server:
         return taken if device is None else taken | {"device_ms": device(self.rendered)}
 
     def image(self, file: str) -> dict:
-        """Write the images of the latest frame (v, h, w, 3), and the memory of the renderer in bytes."""
+        """Write the images of the latest frame (v, h, w, 3); returns the renderer's memory in bytes."""
         np.save(file, np.asarray(self.adapter.read(self.rendered), np.float32))
         device = getattr(self.adapter, "memory", lambda: None)()
         if device is not None:
@@ -61,13 +61,13 @@ class Server:
         return {"memory_bytes": peak, "memory_of": "process"}
 
     def burst(self, setting: str, views: list[int], seconds: float) -> dict:
-        """Render the same views again and again; number of submissions and seconds."""
+        """Render the same views repeatedly; returns the number of submissions and their seconds."""
         begun = time.perf_counter()
         count = self._repeat(setting, [views], seconds)
         return {"submissions": count, "seconds": time.perf_counter() - begun}
 
     def _repeat(self, setting: str, submissions: list[list[int]], seconds: float) -> int:
-        """Render submissions in turn until the time has passed; their number."""
+        """Render submissions in turn until the time has passed; returns their number."""
         end, count = time.perf_counter() + seconds, 0
         while time.perf_counter() < end:
             self.adapter.render(setting, submissions[count % len(submissions)])
@@ -86,7 +86,7 @@ def main() -> None:
     try:
         adapter = runpy.run_path(sys.argv[1])["Adapter"](*sys.argv[2:])
         answer({"facts": adapter.facts, "settings": adapter.settings})
-    except (Exception, SystemExit) as error:  # no GPU, no package, no compiler: the renderer is left out
+    except (Exception, SystemExit) as error:  # no GPU, package or compiler: the renderer is skipped
         answer({"skipped": f"{type(error).__name__}: {error}".splitlines()[0]})
         return
     server = Server(adapter)

@@ -22,24 +22,24 @@ from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util.errors import InputError, unknown
 
 TIMED = Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4, arithmetic="precise")
-"""quality of the benchmark: cut-off and stop of other renderers, for equal work"""
+"""quality of the benchmark: cut-off and stop of other renderers, so that all do equal work"""
 WALL_COLUMNS, WALL_ROWS, _WALL_CODES = 20, 10, 10
 
 
 @dataclass(frozen=True)
 class BenchScene:
-    """A benchmark scene: description and constructor."""
+    """Description and constructor of a benchmark scene."""
 
     about: str
     make: Callable[[], tuple[SplatCloud, Camera]]
     capture: Capture | None = None
     """timed capture; None: rgb of the camera at the quality `TIMED`"""
     without: Mapping[str, Reduced] = field(default_factory=dict)
-    """effect of the capture -> the same frame without it, which is timed for comparison"""
+    """effect of the capture -> the same frame without this effect, timed for comparison"""
 
 
 def tag() -> tuple[SplatCloud, Camera]:
-    """A single AprilTag, a third of the image height: the fixed cost of a frame."""
+    """One AprilTag, a third of the image height: the fixed cost of a frame."""
     placed = PlacedMarker(marker("apriltag:36h11:5", size=0.16), rigid_matrix((0.0, 0.0, 0.55)))
     return Scene((), markers=(placed,)).cloud(), standard_camera(640, 480)
 
@@ -84,7 +84,7 @@ BENCH_SCENES: dict[str, BenchScene] = {
 """benchmark scenes in the order of listings"""
 
 MOST_VIEWS = 8
-"""maximum views of a user's scene, evenly spread over the trajectory"""
+"""maximum number of views of a user's scene, evenly distributed over the trajectory"""
 
 
 def own_scenes(
@@ -92,13 +92,13 @@ def own_scenes(
 ) -> dict[str, BenchScene]:
     """Benchmark scenes of a user's scene by name, such as `room.toml@2`, with everything that it requests.
 
-    The view is its camera, or poses of a trajectory (camera to world), along which its shutter moves.
+    Views are the scene's camera, or poses of a trajectory (camera to world), which also moves the shutter.
 
     Raises InputError for a scene without a camera.
     """
     camera = scene.camera
     if camera is None:
-        raise InputError(f"{name} has no [camera] table; add one with the size and lens of the images")
+        raise InputError(f"{name} must have a [camera] table, got none; add one with size and lens")
     about = f"{len(scene.cloud()):,} splats, {camera.width} x {camera.height}"
     if path is None:
         captures = {name: scene.capture}
@@ -119,11 +119,11 @@ def own_scenes(
 
 
 DEFAULT_SCENES = ("tag", "r100k_720p", "r1m_1080p", "tag_in_million")
-"""default scenes; they take about a minute on two cores"""
+"""default scenes, which take about a minute on two cores"""
 
 
 def scene_names(words: Iterable[str]) -> tuple[str, ...]:
-    """Distinct scene names: `all` means every scene, no word the default scenes.
+    """Distinct scene names; `all` selects every scene, no word the default scenes.
 
     Raises:
         InputError: an unknown scene.

@@ -29,12 +29,12 @@ from fidsplat.util.errors import FidsplatError
 from fidsplat.util.timing import Timer, frame_timer, time_interleaved
 
 MIN_ROUNDS, SECONDS = 3, 60.0
-"""for a user's scene: no round is started later than SECONDS, after MIN_ROUNDS rounds"""
+"""limit for a user's scene: after MIN_ROUNDS rounds, no round starts later than SECONDS"""
 
 
 @dataclass
 class Result:
-    """Result of a scene on a device, in milliseconds; splats and images stay on the device."""
+    """Times of a scene on a device in milliseconds; splats and images stay on the device."""
 
     scene: str
     device: DeviceInfo
@@ -44,45 +44,45 @@ class Result:
     """wall times of complete frames, with the times of their stages"""
     rates: Rates | None = None
     renderer: str = "fidsplat"
-    """name of the renderer; other renderers are in benchmarks/peers"""
+    """name of the renderer; benchmarks/peers has other renderers"""
     first_frame_ms: float = 0.0
     """time of the first frame, including compilation or loading of cached kernels"""
     counts: dict[str, int] = field(default_factory=dict)
-    """number of splats, visible splats and pairs of the frame, and of fragments if the backend counts them"""
+    """number of splats, visible splats and pairs of splats and tiles; fragments if the backend counts them"""
     host_ms: list[float] = field(default_factory=list)
-    """times until the call returns, for the same frames; the device is then still rendering"""
+    """times until the call returns, while the device is still rendering, for the same frames"""
     mean_rgb: float = 0.0
     memory_bytes: int | None = None
-    """device memory in bytes: cloud, scratch buffers and image"""
+    """device memory in bytes of splats, scratch buffers and image"""
     without: dict[str, Timer] = field(default_factory=dict)
-    """times of the same frames without an effect, by its name"""
+    """times of the same frames without one effect, by the effect's name"""
     rooflines: dict[str, float] = field(default_factory=dict)
-    """roofline by stage in milliseconds, if device rates are known"""
+    """roofline by stage in milliseconds, for devices with known rates"""
 
     @property
     def times_roofline(self) -> dict[str, float]:
-        """Ratio of measured times to the roofline by stage and for the complete `frame`, where known."""
+        """Ratio of the measured time to the roofline, by stage and for the complete `frame`, where known."""
         measured = self.timer.part_medians | {"frame": self.timer.median}
         rooflines = self.rooflines | {"frame": sum(self.rooflines.values())}
         return {name: ms / rooflines[name] for name, ms in measured.items() if rooflines.get(name, 0.0) > 0}
 
     @property
     def host(self) -> float:
-        """Median time of the call in milliseconds."""
+        """Median time until the call returns, in milliseconds."""
         return float(np.median(self.host_ms[-len(self.timer.ms) :])) if self.host_ms else math.nan
 
     @property
     def effects(self) -> dict[str, float]:
-        """Milliseconds that each effect adds to the frame: medians of interleaved differences."""
+        """Milliseconds that each effect adds to a frame: median of the differences of interleaved frames."""
         return {
-            # after an interrupt, one of them may have a frame more
+            # after an interrupt, one of the lists may be longer by a frame
             name: float(np.median([own - other for own, other in zip(self.timer.ms, less.ms, strict=False)]))
             for name, less in self.without.items()
             if less.ms and self.timer.ms
         }
 
     def as_dict(self) -> dict:
-        """Flat record for JSON."""
+        """Flat JSON record of the result."""
         record = {
             "scene": self.scene,
             "renderer": self.renderer,
@@ -120,9 +120,9 @@ class Result:
 
 
 class Bench:
-    """Interleaved benchmark of several devices, so that disturbances affect all.
+    """Benchmark of devices with interleaved frames, so that disturbances affect all devices.
 
-    `results` grows during the run, so an interrupted run keeps its results.
+    `results` grows during the run, so that an interrupted run has results.
     """
 
     def __init__(
@@ -132,13 +132,13 @@ class Bench:
         tick: Callable[[], None],
         scenes: Mapping[str, BenchScene] = BENCH_SCENES,
     ) -> None:
-        """Opens the devices and measures their rates.
+        """Open the devices and measure their rates.
 
         Args:
             devices: names of `Renderer`.
             report: called with the name of each step.
             tick: called after each timed frame.
-            scenes: catalogue of `run`.
+            scenes: scenes by name.
 
         Raises:
             DeviceError, UnknownDeviceError: a device cannot be opened.
@@ -152,7 +152,7 @@ class Bench:
             self.devices[name] = backend.rates() if backend.has("rates") else None
 
     def run(self, scene: str, repeats: int) -> None:
-        """Render a scene `repeats` times on each device. Errors of a device are stored in its result."""
+        """Render a scene `repeats` times on each device. A device's error is stored in its result."""
         self._report(f"making {scene}")
         entry = self._scenes[scene]
         cloud, camera = entry.make()
@@ -165,13 +165,13 @@ class Bench:
         self._report(scene)
         if entry.capture is None:
             time_interleaved(timers, repeats, tick=self._tick)
-        else:  # a frame of any duration
+        else:  # frames may take any time
             few = min(MIN_ROUNDS, repeats)
             time_interleaved(timers, repeats, min_rounds=few, seconds=SECONDS, warm_up=1, tick=self._tick)
 
 
 class SceneRun:
-    """A scene on a device, with its own renderer, so that memory is measured for this scene alone."""
+    """A scene on a device, with a renderer of its own, so that the measured memory is the scene's."""
 
     def __init__(
         self,
@@ -226,7 +226,7 @@ class SceneRun:
         result.memory_bytes = backend.memory_bytes + self.resident.memory_bytes + 12 * pixels
         plain = Capture(self.camera, quality=self.capture.quality)
         if select(cloud, plain) != select(cloud, self.capture):
-            return  # the roofline describes frames without effects
+            return  # the roofline model describes frames without effects
         fragments = overdraw(self.renderer, self.resident, self.camera, self.capture.quality)
         result.counts["fragments"] = int(fragments.sum(dtype=np.int64))
         coefficients = max(cloud.sh_degree + 1, 1) ** 2 - 1
@@ -235,10 +235,10 @@ class SceneRun:
 
 
 def overdraw(renderer: Renderer, resident: ResidentCloud, camera: Camera, quality: Quality) -> np.ndarray:
-    """Number of fragments per pixel (h, w) int32 of all its samples, counted by the blending kernels.
+    """Number of fragments of all samples of a pixel, (h, w) int32, counted by the blending kernels.
 
     Raises:
-        FidsplatError: the device fails, or its backend does not count.
+        FidsplatError: the device fails, or its backend does not count fragments.
     """
     data = resident.data
     assert not isinstance(data, Residency), "splats must be in memory"

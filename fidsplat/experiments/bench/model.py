@@ -1,7 +1,7 @@
 """Roofline model of a frame: minimum bytes and operations of each stage.
 
 devlog/roofline.md derives the numbers. They describe the method (2D splats, exact intersection, float32), not
-our kernels: data is read once, and only composited fragments count.
+the kernels: data is read once, and only composited fragments are counted.
 """
 
 from __future__ import annotations
@@ -10,19 +10,19 @@ from dataclasses import dataclass
 
 from fidsplat.backends.interface import Rates
 
-# bytes read per splat: position, scales and opacity for culling; rotation and colour if it is visible
+# bytes read per splat: position, scales and opacity for culling; rotation and colour if visible
 _DECIDE, _ROTATION, _COLOR = 12 + 8 + 4, 16, 12
-RECORD = 64  # intersection and colour of a splat, as in splat.cl
-WINDOW = 8  # tile range of a splat
+RECORD = 64  # bytes of intersection and colour of a splat, as in splat.cl
+WINDOW = 8  # bytes of the tile range of a splat
 _KEY, _INDEX = 4, 4
-# operations, of which a multiply-add unit can do one per cycle
+# operations that a multiply-add unit executes once per cycle
 _DECIDE_FMA, _SET_UP_FMA, _SET_UP_DIVISIONS = 20, 160, 4
 FRAGMENT_FMA = 30  # exp and division are counted separately
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Counts of splats, pixels and fragments of a frame."""
+    """Numbers of splats, pixels and fragments of a frame."""
 
     splats: int
     visible: int
@@ -32,12 +32,12 @@ class Counts:
     """composited fragments"""
     pixels: int
     sh_coefficients: int = 0
-    """SH coefficients per channel without the constant one; 0 for plain colours"""
+    """SH coefficients per channel above degree 0; 0 for plain colours"""
 
 
 @dataclass(frozen=True)
 class Work:
-    """Minimum work of a stage."""
+    """Minimum work of a stage of a frame."""
 
     bytes: float = 0.0
     """bytes read and written"""
@@ -46,14 +46,14 @@ class Work:
     division: float = 0.0
 
     def ms(self, rates: Rates) -> float:
-        """Minimum time [ms]: memory and arithmetic overlap; all kinds of arithmetic share the units."""
+        """Minimum time in ms: memory and arithmetic overlap; all arithmetic shares the same units."""
         memory = self.bytes / rates.copy_bytes
         arithmetic = self.fma / rates.fma + self.exp / rates.exp + self.division / rates.division
         return 1e3 * max(memory, arithmetic)
 
 
 def roofline_work(counts: Counts) -> dict[str, Work]:
-    """Minimum work by stage, in stage order."""
+    """Minimum work by stage, in the order of the stages."""
     n, visible, colors = counts.splats, counts.visible, 1 + counts.sh_coefficients
     return {
         "project": Work(
@@ -74,5 +74,5 @@ def roofline_work(counts: Counts) -> dict[str, Work]:
 
 
 def roofline_ms(counts: Counts, rates: Rates) -> dict[str, float]:
-    """Roofline by stage in milliseconds for device rates."""
+    """Roofline by stage in milliseconds, for the rates of a device."""
     return {stage: work.ms(rates) for stage, work in roofline_work(counts).items()}

@@ -39,12 +39,12 @@ class Adapter:
         }
 
     def _supported(self, quality: fs.Quality) -> bool:
-        """Whether the device has the quality setting: Warp lacks half precision."""
+        """Whether the device supports the quality, e.g. Warp has no half precision."""
         features = select(fs.SplatCloud.empty(), fs.Capture(quality=quality))
         return not self.renderer.backend.unsupported(features)
 
     def _claims(self, name: str) -> dict[str, dict]:
-        """Definition of the image by kind of splats."""
+        """Settings that define the image, by kind of splats."""
         claim = {field: getattr(self.qualities[name], field) for field in DEFINITION}
         kinds = ("ellipsoids",) if name == EXACT else ("disks", "ellipsoids", "boxes")
         return dict.fromkeys(kinds, claim)
@@ -57,13 +57,13 @@ class Adapter:
         cloud = cloud if groups is None else cloud.with_coplanar_groups(groups)
         (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
         self.camera = fs.Camera.pinhole(*map(int, size), fx, fy, cx, cy, near=float(near))
-        del self.resident  # releases the earlier scene first
+        del self.resident  # release the earlier scene before the upload
         if self.renderer.backend.has("rates"):
             self.renderer.backend.release_scratch()
         self.resident = self.renderer.upload(cloud)
         inverse = np.linalg.inv(self.poses)
         self.vectors = np.hstack([inverse[:, :3, 3], matrices_to_quaternions(inverse[:, :3, :3])])
-        self.capture = lru_cache(1)(self._capture)  # a flight makes one for each frame
+        self.capture = lru_cache(1)(self._capture)  # constructed once per frame of a flight
 
     def _capture(self, setting: str, view: int) -> fs.Capture:
         return fs.Capture(self.camera.with_pose(self.poses[view]), quality=self.qualities[setting])

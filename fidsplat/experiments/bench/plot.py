@@ -1,4 +1,4 @@
-"""Frame times of scenes and devices as bars."""
+"""Bar chart of frame times of scenes and devices."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from fidsplat.experiments.charts import bars, chart, legend_above, plain_ticks
 
 
 def write_plot(results: Sequence[Result], file: Path) -> None:
-    """Write a chart with a bar per device for each scene: median milliseconds of a frame and quartiles.
+    """Write a chart with a bar per scene and device: median milliseconds of a frame, with quartiles.
 
-    The axis is logarithmic; a line shows the roofline of the device if it is known.
+    The axis is logarithmic; a line marks the roofline of the device if it is known.
 
-    Raises InputError when the file cannot be written.
+    Raises InputError if the file cannot be written.
     """
     measured = {(result.scene, result.device.name): result for result in results if result.timer.ms}
     scenes = list(dict.fromkeys(scene for scene, _ in measured))
@@ -30,7 +30,7 @@ def write_plot(results: Sequence[Result], file: Path) -> None:
     width = max(5.0, 1.6 + 0.9 * len(scenes) * len(devices))
     with chart(file, size=(width, 4.2)) as (figure, (axes,)):
         bars(axes, scenes, series, logarithmic=True)
-        named = {"roofline": "roofline: least time of the device's arithmetic and memory"}
+        named = {"roofline": "roofline: minimum time of the device's arithmetic and memory"}
         named["quartiles"] = "quartiles"
         for device, container in zip(devices, list(axes.containers), strict=True):
             for scene, bar in zip(scenes, container, strict=True):

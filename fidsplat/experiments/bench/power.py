@@ -13,10 +13,10 @@ RAPL = Path("/sys/class/powercap")
 
 
 def energy_meter(kind: str) -> Callable[[], float] | None:
-    """Function that returns the joules used so far by a device of a kind, `gpu` or `cpu`; None if the machine
-    does not report them.
+    """Function that returns the joules that a device of a kind, `gpu` or `cpu`, has used so far; None if the
+    machine does not report them.
 
-    GPU: the power of the first GPU. Processor: the power of all packages.
+    GPU: the first GPU. Processor: all packages.
     """
     return _nvml() or _nvidia_smi() if kind == "gpu" else _rapl()
 
@@ -29,7 +29,7 @@ def _rapl(folder: Path = RAPL) -> Callable[[], float] | None:
 
     try:
         return joules if packages and joules() > 0 else None
-    except (OSError, ValueError):  # only root may read the counters
+    except (OSError, ValueError):  # the counters may be readable by root only
         return None
 
 
@@ -39,13 +39,13 @@ def _nvml() -> Callable[[], float] | None:
         pynvml.nvmlInit()
         gpu = pynvml.nvmlDeviceGetHandleByIndex(0)
         pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu)
-    except Exception:  # no package, no driver, or a GPU without the counter
+    except Exception:  # no package, no driver, or a GPU without energy counter
         return None
     return lambda: pynvml.nvmlDeviceGetTotalEnergyConsumption(gpu) / 1e3
 
 
 def _nvidia_smi() -> Callable[[], float] | None:
-    """Energy meter of an NVIDIA GPU: joules, from the power draw at each call. None without nvidia-smi."""
+    """Energy meter that integrates the power draw at each call; None without nvidia-smi."""
     if shutil.which("nvidia-smi") is None:
         return None
     query = ("nvidia-smi", "-i", "0", "--query-gpu=power.draw", "--format=csv,noheader,nounits")

@@ -1,4 +1,4 @@
-"""Scenes of `fidsplat bench --suite` by regime: what dominates the cost of a frame."""
+"""Scenes of `fidsplat bench --suite`, by the regime that dominates the cost of a frame."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ from fidsplat.util.errors import InputError, unknown
 from fidsplat.worlds.city import City, flight
 
 DISKS, ELLIPSOIDS, BOXES = "disks", "ellipsoids", "boxes"
-"""kinds of splats of a scene; renderers declare the kinds that they render"""
+"""kinds of splats of a scene; each renderer declares the kinds that it supports"""
 ARRAYS = ("means", "quats", "scales", "opacities", "colors", "boxes", "coplanar_groups")
 _COUNT, _SCALE = 100_000, 0.03
-"""splats of synthetic scenes, and their median scale in metres"""
+"""number of splats of synthetic scenes, and their median scale in metres"""
 
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Splats with plain colours, and the views to render."""
+    """Splats with plain colours, and the poses from which they are rendered."""
 
     cloud: SplatCloud
     camera: Camera
     poses: np.ndarray
     """(v, 4, 4) world to camera"""
     scene: Scene | None = None
-    """scene of markers whose poses detectors measure"""
+    """scene with markers, whose poses are detected in the image"""
 
     @property
     def kind(self) -> str:
@@ -55,7 +55,7 @@ class Views:
     def save(self, file: Path) -> Path:
         """Write an npz file for adapters: `ARRAYS`, poses, matrix (3, 3), size (2,) and near.
 
-        scales: (n, 2) of disks and boxes, (n, 3) of ellipsoids. boxes, coplanar_groups: if present.
+        scales: (n, 2) of disks and boxes, (n, 3) of ellipsoids. boxes and coplanar_groups are optional.
         """
         cloud, camera = self.cloud, self.camera
         arrays = {name: getattr(cloud, name) for name in ARRAYS}
@@ -75,11 +75,11 @@ class SuiteScene:
     about: str
     make: Callable[[], Views]
     quick: bool = False
-    """whether quick runs include it"""
+    """whether quick runs measure it"""
     large: bool = False
-    """whether processors with few cores leave it out"""
+    """whether it is skipped on processors"""
     batch: bool = False
-    """whether all views are one submission; otherwise each frame renders the next view"""
+    """whether all views are one submission; otherwise each submission is the next view"""
     x: float | None = None
     """abscissa in a series of the regime `scaling`"""
     licence: str = "generated from a seed"
@@ -96,7 +96,7 @@ def _changed(cloud: SplatCloud, **arrays: np.ndarray) -> SplatCloud:
 
 
 def huge(thick: bool) -> Views:
-    """1 % of the splats are 0.5 to 3 m wide, and cover most tiles."""
+    """1 % of the splats are 0.5 to 3 m wide: these cover most tiles."""
     cloud, generator = random_cloud(_COUNT, _SCALE, thick=thick), np.random.default_rng(1)
     factor = np.ones((_COUNT, 1))
     factor[:: _COUNT // 1000] = log_uniform(generator, 15.0, 100.0, (1000, 1))
@@ -106,7 +106,7 @@ def huge(thick: bool) -> Views:
 
 
 def clusters(thick: bool) -> Views:
-    """All splats in 12 dense clusters: a few tiles have most of the work."""
+    """All splats in 12 dense clusters: few tiles have most of the work."""
     cloud, generator = random_cloud(_COUNT, _SCALE, thick=thick), np.random.default_rng(2)
     centres = generator.uniform((-3.0, -1.5, 6.0), (3.0, 1.5, 10.0), (12, 3))
     near = generator.normal(0.0, 0.12, (_COUNT, 3))
@@ -124,14 +124,14 @@ def needles(thick: bool) -> Views:
 
 
 def haze(thick: bool) -> Views:
-    """Faint splats, most below an alpha of 1/50: hundreds of layers at a pixel, and no occlusion."""
+    """Faint splats, most below an alpha of 1/50: hundreds of layers per pixel, without occlusion."""
     cloud, generator = random_cloud(_COUNT, 0.06, thick=thick), np.random.default_rng(3)
     opacities = log_uniform(generator, 1e-3, 2e-2, _COUNT).astype(np.float32)
     return _single(_changed(cloud, opacities=opacities), standard_camera(1280, 720))
 
 
 def street(splats: int, frames: int) -> Views:
-    """A flight through a generated city; most splats are outside of each view."""
+    """Flight through a generated city, with most splats outside of each view."""
     city = City(splats)
     camera, motion = flight(city)
     arrays, _ = collect(city.source.rows)
@@ -140,9 +140,9 @@ def street(splats: int, frames: int) -> Views:
 
 
 def tags(boxes: bool) -> Views:
-    """24 AprilTags at tilts up to 60 degrees, of which detectors measure the poses.
+    """24 AprilTags at tilts up to 60 degrees, whose poses are detected.
 
-    boxes: as exact rectangles, which other renderers lack; otherwise as Gaussians.
+    boxes: exact rectangles, which other renderers lack; otherwise Gaussians.
     """
     quality, placed = MarkerQuality("exact" if boxes else "fitted"), []
     for number in range(24):
@@ -158,7 +158,7 @@ def tags(boxes: bool) -> Views:
 
 
 def captured(name: str, width: int, height: int, frames: int = 1) -> Views:
-    """A captured scene with plain colours, from one view or an orbit of 360 degrees."""
+    """Captured scene with plain colours, from one view or an orbit of 360 degrees."""
     cloud = load_splats(fetch_scene(name))
     means = cloud.means + cloud.origin.astype(np.float32)
     colors = cloud.colors if cloud.sh is None else cloud.sh[:, 0] * C0 + 0.5
@@ -173,7 +173,7 @@ def captured(name: str, width: int, height: int, frames: int = 1) -> Views:
 
 
 def agents(views: int) -> Views:
-    """Small images of 10,000 splats from views on an arc: cameras of simulated robots."""
+    """Small images of 10,000 splats from views on an arc, like cameras of simulated robots."""
     cloud, target = random_cloud(10_000, _SCALE), np.array([0.0, 0.0, 6.0])
     angles = np.linspace(-math.pi / 4, math.pi / 4, views)
     eyes = [target - 6.0 * np.array([math.sin(a), 0.0, math.cos(a)]) for a in angles]
@@ -181,7 +181,7 @@ def agents(views: int) -> Views:
 
 
 def _both(name: str, regime: str, make: Callable[[bool], Views], quick: bool = False) -> dict:
-    """Two versions of a scene: with disks and with 3D Gaussians."""
+    """Two versions of a scene, with disks and with 3D Gaussians."""
     about = (make.__doc__ or "").partition(":")[0].rstrip(".")
     return {
         name: SuiteScene(regime, about, partial(make, False), quick),
@@ -215,7 +215,7 @@ def scaled(count: int, scale: float, width: int, height: int) -> Views:
 def _series() -> dict[str, SuiteScene]:
     """Scenes of the regime `scaling` by name, SERIES@X.
 
-    A series varies the number of splats at a constant covered area, the number of pixels, or the size of
+    The series vary the number of splats at a constant covered area, the number of pixels, and the size of
     splats (overdraw).
     """
     million = 1_000_000
@@ -281,11 +281,11 @@ REGIMES = tuple(dict.fromkeys(scene.regime for scene in SUITE.values()))
 
 
 def suite_scenes(words: Iterable[str], quick: bool, large: bool) -> dict[str, SuiteScene]:
-    """Scenes by name or regime; all that suit the machine if none is given. A word that is both (`haze`) is
-    the scene.
+    """Scenes by name or regime; by default all that suit the machine. A word that is both a scene and a
+    regime (`haze`) selects the scene.
 
     Args:
-        quick: only those of quick runs. large: also those for GPUs.
+        quick: only scenes of quick runs. large: also scenes for GPUs.
 
     Raises:
         InputError: an unknown name.

@@ -1,4 +1,4 @@
-"""Share of each effect in a frame's time: the same frames without one effect at a time."""
+"""Time share of each effect of a frame: the same frames without one effect at a time."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ class Reduced:
 
     capture: Capture
     scene: Scene | None = None
-    """scene with the splats to render, if some are left out"""
+    """scene with the remaining splats; None: all splats"""
 
     def cloud(self) -> SplatCloud | None:
-        """The splats to render; None: all splats of the complete scene."""
+        """Splats to render; None: all splats of the original scene."""
         return None if self.scene is None else self.scene.cloud()
 
 
 def without_effects(scene: Scene, capture: Capture) -> dict[str, Reduced]:
-    """Frames that lack one effect of a capture each, by the name of the effect.
+    """Frames that each lack one effect of a capture, by the name of the effect.
 
-    An effect is listed if its removal changes the selected kernels, and `markers` if the scene has other
+    An effect is included if its removal changes the selected kernels; `markers` are if the scene has other
     splats.
     """
     cloud, quality, standard = scene.cloud(), capture.quality, Quality()
@@ -55,13 +55,13 @@ def without_effects(scene: Scene, capture: Capture) -> dict[str, Reduced]:
 
 
 def middle_camera(capture: Capture) -> Camera:
-    """The camera at the time of the shutter."""
+    """The camera at the pose of the shutter's time."""
     assert capture.camera is not None
     return capture.motion.moved(capture.camera, capture.shutter.time)
 
 
 def _without_lens(camera: Camera | None) -> Camera | None:
-    """A pinhole with the same focal lengths; 53 degrees wide in place of parallel rays."""
+    """A pinhole with the same focal lengths; 53 degrees wide instead of parallel rays."""
     if camera is None or not isinstance(camera.lens, Orthographic):
         return camera and replace(camera, lens=None)
     return replace(camera, lens=None, fx=float(camera.width), fy=float(camera.width))

@@ -1,7 +1,7 @@
-"""`fidsplat bench --suite`: time and error of renderers in processes of their own, by scene.
+"""Suite of `fidsplat bench --suite`: time and error of renderers by scene, each in a process of its own.
 
 Results are one JSON object per machine (benchmarks/splatmark.schema.json), written after each scene. A run
-with the same file measures the scenes and renderers that it lacks.
+with an existing file measures only missing scenes and renderers.
 """
 
 from __future__ import annotations
@@ -38,16 +38,17 @@ from fidsplat.util.timing import Clock, Timer, quartiles, time_interleaved
 from fidsplat.vision.readback import means, read_back
 
 SCHEMA = 1
-"""version of the format of the results"""
+"""version of the results' format"""
 TOO_SLOW = 10_000.0
-"""milliseconds of a submission above which a renderer is left out"""
+"""milliseconds of a submission above which a renderer is skipped"""
 SHORT = 50.0
-"""milliseconds: shorter frames follow untimed ones, since another process used device and caches before"""
+"""milliseconds: shorter frames follow untimed frames, since other processes use device and caches in
+between"""
 Progress = Callable[[str, float], None]
 
 
 class AdapterError(FidsplatError):
-    """A renderer failed; the message is its own."""
+    """Failure of a renderer, with the renderer's message."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Effort:
     rounds: int
     """maximum number of timed frames of each setting"""
     seconds: float
-    """time after which no round is started, after `min_rounds` rounds"""
+    """time in seconds after which no round starts, unless fewer than `min_rounds` are done"""
     min_rounds: int = 3
     fast: float = 400.0
     """milliseconds of a submission up to which settings are interleaved; slower ones are interleaved
@@ -65,17 +66,16 @@ class Effort:
     slow: float = 1000.0
     """milliseconds of a submission above which only the first setting of a renderer is measured"""
     burst: float = 0.5
-    """seconds of frames for the energy of a frame"""
+    """seconds of frames for the measurement of energy"""
     compared_views: int = 3
-    """maximum number of views whose images are compared"""
+    """maximum number of views with compared images"""
 
 
 FULL, QUICK = Effort(40, 3.0), Effort(7, 1.0, min_rounds=1, fast=250.0, slow=250.0, compared_views=1)
 
 
 class RendererProcess:
-    """A renderer in a process of its own (`adapter.py`). A renderer that cannot run has a reason in
-    `skipped`."""
+    """A renderer in its own process (`adapter.py`). `skipped` is the reason if it cannot run."""
 
     def __init__(
         self,
@@ -86,8 +86,8 @@ class RendererProcess:
     ) -> None:
         """
         Args:
-            file: file of the class `Adapter`.
-            python: interpreter of its environment.
+            file: file with the class `Adapter`.
+            python: Python interpreter of the renderer's environment.
         """
         self.name, self.clock = name, Clock()
         self._process = subprocess.Popen(
@@ -95,7 +95,7 @@ class RendererProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL if not os.environ.get("FIDSPLAT_DEBUG") else None,
-            start_new_session=True,  # Ctrl-C is for this process, which closes the pipes
+            start_new_session=True,  # Ctrl-C reaches only this process, which closes the pipes
         )
         assert self._process.stdout is not None
         self._answers = interrupts.lines_of(self._process.stdout)
@@ -110,9 +110,9 @@ class RendererProcess:
         """fields of `Quality` that define the image, by setting and kind of splats"""
 
     def ask(self, do: str, **request: Any) -> dict[str, Any]:
-        """Send a request. Raises AdapterError."""
+        """Send a request and return the response. Raises AdapterError."""
         assert self._process.stdin is not None
-        with suppress(OSError):  # if the process has ended, no answer follows
+        with suppress(OSError):  # the process may have ended; `_answer` reports that
             self._process.stdin.write(json.dumps({"do": do, **request}).encode() + b"\n")
             self._process.stdin.flush()
         return self._answer()
@@ -120,8 +120,8 @@ class RendererProcess:
     def frame(
         self, setting: str, views: list[int], before: list[list[int]] | None = None
     ) -> dict[str, float]:
-        """Render one submission, after untimed submissions `before`; the clock advances by its time.
-        Returns `ms`, `cpu_ms`, and `device_ms` if known."""
+        """Render a submission after untimed submissions `before`; the clock advances by its time.
+        Returns `ms`, `cpu_ms`, and if known `device_ms`."""
         taken = self.ask("frame", setting=setting, views=views, before=before)
         self.clock.seconds += taken["ms"] / 1e3
         return taken
@@ -157,10 +157,10 @@ def own_renderers(devices: Sequence[str]) -> dict[str, Opener]:
 
 
 def other_renderers(folder: Path) -> dict[str, Opener]:
-    """Renderers of the adapters `NAME/adapter.py` of a folder; each in the environment `NAME/.venv`, if there
-    is one.
+    """Renderers of the adapters `NAME/adapter.py` in a folder, each with the Python of `NAME/.venv` if it
+    exists.
 
-    Raises InputError if there is none.
+    Raises InputError if the folder has no adapter.
     """
     files = sorted(folder.glob("*/adapter.py"))
     if not files:
@@ -174,21 +174,21 @@ def other_renderers(folder: Path) -> dict[str, Opener]:
 
 
 class Measurement:
-    """A setting of a renderer in a scene: its result so far, and the timer of its frames."""
+    """A setting of a renderer in a scene: its result so far and the timer of its frames."""
 
     def __init__(
         self, process: RendererProcess, setting: str, result: dict[str, Any], submissions: list[list[int]]
     ) -> None:
-        """submissions: views of each frame; after the last one they start again."""
+        """submissions: views of each frame, which are repeated in a cycle."""
         self.process, self.setting, self.result, self.submissions = process, setting, result, submissions
         self.second_ms = math.inf
-        """milliseconds of the first submission after the first frames"""
+        """time of the first submission after the first frames, in milliseconds"""
         self.timer = Timer(self._render, process.clock, catch_errors=True)
         self._next = cycle(range(len(submissions)))
 
     def _render(self) -> dict[str, float]:
         number = next(self._next)
-        # those of a flight before this one, so that its camera is new to the renderer, as in a flight
+        # preceded by earlier views of a flight, so that the camera is new to the renderer, as in a flight
         before = [self.submissions[number - k] for k in range(min(8, len(self.submissions) - 1), 0, -1)]
         views = self.submissions[number]
         taken = self.process.frame(
@@ -219,7 +219,8 @@ class Measurement:
         return images[0]
 
     def finish(self, burst: float) -> None:
-        """Add the times per view, and if `burst` is above 0 and the machine reports energy, its joules.
+        """Add times per view to the result, and its joules if `burst` is above 0 and the machine reports
+        them.
 
         Raises AdapterError.
         """
@@ -240,7 +241,7 @@ class Measurement:
 
 
 class References:
-    """Float64 reference images of a scene by definition of the image."""
+    """Float64 reference images of a scene, by the settings that define the image."""
 
     def __init__(self, renderer: Renderer, views: Views, chosen: list[int]) -> None:
         self._renderer, self._views, self.chosen = renderer, views, chosen
@@ -248,10 +249,10 @@ class References:
         self._found: dict[str, np.ndarray] = {}
 
     def image(self, claim: Mapping[str, Any]) -> np.ndarray:
-        """(v, h, w, 3) float64 of the chosen views."""
+        """Reference images (v, h, w, 3) float64 of the chosen views."""
         claim = dict(claim)
         if not self._views.cloud.has_coplanar_groups and claim.get("order") == "auto":
-            claim["order"] = "centre"  # the same image
+            claim["order"] = "centre"  # renders the same image
         if self._views.kind != ELLIPSOIDS:
             claim.pop("ellipsoid", None)
         key = json.dumps(claim, sort_keys=True)
@@ -269,7 +270,7 @@ class References:
 
 
 class Suite:
-    """Measurement of scenes by renderers, with a file of results."""
+    """Measurement of scenes with renderers, and the file of its results."""
 
     def __init__(
         self,
@@ -280,7 +281,7 @@ class Suite:
         command: str,
         overwrite: bool = False,
     ) -> None:
-        """Opens the renderers. Raises InputError for a file with results of another machine or version."""
+        """Open the file. Raises InputError for results of another machine or version."""
         self._file, self._scenes, self._effort = file, scenes, effort
         facts = run_facts(None, 0) | {"command": command, "effort": asdict(effort)}
         self.found: dict[str, Any] = {
@@ -313,7 +314,7 @@ class Suite:
         self.found = earlier
 
     def run(self, progress: Progress) -> list[dict[str, Any]]:
-        """Measure what the file lacks; returns all results. Each scene is in the file when it is complete."""
+        """Measure missing scenes and renderers; returns all results. The file is written after each scene."""
         done = {(result["scene"], result["renderer"]) for result in self.found["results"]}
         left = [name for name in self._scenes if any((name, one) not in done for one in self._openers)]
         left.sort(key=lambda name: (self._scenes[name].x is not None, self._scenes[name].large))
@@ -330,7 +331,7 @@ class Suite:
         return self.found["results"]
 
     def save(self) -> None:
-        """Write the file, with a line for each result."""
+        """Write the file with one line per result."""
         compact = partial(json.dumps, allow_nan=False, separators=(",", ":"))
         facts = {name: value for name, value in self.found.items() if name != "results"}
         lines = ",\n".join(compact(one) for one in self.found["results"])
@@ -339,7 +340,7 @@ class Suite:
             stream.write(text.encode())
 
     def _process(self, name: str) -> RendererProcess:
-        """Process of a renderer, started when it is first used or has ended."""
+        """Process of a renderer; started on first use, or again after its end."""
         if name not in self._processes:
             process = self._processes[name] = self._openers[name]()
             facts = {"skipped": process.skipped} if process.skipped else process.facts
@@ -351,7 +352,7 @@ class Suite:
         report("making the scene")
         try:
             views = scene.make()
-        except FidsplatError as error:  # a capture that cannot be downloaded
+        except FidsplatError as error:  # for example a failed download of a capture
             self._add(name, missing, {"skipped": str(error)})
             return
         self.found["scenes"][name] = rounded(
@@ -387,7 +388,7 @@ class Suite:
         seconds = effort.seconds * (0.5 if scene.x is not None else 1.0)
         fast = [one for one in found if one.second_ms <= effort.fast]
         slow = [one for one in found if one.second_ms > effort.fast]
-        for one in fast:  # the frame so far had no warm-up
+        for one in fast:  # discard the first frame, which had no warm-up
             one.timer.ms.clear()
             one.timer.parts.clear()
         for timed, done in ((fast, 0), (slow, 1)):
@@ -401,7 +402,7 @@ class Suite:
             )
         metered: set[str] = set()
         for one in found:
-            # the energy of each renderer's first setting
+            # energy is measured for the first setting of each renderer
             first = one.process.name not in metered and scene.x is None
             metered.add(one.process.name)
             try:
@@ -445,7 +446,7 @@ class Suite:
         return found
 
     def _failed(self, renderer: str) -> None:
-        """End the process of a renderer that failed; the next scene starts it again."""
+        """End the process of a renderer that failed; the next scene starts a new one."""
         if renderer in self._processes:
             self._processes.pop(renderer).close()
 

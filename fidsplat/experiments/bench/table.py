@@ -1,4 +1,4 @@
-"""Table of the results of a scene."""
+"""Table of the results of a benchmark scene."""
 
 from fidsplat.experiments.bench.measure import Result
 
@@ -6,12 +6,12 @@ LEGEND = (
     "ms: median (quartiles) of complete frames; medians of the stages by the device's clock. Splats are "
     "resident and the image stays on the device. host: time until the call returns. x roofline: multiple of "
     "the minimum time at the device's measured peak rates (devlog/roofline.md). of which: time and share "
-    "that an effect adds to the frame; shares overlap where effects depend on each other."
+    "that an effect adds to the frame; shares overlap if effects depend on each other."
 )
 
 
 def scene_table(results: list[Result]) -> tuple[list[str], list[list[str]]]:
-    """Heads and rows of the results of one scene, with two columns for each device."""
+    """Heads and rows of a scene's results, with two columns per device."""
     heads, rows = ["ms"], [["frame"]]
     stages = list(dict.fromkeys(stage for result in results for stage in result.timer.parts))
     rows += [[stage] for stage in stages]

@@ -19,7 +19,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.timing import Timer
 
 COUNTS = (2, 70_000)
-"""numbers of splats of the frames, for launches with few and with many work-items"""
+"""numbers of splats per frame, for launches with few and with many work-items"""
 
 _OUTPUTS = (("rgb",), ("rgb", "depth"), ("rgb", "depth", "normal", "label"))
 _STANDARD = Quality()
@@ -30,25 +30,25 @@ MARKER, DISKS, CAPTURE = "a marker", "disks", "a capture"
 
 @dataclass(frozen=True)
 class Recipe:
-    """A set of kernels to compile."""
+    """Scene whose kernels are compiled."""
 
     sh_degree: int
     """SH degree; -1: plain colours"""
     kinds: tuple[str, ...]
-    """kinds of splats: any of `MARKER`, `DISKS` and `CAPTURE`, in equal numbers"""
+    """kinds of splats, some of `MARKER`, `DISKS` and `CAPTURE`, in equal numbers"""
     outputs: tuple[str, ...]
     quality: Quality = _STANDARD
 
     @property
     def text(self) -> str:
-        """Description of the feature set for the printed table."""
+        """Description of the scene for the printed table."""
         colors = "plain colours" if self.sh_degree < 0 else f"SH of degree {self.sh_degree}"
         quality = "" if self.quality == _STANDARD else "; no low-pass, 3 x 3 samples"
         return f"{' and '.join(self.kinds)}, {colors}: {', '.join(self.outputs)}{quality}"
 
 
 def recipes() -> list[Recipe]:
-    """Recipes of common scenes, the most common first."""
+    """Recipes of common scenes, starting with the most common."""
     common = [
         *((-1, kinds) for kinds in ((MARKER,), (MARKER, DISKS), (DISKS,))),
         *((3, kinds) for kinds in ((CAPTURE,), (MARKER, CAPTURE))),
@@ -62,10 +62,10 @@ def recipes() -> list[Recipe]:
 
 
 def warm(renderer: Renderer, recipes: list[Recipe]) -> Iterator[tuple[Recipe, float]]:
-    """Compile each recipe and yield it with the seconds that it took.
+    """Compile the kernels of each recipe; yields it with the required seconds.
 
     Raises:
-        DeviceError: the compiler refuses, or the device fails.
+        DeviceError: compilation or the device fails.
     """
     camera = Camera.pinhole(64, 48, 60.0, 60.0, 32.0, 24.0)
 
@@ -80,7 +80,7 @@ def warm(renderer: Renderer, recipes: list[Recipe]) -> Iterator[tuple[Recipe, fl
 
 
 def _cloud(recipe: Recipe, count: int) -> SplatCloud:
-    """`count` small visible splats, at least one of each kind."""
+    """Small visible splats, `count` in number, at least one of each kind."""
     degree = None if recipe.sh_degree < 0 else recipe.sh_degree
     count = max(count, len(recipe.kinds))
     flat = random_splats(count, 0, depth=(1.0, 2.0), scale=(0.002, 0.003), across=0.3, sh_degree=degree)

@@ -1,1 +1,1 @@
-"""Trade-off of accuracy and time: every quality setting, alone and in combinations, on standard scenes."""
+"""Trade-off of accuracy and time: all quality settings, separately and combined, on standard scenes."""

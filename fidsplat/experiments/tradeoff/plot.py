@@ -14,7 +14,7 @@ from fidsplat.util.errors import InputError
 INVISIBLE = 1 / 512
 """half an 8-bit level"""
 SMALLEST = 1e-7
-"""lower limit of the error axis; smaller errors are plotted at this value"""
+"""lower limit of the error axis, at which smaller errors are plotted"""
 _LABELS = {
     (PRESET, "gsplat"): "gsplat",
     (PRESET, "fast"): "fast",
@@ -31,9 +31,9 @@ _LABELS = {
 
 
 def write_plot(folders: Sequence[Path], file: Path) -> None:
-    """Write one chart of results, with a panel for each device.
+    """Write one chart of results with a panel for each device.
 
-    Raises InputError when there are no results, the devices have no scene in common, or the file cannot be
+    Raises InputError if there are no results, the devices have no common scene, or the file cannot be
     written.
     """
     devices = load(folders)
@@ -42,13 +42,16 @@ def write_plot(folders: Sequence[Path], file: Path) -> None:
         if all(scene in device.scenes for device in devices):
             write_chart(devices, scene, file)
             return
-    raise InputError(f"{' and '.join(device.title for device in devices)} have no scene in common to plot")
+    titles = " and ".join(device.title for device in devices)
+    raise InputError(
+        f"the devices must have a common scene to plot, got none of {titles}; measure one on all"
+    )
 
 
 def write_chart(devices: Sequence[DeviceResults], scene: str, file: Path) -> None:
-    """Write a chart of time and largest error of settings, with a panel for each device.
+    """Write a chart of time and maximum error of settings, with a panel for each device.
 
-    Only settings with the image definition of the base are comparable.
+    Settings that change the image definition are omitted, since their errors are not comparable.
     """
     with chart(file, len(devices), (9.0 * len(devices), 5.2)) as (figure, panels):
         labels = [_plot(axes, device, scene) for axes, device in zip(panels, devices, strict=True)]
@@ -62,7 +65,7 @@ def write_chart(devices: Sequence[DeviceResults], scene: str, file: Path) -> Non
 def _plot(axes: Axes, device: DeviceResults, scene: str) -> list[tuple[float, float, str]]:
     """Plot the settings of a device; returns labelled points."""
     points = device.same_definition(scene)
-    points = points[points["value"] != "float64"]  # for reference images, and much slower
+    points = points[points["value"] != "float64"]  # only for reference images, and much slower
     points = points.assign(
         error=points["maximum"].clip(lower=SMALLEST),
         label=[_LABELS.get(key) for key in zip(points["knob"], points["value"], strict=True)],
@@ -91,6 +94,6 @@ def _plot(axes: Axes, device: DeviceResults, scene: str) -> list[tuple[float, fl
 
 
 def disk_scenes(device: DeviceResults) -> list[str]:
-    """The user's scenes, random scenes of disks, the largest first, and the hard cases."""
+    """The user's scenes, random scenes of disks from the largest on, and the hard cases."""
     order = [*device.own, *reversed(RANDOM), HARD]
     return sorted((scene for scene in device.scenes if scene in order), key=order.index)

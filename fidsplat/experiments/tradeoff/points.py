@@ -1,4 +1,4 @@
-"""Quality settings of the trade-off: values, constants of other renderers, presets, combinations."""
+"""Quality settings of the trade-off: single values, constants of other renderers, presets, combinations."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.util.errors import InputError, unknown
 
 BASE = TIMED.with_(marker=MarkerQuality("fitted"))
-"""baseline of all comparisons: the cut-off and stop of other renderers with our rules; independent of presets
-and defaults"""
+"""baseline of all comparisons: cut-off and stop of other renderers, other settings as ours; independent of
+presets and defaults"""
 EXACT = Quality(alpha_cutoff=1e-6, transmittance_stop=0.0, arithmetic="precise", marker=BASE.marker)
-"""reference quality in float32; one constant changed in it shows the error of this constant"""
+"""reference quality in float32, in which one constant is changed to show the error of this constant"""
 SHARP = {"lowpass": "none", "samples": 3}
-"""quality of markers: exact splats, the mean of 3 x 3 samples"""
+"""quality of markers: the mean of 3 x 3 samples of unfiltered splats"""
 
 _VALUES: dict[str, tuple[Any, ...]] = {
     "alpha_cutoff": (
@@ -77,7 +77,7 @@ _ABLATIONS: tuple[dict[str, Any], ...] = (
     {"arithmetic": "approximate"},
     {"blend_precision": "float16"},
 )
-"""constants that are changed in `EXACT`, one at a time"""
+"""changes of `EXACT`, one constant at a time"""
 
 _TEXTS = {math.exp(-4.5): "3 sigma"} | {  # cut-off of an opaque splat at 3 sigma
     above / below: f"{above}/{below}"
@@ -87,7 +87,7 @@ _TEXTS = {math.exp(-4.5): "3 sigma"} | {  # cut-off of an opaque splat at 3 sigm
 }  # fmt: skip
 
 PRESET, ABLATION, COMBINED, MARKER = "preset", "alone", "together", "marker"
-"""settings that are not fields of Quality; values of stored keys"""
+"""settings that are not fields of Quality; used in keys of results"""
 SETTINGS = (PRESET, ABLATION, *_VALUES, MARKER, COMBINED)
 """values of --settings"""
 
@@ -103,7 +103,7 @@ class Point:
     quality: Quality
 
     def key(self) -> dict:
-        """Part of a result's key; the quality as differences from the base."""
+        """Part of a result's key, with the quality as its differences from the base."""
         changes = _changes(asdict(self.quality), asdict(BASE))
         return {"knob": self.setting, "value": self.value, "quality": changes}
 
@@ -118,7 +118,7 @@ def quality_of(changes: dict) -> Quality:
 
 
 def _changes(values: dict, others: dict) -> dict:
-    """Nested values that differ."""
+    """Values that differ, also in nested dicts."""
     return {
         name: _changes(value, others[name]) if isinstance(value, dict) else value
         for name, value in values.items()
@@ -142,12 +142,12 @@ def setting_names(names: Iterable[str]) -> tuple[str, ...]:
 def points(
     settings: Iterable[str], on_marker: bool, quick: bool = False, every_value: bool = True
 ) -> list[Point]:
-    """Distinct points for one kind of scene, the most informative first.
+    """Distinct points for one kind of scene, starting with the most informative.
 
-    The base comes first: its own error, and its time relative to itself, which shows the noise.
+    The base is first: its error, and its time relative to itself, which shows the noise.
 
     Args:
-        every_value: vary each setting; otherwise only presets and marker qualities.
+        every_value: vary each setting; False: only presets and marker qualities.
     """
     settings = tuple(settings)
     found = [BASE_POINT]
@@ -179,21 +179,21 @@ def preset(name: str) -> Quality:
 
 
 def ablation(changes: dict[str, Any]) -> Point:
-    """Point with the quality `EXACT`, except for one constant."""
+    """Point with one constant of the quality `EXACT` changed."""
     setting, value = next(iter(changes.items()))
     return Point(ABLATION, f"{setting} {value_text(value)}", EXACT.with_(**changes))
 
 
 def _variation(setting: str, value: Any) -> Point:
-    """A value changed in `BASE`."""
+    """Point with one value of `BASE` changed."""
     changes = {setting: value}
     if value == "exclusive":
-        changes["order"] = "centre"  # the exclusive stop cannot composite layers
+        changes["order"] = "centre"  # required by the exclusive stop
     return Point(setting, value_text(value), BASE.with_(**changes))
 
 
 def value_text(value: Any) -> str:
-    """Value as text; well-known numbers as fractions, such as 1/255."""
+    """Value as text, with common fractions such as 1/255."""
     return _TEXTS.get(value) or (f"{value:g}" if isinstance(value, float) else str(value))
 
 
@@ -207,7 +207,7 @@ def marker_text(quality: MarkerQuality) -> str:
 
 
 def _marker_points(quick: bool) -> Iterator[Point]:
-    """Points of all marker qualities, rendered with the base and with `SHARP`."""
+    """Points of all marker qualities, with the base and with `SHARP`."""
     for quality in (BASE.marker, *(_QUICK_MARKER_QUALITIES if quick else _MARKER_QUALITIES)):
         text = marker_text(quality)
         if quality != BASE.marker:

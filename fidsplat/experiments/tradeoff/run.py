@@ -1,4 +1,4 @@
-"""Trade-off as a sweep: points in order of information, and their measurement."""
+"""Trade-off as a sweep: its points in order of information, and their measurement."""
 
 from __future__ import annotations
 
@@ -25,13 +25,14 @@ NAME = "tradeoff"
 FILE = f"{NAME}.jsonl"
 _EARLY = ("base", PRESET, ABLATION, "alpha_cutoff", "transmittance_stop", MARKER)
 QUICK_SECONDS = 150.0
-"""time limit of the measurement of --quick, which promises 3 minutes with loading and the last batch"""
+"""time limit of a --quick measurement, so that loading and the last batch end within the promised 3
+minutes"""
 QUICK_VIEWS = 2
 """maximum number of views of a user's scene with --quick"""
 OVERHEAD = 0.7
-"""estimated seconds of a point for compilation and evaluation"""
+"""estimated seconds per point for compilation and evaluation"""
 _BATCH = 16
-"""maximum number of points whose images wait for evaluation"""
+"""maximum number of images that wait for evaluation"""
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class TradeoffSettings:
 def prepared(
     options: TradeoffSettings, out: Path, device: str, own: scenes.Views | None = None
 ) -> Iterator[Sweep]:
-    """Sweep with its renderer and results. A view that a device refuses is a result with `error`.
+    """Sweep with its renderer and results. A view that the device cannot render has a result with `error`.
 
     Raises InputError for invalid options, DeviceError if the device cannot be opened.
     """
@@ -90,7 +91,7 @@ def prepared(
 
 
 def estimated_seconds(session: Session, keys: list[Key], effort: Effort) -> float:
-    """Estimated seconds of points, from the time of one frame of the baseline per scene."""
+    """Estimated seconds of points, from one frame of the baseline per scene."""
     frames: dict[str, float] = {}
     total = 0.0
     for key in keys:
@@ -100,18 +101,19 @@ def estimated_seconds(session: Session, keys: list[Key], effort: Effort) -> floa
         frame = 1e-3 * frames[name]
         samples = key["quality"].get("samples", 1) ** 2
         rounds = min(max(effort.minimum, effort.seconds / max(frame * (1 + samples), 1e-6)), effort.maximum)
-        # own frames: the image, its memory, warm-up and rounds; of the baseline: warm-up and rounds
+        # frames of the setting: the image, its memory, warm-up and rounds; of the baseline: warm-up and
+        # rounds
         total += OVERHEAD + frame * ((rounds + 3) * samples + rounds + 1)
     return total
 
 
 def _frame_ms(session: Session, view: str) -> float:
-    """Milliseconds of the second frame of the baseline; 0 if the device refuses it."""
+    """Milliseconds of the second frame of the baseline; 0 if the device cannot render it."""
     try:
         session.render(view, BASE).wait()  # compiles
         resident, scene = session.resident(view, BASE.marker), session.scene(view, BASE.marker)
         return frame_timer(session.renderer, resident, scene.capture, quality=BASE).run()
-    except FidsplatError:  # reported with the points
+    except FidsplatError:  # the results of the points report it
         return 0.0
 
 
@@ -129,7 +131,7 @@ def all_points(names: tuple[str, ...], settings: tuple[str, ...], quick: bool) -
         varied = points.points(settings, on_marker, quick, every_value)
         if name in scenes.GAUSSIANS_3D:
             varied = points.ellipsoid_points(settings)
-        if name == "r1m_1080p":  # 18 million samples: minutes on a CPU; the smaller scene suffices
+        if name == "r1m_1080p":  # 18 million samples take minutes on a CPU; the smaller scene suffices
             varied = [point for point in varied if point.quality.samples <= 2]
         for view in scenes.views_of(name):
             found += _view_points(view, varied, quick)
@@ -159,7 +161,7 @@ def _by_priority(found: list[tuple[int, Key]]) -> list[Key]:
 
 
 def _begin(session: Session, key: Key, quick: bool) -> Work:
-    """Render the images of a point; returns their evaluation."""
+    """Render the images of a point; returns the function that evaluates them."""
     view = key["scene"]
     quality = points.quality_of(key["quality"])
     frame, times = time_point(session, view, quality, QUICK if quick else FULL)

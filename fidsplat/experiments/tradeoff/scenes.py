@@ -23,15 +23,15 @@ GAUSSIANS_3D = ("r100k_720p_3d", "r1m_1080p_3d")
 """scenes of 3D Gaussians, for the values of `ellipsoid`"""
 HARD = "hard"
 MARKERS = {"apriltag": "apriltag", "qr2": "small", "qr5": "medium", "qr10": "large", "qr22": "huge"}
-"""name -> category of the paper; its marker 0 is used"""
+"""category of the paper by name; its marker 0 is used"""
 FEW_SETTINGS = ("apriltag", "qr2", "qr5", "qr22")
-"""markers on which only presets and marker qualities are measured; qr10 is measured with every setting"""
+"""markers for which only presets and marker qualities are measured; qr10 has every setting"""
 NAMES = (*RANDOM, *GAUSSIANS_3D, HARD, *MARKERS)
 QUICK_NAMES = ("r100k_720p", HARD, "apriltag", "qr10")
 TILTS = (0, 60, 80)
 """tilts in degrees"""
 PROTOCOL = PROTOCOLS["fixed-plane"]
-"""view of markers: a plane of 2 x 2 m, 4 m away, in 800 x 800 pixels"""
+"""camera of markers: a plane of 2 x 2 m at a distance of 4 m, in 800 x 800 pixels"""
 GREY = (BACKGROUND, BACKGROUND, BACKGROUND)
 """background of a marker's plane"""
 SEED = 0
@@ -39,7 +39,7 @@ SEED = 0
 
 @dataclass(frozen=True, eq=False)
 class TradeScene:
-    """A view to render."""
+    """View of a scene to render."""
 
     name: str
     """`qr10@60` is the marker qr10 at 60 degrees"""
@@ -55,7 +55,7 @@ class TradeScene:
 
 
 def scene_names(names: Iterable[str], quick: bool = False) -> tuple[str, ...]:
-    """Distinct names of scenes; all if none is given, or those of a quick run.
+    """Distinct scene names; by default all, or those of a quick run.
 
     Raises:
         InputError: an unknown scene.
@@ -68,17 +68,17 @@ def scene_names(names: Iterable[str], quick: bool = False) -> tuple[str, ...]:
 
 
 def views_of(name: str) -> tuple[str, ...]:
-    """Names of the views of a scene: the scene itself, or a marker at each tilt."""
+    """Names of a scene's views: the scene's name, or a marker at each tilt."""
     return tuple(f"{name}@{tilt}" for tilt in TILTS) if name in MARKERS else (name,)
 
 
 def is_marker(view: str) -> bool:
-    """Whether a view or scene name is a marker."""
+    """Whether a name of a view or scene is a marker's."""
     return view.partition("@")[0] in MARKERS
 
 
 def make_view(view: str, quality: MarkerQuality) -> TradeScene:
-    """View of a name in `views_of`. Raises InputError for an unknown mixture or template of the marker."""
+    """View by its name in `views_of`. Raises InputError for an unknown mixture or template of the marker."""
     name, _, tilt = view.partition("@")
     if name in MARKERS:
         placed = placed_marker(name, quality)
@@ -89,7 +89,7 @@ def make_view(view: str, quality: MarkerQuality) -> TradeScene:
 
 @lru_cache(maxsize=32)
 def placed_marker(name: str, quality: MarkerQuality) -> Marker:
-    """Marker of a name on its plane of 2 x 2 m, quiet zone included."""
+    """Marker by name on its plane of 2 x 2 m, including the quiet zone."""
     spec = CATEGORIES[MARKERS[name]].spec(0, SEED)
     plain = marker(spec)
     module = PROTOCOL.module(plain.grid.shape[0])
@@ -101,12 +101,12 @@ Views = Mapping[str, TradeScene]
 
 
 def user_views(views: Mapping[str, BenchScene]) -> dict[str, TradeScene]:
-    """Views of the user's `fidsplat bench` scenes: only splats, on black."""
+    """Views of the user's `fidsplat bench` scenes, with splats only, on black."""
     return {name: TradeScene(name, *view.make()) for name, view in views.items()}
 
 
 def digests(own: Views) -> dict[str, str]:
-    """Digests of the splats and camera of each view, by name, which identify its results."""
+    """Digests of splats and camera of each view, by name, which identify its results."""
     clouds = {id(scene.cloud): scene.cloud for scene in own.values()}
     splats = {number: digest_of(cloud) for number, cloud in clouds.items()}
     return {name: digest_of((splats[id(scene.cloud)], scene.camera)) for name, scene in own.items()}

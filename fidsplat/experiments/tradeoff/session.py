@@ -1,4 +1,4 @@
-"""Measurement session: renderer, uploaded scenes, reference images, interleaved timing, errors of frames."""
+"""Measurement session: renderer, uploaded scenes, reference images, interleaved timing, errors of images."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from fidsplat.vision.metrics import psnr
 from fidsplat.vision.readback import corner_error, own_code
 
 _SCENES, _REFERENCES = 12, 6
-"""maximum number of cached scenes"""
+"""maximum numbers of cached scenes and reference images"""
 DEFINITION = ("lowpass", "samples", "order")
-"""settings that define the image; the others define its accuracy"""
+"""settings that define the image; all other settings define its accuracy"""
 
 
 class Session:
-    """Scenes and reference images, made on request and cached.
+    """Scenes and reference images, computed on demand and cached.
 
-    Reference images come from the renderer itself, or from OpenCL on the CPU if it cannot blend in float64.
+    Reference images are rendered by the renderer, or by OpenCL on the CPU if the renderer lacks float64.
     """
 
     def __init__(self, renderer: Renderer, own: Views | None = None) -> None:
-        """own: views of the user's files, which ignore marker qualities."""
+        """own: views of the user's files, for which marker qualities have no effect."""
         self.renderer, self._precise = renderer, reference_renderer(renderer, Capture())
         self._own, self._uploaded = own or {}, {}
         self._make = lru_cache(_SCENES)(make_view)
         self.resident = lru_cache(_SCENES)(self._resident)
-        """(view, marker quality) -> its splats on the device"""
+        """(view, marker quality) -> splats on the device"""
         self._reference = lru_cache(_REFERENCES)(self._render_reference)
 
     def scene(self, view: str, marker: MarkerQuality) -> TradeScene:
@@ -53,12 +53,12 @@ class Session:
         cloud = self.scene(view, marker).cloud
         if view not in self._own:
             return self.renderer.upload(cloud)
-        if id(cloud) not in self._uploaded:  # views of a file share their splats
+        if id(cloud) not in self._uploaded:  # views of one file share their splats
             self._uploaded[id(cloud)] = self.renderer.upload(cloud)
         return self._uploaded[id(cloud)]
 
     def render(self, view: str, quality: Quality) -> Frame:
-        """Frame of a view at a quality, without waiting for it."""
+        """Frame of a view at a quality, which may still be rendering."""
         capture = self.scene(view, quality.marker).capture
         return self.renderer.render(self.resident(view, quality.marker), capture, quality=quality)
 
@@ -74,7 +74,7 @@ class Session:
     def definition(self, view: str, quality: Quality) -> Quality:
         """Quality of the reference image: the baseline with the image definition of `quality`.
 
-        3D Gaussians are projected exactly. Those of the user's scenes are projected as in `quality`, since
+        3D Gaussians are projected exactly. In the user's scenes they are projected as in `quality`, since
         trained splats depend on the projection of their trainer.
         """
         defined = {name: getattr(quality, name) for name in DEFINITION}
@@ -84,7 +84,7 @@ class Session:
 
 @dataclass(frozen=True)
 class Effort:
-    """Length of a measurement: pairs of frames for some seconds, within limits."""
+    """Length of a measurement: pairs of frames for some seconds, with a minimum and maximum number."""
 
     minimum: int = 5
     maximum: int = 30
@@ -93,14 +93,14 @@ class Effort:
 
 FULL, QUICK = Effort(), Effort(3, 5, 0.2)
 SLOW = 3.0
-"""seconds of a frame above which a quick measurement has one round"""
+"""seconds of a frame above which a quick measurement has only one round"""
 
 
 def time_point(session: Session, view: str, quality: Quality, effort: Effort) -> tuple[Frame, dict]:
     """Render a view with a quality and with the base, interleaved; splats and images stay on the device.
 
-    Returns the image, and `ms`, `base_ms` (medians), their quartiles, `ratio` (median of the pairs' ratios,
-    and its quartiles), `repeats`, `splats`, `pairs`.
+    Returns the frame, and `ms`, `base_ms` (medians), their quartiles, `ratio` (median of the pairs' ratios,
+    with quartiles), `repeats`, `splats`, `pairs`.
     """
     session.render(view, quality).wait()  # compiles
     begun = time.perf_counter()
@@ -130,16 +130,15 @@ def time_point(session: Session, view: str, quality: Quality, effort: Effort) ->
 
 
 _PAIRS = 2_000_000
-"""maximum pixels times splats of the reference renderer per image"""
+"""maximum number of pixels times splats of the reference renderer per image"""
 _MAX_CERTIFICATES, _MIN_CERTIFICATES = 64, 12
-"""pixels with certificates; none if fewer are possible"""
+"""maximum number of pixels with certificates, and minimum number for which certificates are computed"""
 
 
 def compare_image(image: np.ndarray, reference: np.ndarray, scene: TradeScene, quality: Quality) -> dict:
-    """Errors of rgb (h, w, 3) relative to a reference image with the same image definition (order, low-pass
-    ...).
+    """Errors of rgb (h, w, 3) relative to a reference image with the same image definition.
 
-    Returns `maximum`, `rmse`, `maximum_sure` (see `beyond_certificates`), and for markers the result of
+    Returns `maximum`, `rmse`, `maximum_sure` (`beyond_certificates`), and for markers the result of
     `compare_marker`.
     """
     found = errors(image, reference)
@@ -156,11 +155,11 @@ def beyond_certificates(difference: np.ndarray, scene: TradeScene, quality: Qual
     """Maximum error over all pixels that float32 certificates do not explain.
 
     A certificate bounds the change of a pixel by decisions of `quality` within rounding of their thresholds.
-    The pixels with the largest errors have certificates; all other pixels count fully. None if the scene has
-    too many splats, or the reference does not render it.
+    It is subtracted from the error of the pixels with the largest errors. None if the scene has too many
+    splats or the reference cannot render it.
 
     Args:
-        difference: (h, w) the largest error of each pixel.
+        difference: (h, w) largest error of each pixel over the channels.
     """
     size = difference.size
     count = min(_MAX_CERTIFICATES, _PAIRS // max(1, len(scene.cloud) * quality.samples**2), size)
@@ -168,14 +167,14 @@ def beyond_certificates(difference: np.ndarray, scene: TradeScene, quality: Qual
         return None
     worst = np.argsort(difference, axis=None)[::-1][: count + 1]
     rows, columns = np.unravel_index(worst[:count], difference.shape)
-    # the float64 reference has no rounding error
+    # certificates describe float32, the reference renderer is float64
     plain = quality.with_(arithmetic="precise", blend_precision="float32")
     frame = FrameSpec(scene.cloud, scene.camera, plain, ("rgb",), scene.background)
     try:
         certified = reference_images(frame, (rows, columns))["certificate"]
     except FidsplatError:
         return None
-    # certificates are per unit of colour
+    # certificates are relative to the brightest colour
     brightest = max(1.0, 0.0 if scene.cloud.colors is None else float(np.abs(scene.cloud.colors).max()))
     uncertified = [difference.flat[worst[:count]] - certified * brightest, difference.flat[worst[count:]]]
     return max(float(np.concatenate(uncertified).max()), 0.0)
@@ -184,8 +183,8 @@ def beyond_certificates(difference: np.ndarray, scene: TradeScene, quality: Qual
 def compare_marker(image: np.ndarray, scene: TradeScene) -> dict:
     """Compare a marker with the ideal area-sampled texture.
 
-    Returns `ideal_psnr` in dB, `corners_px` (root mean square of corner errors; None if the marker is not
-    detected), and `rectangles` of the partition.
+    Returns `ideal_psnr` in dB, `corners_px` (RMS of corner errors; None if the marker is not detected), and
+    the number of `rectangles` of the partition.
     """
     marker = scene.marker
     assert marker is not None

@@ -1,4 +1,4 @@
-"""Results of `fidsplat tradeoff` on a device as a table."""
+"""Results of `fidsplat tradeoff` as a table for each device."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COLUMNS = (
     "rmse", "per_rectangle", "ideal_psnr", "corners_px", "error",
 )  # fmt: skip
 TILT = 60
-"""degrees: tilt of the marker images of a summary"""
+"""tilt in degrees of the markers in a summary"""
 
 
 def rows_of(record: Record) -> Iterator[dict[str, Any]]:
@@ -47,10 +47,10 @@ def rows_of(record: Record) -> Iterator[dict[str, Any]]:
 
 
 def load(folders: Iterable[Path]) -> list[DeviceResults]:
-    """Read raw or summarised results from folders: one item per device, CPUs first.
+    """Read raw or summarised results from folders: one item per device, starting with CPUs.
 
     Raises:
-        InputError: a folder contains no results, or results of another command.
+        InputError: a folder has no results, or results of another command.
     """
     folders = list(folders)
     by_device: dict[str, list[Summary]] = {}
@@ -59,7 +59,8 @@ def load(folders: Iterable[Path]) -> list[DeviceResults]:
         for record in folder_records(folder, NAME):
             if "knob" not in record.key:
                 raise InputError(
-                    f"{folder} must contain results of fidsplat tradeoff, got other ones; give another folder"
+                    f"results in {folder} must be of fidsplat tradeoff, got another command's; give another "
+                    "folder"
                 )
             records.setdefault(record.run["device"], []).append(record)
         summaries = [summarise(own, rows_of, COLUMNS) for own in records.values()]
@@ -78,7 +79,7 @@ def load(folders: Iterable[Path]) -> list[DeviceResults]:
 
 
 class DeviceResults:
-    """Results of a device. Those of a preset whose settings have changed since are left out."""
+    """Results of a device, without presets whose settings have changed since."""
 
     def __init__(self, summary: Summary) -> None:
         run, rows = summary.runs[0], summary.rows
@@ -101,7 +102,7 @@ class DeviceResults:
     def of(self, scene: str) -> Frame:
         """Measured rows of a scene, in the order of `SETTINGS`.
 
-        `ms` is the ratio of times to the base setting, times the median time of the base setting.
+        `ms` is the ratio of the time to the base's, times the median time of the base.
         """
         found: Frame = self.points[self.points["scene"] == scene]
         order = found["knob"].map(list(("base", *SETTINGS)).index)
@@ -111,7 +112,7 @@ class DeviceResults:
     def same_definition(self, scene: str) -> Frame:
         """Rows with the low-pass, samples and order of the base setting, whose errors are comparable."""
         found = self.of(scene)
-        # gsplat's stop needs the order of centres, which is the base's without coplanar groups
+        # gsplat's stop requires the order of centres, which equals the base's without coplanar groups
         constants = found["quality"].str.replace("order=centre ", "")
         changed = found["quality"].where(found["knob"] == "order", constants).str.split(r"[ =]")
         return found[[not set(DEFINITION) & set(words) for words in changed]]
@@ -122,7 +123,7 @@ class DeviceResults:
 
 
 def quality_text(changes: dict[str, Any]) -> str:
-    """Differences of a quality from the base, e.g. "alpha_cutoff=1e-05 marker.template=9"."""
+    """Differences of a quality from the base as text, e.g. "alpha_cutoff=1e-05 marker.template=9"."""
     words = []
     for name, value in sorted(changes.items()):
         if isinstance(value, dict):

@@ -1,4 +1,8 @@
-"""The data set of the paper's section 4.1: 25 markers x 4 viewpoint collections, 100 scenes for COLMAP.
+"""Write the data set of the paper's section 4.1: 25 markers x 4 viewpoint collections, 100 scenes for COLMAP.
+
+    python benchmarks/paper_dataset.py -o DATASET [--truth blender-standard --blender DIR] [--seed 0]
+
+Existing scenes are unchanged. About 300 MB.
 
 SCENE/images/view-00.png ...      training images
 SCENE/sparse/0/cameras.bin ...    their model, .bin and .txt
@@ -9,26 +13,29 @@ SCENE/marker.json                 spec, sizes, corners
 
 from __future__ import annotations
 
+import argparse
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
-from fidsplat.experiments.blender import TEST, TRAINING, image_file
+from fidsplat.cameras import Camera
+from fidsplat.experiments.blender import TEST, TRAINING, check_images, image_file
+from fidsplat.experiments.demo_views import write_views
 from fidsplat.experiments.setup import (
     BACKGROUND,
     CATEGORIES,
     COLLECTIONS,
     PLANE,
     PROTOCOLS,
+    SEED,
     Category,
     novel_cameras,
     training_cameras,
 )
-from fidsplat.experiments.views import exact_view
-from fidsplat.formats.colmap import save_colmap
-from fidsplat.images.files import read_image, write_png
+from fidsplat.experiments.views import TRUTHS, exact_view
+from fidsplat.images.files import read_image
 from fidsplat.markers import marker
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, read_text, writable_folder, write_json
@@ -72,24 +79,22 @@ def write_scene(scene: dict, out: Path, seed: int, truth: str, blender: Path) ->
         return folder
     # an interrupted run must not mix two kinds of images
     file.unlink(missing_ok=True)
-    points, colors = _points(spec, f"{seed} points {category.name} {index}")
-    for place, kind, cameras in (
+    points = _points(spec, f"{seed} points {category.name} {index}")
+
+    def image(kind: str, i: int, camera: Camera) -> np.ndarray:
+        if not truth.startswith("blender-"):
+            return np.repeat(exact_view(spec, camera, truth == "exact-linear")[:, :, None], 3, axis=2)
+        source = image_file(blender, truth.removeprefix("blender-"), category.name, index, kind, i)
+        if not source.is_file():
+            raise InputError(f"{source} is missing; run fidsplat experiment blender --training first")
+        return read_image(source)
+
+    for part, kind, cameras in (
         (folder, TRAINING, training_cameras(scene["views"])),
         (folder / "test", TEST, novel_cameras(category, index, seed)),
     ):
-        writable_folder(place / "images")
-        names = [f"{kind}-{i:02d}.png" for i in range(len(cameras))]
-        for i, (name, camera) in enumerate(zip(names, cameras, strict=True)):
-            if truth.startswith("blender-"):
-                view = truth.removeprefix("blender-")
-                source = image_file(blender, view, category.name, index, kind, i)
-                if not source.is_file():
-                    raise InputError(f"{source} is missing; run fidsplat experiment blender --training first")
-                image = read_image(source)
-            else:
-                image = np.repeat(exact_view(spec, camera, truth == "exact-linear")[:, :, None], 3, axis=2)
-            write_png(place / "images" / name, image)
-        save_colmap(place / "sparse" / "0", names, cameras, points, colors)
+        images = (image(kind, i, camera) for i, camera in enumerate(cameras))
+        list(write_views(part, kind, cameras, images, *points))
     write_json(file, facts, indent=1)
     return folder
 
@@ -124,3 +129,27 @@ def _points(spec: str, seed: str) -> tuple[np.ndarray, np.ndarray]:
     column, row = (uv * grid.shape[::-1]).astype(int).T
     points = np.column_stack([(uv - 0.5) * PLANE, np.zeros(POINTS)])
     return points, np.repeat(255 * (1 - grid[row, column])[:, None], 3, axis=1).astype(np.uint8)
+
+
+def write_dataset(
+    out: Path,
+    truth: str,
+    blender: Path,
+    seed: int = SEED,
+    categories: Iterable[Category] = CATEGORIES.values(),
+) -> None:
+    """Write all scenes of the data set. Raises InputError for Blender's images of another seed."""
+    if truth.startswith("blender-"):
+        check_images(blender, truth.removeprefix("blender-"), seed)
+    for scene in dataset_scenes(categories):
+        print(write_scene(scene, writable_folder(out), seed, truth, blender))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("-o", "--out", type=Path, default=Path("fidsplat-dataset"))
+    parser.add_argument("--truth", choices=TRUTHS, default="exact", help="renderer of the images")
+    parser.add_argument("--blender", type=Path, default=Path("fidsplat-experiments/blender"))
+    parser.add_argument("--seed", type=int, default=SEED)
+    words = parser.parse_args()
+    write_dataset(words.out, words.truth, words.blender, words.seed)
