@@ -21,7 +21,7 @@ from fidsplat.formats.usd import load_usd, save_usd
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.arguments import instance
 from fidsplat.util.errors import InputError, unknown
-from fidsplat.util.files import path_of
+from fidsplat.util.files import path_of, read_input
 
 
 @dataclass(frozen=True)
@@ -69,13 +69,25 @@ NAMED = {
     META: Format("streamed SOG", load_streamed, None),
 }
 """formats by file name"""
-_CONVERTERS = dict.fromkeys((".ksplat", ".lcc", ".lcc2"), "splat-transform") | {
-    ".ckpt": "ns-export gaussian-splat of nerfstudio",
-    ".pt": "gsplat.export_splats",
-    ".spx": "gsbox",
-    ".usdz": "unzip",
+_TRANSFORM = "convert it by splat-transform"
+_UNREAD = {
+    **dict.fromkeys((".ksplat", ".lcc", ".lcc2"), _TRANSFORM),
+    ".ckpt": "convert it by ns-export gaussian-splat of nerfstudio",
+    ".pt": "convert it by gsplat.export_splats",
+    ".spx": "convert it by gsbox",
+    ".toml": "fidsplat render, view, fly and Scene.load read scene files",
+    ".usdz": "extract it by unzip",
 }
-"""tools that convert formats which are not read, by suffix"""
+"""remedies for files that are not read, by suffix"""
+_MAGIC = {
+    b"ply": ".ply",
+    b"NGSP": ".spz",
+    b"\x1f\x8b": ".spz",
+    b"glTF": ".glb",
+    b"PK": ".sog",
+    b"#usda": ".usda",
+}
+"""first bytes of files of a format"""
 
 
 def stored_bytes(path: str | os.PathLike[str]) -> int:
@@ -90,10 +102,23 @@ def stored_bytes(path: str | os.PathLike[str]) -> int:
     return size
 
 
-def converter(suffix: str) -> str:
-    """The end of a message about an unknown suffix: the tool that converts such files, or nothing."""
-    tool = _CONVERTERS.get(suffix.lower())
-    return f"; convert it by {tool}" if tool else ""
+def remedy_for(path: Path) -> str:
+    """End of a message about a file or folder that is not read: how to convert it, or what to name."""
+    if path.is_dir():
+        names = [file.name for file in sorted(path.iterdir()) if file.name in NAMED or file.suffix in FORMATS]
+        return f"; name a file in the folder, such as {path / names[0]}" if names else ""
+    return f"; {_UNREAD[suffix]}" if (suffix := path.suffix.lower()) in _UNREAD else ""
+
+
+def _misnamed(path: Path, known: Format) -> str:
+    """End of a message about a file whose content is of another format."""
+    if not path.is_file():
+        return ""
+    head = read_input(path, first=8)
+    suffix = next((suffix for magic, suffix in _MAGIC.items() if head.startswith(magic)), None)
+    if suffix is None or FORMATS[suffix].name == known.name:
+        return ""
+    return f"; its content is {FORMATS[suffix].name}: rename it to {path.stem}{suffix}"
 
 
 def format_of(path: str | os.PathLike[str], remedy: str = "") -> Format:
@@ -113,8 +138,11 @@ def load_splats(path: str | os.PathLike[str], progress: Progress | None = None) 
 
     Raises InputError for an unknown suffix or a damaged file.
     """
-    known = format_of(path, converter(path_of(path).suffix))
-    return load_ply(path, progress) if known.load is load_ply else known.load(path_of(path))
+    known, file = format_of(path, remedy_for(path_of(path))), path_of(path)
+    try:
+        return load_ply(file, progress) if known.load is load_ply else known.load(file)
+    except InputError as error:
+        raise InputError(f"{error}{_misnamed(file, known)}") from error
 
 
 def save_splats(cloud: SplatCloud, path: str | os.PathLike[str]) -> None:

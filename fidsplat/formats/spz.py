@@ -156,10 +156,11 @@ def _frames(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.n
     for (name, width), (packed, size) in zip(
         widths.items(), _SIZES.iter_unpack(data[table:place]), strict=True
     ):
-        if size != n * width or packed > len(data) - place:
+        if size != n * width:
+            raise InputError(f"{path}: the array {name} must expand to {n * width} bytes, got {size}")
+        if packed > len(data) - place:
             raise InputError(
-                f"{path}: the array {name} must expand to {n * width} bytes and end by byte {len(data)}, got "
-                f"{size} bytes and the end {place + packed}"
+                f"{path}: truncated: {name} must end by byte {len(data)}, got the end {place + packed}"
             )
         try:
             whole = zstd.decompress(memoryview(data)[place : place + packed], size)

@@ -106,12 +106,7 @@ class Renderer:
         if isinstance(cloud, ChunkedSplats):
             return ResidentCloud(self.backend, Residency(cloud, self.backend), capture)
         if not isinstance(cloud, SplatCloud):
-            raise invalid(
-                "scene",
-                "a Scene, a SplatCloud or a Store",
-                scene,
-                "Scene.load reads a file; marker.cloud are splats",
-            )
+            raise invalid("scene", "a Scene, a SplatCloud or a Store", scene, "Scene.load reads a file")
         with self._lock:
             return ResidentCloud(self.backend, self.backend.upload(cloud), capture, cloud.labels)
 

@@ -136,7 +136,9 @@ def _parse(file: Path) -> dict:
             )
         return tomllib.loads(text)
     except UnicodeDecodeError:
-        raise InputError(f"{file} is not a scene file: it is not text in UTF-8") from None
+        raise InputError(
+            f"{file} is not a scene file: it is not text in UTF-8; load_splats reads splats"
+        ) from None
     except RecursionError:
         raise InputError(f"{file} is not a scene file: its lists are nested too deeply") from None
     except InputError:

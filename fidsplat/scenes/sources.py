@@ -12,7 +12,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.capture.quality import Quality
 from fidsplat.formats.collect import Progress
-from fidsplat.formats.files import FORMATS, NAMED, converter, load_splats
+from fidsplat.formats.files import FORMATS, NAMED, load_splats, remedy_for
 from fidsplat.formats.trajectories import load_cameras, load_trajectory
 from fidsplat.scenes.scene import Scene
 from fidsplat.scenes.up import sampled
@@ -105,7 +105,7 @@ def load_source(
         return Scene((cloud,), camera=framing_camera(cloud, pose, size))
     raise InputError(
         f"the source must be a scene file (.toml), a store ({SUFFIX}) or a splat file "
-        f"({', '.join([*FORMATS, *NAMED])}), got {source}{converter(suffix)}"
+        f"({', '.join([*FORMATS, *NAMED])}), got {source}{remedy_for(path_of(source))}"
     )
 
 

@@ -281,6 +281,9 @@ def test_a_gltf_may_begin_with_as_many_spaces_as_it_likes(tmp_path):
         ("a.usda", b"#usda 2.0\n", "usd-core can read, got '#usda 2.0'; convert a later version by usdcat"),
         ("a.ksplat", b"", "unknown suffix of a splat file '.ksplat'.*; convert it by splat-transform"),
         ("a.spz", b"", "cannot read .*a.spz: it is empty"),
+        ("a.spz", b"ply\n", "got b'ply.n'; its content is PLY: rename it to a.ply"),
+        ("a.glb", b"NGSP" + bytes(99), "its content is SPZ: rename it to a.spz"),
+        ("a.toml", b"", "unknown suffix of a splat file '.toml'.*; fidsplat render, .* read scene files"),
     ],
 )
 def test_files_that_are_not_read_name_their_version_and_a_tool(tmp_path, name, data, words):
@@ -289,6 +292,13 @@ def test_files_that_are_not_read_name_their_version_and_a_tool(tmp_path, name, d
     (tmp_path / name).write_bytes(data)
     with pytest.raises(fs.InputError, match=words):
         fs.load_splats(tmp_path / name)
+
+
+def test_a_folder_with_a_splat_file_names_the_file(tmp_path, capsys):
+    (tmp_path / "lod-meta.json").touch()
+    for command in ("info", "render"):
+        assert main([command, str(tmp_path)]) == 2
+        assert f"name a file in the folder, such as {tmp_path}/lod-meta.json" in capsys.readouterr().err
 
 
 @pytest.mark.sweep
