@@ -16,6 +16,8 @@ PIXEL = 0.5
 """added to pixel coordinates of ROS and OpenCV, where the centre of the first pixel is 0, not 0.5"""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """rotation between OpenGL's camera axes (y up, z backwards) and OpenCV's"""
+LINK_FROM_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+"""REP-103's body axes (x forward, y left, z up) from OpenCV's camera axes"""
 _COLMAP: dict[str, tuple[type[BrownConrady | Fisheye], tuple[str, ...]]] = {
     "SIMPLE_PINHOLE": (BrownConrady, ()),
     "PINHOLE": (BrownConrady, ()),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fidsplat.cameras.foreign import LINK_FROM_OPTICAL
 from fidsplat.cameras.screw import exponential
 from fidsplat.commands.options import Json, require_packages
 from fidsplat.commands.output import console, report
@@ -140,7 +141,6 @@ class _Sender:
     def send(self, step: int, moment: float) -> None:
         """Send images, pose and points at a time of the scene in seconds."""
         import fidsplat as fs
-        from fidsplat.render.scan import LINK_FROM_OPTICAL
 
         capture, now = self.capture, time.time()
         capture = capture.with_(shutter=replace(capture.shutter, time=moment))

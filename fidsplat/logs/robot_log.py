@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye
-from fidsplat.cameras.foreign import PIXEL
+from fidsplat.cameras.foreign import LINK_FROM_OPTICAL, PIXEL
 from fidsplat.effects import IMAGES
 from fidsplat.images.files import encode_image, pixels_of, to_uint8
 from fidsplat.logs.reader import SCENE
@@ -20,8 +20,6 @@ from fidsplat.util.arguments import instance, invalid, items, number, real_array
 from fidsplat.util.errors import InputError, unknown
 from fidsplat.vision.detect import Detection
 
-OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
-"""link_from_optical: REP-103's body axes (x forward, y left, z up) from OpenCV's"""
 _POINT_FIELDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 """datatypes of sensor_msgs/PointField"""
 
@@ -145,13 +143,16 @@ class RobotLog:
         if self.world_from_scene is None:
             return self.transform(time, camera, pose)
         given = _rigid(pose, f"the pose of {text('the name of a frame', camera)}")
-        link, parent = self.world_from_scene @ given @ np.linalg.inv(OPTICAL), self.world
+        link, parent = self.world_from_scene @ given @ np.linalg.inv(LINK_FROM_OPTICAL), self.world
         transforms = [(self.world, SCENE, self.world_from_scene)]
         if base is not None:
             carrier, parent = _rigid(base, "the pose of base_link"), "base_link"
             transforms.append((self.world, parent, carrier))
             link = np.linalg.inv(carrier) @ link
-        transforms += [(parent, f"{camera}_link", link), (f"{camera}_link", self._frame(camera), OPTICAL)]
+        transforms += [
+            (parent, f"{camera}_link", link),
+            (f"{camera}_link", self._frame(camera), LINK_FROM_OPTICAL),
+        ]
         self._transforms(time, *transforms)
 
     def clock(self, time: float) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fidsplat.cameras import Camera, Motion, RayTable, Shutter
+from fidsplat.cameras.foreign import LINK_FROM_OPTICAL
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.lidar import Lidar, Spinning
 from fidsplat.capture.sensor import LUMINANCE, Sensor
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
     from fidsplat.scenes import Scene
     from fidsplat.splats.cloud import SplatCloud
 
-LINK_FROM_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
-"""the lidar's axes (x forward, y left, z up) from those of a camera (z forward, y down)"""
 _REFERENCE = 0.1  # reflectivity for which `Lidar.detection_range` is stated
 _ODDS = 9  # odds of a detection at that range: a probability of 90 %
 # the odds grow with the fourth power of the signal: a third of the signal has a probability of 10 %
@@ -203,15 +202,11 @@ def _resident(scene: Any, renderer: Renderer | None) -> tuple[Renderer, Any]:
     from fidsplat.render.renderer import Renderer
     from fidsplat.render.resident import ResidentCloud
 
-    if isinstance(scene, ResidentCloud):
-        if renderer is None:
-            raise InputError(
-                "renderer must be the renderer that uploaded the cloud, got None; pass renderer="
-            )
-        return renderer, scene
-    if renderer is None:
-        renderer = Renderer(getattr(scene, "device", None))
-    return renderer, renderer.upload(scene)
+    resident = isinstance(scene, ResidentCloud)
+    if renderer is None and resident:
+        raise InputError("renderer must be the renderer that uploaded the cloud, got None; pass renderer=")
+    renderer = renderer or Renderer(getattr(scene, "device", None))
+    return renderer, scene if resident else renderer.upload(scene)
 
 
 @dataclass(frozen=True)

@@ -59,21 +59,21 @@ def read_description(
 ) -> Description:
     """Read the cameras and links of an SDF or URDF file.
 
-    SDF: nested models and includes, poses relative to links, frames and joints of the same model;
-        sensors that are cameras, with field of view or intrinsics, distortion, clip, noise and update rate.
-        URDF: links, joints at 0, sensors within `<gazebo reference>`, and `<sensor>` elements.
+    SDF: nested models and includes, poses relative to links, frames and joints of the same model; sensors
+    that are cameras, with field of view or intrinsics, distortion, clip, noise and update rate. URDF: links,
+    joints at 0, sensors within `<gazebo reference>`, and `<sensor>` elements.
 
-        Args:
-            path: the file, or a model's folder with model.sdf in it.
-            models: folders that are searched for `model://NAME` before those of the environment variables
-                GZ_SIM_RESOURCE_PATH and SDF_PATH and the file's folder.
-            most_models: maximum number of models of an SDF file with all includes; a few lines can include
+    Args:
+        path: the file, or a model's folder with model.sdf in it.
+        models: folders that are searched for `model://NAME` before those of the environment variables
+            GZ_SIM_RESOURCE_PATH and SDF_PATH and the file's folder.
+        most_models: maximum number of models of an SDF file with all includes; a few lines can include
             millions.
 
-        Raises:
-            InputError: a file that cannot be read, too many or too deeply nested models, an include that is
-            not found or includes itself, an invalid camera, two cameras of one name; the message names the
-            file and the element.
+    Raises:
+        InputError: a file that cannot be read, too many or too deeply nested models, an include that is not
+            found or includes itself, an invalid camera, two cameras of one name; the message names the file
+            and the element.
     """
     file = path_of(path)
     if file.is_dir():

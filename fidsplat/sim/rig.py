@@ -158,12 +158,16 @@ class Rig:
             label: compose(given[name], self._rest[name]) if name in self._rest else given[name]
             for label, name in self.labels.items()
         }
-        batches = {
-            name: self._render_camera(
-                self._captures_of(name, names, external[name], count), poses[name], groups, mask
+        batches = {}
+        for name in self.cameras:
+            captures: Any = self._captures_of(name, names, external[name], count)
+            batches[name] = self.renderer.render_batch(
+                self._cloud,
+                captures[0] if len(captures) == 1 else captures,
+                poses=poses[name],
+                groups=groups,
+                mask=mask,
             )
-            for name in self.cameras
-        }
         self._rendered += count
         return RigImages(self, batches, given, poses)
 
@@ -239,16 +243,6 @@ class Rig:
             capture.with_(sensor=replace(capture.sensor, seed=seed), external_depth=one)
             for seed, one in zip(seeds, external or [None] * count, strict=True)
         ]
-
-    def _render_camera(
-        self,
-        captures: list[Capture],
-        poses: np.ndarray,
-        groups: dict[int, np.ndarray],
-        mask: Any,
-    ) -> FrameBatch:
-        taken = captures[0] if len(captures) == 1 else captures
-        return self.renderer.render_batch(self._cloud, taken, poses=poses, groups=groups, mask=mask)
 
 
 class SimulatorRig(Rig):
