@@ -97,8 +97,8 @@ def errors_of(
         if selection == before:
             continue
         if exact is None:
-            exact = renderer.render(splats.part(complete), capture)["rgb"].astype(np.float64)
-        merged = renderer.render(splats.part(selection), capture)["rgb"]
+            exact = renderer.render(splats.load(complete), capture)["rgb"].astype(np.float64)
+        merged = renderer.render(splats.load(selection), capture)["rgb"]
         # no change of a pixel gives None, not an error of 0
         worst[number], before = float(np.abs(merged - exact).max()) or None, selection
     return worst

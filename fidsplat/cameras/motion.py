@@ -14,7 +14,7 @@ import numpy as np
 
 from fidsplat.cameras.pinhole import Camera
 from fidsplat.splats.rotations import check_similarity, pose_matrix
-from fidsplat.util.arguments import as_float, instance, invalid, number, own_scalars, whole_number
+from fidsplat.util.arguments import as_float, instance, invalid, number, python_scalars, whole_number
 from fidsplat.util.errors import InputError
 
 MAX_SUB_POSES = 1024
@@ -41,7 +41,7 @@ class Shutter:
     h rows is displaced by at most v (rows_per_band - 1) / (2 h) pixels; 1 is exact and slow"""
 
     def __post_init__(self) -> None:
-        own_scalars(self)
+        python_scalars(self)
         for name in ("time", "exposure_time", "readout"):
             value = getattr(self, name)
             if not math.isfinite(as_float(value)):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.util.arguments import LARGEST, PickledByFields, array_of, as_float, invalid, own_scalars
+from fidsplat.util.arguments import LARGEST, PickledByFields, array_of, as_float, invalid, python_scalars
 from fidsplat.util.errors import InputError
 
 MAX_PANORAMA = 16384
@@ -26,7 +26,7 @@ class Fog:
     """RGB"""
 
     def __post_init__(self) -> None:
-        own_scalars(self)
+        python_scalars(self)
         ok = isinstance(self.density, (int, float)) and not isinstance(self.density, bool)
         if not (ok and 0 <= self.density <= LARGEST):
             raise InputError(

@@ -14,7 +14,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera, RayTable
 from fidsplat.cameras.pinhole import MAX_SIZE
-from fidsplat.util.arguments import array_of, instance, invalid, items, number, own_scalars, whole_number
+from fidsplat.util.arguments import array_of, instance, invalid, items, number, python_scalars, whole_number
 from fidsplat.util.directions import disk, perpendicular, unit
 from fidsplat.util.errors import InputError, unknown
 
@@ -170,7 +170,7 @@ class Lidar:
     """publication with the values of a preset"""
 
     def __post_init__(self) -> None:
-        own_scalars(self)
+        python_scalars(self)
         instance("pattern", self.pattern, Pattern, "a Spinning or a Rosette")  # type: ignore[arg-type]
         for name, low, high, requirement in (
             ("rate", 1e-3, 1e6, "scans per second, above 0"),

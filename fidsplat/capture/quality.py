@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from numbers import Real
 from typing import Any
 
-from fidsplat.util.arguments import as_float, instance, invalid, own_scalars, parse_setting, whole_number
+from fidsplat.util.arguments import as_float, instance, invalid, parse_setting, python_scalars, whole_number
 from fidsplat.util.errors import InputError, unknown
 
 LOWPASS = ("screen", "pixel", "none")
@@ -158,7 +158,7 @@ class Quality:
     """Conversion of markers to splats."""
 
     def __post_init__(self) -> None:
-        own_scalars(self)
+        python_scalars(self)
 
         def within(name: str, low: float, high: float, low_open: bool, high_open: bool) -> None:
             value = getattr(self, name)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.util.arguments import as_float, invalid, items, number, own_scalars, whole_number
+from fidsplat.util.arguments import as_float, invalid, items, number, python_scalars, whole_number
 from fidsplat.util.errors import InputError
 from fidsplat.util.response import to_light
 
@@ -72,7 +72,7 @@ class Sensor:
     frame"""
 
     def __post_init__(self) -> None:
-        own_scalars(self)
+        python_scalars(self)
         if not as_float(self.full_well) >= 1:
             raise invalid("sensor: full_well", "a number of electrons, 1 or more", self.full_well)
         for name, highest in (("exposure", LARGEST), ("gain", LARGEST), ("read_noise", self.full_well)):

@@ -13,7 +13,7 @@ from fidsplat.commands.output import (
     print_table,
     steps_shown,
 )
-from fidsplat.util.errors import InputError, several
+from fidsplat.util.errors import InputError, counted
 from fidsplat.util.files import writable_folder
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ def _print(result: "CheckResult", where: "Console") -> None:
     print_table(where, *case_table(result))
     print_lines(where, *(f"failed: {words}" for words in result.failures))
     wrong = len(result.failures)
-    verdict = f"{several(wrong, 'checks')} failed" if wrong else "all checks passed"
+    verdict = f"{counted(wrong, 'checks')} failed" if wrong else "all checks passed"
     print_lines(where, f"{verdict}; {result.seconds:.0f} s")
 
 

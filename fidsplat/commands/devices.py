@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from fidsplat.commands.options import Device, Json
 from fidsplat.commands.output import report, show_progress
-from fidsplat.util.errors import several
+from fidsplat.util.errors import counted
 
 if TYPE_CHECKING:
     from fidsplat.backends.interface import DeviceInfo
@@ -37,7 +37,7 @@ class Devices:
 
 def _row(info: DeviceInfo) -> tuple[str, ...]:
     version = info.version if info.platform in info.version else f"{info.platform}: {info.version}"
-    units, float64 = several(info.compute_units, "units"), "with" if info.float64 else "no"
+    units, float64 = counted(info.compute_units, "units"), "with" if info.float64 else "no"
     usable = "yes" if info.usable else "no"
     return (
         info.name,

@@ -13,7 +13,7 @@ from fidsplat.commands.output import console, delayed_progress, print_json, prin
 from fidsplat.experiments.city_demo import CityDemoSettings
 from fidsplat.store.build_plan import BuildSettings
 from fidsplat.store.detail_errors import DetailSettings
-from fidsplat.util.errors import InputError, several
+from fidsplat.util.errors import InputError, counted
 
 if TYPE_CHECKING:
     import fidsplat as fs
@@ -101,12 +101,12 @@ class Place:
             poses = grid_poses(counts, pitch)
         store = fs.Store(fs.place_store(self.source, self.out, poses, overwrite=self.overwrite))
         facts = {"store": str(store.path), "places": store.instances, "splats": len(store)}
-        words = f"{several(len(store), 'splats')} at {several(store.instances, 'places')}: {store.path}"
+        words = f"{counted(len(store), 'splats')} at {counted(store.instances, 'places')}: {store.path}"
         return report(self.json, facts, words)
 
 
 def _splats(store: fs.Store) -> str:
-    return f"{several(len(store), 'splats')} in {several(store.chunks, 'chunks')}"
+    return f"{counted(len(store), 'splats')} in {counted(store.chunks, 'chunks')}"
 
 
 def _parse_triple(name: str, text: str | None, kind: type) -> list:
@@ -154,7 +154,7 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     rows += [
         (
             f"level {one['level']}",
-            f"{several(one['splats'], 'splats')} in {several(one['nodes'], 'nodes')}, cells of "
+            f"{counted(one['splats'], 'splats')} in {counted(one['nodes'], 'nodes')}, cells of "
             f"{one['cell_m']:.3g} m",
         )
         for one in facts["levels"]
@@ -256,7 +256,7 @@ class Verify:
             wrong = store.verify(progress)
         facts = {"store": self.store, "nodes": len(store.nodes), "damaged": wrong}
         report(
-            self.json, facts, *(wrong or [f"{self.store} is complete: {several(len(store.nodes), 'nodes')}"])
+            self.json, facts, *(wrong or [f"{self.store} is complete: {counted(len(store.nodes), 'nodes')}"])
         )
         return 1 if wrong else 0
 

@@ -14,11 +14,11 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from fidsplat.util.arguments import (
+    from_fields,
     instance,
-    made_of,
     number,
-    own_scalars,
     parse_settings,
+    python_scalars,
     real_array,
     whole_number,
 )
@@ -63,7 +63,7 @@ class SheetShape:
     """metres: maximum distance of the splats from the surface; None: size / 2500"""
 
     def __post_init__(self) -> None:
-        own_scalars(self)
+        python_scalars(self)
         for name in [each.name for each in fields(self) if each.type == "float"]:
             number(f"shape: {name}", getattr(self, name), *self.limits.get(name, ()))
         if self.deviation is not None:
@@ -353,7 +353,7 @@ def shape_of(shape: SheetShape | str | None) -> SheetShape | None:
     name, *settings = (part.strip() for part in shape.split(","))
     if name not in SHAPES:
         raise InputError(unknown("shape", name, SHAPES))
-    return made_of("shape", SHAPES[name], parse_settings("shape", SHAPES[name], settings))
+    return from_fields("shape", SHAPES[name], parse_settings("shape", SHAPES[name], settings))
 
 
 def axis_of(axis: str | tuple[float, ...]) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 from fidsplat.images.apriltag3 import HOLE
 from fidsplat.markers.partition import merge_runs, partition
 from fidsplat.markers.printing import Printed
-from fidsplat.util.arguments import instance, number, own_scalars, parse_settings, whole_number
+from fidsplat.util.arguments import instance, number, parse_settings, python_scalars, whole_number
 from fidsplat.util.errors import InputError
 
 CELLS = 16
@@ -83,7 +83,7 @@ class Wear:
     """seed of all random numbers"""
 
     def __post_init__(self) -> None:
-        own_scalars(self)
+        python_scalars(self)
         for name in EFFECTS:
             number(f"wear: {name}", getattr(self, name), "a severity from 0 to 1", 0.0, 1.0)
         whole_number("wear: seed", self.seed, 0, 2**63 - 1)

@@ -1,1 +1,1 @@
-"""Work that is done by processes on other machines."""
+"""Rendering by worker processes on other machines."""

@@ -1,4 +1,4 @@
-"""Rendering of flights by workers, which return images as bytes of their files, as no disk is shared."""
+"""Rendering of flights by workers, which return the bytes of image files, as they may share no disk."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ Files = dict[tuple[str, str], bytes]
 
 @dataclass(frozen=True, eq=False)
 class FlightWork:
-    """Data that a worker needs to render a flight; a call opens the device. Stores are not sent: workers read
-    them at the same path."""
+    """Picklable constructor of a worker's renderer of a flight. Workers read stores at the same path."""
 
     flight: Flight
     device: str
@@ -41,7 +40,7 @@ class FlightWork:
 
 @dataclass(frozen=True)
 class PackedWork:
-    """Pickled work, unpacked by the worker, so that a missing store is reported."""
+    """Pickled `FlightWork`; the worker checks the stores before it unpickles the flight."""
 
     flight: bytes
     stores: dict[str, str]
@@ -50,7 +49,7 @@ class PackedWork:
     memory_budget: int | None
 
     def __call__(self) -> FlightRenderer:
-        """Raises InputError if a store is missing on the worker, or differs."""
+        """Open the device; raise InputError if a store is missing on the worker, or differs."""
         for path, identity in self.stores.items():
             try:
                 same = Store(path).identity == identity
@@ -68,7 +67,7 @@ class PackedWork:
 
 
 class FlightRenderer:
-    """Renderer of frames of a flight, whose splats stay on the device."""
+    """Renderer of a flight's frames, with the splats on the device."""
 
     def __init__(self, work: FlightWork) -> None:
         self._flight = work.flight
@@ -94,8 +93,8 @@ class FlightRenderer:
 
 
 def render_flight(folder: FlightFolder, engine: Engine, workers: int) -> Iterator[int]:
-    """Render the missing frames of a flight on workers; yields the number of each frame once its files are
-    complete here. Raises FidsplatError like `drain`."""
+    """Render the missing frames of a flight on workers, write their files, and yield the number of each
+    completed frame. Raises FidsplatError like `drain`."""
     for k, files in drain(engine, folder.remaining(), workers):
         for (name, suffix), content in _checked(files, k, folder.flight.capture.outputs).items():
             write_file(folder.file(k, name, suffix), content)

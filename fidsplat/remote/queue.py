@@ -1,4 +1,4 @@
-"""Work queue for worker processes that may die; every item is completed exactly once."""
+"""Work queue for worker processes that may fail; every item is completed exactly once."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Any, Protocol, TypeVar
 from fidsplat.util.errors import FidsplatError
 
 ATTEMPTS = 3
-"""number of lost workers after which an item counts as the cause"""
+"""number of lost workers after which an item is not tried again"""
 
 Item = TypeVar("Item", bound=Hashable)
 
 
 class WorkerLost(Exception):
-    """The process of an item died; the text is the known cause."""
+    """The process of a worker has ended; the text is the cause, if known."""
 
 
 class Engine(Protocol):
     """Starts workers and submits items to them."""
 
     def start(self) -> Any:
-        """Start a worker; it may still be starting."""
+        """Start a worker, without waiting for it."""
         ...
 
     def submit(self, worker: Any, item: Any) -> Hashable:
@@ -30,25 +30,25 @@ class Engine(Protocol):
         ...
 
     def wait(self, tickets: Sequence[Any]) -> Any:
-        """The first ticket whose item is done or whose worker died."""
+        """Wait for the first ticket whose item is done or whose worker is lost."""
         ...
 
     def result(self, ticket: Any) -> Any:
         """The result of a ticket's item.
 
         Raises:
-            WorkerLost: its worker died.
-            FidsplatError: no worker can do the item.
+            WorkerLost: its worker is lost.
+            FidsplatError: the item cannot be processed.
         """
         ...
 
 
 def drain(engine: Engine, items: Iterable[Item], workers: int) -> Iterator[tuple[Item, Any]]:
-    """Yield every item with its result, in the order of completion. A worker has one item at a time; if it
-    dies, a new worker gets the item.
+    """Yield every item with its result, in the order of completion. A worker processes one item at a time; if
+    the worker is lost, another one receives the item.
 
     Raises:
-        FidsplatError: an item cannot be done, or has lost `ATTEMPTS` workers.
+        FidsplatError: an item cannot be processed, or `ATTEMPTS` workers are lost with it.
     """
     waiting, lost = deque(items), Counter()
     idle: list[Any] = []

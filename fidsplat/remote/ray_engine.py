@@ -1,4 +1,4 @@
-"""Ray workers: actors on the machines of a cluster, each with the state that its items share."""
+"""Workers of a Ray cluster: actors, each with the state that its items share."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Make = Callable[[], Callable[[Any], Any]]
 
 
 class Worker:
-    """Worker in a process of the cluster."""
+    """Ray actor that processes items."""
 
     def __init__(self) -> None:
         self._do: Callable[[Any], Any] | None = None
@@ -63,7 +63,7 @@ class RayEngine:
         gpus, cores = int(there.get("GPU", 0)), int(there.get("CPU", 0))
         machines = sum(node["Alive"] for node in ray.nodes())
         self.workers = workers or gpus or machines
-        # workers share cores and GPUs that are fewer, as an actor without its resources would wait forever
+        # fractions of fewer cores and GPUs, as Ray never starts an actor without its resources
         self._actor = ray.remote(Worker).options(
             num_cpus=_share(cores, self.workers),
             num_gpus=_share(gpus, self.workers),
@@ -79,7 +79,7 @@ class RayEngine:
         self._spare.append(first)
 
     def start(self) -> Any:
-        """Start a worker; it may still be starting."""
+        """Start a worker, without waiting for it."""
         if self._spare:
             return self._spare.pop()
         self._actors.append(self._actor.remote())
@@ -132,12 +132,14 @@ def _share(count: int, workers: int) -> float:
 
 @contextmanager
 def ray_engine(address: str, make: Make, workers: int | None = None) -> Iterator[RayEngine]:
-    """The workers of a cluster. `local` starts a cluster on this machine, `auto` uses the one that runs here,
-    `ray://HOST:10001` or `HOST:6379` another.
+    """Context with the workers of a cluster.
+
+    address: `local` starts a cluster on this machine, `auto` connects to the running cluster of this machine,
+    `ray://HOST:10001` or `HOST:6379` to that of another.
 
     Raises:
-        InputError: no such cluster, the extra `ray` is missing, or workers have another fidsplat.
-        FidsplatError: workers die while they start.
+        InputError: no such cluster, the extra `ray` is missing, or workers have another version of fidsplat.
+        FidsplatError: workers end while they start.
     """
     ray = _ray()
     own = not ray.is_initialized()

@@ -18,8 +18,8 @@ from fidsplat.util.arguments import (
     changes_of,
     invalid,
     number,
-    own_scalars,
     parse_settings,
+    python_scalars,
     whole_number,
 )
 from fidsplat.util.errors import InputError, unknown
@@ -72,7 +72,7 @@ class Lighting:
     """splats within this many metres in front of the marker do not occlude light; None: size / 20"""
 
     def __post_init__(self) -> None:
-        own_scalars(self)
+        python_scalars(self)
         for name, known in (("source", SOURCES), ("view", VIEWS)):
             value = getattr(self, name)
             if value not in known:
@@ -130,7 +130,7 @@ class Light:
     """points of the light from which shadows are rendered, 1 to 1024; more make softer edges smoother"""
 
     def __post_init__(self) -> None:
-        own_scalars(self)
+        python_scalars(self)
         self._number("intensity", 0, LARGEST)
         whole_number(f"{self.kind}: samples", self.samples, 1, MAX_SAMPLES)
         object.__setattr__(self, "color", _radiance(f"{self.kind}: color", self.color))

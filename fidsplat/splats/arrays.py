@@ -1,4 +1,4 @@
-"""Arrays of a SplatCloud: input checks, invalid splats, types, origins, quaternions and concatenation."""
+"""Arrays of a SplatCloud: checks, invalid splats, types, origins, quaternions and concatenation."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -26,9 +26,9 @@ def all_scales(cloud: Any) -> np.ndarray:
 
 
 def rows_beyond(array: np.ndarray, limit: float) -> np.ndarray | None:
-    """Mask of the rows with a value that is not finite or beyond +-limit; None if there is none."""
+    """Mask of the rows with a value that is not finite or beyond +-limit; None if there are none."""
     with np.errstate(invalid="ignore"):
-        if not array.size or (array.min() >= -limit and array.max() <= limit):  # false where there is a NaN
+        if not array.size or (array.min() >= -limit and array.max() <= limit):  # False with a NaN
             return None
         good = array <= limit
         good &= array >= -limit
@@ -36,8 +36,7 @@ def rows_beyond(array: np.ndarray, limit: float) -> np.ndarray | None:
 
 
 def find_defects(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, dict[str, int]]:
-    """Mask of the valid rows, or None if all are; and the number of other rows by the first defect of
-    each."""
+    """Mask of the valid rows (None if all are valid), and numbers of invalid rows by their first defect."""
     bad: np.ndarray | None = None
     dropped: dict[str, int] = {}
     s, o = arrays["scales"], arrays["opacities"]
@@ -63,7 +62,7 @@ def find_defects(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, dict
 
 
 def drop_report(dropped: dict[str, int], n: int, source) -> str:
-    """Text of the warning about splats that are left out."""
+    """Text of the warning about dropped splats."""
     parts = ", ".join(f"{reason}: {count}" for reason, count in dropped.items())
     start = "" if source is None else f"{source}: "
     total = sum(dropped.values())
@@ -75,7 +74,7 @@ _STORED = {
     "scale not above 0": "scales are standard deviations in metres: take exp() of logarithms",
     "opacity outside [0, 1]": "opacities are from 0 to 1: take the sigmoid of logits",
 }
-"""hints at raw parameters of trainers, for defects of more than a quarter of all splats"""
+"""hints by defect, for more than a quarter of all splats: they may be raw parameters of a trainer"""
 
 
 def square_of(quats: np.ndarray) -> np.ndarray:
@@ -83,9 +82,9 @@ def square_of(quats: np.ndarray) -> np.ndarray:
     return np.einsum("ij,ij->i", quats, quats, dtype=np.float64)
 
 
-# Turning the frame cyclically keeps it right-handed. Row i makes axis i the third: its new axes are
-# (y, z, x) for i = 0 and (z, x, y) for i = 1, a third of a turn about (1, 1, 1) and back.
-_TURNS = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]])
+# Row i rotates axis i to the third: a cyclic permutation of the axes, which stay right-handed. The new axes
+# are (y, z, x) for i = 0 and (z, x, y) for i = 1, by rotations of +-120 degrees about (1, 1, 1).
+_ROTATIONS = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]])
 _CYCLES = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
 
 
@@ -109,7 +108,7 @@ def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
 
 
 def check_scale(colors: np.ndarray) -> np.ndarray:
-    """Refuse bytes as colours: 1 is white."""
+    """Raise InputError for colours from 0 to 255, as 1 is white."""
     if colors.dtype == np.uint8 and colors.size and colors.max() > 1:
         raise InputError("colors must have 1 as white, got bytes up to 255; give colors / 255")
     return colors
@@ -153,11 +152,12 @@ def as_single(array: np.ndarray) -> np.ndarray:
 
 
 def choose_origin(means: np.ndarray, single: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means (n, 3) float32 relative to an origin (3,) float64, and the origin, for finite world means (n, 3).
+    """Choose an origin (3,) float64 for finite world means (n, 3), and return means (n, 3) float32 relative
+    to it, and the origin. single: the means as float32.
 
-    ``single`` is the means as float32. The origin is 0 unless means that are not all float32 numbers are
-    further from 0 than 64 times the cloud's reach, so that float32 would lose at least 6 of its 24 bits. Then
-    it is the centre of the bounding box, rounded to a power of two near the reach.
+    The origin is 0, unless float32 would lose at least 6 of its 24 bits: means that float32 cannot represent
+    exactly are further from 0 than 64 times the cloud's radius. Then it is the centre of the bounding box,
+    rounded to a power of two near the radius.
     """
     zero = np.zeros(3)
     if means.dtype == F32 or not len(means) or np.array_equal(single, means):
@@ -173,7 +173,7 @@ def choose_origin(means: np.ndarray, single: np.ndarray, scales: np.ndarray) -> 
 
 def unit_quaternions(quats: np.ndarray) -> np.ndarray:
     """Normalised quaternions; those that are normalised up to float32 rounding stay unchanged."""
-    unit = quats  # only arrays of the cloud are writable
+    unit = quats
     for start in range(0, len(quats), 4096):  # bounds the float64 copy
         part = slice(start, start + 4096)
         square = square_of(quats[part])
@@ -187,11 +187,11 @@ def unit_quaternions(quats: np.ndarray) -> np.ndarray:
 def with_thinnest_last(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotate 3D Gaussians, quats (n, 4) wxyz and scales (n, 3), so that their third axis is the thinnest."""
     thin = 2 - np.argmin(scales[:, ::-1], axis=1)
-    turned = thin != 2
-    if turned.any():
+    moved = thin != 2
+    if moved.any():
         quats = quats.copy()
         with np.errstate(over="ignore", invalid="ignore"):
-            quats[turned] = quaternion_multiply(quats[turned], _TURNS[thin[turned]])
+            quats[moved] = quaternion_multiply(quats[moved], _ROTATIONS[thin[moved]])
     return quats, np.take_along_axis(scales, _CYCLES[thin], axis=1)
 
 

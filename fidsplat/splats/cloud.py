@@ -62,7 +62,7 @@ class SplatCloud(PickledByFields, Summarised):
     labels: np.ndarray
     """(n,) int32"""
     origin: np.ndarray
-    """(3,) float64, metres, world position of means 0"""
+    """(3,) float64, metres, world position that means are relative to"""
     coplanar_groups: np.ndarray | None = None
     """(n,) int32, or None: splats with the same id >= 0 are coplanar and composited without an order
     (`with_coplanar_groups`); -1 for splats in no group"""
@@ -80,8 +80,8 @@ class SplatCloud(PickledByFields, Summarised):
     ):
         """Validate and freeze n splats.
 
-        means (n, 3) metres; quats (n, 4) wxyz of any length but 0; scales (n, 2) metres, or (n, 3), whose
-        third becomes ``thickness``: 0 is a disk; opacities (n,) in [0, 1]; exactly one of colors (n, 3) and
+        means (n, 3) metres; quats (n, 4) wxyz of any length but 0; scales (n, 2) metres, or (n, 3) with
+        ``thickness`` as the third, 0 for a disk; opacities (n,) in [0, 1]; exactly one of colors (n, 3) and
         sh (n, 1 | 4 | 9 | 16, 3); labels: an int or (n,) ints, default 0.
 
         origin None: means are world coordinates; float32 means are stored unchanged with origin 0; float64
@@ -157,13 +157,13 @@ class SplatCloud(PickledByFields, Summarised):
         return cloud
 
     def _finish(self, given, single: dict[str, np.ndarray], labels, origin, dropped: dict[str, int]) -> None:
-        """Freeze validated splats; given: the means in their original type."""
+        """Freeze validated splats. given: the means in their original type."""
         single["quats"] = unit_quaternions(single["quats"])
         if "thickness" in single and not single["thickness"].any():
             del single["thickness"]
         if origin is not None:
             new_origin = check_origin(origin)
-        else:  # after dropping, so dropped splats do not affect it
+        else:  # chosen without the dropped splats
             single["means"], new_origin = choose_origin(given, single["means"], single["scales"])
         self._set(**dict.fromkeys(OPTIONAL) | single, labels=labels, origin=new_origin, dropped=dropped)
 
@@ -204,7 +204,7 @@ class SplatCloud(PickledByFields, Summarised):
 
     @property
     def plain_colors(self) -> np.ndarray | None:
-        """Colours (n, 3) float32 that are the same from all directions; None with SH above degree 0."""
+        """Colours (n, 3) float32 that do not depend on the direction; None with SH above degree 0."""
         if self.sh is None or self.sh_degree > 0:
             return self.colors
         return colors_of_degree({"sh": self.sh}, -1)["colors"]
@@ -247,23 +247,22 @@ class SplatCloud(PickledByFields, Summarised):
         return (self.means - reach).min(axis=0) + self.origin, (self.means + reach).max(axis=0) + self.origin
 
     def reach(self, sigmas: float) -> np.ndarray:
-        """Half extents (n, 3) float64 [m] along the world axes: Gaussians to `sigmas`, boxes to their
-        corners."""
+        """Half extents (n, 3) float64 [m] along the world axes: Gaussians to `sigmas`, boxes to corners."""
         sigmas = number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
-        turns = quaternion_to_matrix(self.quats)
-        axes = turns[:, :, :2] * (sigmas * self.scales.astype(np.float64))[:, None, :]
+        rotations = quaternion_to_matrix(self.quats)
+        axes = rotations[:, :, :2] * (sigmas * self.scales.astype(np.float64))[:, None, :]
         squares = (axes * axes).sum(axis=2)
         if self.thickness is not None:
-            squares += (turns[:, :, 2] * (sigmas * self.thickness.astype(np.float64))[:, None]) ** 2
+            squares += (rotations[:, :, 2] * (sigmas * self.thickness.astype(np.float64))[:, None]) ** 2
         if self.boxes is None:
             return np.sqrt(squares)
-        corners = np.abs(turns[:, :, :2] * self.scales.astype(np.float64)[:, None, :]).sum(axis=2)
+        corners = np.abs(rotations[:, :, :2] * self.scales.astype(np.float64)[:, None, :]).sum(axis=2)
         return np.where(self.boxes[:, None], corners, np.sqrt(squares))
 
     def flattened(self) -> "SplatCloud":
         """The cloud with its 3D Gaussians flattened to disks; the thinnest axis becomes the normal.
 
-        For renderers of 2D Gaussians. Captures of thick splats lose their haze (docs/experiments.md).
+        For renderers of 2D Gaussians. Captured scenes of thick splats lose their haze (docs/experiments.md).
         """
         if self.thickness is None:
             return self
@@ -310,9 +309,8 @@ class SplatCloud(PickledByFields, Summarised):
     def with_coplanar_groups(self, groups) -> "SplatCloud":
         """A copy with coplanar groups: one id or (n,) ids, -1 for no group.
 
-        Renderers composite the splats of a group as one layer, so the result does not depend on their order.
-        The splats of a group must be coplanar, as those of a marker are. Raises InputError for anything but
-        ints of at least -1.
+        Renderers composite the splats of a group as one layer, so that the result does not depend on their
+        order. The splats of a group must be coplanar. Raises InputError for anything but ints of at least -1.
         """
         ids = whole_numbers(groups, len(self), "coplanar_groups")
         if (ids < -1).any():
@@ -353,9 +351,9 @@ class SplatCloud(PickledByFields, Summarised):
     def concatenate(clouds: Sequence["SplatCloud"]) -> "SplatCloud":
         """All splats of several clouds, in order.
 
-        When any has SH, all get SH of the highest degree (colours become degree 0, missing bands 0). Clouds
-        that share an origin keep their bits; otherwise a common one is chosen as in the constructor.
-        Coplanar groups of different clouds stay different. ``dropped`` adds up.
+        If a cloud has SH, all are converted to SH of the highest degree (colours to degree 0, missing bands
+        to 0). Means of clouds with the same origin stay bit-identical; otherwise a common origin is chosen as
+        in the constructor. Coplanar groups of different clouds stay different. ``dropped`` is summed.
         """
         try:
             clouds = list(clouds)

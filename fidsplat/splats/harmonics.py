@@ -58,8 +58,10 @@ def sh_basis(degree: int, dirs: np.ndarray) -> np.ndarray:
 
 
 def colors_of_degree(given: Mapping[str, np.ndarray], sh_degree: int) -> dict[str, np.ndarray]:
-    """`colors` or `sh` converted to an SH degree, with 0 for missing bands; degree -1: plain colours, from
-    `sh` of degree 0. given: also `means`."""
+    """`colors` or `sh` converted to an SH degree, with 0 for missing bands; degree -1: plain colours.
+
+    given: arrays of a cloud: `means`, and `colors` or `sh`; for degree -1, `sh` must have degree 0.
+    """
     if sh_degree < 0:
         if "colors" in given:
             return {"colors": given["colors"]}
@@ -78,11 +80,11 @@ def colors_of_degree(given: Mapping[str, np.ndarray], sh_degree: int) -> dict[st
 
 
 def color_range(colors: np.ndarray | None, sh: np.ndarray | None) -> tuple[float, float]:
-    """Bounds of all channels of colours (n, 3), or of SH (n, k, 3) over all directions; they contain 0.
-    Values that are not finite are ignored.
+    """Bounds, at most 0 and at least 0, on all channels of colours (n, 3), or of SH (n, k, 3) over all
+    directions. Values that are not finite are ignored.
 
-    The squared basis values of band l sum to (2 l + 1) / (4 pi), so the band is at most the square root of
-    that times the norm of its coefficients.
+    The squared basis values of band l sum to (2 l + 1) / (4 pi), so that a band is at most the square root of
+    this sum times the norm of its coefficients.
     """
     if sh is None:
         values = np.zeros(0) if colors is None else colors[np.isfinite(colors)]
@@ -96,9 +98,11 @@ def color_range(colors: np.ndarray | None, sh: np.ndarray | None) -> tuple[float
 
 
 def rotation_of_coefficients(degree: int, rotation: np.ndarray) -> np.ndarray:
-    """Matrix D (k, k) float64 that rotates SH coefficients by R (3, 3): basis(R d) D f = basis(d) f. It is
-    block diagonal; each band is solved for on fixed directions."""
-    dirs = sphere(32)  # every band is well conditioned on these
+    """Matrix D (k, k) float64 that rotates SH coefficients by R (3, 3): basis(R d) D f = basis(d) f.
+
+    D is block diagonal; least squares over fixed directions yield the block of each band.
+    """
+    dirs = sphere(32)  # enough for a well-conditioned solution
     before, after = sh_basis(degree, dirs), sh_basis(degree, dirs @ np.asarray(rotation, np.float64).T)
     result = np.zeros((before.shape[1],) * 2)
     for band in range(degree + 1):

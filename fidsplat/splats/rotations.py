@@ -69,9 +69,11 @@ def _outer_product(r: np.ndarray) -> np.ndarray:
 
 
 def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray, float, np.ndarray]:
-    """Split a 4x4 rigid transform with uniform scale into rotation (3, 3), scale, translation (3,), float64.
-    Raises InputError, naming ``name``, for another matrix (within 1e-6); with ``rigid`` the scale must be
-    1."""
+    """Split a 4x4 similarity transform into rotation (3, 3), scale and translation (3,), float64.
+
+    Raises InputError, with ``name``, for another matrix (within 1e-6), and with ``rigid`` for a scale other
+    than 1.
+    """
     m = real_array(name, matrix, "a 4x4 matrix of numbers")
     if m.shape != (4, 4):
         raise InputError(f"{name} must be a 4x4 matrix, got shape {m.shape}")
@@ -103,9 +105,11 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
 
 
 def pose_matrix(pose: Any, name: str) -> Any:
-    """The matrix of a pose: a 4x4 matrix, which is returned unchecked, a pair (position, quaternion w, x, y,
-    z), or both in 7 numbers. Raises InputError, naming ``name``, for a quaternion whose length is not 1
-    within 1e-3."""
+    """Convert a pose to a matrix. A pose is a 4x4 matrix, which is returned unchecked, a pair (position,
+    quaternion w, x, y, z), or both in 7 numbers.
+
+    Raises InputError, with ``name``, for a quaternion whose length is not 1 within 1e-3.
+    """
     pair = isinstance(pose, tuple | list) and len(pose) == 2
     try:
         vector = not pair and np.shape(pose) == (7,)

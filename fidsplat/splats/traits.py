@@ -36,5 +36,5 @@ class PlacedTraits(CloudTraits, Protocol):
 
     @property
     def origin(self) -> np.ndarray:
-        """(3,) float64 metres: world position of the means' zero."""
+        """(3,) float64 metres: world position that means are relative to."""
         ...

@@ -1,7 +1,7 @@
 """Out-of-core build of a store: a bucket sort by Morton code, then levels of detail from the bottom up.
 
-Inputs are read once, in parts, and distributed over bucket files; each bucket is sorted and written. Progress
-is saved, so that an interrupted build resumes. Memory follows `BuildPlan.memory`, not the inputs.
+Inputs are read once, in windows of rows, and distributed over bucket files; each bucket is then sorted and
+written. Progress is saved, so that an interrupted build resumes. `BuildPlan.memory` limits the memory.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from fidsplat.util.errors import InputError, bytes_words
 from fidsplat.util.files import atomic_write, from_json, path_of, read_input
 
 _SAVE_EVERY = 16
-"""number of parts of the work after which progress is saved"""
+"""number of windows or merged nodes after which progress is saved"""
 _MIN_ROOT = 64
 """number of splats below which no further level of detail is built"""
 
@@ -50,9 +50,9 @@ def build_store(
     """Build a store from splat files and return its folder. The same call resumes an interrupted build.
 
     Args:
-        inputs: PLY files of any size, which are read in parts; files of other formats, which are loaded; or
-            `Source` objects. One streamed SOG (lod-meta.json) keeps its chunks and levels of detail, without
-            settings.
+        inputs: PLY files of any size, which are read in windows; files of other formats, which are loaded; or
+            `Source` objects. A streamed SOG (lod-meta.json) as the only input keeps its chunks and levels of
+            detail; settings do not apply to it.
         out: the store's folder; its name ends with .fss.
         settings: `BuildSettings`; None: the defaults. `changes` are settings by name: chunk, memory, levels,
             sh_degree, colors.
@@ -106,7 +106,7 @@ class _Build:
                 self._finish()
 
     def _saved_state(self) -> dict[str, Any]:
-        """Saved progress; a fresh state if there is none for these inputs."""
+        """Saved progress; the initial state if none is saved for these inputs."""
         try:
             state = from_json(read_input(self.folder / "state.json"))
             if state["plan"] == self.plan.digest and self._is_on_disk(state):
@@ -139,15 +139,15 @@ class _Build:
         self,
         pool: ThreadPoolExecutor,
         work: Callable[[Any], Any],
-        given: Iterable[Any],
-        most: int | None = None,
+        inputs: Iterable[Any],
+        max_pending: int | None = None,
     ) -> Iterator[Any]:
-        """Run `work` in threads, and yield results in the order of inputs. most: maximum number of pending
-        results."""
+        """Run `work` in threads, and yield results in the order of inputs. max_pending: maximum number of
+        pending results."""
         waiting: deque[Future] = deque()
-        for one in given:
+        for one in inputs:
             waiting.append(pool.submit(work, one))
-            if len(waiting) > (self.workers if most is None else most - 1):
+            if len(waiting) > (self.workers if max_pending is None else max_pending - 1):
                 yield interrupts.result_of(waiting.popleft())
         while waiting:
             yield interrupts.result_of(waiting.popleft())
@@ -169,10 +169,10 @@ class _Build:
                 stream.truncate(lengths[number] * plan.record.itemsize)
                 files.append(stream)
             first = state["windows"]
-            for done, (parts, why) in enumerate(
-                self._in_order(pool, self._spread, plan.windows[first:]), first + 1
+            for done, (by_bucket, why) in enumerate(
+                self._in_order(pool, self._distributed, plan.windows[first:]), first + 1
             ):
-                for number, records in parts:
+                for number, records in by_bucket:
                     files[number].write(records.data)
                     lengths[number] += len(records)
                     if "thickness" in plan.columns:
@@ -184,10 +184,10 @@ class _Build:
                     self._save(windows=done, lengths=lengths, dropped=dict(dropped), thick=thick)
                 self.progress("reading splats", done / len(plan.windows))
 
-    def _spread(
+    def _distributed(
         self, window: tuple[int, tuple[int, int]]
     ) -> tuple[list[tuple[int, np.ndarray]], dict[str, int]]:
-        """Distribute a part of an input over buckets: its records by bucket, in the order of the input."""
+        """Records of a window by bucket, in the order of the input; and invalid splats by reason."""
         plan, (number, span) = self.plan, window
         arrays, dropped = splats_of(plan.sources[number], span, plan.origin, plan.columns, plan.sh_degree)
         codes = plan.grid.codes(arrays["means"])
@@ -201,8 +201,8 @@ class _Build:
         for name, array in arrays.items():
             records[name] = array[order]
         ends = np.cumsum(np.bincount(buckets, minlength=self.buckets))
-        parts = np.split(records, ends[:-1])
-        return [(at, own) for at, own in enumerate(parts) if len(own)], dropped
+        buckets = np.split(records, ends[:-1])
+        return [(number, own) for number, own in enumerate(buckets) if len(own)], dropped
 
     # buckets to chunks
 
@@ -254,8 +254,8 @@ class _Build:
             if not groups or (len(groups[0]) == 1 and _is_root(nodes, level)):
                 return
             rows = int(nodes["first"][-1] + nodes["count"][-1])
-            most = min(self.workers, max(1, self.plan.memory // self.plan.merge_bytes))
-            work = self._in_order(pool, self._merged, (nodes[group] for group in groups[done:]), most)
+            pending = min(self.workers, max(1, self.plan.memory // self.plan.merge_bytes))
+            work = self._in_order(pool, self._merged, (nodes[group] for group in groups[done:]), pending)
             for number, (parent, size) in enumerate(work, done + 1):
                 node = node_record(parent, rows)
                 node["level"], node["size"] = level + 1, size
@@ -269,7 +269,7 @@ class _Build:
             self._save(level=level + 1, merged=0)
 
     def _merged(self, children: np.ndarray) -> tuple[dict[str, np.ndarray], float]:
-        """Merged splats of nodes (records), and the edge [m] of their cells."""
+        """Merged splats of nodes, given as records, and the edge [m] of the merged cells."""
         first, end = int(children["first"][0]), int(children["first"][-1] + children["count"][-1])
         return merged(self.columns.read(first, end), self.plan.grid)
 
@@ -308,13 +308,13 @@ class _Build:
 
 
 def _groups(nodes: np.ndarray, level: int, pinned: int) -> list[np.ndarray]:
-    """Group the nodes of a level; each group becomes a node of the next. Rows from `pinned` on are not
-    merged."""
+    """Indices of the nodes of a level, in groups that become nodes of the next level; without rows from
+    `pinned` on, which are not merged."""
     below = np.flatnonzero((nodes["level"] == level) & ((level > 0) | (nodes["first"] < pinned)))
     return np.array_split(below, -(-len(below) // REDUCTION)) if len(below) else []
 
 
 def _is_root(nodes: np.ndarray, level: int) -> bool:
-    """Whether the level has a single node, and merging it again would save less than half of its splats."""
+    """Whether no level above is worthwhile: the level has few splats, or more than half of those below."""
     counts = [int(nodes["count"][nodes["level"] == at].sum()) for at in (level - 1, level)]
     return counts[1] <= _MIN_ROOT or (level > 0 and 2 * counts[1] > counts[0])

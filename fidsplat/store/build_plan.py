@@ -1,4 +1,4 @@
-"""Plan of a build: columns, order and parts of a store, deterministic so that a build can be resumed."""
+"""Plan of a build: columns, order and windows of a store, deterministic so that a build can be resumed."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _MIN_MEMORY = 256 * 2**20
 _MERGE_BYTES = 400, 6
 """memory per merged splat: a constant in bytes, and a multiple of its size"""
 ON_PLANE = np.uint64(1 << 63)
-"""Morton code that sorts coplanar splats last, into chunks that are part of every frame, as a group is one
-layer"""
+"""Morton code that sorts coplanar splats last, into pinned chunks: every frame needs all splats of a group,
+which is composited as one layer"""
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class BuildSettings:
     chunk: int = CHUNK
     """maximum number of splats per chunk"""
     memory: Bytes = 2 * 2**30
-    """approximate memory while building"""
+    """approximate memory while building, in bytes"""
     levels: bool = True
-    """store levels of detail; without them every image is exact"""
+    """whether to store levels of detail"""
     sh_degree: int | None = None
-    """maximum SH degree to store (default: that of the files)"""
+    """maximum SH degree to store; None: the degree of the files"""
     colors: str = "float32"
     """type of colours and SH: float32 or float16"""
 
@@ -58,7 +58,7 @@ class BuildSettings:
 
 @dataclass(frozen=True)
 class BuildPlan:
-    """Columns, order and parts of a build."""
+    """Columns, order and windows of a build."""
 
     sources: tuple[Source, ...]
     chunk: int
@@ -74,7 +74,7 @@ class BuildPlan:
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of a splat's part of each column."""
+        """Shape of one splat in each column."""
         every = shapes_of(self.sh_degree)
         return {name: every[name] for name in self.columns}
 
@@ -102,7 +102,7 @@ class BuildPlan:
 
     @cached_property
     def windows(self) -> list[tuple[int, tuple[int, int]]]:
-        """Parts in which inputs are read: (number of the input, rows [first, end))."""
+        """Windows in which inputs are read: (number of the input, rows [first, end))."""
         step = max(1, self.memory // (24 * self.record.itemsize) // WINDOW) * WINDOW
         step = min(step, 4 * WINDOW)
         parts = [spans(source.rows.count, step) for source in self.sources]
@@ -116,7 +116,7 @@ class BuildPlan:
 
     @cached_property
     def digest(self) -> str:
-        """Hexadecimal digest of everything that the store depends on."""
+        """Hexadecimal digest of inputs and settings, by which an interrupted build is resumed."""
         sha = hashlib.sha256()
         for source in self.sources:
             sha.update(printable(f"{source.stamp} {source.rows.count} {source.first_group}\n").encode())
@@ -155,6 +155,6 @@ def plan_build(sources: Sequence[Source], settings: BuildSettings | None = None)
         most, needed = memory * min(chunk, rows) // plan.merge_bytes, plan.merge_bytes / 2**20
         raise InputError(
             f"chunk must be at most {most:,} for levels of detail in {memory / 2**20:,.0f} MiB of memory, "
-            f"got {chunk:,}, which takes {needed:,.0f} MiB; allow more memory, or no levels"
+            f"got {chunk:,}, which needs {needed:,.0f} MiB; allow more memory, or no levels"
         )
     return plan

@@ -1,4 +1,4 @@
-"""Splats of several stores, then of a cloud in memory, as one scene that is read in chunks."""
+"""Chunked splats: several stores, followed by a cloud in memory, as one scene that is read in chunks."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from fidsplat.store.subchunks import Subchunks, SubchunkTable
 from fidsplat.util.errors import InputError
 
 HOST_CACHE_BYTES = 2 * 2**30
-"""capacity in bytes of the cache of chunks whose arrays are computed, not mapped from files"""
+"""capacity in bytes of the cache of chunks whose arrays are computed and not mapped from files"""
 
 CellSizes = float | tuple[tuple[float, ...], ...]
-"""projected size [samples] below which cells are merged; one number, or one for each level of each store"""
+"""projected size [samples] below which cells are merged: one number, or one for each level of each store"""
 
 NodeMasks = tuple[np.ndarray, ...]
-"""for each store (instances * nodes,) bool: mask of the selected nodes"""
+"""mask (instances * nodes,) bool of the selected nodes of each store"""
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Selected nodes of each store, or rows of them, in splat order."""
+    """Selected nodes of each store, with all their rows or ranges of rows, in splat order."""
 
     nodes: tuple[tuple[int, ...], ...]
-    """numbers of the nodes of each store"""
+    """numbers of the nodes of each store; a node occurs once for each range of rows"""
     rows: tuple[tuple[tuple[int, int], ...], ...] | None = None
-    """first row and number of rows of each node; None: all rows"""
+    """range of rows of each node: first row and number of rows; None: all rows"""
 
     @staticmethod
     def of(masks: NodeMasks) -> Selection:
@@ -57,13 +57,13 @@ class Selection:
 
 
 class ChunkedSplats:
-    """Stores, then splats in memory, as one scene that is read in chunks. Threads may share one."""
+    """Splats of stores, then of a cloud in memory, as one scene that is read in chunks. Thread-safe."""
 
     def __init__(self, stores: Sequence[Store], in_memory: SplatCloud | None = None) -> None:
         self.stores = tuple(stores)
         self.in_memory = SplatCloud.empty() if in_memory is None else in_memory
         self.origin = self.stores[0].origin
-        """(3,) float64 metres: the world's position of the means' zero"""
+        """(3,) float64 metres: world position that means are relative to"""
         parts = [*self.stores, self.in_memory] if len(self.in_memory) else list(self.stores)
         self.sh_degree = max(max(part.sh_degree for part in parts), -1)
         if self.sh_degree == 0:
@@ -85,7 +85,7 @@ class ChunkedSplats:
 
     @property
     def content(self) -> tuple:
-        """Identity of the content: of the stores and of the cloud in memory; used in digests."""
+        """Digests of the stores, and the cloud in memory; for digests of the scene."""
         return (*(store.identity for store in self.stores), self.in_memory)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -100,7 +100,7 @@ class ChunkedSplats:
         """All splats in one cloud."""
         if len(self.stores) == 1 and not len(self.in_memory):
             return self.stores[0].cloud()
-        return self.part(self.all_chunks())
+        return self.load(self.all_chunks())
 
     def all_chunks(self) -> Selection:
         """All chunks, without nodes of levels of detail."""
@@ -108,9 +108,8 @@ class ChunkedSplats:
         return Selection.of(tuple(masks))
 
     def cell_sizes(self, *qualities: Quality) -> CellSizes:
-        """Projected size [samples] below which cells are merged, from the `detail_error` of the strictest
-        quality; 0: exact. Raises InputError if the errors of the store's levels of detail were not
-        measured."""
+        """Projected size [samples] below which cells are merged, by the lowest `detail_error` of the
+        qualities; 0: exact. Raises InputError if a store's levels of detail were not measured."""
         if not all(quality.detail_error for quality in qualities):
             return 0.0
         each = ([store.cell_sizes(quality) for quality in qualities] for store in self.stores)
@@ -125,7 +124,7 @@ class ChunkedSplats:
 
     @cached_property
     def pinned(self) -> NodeMasks:
-        """Chunks with coplanar groups, which are part of every frame."""
+        """Masks of chunks with coplanar groups, which are part of every frame."""
         each = ((store, store.nodes) for store in self.stores)
         return tuple(
             np.tile((nodes["level"] == 0) & (nodes["first"] >= store.header.pinned), store.instances)
@@ -133,7 +132,7 @@ class ChunkedSplats:
         )
 
     def boxes(self, number: int, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
-        """Corners (instances * nodes, 3) [m] of boxes around a store's nodes, from the origin."""
+        """Corners (instances * nodes, 3) [m] of boxes around a store's nodes, relative to the origin."""
         store = self.stores[number]
         low, high = store.boxes(sigmas)
         return low + (store.origin - self.origin), high + (store.origin - self.origin)
@@ -150,7 +149,7 @@ class ChunkedSplats:
 
     # splats of a selection
 
-    def part(self, selection: Selection) -> PartialCloud:
+    def load(self, selection: Selection) -> PartialCloud:
         """The splats of a selection of complete nodes."""
         parts = [self.chunk(number, node) for number, nodes in enumerate(selection.nodes) for node in nodes]
         if len(self.in_memory) or not parts:
@@ -174,15 +173,15 @@ class ChunkedSplats:
         return np.concatenate(ids)
 
     def prefetch(self, selection: Selection) -> None:
-        """Read the nodes of a selection into memory."""
+        """Load the nodes of a selection into memory."""
         for number, nodes in enumerate(selection.nodes):
             for node in nodes:
                 for array in self.chunk(number, node).values():
-                    # reading one byte of each memory page loads it
+                    # the system loads a page of a mapped file when one of its bytes is read
                     array.reshape(-1).view(np.uint8)[:: 1 << 12].max(initial=0)
 
     def chunk(self, number: int, node: int) -> dict[str, np.ndarray]:
-        """Arrays of a node of a store, in the columns and relative to the origin of this scene."""
+        """Arrays of a node of a store, with the columns of this scene and relative to its origin."""
         store, key = self.stores[number], (number, node)
         with self._lock:
             if key in self._cache:
@@ -202,32 +201,31 @@ class ChunkedSplats:
         return arrays
 
     def unplaced_chunk(self, number: int, node: int) -> dict[str, np.ndarray]:
-        """Arrays of a node of a placed store, in the frame of the store, without its pose."""
+        """Arrays of a node of an instanced store, without the pose of the instance."""
         return self._with_columns(self.stores[number].load(node, placed=False), self._first_groups[number])
 
     @cached_property
     def in_memory_arrays(self) -> dict[str, np.ndarray]:
-        """Arrays of the cloud in memory, in the columns and relative to the origin of this scene."""
+        """Arrays of the cloud in memory, with the columns of this scene and relative to its origin."""
         arrays = self._relative(present_arrays(self.in_memory), self.in_memory.origin)
         return self._with_columns(arrays, self._first_groups[-1])
 
     @cached_property
     def _first_groups(self) -> list[int]:
-        """Offset added to the group ids of each store, and last of the cloud in memory."""
+        """Offsets added to the group ids of each store, and of the cloud in memory."""
         ids = self.in_memory.coplanar_groups
         own = -1 if ids is None else int(ids.max(initial=-1))
         return group_offsets([*(store.last_group() for store in self.stores), own])
 
     def _relative(self, arrays: dict[str, np.ndarray], origin: np.ndarray) -> dict[str, np.ndarray]:
-        """Arrays with means relative to this scene's origin instead of another."""
+        """The arrays with means relative to this scene's origin. origin: that of the given means."""
         offset = origin - self.origin
         if not offset.any():
             return arrays
         return arrays | {"means": (arrays["means"] + offset).astype(np.float32)}
 
     def _with_columns(self, arrays: dict[str, np.ndarray], first_group: int) -> dict[str, np.ndarray]:
-        """The arrays of a chunk in the columns of this scene. first_group: offset of the coplanar group
-        ids."""
+        """The arrays with the columns of this scene. first_group: offset added to coplanar group ids."""
         count = len(arrays["means"])
         columns = {name: arrays[name] for name in ("means", "quats", "scales", "opacities", "labels")}
         columns |= colors_of_degree(arrays, self.sh_degree)

@@ -1,4 +1,4 @@
-"""Column files of a store that is being built, and records of its nodes."""
+"""Column files and node records of a store during its build."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fidsplat.store.layout import FAR, NODE, NPY_HEADER, checksum, column_file, 
 
 
 class ColumnFiles:
-    """Files of arrays whose rows are written in any order. Threads may share them."""
+    """Column files, written and read by rows in any order. Thread-safe."""
 
     def __init__(self, folder: Path, kinds: dict[str, str], shapes: dict[str, tuple[int, ...]]) -> None:
         self._folder, self.kinds, self._shapes = folder, kinds, shapes
@@ -67,7 +67,7 @@ def node_record(splats: dict[str, np.ndarray], first: int) -> np.ndarray:
     if "thickness" in splats:
         largest = np.maximum(largest, splats["thickness"])
     node["first"], node["count"], node["parent"], node["crc"] = first, len(means), -1, checksum(splats)
-    # rounded away from the splats
+    # the boxes are rounded outwards
     far = np.float32(FAR * 1.0001) * largest[:, None]
     node["reach"] = np.nextafter(largest.max(), np.float32(np.inf))
     node["low"], node["high"] = means.min(axis=0), means.max(axis=0)

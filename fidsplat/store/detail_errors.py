@@ -1,4 +1,4 @@
-"""Measured errors of a store's levels of detail, by low-pass, level and cell size on the image."""
+"""Measured errors of a store's levels of detail, by low-pass filter, level and projected cell size."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class DetailSettings:
     """Views of a measurement of levels of detail. Raises InputError for an unusable value."""
 
     views: int = 60
-    """number of viewpoints; levels are measured in rotation, one for each viewpoint"""
+    """number of viewpoints; each measures one level, round robin"""
     lowpass: Names = ("pixel",)
     """low-pass filters: pixel, screen, none"""
     seed: int = 0
@@ -46,20 +46,20 @@ class DetailErrors:
     level: int
     """highest level of the rendered nodes"""
     sizes: tuple[float, ...]
-    """increasing sizes [samples]: cells that are smaller on the image are merged"""
+    """increasing projected sizes [samples] below which cells are merged"""
     errors: tuple[float | None, ...]
-    """for each size the largest rgb error over all views; None if no view had cells of about this size"""
+    """largest rgb error over all views, for each size; None if no view had cells of about this size"""
     views: int
     device: str
     date: str
 
 
 def allowed_cell_size(measured: Iterable[DetailErrors], level: int, error: float) -> float:
-    """Largest cell size [samples] of a level whose error in the measured views is at most `error` / `MARGIN`;
-    0 if there is none.
+    """Largest cell size [samples] of a level with a measured error of at most `error` / `MARGIN`; 0 if there
+    is none.
 
-    Measurements of the adjacent levels count too: cells of equal size have similar errors, but few views
-    contain a level's cells in the gaps between surfaces, where their error is largest.
+    The errors of adjacent levels count too, as cells of equal size have similar errors: few views contain
+    cells of one level at the edges of surfaces, where errors are largest.
     """
     near = [one for one in measured if abs(one.level - level) <= 1]
     if not any(one.level == level for one in near):
@@ -75,13 +75,13 @@ def allowed_cell_size(measured: Iterable[DetailErrors], level: int, error: float
 
 
 def save_detail_errors(folder: Path, identity: str, measured: Sequence[DetailErrors]) -> None:
-    """Write measured errors into a store's folder; earlier ones of other low-passes and levels stay."""
+    """Write measured errors into a store's folder; replace those of the same low-pass filter and level."""
     every = [*load_detail_errors(folder, identity), *measured]
     known = {(one.lowpass, one.level): one for one in every}
     rows = [vars(one) for _, one in sorted(known.items())]
     with atomic_write(folder / FILE) as stream:
-        said = {"identity": identity, "details": rows}
-        stream.write(json.dumps(said | {"crc": header_crc(said)}, indent=1).encode())
+        content = {"identity": identity, "details": rows}
+        stream.write(json.dumps(content | {"crc": header_crc(content)}, indent=1).encode())
 
 
 def load_detail_errors(folder: Path, identity: str) -> list[DetailErrors]:
@@ -89,14 +89,14 @@ def load_detail_errors(folder: Path, identity: str) -> list[DetailErrors]:
     file = folder / FILE
     if not file.exists():
         return []
-    content = read_input(file)
+    data = read_input(file)
     try:
-        said = from_json(content)
-        if said["crc"] != header_crc(said):
+        content = from_json(data)
+        if content["crc"] != header_crc(content):
             raise ValueError
-        if said["identity"] != identity:
+        if content["identity"] != identity:
             return []
-        rows = [row | {name: tuple(row[name]) for name in ("sizes", "errors")} for row in said["details"]]
+        rows = [row | {name: tuple(row[name]) for name in ("sizes", "errors")} for row in content["details"]]
         loaded = [DetailErrors(**row) for row in rows]
         for one in loaded:
             if len(one.sizes) != len(one.errors) or list(one.sizes) != sorted(map(float, one.sizes)):

@@ -21,8 +21,10 @@ from fidsplat.util.files import atomic_write
 
 
 def grid_poses(counts: Sequence[int], pitch: Sequence[float]) -> list[np.ndarray]:
-    """Poses (4, 4) on a grid along the world's axes, the first the identity. counts: instances along x, y, z.
-    pitch: metres between them."""
+    """Poses (4, 4) on a grid along the world's axes, from the identity on.
+
+    counts: numbers of instances along x, y, z. pitch: distances between them [m].
+    """
     if math.prod(counts) > 10_000_000:
         raise InputError(f"a grid must have at most 10,000,000 instances, got {' x '.join(map(str, counts))}")
     steps = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
@@ -38,15 +40,15 @@ def place_store(
     *,
     overwrite: bool = False,
 ) -> Path:
-    """Write a store that shows another store's splats at many poses, and return its folder.
+    """Write a store with instances of another store at many poses, and return its folder.
 
-    It contains the poses and the relative path of the other store.
+    The instanced store contains the poses and the relative path of the other store.
 
     Args:
         store: the store to repeat; it must not be instanced itself.
         out: the new store's folder; its name ends with .fss.
-        poses: p rigid matrices (4, 4), or pairs (position, quaternion): world motion from the store's own
-            pose to each instance.
+        poses: p rigid matrices (4, 4), or pairs (position, quaternion): the transform of each instance in the
+            world.
         overwrite: whether an existing store is replaced.
 
     Raises:

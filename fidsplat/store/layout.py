@@ -4,11 +4,11 @@
     city.fss/nodes.npy        a record for each chunk and each node of the levels of detail (`NODE`)
     city.fss/means.npy ...    a column for each array: the splats of all chunks in their order, then the
                               merged splats of the levels of detail
-    city.fss/places.npy       of an instanced store, instead of columns: poses (p, 4, 4) of another store
+    city.fss/places.npy       in an instanced store instead of columns: poses (p, 4, 4) of another store
     city.fss/detail.json      measured errors of the levels of detail, if any
 
-The index of a splat is its row. A chunk is a run of rows, so a selection of chunks keeps the order of the
-scene, which decides ties of depth.
+The index of a splat is its row. A chunk is a run of rows, so that a selection of chunks keeps the order of
+the scene, by which splats of equal depth are sorted.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FORMAT, VERSION = "fidsplat store", 1
 SUFFIX = ".fss"
 HEADER, NODES, PLACES = "store.json", "nodes.npy", "places.npy"
 CHUNK = 32768
-"""splats of a chunk: small enough for culling, large enough for a sequential read of about 2 MB"""
+"""splats of a chunk: few enough for culling, enough for a sequential read of about 2 MB"""
 FAR = 5.0
 """extent of the larger boxes of a node, in standard deviations"""
 MAX_CHUNK = 2**22
@@ -47,7 +47,7 @@ NPY_HEADER = 128
 _MAX_NODE = 2**24
 """limit on the splats of a node of the levels of detail, which merges four of the level below"""
 _MAX_ROWS = 2**32
-"""limit on the rows of a store: its splats and those of all levels of detail, which are fewer"""
+"""limit on the rows of a store: its splats and those of all levels of detail"""
 _TYPES = dict.fromkeys(("means", "quats", "scales", "opacities", "thickness"), ("<f4",))
 _TYPES |= dict.fromkeys(("labels", "coplanar_groups"), ("<i4",))
 """allowed NumPy types of each column"""
@@ -58,7 +58,7 @@ NODE = np.dtype(
         ("count", "<i4"),  # splats
         ("level", "<i4"),  # 0: a chunk of the scene; above: a level of detail
         ("parent", "<i4"),  # the node of the next level that replaces it and its neighbours; -1: none
-        ("crc", "<u4"),  # CRC-32 of its rows of all columns, one after the other
+        ("crc", "<u4"),  # CRC-32 of its rows, column after column
         ("size", "<f4"),  # metres: edge of the cells whose splats were merged; 0 on level 0
         ("reach", "<f4"),  # metres: largest standard deviation
         ("low", "<f4", 3),  # metres from the origin: lowest corner of the box around the centres
@@ -82,9 +82,9 @@ class Header:
     chunk: int
     """maximum number of splats of a chunk"""
     origin: tuple[float, float, float]
-    """metres: world position of the means' zero"""
+    """world position [m] that means are relative to"""
     sh_degree: int
-    """-1: plain colours"""
+    """SH degree 0 to 3; -1: plain colours"""
     columns: dict[str, str]
     """NumPy's type of each array, e.g. {"means": "<f4"}"""
     ellipsoids: str
@@ -98,46 +98,46 @@ class Header:
     sources: tuple[str, ...] = ()
     """names of the source files"""
     store: str | None = None
-    """of an instanced store: relative path of the other store"""
+    """relative path of the other store, in an instanced store"""
     places_crc: int | None = None
-    """CRC-32 of the poses"""
+    """CRC-32 of the poses, in an instanced store"""
 
     def save(self, folder: Path) -> None:
-        """Write the header last: a folder without it is not a store."""
-        said = {"format": FORMAT, "version": VERSION, **asdict(self)}
+        """Write the header, as the last file of a store: a folder without it is not a store."""
+        content = {"format": FORMAT, "version": VERSION, **asdict(self)}
         with atomic_write(folder / HEADER) as stream:
-            stream.write(json.dumps(said | {"crc": header_crc(said)}, indent=1).encode())
+            stream.write(json.dumps(content | {"crc": header_crc(content)}, indent=1).encode())
 
 
-def header_crc(said: Mapping[str, Any]) -> int:
+def header_crc(content: Mapping[str, Any]) -> int:
     """CRC-32 of the fields of a header except the checksum."""
-    rest = {name: value for name, value in said.items() if name != "crc"}
+    rest = {name: value for name, value in content.items() if name != "crc"}
     return zlib.crc32(json.dumps(rest, sort_keys=True).encode())
 
 
 def read_header(folder: Path) -> Header:
-    """Read a header. Raises InputError if the folder is not a store or of a newer version."""
+    """Read a header. Raises InputError if the folder is not a store, or a store of another version."""
     file = folder / HEADER
     try:
-        said = from_json(read_input(file))
+        content = from_json(read_input(file))
     except InputError as error:
         if not file.exists():
             raise InputError(f"{folder} is not a store: it has no {HEADER}") from None
         raise error
     except ValueError:
         raise InputError(f"{file} is damaged: it is not JSON; build the store again") from None
-    if not isinstance(said, dict) or said.get("format") != FORMAT:
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f"{folder} is not a store: its {HEADER} has another format")
-    version = said.get("version")
+    version = content.get("version")
     if version != VERSION:
         raise InputError(
             f"{folder} is a store of version {version!r}, and this fidsplat reads version {VERSION}; "
             "use the fidsplat that wrote it, or build it again"
         )
     try:
-        if said.get("crc") != header_crc(said):
+        if content.get("crc") != header_crc(content):
             raise ValueError("its checksum differs")
-        known: dict[str, Any] = {each.name: said[each.name] for each in fields(Header)}
+        known: dict[str, Any] = {each.name: content[each.name] for each in fields(Header)}
         known |= {name: tuple(known[name]) for name in ("sources", "origin")}
         header = Header(**known)
         _check(header)
@@ -190,8 +190,7 @@ def shapes_of(sh_degree: int) -> dict[str, tuple[int, ...]]:
 
 
 def npy_header(kind: str, shape: tuple[int, ...]) -> bytes:
-    """Header of a .npy file, of fixed length, so that it can be rewritten when the number of rows is
-    known."""
+    """Header of a .npy file, of fixed length, so that it can be written after the rows."""
     text = f"{{'descr': '{np.dtype(kind).str}', 'fortran_order': False, 'shape': {shape!r}, }}"
     body = text.encode("ascii").ljust(NPY_HEADER - 11) + b"\n"
     return b"\x93NUMPY\x01\x00" + (NPY_HEADER - 10).to_bytes(2, "little") + body
@@ -216,8 +215,11 @@ def checksum(parts: Mapping[str, np.ndarray]) -> int:
 
 
 def map_column(folder: Path, name: str, kind: str, shape: tuple[int, ...], starts: np.ndarray) -> np.ndarray:
-    """Memory-map a column (rows, ...), read-only. starts: (n,) first rows of the nodes. Raises InputError if
-    the file is missing, truncated or does not match the header."""
+    """Memory-map a column (rows, ...), read-only.
+
+    starts: (n,) first rows of the nodes, to name the first missing chunk of a truncated file. Raises
+    InputError if the file is missing, truncated or does not match the header.
+    """
     file, header = column_file(folder, name), npy_header(kind, shape)
     size = NPY_HEADER + row_bytes(kind, shape[1:]) * shape[0]
     try:
@@ -241,7 +243,7 @@ def map_column(folder: Path, name: str, kind: str, shape: tuple[int, ...], start
     check_holes(file)
     try:
         return np.memmap(file, kind, "r", NPY_HEADER, shape).view(np.ndarray)
-    except OSError as error:  # such as a limit on the address space
+    except OSError as error:  # for instance by a limit on the address space
         raise InputError(f"cannot map {file} into memory: {error.strerror or error}") from error
 
 
@@ -263,14 +265,13 @@ def read_nodes(folder: Path, header: Header) -> np.ndarray:
         nodes = np.empty(0)
     if nodes.dtype != NODE or nodes.ndim != 1 or zlib.crc32(nodes.tobytes()) != header.nodes_crc:
         raise InputError(f"{file} is damaged: its checksum differs; build the store again")
-    if wrong := _misfit(nodes, header):
+    if wrong := _contradiction(nodes, header):
         raise InputError(f"{file} does not match {HEADER}: {wrong}; build the store again")
     return nodes
 
 
-def _misfit(nodes: np.ndarray, header: Header) -> str:
-    """Describe a contradiction between an index and its header on which rendering relies; empty if there is
-    none."""
+def _contradiction(nodes: np.ndarray, header: Header) -> str:
+    """Describe a contradiction between an index and its header; empty if there is none."""
     first, count, level, parent = (
         nodes[name].astype(np.int64) for name in ("first", "count", "level", "parent")
     )
@@ -280,7 +281,7 @@ def _misfit(nodes: np.ndarray, header: Header) -> str:
     if count.max(initial=0) > _MAX_NODE:
         return f"a node of the levels of detail must have at most {_MAX_NODE} splats, got {int(count.max())}"
     if ends.max(initial=0) != header.rows or (first != ends - count).any():
-        return f"its nodes must be {header.rows} rows, one after the other"
+        return f"its nodes must cover {header.rows} rows without gaps"
     if not np.isin(np.diff(level, prepend=0), (0, 1)).all():
         return "levels must rise from 0, one by one"
     if count[chunk].sum() != header.splats:

@@ -1,13 +1,13 @@
 """Merging splats for levels of detail.
 
 The splats of a cell whose normals have the same main axis are merged into one disk by moment matching,
-weighted by opacity times area: their mean, their covariance without its smallest axis, their mean colour, and
-an opacity that preserves opacity times area. At a distance, where cells are smaller than pixels, the merged
-splat covers the same share of a pixel. The error is measured (fidsplat/accuracy/detail_errors.py).
+weighted by opacity times area: the disk has their mean, their covariance without its smallest axis, their
+mean colour, and an opacity that preserves opacity times area. Where cells are smaller than pixels, the merged
+splat covers the same share of a pixel. fidsplat/accuracy/detail_errors.py measures the error.
 
-The opacity can exceed 1: merged splats are only rendered smaller than a pixel, where the low-pass reduces
-alpha. A cell that contains an edge of brightness has two splats: one would move the edge by up to an eighth
-of the cell.
+The opacity can exceed 1, as the low-pass filter reduces the alpha of splats smaller than a pixel. A cell with
+an edge between bright and dark splats becomes two splats; a single one would shift the edge by up to an
+eighth of the cell.
 """
 
 from __future__ import annotations
@@ -25,13 +25,16 @@ MAX_OPACITY = 4.0
 EDGE = 0.06
 """standard deviation of brightness in a cell above which bright and dark splats are merged separately"""
 _CLASSES = 3
+"""main axes of normals"""
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def merged(splats: dict[str, np.ndarray], grid: Grid) -> tuple[dict[str, np.ndarray], float]:
-    """Merge splats (arrays of a store's columns) to about a quarter of their number; returns the merged
-    splats and the edge [m] of the cells. A merged splat has the label of the splat with the largest
-    weight."""
+    """Merge splats (arrays of a store's columns) to about a quarter of their number. A merged splat has the
+    label of the splat with the largest weight.
+
+    Returns the merged splats and the edge [m] of the cells.
+    """
     u, v, normal = _frames(splats["quats"])
     sides = np.abs(normal)
     classes = np.where(sides[0] > sides[1], np.where(sides[0] > sides[2], 0, 2), 1 + (sides[2] > sides[1]))
@@ -51,7 +54,7 @@ def _runs(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _split_edges(keys: np.ndarray, splats: dict[str, np.ndarray]) -> np.ndarray:
-    """(n,) new cell keys, with two different keys in each cell that contains an edge of brightness."""
+    """New cell keys (n,), with different keys for bright and dark splats of cells with an edge."""
     colors = splats["colors"] if "colors" in splats else C0 * splats["sh"][:, 0]
     order, starts = _runs(keys)
     light = colors.astype(np.float64).mean(axis=1)[order]
@@ -73,7 +76,7 @@ def _frames(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _cells(codes: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
-    """(n,) key of each splat's cell and class, and the number of combined grid levels."""
+    """Keys (n,) of cell and class of each splat, and the number of combined grid levels."""
     target = max(1, len(codes) // REDUCTION)
     ordered = np.sort(codes)
     # number of levels at which neighbouring splats in Morton order differ
@@ -94,8 +97,10 @@ def _cells(codes: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
 def _by_moments(
     splats: dict[str, np.ndarray], frames: tuple[np.ndarray, np.ndarray, np.ndarray], starts: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """One splat for each run of splats, or copies where its opacity would be too high. frames: tangents and
-    normal."""
+    """One splat for each run of splats, or several copies where the opacity exceeds `MAX_OPACITY`.
+
+    frames: two tangents and the normal, each (3, n). starts: first index of each run.
+    """
     count = len(splats["means"])
     lengths = np.diff(np.append(starts, count))
     scales = splats["scales"].T.astype(np.float64)
@@ -151,5 +156,5 @@ def _by_moments(
 def _first_of_largest(weights: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """First index of the largest weight of each run."""
     largest = np.repeat(np.maximum.reduceat(weights, starts), lengths)
-    places = np.where(weights == largest, np.arange(len(weights)), len(weights))
-    return np.minimum.reduceat(places, starts)
+    indices = np.where(weights == largest, np.arange(len(weights)), len(weights))
+    return np.minimum.reduceat(indices, starts)

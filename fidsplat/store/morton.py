@@ -10,8 +10,8 @@ BITS = 21
 """bits of a code per axis"""
 
 
-def _spread(bits: int) -> np.ndarray:
-    """(2^bits,) uint64: the bits of an index with two zeros between each."""
+def _interleaved(bits: int) -> np.ndarray:
+    """Table (2^bits,) uint64: the bits of each index, with two zeros after each bit."""
     index = np.arange(1 << bits, dtype=np.uint64)
     spread = np.zeros_like(index)
     for bit in range(bits):
@@ -20,20 +20,20 @@ def _spread(bits: int) -> np.ndarray:
 
 
 _LOW_BITS = 11
-_TABLE = _spread(_LOW_BITS)
+_TABLE = _interleaved(_LOW_BITS)
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Cube divided into cells; points outside belong to the nearest cell at its sides."""
+    """Cube divided into cells; points outside belong to the nearest cell."""
 
     low: tuple[float, float, float]
-    """metres from the origin"""
+    """minimum corner, in metres relative to the origin"""
     side: float
-    """metres"""
+    """edge of the cube [m]"""
 
     def codes(self, means: np.ndarray) -> np.ndarray:
-        """(n,) uint64 Morton codes of centres (n, 3)."""
+        """Morton codes (n,) uint64 of centres (n, 3)."""
         scale = (1 << BITS) / self.side
         codes = np.zeros(len(means), np.uint64)
         for axis in range(3):
@@ -44,7 +44,7 @@ class Grid:
         return codes
 
     def size(self, shift: int) -> float:
-        """Edge [m] of cells whose codes agree except for their last 3 `shift` bits."""
+        """Edge [m] of cells after `shift` levels of grid cells are combined."""
         return self.side / (1 << BITS) * (1 << shift)
 
 

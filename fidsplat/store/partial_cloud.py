@@ -1,4 +1,4 @@
-"""Partial clouds: some splats of a scene, with the traits of the complete scene."""
+"""Partial clouds: a subset of a scene's splats, with the traits of the complete scene."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 from fidsplat.splats.arrays import OPTIONAL
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import rotation_of_coefficients
-from fidsplat.splats.rotations import matrix_to_quaternion
+from fidsplat.splats.rotations import matrix_to_quaternion, quaternion_multiply
 from fidsplat.splats.traits import PlacedTraits
 
 
 class PartialCloud(SplatCloud):
-    """Some splats of a scene, in its order, rendered with the traits of the complete scene."""
+    """A subset of a scene's splats in its order, rendered with the traits of the complete scene."""
 
     _scene: PlacedTraits
 
@@ -66,22 +66,14 @@ def concatenated(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndar
 def transformed(
     splats: Mapping[str, np.ndarray], rotation: np.ndarray, offset: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Splats rotated by a matrix (3, 3) and moved by (3,) metres; each result is independent of other
-    splats."""
+    """Splats rotated by a matrix (3, 3) and moved by (3,) metres.
+
+    The result of a splat does not depend on the other splats, as that of a matrix product may.
+    """
     x, y, z = splats["means"].T.astype(np.float64)
     means = [rotation[i, 0] * x + rotation[i, 1] * y + rotation[i, 2] * z + offset[i] for i in range(3)]
-    w, a, b, c = splats["quats"].T.astype(np.float64)
-    p, q, r, s = matrix_to_quaternion(rotation)
-    quats = [
-        p * w - q * a - r * b - s * c,
-        p * a + q * w + r * c - s * b,
-        p * b - q * c + r * w + s * a,
-        p * c + q * b - r * a + s * w,
-    ]
-    result = dict(splats) | {
-        "means": np.stack(means, axis=1).astype(np.float32),
-        "quats": np.stack(quats, axis=1).astype(np.float32),
-    }
+    quats = quaternion_multiply(matrix_to_quaternion(rotation), splats["quats"]).astype(np.float32)
+    result = dict(splats) | {"means": np.stack(means, axis=1).astype(np.float32), "quats": quats}
     if "sh" in result and result["sh"].shape[1] > 1:
         degree = int(np.sqrt(result["sh"].shape[1])) - 1
         matrix = rotation_of_coefficients(degree, rotation).astype(np.float32)

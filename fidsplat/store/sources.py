@@ -1,4 +1,4 @@
-"""Sources of a store: splat files as rows that are read in parts and converted to the store's columns."""
+"""Sources of a store: splat files, read in windows of rows and converted to the store's columns."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
 
 _SAMPLES, _SAMPLE = 64, 4096
-"""number of parts of each source, and rows of a part, that are sampled for bounds"""
+"""maximum number of windows of each source, and rows of a window, that are sampled for bounds"""
 
 
 @dataclass(frozen=True)
 class Source:
-    """One input: its rows, relative to an origin (3,) float64 [m]."""
+    """One input of a store."""
 
     rows: Rows
     origin: np.ndarray
+    """(3,) float64 metres: world position that means are relative to"""
     stamp: str
-    """path, size and time of the file, to detect a later change"""
+    """path, size and modification time of the file, to detect changes"""
     first_group: int = 0
     """offset added to its coplanar group ids, so that groups of different inputs stay different"""
 
@@ -60,7 +61,7 @@ def _open(file: Path) -> Source:
 
 
 def source_of(cloud: SplatCloud, name: Path, stamp: str) -> Source:
-    """A cloud in memory as a source."""
+    """A source of the splats of a cloud."""
     if cloud.boxes is not None:
         raise InputError("a store cannot contain box footprints; put markers into a scene file next to it")
     arrays = present_arrays(cloud) | {"scales": all_scales(cloud)}
@@ -103,7 +104,7 @@ def degree_of(source: Source) -> int:
 
 def sample(sources: Sequence[Source]) -> tuple[np.ndarray, np.ndarray]:
     """Sampled centres (n, 3) float32 [m] of all sources, and the origin (3,) float64 that they are relative
-    to: that of all sources, or else a point near the splats."""
+    to: the common origin of the sources, or else a point near the splats."""
     means, single, scales = [], [], []
     for source in sources:
         count = source.rows.count
@@ -125,8 +126,8 @@ def sample(sources: Sequence[Source]) -> tuple[np.ndarray, np.ndarray]:
 def splats_of(
     source: Source, span: tuple[int, int], origin: np.ndarray, columns: dict[str, str], sh_degree: int
 ) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Splats of a range of rows, in a store's columns and relative to its origin; and invalid splats by
-    reason."""
+    """Splats of a range of rows, with a store's columns and relative to its origin; and the number of invalid
+    splats by reason."""
     part, dropped = window(source.rows, *span)
     count = len(part["means"])
     means = part["means"]

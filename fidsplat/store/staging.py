@@ -26,7 +26,7 @@ def store_folder(out: str | os.PathLike[str]) -> Path:
 
 
 def refuse_existing(folder: Path, overwrite: bool) -> None:
-    """Raise InputError if a path exists and must not be replaced, or is not a store."""
+    """Raise InputError if a path exists, unless it is a store or an empty folder and `overwrite` is set."""
     if not flag("overwrite", overwrite) and folder.exists():
         raise InputError(f"{folder} exists already; give another name, or --overwrite")
     if folder.exists() and not folder.is_dir():
@@ -37,8 +37,10 @@ def refuse_existing(folder: Path, overwrite: bool) -> None:
 
 @contextmanager
 def staged(folder: Path) -> Iterator[Path]:
-    """Lock the staging folder next to `folder` and yield it, with the files of an interrupted build. On
-    success it replaces `folder`. Raises InputError if another process builds there."""
+    """Lock the staging folder of `folder` and yield it; on success it replaces `folder`.
+
+    It may contain the files of an interrupted build. Raises InputError if another process has locked it.
+    """
     part = folder.with_name(f".{folder.name}.part")
     writable_folder(part)
     try:

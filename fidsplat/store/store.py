@@ -30,8 +30,8 @@ from fidsplat.util.npy import load_npy
 class Store(Summarised):
     """Splats on disk, built by `fidsplat store build` or instanced by `fidsplat store place`.
 
-    Splats are read when a view needs them. An instanced store shows another store's splats at several poses,
-    those of the first pose first. Threads may share a store; it is pickled by its path.
+    Splats are read when a view needs them. An instanced store has the splats of another store at several
+    poses, pose after pose. A store is thread-safe, and pickled by its path.
 
     Args:
         path: its folder, e.g. city.fss.
@@ -73,10 +73,12 @@ class Store(Summarised):
         self._own = own
         self.nodes = layout.read_nodes(self._folder, own)
         """(n,) records of `layout.NODE`: chunks and nodes of levels of detail, of one instance"""
-        self._columns = self._mapped()
-        if (
-            self.has_coplanar_groups
-        ):  # coplanar splats are part of every frame and are prepared on the host, so they must be valid
+        starts, shapes = self.nodes["first"], layout.shapes_of(own.sh_degree)
+        self._columns = {
+            name: layout.map_column(self._folder, name, kind, (own.rows, *shapes[name]), starts)
+            for name, kind in own.columns.items()
+        }
+        if self.has_coplanar_groups:  # the host prepares coplanar splats, which must be valid
             rows = self._rows(own.pinned, own.splats, None)
             if wrong := _unrenderable(rows):
                 raise InputError(
@@ -147,7 +149,7 @@ class Store(Summarised):
 
     @property
     def origin(self) -> np.ndarray:
-        """World position (3,) float64 in metres that `means` are relative to."""
+        """(3,) float64 metres: world position that means are relative to."""
         return np.array(self.header.origin)
 
     @property
@@ -168,7 +170,7 @@ class Store(Summarised):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the files; of an instanced store those of the placed store."""
+        """Bytes of the files; of an instanced store, those of the other store."""
         return sum(file.stat().st_size for file in self._folder.iterdir() if file.is_file())
 
     @property
@@ -178,7 +180,7 @@ class Store(Summarised):
         return sum(layout.row_bytes("<f4", shapes[name]) for name in {*self._own.columns, "labels"})
 
     def bounds(self, sigmas: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
-        """Axis-aligned box (min (3,), max (3,)) float64, world, around all chunks to that many standard
+        """Axis-aligned box (min (3,), max (3,)) float64, world, around all splats to `sigmas` standard
         deviations. Raises InputError for an empty store."""
         low, high = self.boxes(sigmas)
         leaves = np.tile(self.nodes["level"] == 0, self.instances)
@@ -188,7 +190,7 @@ class Store(Summarised):
 
     @cached_property
     def detail_errors(self) -> list[DetailErrors]:
-        """Measured errors of the levels of detail; of an instanced store those of the placed store."""
+        """Measured errors of the levels of detail; of an instanced store, those of the other store."""
         return load_detail_errors(self._folder, self.header.identity)
 
     @property
@@ -216,12 +218,12 @@ class Store(Summarised):
     # nodes of all instances: node i of instance p has the number p * len(nodes) + i
 
     def boxes(self, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corners, (instances * nodes, 3) float64 [m] from the origin, of boxes around the
-        splats of each node to that many standard deviations."""
+        """Minimum and maximum corners, (instances * nodes, 3) float64 [m] relative to the origin, of boxes
+        around the splats of each node to `sigmas` standard deviations."""
         sigmas = checked_number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
         nodes, share = self.nodes, min(sigmas / layout.FAR, 1.0)
         beyond = np.maximum(sigmas - layout.FAR, 0.0) * nodes["reach"].astype(np.float64)[:, None]
-        # the extent of a box is a convex function of the number of standard deviations: below its chord
+        # a box's extent is a convex function of the standard deviations: interpolation bounds it from above
         low = (1 - share) * nodes["low"].astype(np.float64) + share * nodes["far_low"] - beyond
         high = (1 - share) * nodes["high"].astype(np.float64) + share * nodes["far_high"] + beyond
         if self.poses is None:
@@ -235,7 +237,7 @@ class Store(Summarised):
     def instance_boxes(
         self, low: np.ndarray, high: np.ndarray, instances: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Boxes (k, 3) of the other store, each at the pose of an instance (k,)."""
+        """Boxes of the other store, given by corners (k, 3), each moved to the pose of an instance (k,)."""
         assert self.poses is not None
         rotations = self.poses[instances, :3, :3]
         center, half = (low + high) / 2, (high - low) / 2
@@ -244,19 +246,19 @@ class Store(Summarised):
 
     @cached_property
     def _offsets(self) -> np.ndarray:
-        """(p, 3) float64 metres: translation of the other store's means to each instance."""
+        """(p, 3) float64 metres: translation from the other store's means to each instance's."""
         assert self.poses is not None
         inner, outer = np.array(self._own.origin), self.origin
         return self.poses[:, :3, :3] @ inner + self.poses[:, :3, 3] - outer
 
     def first_of(self, numbers: np.ndarray) -> np.ndarray:
-        """(k,) int64: index of the first splat of chunks, by number; -1 for nodes of levels of detail."""
+        """Index (k,) int64 of the first splat of chunks, by number; -1 for nodes of levels of detail."""
         instance, node = np.divmod(self._checked(numbers), max(len(self.nodes), 1))
         own = self.nodes[node]
         return np.where(own["level"] == 0, own["first"] + instance * self._own.splats, -1)
 
     def counts(self, numbers: np.ndarray) -> np.ndarray:
-        """(k,) number of splats of nodes, by their numbers."""
+        """Numbers of splats (k,) of nodes, by number."""
         return self.nodes["count"][self._checked(numbers) % max(len(self.nodes), 1)]
 
     def _checked(self, numbers: np.ndarray) -> np.ndarray:
@@ -267,8 +269,10 @@ class Store(Summarised):
         return given.astype(np.int64)
 
     def load(self, number: int, placed: bool = True) -> dict[str, np.ndarray]:
-        """Splats of a node, by its number: arrays like those of a cloud, relative to `origin`. placed:
-        whether to apply the pose of the instance."""
+        """Splats of a node, by number, as arrays of a cloud relative to `origin`.
+
+        placed: whether to apply the pose of the instance.
+        """
         last = self.instances * len(self.nodes) - 1
         flag("placed", placed)
         instance, node = divmod(whole_number("the number of a node", number, 0, last), len(self.nodes))
@@ -277,7 +281,7 @@ class Store(Summarised):
 
     @cached_property
     def pose_rows(self) -> np.ndarray:
-        """(p, 16) float64: poses in the layout of `Chunk.pose`; (0, 16) if it is not instanced."""
+        """(p, 16) float64: poses in the layout of `Chunk.pose`; (0, 16) if the store is not instanced."""
         if self.poses is None:
             return np.empty((0, 16))
         rotations = self.poses[:, :3, :3]
@@ -301,13 +305,12 @@ class Store(Summarised):
         return int(self._columns["coplanar_groups"][self._own.pinned : self._own.splats].max(initial=-1))
 
     def cloud(self) -> SplatCloud:
-        """All splats in one cloud, memory-mapped if possible. Its frames are bit-identical to those of the
-        store."""
+        """All splats in one cloud, memory-mapped if possible; its frames are bit-identical to the store's."""
         parts = [self._rows(0, self._own.splats, instance) for instance in range(self.instances)]
         return PartialCloud.of(concatenated(parts), self, self.header.dropped)
 
     def verify(self, progress: Progress | None = None) -> list[str]:
-        """Check the checksum and values of every chunk, and return a description of each defect."""
+        """Check the checksums and the values of all chunks, and return a description of each defect."""
         callback("progress", progress)
         wrong = []
         for number, node in enumerate(self.nodes):
@@ -321,13 +324,6 @@ class Store(Summarised):
             if progress is not None:
                 progress(f"checking {self.path.name}", (number + 1) / len(self.nodes))
         return wrong
-
-    def _mapped(self) -> dict[str, np.ndarray]:
-        own, shapes = self._own, layout.shapes_of(self._own.sh_degree)
-        return {
-            name: layout.map_column(self._folder, name, kind, (own.rows, *shapes[name]), self.nodes["first"])
-            for name, kind in own.columns.items()
-        }
 
     def _rows(self, first: int, end: int, instance: int | None) -> dict[str, np.ndarray]:
         """Splats of rows [first, end) at the pose of an instance; None: as stored."""
@@ -353,7 +349,7 @@ def _unrenderable(rows: dict[str, np.ndarray], merged: bool = False) -> str:
 
 
 def _rounded(middles: np.ndarray, around: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corners of placed boxes, padded by 1e-6 for the rounding of centres to float32."""
+    """Minimum and maximum corners of boxes, padded by 1e-6 for the rounding of centres to float32."""
     around = around + 1e-6 * (np.abs(middles) + around)
     return middles - around, middles + around
 

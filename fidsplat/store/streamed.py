@@ -25,7 +25,7 @@ from fidsplat.util.files import path_of
 _LEAF = 2**18
 """maximum splats of a leaf of streamed SOG, unless a chunk has more"""
 _GRID = 64
-"""number of grid cells along the largest extent, for estimating the area of a scene"""
+"""number of grid cells along the largest extent, for the estimated area of a scene"""
 
 
 def is_streamed(inputs: object) -> bool:
@@ -36,8 +36,7 @@ def is_streamed(inputs: object) -> bool:
 
 
 def import_streamed(path: Path, folder: Path, progress: Progress) -> None:
-    """Write a store with the chunks and levels of a streamed SOG. Raises InputError for one with an
-    environment."""
+    """Write a store with the chunks and levels of a streamed SOG; raise InputError for an environment."""
     scene = read_streamed(path)
     scene.check_memory()
     if scene.environment is not None:
@@ -115,9 +114,11 @@ def _area(means: np.ndarray) -> float:
 
 
 def export_streamed(store: Store, path: Path) -> None:
-    """Write a store as streamed SOG with its levels, next to a file lod-meta.json. A leaf of the file is a
-    node of the store that represents at most 262,144 splats of the scene. Coarser levels, coplanar groups and
-    labels are left out. Raises InputError for an instanced store."""
+    """Write a store as streamed SOG with its levels, at the path of lod-meta.json.
+
+    A leaf of the file is a node of the store that represents at most 262,144 splats. Coarser levels, coplanar
+    groups and labels are omitted. Raises InputError for an instanced store.
+    """
     if store.poses is not None:
         raise InputError(
             f"a store written as streamed SOG must have no instances, got {len(store.poses):,}; write the "

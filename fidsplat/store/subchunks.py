@@ -17,15 +17,15 @@ class Subchunks:
     """Subchunks of some nodes of a store, in splat order."""
 
     nodes: np.ndarray
-    """(k,) int64 number of the node"""
+    """(k,) int64 numbers of their nodes"""
     first: np.ndarray
     """(k,) int64 first row within the node"""
     rows: np.ndarray
-    """(k,) int64 number of rows"""
+    """(k,) int64 numbers of rows"""
     low: np.ndarray
-    """(k, 3) float64 metres: lowest corners of boxes around the centres"""
+    """(k, 3) float64 metres: minimum corners of boxes around the centres"""
     high: np.ndarray
-    """(k, 3) float64 metres: highest corners"""
+    """(k, 3) float64 metres: maximum corners"""
     reach: np.ndarray
     """(k,) metres: largest standard deviation"""
     pinned: np.ndarray
@@ -36,22 +36,24 @@ class Subchunks:
         return Subchunks(*(getattr(self, field.name)[which] for field in fields(self)))
 
     def boxes(self, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corners (k, 3) of boxes around splats to that many standard deviations."""
+        """Minimum and maximum corners (k, 3) of boxes around splats to `sigmas` standard deviations."""
         around = sigmas * self.reach[:, None]
         return self.low - around, self.high + around
 
 
 class SubchunkTable:
-    """Subchunks of a store, computed on first use. offset: (3,) metres, added to all boxes. pinned: (n,)
-    bool: nodes that are part of every frame."""
+    """Subchunks of a store, computed on first use.
+
+    offset: (3,) metres, added to all boxes. pinned: (n,) bool: nodes that are part of every frame.
+    """
 
     def __init__(self, store: Store, offset: np.ndarray, pinned: np.ndarray) -> None:
         self._store, self._offset, self._pinned = store, offset, pinned
         self._known: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
-        """cache: node of the unplaced store -> corners of the boxes, largest standard deviations"""
+        """cache by node without its instance: corners of the boxes, largest standard deviations"""
 
     def of(self, numbers: np.ndarray) -> Subchunks:
-        """The subchunks of nodes (k,), by their numbers."""
+        """The subchunks of nodes (k,), by number."""
         store = self._store
         instances, own = np.divmod(numbers, max(len(store.nodes), 1))
         each = [self._boxes(node) for node in own.tolist()]

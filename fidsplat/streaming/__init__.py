@@ -1,1 +1,1 @@
-"""Rendering scenes larger than memory: culling, level of detail, residency."""
+"""Rendering of scenes larger than device memory: culling, level of detail, chunk cache."""

@@ -22,14 +22,15 @@ from fidsplat.streaming.level_of_detail import visible_nodes
 from fidsplat.streaming.occlusion_test import contributing_tiles, occluded, occluded_nodes
 
 _MIN_ROWS = 16
-"""pixels"""
+"""minimum height of a band [px]"""
 _MAX_OVERLAP = 1.6
-"""a band is split if its halves have at most this many times its splats; with a fisheye each may need all"""
+"""a band is split if its halves together have at most this many times its splats; with a fisheye lens, each
+half may need all splats"""
 
 
 @dataclass(frozen=True)
 class BandData:
-    """A band of rows on the device: its splats, or its images if it has been rendered already."""
+    """A band of rows on the device: its splats, or its images if it is already rendered."""
 
     rows: tuple[int, int]
     """pixels [first, end)"""
@@ -61,7 +62,7 @@ class Band:
         return Band(scene, view, features, cell_sizes, (first // view.samples, end // view.samples))
 
     def with_rows(self, first: int, end: int) -> Band:
-        """A band of other rows, rendered from all of its visible nodes."""
+        """The band of other rows, rendered from all its visible nodes."""
         return replace(self, rows=(first, end), subset=None, subchunks=None)
 
     def with_nodes(self, nodes: NodeMasks) -> Band:
@@ -80,7 +81,7 @@ class Band:
         return self.with_nodes(nodes).without_occluded_subchunks(termination)
 
     def without_occluded_subchunks(self, termination: TerminationDepths) -> Band:
-        """The same rows, rendered from those subchunks of its nodes that can contribute."""
+        """The same rows, rendered from the subchunks that can contribute."""
         every = self.scene.subchunks(self.nodes)
         masked = tuple((each, self._can_contribute(each, termination)) for each in every)
         return self._with_cache(replace(self, subchunks=masked))
@@ -156,7 +157,7 @@ class Band:
 
     @property
     def halves(self) -> list[Band]:
-        """Bands of the upper and the lower half of the rows; empty if splitting does not help."""
+        """The upper and the lower half of the band; empty if the band cannot be split."""
         first, end = self.rows
         middle = (first + end) // 2
         if end - first < 2 * _MIN_ROWS or self.full_view.sub_frames:
@@ -170,12 +171,12 @@ class BandSplitter:
 
     def __init__(self) -> None:
         self._cuts: dict[tuple[int, int], list[int]] = {}
-        """image height of the previous view -> first rows of its bands, and the end"""
+        """first rows of the bands of the previous view, and the end, by the view's rows"""
         self._capacity = 0
-        """largest number of splats that fitted"""
+        """largest number of splats of a band that fits"""
 
     def split(self, full: Band, fits: Callable[[Band], bool]) -> Iterator[Band]:
-        """Bands from the top that fit, or cannot be split. `fits` is called right before each is yielded."""
+        """Bands from the top that fit or cannot be split; `fits` is called immediately before each."""
         waiting = [full.with_rows(*rows) for rows in pairwise(self._cuts.get(full.rows, full.rows))]
         bands: list[Band] = []
         while waiting:

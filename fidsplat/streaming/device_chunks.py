@@ -1,4 +1,4 @@
-"""Chunks of a scene as a device's chunk cache loads them."""
+"""Chunks of a scene in the form that a device's chunk cache loads."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from fidsplat.store.store import Store
 
 
 class DeviceChunks:
+    """Chunks of a scene by selection, each with the function that loads its arrays."""
+
     def __init__(self, scene: ChunkedSplats) -> None:
         self.scene = scene
         self._chunks: dict[tuple[int, bool], dict[int, Chunk]] = {}
-        """(number of the store, posed by the device) -> chunks, by node"""
+        """chunks by number of the store and whether the device applies poses, then by node"""
 
     @property
     def largest_chunk(self) -> int:
@@ -53,13 +55,13 @@ class DeviceChunks:
     @cached_property
     def _group_ids(self) -> np.ndarray:
         """Sorted ids of all coplanar groups, whose chunks are part of every frame."""
-        ids = self.scene.part(Selection.of(self.scene.pinned)).coplanar_groups
+        ids = self.scene.load(Selection.of(self.scene.pinned)).coplanar_groups
         assert ids is not None
         return np.unique(ids[ids >= 0])
 
     def _can_pose(self, store: Store) -> bool:
-        """Whether a device may apply a store's poses: SH would have to be rotated too, and means of another
-        origin would be rounded twice."""
+        """Whether a device may apply a store's poses. The host applies them to SH, which must be rotated, and
+        to means relative to another origin, which the device would round twice."""
         offset = store.origin - self.scene.origin
         return store.poses is not None and self.scene.sh_degree < 0 and not offset.any()
 
@@ -78,7 +80,7 @@ class DeviceChunks:
         return self._on_device({name: array[first:end] for name, array in arrays.items()})
 
     def _on_device(self, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Arrays with dense indices of coplanar groups and integers for flags."""
+        """Arrays with consecutive indices of coplanar groups, and flags as int32."""
         result = dict(arrays)
         if "coplanar_groups" in result:
             ids, known = result["coplanar_groups"], self._group_ids

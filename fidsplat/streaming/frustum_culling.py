@@ -20,8 +20,8 @@ from fidsplat.effects import FeatureSet
 from fidsplat.store.merge import MAX_OPACITY
 
 Boxes = Callable[[float], tuple[np.ndarray, np.ndarray]]
-"""function from a number of standard deviations to lowest and highest corners (n, 3) float64 [m] of boxes
-around the splats to that extent"""
+"""function of a number of standard deviations that returns the minimum and maximum corners (n, 3) float64 [m]
+of boxes around the splats to that extent"""
 
 PADDING = 1.01
 """factor by which the extent of splats is enlarged, for rounding errors"""
@@ -33,8 +33,11 @@ _ROUNDING = 1e-5
 
 
 def in_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
-    """(n,) bool: whether a box can contain splats that contribute to the frame, at any pose of the shutter
-    and of moving groups. reach: (n,) metres: largest standard deviation of a box's splats."""
+    """Mask (n,) of boxes with splats that may contribute to the frame, at any pose of the shutter and of
+    moving groups.
+
+    reach: (n,) largest standard deviation of each box's splats [m].
+    """
     if view.sub_frames:
         visible = np.zeros(len(reach), bool)
         for sub_frame in view.sub_frames:
@@ -64,17 +67,19 @@ class Extent:
     radius: float
     """extent of disks to the sides, in standard deviations"""
     margin: float
-    """samples around their projection"""
+    """margin around their projection [samples]"""
     depths: float
     """extent of disks in depth, in standard deviations"""
     nearer: float = 1.0
-    """factor on depths"""
+    """factor on the depth of the nearest point"""
 
     @staticmethod
     def of(view: View, features: FeatureSet, minimum: float = 0.0) -> Extent | None:
-        """The extent of a view's splats, of at least `minimum` standard deviations; None if unbounded: the
-        low-pass `pixel` has no bound for distorted lenses, for parallel rays and for cut-offs as low as
-        1e-13."""
+        """The extent of a view's splats, of at least `minimum` standard deviations; None if it is unbounded.
+
+        With the low-pass `pixel`, it is unbounded for distorted lenses, for parallel rays and for alpha
+        cut-offs below about 1e-13.
+        """
         radius = max(cutoff_radius(view), minimum)
         # margin for the low-pass disc, or for the low-pass of EWA
         plain = Extent(radius, radius * view.samples + 2.0, radius)
@@ -90,7 +95,7 @@ class Extent:
         return Extent(larger * radius, margin, radius / nearer, nearer)
 
     def nearest(self, view: View, boxes: CameraBoxes) -> np.ndarray:
-        """(n,) metres: lower bounds on depths. boxes: to `depths` standard deviations."""
+        """Lower bounds (n,) on depths [m]. boxes: boxes to `depths` standard deviations."""
         nearest = boxes.nearest(view)
         return np.minimum(self.nearer * nearest, nearest)
 
@@ -100,15 +105,15 @@ def _widened(features: FeatureSet) -> bool:
 
 
 def cutoff_radius(view: View) -> float:
-    """Radius [standard deviations] at which splats of the highest opacity reach the cut-off, padded."""
+    """Radius [standard deviations] at which the alpha of the most opaque splats is the cut-off, padded."""
     return PADDING * math.sqrt(2.0 * (math.log(MAX_OPACITY) - view.log_cut))
 
 
 def ewa_reach(view: View, features: FeatureSet, radius: float, reach: np.ndarray) -> np.ndarray | None:
-    """Extent of EWA footprints around projected centres, (n,) samples times the depth [m]; None without EWA.
+    """Extent (n,) of EWA footprints around projected centres, in samples times depth [m]; None without EWA.
 
-    EWA projects by the derivative at the centre, so a footprint can reach further than the splat. radius:
-    standard deviations; reach: (n,) metres, largest standard deviation.
+    EWA projects by the derivative at the centre, so that a footprint can be larger than the projected splat.
+    radius: extent in standard deviations. reach: (n,) largest standard deviations [m].
     """
     if not {"ellipsoid_ewa", "ellipsoid_ewa_antialiased"} & features.names:
         return None
@@ -119,19 +124,19 @@ def ewa_reach(view: View, features: FeatureSet, radius: float, reach: np.ndarray
 def _in_pose_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
     extent = Extent.of(view, features)
     if extent is None:
-        # splats whose centre is behind the near plane are not widened
-        whole = CameraBoxes(view, *boxes(cutoff_radius(view)))
-        return whole.furthest(view) >= view.near * (1 - _ROUNDING)
+        # the low-pass filter does not change splats whose centre is behind the near plane
+        disks = CameraBoxes(view, *boxes(cutoff_radius(view)))
+        return disks.furthest(view) >= view.near * (1 - _ROUNDING)
     radius, margin = extent.radius, extent.margin
     centers = CameraBoxes(view, *boxes(0.0))
-    whole = CameraBoxes(view, *boxes(radius))
-    visible = whole.furthest(view) >= view.near * (1 - _ROUNDING)
-    deep = whole if extent.depths == radius else CameraBoxes(view, *boxes(extent.depths))
+    disks = CameraBoxes(view, *boxes(radius))
+    visible = disks.furthest(view) >= view.near * (1 - _ROUNDING)
+    deep = disks if extent.depths == radius else CameraBoxes(view, *boxes(extent.depths))
     visible &= extent.nearest(view, deep) <= view.far * (1 + _ROUNDING)
     if view.raster is None:
         wide = ewa_reach(view, features, radius, reach)
         for normal, offset in _pinhole_sides(view, margin):
-            inside = whole.beyond(normal) + offset >= 0
+            inside = disks.beyond(normal) + offset >= 0
             if wide is not None:
                 inside |= centers.beyond(normal) + offset + wide >= 0
             visible &= inside
@@ -144,13 +149,13 @@ def _in_pose_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.n
         if _widened(features):
             step = _max_ray_rotation(view) * max(margin, extent.depths * _ACROSS + 2.0)
             return visible & centers.within(_max_ray_angle(view.raster), step, extent.depths * reach)
-        return visible & whole.within(_max_ray_angle(view.raster) + step)
+        return visible & disks.within(_max_ray_angle(view.raster) + step)
     low, high = _slopes(view.raster)
     for axis in (0, 1):
         for sign, side in ((1.0, low[axis] - step), (-1.0, high[axis] + step)):
             normal = np.zeros(3)
             normal[axis], normal[2] = sign, -sign * side
-            visible &= whole.beyond(normal) >= 0
+            visible &= disks.beyond(normal) >= 0
     return visible
 
 
@@ -167,24 +172,24 @@ class CameraBoxes:
         self._half = half
 
     def beyond(self, normal: np.ndarray) -> np.ndarray:
-        """(n,) largest dot product of a box's points with a vector (3,) of the camera's frame."""
+        """Largest dot product (n,) of a box's points with a vector (3,) in the camera's frame."""
         reach = self._half @ np.abs(self._view.rotation.T @ normal)
         return self.middle @ normal + reach + self.rounding * np.abs(normal).sum()
 
     def nearest(self, view: View) -> np.ndarray:
-        """(n,) metres: lowest depth of each box, by the view's definition of depth."""
+        """Lowest depth (n,) of each box [m], by the view's definition of depth."""
         if view.along_ray:
             return np.maximum(np.linalg.norm(self.middle, axis=1) - self._radius, 0.0)
         return -self.beyond(np.array([0.0, 0.0, -1.0]))
 
     def furthest(self, view: View) -> np.ndarray:
-        """(n,) metres: highest depth of each box."""
+        """Highest depth (n,) of each box [m]."""
         if view.along_ray:
             return np.linalg.norm(self.middle, axis=1) + self._radius
         return self.beyond(np.array([0.0, 0.0, 1.0]))
 
     def off_axis(self) -> np.ndarray:
-        """(n,) metres: lowest distance from the vertical axis, around which panoramas are stretched."""
+        """Lowest distance (n,) of each box from the vertical axis [m], near which panoramas are stretched."""
         return np.maximum(np.hypot(self.middle[:, 0], self.middle[:, 2]) - self._radius, 0.0)
 
     @property
@@ -192,8 +197,8 @@ class CameraBoxes:
         return np.linalg.norm(self._half, axis=1) + self.rounding
 
     def within(self, angle: float, step: float = 0.0, further: np.ndarray | None = None) -> np.ndarray:
-        """(n,) bool: boxes that can have points within an angle [rad] of the optical axis, if displaced by a
-        share `step` of their distance to the camera, and `further` (n,) metres."""
+        """Mask (n,) of boxes that may have points within an angle [rad] of the optical axis, after a
+        displacement by a share `step` of their distance to the camera and by `further` (n,) metres."""
         distance = np.linalg.norm(self.middle, axis=1)
         with np.errstate(over="ignore"):  # infinite for a box around the camera
             around = np.arcsin(np.minimum(self._radius / np.maximum(distance, 1e-300), 1.0))
@@ -206,7 +211,7 @@ class CameraBoxes:
 
 
 def _pinhole_sides(view: View, margin: float) -> list[tuple[np.ndarray, float]]:
-    """Half spaces normal . p + offset >= 0 of the frustum's sides, `margin` samples wider."""
+    """Half spaces normal . p + offset >= 0 of the frustum's sides, widened by `margin` samples."""
     sides = []
     rows = (0, view.height) if view.band is None else view.band
     grid = ((0, view.focal_x, view.center_x, (0, view.width)), (1, view.focal_y, view.center_y, rows))
@@ -251,8 +256,8 @@ def _slopes(raster: RayRaster) -> tuple[np.ndarray, np.ndarray]:
 
 
 def projected_sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
-    """(n,) samples: upper bound on the projected size of lengths (n,) [m] anywhere in each box, over all
-    poses of the shutter and moving groups; infinite where a box reaches the camera."""
+    """Upper bound (n,) on the projected size [samples] of lengths (n,) [m] anywhere in each box, at all poses
+    of the shutter and moving groups; infinite where a box contains the camera."""
     if view.sub_frames:
         return np.max(
             [projected_sizes(sub_frame.view, boxes, edges) for sub_frame in view.sub_frames], axis=0
@@ -265,9 +270,9 @@ def projected_sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
         if one.parallel:
             largest = np.maximum(largest, edges * focal)
             continue
-        placed = CameraBoxes(one, *boxes(0.0))
+        centers = CameraBoxes(one, *boxes(0.0))
         panorama = one.raster is not None and isinstance(one.raster.lens, Equirectangular)
-        nearest = placed.off_axis() if panorama else placed.nearest(one)
+        nearest = centers.off_axis() if panorama else centers.nearest(one)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             size = np.where(nearest > 0, edges * focal / np.maximum(nearest, 1e-300), np.inf)
         largest = np.maximum(largest, np.where(edges > 0, size, 0.0))

@@ -1,4 +1,4 @@
-"""Level-of-detail selection: the coarsest visible nodes that the allowed error permits."""
+"""Level-of-detail selection: the coarsest visible nodes within the allowed error."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from fidsplat.streaming.frustum_culling import in_frustum, projected_sizes
 def select(
     scene: ChunkedSplats, views: Sequence[View], features: FeatureSet, cell_sizes: CellSizes = 0.0
 ) -> Selection:
-    """The nodes that views need. cell_sizes: cells below this size on the image are merged; 0: exact."""
+    """The visible nodes of views. cell_sizes: projected size below which cells are merged; 0: exact."""
     return Selection.of(visible_nodes(scene, views, features, cell_sizes))
 
 
 def visible_nodes(
     scene: ChunkedSplats, views: Sequence[View], features: FeatureSet, cell_sizes: CellSizes = 0.0
 ) -> NodeMasks:
-    """Masks of the nodes that views need: visible, and the coarsest that the cell sizes allow."""
+    """Masks of the visible nodes of views, each the coarsest that the cell sizes allow."""
     masks = []
     for number, store in enumerate(scene.stores):
         sizes = cell_sizes[number] if isinstance(cell_sizes, tuple) else (cell_sizes,) * (store.levels + 1)
@@ -34,7 +34,7 @@ def visible_nodes(
 def _visible_nodes(
     scene: ChunkedSplats, number: int, views: Sequence[View], features: FeatureSet, cell_sizes: np.ndarray
 ) -> np.ndarray:
-    """(instances * nodes,) bool: the nodes of one store. cell_sizes: (levels + 1,) samples."""
+    """Mask (instances * nodes,) of the visible nodes of one store. cell_sizes: (levels + 1,) samples."""
     store, boxes = scene.stores[number], partial(scene.boxes, number)
     if not len(store.nodes):
         return np.zeros(0, bool)

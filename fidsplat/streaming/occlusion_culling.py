@@ -1,10 +1,10 @@
 """Occlusion culling of chunks: occluded chunks are neither read nor rendered.
 
-The frame is bit-identical to that of all chunks (fidsplat/backends/termination_depth.py). A view is rendered
-from a guess: the nodes that are not occluded by the previous view's termination depths, or the nearest nodes.
-All other nodes are then tested against the termination depths of this frame. If all are occluded, the frame
-is complete. If few are not, the tiles to which they can contribute are rendered again and copied into the
-frame. If many are not, they are added and the complete frame is rendered again.
+The frame is bit-identical to that of all chunks (fidsplat/backends/termination_depth.py). A view is first
+rendered from a guess: the nodes that the previous view's termination depths do not occlude, or the nearest
+nodes. The other nodes are then tested against the termination depths of this frame. If all are occluded, the
+frame is complete. If a few are visible, the tiles to which they can contribute are rendered again and copied
+into the frame. If many are visible, they are added and the complete frame is rendered again.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ MIN_SPLATS = 1_000_000
 _INITIAL_SPLATS = 1_500_000
 """number of splats of the first guess, and minimum number added per pass"""
 _MAX_GROWTH = 2.0
-"""limit on the growth of a guess per pass: nodes that are added first may occlude the rest"""
+"""maximum growth of a guess per pass, as the nodes that are added first may occlude the rest"""
 _MAX_VISIBLE = 0.7
-"""share of splats that are not occluded above which all splats of a view are rendered"""
+"""share of visible splats above which all splats of a view are rendered"""
 _PROBE_SHARE, _PROBE_SPLATS = 4, 4_000_000
-"""maximum size of a guess with which occlusion culling is always tried: share of all splats, and number"""
+"""occlusion culling is not abandoned before a pass has a quarter of the view's splats, and this number"""
 _PAUSE = 16
 """number of views without occlusion culling after a view with little occlusion"""
 _SAMPLES_PER_TILE, _MOTION_SLACK = 4, 4.0
-"""reprojection of termination depths: number of sampled directions per tile, across and down; and the
-multiple of the camera's motion that is added to the depths"""
+"""reprojection of termination depths: number of sampled directions per tile, across and down; and multiple
+of the camera's motion that is added to the depths"""
 _PATCH_RATIO = 2
-"""missing chunks are rendered alone if the frame has this many times more splats"""
+"""missing chunks are rendered alone if the frame has at least this many times their splats"""
 _MAX_PASSES = 12
-"""maximum number of passes; then a view is rendered from all visible chunks"""
+"""maximum number of passes, after which a view is rendered from all visible chunks"""
 
 
 class OcclusionCulling:
-    """Occlusion culling of successive views, by the termination depths of the previous one."""
+    """Occlusion culling of successive views, by the termination depths of the previous view."""
 
     def __init__(self) -> None:
         self._last: tuple[View, TerminationDepths] | None = None
@@ -52,7 +52,7 @@ class OcclusionCulling:
         """number of views to render without occlusion culling"""
 
     def is_worthwhile(self, full: Band, views_later: int = 0) -> bool:
-        """Whether occlusion culling is expected to save time. views_later: number of views until this one."""
+        """Whether occlusion culling may save time. views_later: number of views before this one."""
         return full.count >= MIN_SPLATS and self._pause <= views_later
 
     def skip_view(self) -> None:
@@ -73,10 +73,10 @@ class OcclusionCulling:
         render_band: Callable[[Band, int], tuple[Images, TerminationDepths]],
         copy_tiles: Callable[[Images, Images, np.ndarray], None],
     ) -> tuple[list[Band], Images] | None:
-        """Render a view without occluded chunks: the rendered bands, and the images.
+        """Render a view without occluded chunks, and return the rendered bands and the images.
 
-        Returns None if the view must be rendered from all visible chunks: little is occluded, or the rest
-        does not fit.
+        Returns None if the view must be rendered from all visible chunks: few chunks are occluded, or the
+        others do not fit.
 
         Args:
             fits, render_band: receive a band and the index of its first splat, after those of other bands.
@@ -132,7 +132,7 @@ def _without(nodes: NodeMasks, others: NodeMasks) -> NodeMasks:
 
 
 def _nearest(full: Band, nodes: NodeMasks, max_splats: int) -> NodeMasks:
-    """The nearest of some nodes, with about `max_splats` splats in total; at least one node."""
+    """The nearest of the given nodes, with about `max_splats` splats in total; at least one node."""
     keys = node_keys(full.scene, full.view, full.features)
     depths = [depth[mask] for depth, mask in zip(keys, nodes, strict=True)]
     counts = [count[mask] for count, mask in zip(full.scene.node_counts, nodes, strict=True)]
@@ -150,8 +150,8 @@ def _nearest(full: Band, nodes: NodeMasks, max_splats: int) -> NodeMasks:
 
 
 def _reprojected(last: View, termination: TerminationDepths, view: View) -> TerminationDepths | None:
-    """Guess of a view's termination depths: those of the previous view in the same directions, plus a
-    multiple of the camera's motion. None where the views overlap by less than half."""
+    """Estimated termination depths of a view: those of the previous view in the same directions, plus a
+    multiple of the camera's motion. None if the views overlap by less than half."""
     if (last.width, last.height, last.parallel) != (view.width, view.height, view.parallel):
         return None
     rows, columns = termination.depths.shape

@@ -26,7 +26,7 @@ def is_supported(view: View, features: FeatureSet) -> bool:
 
 
 def minimum_keys(view: View, features: FeatureSet, boxes: Boxes) -> np.ndarray:
-    """(n,) metres: lower bound on the sort keys of the splats in each box."""
+    """Lower bound (n,) on the sort keys of the splats in each box [m]."""
     extent = _extent(view, features)
     assert extent is not None  # the caller has checked `is_supported`
     if not {"compose_ordered", "compose_coplanar"}.isdisjoint(features.names):
@@ -37,7 +37,7 @@ def minimum_keys(view: View, features: FeatureSet, boxes: Boxes) -> np.ndarray:
 def occluded(
     view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, termination: TerminationDepths
 ) -> np.ndarray:
-    """(n,) bool: boxes whose splats cannot contribute to a frame with these termination depths."""
+    """Mask (n,) of the boxes whose splats cannot contribute to a frame with these termination depths."""
     keys, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, termination)
     return keys > _RangeMaximum(termination.depths).within(*spans)
 
@@ -45,7 +45,7 @@ def occluded(
 def contributing_tiles(
     view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, termination: TerminationDepths
 ) -> np.ndarray:
-    """(rows, columns) bool: tiles to which splats of the boxes can contribute."""
+    """Mask (rows, columns) of the tiles to which splats of the boxes can contribute."""
     tiles = np.zeros(termination.depths.shape, bool)
     keys, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, termination)
     for key, top, bottom, left, right in zip(keys, *spans, strict=True):
@@ -54,7 +54,7 @@ def contributing_tiles(
 
 
 def node_keys(scene: ChunkedSplats, view: View, features: FeatureSet) -> tuple[np.ndarray, ...]:
-    """(instances * nodes,) metres for each store: lower bounds on the sort keys of nodes."""
+    """Lower bounds (instances * nodes,) on the sort keys of each store's nodes [m]."""
     numbers = range(len(scene.stores))
     return tuple(minimum_keys(view, features, partial(scene.boxes, number)) for number in numbers)
 
@@ -96,8 +96,8 @@ def _extent(view: View, features: FeatureSet) -> Extent | None:
 def _projected_extent(
     view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds on x, y of the splats of each box on the image, (n, 2) samples each, without a lens; infinite
-    where a box reaches the camera."""
+    """Bounds on the x and y of each box's splats on the image of a pinhole camera, (n, 2) samples each;
+    infinite where a box contains the camera."""
     extent = _extent(view, features)
     assert extent is not None  # the caller has checked `is_supported`
     radius, margin = extent.radius, extent.margin
@@ -137,8 +137,7 @@ class _RangeMaximum:
 
     def __init__(self, values: np.ndarray) -> None:
         self._tables: dict[tuple[int, int], np.ndarray] = {(0, 0): values}
-        """for each size, powers of two (rows, columns): maximum of the rectangle of this size that starts at
-        each cell"""
+        """maximum of the rectangle of 2^a x 2^b cells that starts at each cell, by exponents (a, b)"""
 
     def _table(self, down: int, across: int) -> np.ndarray:
         if (down, across) not in self._tables:

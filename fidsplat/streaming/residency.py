@@ -1,4 +1,4 @@
-"""Device chunk cache with prefetch: chunks of rendered views stay, those of the next view are prefetched."""
+"""Residency of a scene's chunks on a device, with prefetch of the next view's chunks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 
 def one_ahead(items: Iterator[T]) -> Iterator[T]:
-    """The items, each yielded after the next was computed. An error is raised after the items before."""
+    """Yield each item after the next one is computed; raise an error after the items before it."""
     previous: list[T] = []
     while True:
         try:
@@ -46,7 +46,7 @@ def one_ahead(items: Iterator[T]) -> Iterator[T]:
 
 
 class Residency:
-    """The chunks of a scene on a device. Used by one thread at a time."""
+    """Chunks of a scene on a device, loaded by view; for one thread at a time."""
 
     def __init__(self, scene: ChunkedSplats, backend: Backend) -> None:
         self.scene, self._backend, self.chunks = scene, backend, DeviceChunks(scene)
@@ -55,7 +55,7 @@ class Residency:
         self._splitter, self._occlusion = BandSplitter(), OcclusionCulling()
         self._prefetch_thread: threading.Thread | None = None
         self.nodes = 0
-        """number of selected nodes of the last views"""
+        """number of nodes from which the last views were rendered"""
 
     @property
     def count(self) -> int:
@@ -70,7 +70,7 @@ class Residency:
     def bands(
         self, view: View, features: FeatureSet, quality: Quality, pipeline: Pipeline
     ) -> Iterator[BandData]:
-        """Bands of a view from the top with their splats, uploaded when requested; one if all fits."""
+        """Bands of a view from the top, each uploaded when it is requested; one if all splats fit."""
         full = Band.of(self.scene, view, features, self.scene.cell_sizes(quality))
 
         def fits(band: Band, first_id: int = 0) -> bool:
@@ -103,17 +103,19 @@ class Residency:
     def gather(
         self, views: Sequence[View], features: FeatureSet, qualities: Iterable[Quality]
     ) -> tuple[ResidentData, Callable[[], np.ndarray]]:
-        """Load the splats that are visible in any of several views; returns them, and a function that returns
-        their scene indices (n,) int32. The strictest quality applies to all views."""
+        """Load the splats that are visible in any of several views. The lowest `detail_error` applies to all.
+
+        Returns the splats, and a function that returns their scene indices (n,) int32.
+        """
         selection = select(self.scene, views, features, self.scene.cell_sizes(*qualities))
         self.nodes = len(selection)
         return self._data(selection), partial(self.scene.ids, selection)
 
     def _data(self, selection: Selection, first_id: int = 0) -> ResidentData:
         if self._current is None or self._current[:2] != (selection, first_id):
-            self._current = None  # released before the upload, so that the device need not hold both
+            self._current = None  # released before the upload, as both may not fit on the device
             if self._cache is None:
-                data = self._backend.upload(self.scene.part(selection))
+                data = self._backend.upload(self.scene.load(selection))
             else:
                 data = self._cache.gather(self.chunks.of(selection, self._cache.applies_poses), first_id)
             self._current = selection, first_id, data
@@ -123,7 +125,7 @@ class Residency:
         return self._backend.has("termination_depths") and occlusion_test.is_supported(view, features)
 
     def prefetched(self, captures: Iterator[Capture]) -> Iterator[Capture]:
-        """The captures, each yielded while the chunks of the next are prefetched."""
+        """Yield the captures, each while the chunks of the next one are prefetched."""
 
         def started() -> Iterator[Capture]:
             for number, capture in enumerate(captures):
@@ -134,11 +136,11 @@ class Residency:
         try:
             yield from one_ahead(started())
         finally:
-            if self._prefetch_thread is not None:  # wait, as the device may be closed next
+            if self._prefetch_thread is not None:  # the caller may close the device next
                 self._prefetch_thread.join()
 
     def _prefetch(self, capture: Capture) -> None:
-        """Start to load the chunks of a view in a thread, unless one is running. Rendering reports errors."""
+        """Load the chunks of a view in a thread, unless one is running; rendering reports its errors."""
         features, view = prepare(self.scene, capture)
         cell_sizes = self.scene.cell_sizes(capture.quality)
         if self._prefetch_thread is not None and self._prefetch_thread.is_alive():

@@ -1,1 +1,1 @@
-"""Files, errors, interrupts, limits and timing, for all packages."""
+"""Utilities of all packages: arguments, files, errors, interrupts, limits and timing."""

@@ -17,9 +17,9 @@ from fidsplat.util.errors import InputError, unknown
 
 T = TypeVar("T")
 Bytes = Annotated[int, "bytes"]
-"""a number of bytes; the command line accepts units"""
+"""number of bytes; the command line accepts units"""
 Names = Annotated[tuple[str, ...], "separated by commas"]
-"""names, which the command line separates by commas"""
+"""names, separated by commas on the command line"""
 LARGEST = 1e15
 """largest length [m] or colour; products of larger numbers would overflow in single precision"""
 _LONGEST = 200
@@ -55,7 +55,7 @@ def number(
     low: float = -math.inf,
     high: float = math.inf,
 ) -> float:
-    """A finite number within [low, high], as a float."""
+    """Check that a value is a finite number within [low, high], and return it as a float."""
     found = as_float(value)
     if not (math.isfinite(found) and low <= found <= high):
         raise invalid(what, requirement, value)
@@ -63,7 +63,7 @@ def number(
 
 
 def whole_number(what: str, value: Any, low: int, high: int) -> int:
-    """A whole number within [low, high], as an int."""
+    """Check that a value is a whole number within [low, high], and return it as an int."""
     try:
         found = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
@@ -74,21 +74,21 @@ def whole_number(what: str, value: Any, low: int, high: int) -> int:
 
 
 def flag(what: str, value: Any) -> bool:
-    """Validated bool. Raises InputError for a value of another type."""
+    """Check that a value is a bool, and return it."""
     if isinstance(value, bool) or (type(value).__name__ in ("bool", "bool_") and hasattr(value, "item")):
         return bool(value)
     raise invalid(what, "True or False", value)
 
 
 def instance(what: str, value: Any, kind: type[T], requirement: str = "", remedy: str = "") -> T:
-    """An instance of a class."""
+    """Check that a value is an instance of a class, and return it."""
     if not isinstance(value, kind):
         raise invalid(what, requirement or f"a {kind.__name__}", value, remedy)
     return value
 
 
 def text(what: str, value: Any) -> str:
-    """A string that can be encoded as UTF-8, that is, without half of a surrogate pair."""
+    """Check that a value is a string that UTF-8 can encode, and return it."""
     try:
         if isinstance(value, str):
             value.encode()
@@ -99,14 +99,14 @@ def text(what: str, value: Any) -> str:
 
 
 def callback(what: str, value: Any) -> Any:
-    """A function, or None."""
+    """Check that a value is a function or None, and return it."""
     if value is not None and not callable(value):
         raise invalid(what, "a function or None", value)
     return value
 
 
 def items(what: str, value: Any, kind: type[T], requirement: str) -> tuple[T, ...]:
-    """The items of an iterable, all of one class."""
+    """Check that a value is an iterable of instances of a class, and return its items."""
     found = tuple(value) if isinstance(value, Iterable) and getattr(value, "shape", None) != () else None
     if found is None or not all(isinstance(item, kind) for item in found):
         raise invalid(what, requirement, value)
@@ -114,7 +114,7 @@ def items(what: str, value: Any, kind: type[T], requirement: str) -> tuple[T, ..
 
 
 def settings_with(kind: type[T], settings: T | None, changes: dict[str, Any]) -> T:
-    """A settings dataclass (None: its defaults) with changed fields; an unknown field is an error."""
+    """A settings dataclass (None: its defaults) with changes by field name; an unknown name is an error."""
     if settings is not None:
         instance("settings", settings, kind)
     known = [field.name for field in fields(kind)]  # type: ignore[arg-type]
@@ -125,10 +125,10 @@ def settings_with(kind: type[T], settings: T | None, changes: dict[str, Any]) ->
 
 
 def parse_settings(what: str, kind: type, parts: Iterable[str]) -> dict[str, Any]:
-    """Values of fields of a dataclass from texts `name=value`, in the types of the fields."""
+    """Values of a dataclass's fields from texts `key=value`, in the types of the fields."""
     found = {}
     for part in parts:
-        name, equals, value = (piece.strip() for piece in part.partition("="))
+        name, equals, value = (text.strip() for text in part.partition("="))
         if not equals:
             raise InputError(f"{what} must be settings as key=value, got {part!r}")
         found[name] = parse_setting(what, kind, name, value)
@@ -136,7 +136,7 @@ def parse_settings(what: str, kind: type, parts: Iterable[str]) -> dict[str, Any
 
 
 def parse_setting(what: str, kind: type, name: str, text: str) -> Any:
-    """Value of a field of a dataclass from a text, by its annotation; spaces separate several numbers."""
+    """Value of a dataclass's field from a text, by the field's annotation; spaces separate numbers."""
     types = {field.name: str(field.type) for field in fields(kind)}
     if name not in types:
         raise InputError(unknown(f"setting of {what}", name, types))
@@ -150,7 +150,7 @@ def parse_setting(what: str, kind: type, name: str, text: str) -> Any:
                 return _numbers(text)
         return convert(text)
     except ValueError:
-        wanted = {int: "a whole number", float: "a number"}.get(convert, "numbers with spaces between")
+        wanted = {int: "a whole number", float: "a number"}.get(convert, "numbers separated by spaces")
         raise InputError(f"{what}: {name} must be {wanted}, got {text!r}") from None
 
 
@@ -169,8 +169,8 @@ def changes_of(settings: Any) -> dict[str, Any]:
     }
 
 
-def made_of(what: str, kind: type[T], values: dict[str, Any]) -> T:
-    """An instance of a dataclass; a missing field is an error."""
+def from_fields(what: str, kind: type[T], values: dict[str, Any]) -> T:
+    """An instance of a dataclass from values by field name; a missing field is an error."""
     for field in fields(kind):  # type: ignore[arg-type]
         if field.default is MISSING and field.default_factory is MISSING and field.name not in values:
             raise InputError(f"{what}: {field.name} must be given, got none")
@@ -190,8 +190,8 @@ class PickledByFields:
             object.__setattr__(self, name, value)
 
 
-def own_scalars(data: Any) -> None:
-    """Replace NumPy scalars among the fields of a dataclass, frozen or not, by Python numbers."""
+def python_scalars(data: Any) -> None:
+    """Convert NumPy scalars in the fields of a dataclass, frozen or not, to Python numbers, in place."""
     for field in fields(data):
         value = getattr(data, field.name)
         if isinstance(value, np.generic):
@@ -199,7 +199,10 @@ def own_scalars(data: Any) -> None:
 
 
 def array_of(what: str, value: Any, requirement: str, kinds: str = "fiub") -> np.ndarray:
-    """An array of any shape, without a copy if possible. kinds: allowed values of `dtype.kind`."""
+    """Convert a value to an array of any shape, without a copy if possible.
+
+    kinds: allowed values of `dtype.kind`.
+    """
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):  # for example rows of different lengths
@@ -210,5 +213,5 @@ def array_of(what: str, value: Any, requirement: str, kinds: str = "fiub") -> np
 
 
 def real_array(what: str, value: Any, requirement: str = "an array of real numbers") -> np.ndarray:
-    """An array of real numbers, of any shape, as float64."""
+    """Convert a value to a float64 array of any shape."""
     return array_of(what, value, requirement).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Unit vectors: perpendicular frames, and even samples of a sphere and a disk."""
+"""Unit vectors, perpendicular vectors, and uniform samples of a sphere and a disk."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def perpendicular(axes: np.ndarray) -> np.ndarray:
 
 
 def sphere(count: int, lowest: float = -1.0) -> np.ndarray:
-    """Even unit vectors (n, 3) with z from `lowest` to 1: a Fibonacci lattice."""
+    """Fibonacci lattice: uniform unit vectors (n, 3) with z from `lowest` to 1."""
     i = np.arange(count)
     z, angle = 1 - (1 - lowest) * (i + 0.5) / count, GOLDEN * i
     radius = np.sqrt(1 - z * z)
@@ -27,7 +27,7 @@ def sphere(count: int, lowest: float = -1.0) -> np.ndarray:
 
 
 def disk(count: int, first: float = 0.5) -> np.ndarray:
-    """Even points (n, 2) of the unit disk: Vogel's spiral. first: 0 has a point at the centre."""
+    """Vogel's spiral: uniform points (n, 2) of the unit disk. first: 0 for a point at the centre."""
     i = np.arange(count)
     radius, angle = np.sqrt((i + first) / max(count - 0.5 + first, 1)), GOLDEN * i
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)

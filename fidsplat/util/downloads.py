@@ -1,4 +1,4 @@
-"""Downloads with a checksum into the user's cache."""
+"""Downloads of files with a known size and checksum."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ _BLOCK, _SECONDS = 2**18, 30
 def download(
     url: str, target: Path, size: int, sha256: str, progress: Callable[[int], None] = lambda _: None
 ) -> Path:
-    """Download a file unless it is present, check its size and SHA-256, and return its path. progress: called
-    with the number of bytes of each part read."""
+    """Download a file unless it exists, check its size and SHA-256, and return its path.
+
+    progress: called with the number of bytes of each block.
+    """
     if target.is_file() and target.stat().st_size == size:
         progress(size)
         return target

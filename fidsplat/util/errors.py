@@ -8,12 +8,12 @@ LONGEST = 2000
 
 
 class FidsplatError(Exception):
-    """Base of the errors that fidsplat raises deliberately. The text states the problem and the remedy."""
+    """Base of fidsplat's errors. The text states the problem and the remedy."""
 
     exit_status = 1
 
     def __str__(self) -> str:
-        text = Exception.__str__(self)  # KeyError's own text is a repr
+        text = Exception.__str__(self)  # str() of a KeyError is a repr of the text
         return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
 
 
@@ -43,11 +43,11 @@ class UnknownDeviceError(DeviceError):
 
 
 def unknown(what: str, name: object, known: Iterable[str], within: str = "", likeness: float = 0.6) -> str:
-    """Message about an unknown name, with the nearest known name and a list of all.
+    """Message about an unknown name, with the most similar known name and a list of all.
 
     Args:
-        what: kind of the name, such as "output".
-        within: prefix of the name that is not compared, such as "camera.".
+        what: what the name denotes, such as "output".
+        within: prefix of the name in the message, such as "camera.".
         likeness: minimum similarity of the suggestion, 0 to 1.
     """
     names = list(known)
@@ -59,18 +59,18 @@ def unknown(what: str, name: object, known: Iterable[str], within: str = "", lik
 
 
 def did_you_mean(name: object, known: Iterable[str], likeness: float = 0.6) -> str:
-    """The nearest known name as a question in brackets, after a space; empty if none is similar."""
+    """The most similar known name as a question in brackets, after a space; empty if none is similar."""
     near = difflib.get_close_matches(str(name)[:100].lower(), list(known), 1, likeness)
     return f" (did you mean {near[0]!r}?)" if near else ""
 
 
 def bytes_words(size: float) -> str:
-    """A number of bytes for messages, with three digits if it is small."""
+    """A number of bytes as text in KiB or MiB, for messages."""
     if size < 2**20:
         return f"{size / 2**10:.3g} KiB"
     return f"{size / 2**20:.3g} MiB" if size < 100 * 2**20 else f"{size / 2**20:.0f} MiB"
 
 
-def several(count: int, things: str) -> str:
-    """A count with its noun in the singular or plural: "1 chunk" for "chunks"."""
-    return f"{count:,} {things if count != 1 else things.removesuffix('s')}"
+def counted(count: int, nouns: str) -> str:
+    """A count with its noun in the singular or plural: "1 chunk" for 1 and "chunks"."""
+    return f"{count:,} {nouns if count != 1 else nouns.removesuffix('s')}"

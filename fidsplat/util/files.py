@@ -1,4 +1,4 @@
-"""Paths, atomic writes, and reads of regular files."""
+"""Checked paths, atomic writes, and reads of regular files."""
 
 import json
 import math
@@ -19,7 +19,7 @@ MAX_NAME, MAX_PATH = 255, 4095
 
 
 def path_of(path: str | os.PathLike[str]) -> Path:
-    """A path as pathlib.Path. Raises InputError for anything but a path that a file can have."""
+    """A path as pathlib.Path. Raises InputError for a value that cannot be the path of a file."""
     try:
         name = os.fspath(path)
     except TypeError:
@@ -48,8 +48,7 @@ def path_of(path: str | os.PathLike[str]) -> Path:
 
 
 def ordinary_file(path: str | os.PathLike[str]) -> Path:
-    """The path of a file that exists or can be created. Raises InputError for a folder, a device or a
-    pipe."""
+    """Check that a path is a regular file or does not exist; raise InputError for a folder or device."""
     target = path_of(path)
     if target.exists() and not target.is_file():
         raise InputError(
@@ -80,8 +79,8 @@ def existing(path: str | os.PathLike[str]) -> Path:
 
 
 def regular_file(path: str | os.PathLike[str]) -> Path:
-    """Check that a path is a regular file, for libraries that open files themselves. Raises InputError for a
-    folder, and for a pipe or a device, whose reading may block."""
+    """Check that a path is a regular file, for libraries that open files themselves. Raises InputError for
+    others: reading a pipe or a device may block."""
     file = existing(path)
     if not file.is_file():
         raise InputError(f"{file} must be a regular file, got {kind_of(file)}; give the name of a file")
@@ -89,7 +88,7 @@ def regular_file(path: str | os.PathLike[str]) -> Path:
 
 
 def kind_of(path: Path) -> str:
-    """Kind of a path for messages: a file, a folder, a pipe, nothing and so on."""
+    """Type of a path for messages: "a file", "a folder", "a pipe", "nothing" and so on."""
     try:
         return _KINDS.get(stat.S_IFMT(path.stat().st_mode), "something else")
     except OSError:
@@ -100,19 +99,19 @@ def open_input(path: str | os.PathLike[str]) -> BinaryIO:
     """Open an input file for binary reading. Raises InputError if it is not a regular file."""
     file = regular_file(path)
     try:
-        # O_NONBLOCK: a pipe that has replaced the file since the check is then read as empty
+        # O_NONBLOCK: if a pipe has replaced the file since the check, opening it does not block
         return os.fdopen(os.open(file, os.O_RDONLY | os.O_CLOEXEC | getattr(os, "O_NONBLOCK", 0)), "rb")
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror or error}") from error
 
 
-def read_input(path: str | os.PathLike[str], most: int | None = None, first: int | None = None) -> bytes:
-    """Read an input file, or only its `first` bytes. most: maximum size in bytes. Raises InputError if it is
-    not regular, too large, beyond `input_limit` or unreadable."""
+def read_input(path: str | os.PathLike[str], max_bytes: int | None = None, first: int | None = None) -> bytes:
+    """Read an input file, or only its `first` bytes. Raises InputError if it is not regular, unreadable,
+    larger than `max_bytes` or beyond `input_limit`."""
     with open_input(path) as stream:
         size = os.fstat(stream.fileno()).st_size
-        if most is not None and size > most:
-            raise InputError(f"{path} must have at most {most:,} bytes, got {size:,}; give another file")
+        if max_bytes is not None and size > max_bytes:
+            raise InputError(f"{path} must have at most {max_bytes:,} bytes, got {size:,}; give another file")
         if first is None:
             check_expansion(path_of(path), size, "its length")
         try:
@@ -122,14 +121,15 @@ def read_input(path: str | os.PathLike[str], most: int | None = None, first: int
 
 
 def read_text(path: str | os.PathLike[str], errors: str = "strict") -> str:
-    """Read an input file as UTF-8 with \\n as line end. Raises InputError if it cannot be read, and
-    ValueError for bytes that are not UTF-8, unless `errors` (see `bytes.decode`) allows them."""
+    """Read an input file as UTF-8, with line ends converted to \\n. Raises InputError if it cannot be read,
+    and ValueError for bytes that are not UTF-8. errors: as for `bytes.decode`."""
     return read_input(path).decode("utf-8", errors).replace("\r\n", "\n").replace("\r", "\n")
 
 
 @contextmanager
 def utf8_path(path: Path) -> Iterator[Path]:
-    """A symbolic link to a file whose name is not UTF-8, for libraries that crash on such names."""
+    """Context with a path whose name is UTF-8: the path itself, or a symbolic link to it, for libraries that
+    crash on other names."""
     try:
         os.fspath(path).encode()
     except UnicodeEncodeError:
@@ -142,12 +142,12 @@ def utf8_path(path: Path) -> Iterator[Path]:
 
 
 def printable(text: str) -> str:
-    """Text with escapes for bytes of file names that are not UTF-8, for pages and charts."""
+    """Escape the bytes of a file name that are not UTF-8, for pages and charts."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
 def from_json(text: str | bytes, finite: bool = False) -> Any:
-    """Parse JSON. Raises ValueError for anything else, and with `finite` for infinities and NaN."""
+    """Parse JSON. Raises ValueError for invalid JSON, and with `finite` for infinities and NaN."""
     numbers: dict[str, Any] = {"parse_float": _finite, "parse_constant": _finite} if finite else {}
     try:
         return json.loads(text, **numbers)
@@ -164,7 +164,7 @@ def _finite(text: str) -> float:
 @contextmanager
 def atomic_write(path: str | os.PathLike[str], durable: bool = False) -> Iterator[BinaryIO]:
     """Open a temporary file next to ``path`` for binary writing, and rename it to ``path`` after success, so
-    that no reader gets an incomplete file. durable: wait until it is on the disk, for a power cut."""
+    that ``path`` is never incomplete. durable: flush it to the disk, in case of a power failure."""
     with atomic_path(path) as part, part.open("wb") as stream:
         yield stream
         if durable:
@@ -192,8 +192,8 @@ def write_json(path: str | os.PathLike[str], value: Any, indent: int | None = No
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str], suffix: str = "") -> Iterator[Path]:
-    """An empty temporary file that is renamed to ``path`` after success, for libraries that open files.
-    suffix: ending of the temporary name."""
+    """Create an empty temporary file, and rename it to ``path`` after success, for libraries that open files.
+    suffix: suffix of the temporary name."""
     interrupts.check()
     target = ordinary_file(path)
     try:
@@ -216,7 +216,7 @@ def atomic_path(path: str | os.PathLike[str], suffix: str = "") -> Iterator[Path
 
 
 def writable_folder(path: str | os.PathLike[str]) -> Path:
-    """Create a folder with its parents and check that a file can be written in it, before long work."""
+    """Create a folder with its parents, and check that it is writable."""
     folder = path_of(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -238,7 +238,7 @@ def user_cache() -> Path:
 
 
 def _umask() -> int:
-    # setting the mask is the only portable way to read it; temporary files are created with 0600
+    # the only portable way to read the mask is to set it
     mask = os.umask(0)
     os.umask(mask)
     return mask
@@ -248,10 +248,10 @@ def kernels_folder() -> Path:
     """The folder of the kernels: `kernels/` next to the package in a checkout, `fidsplat/_kernels` in a
     wheel."""
     here = Path(__file__).resolve().parents[1]
-    places = (here / "_kernels", here.parent / "kernels")
-    for place in places:
-        if (place / "opencl").is_dir():
-            return place
+    folders = (here / "_kernels", here.parent / "kernels")
+    for folder in folders:
+        if (folder / "opencl").is_dir():
+            return folder
     raise DeviceError(
-        f"the kernels are missing: neither {places[0]} nor {places[1]} is there; reinstall fidsplat"
+        f"the kernels must be in {folders[0]} or {folders[1]}, got neither folder; reinstall fidsplat"
     )

@@ -1,9 +1,8 @@
-"""Cooperative cancellation: SIGINT and SIGTERM set a flag, and work stops at its next step.
+"""Cooperative cancellation: SIGINT and SIGTERM set a flag, and work stops at its next call of `check`.
 
-The handler does not raise, as its exception could arise between any two instructions: in a finalizer or a
-callback of a library, which would discard it, or while a library loads, which would abort the process.
-`check`, called by the work, raises instead. A second signal, half a second later or more, raises immediately,
-for work without frequent steps; a third ends the process.
+The handler does not raise, as its exception could interrupt any code: a finalizer or a callback of a library
+would discard it, and a library that is being loaded would abort the process. A second signal, at least half a
+second later, raises immediately, for work that seldom calls `check`. A third signal ends the process.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import signal
 import threading
 import time
 
-TYPE_CHECKING = False  # this module is loaded first, so that slow imports come later
+TYPE_CHECKING = False  # not imported from typing: this module is loaded first, before slow imports
 if TYPE_CHECKING:
     import subprocess
     from collections.abc import Callable, Iterator, Sequence
@@ -27,23 +26,24 @@ if TYPE_CHECKING:
 PERIOD = 0.1
 """seconds between two checks of the flag while waiting"""
 REPEAT = 0.5
-"""seconds in which a second signal counts as a duplicate: `timeout` and shells signal a process and its
-group"""
+"""seconds in which a second signal counts as a duplicate, as `timeout` and shells signal a process and also
+its group"""
 
 _number: int | None = None
 """number of the received signal"""
 _since = 0.0
-"""time of the signal, time.monotonic()"""
+"""time.monotonic() of the signal"""
 _postponed = 0
+"""number of active `postponed` blocks"""
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM. It stops a command like Ctrl-C, so that incomplete files are removed."""
+    """Exception for SIGTERM, which stops a command like Ctrl-C, so that incomplete files are removed."""
 
 
 def install() -> dict[int, Any]:
-    """Let SIGINT and SIGTERM set the flag, unless they are ignored; returns the replaced handlers. Outside
-    the main thread nothing changes."""
+    """Let SIGINT and SIGTERM set the flag, unless they are ignored, and return the replaced handlers; does
+    nothing outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         return {}
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -70,8 +70,7 @@ def handled() -> Iterator[None]:
 
 
 def check() -> None:
-    """Raise KeyboardInterrupt, or Terminated, in the main thread after a signal. Work calls it at each
-    step."""
+    """Raise KeyboardInterrupt or Terminated after a signal, in the main thread; work calls it regularly."""
     if _number is not None and not _postponed and threading.current_thread() is threading.main_thread():
         raise _stop(_number)
 
@@ -79,7 +78,7 @@ def check() -> None:
 @contextlib.contextmanager
 def postponed() -> Iterator[Callable[[], KeyboardInterrupt | None]]:
     """Disable `check` within the block, so that work is completed or saved. Yields a function that returns
-    the exception to raise after a signal, and None before."""
+    the exception of a received signal, or None."""
     global _postponed
     _postponed += 1
     try:
@@ -89,7 +88,7 @@ def postponed() -> Iterator[Callable[[], KeyboardInterrupt | None]]:
 
 
 def result_of(future: Future[T]) -> T:
-    """The result of a task in another thread; signals interrupt the waiting."""
+    """Wait for the result of a task in another thread; signals interrupt the waiting."""
     from concurrent.futures import wait
 
     while not wait([future], PERIOD).done:
@@ -98,7 +97,7 @@ def result_of(future: Future[T]) -> T:
 
 
 def sleep(seconds: float) -> None:
-    """Sleep until a signal arrives or the time has passed."""
+    """Sleep for a time; signals interrupt it."""
     end = time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0:
         check()

@@ -1,5 +1,5 @@
-"""Limits: memory that input files may expand to, and limits of the process (`ulimit`) below which
-libraries and drivers crash. The standard library is all that this module imports."""
+"""Limits: memory that input files may expand to, and limits of the process (`ulimit`) below which libraries
+and drivers crash. This module imports only the standard library, as it runs before slow imports."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ except ImportError:  # Windows has no such limits
     resource = None
 
 VARIABLE = "FIDSPLAT_INPUT_LIMIT"
-"""environment variable with a number of bytes that replaces the limit"""
+"""environment variable with a number of bytes that replaces the limit of a file"""
 FLOOR = 2**29
-"""bytes that any file may expand to; an image of one colour is a thousand times larger than its PNG"""
+"""bytes that any file may expand to, as an image of one colour is a thousand times larger than its PNG"""
 RATIO = 64
-"""ratio to its size on disk that a larger file may expand to; SOG and SPZ files expand about 20 times"""
+"""maximum ratio of a larger file's expanded size to its size; SOG and SPZ files expand about 20 times"""
 
 
 def input_limit(size: int) -> int:
-    """Bytes that a file of a size may expand to: `FIDSPLAT_INPUT_LIMIT`, else the larger of 512 MiB and 64
-    times its size, but at most half of the machine's memory."""
+    """Bytes that a file of `size` bytes may expand to: `FIDSPLAT_INPUT_LIMIT`, or else 64 times its size, at
+    least 512 MiB and at most half of the machine's memory."""
     text = os.environ.get(VARIABLE)
     if text is None:
         return min(max(FLOOR, RATIO * size), _half_of_memory())
@@ -42,8 +42,8 @@ def _half_of_memory() -> int:
 
 
 def check_total(what: str, need: int, remedy: str) -> None:
-    """Raise InputError if the parts of a scene together need more memory than `FIDSPLAT_INPUT_LIMIT`, by
-    default half of the machine's memory."""
+    """Raise InputError if a scene needs more bytes of memory than `FIDSPLAT_INPUT_LIMIT`, by default half of
+    the machine's memory."""
     limit = input_limit(0) if VARIABLE in os.environ else _half_of_memory()
     if need > limit:
         raise InputError(
@@ -55,9 +55,12 @@ def check_total(what: str, need: int, remedy: str) -> None:
 def check_expansion(path: Path | str, need: float, what: str, size: int | None = None) -> None:
     """Raise InputError if a file would expand beyond `input_limit`.
 
-    path: the file, or with a size a description of its part. need: bytes of memory after expansion. what:
-    declared content, for the message: "100,000,000 splats". size: bytes of the file or of its compressed
-    part; None: those on the disk, without the holes of a sparse file.
+    Args:
+        path: the file; with `size`, any description of the compressed data.
+        need: bytes of memory after expansion.
+        what: declared content, for the message: "100,000,000 splats".
+        size: bytes of the compressed data; None: bytes of the file on the disk, without the holes of a sparse
+            file.
     """
     if size is None:
         status = Path(path).stat()
@@ -71,8 +74,7 @@ def check_expansion(path: Path | str, need: float, what: str, size: int | None =
 
 
 def check_holes(path: Path | str) -> None:
-    """Raise InputError for a sparse file that is much larger than its data on the disk, for memory-mapped
-    files."""
+    """Raise InputError if a file to be memory-mapped is sparse and much larger than its data on the disk."""
     status = Path(path).stat()
     stored = 512 * status.st_blocks
     if status.st_size > (limit := max(input_limit(0), RATIO * stored)):
@@ -92,7 +94,7 @@ _OPEN_FILES = 32
 
 
 def check_imports() -> None:
-    """Raise InputError if the limit on memory is too low for imports, as OpenBLAS would crash."""
+    """Raise InputError if the memory limit is too low for imports, in which OpenBLAS would crash."""
     needed = _IMPORTS + _cores() * _PER_CORE
     if (space := _limit("RLIMIT_AS")) < needed:
         raise InputError(
@@ -103,8 +105,8 @@ def check_imports() -> None:
 
 @cache
 def check_driver(family: str) -> None:
-    """Raise DeviceError if a limit is too low for the driver of a family, which would abort the process.
-    Checked once, as the loaded driver counts as used memory."""
+    """Raise DeviceError if a limit is so low that the driver of a device family would abort the process.
+    Checked only once, as a loaded driver already uses its memory."""
     if (largest := _limit("RLIMIT_FSIZE")) < _FILE:
         raise DeviceError(
             f"the limit on file size must be at least {bytes_words(_FILE)} for compiled kernels, got "

@@ -1,4 +1,4 @@
-"""Text as Markdown and HTML."""
+"""Markdown and HTML of text, summaries and tables."""
 
 import html
 import re
@@ -9,7 +9,7 @@ _SPACE = re.compile(r"\s+")
 
 
 def escaped(text: object) -> str:
-    """Text as one line of Markdown, with character references for HTML, links, images and table cells.
+    """Text as one line of Markdown, with the characters of HTML, links, images and tables escaped.
 
     Emphasis and code (`*`, `_`, a backtick) are not escaped, as they change only the typeface.
     """
@@ -17,7 +17,7 @@ def escaped(text: object) -> str:
 
 
 class Summarised:
-    """Base of classes with a short summary, which notebooks show as a table."""
+    """Base of classes with a short summary, which notebooks display as a table."""
 
     def summary(self) -> dict[str, str]:
         """Short descriptions by name."""

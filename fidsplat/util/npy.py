@@ -21,14 +21,16 @@ _MAGIC = b"\x93NUMPY\x01\x00"
 
 
 def load_npy(file: Path) -> np.ndarray:
-    """The array of a .npy file, read-only. Raises ValueError for damaged content or Python objects."""
+    """Read the array of a .npy file, read-only. Raises ValueError for damaged data or Python objects."""
     with open_input(file) as stream:
         return _array(stream.read())
 
 
 def load_npz(file: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file of `numpy.savez`, or those of some names, read-only, with their CRC-32
-    checked. Raises ValueError if an array is missing, damaged or compressed, or holds Python objects."""
+    """Read all or named arrays of a .npz file of `numpy.savez`, read-only, and check their CRC-32.
+
+    Raises ValueError if an array is missing, damaged, compressed or contains Python objects.
+    """
     with open_input(file) as stream:
         try:
             with ZipFile(stream) as members:

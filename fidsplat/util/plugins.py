@@ -9,7 +9,7 @@ from typing import Any
 
 @cache
 def load_plugins(group: str, register: Callable[[Any], None]) -> None:
-    """Register the objects of a group's entry points, once per process. A plugin that fails is a warning."""
+    """Register the objects of a group's entry points, once per process; warn about plugins that fail."""
     for entry in entry_points(group=group):
         try:
             register(entry.load())

@@ -21,19 +21,19 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 _REBUILDING = {"fidsplat", "numpy", "copyreg"}
 """packages whose functions are allowed in pickles, as they restore data"""
 _WITHOUT_SOURCES = {"__pycache__", "_kernels"}
-"""folders of the package without sources of its own; a wheel has the kernels in one of them"""
+"""folders of the package to skip: bytecode, and a wheel's copy of the kernels"""
 
 
 def digest_of(content: object) -> str:
     """SHA-256 of plain data as 16 hexadecimal digits. Raises PicklingError, AttributeError or TypeError for
-    others."""
+    functions and other objects."""
     digest = _Digest()
     _DataPickler(digest, protocol=5).dump(content)
     return digest.sha.hexdigest()[:16]
 
 
 class _DataPickler(pickle.Pickler):
-    """Pickler that refuses functions, of which pickle stores only the names."""
+    """Pickler that refuses functions, since a pickle contains only their names."""
 
     def persistent_id(self, obj: Any) -> None:
         known = (getattr(obj, "__module__", None) or "").partition(".")[0] in _REBUILDING
@@ -55,8 +55,8 @@ class _Digest:
 
 @cache
 def code_hash() -> str:
-    """SHA-256 of all files of the package and the kernels, as 16 hexadecimal digits, equal in a checkout and
-    a wheel."""
+    """SHA-256 of all files of the package and the kernels, as 16 hexadecimal digits; a checkout and its wheel
+    have the same."""
     found = hashlib.sha256()
     for name, file in sorted(sources().items()):
         content = file.read_bytes()
@@ -77,8 +77,11 @@ def sources() -> dict[str, Path]:
 
 
 def run_facts(device: str | None, seed: int, versions: Mapping[str, str] | None = None) -> dict:
-    """Provenance of a run as plain data. device: title and driver of the rendering device. seed: of texts,
-    views and scenes. versions: those of other packages by name."""
+    """Provenance of a run as plain data.
+
+    device: title and driver of the rendering device. seed: seed of the run. versions: versions of other
+    packages by name.
+    """
     return {
         "device": device,
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",

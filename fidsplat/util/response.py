@@ -1,4 +1,4 @@
-"""Response of a camera: from linear light to colours, and its inverse. Values above 1 are kept."""
+"""Response curve of a camera, from linear light to colours, and its inverse; values above 1 are kept."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def to_light(colors: np.ndarray, response: str | float, dtype: type = np.float64) -> np.ndarray:
-    """Linear light of colours, computed as `dtype`; the curve of sRGB continues above 1."""
+    """Linear light of colours, computed in `dtype`; the sRGB curve is extended above 1."""
     colors = np.maximum(np.asarray(colors, dtype), 0)
     if response == "linear":
         return colors

@@ -1,4 +1,4 @@
-"""Standard streams of the process: closed ones, and messages that libraries write to stderr."""
+"""Standard streams of the process: replace closed ones, and discard output."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ _users, _copy = 0, -1
 
 
 def open_missing() -> None:
-    """Replace a closed stdin, stdout or stderr by the null device. Otherwise the next opened file would take
-    its descriptor and receive the output."""
+    """Replace a closed stdin, stdout or stderr by the null device; otherwise the next opened file would have
+    its descriptor, and receive the output."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            # takes the lowest free descriptor, which is the missing one
+            # open() uses the lowest free descriptor, which is the missing one
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 it stays open
 
 
 def discard_stdout() -> None:
     """Discard further output on stdout, including Python's final flush."""
-    with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor is not flushed at the end
+    with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor has no final flush
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

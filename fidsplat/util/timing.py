@@ -1,4 +1,4 @@
-"""Interleaved timing: compared functions run alternately, so that disturbances affect all of them.
+"""Interleaved timing: functions run alternately, so that disturbances affect all of them.
 
 ```python
 ours, theirs = Timer(render_ours), Timer(render_theirs)
@@ -23,8 +23,7 @@ WARM_UP = 2
 
 
 class Clock:
-    """A clock in seconds that the timed work advances itself, for stages timed by the device or a child
-    process."""
+    """A clock in seconds that the timed work advances, for times by the device or a child process."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -98,7 +97,7 @@ def frame_timer(
     clock: Callable[[], float] = time.perf_counter,
     **how,
 ) -> Timer:
-    """A timer of frames, `renderer.render(scene, camera, **how)`, that stay on the device. A run ends when
+    """A timer of `renderer.render(scene, camera, **how)` with the frame left on the device. A run ends when
     the device is done; its parts are the stages, by the device's clock."""
     render = lambda: renderer.render(scene, camera, **how).wait()  # noqa: E731
     return Timer(render, clock, catch_errors, parts=lambda frame: frame.timings)

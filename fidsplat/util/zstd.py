@@ -1,4 +1,4 @@
-"""Zstandard frames: compression, and decompression to a known size."""
+"""Compression to Zstandard frames, and decompression to a known size."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def decompress(data: bytes | memoryview, size: int) -> bytes:
     """The content of a frame of `size` bytes. Raises ValueError for damaged data or another size."""
     library = _library()
     try:
-        # a frame declares its own size, which the other calls would allocate unchecked
+        # other calls allocate the size that the frame declares, unchecked
         with library.ZstdDecompressor(max_window_size=2**27).stream_reader(bytes(data)) as stream:
             found = stream.read(size + 1)
     except library.ZstdError as error:

@@ -132,4 +132,4 @@ def test_missing_kernels_are_a_clear_error(tree, tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", ASK, str(tmp_path)], cwd=tmp_path, capture_output=True, text=True, env=clean()
     )
-    assert "DeviceError: the kernels are missing" in done.stderr
+    assert "DeviceError: the kernels must be in" in done.stderr

@@ -343,7 +343,7 @@ def test_coplanar_groups_of_stores_are_part_of_every_frame(tmp_path, reference):
         [prepare(store, fs.Capture(look(at=(0, 0, 90))))[1]],
         prepare(store, fs.Capture(near))[0],
     )
-    part = ChunkedSplats([store]).part(selection)
+    part = ChunkedSplats([store]).load(selection)
     assert len(part) == len(marker)
     assert ChunkedSplats([store]).ids(selection).tolist() == list(range(len(store) - len(marker), len(store)))
 
