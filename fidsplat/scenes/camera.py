@@ -1,4 +1,4 @@
-"""Lenses, shutters and keyframes in scene files: the tables below [camera]."""
+"""Lenses, shutters and keyframes in scene files: the subtables of [camera]."""
 
 import math
 from collections.abc import Callable
@@ -48,8 +48,8 @@ def read_lens(camera: Table) -> Lens | None:
 
 
 def read_focal_lengths(camera: Table, width: int, height: int, lens: Lens | None) -> tuple[float, float]:
-    """fx and fy of a [camera] table: pixels, per radian for a fisheye or panorama, per metre for parallel
-    rays."""
+    """fx and fy of a [camera] table, in pixels; per radian for a fisheye or panorama, per metre for an
+    orthographic lens."""
     if isinstance(lens, Orthographic):
         table = camera.table("orthographic", ORTHOGRAPHIC)
         if "metres_wide" in table:
@@ -83,7 +83,7 @@ def read_focal_lengths(camera: Table, width: int, height: int, lens: Lens | None
 
 
 def lens_table(camera: Camera) -> tuple[str, dict[str, float]] | None:
-    """Name and content of the table of a camera's lens; None for a pinhole."""
+    """Name and values of the table of a camera's lens; None for a pinhole."""
     lens = camera.lens
     if lens is None:
         return None

@@ -16,12 +16,12 @@ from fidsplat.util.files import from_json, user_cache
 MIRROR = "FIDSPLAT_SCENES"
 """environment variable with a folder or URL that replaces the address of the files"""
 _WAIT = 0.5
-"""seconds to wait for a download that runs meanwhile"""
+"""seconds to wait for a download in the background"""
 
 
 @dataclass(frozen=True)
 class CapturedScene:
-    """A public capture: its author and licence, and its files with sizes and checksums."""
+    """A public captured scene: author, licence, and files with sizes and checksums."""
 
     name: str
     title: str
@@ -32,7 +32,7 @@ class CapturedScene:
     url: str
     """address of the folder of its files"""
     open: str
-    """the file that readers open"""
+    """name of the file to load"""
     files: dict[str, tuple[int, str]]
     """size in bytes and SHA-256 of each file"""
 
@@ -55,13 +55,11 @@ def captured_scenes() -> dict[str, CapturedScene]:
 
 
 def fetch_scene(name: str, progress: Callable[[str, float], None] = lambda *_: None) -> Path:
-    """Path of a captured scene in the user's cache, downloaded on first use.
+    """Path of a captured scene in the user's cache; downloads it on first use, from `MIRROR` if it is set.
 
-    FIDSPLAT_SCENES: environment variable with a folder or URL to read the files from instead.
+    progress: called with the current step and its share done, 0 to 1.
 
-    progress: callback of the current task and its completed share, 0 to 1.
-
-    Raises InputError for an unknown name, or if a file cannot be downloaded or differs from its checksum.
+    Raises InputError for an unknown name, a failed download or a wrong checksum.
     """
     if name not in captured_scenes():
         raise InputError(unknown("name of a captured scene", name, captured_scenes()))
@@ -80,10 +78,10 @@ def fetch_scene(name: str, progress: Callable[[str, float], None] = lambda *_: N
 
 
 def fetch_meanwhile(name: str) -> Callable[[], str]:
-    """Download a captured scene in a thread. Returns a function that returns why it is missing, or "".
+    """Download a captured scene in a thread. Returns a function that returns why the scene is missing, or "".
 
-    A thread that hangs at the end of the process keeps the globals of its functions alive; those of this
-    module hold no objects of zxing-cpp, which would report them as leaks.
+    This module must not import zxing-cpp: a thread that hangs at the end of the process keeps the globals of
+    its module alive, which zxing-cpp would report as leaks.
     """
     found: list[str] = []
 
@@ -94,7 +92,7 @@ def fetch_meanwhile(name: str) -> Callable[[], str]:
         except InputError as error:
             found.append(str(error))
 
-    thread = Thread(target=fetch, daemon=True)  # the command ends although a download hangs
+    thread = Thread(target=fetch, daemon=True)  # a hanging download must not block the end of the command
     thread.start()
 
     def missing() -> str:

@@ -20,7 +20,7 @@ _Part = TypeVar("_Part", Sensor, Fog)
 
 
 def read_part(top: Table, name: str, kind: type[_Part]) -> _Part | None:
-    """The sensor or the fog of a scene file; None if it has none. Raises InputError, naming the key."""
+    """The sensor or the fog of a scene file; None without the table. Raises InputError with the key."""
     if name not in top:
         return None
     table = top.table(name, names_of(kind))
@@ -29,7 +29,7 @@ def read_part(top: Table, name: str, kind: type[_Part]) -> _Part | None:
 
 
 def read_background(top: Table, folder: Path) -> Gradient | Panorama | None:
-    """The background of a scene file's own table; None if it has none. Raises InputError, naming the key."""
+    """The background of the table [background]; None without it. Raises InputError with the key."""
     if "background" not in top:
         return None
     table = top.table("background", BACKGROUND)
@@ -50,16 +50,16 @@ def environment_tables(scene: SceneParts, folder: Path) -> dict[str, dict]:
     Raises InputError for a panorama that was not loaded from a file.
     """
     tables: dict[str, dict] = {}
-    around = scene.background
-    if isinstance(around, Gradient):
-        tables["background"] = {name: list(getattr(around, name)) for name in names_of(Gradient)}
-    elif isinstance(around, Panorama):
-        if around.file is None:
+    background = scene.background
+    if isinstance(background, Gradient):
+        tables["background"] = {name: list(getattr(background, name)) for name in names_of(Gradient)}
+    elif isinstance(background, Panorama):
+        if background.file is None:
             raise InputError(
                 "a background panorama must be loaded from a file to be saved, got an array; write it as an "
                 "image and use Panorama.load"
             )
-        tables["background"] = {"image": os.path.relpath(around.file, folder)}
+        tables["background"] = {"image": os.path.relpath(background.file, folder)}
     if scene.fog is not None:
         tables["fog"] = {"density": float(scene.fog.density), "color": list(scene.fog.color)}
     if scene.sensor is not None:
@@ -71,7 +71,7 @@ def environment_tables(scene: SceneParts, folder: Path) -> dict[str, dict]:
 
 
 def read_quality(top: Table, render: Table) -> Quality | str | None:
-    """Quality of a scene file: the table [quality], or the text `quality` of [render]."""
+    """Quality of a scene file: the table [quality], or the key `quality` of [render]."""
     # samples, lowpass and first_hit are keys of [render] in files without [quality]
     older = {"samples": render.whole, "lowpass": render.text, "first_hit": render.number}
     given = [key for key in ("quality", *older) if key in render]
@@ -118,9 +118,7 @@ def _changes(given: Quality | MarkerQuality, plain: Quality | MarkerQuality) -> 
 def marker_settings(quality: MarkerQuality, scene: Quality | str | None) -> dict[str, Any]:
     """Settings of a marker that differ from the scene's quality."""
     changes = _changes(quality, Quality.of(scene).marker)
-    if (
-        "growth" in changes and quality.growth is None
-    ):  # a file cannot express None, the default of the mixture
+    if "growth" in changes and quality.growth is None:  # TOML has no None, the default of the mixture
         from fidsplat.markers.mixture import fitted_growth
 
         changes["growth"] = fitted_growth() if quality.mixture == "fitted" else 0.0

@@ -1,4 +1,4 @@
-"""Lights of a scene, and the model of a marker's colours in their light."""
+"""Lights of a scene, and the reflection model of markers."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ SOURCES = ("scene", "lights")
 VIEWS = ("any", "camera")
 MAX_SAMPLES = 1024
 GRIDS = (1, 2, 3, 5, 9, 17)
-"""numbers of panoramas along a side; a finer grid contains the points of the coarser ones"""
+"""allowed numbers of panoramas along a side; each grid contains the points of the coarser ones"""
 
 
 @dataclass(frozen=True)
 class Lighting:
-    """Model of the colours of a marker in the light that it receives.
+    """Reflection model of a marker: its colours in the light of the scene.
 
     The reflectance of a splat of colour c is `ink` + (`paper` - `ink`) c, with c in linear light. Matte
-    paper of reflectance 1 under radiance L from all sides has the radiance L. Raises InputError for a value
-    out of range.
+    paper of reflectance 1 under radiance L from all directions has the radiance L. Raises InputError for a
+    value out of range.
     """
 
     source: str = "scene"
-    """"scene": the splats and background around the marker, and the scene's lights; "lights": these only"""
+    """"scene": light from splats, background and lights of the scene; "lights": from its lights only"""
     paper: float = 0.85
     """reflectance of white, 0 to 1"""
     ink: float = 0.05
@@ -60,16 +60,16 @@ class Lighting:
     """response of the scene's colours to light: "srgb", "linear", or a gamma as in `Sensor.response`; values
     above 1 are kept"""
     ambient: tuple[float, float, float] | None = None
-    """linear RGB radiance where the panorama contains no splats; None: the scene's background"""
+    """linear RGB radiance of the directions without splats; None: the scene's background"""
     rows: int = 64
-    """rows of the panorama that is rendered at each measured point, 8 to 1024"""
+    """height in pixels of the panoramas by which light is measured, 8 to 1024"""
     panoramas: int = 5
-    """largest number of panoramas along a side: 1, 2, 3, 5, 9 or 17; fewer where `step` holds"""
+    """maximum number of panoramas along a side of the marker: 1, 2, 3, 5, 9 or 17"""
     step: float = 0.02
-    """largest difference of colour within a rectangle, above which it is split; and of interpolated light,
-    relative to the marker's largest, above which more panoramas are rendered"""
+    """largest difference of colour within a rectangle, above which the rectangle is split; and largest error
+    of interpolated light, relative to the marker's largest light, above which more panoramas are rendered"""
     clearance: float | None = None
-    """splats within this many metres in front of the marker do not occlude light; None: size / 20"""
+    """distance in front of the marker [m] within which splats do not occlude light; None: size / 20"""
 
     def __post_init__(self) -> None:
         python_scalars(self)
@@ -97,14 +97,14 @@ class Lighting:
             number("light: response", self.response, requirement, *GAMMAS)
 
     def displayed(self, radiance: np.ndarray) -> np.ndarray:
-        """Colours of radiance that the marker reflects."""
+        """Colours of reflected radiance."""
         with np.errstate(over="ignore"):
             return np.minimum(to_colors(self.exposure * radiance, self.response), LARGEST)
 
     @staticmethod
     def of(value: Any) -> Lighting | None:
-        """A Lighting from itself, a text such as "lights,roughness=0.3", or None. Raises InputError for
-        anything else."""
+        """Convert a text such as "lights,roughness=0.3" to a Lighting; a Lighting and None stay the same.
+        Raises InputError for anything else."""
         if value is None or isinstance(value, Lighting):
             return value
         if isinstance(value, str):
@@ -115,19 +115,18 @@ class Lighting:
 
 @dataclass(frozen=True, kw_only=True)
 class Light:
-    """A light in the scene: the common part of `Sun`, `PointLight` and `SpotLight`.
+    """Base of the lights of a scene, `Sun`, `PointLight` and `SpotLight`.
 
-    Lights illuminate markers with `light`; captured splats keep their colours. Raises InputError for a value
-    out of range.
+    Lights illuminate markers with a `light`, not captured splats. Raises InputError for a value out of range.
     """
 
     kind: ClassVar[str]
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """linear RGB, factors of the intensity, at least 0"""
+    """linear RGB factors of the intensity, at least 0"""
     intensity: float = 1.0
-    """irradiance of a surface that faces the sun; of other lights that at a distance of 1 m on the axis"""
+    """irradiance of a surface that faces the light, for point and spot lights 1 m away on the axis"""
     samples: int = 32
-    """points of the light from which shadows are rendered, 1 to 1024; more make softer edges smoother"""
+    """number of points on the light from which shadows are rendered, 1 to 1024; more smooth soft shadows"""
 
     def __post_init__(self) -> None:
         python_scalars(self)
@@ -157,7 +156,7 @@ class Sun(Light):
 
     kind: ClassVar[str] = "sun"
     direction: tuple[float, float, float]
-    """world direction in which its light travels, of any length"""
+    """direction of propagation of the light in the world, of any length"""
     angle: float = math.radians(0.53)
     """angular diameter in radians, 0 to 3"""
 
@@ -172,9 +171,9 @@ class PointLight(Light):
 
     kind: ClassVar[str] = "point"
     position: tuple[float, float, float]
-    """metres in the world"""
+    """centre in the world [m]"""
     radius: float = 0.0
-    """metres"""
+    """radius [m]"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -189,9 +188,9 @@ class SpotLight(PointLight):
     direction: tuple[float, float, float]
     """axis of the cone in the world, of any length"""
     inner: float = 0.0
-    """angle from the axis in radians up to which the intensity is constant"""
+    """angle from the axis [rad] up to which the intensity is constant"""
     outer: float = math.radians(45)
-    """angle from the axis in radians from which it is 0, above `inner`, at most pi / 2"""
+    """angle from the axis [rad] from which the intensity is 0, above `inner`, at most pi / 2"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -207,7 +206,7 @@ _ANGLES = {"angle", "inner", "outer"}
 
 
 def read_lights(top: Table) -> tuple[Light, ...]:
-    """The lights of the tables [[lights]]. Raises InputError, naming the key."""
+    """The lights of the tables [[lights]]. Raises InputError with the key."""
     found = []
     every = {_key(name) for kind in LIGHTS.values() for name in names_of(kind)}
     for any_kind in top.tables("lights", ("kind", *sorted(every))):
@@ -220,7 +219,7 @@ def read_lights(top: Table) -> tuple[Light, ...]:
 
 
 def light_tables(lights: tuple[Light, ...]) -> Iterator[dict[str, Any]]:
-    """Content of the tables [[lights]]."""
+    """Tables [[lights]] of lights."""
     for light in lights:
         changes = changes_of(light)
         changes |= {name: math.degrees(changes[name]) for name in _ANGLES & changes.keys()}
@@ -228,7 +227,7 @@ def light_tables(lights: tuple[Light, ...]) -> Iterator[dict[str, Any]]:
 
 
 def read_lighting(marker: Table) -> Lighting | None:
-    """The light of a [[markers]] table: the name of a source, or a table. Raises InputError."""
+    """Parse the key `light` of a [[markers]] table: the name of a source, or a table."""
     if "light" not in marker:
         return None
     if marker.is_text("light"):

@@ -42,12 +42,12 @@ class PlacedMarker(PickledByFields):
     label: int = 1
     """label of its splats; a Scene numbers its markers 1, 2, ..."""
     motion: Pose | None = None
-    """its pose at a time in seconds; None: constant"""
+    """pose at a time [s]; None: constant"""
     bundle: str | None = None
-    """name of the rigid object that it is attached to; markers of a bundle are detected as one pose"""
+    """name of the rigid object of several markers, whose poses are detected together"""
     light: Lighting | str | None = None
-    """colours from light when the scene is rendered: "scene", "lights" or a Lighting; None: the marker's own.
-    A moving marker keeps the light of its initial pose."""
+    """light that determines the rendered colours: "scene", "lights" or a Lighting; None: the marker's own
+    colours. The light of a moving marker is that at its initial pose."""
 
     def __post_init__(self) -> None:
         given = pose_matrix(self.pose, "a marker's pose")
@@ -84,10 +84,10 @@ class SceneParts(PickledByFields):
     """Data of a scene. Raises InputError for a field of the wrong type."""
 
     clouds: tuple[SplatCloud, ...] = ()
-    """splats in the world, with labels of their own (0 unless given)"""
+    """splats in the world, with their own labels"""
     camera: Camera | None = None
     markers: tuple[PlacedMarker, ...] = ()
-    """markers; marker i gets the label i + 1, whatever label it had"""
+    """markers; the label of marker i is set to i + 1"""
     background: Background = (0.0, 0.0, 0.0)
     """RGB in display space, a Gradient or a Panorama"""
     outputs: tuple[str, ...] = ("rgb",)
@@ -95,20 +95,20 @@ class SceneParts(PickledByFields):
     quality: Quality | str | None = None
     """a Quality, text (`Quality.of`), or None for the default"""
     device: str | None = None
-    """a device's name, or None for the default"""
+    """name of a device, or None for the default"""
     shutter: Shutter | None = None
     """time, exposure and readout; None: an instantaneous shutter at time 0"""
     camera_motion: Pose | None = None
-    """world_to_camera at a time in seconds; None: constant"""
+    """world_to_camera at a time [s]; None: constant"""
     sensor: Sensor | None = None
     """sensor model applied to rgb"""
     fog: Fog | None = None
     """fog between camera and splats"""
     stores: tuple[Store, ...] = ()
-    """splats on disk, in the world, with labels of their own; visible chunks are read"""
+    """splats on disk, in the world, with their own labels; visible chunks are read"""
     cloud_motions: Mapping[int, Pose] = field(default_factory=dict)
-    """number of a moving cloud -> its rigid world motion at a time in seconds; the cloud gets a unique label,
-    above those of markers"""
+    """rigid world motion at a time [s] of moving clouds, by index; these clouds have unique labels above
+    those of markers"""
     lights: tuple[Light, ...] = ()
     """lights that illuminate the markers with `light`"""
 
@@ -117,7 +117,7 @@ class SceneParts(PickledByFields):
         put(self, "clouds", _all_of(self.clouds, SplatCloud, "clouds"))
         put(self, "stores", _all_of(self.stores, Store, "stores"))
         put(self, "lights", _all_of(self.lights, Light, "lights"))
-        Motion(self.camera_motion)  # reports an invalid motion here rather than when rendering
+        Motion(self.camera_motion)  # raises for an invalid motion
         moving = self.cloud_motions
         if not isinstance(moving, Mapping) or not all(map(callable, moving.values())):
             raise InputError(
@@ -162,10 +162,7 @@ class SceneParts(PickledByFields):
         )  # fmt: skip
 
     def cloud(self) -> SplatCloud:
-        """All splats in one cloud: stores (read completely), clouds, then markers.
-
-        Clouds keep their labels unless they move.
-        """
+        """All splats in one cloud: stores (read completely), clouds, then markers."""
         return self.splats.cloud() if isinstance(self.splats, ChunkedSplats) else self.splats
 
     @cached_property
@@ -175,7 +172,7 @@ class SceneParts(PickledByFields):
 
     @property
     def content(self) -> SplatCloud | tuple:
-        """Identity of the splats for digests: the cloud, or the identities of stores and the cloud."""
+        """The splats for digests: the cloud, or digests of the stores and the cloud in memory."""
         return self.splats.content if isinstance(self.splats, ChunkedSplats) else self.splats
 
     @cached_property

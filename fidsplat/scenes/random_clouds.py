@@ -1,7 +1,7 @@
 """Random clouds, identical on every machine for the same seed.
 
-`load_scene` returns large scenes for timing, similar to captured ones. `random_splats` returns small clouds
-with extreme opacities for tests. `fidsplat.selftest` has scenes with invalid or extreme values."""
+`load_scene` returns large scenes for timing, `random_splats` small clouds with extreme opacities for tests.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HARD_OPACITIES = np.array([0.002, 0.05, 0.3, 0.5, 0.9, 0.99, 1.0], np.float32)
 
 @dataclass(frozen=True)
 class StandardScene:
-    """A cube of random splats, 8 m wide, with its centre 8 m in front of the camera."""
+    """A random cloud in a cube of 8 m, whose centre is 8 m in front of the camera."""
 
     count: int
     median_scale: float
@@ -50,14 +50,14 @@ def load_scene(name: str, seed: int = 0) -> tuple[SplatCloud, Camera]:
 
 
 def standard_camera(width: int, height: int) -> Camera:
-    """The scenes' camera, 60 degrees wide."""
+    """The camera of the scenes, with a field of view of 60 degrees."""
     focal = 0.5 * width / math.tan(math.radians(30))
     return Camera.pinhole(width, height, focal, focal, width / 2, height / 2)
 
 
 def random_cloud(count: int, median_scale: float, seed: int = 0, thick: bool = False) -> SplatCloud:
-    """`count` splats: centres uniform in a cube of 8 m, orientations uniform, scales log-normal, opacities
-    beta(1.2, 1). thick: with a third scale."""
+    """Random splats: centres uniform in a cube of 8 m, orientations uniform, scales log-normal, opacities
+    beta(1.2, 1). thick: whether they are 3D Gaussians."""
     generator = np.random.default_rng(seed)
     means = generator.uniform(-4.0, 4.0, (count, 3)).astype(np.float32)
     means[:, 2] += 8.0
@@ -80,7 +80,7 @@ def random_splats(
     across: float = 2.0,
     sh_degree: int | None = None,
 ) -> SplatCloud:
-    """Splats around a camera at the origin that looks down +z, with opacities of `HARD_OPACITIES`: centres
+    """Random splats around a camera at the origin that looks along +z: opacities of `HARD_OPACITIES`, centres
     uniform in a box, orientations uniform, scales log-uniform, labels 0 to 8; colours, or SH of a degree."""
     generator = np.random.default_rng(seed)
     x, y = generator.uniform(-across, across, (2, count))

@@ -1,4 +1,4 @@
-"""Reading scene files: TOML to the data of a Scene."""
+"""Reader of scene files in TOML."""
 
 import math
 import os
@@ -33,8 +33,8 @@ from fidsplat.util.limits import check_total
 
 MAX_BYTES = 16 * 2**20
 MAX_PARTS = 8
-"""limit on the parts of a dotted key (scene files have at most three): the parser takes quadratic time and
-memory"""
+"""maximum number of parts of a dotted key, for which tomllib needs quadratic time and memory; scene files
+have at most three"""
 TOP = ("camera", "splats", "markers", "render", "quality", "sensor", "fog", "background", "lights")
 CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
 CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLES, "shutter", "motion")
@@ -58,8 +58,8 @@ MARKER = (
 MARKERS = (*MARKER, *setting_types(MarkerQuality))
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
 
-# Finds a dotted key of too many parts; strings and comments are matched to be skipped. Quantifiers are
-# possessive and unclosed strings end with the file, so that the time is linear for every input.
+# Matches a dotted key of too many parts, and strings and comments in order to skip them. Quantifiers are
+# possessive and unclosed strings extend to the end of the file, so that the time is linear.
 _BASIC, _LITERAL = r'"(?:[^"\\\n]|\\.)*+"?', r"'[^'\n]*+'?"
 _LONG_KEY = re.compile(
     r"[\s\[\]{}=,]++"
@@ -76,11 +76,12 @@ def read_scene(
     quality: Quality | str | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Fields of `SceneParts` from a scene file and the files that it names, relative to its folder.
+    """Read the fields of `SceneParts` from a scene file and the files that it names, relative to its folder.
 
-    quality: replaces the file's, also for markers. progress: called with the current step and its share done.
+    quality: replaces the quality of the file, also for markers. progress: called with the current step and
+    its share done.
 
-    Raises InputError, which names file and key.
+    Raises InputError with file and key.
     """
     file = path_of(path)
     top = Table(_parse(file), str(file), "", TOP)
@@ -148,7 +149,7 @@ def _parse(file: Path) -> dict:
 
 
 def _camera(table: Table, first: np.ndarray | None) -> Camera:
-    """Camera of a table. first: the pose of the first keyframe, if it moves."""
+    """Camera of a table. first: pose of the first keyframe; None for a fixed camera."""
     width, height = table.whole("width"), table.whole("height")
     near, far = table.number("near", 0.01), table.number("far", math.inf, infinite=True)
     lens = read_lens(table)
@@ -197,8 +198,8 @@ def _store(table: Table, folder: Path) -> Store:
 
 
 def _checked_total(file: Path, total: int, cloud: SplatCloud) -> int:
-    """Bytes of splats with another cloud. Raises InputError beyond the limit: a short file could repeat one
-    splat file any number of times."""
+    """Add the bytes of a cloud to a total; raise InputError above the limit, as a small scene file can repeat
+    one splat file."""
     arrays = (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh, cloud.colors)
     total += sum(array.nbytes for array in arrays if array is not None)
     check_total(f"the splats of {file}", total, "build a store of them (`fidsplat store build`)")
@@ -206,7 +207,7 @@ def _checked_total(file: Path, total: int, cloud: SplatCloud) -> int:
 
 
 def _splats(table: Table, load: Callable[[str], SplatCloud]) -> tuple[SplatCloud, Trajectory | None]:
-    """Splats of a file at their pose, and their motion from there."""
+    """Splats of a [[splats]] table at their pose, and their motion relative to it."""
     name, scale = table.text("file"), table.number("scale", 1.0)
     if not scale > 0:
         raise table.error("scale", f"must be above 0, got {scale!r}")
@@ -220,7 +221,7 @@ def _splats(table: Table, load: Callable[[str], SplatCloud]) -> tuple[SplatCloud
 
 
 def _shape(table: Table) -> SheetShape:
-    """Shape of a marker: the inline table `shape`."""
+    """Shape of a marker from the table `shape`."""
     names = dict.fromkeys(name for kind in SHAPES.values() for name in names_of(kind))
     kind, own = table.table("shape", ("kind", *names)).of_kind(SHAPES)
     with own.at():
@@ -236,7 +237,7 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progre
     own, light = table.values(MarkerQuality), read_lighting(table)
     if quiet_zone is not None and quiet_zone < 0:
         raise table.error("quiet_zone", f"must be 0 or more modules, got {quiet_zone}")
-    from fidsplat.markers import marker, with_file  # late: it imports heavy packages
+    from fidsplat.markers import marker, with_file  # lazy: heavy imports
 
     limit = {} if max_splats is None else {"max_splats": max_splats}
     limit |= {name: table.numbers(name, 3) for name in ("black", "white") if name in table}

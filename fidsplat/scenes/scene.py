@@ -31,7 +31,7 @@ class Scene(SceneParts, Summarised):
         return f"Scene({', '.join([*words, *(placed.marker.spec for placed in self.markers)])})"
 
     def summary(self) -> dict[str, str]:
-        """Content of the scene in words, for tables."""
+        """Content of the scene as text, by topic."""
         rows = {f"store {i}": f"{len(s):,} splats in {s.path}" for i, s in enumerate(self.stores)}
         rows |= {f"cloud {i}": f"{len(cloud):,} splats" for i, cloud in enumerate(self.clouds)}
         for placed in self.markers:
@@ -53,10 +53,10 @@ class Scene(SceneParts, Summarised):
     ) -> Scene:
         """Read a scene file (docs/scene-files.md).
 
-        quality: replaces the file's; its marker settings apply to markers without their own.
+        quality: replaces the quality of the file; its marker settings apply to markers without their own.
         progress: called with the current step and its share done, 0 to 1.
 
-        Raises InputError, which names file and key.
+        Raises InputError with file and key.
         """
         return Scene(**read_scene(path, quality, progress))
 
@@ -68,13 +68,13 @@ class Scene(SceneParts, Summarised):
         write_scene(self, path)
 
     def surface_at(self, camera: Camera | None = None, pixel: Any = None, **options: Any) -> Surface:
-        """Position and normal of the surface at a pixel, from rendered depth: `fs.surface_at`, whose further
-        arguments are options: ray, radius, renderer, resident.
+        """Position and normal of the surface at a pixel, from rendered depth.
 
-        Raises:
-            InputError: no plane in at least half of the patch; a pixel outside the image.
+        options: ray, radius, renderer, resident of `fs.surface_at`.
+
+        Raises InputError if less than half of the patch is one plane, or the pixel is outside the image.
         """
-        import fidsplat  # the facade loads the renderer; scenes import nothing that renders
+        import fidsplat  # lazy: it imports the renderer, on which scenes do not depend
 
         return fidsplat.surface_at(self, camera, pixel, **options)
 
@@ -92,20 +92,20 @@ class Scene(SceneParts, Summarised):
     ) -> Scene:
         """The scene with one more marker, upright on the surface at a pixel or along a ray.
 
-        On floors and ceilings the top of the marker is the top of the image.
+        On floors and ceilings, the upper edge of the marker faces the top of the image.
 
         Args:
-            marker: its quiet zone defines the patch of the surface, unless `radius` is given.
-            camera, pixel: by default the scene's camera; (x, y).
-            up: (3,) vertical of the scene; by default `fidsplat info` guesses it.
-            lift: metres in front of the surface; by default 1 mm and twice the roughness.
+            marker: the marker; the patch of the surface has the size of its quiet zone, unless `radius` is
+                given.
+            camera, pixel: camera, by default the scene's, and (x, y) in its image.
+            up: (3,) vertical of the scene; None: as estimated by `fidsplat info`.
+            lift: distance in front of the surface [m]; None: 1 mm plus twice the roughness.
             bundle, light: see `PlacedMarker`.
             options: ray, radius, renderer, resident of `fs.surface_at`.
 
-        Raises:
-            InputError: no plane in at least half of the patch; a pixel outside the image.
+        Raises InputError if less than half of the patch is one plane, or the pixel is outside the image.
         """
-        from fidsplat.markers import Marker  # here, as most scenes load without them
+        from fidsplat.markers import Marker  # lazy: heavy imports
 
         instance("marker", marker, Marker, "a Marker, e.g. fs.marker('apriltag:36h11:5', 0.16)")
         found = self.surface_at(camera, pixel, **{"radius": marker.radius} | options)

@@ -1,4 +1,4 @@
-"""Scenes of any input: scene files, splat files and stores, which get a camera that frames them."""
+"""Scenes from any input: scene files, or splat files and stores with a camera that frames them."""
 
 from __future__ import annotations
 
@@ -27,10 +27,9 @@ WIDTH, HEIGHT, FOV_X = 1280, 720, math.radians(60.0)
 ELEVATION = math.radians(15.0)
 MARGIN = 1.1
 REACH = 1.5
-"""standard deviations of a splat that must be visible; with 3, faint tails would set the camera's distance"""
+"""extent of the framed splats in standard deviations; with 3, faint tails would determine the distance"""
 MANY = 10_000
-"""captured scenes have strays far away: a cloud of this many is framed without the outermost 1 % of its
-splats"""
+"""number of splats from which a cloud is framed without its outermost 1 %, as captures have outliers"""
 
 
 @dataclass(frozen=True)
@@ -38,13 +37,13 @@ class StartPose:
     """Pose of the camera: options of commands that render one view."""
 
     up: tuple[float, float, float] | None = None
-    """X Y Z: direction that points up in the image (default: the camera's own; for a splat file the guess of
+    """X Y Z: direction that points up in the image (default: the camera's; for a splat file, the estimate of
     `fidsplat info`)"""
     position: tuple[float, float, float] | None = None
-    """X Y Z: centre of projection in metres (default: the camera's own)"""
+    """X Y Z: centre of projection in metres (default: the camera's)"""
     look_at: tuple[float, float, float] | None = None
-    """X Y Z: point in the middle of the image (default: the direction stays; for a splat file the middle of
-    the scene)"""
+    """X Y Z: point in the middle of the image (default: in the camera's direction; for a splat file, the
+    middle of the scene)"""
 
     def __post_init__(self) -> None:
         for name in ("up", "position", "look_at"):
@@ -54,7 +53,7 @@ class StartPose:
                 raise InputError(f"camera {name} must be {requirement}, got {value}")
 
     def applied(self, camera: Camera, middle=None) -> Camera:
-        """The camera at this pose. middle: (3,) default of `look_at` with a position."""
+        """The camera at this pose. middle: (3,) default of `look_at`; None: in the camera's direction."""
         if self == OWN_POSE:
             return camera
         rotation = camera.world_to_camera[:3, :3]
@@ -67,7 +66,7 @@ class StartPose:
 
 
 OWN_POSE = StartPose()
-"""the camera's own pose"""
+"""pose that keeps the camera"""
 
 
 def load_source(
@@ -79,10 +78,10 @@ def load_source(
 ) -> Scene:
     """Load a scene file, or a splat file or store with a camera that frames it.
 
-    pose, size: replace those of the camera; size is (width, height) in pixels.
+    pose, size: pose and (width, height) in pixels that replace those of the camera.
 
     Raises:
-        InputError: another kind of file; a scene without a camera.
+        InputError: a file of another format; a scene without a camera.
     """
     suffix = Path(source).suffix.lower()
     if suffix == ".toml":
@@ -93,7 +92,7 @@ def load_source(
                 "position, look_at"
             )
         camera = scene.camera if size is None else scene.camera.with_size(*size)
-        if pose != OWN_POSE:  # a moving camera would not be there
+        if pose != OWN_POSE:  # replaces the motion of the camera
             camera = scene.capture.motion.moved(camera, scene.capture.shutter.time)
             scene = replace(scene, camera_motion=None)
         return replace(scene, camera=pose.applied(camera))
@@ -112,10 +111,10 @@ def load_source(
 def framing_camera(
     cloud: SplatCloud | Store, pose: StartPose = OWN_POSE, size: tuple[int, int] | None = None
 ) -> Camera:
-    """A camera with all splats in view, 60 degrees wide, by default 1280 x 720 pixels.
+    """A camera with all splats in its field of view of 60 degrees, by default 1280 x 720 pixels.
 
-    It views the scene with its up axis upwards and x to the right, where possible; from 15 degrees above if
-    the pose names the up axis, or level areas show it, and else horizontally: from -z for y down.
+    The vertical of the scene points up in the image, and x to the right, if possible. The camera looks down
+    by 15 degrees if `pose` gives the vertical or horizontal surfaces determine it, and else horizontally.
     """
     width, height = (WIDTH, HEIGHT) if size is None else size
     guess = guess_up(sampled(cloud))
@@ -138,7 +137,7 @@ def framing_camera(
 def _extent(cloud: SplatCloud | Store) -> tuple[np.ndarray, np.ndarray]:
     if len(cloud) == 0:
         return -np.ones(3), np.ones(3)
-    if isinstance(cloud, Store):  # bounds of its chunks, which are small compared with the scene
+    if isinstance(cloud, Store):  # by the boxes of its chunks, which are small compared with the scene
         return cloud.bounds(REACH)
     reach = cloud.reach(REACH)
     share = 0.5 if len(cloud) >= MANY else 0.0

@@ -1,4 +1,4 @@
-"""Surface of a scene at a point: a plane fitted to points of rendered depth."""
+"""Plane fit to rendered depth: the surface of a scene at a point."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ from fidsplat.util.arguments import number, real_array
 from fidsplat.util.errors import InputError
 
 TOLERANCE = 0.1
-"""largest distance of an inlier from the plane, as a share of the radius of the patch"""
-LEAST_SHARE = 0.5
-"""smallest share of inliers of a surface"""
+"""maximum distance of an inlier from the plane, as a share of the radius of the patch"""
+MIN_SHARE = 0.5
+"""minimum share of inliers"""
 GRAZING = 0.02
-"""smallest cosine between the ray and the normal"""
+"""minimum cosine between the ray and the normal"""
 LIFT = 1e-3
-"""metres in front of a surface that is smooth"""
+"""distance of a marker in front of a smooth surface [m]"""
 LEVEL = 0.17
-"""smallest sine of the angle between the normal and the direction of a marker's upper edge"""
+"""minimum sine of the angle between the normal and the direction of a marker's upper edge"""
 _TRIPLES = 128
+"""number of candidate planes"""
 _TUKEY = 4.685
+"""threshold of Tukey's weights in standard deviations"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,23 +31,23 @@ class Surface:
     """A plane fitted to a patch of a scene's surface."""
 
     position: np.ndarray
-    """(3,) float64 world metres, on the ray"""
+    """(3,) float64, intersection of the ray and the plane in the world [m]"""
     normal: np.ndarray
     """(3,) float64 unit vector in the world, towards the camera"""
     inlier_share: float
-    """share of the patch in the plane, 0.5 to 1"""
+    """share of inliers among the pixels of the patch, 0.5 to 1"""
     roughness: float
-    """metres: RMS distance of the inliers from the plane"""
+    """RMS distance of the inliers from the plane [m]"""
     radius: float
-    """metres: radius of the patch"""
+    """radius of the patch [m]"""
 
     def pose(self, ups: Iterable, lift: float | None = None) -> np.ndarray:
         """world_from_marker (4, 4) float64 of a marker on the surface.
 
         Args:
-            ups: (k, 3) world directions of its upper edge; the first that is not within 10 degrees of the
+            ups: (k, 3) world directions towards its upper edge; the first one more than 10 degrees from the
                 normal is used.
-            lift: metres in front of the surface; None: 1 mm and twice the roughness.
+            lift: distance in front of the surface [m]; None: 1 mm plus twice the roughness.
         """
         lift = LIFT + 2 * self.roughness if lift is None else number("lift", lift)
         for up in ups:
@@ -64,21 +66,20 @@ class Surface:
 
 
 def fit_surface(points: np.ndarray, origin: np.ndarray, ray: np.ndarray, radius: float) -> Surface:
-    """The dominant plane of points, where a ray intersects it.
-
-    Consensus of planes through three points (MSAC), then least squares with Tukey's weights.
+    """Fit the dominant plane of points by MSAC, then by least squares with Tukey's weights, and intersect it
+    with a ray.
 
     Args:
         points: (n, 3) world points of a patch, one for each pixel; NaN for empty pixels.
-        origin, ray: (3,) a point of the ray and its direction.
-        radius: metres, radius of the patch.
+        origin, ray: (3,) origin and direction of the ray.
+        radius: radius of the patch [m].
 
     Raises:
         InputError: less than half of the pixels are in one plane, or the ray is parallel to it.
     """
     filled = points[np.isfinite(points).all(1)]
     share = len(filled) / max(len(points), 1)
-    if share < LEAST_SHARE or len(filled) < 3:
+    if share < MIN_SHARE or len(filled) < 3:
         raise InputError(_refusal(f"{100 - 100 * share:.0f} % of the patch without splats"))
     centre = filled.mean(0)
     local, tolerance = filled - centre, TOLERANCE * radius
@@ -108,7 +109,7 @@ def fit_surface(points: np.ndarray, origin: np.ndarray, ray: np.ndarray, radius:
     residuals = (local - middle) @ normal
     inside = np.abs(residuals) <= tolerance
     share = float(inside.sum() / len(points))
-    if share < LEAST_SHARE:
+    if share < MIN_SHARE:
         raise InputError(_refusal(f"{100 * share:.0f} %"))
     ray = ray / np.linalg.norm(ray)
     slope = float(ray @ normal)
@@ -124,6 +125,6 @@ def fit_surface(points: np.ndarray, origin: np.ndarray, ray: np.ndarray, radius:
 
 def _refusal(got: str) -> str:
     return (
-        f"the surface must be one plane in at least {100 * LEAST_SHARE:.0f} % of the patch, got {got}; "
+        f"the surface must be one plane in at least {100 * MIN_SHARE:.0f} % of the patch, got {got}; "
         "give another pixel or radius"
     )

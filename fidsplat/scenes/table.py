@@ -1,4 +1,4 @@
-"""Tables of scene files, with checked keys, types and lengths; errors name the key."""
+"""TOML tables with checked keys, types and lengths; errors contain the key."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -12,15 +12,15 @@ _MISSING = object()
 
 
 def names_of(kind: type) -> tuple[str, ...]:
-    """Keys of the table of a dataclass."""
+    """Names of the fields of a dataclass, which are the keys of its table."""
     return tuple(field.name for field in fields(kind))
 
 
 class Table:
-    """A TOML table at a path of keys in a file.
+    """A TOML table, with its file and the path of its key.
 
-    Raises InputError if it is not a table or has a key that is not ``known``; methods raise it for a missing
-    key without a default and for a value of the wrong type.
+    Raises InputError for another value or a key that is not ``known``; methods raise it for a missing key
+    without a default and for a value of the wrong type.
     """
 
     def __init__(self, values, file: str, path: str, known: tuple[str, ...]) -> None:
@@ -41,7 +41,7 @@ class Table:
         return f"{self._path}.{key}" if self._path else key
 
     def error(self, key: str, message: str) -> InputError:
-        """InputError about one key, for the caller to raise."""
+        """An InputError about one key."""
         return InputError(f"{self._file}: {self._name(key)} {message}")
 
     @contextmanager
@@ -53,7 +53,7 @@ class Table:
             message, name = str(error), self._name(key) if key else self._path
             if message.startswith(f"{self._file}: "):
                 raise
-            # the last part of the name is often the object that the message begins with
+            # messages often begin with the last part of the name
             message = message.removeprefix(f"{name.rpartition('.')[2]}: ")
             raise InputError(f"{self._file}: {name}: {message}") from error
 
@@ -72,11 +72,14 @@ class Table:
         return value
 
     def is_text(self, key: str) -> bool:
-        """Whether a key has a string."""
+        """Whether the value of a key is a string."""
         return isinstance(self._values.get(key), str)
 
     def of_kind(self, kinds: Mapping[str, type], key: Callable[[str], str] = str) -> "tuple[type, Table]":
-        """Class that `kind` names, and the table with its keys only. key: key of a field."""
+        """The class that the key `kind` names, and the table restricted to its fields.
+
+        key: function from the name of a field to its key.
+        """
         name = self.text("kind")
         if name not in kinds:
             raise self.error("kind", f"must be {', '.join(kinds)}, got {name!r}")
@@ -100,7 +103,7 @@ class Table:
         return value
 
     def number(self, key: str, default: Any = _MISSING, infinite: bool = False) -> Any:
-        """A finite float (or, where allowed, an infinite one), or the default."""
+        """A finite float, or with `infinite` also an infinite one, or the default."""
         value = self._get(key, default)
         if key not in self._values:
             return value
@@ -130,10 +133,10 @@ class Table:
         return [self._vector(f"{key}[{i}]", row, 4) for i, row in enumerate(value)]
 
     def values(self, kind: type, key: Callable[[str], str] = str) -> dict[str, Any]:
-        """Values for the fields of a dataclass, in their types.
+        """Values of the fields of a dataclass, in their types.
 
-        Fields without a default are required. Fields with a default factory have their own table, and are
-        omitted. A value may be infinite only if its default is. key: key of a field.
+        Fields without a default are required. Fields with a default factory have their own table and are
+        omitted. A value may be infinite only if the default is. key: function from a field's name to its key.
         """
         readers: dict[str, Callable[[str], Any]] = {
             "int": self.whole,
@@ -190,7 +193,7 @@ def _is_whole(value) -> bool:
 
 
 def _kind(value) -> str:
-    """Description of a value in an error: its text if short, else its kind."""
+    """Short description of a value for an error message."""
     if isinstance(value, dict):
         return "a table"
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""Guess of the vertical of a scene."""
+"""Estimated vertical of a scene."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from fidsplat.store.partial_cloud import PartialCloud, concatenated
 from fidsplat.store.store import Store
 
 CHUNKS = 32
-"""largest number of chunks of a store that its up axis is guessed from"""
+"""maximum number of chunks of a store for the estimate of its vertical"""
 
 
 def scene_up(scene: SceneParts) -> np.ndarray:
-    """Direction (3,) that points up in a scene, as `fidsplat info` guesses it."""
+    """Estimated direction (3,) that points up in a scene, as printed by `fidsplat info`."""
     return guess_up(sampled(scene.stores[0] if scene.stores else scene.cloud())).direction
 
 
 def sampled(cloud: SplatCloud | Store) -> SplatCloud:
-    """The cloud, or some chunks of a store."""
+    """The cloud, or evenly spaced chunks of a store."""
     if not isinstance(cloud, Store):
         return cloud
     chunks = np.flatnonzero(np.tile(cloud.nodes["level"] == 0, cloud.instances))

@@ -1,5 +1,6 @@
-"""Writing scene files: a Scene to TOML and PLY files."""
+"""Writer of scene files in TOML, and of the PLY files that they name."""
 
+import json
 import os
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from fidsplat.util.files import path_of, write_file
 
 
 def write_scene(scene: SceneParts, path: str | os.PathLike[str]) -> None:
-    """Write STEM-splats-I.ply for each cloud, then the scene file, so that no named file is missing.
+    """Write STEM-splats-I.ply for each cloud, then the scene file, which never names a missing file.
 
     Raises InputError if a file cannot be written, or a marker cannot be expressed in a scene file.
     """
@@ -62,7 +63,7 @@ def write_scene(scene: SceneParts, path: str | os.PathLike[str]) -> None:
 
 
 def marker_block(placed: PlacedMarker, folder: Path, quality: Quality | str | None = None) -> str:
-    """The [[markers]] table of a marker for a scene file in a folder. quality: the scene's.
+    """The [[markers]] table of a marker for a scene file in a folder. quality: quality of the scene.
 
     Raises InputError if the marker cannot be expressed in a scene file.
     """
@@ -118,24 +119,11 @@ def _table(head: str, values: dict) -> str:
 
 
 def _value(value) -> str:
-    if isinstance(value, str):
-        return _string(value)
+    if isinstance(value, str):  # the escapes of JSON are those of TOML, except for DEL
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, list):
         return f"[{', '.join(map(_value, value))}]"
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key} = {_value(part)}" for key, part in value.items()) + "}"
     plain = value.item() if isinstance(value, np.generic) else value
     return repr(plain)  # Python and TOML write int, float and inf alike
-
-
-def _string(text: str) -> str:
-    """A TOML basic string: quotes, backslashes and control characters escaped."""
-    parts = []
-    for char in text:
-        if char in '"\\':
-            parts.append("\\" + char)
-        elif ord(char) < 0x20 or ord(char) == 0x7F:
-            parts.append(f"\\u{ord(char):04x}")
-        else:
-            parts.append(char)
-    return '"' + "".join(parts) + '"'

@@ -1,6 +1,6 @@
-"""Interactive viewer: rendered images, streamed as the background of a viser page (extra `viewer`).
+"""Interactive viewer: rendered images as the background of a viser page (extra `viewer`).
 
-`settings` and `session` hold what is rendered, `stream` decides when and at which size, `scene_file` writes a
-moved marker back to its scene file; none of them depends on a browser. `server`, `controls`, `nodes` and
-`gizmo` are the page, `guard` its protection against pages of other sites.
+`settings` and `session` hold the render state, `stream` schedules images, and `scene_file` writes moved
+markers to the scene file; none of them depends on a browser. `server`, `controls` and `nodes` are the page,
+`guard` protects it against pages of other sites.
 """

@@ -1,4 +1,4 @@
-"""Panel of the page: sliders and selectors of the settings, and buttons."""
+"""Control panel of the page: sliders, selectors and buttons."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Controls:
     """The panel of a viser page (its `gui`).
 
     Args:
-        devices: names in the menu of devices, including the session's device.
+        devices: names in the device menu, including the session's device.
     """
 
     def __init__(self, gui: Any, session: Session, devices: list[str], actions: Actions) -> None:
@@ -83,7 +83,7 @@ class Controls:
 
     @property
     def new_marker(self) -> tuple[str, float] | None:
-        """Spec and size of the marker that a click places; None: a click reads the pixel."""
+        """Spec and size [m] of the marker that a click places; None: a click reads the pixel."""
         return (self._spec.value, float(self._size.value)) if self._places.value else None
 
     def end_placing(self) -> None:
@@ -91,12 +91,12 @@ class Controls:
         self._places.value = False
 
     def offer_targets(self, names: list[str]) -> None:
-        """Replace the names of the gizmo's selector; none is selected."""
+        """Replace the names in the selector of the gizmo, and select none."""
         self._targets.value = NO_TARGET
         self._targets.options = [NO_TARGET, *names]
 
     def update_from(self, scene: Scene, settings: Settings) -> None:
-        """Set the sliders and selectors to the settings of another scene."""
+        """Set the sliders and selectors to other settings."""
         self._offer_times(scene)
         for name, slider in self._sliders.items():
             value = float(getattr(settings, name))
@@ -107,7 +107,7 @@ class Controls:
             self._lens.value = settings.lens
 
     def _offer_times(self, scene: Scene) -> None:
-        """Show sliders for the shutter if the scene moves."""
+        """Show the sliders of the shutter if and only if the scene moves."""
         if not scene.motion.groups:
             for name in {"time", "exposure_ms", "readout_ms"} & self._sliders.keys():
                 self._sliders.pop(name).remove()

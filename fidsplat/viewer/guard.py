@@ -1,9 +1,8 @@
 """Origin check and content security policy of the viewer's server.
 
-A browser lets any page open a WebSocket to any address, including this machine's, and viser does not check
-the page's origin: another site in the same browser could move markers of an open scene. Browsers send the
-origin of the page and the requested host; both are checked. Programs other than browsers send no origin and
-are accepted.
+Any page in a browser can open a WebSocket to any address, including this machine's, and viser does not check
+the origin of the page: another site could move markers of an open scene. Browsers send the origin of the page
+and the requested host; both are checked. Other programs send no origin and are accepted.
 """
 
 from __future__ import annotations
@@ -35,8 +34,8 @@ def refusal(origin: str | None, host: str | None, listens: str) -> str:
 
     Args:
         origin, host: headers of the request; a browser sends both.
-        listens: address that the server listens on. If it is local, other host names are refused, as a
-            foreign name may have been made to point here (DNS rebinding).
+        listens: address that the server listens on. If it is local, other host names are refused, against
+            DNS rebinding.
     """
     if origin is None:
         return ""
@@ -69,11 +68,10 @@ def _local(listens: str) -> bool:
 
 
 def guarded(make: Callable[[], Any], listens: str) -> Any:
-    """The WebSocket server that `make` starts, with an origin check that answers other sites with 403. viser
-    has no setting for it, so websockets' `serve` is replaced while the server starts.
+    """Start a WebSocket server by `make`, with an origin check that answers other sites with status 403.
 
-    Raises:
-        FidsplatError: the server could not be guarded and was stopped.
+    viser has no setting for the check, so websockets' `serve` is replaced while the server starts. Raises
+    FidsplatError if viser does not call it.
     """
     from websockets.asyncio import server
 
@@ -100,7 +98,7 @@ def guarded(make: Callable[[], Any], listens: str) -> Any:
 
 
 async def _answer(listens: str, further: Callable[..., Any] | None, connection: Any, request: Any) -> Any:
-    """A refusal, or the server's own response."""
+    """The response to a request: a refusal, or the server's response with security headers."""
     headers = request.headers
     if why := refusal(headers.get("Origin"), headers.get("Host"), listens):
         return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
@@ -114,13 +112,11 @@ async def _answer(listens: str, further: Callable[..., Any] | None, connection: 
 
 @cache
 def policy() -> str:
-    """The content security policy of the page: only viser's own scripts run, and no frames are allowed, so
-    that injected markup cannot run code.
+    """The content security policy of the page: only viser's scripts run, and frames are forbidden, so that
+    injected markup cannot run code.
 
-    viser's page is one file: a loader, and a program that the loader decodes from its attributes.
-
-    Raises:
-        FidsplatError: the page of this viser version has another form.
+    viser's page is one file: a loader, and a program that the loader decodes from its attributes. Raises
+    FidsplatError if the page of this viser version has another form.
     """
     import viser
     import zstandard
@@ -147,7 +143,7 @@ def policy() -> str:
 
 
 def _decoded(text: str, alphabet: str) -> bytes:
-    """The packed bytes: four of every five digits, and d - 1 of d further digits."""
+    """Decode text in the base of an alphabet: five digits to four bytes, and d remaining digits to d - 1."""
     table = np.zeros(128, np.uint64)
     table[[ord(letter) for letter in alphabet]] = np.arange(len(alphabet))
     values, base = table[np.frombuffer(text.encode("ascii"), np.uint8)], np.uint64(len(alphabet))

@@ -1,4 +1,4 @@
-"""Overlays of the page: outlines and names of markers, camera frusta, and the gizmo."""
+"""3D overlays of the page: outlines and names of markers, camera frusta, and the gizmo."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MANY = 60
 
 
 class Nodes:
-    """Nodes of a viser page (its `scene`)."""
+    """3D overlays of a viser page (its `scene`)."""
 
     def __init__(self, page: Any) -> None:
         self._page = page
@@ -31,8 +31,10 @@ class Nodes:
         self.visible = True
 
     def show(self, scene: Scene, overlay: bool) -> None:
-        """Show outlines and names of the scene's markers, and its camera. Without overlay show none: with
-        another lens than the page's they would not match the image."""
+        """Show outlines and names of the scene's markers, and its camera.
+
+        overlay: False hides them, as for lenses other than the page's, whose images they would not match.
+        """
         for node in self._shown:
             node.remove()
         self._shown = []
@@ -45,9 +47,9 @@ class Nodes:
             self._shown.append(self._frustum("/scene camera", scene.camera, pose, _CAMERA, 0.1))
 
     def within(self, position: Iterable[float], distance: float) -> bool:
-        """Whether there are outlines or frusta, and all are within a distance of a position."""
-        places = [np.asarray(node.position, float) for node in (*self._shown, *self._frusta)]
-        return bool(places) and float(np.linalg.norm(np.array(places) - position, axis=1).max()) < distance
+        """Whether there are outlines or frusta, and all are within a distance [m] of a position."""
+        positions = np.array([node.position for node in (*self._shown, *self._frusta)], float).reshape(-1, 3)
+        return len(positions) > 0 and bool(np.linalg.norm(positions - position, axis=1).max() < distance)
 
     def show_keyframes(self, camera: Camera | None, poses: Iterable[np.ndarray]) -> None:
         """Show frusta of camera-to-world poses (4, 4)."""
@@ -62,11 +64,9 @@ class Nodes:
     def show_gizmo(
         self, pose: np.ndarray | None, size: float, moved: Callable[[np.ndarray, bool], None]
     ) -> None:
-        """Show a gizmo at a pose (4, 4), or none for None.
+        """Show a gizmo at a pose (4, 4), or hide it for None.
 
-        Args:
-            size: in metres.
-            moved: called with the new pose and whether the gizmo was released.
+        size: size of the gizmo [m]. moved: called with the new pose and whether the gizmo was released.
         """
         if self._gizmo is not None:
             self._gizmo.remove()
@@ -112,7 +112,7 @@ class Nodes:
             aspect=wide / tall,
             scale=scale,
             thickness=2.0,
-            thickness_units="screen",  # thin edges, as the page starts inside this frustum
+            thickness_units="screen",  # thin edges, as the page's first camera is inside this frustum
             color=color,
             wxyz=matrix_to_quaternion(pose[:3, :3]),
             position=pose[:3, 3],
@@ -120,7 +120,7 @@ class Nodes:
 
 
 LIVE_LIMIT = 100_000
-"""largest number of splats of a file that is rendered while it is dragged; larger files move on release"""
+"""maximum number of splats of a file that is rendered while it is dragged; larger files move on release"""
 _FILE = "file "
 
 
@@ -137,7 +137,7 @@ class GizmoTarget:
     size: float
     """size of the gizmo in metres"""
     animated: bool
-    """whether keyframes move it"""
+    """whether it has keyframes"""
     cloud: int = 0
     """index of the splat file among the scene's clouds"""
     splats: SplatCloud | None = None
@@ -149,7 +149,7 @@ class GizmoTarget:
         return self.splats is None or len(self.splats) <= LIVE_LIMIT
 
     def moved(self, scene: Scene, pose: np.ndarray) -> Scene | None:
-        """The scene with the target at another pose; None if the scene no longer has it."""
+        """The scene with the target at another pose; None if the scene no longer has the target."""
         if self.splats is None:
             if self.number >= len(scene.markers):
                 return None
@@ -171,7 +171,7 @@ def target_names(scene: Scene, splat_files: Sequence[SplatFile]) -> list[str]:
 
 
 def find_target(scene: Scene, splat_files: Sequence[SplatFile], name: str) -> GizmoTarget | None:
-    """The target of a name of `target_names`; None if the scene no longer has it."""
+    """The target with a name of `target_names`; None if the scene no longer has it."""
     number = int(name.removeprefix(_FILE).partition(":")[0]) - 1
     if not name.startswith(_FILE):
         if number not in range(len(scene.markers)):

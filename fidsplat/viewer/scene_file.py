@@ -1,4 +1,4 @@
-"""Write the pose of a moved marker or splat file, or a new marker, to a scene file; all other lines stay."""
+"""Editor of scene files: writes a pose or a new marker, and keeps all other lines."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ class SceneFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.text = self._read()
-        """text of the scene on display; only this text is edited"""
+        """text of the displayed scene; a file with another text is not written"""
         self._last_read = self.text
 
     def changed(self) -> str | None:
-        """The text, if another program has changed it since the last call; else None."""
+        """The text if another program has changed it since the last call, or else None."""
         text = self._read()
         known, self._last_read = self._last_read, text
         return None if text == known else text
@@ -146,7 +146,8 @@ def _parsed(text: str) -> Any:
 
 
 def _expected(text: str, kind: str, number: int, position: list[float], quaternion: list[float]) -> Any:
-    """The content that the new text must have; a value that no file has if the table does not exist."""
+    """The content that the edited text must have; if the table does not exist, a value that differs from all
+    contents."""
     scene = _parsed(text)
     try:
         scene[kind][number] |= {"position": position, "quaternion": quaternion}

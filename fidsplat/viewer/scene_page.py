@@ -1,4 +1,4 @@
-"""Self-contained HTML page of a scene: splats and markers as SOG, rendered by the PlayCanvas Engine."""
+"""Self-contained HTML page of a scene, rendered by the PlayCanvas Engine."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ _FILES = {
 }
 """files of the npm package and their SHA-256"""
 MAX_SPLATS = 8_000_000
-"""splats of a page: a browser holds its file as one text of at most half a gigabyte"""
+"""maximum number of splats of a page, as browsers limit a text to about half a gigabyte"""
 _GLTF_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
-_SIGHT = np.diag([1.0, -1.0, -1.0, 1.0])
-"""from a camera with y down and z forward to one with y up and z backward"""
+_OPENGL_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])
+"""from camera axes with y up and z backward to axes with y down and z forward, or back"""
 
 
 def save_page(scene: Scene, path: str | os.PathLike[str], title: str = "fidsplat") -> None:
     """Write a scene as one HTML file that renders it offline, with WebGL 2, from its camera.
 
-    The scene's lens, shutter, sensor, fog and light on markers are left out, and markers and boxes are
-    Gaussians; moving objects have their pose at time 0.
+    The page omits the scene's lens, shutter, sensor, fog and the light on markers. Markers and boxes are
+    Gaussians, and moving objects have their pose at time 0.
 
-    Raises InputError for a scene without camera or splats, if the engine cannot be obtained, or for a file
-    that cannot be written.
+    Raises InputError for a scene without a camera or splats, a failed download of the engine, or a file that
+    cannot be written.
     """
     if scene.camera is None:
         raise InputError("a scene for a page must have a camera, got none; add a [camera] table")
@@ -62,7 +62,7 @@ def save_page(scene: Scene, path: str | os.PathLike[str], title: str = "fidsplat
     marked = [placed.marker.gaussians.transformed(placed.pose) for placed in scene.markers]
     files = {}
     with tempfile.TemporaryDirectory() as folder:
-        # markers without loss: 8 bits of a scale would show as seams
+        # markers are not compressed: scales of 8 bits would cause seams
         for name, clouds, save in (("scene.sog", parts, save_sog), ("markers.ply", marked, save_ply)):
             if clouds := [cloud for cloud in clouds if len(cloud)]:
                 save(SplatCloud.concatenate(clouds), Path(folder, name))
@@ -89,14 +89,14 @@ def save_page(scene: Scene, path: str | os.PathLike[str], title: str = "fidsplat
 
 
 def _in_script(text: str) -> str:
-    """Escape text so that it cannot end the script element that holds it."""
+    """Escape text for a script element, which the text must not end."""
     return text.replace("</script", "<\\/script").replace("<!--", "<\\!--")
 
 
 def _view(means: np.ndarray, camera: Camera) -> dict[str, Any]:
     """Pose, field of view and clipping of a camera, in PlayCanvas' axes."""
     world_to_camera = np.asarray(camera.world_to_camera, np.float64)
-    pose = _GLTF_AXES @ np.linalg.inv(world_to_camera) @ _SIGHT
+    pose = _GLTF_AXES @ np.linalg.inv(world_to_camera) @ _OPENGL_CAMERA
     depths = means @ world_to_camera[2, :3] + world_to_camera[2, 3]
     front = depths[depths > 0]
     middle = float(np.median(front)) if len(front) else 1.0
@@ -111,7 +111,7 @@ def _view(means: np.ndarray, camera: Camera) -> dict[str, Any]:
 
 
 def engine_files(run: Callable[[list[str]], str] | None = None) -> tuple[str, str]:
-    """Source and licence of the PlayCanvas Engine, from the user's cache, or from npm on first use.
+    """Source and licence text of the PlayCanvas Engine, from the user's cache, or from npm on first use.
 
     Raises InputError if npm is missing or the files differ from their checksums.
     """

@@ -1,4 +1,4 @@
-"""The viewer's page: viser's server, an image stream per browser, and the actions of the controls."""
+"""The viewer's page: viser's server, an image stream for each browser, and the actions of the controls."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ from fidsplat.vision.readback import read_back
 POLL_INTERVAL = 1.0
 """seconds between two checks of the scene file"""
 DEPTH_RANGE = 167.0
-"""metres: viser encodes larger depths as this one, which would occlude everything behind it"""
+"""largest depth in viser's encoding [m]; larger depths would occlude overlays behind this distance"""
 JPEG = 75
-"""quality of images while moving; images at rest are lossless PNG"""
+"""JPEG quality of images while moving; images at rest are lossless PNG"""
 
 
 def check_port(host: str, port: int) -> None:
-    """Raise InputError for a port that is invalid or in use, as viser would silently use the next one, and
-    for an empty host, which would open the page to the whole network."""
+    """Raise InputError for a port that is invalid or in use, for which viser would silently use another one,
+    and for an empty host, which would open the page to the network."""
     if not 0 <= port <= 65535:
         raise InputError(f"--port must be 1 to 65535, or 0 for any free port, got {port}")
     if not host:
@@ -68,7 +68,7 @@ class Viewer:
 
     Args:
         scene: scene to show.
-        file: its scene file; loaded again when it changes, and written when a marker is moved.
+        file: scene file of the scene; loaded again when it changes, and written when a marker is moved.
         device, memory_budget: see `Session`.
         page: address and frame rate; None: the defaults. `changes` are its fields: port, host, rate.
         keyframes: camera-to-world poses shown as keyframes.
@@ -163,7 +163,7 @@ class Viewer:
         self._set_camera(stream, client.camera)
 
     def _set_camera(self, stream: Stream, camera: Any) -> None:
-        """Use a browser's camera; one that cannot render changes nothing."""
+        """Set the viewpoint to a browser's camera; an invalid camera is reported and ignored."""
         try:
             stream.set_viewpoint(_viewpoint(camera))
         except FidsplatError as error:
@@ -327,7 +327,7 @@ class Viewer:
         return [] if self._file is None else self._file.splat_files()
 
     def select_target(self, name: str) -> None:
-        """Show the gizmo at a marker or a splat file, by its name in the selector."""
+        """Show the gizmo at a marker or a splat file, given by its name in the selector."""
         scene, _ = self.session.requested()
         self._target = None if name == NO_TARGET else find_target(scene, self._splat_files, name)
         if self._target is not None and self._target.animated:
@@ -342,7 +342,7 @@ class Viewer:
         """Show or hide outlines, names and frusta."""
         self._nodes.visible = visible
         self._nodes.show(self.session.state.scene, self._overlay)
-        self._refresh()  # with the depth that occludes them, or without
+        self._refresh()  # images include the depth that occludes overlays only if these are visible
 
     def _move(self, pose: np.ndarray, released: bool) -> None:
         """Move the target while the gizmo is dragged; on release write its pose to the scene file."""
@@ -360,12 +360,12 @@ class Viewer:
                     self._file.write_pose(target.number, pose, target.kind)
                 except FidsplatError as error:
                     problem = str(error)
-                    if target.splats is not None:  # the position of splats is known only from the file
+                    if target.splats is not None:  # the next move starts at the position in the file
                         moved = target.moved(scene, target.pose)
             self.session.request(scene=moved, done=lambda why: self._controls.show_status(why or problem))
 
     def _watch(self) -> None:
-        """Load the scene file when another program has changed it, and the newest splats of a training."""
+        """Poll the scene file for changes by other programs, and `reload` for newer splats; load both."""
         while not self._closed.wait(POLL_INTERVAL):
             try:
                 if self._reload is not None and (newer := self._reload()) is not None:
@@ -381,8 +381,8 @@ class Viewer:
                 self._controls.show_status(f"{error}; the previous scene is shown")
 
     def _edited(self, scene: Scene, text: str, problem: str | None) -> None:
-        """Accept the text of an edited scene file once its scene is shown. Until then, and while the scene
-        cannot be shown, no pose is written to the file, as its tables may have changed."""
+        """Accept the text of an edited scene file after its scene is displayed. Until then no pose is written
+        to the file, as its tables may have changed."""
         if problem is None and self._file is not None:
             with self._lock:
                 self._file.text = text
@@ -393,7 +393,7 @@ class Viewer:
 
 
 def _silent() -> contextlib.AbstractContextManager[Any]:
-    """Discard viser's messages on stdout; commands print their own."""
+    """Context that discards viser's messages on stdout, as commands print their own."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
@@ -421,8 +421,8 @@ def _viewpoint(camera: Any) -> Viewpoint:
 
 
 def _upright(pose: np.ndarray) -> np.ndarray:
-    """Axis of rotation of the page: the axis of the scene that points up in an image without roll, so that a
-    camera that looks down rotates about the vertical; else the camera's own up direction."""
+    """Up direction of the page, about which the camera rotates: the world axis that points up in the image,
+    if it is perpendicular to the image's rows, and else the camera's up direction."""
     up = -pose[:3, 1]
     axes = [axis for axis in (*np.eye(3), *-np.eye(3)) if abs(axis @ pose[:3, 0]) < 1e-6]
     best = max(axes, key=lambda axis: axis @ up, default=up)
@@ -430,8 +430,8 @@ def _upright(pose: np.ndarray) -> np.ndarray:
 
 
 def _distance(scene: Scene, pose: np.ndarray) -> float:
-    """Metres from the camera to the page's centre of rotation: the nearest marker, else the middle of the
-    splats."""
+    """Distance [m] from the camera to the page's centre of rotation: the nearest marker, or else the middle
+    of the splats."""
     targets = [placed.pose[:3, 3] for placed in scene.markers]
     if not targets and isinstance(scene.splats, ChunkedSplats):
         targets = [sum(scene.splats.bounds()) / 2]

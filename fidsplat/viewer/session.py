@@ -1,5 +1,5 @@
-"""Viewer session: scene, settings and renderer. A thread compiles the kernels for new settings or scenes
-while the old ones are still rendered."""
+"""Viewer session: scene, settings and renderer. A thread compiles the kernels of a new state while the old
+one is still rendered."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FIRST = Viewpoint((0.0, 0.0, -1.0), (1.0, 0.0, 0.0, 0.0), 1.0, 64, 48)
 
 @dataclass(frozen=True, eq=False)
 class RenderState:
-    """Scene, settings, renderer and uploaded splats of an image."""
+    """Scene and settings with a renderer, compiled kernels and uploaded splats."""
 
     scene: Scene
     settings: Settings
@@ -47,7 +47,7 @@ class StillImage:
     def occluding_depth(self) -> np.ndarray:
         """Depth (h, w) in metres that occludes outlines: the median depth, infinite where nothing is opaque.
 
-        It is the largest of 3 x 3 pixels and 0.5 % further away, so that outlines on a surface are visible.
+        The largest depth of 3 x 3 pixels, increased by 0.5 %, so that outlines on a surface are visible.
         """
         depth = self.frame["depth_median"]
         depth = np.pad(np.where(depth > 0, depth, np.inf), 1, constant_values=-np.inf)
@@ -70,8 +70,7 @@ class StillImage:
     def place(self, marker: Marker, x: float, y: float) -> PlacedMarker:
         """The marker on the surface at a position in the image, 0 to 1 from the left and from the top.
 
-        Raises:
-            InputError: no plane in at least half of the marker's area.
+        Raises InputError if less than half of the marker's area is one plane.
         """
         state, camera = self.state, self.frame.capture.camera
         assert camera is not None
@@ -92,10 +91,10 @@ class Session:
     """The render state that all browsers share.
 
     Args:
-        scene: first scene.
+        scene: initial scene.
         device: device that replaces the scene's.
         memory_budget: bytes of device memory, see `Renderer`.
-        changed: called in any thread when the state has changed.
+        changed: called after the state has changed, in any thread.
 
     Raises:
         DeviceError: the device cannot be used.
@@ -121,11 +120,10 @@ class Session:
         settings: Settings | None = None,
         done: Callable[[str | None], None] | None = None,
     ) -> None:
-        """Render another scene or other settings once their kernels are compiled. A newer request replaces an
-        older one of its kind.
+        """Change to another scene or other settings when their kernels are compiled; replaces pending
+        requests.
 
-        Args:
-            done: called afterwards with None, or with an error message if the old state remains.
+        done: called afterwards with None, or with an error message if the old state remains.
         """
         with self._wake:
             self._pending.scene = scene or self._pending.scene
@@ -135,7 +133,7 @@ class Session:
             self._wake.notify_all()
 
     def requested(self) -> tuple[Scene, Settings]:
-        """The newest requested scene and settings, else the current ones."""
+        """The scene and settings of the newest request, or else the current ones."""
         with self._wake:
             request, state = self._pending, self.state
             return request.scene or self._applying.scene or state.scene, (
@@ -143,7 +141,7 @@ class Session:
             )
 
     def settle(self, timeout: float = 60.0) -> bool:
-        """Wait until no request is pending; False at the timeout."""
+        """Wait until no request is pending; return False after the timeout [s]."""
         with self._wake:
             return self._wake.wait_for(lambda: not (self._working or self._has_pending()), timeout)
 
@@ -155,7 +153,7 @@ class Session:
         return StillImage(frame, state, viewpoint)
 
     def render_moving(self, viewpoint: Viewpoint, scale: float) -> Frame:
-        """The colours of a viewpoint at a coarser quality, scaled down, while the camera moves."""
+        """The image of a viewpoint while the camera moves: rgb at a coarser quality, smaller by `scale`."""
         state = self.state
         camera = viewpoint.camera(state.scene, state.settings.lens, scale)
         return state.renderer.render(state.resident, state.settings.moving(state.scene, camera))
@@ -201,8 +199,8 @@ class Session:
         return None
 
     def _prepare(self, scene: Scene, settings: Settings, before: RenderState | None) -> RenderState:
-        """A compiled render state. A new renderer is opened if kernels must be compiled, so that its lock
-        does not delay images; otherwise the current renderer is used."""
+        """A render state with compiled kernels. If kernels must be compiled, a new renderer compiles them, as
+        the lock of the current one would delay images."""
         device = settings.device or default_device()
         camera = _FIRST.camera(scene, settings.lens)
         captures = settings.moving(scene, camera), settings.capture(scene, camera)

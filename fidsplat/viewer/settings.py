@@ -1,4 +1,4 @@
-"""Settings of the viewer's controls as plain data, and the captures made from them."""
+"""Settings of the viewer as plain data, and their captures."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from fidsplat.util.errors import InputError
 LENSES = ("pinhole", "fisheye", "panorama", "parallel", "scene")
 """`fisheye` has a field of view of 180 degrees; `scene` is the lens of the scene's camera"""
 AT_REST = ("rgb", "depth", "depth_median", "label", "splat_id")
-"""outputs of the exact image, which a click reads; the median depth occludes the outlines"""
+"""outputs of the exact image, for clicks and for the occlusion of outlines"""
 _MOVING = Quality.named("fast")
-"""limits of the quality while the camera moves"""
+"""maximum quality while the camera moves"""
 _FOG_COLOR = (0.7, 0.7, 0.7)
-_LEAST, _MOST = 16, 16384  # pixels a side
+_MIN_SIDE, _MAX_SIDE = 16, 16384  # pixels
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,12 @@ class Viewpoint:
     quaternion: tuple[float, float, float, float]
     """w, x, y, z: camera to world"""
     fov_y: float
-    """radians"""
+    """vertical field of view [rad]"""
     width: int
-    """pixels of the page"""
+    """width and height of the page [px]"""
     height: int
     distance: float = 1.0
-    """metres to the centre of rotation; a parallel projection has the same width there as a pinhole camera"""
+    """distance to the centre of rotation [m], where orthographic and pinhole images have the same width"""
 
     def __post_init__(self) -> None:
         numbers = (*self.position, *self.quaternion, self.fov_y, self.distance)
@@ -68,9 +68,9 @@ class Viewpoint:
             raise InputError(
                 f"the page's field of view must be 0.001 to 3.14 radians, got {self.fov_y}; reload the page"
             )
-        if not (1 <= self.width <= _MOST and 1 <= self.height <= _MOST):
+        if not (1 <= self.width <= _MAX_SIDE and 1 <= self.height <= _MAX_SIDE):
             raise InputError(
-                f"the page must be 1 to {_MOST} pixels a side, got {self.width} x {self.height}; "
+                f"the page must be 1 to {_MAX_SIDE} pixels a side, got {self.width} x {self.height}; "
                 "make it smaller"
             )
 
@@ -80,12 +80,11 @@ class Viewpoint:
         return rigid_matrix(self.position, self.quaternion)
 
     def camera(self, scene: Scene, lens: str = "pinhole", scale: float = 1.0) -> Camera:
-        """The camera of an image that is smaller than the page by a scale.
+        """The camera of an image whose size is that of the page times `scale`.
 
-        Raises:
-            InputError: an unknown lens, or the scene's where its camera has none.
+        Raises InputError for an unknown lens.
         """
-        width, height = (max(_LEAST, round(size * scale)) for size in (self.width, self.height))
+        width, height = (max(_MIN_SIDE, round(size * scale)) for size in (self.width, self.height))
         world_to_camera = np.linalg.inv(self.pose)
         world_to_camera[3] = 0, 0, 0, 1
         near = 0.01 if scene.camera is None else scene.camera.near
@@ -116,12 +115,12 @@ class Settings:
     """Values of the controls."""
 
     device: str | None = None
-    """name; None: the scene's, or the default"""
+    """name of the device; None: the scene's, or the default"""
     quality: str | None = None
-    """None: the scene's"""
+    """preset of the quality; None: the scene's quality"""
     lens: str = "pinhole"
     fog: float = 0.0
-    """1 / metres"""
+    """density of the fog [1/m]"""
     exposure: float = 1.0
     """exposure factor of the sensor"""
     noise: float = 0.0
@@ -148,18 +147,14 @@ class Settings:
         )
 
     def updated_from(self, before: Scene, after: Scene) -> Settings:
-        """Settings after an edit of the scene file: values that the edit changes come from the file, all
-        others and the device stay."""
+        """Settings after an edit of the scene file, with the values that the edit changes, except the
+        device."""
         old, new = asdict(Settings.of(before)), asdict(Settings.of(after))
         edited = {name: value for name, value in new.items() if value != old[name] and name != "device"}
         return replace(self, **edited)
 
     def moving(self, scene: Scene, camera: Camera) -> Capture:
-        """Capture while the camera moves: only rgb, one sample per pixel, at most the quality of `fast`.
-
-        Raises:
-            InputError: a value out of range.
-        """
+        """Capture while the camera moves: rgb only, one sample per pixel, at most the quality of `fast`."""
         capture = self.capture(scene, camera)
         quality = capture.quality
         coarse = quality.with_(
@@ -173,11 +168,7 @@ class Settings:
         return replace(capture, outputs=("rgb",), quality=coarse)
 
     def capture(self, scene: Scene, camera: Camera) -> Capture:
-        """Capture of the exact image from a browser's camera.
-
-        Raises:
-            InputError: a value out of range.
-        """
+        """Capture of the exact image. Raises InputError for a value out of range."""
         own = scene.capture
         color = _FOG_COLOR if own.fog is None else own.fog.color
         shutter = replace(
@@ -186,7 +177,7 @@ class Settings:
             exposure_time=self.exposure_ms / 1e3,
             readout=self.readout_ms / 1e3,
         )
-        # the square of a smaller noise could underflow to 0
+        # the square of smaller noise may underflow to 0
         full_well = max(1.0, 1 / self.noise**2) if self.noise > 1e-9 else math.inf
         read_noise = 0.0 if math.isinf(full_well) else min(own.sensor.read_noise, full_well)
         sensor = replace(own.sensor, exposure=self.exposure, full_well=full_well, read_noise=read_noise)

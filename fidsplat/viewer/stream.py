@@ -1,5 +1,5 @@
-"""Image stream to one browser: only the newest viewpoint, scaled down while it moves, one exact image at
-rest, nothing without changes."""
+"""Image stream to one browser: small images of the newest viewpoint while it moves, and one exact image at
+rest."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from fidsplat.util.errors import FidsplatError
 from fidsplat.viewer.settings import Viewpoint
 
 MIN_SCALE, SCALE_STEPS = 1 / 4, 32
-"""minimum scale and number of steps up to 1; few sizes, so that buffers are reused"""
+"""minimum scale, and number of steps up to 1; few different sizes, so that buffers are reused"""
 REST_DELAY = 0.15
-"""seconds without a change before the exact image"""
+"""time without a change before the exact image is rendered [s]"""
 
 
 @dataclass
 class Pace:
-    """Image scale for a target frame rate; time is proportional to the number of pixels."""
+    """Controller of the image scale for a frame rate; assumes a time proportional to the number of pixels."""
 
     rate: float = 30.0
     """target frames per second"""
     scale: float = 0.5
 
     def update(self, seconds: float, scale: float) -> None:
-        """Adapt the scale to the time of an image."""
+        """Adapt the scale to the time of an image with a scale."""
         aim = scale * (0.9 / self.rate / max(seconds, 1e-6)) ** 0.5
-        # move half of the way, since another process may have slowed this image
+        # half of the change, since other processes may have slowed this image
         self.scale = min(1.0, max(MIN_SCALE, (self.scale + aim) / 2))
 
     @property
@@ -42,9 +42,9 @@ class Stream:
     """Image scheduler of one browser.
 
     Args:
-        moving: renders a viewpoint at a scale and returns a function that sends the image. That function runs
-            in another thread, so that one image is encoded while the next is rendered.
-        rest: renders and sends the exact image, after all others.
+        moving: renders a viewpoint at a scale and returns a function that sends the image. The function runs
+            in another thread, so that one image is encoded while the next one is rendered.
+        rest: renders and sends the exact image.
         failed: called with an error message; the stream continues.
         rate: target frames per second while moving.
         clock: time in seconds.
@@ -68,14 +68,14 @@ class Stream:
         self._since = -1e9
 
     def set_viewpoint(self, viewpoint: Viewpoint) -> None:
-        """Set the newest viewpoint, which replaces one that is not rendered yet."""
+        """Set the newest viewpoint; a previous one that is not rendered yet is dropped."""
         with self._wake:
             if viewpoint != self._viewpoint:
                 self._viewpoint = viewpoint
                 self._refresh()
 
     def refresh(self) -> None:
-        """Render the viewpoint again after another change."""
+        """Render the viewpoint again after a change of the scene or the settings."""
         with self._wake:
             self._refresh()
 
@@ -84,8 +84,8 @@ class Stream:
         self._wake.notify_all()
 
     def step(self) -> float | None:
-        """Render the image that is due. Returns the seconds until the next one may be due, or None to wait
-        for a change."""
+        """Render the image that is due. Returns the seconds until the next image, or None to wait for a
+        change."""
         with self._wake:
             viewpoint, new, left = self._viewpoint, self._new, REST_DELAY - (self._clock() - self._since)
             if viewpoint is None or (not new and self._exact):
@@ -111,7 +111,7 @@ class Stream:
         return 0.0
 
     def _wait_sent(self) -> None:
-        """Wait until the previous image is sent; raises its error."""
+        """Wait until the previous image is sent, and raise its error."""
         sending, self._sending = self._sending, None
         if sending is not None:
             sending.result()

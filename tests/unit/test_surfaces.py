@@ -215,7 +215,7 @@ def test_the_command_places_a_marker(wall, tmp_path, capsys):
     assert angle(-placed.pose[:3, 2], NORMAL) < 0.02
     file.write_text(f'markers = [{{spec = "aruco:4x4_50:1", size = 0.1}}]\n{text}')
     assert "must be [[markers]] tables" in fails(capsys, *words, "--append")[1]
-    for light, expected in (("ambient=red", "ambient must be numbers separated by spaces"), ("scen", "'scene'?")):
+    for light, expected in (("ambient=red", "must be numbers separated by spaces"), ("scen", "'scene'?")):
         assert expected in fails(capsys, *words, "--light", light)[1]
 
 
