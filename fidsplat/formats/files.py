@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,9 +70,8 @@ NAMED = {
     META: Format("streamed SOG", load_streamed, None),
 }
 """formats by file name"""
-_TRANSFORM = "convert it by splat-transform"
 _UNREAD = {
-    **dict.fromkeys((".ksplat", ".lcc", ".lcc2"), _TRANSFORM),
+    **dict.fromkeys((".ksplat", ".lcc", ".lcc2"), "convert it by splat-transform"),
     ".ckpt": "convert it by ns-export gaussian-splat of nerfstudio",
     ".pt": "convert it by gsplat.export_splats",
     ".spx": "convert it by gsbox",
@@ -79,14 +79,7 @@ _UNREAD = {
     ".usdz": "extract it by unzip",
 }
 """remedies for files that are not read, by suffix"""
-_MAGIC = {
-    b"ply": ".ply",
-    b"NGSP": ".spz",
-    b"\x1f\x8b": ".spz",
-    b"glTF": ".glb",
-    b"PK": ".sog",
-    b"#usda": ".usda",
-}
+_MAGIC = {b"ply": ".ply", b"NGSP": ".spz", b"glTF": ".glb", b"#usda": ".usda", b"PXR-USDC": ".usdc"}
 """first bytes of files of a format"""
 
 
@@ -104,30 +97,27 @@ def stored_bytes(path: str | os.PathLike[str]) -> int:
 
 def remedy_for(path: Path) -> str:
     """End of a message about a file or folder that is not read: how to convert it, or what to name."""
+    suffix = path.suffix.lower()
     if path.is_dir():
-        names = [file.name for file in sorted(path.iterdir()) if file.name in NAMED or file.suffix in FORMATS]
-        return f"; name a file in the folder, such as {path / names[0]}" if names else ""
-    return f"; {_UNREAD[suffix]}" if (suffix := path.suffix.lower()) in _UNREAD else ""
-
-
-def _misnamed(path: Path, known: Format) -> str:
-    """End of a message about a file whose content is of another format."""
-    if not path.is_file():
+        with suppress(OSError):
+            names = [file for file in sorted(path.iterdir()) if file.name in NAMED or file.suffix in FORMATS]
+            return f"; name a file in the folder, such as {names[0]}" if names else ""
+    if suffix in _UNREAD:
+        return f"; {_UNREAD[suffix]}"
+    head = read_input(path, first=8) if path.is_file() else b""
+    content = next((suffix for magic, suffix in _MAGIC.items() if head.startswith(magic)), suffix)
+    if FORMATS.get(content) is FORMATS.get(suffix):
         return ""
-    head = read_input(path, first=8)
-    suffix = next((suffix for magic, suffix in _MAGIC.items() if head.startswith(magic)), None)
-    if suffix is None or FORMATS[suffix].name == known.name:
-        return ""
-    return f"; its content is {FORMATS[suffix].name}: rename it to {path.stem}{suffix}"
+    return f"; its content is {FORMATS[content].name}: rename it to {path.stem}{content}"
 
 
-def format_of(path: str | os.PathLike[str], remedy: str = "") -> Format:
+def format_of(path: str | os.PathLike[str]) -> Format:
     """Format of a file by its name or suffix. Raises InputError for an unknown format."""
     if (named := NAMED.get(path_of(path).name.lower())) is not None:
         return named
     suffix = path_of(path).suffix.lower()
     if suffix not in FORMATS:
-        raise InputError(f"{path}: {unknown('suffix of a splat file', suffix, FORMATS)}{remedy}")
+        raise InputError(f"{path}: {unknown('suffix of a splat file', suffix, FORMATS)}")
     return FORMATS[suffix]
 
 
@@ -138,11 +128,12 @@ def load_splats(path: str | os.PathLike[str], progress: Progress | None = None) 
 
     Raises InputError for an unknown suffix or a damaged file.
     """
-    known, file = format_of(path, remedy_for(path_of(path))), path_of(path)
+    file = path_of(path)
     try:
+        known = format_of(file)
         return load_ply(file, progress) if known.load is load_ply else known.load(file)
     except InputError as error:
-        raise InputError(f"{error}{_misnamed(file, known)}") from error
+        raise InputError(f"{error}{remedy_for(file)}") from error
 
 
 def save_splats(cloud: SplatCloud, path: str | os.PathLike[str]) -> None:

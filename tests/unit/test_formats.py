@@ -283,6 +283,11 @@ def test_a_gltf_may_begin_with_as_many_spaces_as_it_likes(tmp_path):
         ("a.spz", b"", "cannot read .*a.spz: it is empty"),
         ("a.spz", b"ply\n", "got b'ply.n'; its content is PLY: rename it to a.ply"),
         ("a.glb", b"NGSP" + bytes(99), "its content is SPZ: rename it to a.spz"),
+        (
+            "a.dat",
+            b"PXR-USDC",
+            "unknown suffix .*; its content is OpenUSD ParticleField: rename it to a.usdc",
+        ),
         ("a.toml", b"", "unknown suffix of a splat file '.toml'.*; fidsplat render, .* read scene files"),
     ],
 )
