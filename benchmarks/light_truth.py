@@ -1,7 +1,7 @@
 """Compare lit and bent markers with Blender's Cycles: radiance, shadow edges, corners, detection rates.
 
 python benchmarks/light_truth.py -o light-truth                 `fidsplat experiment blender --install` before
-python benchmarks/light_truth.py -o light-truth --poses 1000 --samples 512
+python benchmarks/light_truth.py -o light-truth --poses 1000 --samples 128 --case poses
 
 A marker hangs on the wall of a room of glowing panels, under a shelf, in our renderer as boxes, in Blender as
 planes. Existing images of Blender are kept, so that an interrupted run continues.
@@ -24,7 +24,7 @@ import numpy as np
 
 import fidsplat as fs
 from fidsplat.experiments.blender import default_environment, image_job, ready, run_worker
-from fidsplat.experiments.tags_report import wilson
+from fidsplat.experiments.tags_report import NORMAL, wilson
 from fidsplat.images.files import to_uint8, write_png
 from fidsplat.images.filters import grey_of
 from fidsplat.images.visualize import contact_sheet
@@ -337,7 +337,7 @@ def main() -> int:
     """Render, compare, print and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("-o", "--out", default="light-truth", help="folder for images and figures")
-    parser.add_argument("--samples", type=int, default=256, help="of Cycles; poses: a quarter, denoised")
+    parser.add_argument("--samples", type=int, default=256, help="of Cycles")
     parser.add_argument("--poses", type=int, default=200, help="views for detection rates")
     parser.add_argument("--case", action="append", default=None, help="name of a case (default: all)")
     parser.add_argument("--device", default=None)
@@ -350,8 +350,7 @@ def main() -> int:
     for case in cases(arguments.poses):
         if arguments.case and case.name not in arguments.case:
             continue
-        poses = case.name == "poses"
-        job = {"samples": arguments.samples // (4 if poses else 1), "denoise": poses}
+        job = {"samples": arguments.samples, "denoise": False}
         one = job_of(case, folder)
         list(run_worker(python, WORKER, [one], job, arguments.threads))
         truth = [np.load(image["file"]) for image in one["images"]]
@@ -372,8 +371,8 @@ def main() -> int:
 
 
 def detection(case: Case, light: dict[str, list[np.ndarray]], factor: int) -> dict[str, Any]:
-    """Detections in images reduced by a factor: numbers, intervals of their shares, equal results, and median
-    errors of corners."""
+    """Detections in images reduced by a factor: numbers, intervals of their shares, equal results, median
+    errors of corners, and the difference of the shares in percentage points with its interval of 95 %."""
     small = replace(case, cameras=tuple(resized(camera, 1 / factor) for camera in case.cameras))
     errors = {
         name: read_all(
@@ -389,6 +388,9 @@ def detection(case: Case, light: dict[str, list[np.ndarray]], factor: int) -> di
             name: [int(own.sum()), *wilson(int(own.sum()), len(own)), float(np.nanmedian(each[name]))]
             for name, own in read.items()
         } | {"equal": float((read["ours"] == read["Cycles"]).mean())}
+        apart = 100.0 * (read["ours"].astype(int) - read["Cycles"])  # of the same pose
+        half = NORMAL * float(apart.std()) / math.sqrt(len(apart))
+        found[detector]["difference"] = [float(apart.mean()) + off for off in (0.0, -half, half)]
     return found
 
 

@@ -251,8 +251,12 @@ def _field(placed: PlacedMarker, light: Lighting, points: _Points, around: _Surr
         return np.stack(found)
 
     if light.source == "lights":
-        ambient = (0.0, 0.0, 0.0) if light.ambient is None else light.ambient
-        return LightField.uniform(ambient)
+        if light.ambient is None and not around.lights:
+            raise InputError(
+                f"marker {placed.label} with light 'lights' must have a light, got none; add [[lights]] or "
+                "ambient = [0.5, 0.5, 0.5]"
+            )
+        return LightField.uniform(light.ambient or (0.0, 0.0, 0.0))
     normal = unit(surface.normals.mean(axis=0))
     levels = tuple(count for count in GRIDS if 3 <= count <= light.panoramas) or (light.panoramas,)
     field = LightField.measured(light.rows, levels, places, radiance_at, normal, light.step)
@@ -328,14 +332,15 @@ def _from_camera(
         viewers = np.broadcast_to(-camera.world_to_camera[2, :3], surface.points.shape)
     else:
         viewers = unit(camera.position - surface.points)
-    found = np.empty((len(viewers), 3))
+    found, black = np.zeros((len(viewers), 3)), not arriving.field.radiance.any()
     for start in range(0, len(viewers), _CHUNK):
         rows = slice(start, start + _CHUNK)
         shown = [(point, one[rows]) for point, one in arriving.points]
         normals = surface.normals[rows]
-        directions, weights = lobe(viewers[rows, None], normals, shiny)
-        radiance = arriving.field.arriving(directions[:, 0], points.local[rows, :2])
-        found[rows] = np.einsum("nk,nkc->nc", weights[:, 0], radiance)
+        if not black:
+            directions, weights = lobe(viewers[rows, None], normals, shiny)
+            radiance = arriving.field.arriving(directions[:, 0], points.local[rows, :2])
+            found[rows] = np.einsum("nk,nkc->nc", weights[:, 0], radiance)
         found[rows] += _highlights(surface.points[rows], normals, viewers[rows, None], shiny, shown)[:, 0]
     cosine = np.einsum("mc,mc->m", viewers, surface.normals)
     return found, 1 - fresnel(cosine, shiny.reflectance)

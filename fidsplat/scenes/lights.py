@@ -197,7 +197,8 @@ class SpotLight(PointLight):
         self._number("inner", 0, math.pi / 2)
         self._number("outer", 0, math.pi / 2)
         if not self.inner < self.outer:
-            raise InputError(f"spot: outer must be above inner, got {self.outer:g} and {self.inner:g}")
+            inner, outer = (f"{math.degrees(angle):g} degrees" for angle in (self.inner, self.outer))
+            raise InputError(f"spot: outer must be above inner, {inner}, got {outer}")
 
 
 LIGHTS: dict[str, type[Light]] = {kind.kind: kind for kind in (Sun, PointLight, SpotLight)}

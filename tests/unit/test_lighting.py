@@ -372,7 +372,7 @@ def test_errors_of_scene_files(tmp_path, text, words):
         (lambda: fs.Lighting(panoramas=2.0), "panoramas must be 1, 2, 3, 5, 9, 17, got 2.0"),
         (lambda: fs.Lighting(panoramas=4), "panoramas must be 1, 2, 3, 5, 9, 17, got 4"),
         (lambda: fs.Sun(direction=(0, 0, math.nan)), "three finite numbers"),
-        (lambda: fs.SpotLight(position=(0, 0, 0), direction=(0, 0, 1), inner=0.8), "outer must be above"),
+        (lambda: fs.SpotLight(position=(0, 0, 0), direction=(0, 0, 1), inner=0.8), "outer must be above inner, 45.8366 degrees, got 45 degrees"),
         (lambda: PlacedMarker(TAG, light=1), "a marker's light must be"),
         (lambda: fs.Scene(lights=[1]), "lights must be a list of Light"),
     ],
@@ -393,6 +393,8 @@ def test_errors_of_light_that_cannot_be_computed():
         lit(of_lights(SUN, roughness=0.3))
     with pytest.raises(fs.InputError, match="the scene must have a camera"):
         lit(of_lights(SUN, roughness=0.3, view="camera"))
+    with pytest.raises(fs.InputError, match="must have a light, got none; add"):
+        lit(replace(dark, markers=[PlacedMarker(TAG, light="lights")]))
 
 
 def test_a_light_inside_of_a_wall_is_an_error():
