@@ -96,7 +96,11 @@ def _locus_detector(family: str) -> Any:
 
 def _cv2_qr(grey: np.ndarray, target: Target) -> Attempt:
     """OpenCV's QRCodeDetector."""
-    text, quad, _ = cv2.QRCodeDetector().detectAndDecode(grey)
+    detector, text = cv2.QRCodeDetector(), None
+    try:
+        text, quad, _ = detector.detectAndDecode(grey)
+    except cv2.error:  # OpenCV 5 raises it for symbols that it cannot decode
+        quad = detector.detect(grey)[1]
     every = [] if quad is None else [quad.reshape(4, 2) + 0.5]
     return attempt_of([(text, quad) for quad in every], target, every)
 

@@ -50,6 +50,17 @@ def test_another_code_in_its_place_is_found_at_most_and_not_read(kind, name):
     assert result.found == (name not in ("pupil", "locus"))
 
 
+def test_a_code_whose_decoder_fails_is_found_and_not_read(monkeypatch):
+    class Failing(cv2.QRCodeDetector):
+        def detectAndDecode(self, grey):
+            raise cv2.error("mode 15 in function 'decodeSymbols'")
+
+    monkeypatch.setattr(cv2, "QRCodeDetector", Failing)
+    image, target = ideal("small", 10.0)
+    assert attempt("cv2", image, target) == Attempt(True, False)
+    assert attempt("cv2", np.full_like(image, 128), target) == Attempt(False, False)
+
+
 @pytest.mark.parametrize("name", ["aruco", "cv2", "zxing"])
 def test_a_quadrilateral_elsewhere_is_not_the_code(name):
     image, target = ideal("apriltag" if name == "aruco" else "small", 10.0)
