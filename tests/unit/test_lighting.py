@@ -372,7 +372,10 @@ def test_errors_of_scene_files(tmp_path, text, words):
         (lambda: fs.Lighting(panoramas=2.0), "panoramas must be 1, 2, 3, 5, 9, 17, got 2.0"),
         (lambda: fs.Lighting(panoramas=4), "panoramas must be 1, 2, 3, 5, 9, 17, got 4"),
         (lambda: fs.Sun(direction=(0, 0, math.nan)), "three finite numbers"),
-        (lambda: fs.SpotLight(position=(0, 0, 0), direction=(0, 0, 1), inner=0.8), "above inner, 45.8366 degrees, got 45 degrees"),
+        (
+            lambda: fs.SpotLight(position=(0, 0, 0), direction=(0, 0, 1), inner=0.8),
+            "inner, 45.8366 degrees, got 45 degrees",
+        ),
         (lambda: PlacedMarker(TAG, light=1), "a marker's light must be"),
         (lambda: fs.Scene(lights=[1]), "lights must be a list of Light"),
     ],
