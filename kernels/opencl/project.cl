@@ -90,6 +90,7 @@ kernel void project(
     uint at = number * count + i;
     view += number;
     KEY = CULLED;
+//@@ kept
 //@@ splat_view
 
     // read before the first test, so that memory latency is paid once; arrays are aligned for vector loads (Resident)
@@ -248,6 +249,8 @@ INLINE void write_splat(
 #if BATCH > 1
 #undef record
 #undef bounds
+#endif
+#if BATCH > 1 || defined(KEPT)
 // Key of a splat that is culled by its bounding sphere; 0 for others.
 #undef RETURN_CULLED
 #define RETURN_CULLED return CULLED
@@ -262,6 +265,9 @@ INLINE uint sphere_key(
 //@@ cull_frustum
     return 0;
 }
+#endif
+//@@ project_kernels
+#if BATCH > 1
 
 kernel void project(
 //@@ arguments project

@@ -9,6 +9,7 @@ from traces import CAMERA, CULLED, listing, traced
 
 import fidsplat as fs
 from fidsplat.backends.batched_views import ViewBatch
+from fidsplat.backends.opencl import pipeline as pipeline_module
 from fidsplat.backends.opencl import tiling
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.view import View
@@ -116,6 +117,34 @@ def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
     for images, own in zip(batch_images.read("rgb"), (other, expected), strict=True):
         assert np.array_equal(images, own.read("rgb", 0))
     assert launched.count("tally_local") > (3 if budget else 2)
+
+
+def test_splats_culled_before_projection(backend, monkeypatch):
+    """Large clouds have records only for splats that may be visible. Views of few, of none, of more than the
+    buffers hold, which are rendered again when they are read, and of few again."""
+    cloud, outputs = random_splats(9000, seed=5, scale=(1e-3, 0.05), across=1.5), ("rgb", "splat_id")
+    features, _ = prepare(cloud, fs.Capture(CAMERA, outputs))
+    eyes = [(0.0, 0.0, 3.2), (0.0, 0.0, 50.0), (0.0, 0.0, 1.0), (0.3, 0.0, 3.0)]
+    views = [
+        prepare(cloud, fs.Capture(fs.Camera.look_at(161, 117, 1.0, eye, (0.0, 0.0, eye[2] + 9)), outputs))[1]
+        for eye in eyes
+    ]
+    rendered = []
+    for least in (pipeline_module.MIN_CULLED, 1):
+        monkeypatch.setattr(pipeline_module, "MIN_CULLED", least)
+        own = type(backend)(backend.device)  # with new buffers
+        pipeline, resident = own.pipeline(features, listing(own, "tiled")), own.upload(cloud)
+        rendered.append([pipeline.render_view(resident, view) for view in (*views, *views)])
+        rendered[-1].append(pipeline.render(resident, ViewBatch.single(views[2])))
+        for images in rendered[-1]:
+            images.read("rgb")
+    culled = own.pool.size("kept") // 4
+    assert 4096 < culled < 9000
+    assert own.pool.size("splats") == culled * pipeline.source.records["Splat"].itemsize
+    for images, expected in zip(*rendered, strict=True):
+        assert images.stats == expected.stats
+        for name in outputs:
+            assert np.array_equal(images.read(name), expected.read(name), equal_nan=True), name
 
 
 def test_lists_that_overflow_are_made_again(backend):

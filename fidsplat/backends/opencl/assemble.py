@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import chain
@@ -31,7 +31,7 @@ from fidsplat.backends.opencl.declare import (
     output_argument,
 )
 from fidsplat.backends.opencl.effect_layouts import LAYOUTS, extension_layout
-from fidsplat.backends.opencl.layout import BOUNDS, GROUP_KERNELS, KERNELS, MOMENTS, SPLAT, VIEW
+from fidsplat.backends.opencl.layout import BOUNDS, GROUP_KERNELS, KEPT_KERNELS, KERNELS, MOMENTS, SPLAT, VIEW
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.effects import FeatureSet, Output
 from fidsplat.effects.extensions import EXTENSIONS
@@ -78,7 +78,7 @@ _EFFECT_ARGUMENTS = {
         name: name
         for name in ("project", "emit", "blend", "backdrop", "resolve", "project_backward", "project_step")
     },
-    **{"blend_checkpoints": "blend_backward", "blend_backward": "blend_backward"},
+    **{"blend_checkpoints": "blend_backward", "blend_backward": "blend_backward", "find_kept": "project"},
 }
 """fields of `Layout` with the arguments that effects add to these kernels"""
 
@@ -167,14 +167,10 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     files += [*_dialect(shape, _scalars(features), features.slots), "part/resolve_pixel.cl"]
     if "blend_half" not in layouts:
         files.append("part/blend_float.cl")
-    if shape.batch > 1 and "camera_pinhole" in layouts:
-        # not for mixtures of disks and 3D Gaussians, whose bounds are computed in another way
-        if "lowpass_screen" in layouts and "thickness" not in layouts:
-            files.append("part/cull_frustum.cl")
-        if "lowpass_pixel" in layouts and "thickness" not in layouts:
-            files.append("part/cull_frustum_pixel.cl")
-        if "ellipsoids_only" in layouts:
-            files.append("part/cull_frustum_ewa.cl")
+    if shape.batch > 1 or shape.culls:
+        files += _frustum_parts(layouts)
+    if shape.culls:
+        files.append("part/kept_splats.cl")
     if fused:
         files.append("part/resolve_fused.cl")
     if shape.lists == "tiled":
@@ -208,6 +204,23 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     _refuse_unknown_hooks(files)
     declared = Declarations(_scalars(features), layouts, features.images, fused, kernels_of(shape))
     return Assembler(files, declared, numbers_of(features, shape)).source(stages)
+
+
+def _frustum_parts(layouts: Collection[str]) -> list[str]:
+    """The file with the test of bounding spheres; none for lenses, and for mixtures of disks and 3D
+    Gaussians, whose bounds are computed in another way."""
+    if "camera_pinhole" not in layouts:
+        return []
+    if "ellipsoids_only" in layouts:
+        return ["part/cull_frustum_ewa.cl"]
+    filters = {"lowpass_screen": "", "lowpass_pixel": "_pixel"}
+    thin = "thickness" not in layouts
+    return [f"part/cull_frustum{suffix}.cl" for name, suffix in filters.items() if thin and name in layouts]
+
+
+def culls_before_projection(features: FeatureSet) -> bool:
+    """Whether splats outside of the frustum can be culled by bounding spheres."""
+    return bool(_frustum_parts(layouts_of(features)))
 
 
 def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
@@ -249,7 +262,8 @@ def _dialect(shape: DeviceShape, scalars: Scalars, slots: Iterable[str] = ()) ->
 
 def kernels_of(shape: DeviceShape) -> Mapping[str, tuple[Argument, ...]]:
     """The arguments of each kernel in the schedule of a shape."""
-    return KERNELS | GROUP_KERNELS if shape.schedule == "group" else KERNELS
+    kernels = KERNELS | GROUP_KERNELS if shape.schedule == "group" else KERNELS
+    return kernels | KEPT_KERNELS if shape.culls else kernels
 
 
 @cache

@@ -108,6 +108,8 @@ class DeviceFrame:
         frame; 0: no limit."""
         self.workspace, self.commands, self.shape = workspace, commands, shape
         self.resident, self.plan = resident, plan
+        self.projected = resident.count
+        """number of splats of each view that have records; a capacity where others are culled before"""
         self.batch, self.views = views, len(views)
         self.view = view = views.view
         self.waits = replay_queue is None or shape.lists == "ordered"

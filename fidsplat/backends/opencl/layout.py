@@ -353,3 +353,10 @@ GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
 }
 """Kernels with other arguments in the group schedule, where a work-group shares a tile."""
+
+KEPT_KERNELS: dict[str, tuple[Argument, ...]] = {
+    "project": takes(KERNELS["project"], "in uint kept  // splats that are projected"),
+    "find_kept": takes(KERNELS["project"], "in uint kept", "out uint kept_bits kept_counts"),
+    "list_kept": takes("uint capacity", "in uint kept_bits kept_counts", "out uint kept tallies"),
+}
+"""Kernels with frustum culling before projection."""

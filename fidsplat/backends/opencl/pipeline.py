@@ -13,7 +13,7 @@ import pyopencl as cl
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import Pipeline
 from fidsplat.backends.opencl import tiling
-from fidsplat.backends.opencl.assemble import Source
+from fidsplat.backends.opencl.assemble import Source, culls_before_projection
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.device_frame import DeviceFrame, Rendered
 from fidsplat.backends.opencl.frame import render
@@ -31,6 +31,8 @@ from fidsplat.util.errors import DeviceError
 
 MIN_BATCHED = 1 << 14
 """minimum splats of clouds whose set-up is vectorised on CPUs"""
+MIN_CULLED = 1 << 21
+"""minimum splats of clouds that are culled before projection; two more launches cost smaller ones more"""
 _MAX_FRAMES = 32
 """maximum number of cached frames of a cloud"""
 _MAX_RASTERS = 4
@@ -87,6 +89,8 @@ class OpenCLPipeline(Pipeline):
                 return images
             if resident.coherent and self.shape.lists == "tiled":
                 return self._with_lists("local").render_view(resident, view)
+            if resident.count >= MIN_CULLED and not resident.streamed and self._culls:
+                return self._other(self.features, replace(self.shape, culls=True)).render_view(resident, view)
             plan = self._planner.frame(resident, view)
             if plan.chunk and self.shape.lists != "ordered":
                 # frames in chunks use only this strategy; it is the fastest with little memory
@@ -252,7 +256,13 @@ class OpenCLPipeline(Pipeline):
 
     def _with_lists(self, lists: str) -> OpenCLPipeline:
         """The pipeline with another tile-binning strategy."""
-        return self._other(self.features, replace(self.shape, lists=lists))
+        return self._other(self.features, replace(self.shape, lists=lists, culls=False))
+
+    @cached_property
+    def _culls(self) -> bool:
+        """Whether large clouds are rendered by the pipeline with frustum culling before projection."""
+        tiled = self.shape.lists == "tiled" and not self.shape.culls
+        return tiled and culls_before_projection(self.features)
 
     @cached_property
     def _unbatched(self) -> OpenCLPipeline:

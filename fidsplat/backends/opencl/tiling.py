@@ -32,6 +32,8 @@ _ITEMS = 256
 _START_TILES, _START_SHARES = 512, 32
 """tiles per work-group of the kernel `tile_starts`, and maximum number of work-groups, each of which reads
 all list lengths"""
+_KEPT_SPLATS = 4096
+"""splats per work-group of the kernels of part/kept_splats.cl"""
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 
 
@@ -56,9 +58,36 @@ def allocate_tallies(frame: DeviceFrame, words: int, big: int = 0) -> None:
     cl.enqueue_fill_buffer(frame.queue, tallies, np.zeros(1, np.uint32), 0, 4 * words)
 
 
+def cull(frame: DeviceFrame, big: int) -> None:
+    """List the splats of the cloud that are not culled by their bounding spheres, and set
+    `frame.projected`."""
+    count, pool = frame.resident.count, frame.pool
+    groups, items = -(-count // _KEPT_SPLATS), (_ITEMS,)
+    for name in ("splats", "keys", "windows"):  # of the previous frame; allocated later
+        frame.take(name, 0)
+    frame.take("kept", 4 * MIN_BIG)
+    frame.take("kept_bits", _KEPT_SPLATS // 8 * groups)
+    frame.take("kept_counts", 4 * groups)
+    arrays = {name: frame.resident.part(name, 0, count) for name in frame.source.cloud_arrays}
+    frame.launch("project", "find_kept", (groups * _ITEMS,), items, frame.views, count=count, **arrays)
+    while True:
+        frame.projected = min(pool.size("kept") // 4, count)
+        frame.launch("project", "list_kept", (groups * _ITEMS,), items, capacity=frame.projected)
+        if not frame.waits:
+            break
+        found = int(frame.read("tallies", np.uint32, (TALLIES,))[VISIBLE])
+        if found <= frame.projected:
+            break
+        frame.take("kept", 4 * min(found * 17 // 16, count))
+        allocate_tallies(frame, TALLIES + frame.tiles, big)
+
+
 def project(frame: DeviceFrame, first: int, end: int) -> None:
-    """Project splats [first, end): write their records, sort keys and tile windows."""
+    """Project splats [first, end), or of these the splats of `cull`: write their records, sort keys and tile
+    windows."""
     count, size = end - first, _splat_capacity(frame, end - first)
+    if frame.shape.culls:
+        size = frame.projected
     frame.take("splats", size * frame.source.records["Splat"].itemsize)
     frame.take("keys", KEYS * size)
     windows = frame.take("windows", WINDOWS * size)
@@ -68,6 +97,7 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
     if count:
         arrays = {name: frame.resident.part(name, first, end) for name in frame.source.cloud_arrays}
         batch = frame.shape.batch
+        count = size if frame.shape.culls else count
         items, group = (count, 64) if batch == 1 else (-(-count // batch), 1)
         frame.launch("project", "project", (items,), (group,), frame.views, count=count, **arrays)
 
@@ -226,9 +256,11 @@ def pair_capacity(workspace: Workspace) -> int:
 
 def project_and_count(frame: DeviceFrame, big: int = 0) -> None:
     """Project the cloud and count the pairs of each tile, with buffers for at least `big` big splats."""
-    count = frame.resident.count
     allocate_tallies(frame, TALLIES + frame.tiles, big)
-    project(frame, 0, count)
+    if frame.shape.culls:
+        cull(frame, big)
+    project(frame, 0, frame.resident.count)
+    count = frame.projected
     frame.launch("bin", "tally_big", (_big_groups(frame) * _ITEMS,), (_ITEMS,), count=count)
     if frame.shape.lists == "local":
         launch_local(frame, "tally_local")
@@ -248,7 +280,7 @@ def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
 def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band: bool) -> None:
     frame.take("pairs", 8 * capacity)
     frame.take("lists", 4 * capacity)
-    count, views, groups = frame.resident.count, frame.views, _big_groups(frame)
+    count, views, groups = frame.projected, frame.views, _big_groups(frame)
     given = {"band_first": band.first, "band_end": band.end, "capacity": capacity, "first_band": first_band}
     if frame.shape.lists == "local":  # big splats, then all others
         frame.launch(
