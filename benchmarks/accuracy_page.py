@@ -65,7 +65,7 @@ CONSTANTS = (
 
 
 def write_accuracy(folders: Sequence[Path], page: Path = PAGE, report: Path = REPORT) -> None:
-    """Write the block of a page, and a report with its tables and charts in the folder of its name."""
+    """Write the generated block of a page, and a report with tables and charts in the folder of its name."""
     folder = report.with_suffix("")
     write_report(folders, report)
     devices = [device for device in load([folder]) if SCENE in device.scenes]
@@ -87,7 +87,7 @@ def write_accuracy(folders: Sequence[Path], page: Path = PAGE, report: Path = RE
 
 
 def constants_table(devices: Sequence[DeviceResults]) -> Frame:
-    """Time that each constant saves relative to the exact image, its largest error, and verdicts."""
+    """Table of constants: time saved relative to the exact image, largest error, and verdicts."""
     rows = []
     for constant in CONSTANTS:
         row: dict[str, str] = {"constant": constant.text, "used by": constant.users}
@@ -126,7 +126,7 @@ def suite_facts(device: splatmark.Device, folder: Path) -> dict[str, str]:
 
 
 def write_chart(device: splatmark.Device, file: Path) -> None:
-    """Write a chart of the time and largest error of every renderer and setting, a panel for each scene."""
+    """Write a chart of time and largest error of all renderers and settings, with a panel for each scene."""
     renderers = list(dict.fromkeys(one["renderer"] for one in device.results))
     with chart(file, len(SHOWN), (11.0, 4.6)) as (figure, panels):
         points = []

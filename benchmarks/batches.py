@@ -2,8 +2,8 @@
 
     python benchmarks/batches.py --device opencl [--rows scenes agents few] [--repeats 5] [--json FILE]
 
-Splats and images stay on the device. A time is from the call until the device is done, over the views; `host`
-is the part until the call returns. Cameras are on an arc around their target.
+Splats and images stay on the device. Times are per view, from the call until the device has finished; `host`
+is the time until the call returns. Cameras are on an arc around their target.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _ALONE = 32
 
 
 def arc(views: int) -> np.ndarray:
-    """Poses (views, 7) on a quarter of a circle of 6 metres around the point 6 metres ahead."""
+    """Poses (views, 7) on a quarter circle with a radius of 6 metres around a point 6 metres ahead."""
     target, poses = np.array([0.0, 0.0, 6.0]), []
     for angle in np.linspace(-np.pi / 4, np.pi / 4, views):
         position = target - 6.0 * np.array([np.sin(angle), 0.0, np.cos(angle)])
@@ -65,7 +65,7 @@ def scene_of(row: Row) -> tuple[fs.SplatCloud, fs.Capture, np.ndarray]:
 
 
 def measure(renderer: fs.Renderer, name: str, repeats: int) -> dict:
-    """Figures of a row, per view."""
+    """Measured figures of a row, per view."""
     row = ROWS[name]
     cloud, capture, poses = scene_of(row)
     resident = renderer.upload(cloud)

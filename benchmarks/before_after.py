@@ -5,10 +5,10 @@
     python benchmarks/before_after.py COMMIT --pytest [WORDS] [--device D]
 
 Both processes render a scene of this tree with equal constants (alpha cut-off 1/255, stop 1e-4, precise
-arithmetic); splats and images stay on the device. The trees alternate frame by frame, and the first of a pair
-changes. Reported are the median and quartiles of the ratio of this tree's time to the commit's, and median
-stage times by the device clock. --cpu-time measures CPU time of all threads, which other processes disturb
-less.
+arithmetic); splats and images stay on the device. The trees alternate frame by frame, and also alternate as
+the first of a pair. The report has the median and quartiles of the ratio of this tree's time to the commit's,
+and median stage times by the device clock. --cpu-time measures the CPU time of all threads, which other
+processes disturb less.
 
 --pytest runs `pytest benchmarks/` with both trees, one after the other, and compares them by
 `pytest-benchmark compare`; WORDS are arguments of pytest, such as "-k tag".
@@ -95,7 +95,7 @@ class Tree:
         """stage times of each frame in milliseconds"""
 
     def frame(self) -> None:
-        """Render a frame; the clock advances by its time."""
+        """Render a frame and advance the clock by its time."""
         assert self.child.stdin is not None
         self.child.stdin.write("\n")
         self.child.stdin.flush()

@@ -1,5 +1,5 @@
-"""Blender worker: lit markers in a room of glowing panels, and diffuse meshes. Runs in Blender's Python
-without fidsplat.
+"""Blender worker that renders lit markers in a room of glowing panels, and diffuse meshes, in Blender's
+Python without fidsplat.
 
     python blender_room.py JOB.json
 
@@ -67,7 +67,7 @@ def add(name: str, vertices: list, faces: list, material):
 
 
 def nodes(name: str):
-    """A material without nodes but its output."""
+    """Make a material with only an output node."""
     made = bpy.data.materials.new(name)
     made.use_nodes = True
     made.node_tree.nodes.clear()
@@ -75,7 +75,7 @@ def nodes(name: str):
 
 
 def emission(radiance: list):
-    """Material that radiates and reflects nothing."""
+    """Make a material that radiates and does not reflect."""
     made, tree, output = nodes("emission")
     shader = tree.nodes.new("ShaderNodeEmission")
     shader.inputs["Color"].default_value = (*radiance, 1.0)
@@ -84,7 +84,7 @@ def emission(radiance: list):
 
 
 def diffuse_mesh(given: dict) -> None:
-    """A mesh that reflects diffusely, with an albedo of each face."""
+    """Add a diffuse mesh with an albedo per face."""
     made, tree, output = nodes("diffuse")
     albedo = tree.nodes.new("ShaderNodeAttribute")
     albedo.attribute_name = "albedo"
@@ -111,7 +111,7 @@ def add_light(light: dict) -> None:
 
 
 def sheet(one: dict) -> None:
-    """The marker as a mesh of its sheet with a texture of one pixel per module."""
+    """Add a marker as the mesh of its sheet, with a texture of one pixel per module."""
     points, grid = np.array(one["points"]), np.array(one["grid"])
     rows, columns = points.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)

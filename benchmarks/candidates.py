@@ -5,9 +5,9 @@
 
 Each scene of `random_scenes.py` is rendered with every candidate and compared with the image at full
 precision, in float64 (`fidsplat.accuracy.error.reference_renderer`). Costs are medians of interleaved frames
-of the scenes of TIMED, of processor time on CPUs. In a second round, the Pareto front is rendered with every
-set of MODIFIERS (and OF_GPUS) and with FINEST; the new Pareto front is written. Settings that the device
-lacks are left out. Entries of other kinds of devices stay.
+of the scenes of TIMED, of processor time on CPUs. In a second round, the Pareto front is rendered with all
+sets of MODIFIERS (and OF_GPUS) and with FINEST; the new Pareto front is written. Settings that the device
+lacks are skipped. Entries of other kinds of devices are unchanged.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ SLACK = 1.02
 
 
 class Measurement:
-    """Candidates (settings) with errors (scenes, candidates) and costs (candidates,)."""
+    """Settings of candidates, with their errors (scenes, candidates) and costs (candidates,)."""
 
     def __init__(self, candidates: list[dict], errors_: np.ndarray, costs: np.ndarray) -> None:
         self.candidates, self.errors, self.costs = candidates, errors_, costs
@@ -67,11 +67,11 @@ class Measurement:
         ]
 
     def of(self, chosen: list[int]) -> Measurement:
-        """The measurement of some candidates."""
+        """Measurement restricted to some candidates."""
         return Measurement([self.candidates[k] for k in chosen], self.errors[:, chosen], self.costs[chosen])
 
     def rows(self) -> list[dict]:
-        """Rows of candidates.json, the fastest first."""
+        """Rows of candidates.json, sorted by cost."""
         rows = []
         for settings, off, cost in zip(self.candidates, self.errors.T, self.costs.tolist(), strict=True):
             sizes = (round_up(size) for size in (np.quantile(off, 0.05), np.median(off), off.max()))
@@ -80,7 +80,7 @@ class Measurement:
 
 
 def round_up(value: float) -> float:
-    """To three digits."""
+    """Round up to three significant digits."""
     return float(f"{value * 1.0005:.3g}")
 
 
@@ -168,7 +168,7 @@ def all_errors(renderer: fs.Renderer, scenes, truths, candidates: list[dict]) ->
 
 
 def all_costs(renderer: fs.Renderer, candidates: list[dict], repeats: int) -> np.ndarray:
-    """Time of a frame over that of the candidates' base (candidates,): the mean over the timed scenes."""
+    """Frame time relative to the candidates' base (candidates,), mean over the timed scenes."""
     qualities = [quality({}), *(quality(settings) for settings in candidates)]
     # CPU time hardly depends on other processes
     clock = time.process_time if renderer.device.kind == "cpu" else time.perf_counter

@@ -50,7 +50,7 @@ def cloud(seed: int, count: int = 1500, degree: int | None = None, largest: floa
 
 
 def in_coplanar_groups(splats: fs.SplatCloud) -> fs.SplatCloud:
-    """Splats in coplanar groups of forty; the first forty are in no group."""
+    """The splats in coplanar groups of forty, except the first forty, which have no group."""
     groups = np.arange(len(splats)) // 40 - 1
     if hasattr(splats, "with_coplanar_groups"):
         return splats.with_coplanar_groups(groups)
@@ -225,7 +225,7 @@ def main() -> int:
         return 0
     if options.commit is None:
         parser.error("name a commit, or a folder with its files")
-    from before_after import ROOT, checked_out  # here: the package of another tree may lack these modules
+    from before_after import ROOT, checked_out  # here, since another tree may lack these modules
 
     with tempfile.TemporaryDirectory() as folder:
         given = Path(options.commit).resolve()

@@ -1,5 +1,5 @@
-"""Benchmark suite: `pytest benchmarks/`, with `--device D` for another device and `--big` for scenes that are
-skipped on a small machine. `--benchmark-json FILE` writes the figures, with facts of the device.
+"""Benchmark suite: `pytest benchmarks/`. `--device D` selects a device, `--big` adds scenes that small
+machines skip, and `--benchmark-json FILE` writes the figures with facts of the device.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 python benchmarks/depth_cameras.py [NAME ...] [--device opencl] [--json FILE]
 
-The error is the root mean square distance along z to the plane that fits best, over the middle 120 x 120
-pixels without 0.5 % at both ends, as in librealsense's depth-quality tool; the bias is that of the mean.
-`published` has the curve that the parameters follow.
+The error is the RMS distance along z from a fitted plane, over the middle 120 x 120 pixels without the 0.5 %
+largest and smallest distances, as in librealsense's depth-quality tool; the bias is the error of the mean
+depth. `published` is the published curve from which the parameters were derived.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ PUBLISHED: dict[str, Callable[[float], float]] = {
 
 
 def wall(z: float, grey: float = 0.9, tilt: float = 0.0) -> fs.Scene:
-    """A wall at a distance, rotated about the vertical by degrees."""
+    """A wall at a distance in metres, rotated about the vertical by some degrees."""
     turn = [math.cos(math.radians(tilt) / 2), 0, math.sin(math.radians(tilt) / 2), 0]
     color = to_colors(np.full((1, 3), grey), "srgb")
     return fs.Scene([fs.SplatCloud([[0, 0, z]], [turn], [[8.0, 8.0]], [1.0], colors=color).with_boxes()])
 
 
 def errors(depth: np.ndarray, z: float) -> tuple[float, float, float]:
-    """Share of measured pixels, root mean square distance from the best plane, and bias, in metres."""
+    """Share of measured pixels, RMS distance from the fitted plane in metres, and bias in metres."""
     h, w = depth.shape
     y, x = np.mgrid[h // 2 - MIDDLE : h // 2 + MIDDLE, w // 2 - MIDDLE : w // 2 + MIDDLE]
     found = depth[y, x].astype(np.float64)

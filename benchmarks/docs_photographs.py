@@ -1,4 +1,5 @@
-"""The image of docs/from-photographs.md: a photograph, the trained scene from its camera, a robot's image.
+"""Make the image of docs/from-photographs.md: a photograph, the trained scene from its camera, a robot's
+image.
 
 python benchmarks/photographs.py -o /tmp/photographs --up
 fidsplat train /tmp/photographs/scene -o /tmp/photographs/scene/splats.ply
@@ -22,7 +23,7 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "from-photographs.md"
 
 
 def robot_image(scene: Path) -> np.ndarray:
-    """Image of the page's program in MuJoCo."""
+    """Image that the page's MuJoCo program renders."""
     found = re.search(r"```python\n(import mujoco.*?)```", PAGE.read_text(), re.DOTALL)
     assert found is not None
     with tempfile.TemporaryDirectory() as folder:

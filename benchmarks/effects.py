@@ -4,9 +4,9 @@
     python benchmarks/effects.py --table FILE.json [FILE.json ...]       the table of devlog/effect-prices.md
 
 Frames with and without the effect alternate, the images stay on the device, and the queue is drained before
-and after each frame, so that disturbances affect both. The price is the median of the ratios of the two
-times, less 1. The quartiles of the ratios, and the row "base again" with equal frames, show the uncertainty.
-Boxes have the positions, rotations and scales of the scene's Gaussians and cover fewer pixels.
+and after each frame, so that disturbances affect both. The cost is the median ratio of the two times, minus
+1. The quartiles of the ratios, and the row "base again" with equal frames, show the uncertainty. Boxes have
+the positions, rotations and scales of the scene's Gaussians and cover fewer pixels.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ SENSORS = {
 
 
 def turning(time: float) -> np.ndarray:
-    """Pose of a camera that rotates by 30 degrees a second."""
+    """Pose of a camera that rotates by 30 degrees per second."""
     angle = math.radians(30) * time
     return fs.Camera.look_at(2, 2, 1.0, (0, 0, 0), (math.sin(angle), 0, math.cos(angle))).world_to_camera
 
 
 def moved(time: float) -> np.ndarray:
-    """Pose of a group that moves to the right at 1 m a second."""
+    """Pose of a group that moves to the right at 1 m/s."""
     matrix = np.eye(4)
     matrix[0, 3] = time
     return matrix
@@ -170,7 +170,7 @@ LIGHTS: dict[str, dict] = {
 
 
 def measure_light(names: list[str], scene: str, device: str, repeats: int) -> list[dict]:
-    """Seconds to compute the light of an AprilTag in the scene, after a first time that compiles kernels."""
+    """Seconds to compute the light of an AprilTag in the scene, after a run that compiles kernels."""
     renderer = fs.Renderer(device)
     cloud, camera = load_scene(scene)
     tag, pose = fs.marker("apriltag:36h11:5", size=0.16), np.eye(4)
@@ -192,7 +192,7 @@ def measure_light(names: list[str], scene: str, device: str, repeats: int) -> li
 
 
 def page_table(files: list[str]) -> str:
-    """The results of several devices side by side, in Markdown; each file is what --json prints."""
+    """Markdown table of the results of several devices, from files of --json."""
     runs = [{row["effect"]: row for row in json.loads(Path(file).read_text("utf-8"))} for file in files]
     firsts = [next(iter(run.values())) for run in runs]
     head = "".join(f" {first['device']}, {first['repeats']} pairs | |" for first in firsts)

@@ -1,6 +1,6 @@
 """Make the images of effects for the pages and the README, except the low-pass (filter_quality.py).
 
-python benchmarks/effects_pictures.py [--device opencl] [--out docs/images]
+python benchmarks/effects_images.py [--device opencl] [--out docs/images]
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def examples(renderer: fs.Renderer, out: Path) -> None:
 
 
 def turned(degrees: float) -> Callable[[float], np.ndarray]:
-    """Motion of the scene's camera, which rotates by some degrees a second."""
+    """Motion of the scene's camera, a rotation by some degrees per second."""
 
     def pose(time: float) -> np.ndarray:
         angle = math.radians(degrees) * time
@@ -107,13 +107,13 @@ def turned(degrees: float) -> Callable[[float], np.ndarray]:
 
 
 def shining(degree: int) -> fs.Scene:
-    """The globe with its spherical harmonics up to a degree."""
+    """Scene of the globe with spherical harmonics up to a degree."""
     camera = fs.Camera.look_at(WIDTH, HEIGHT, math.radians(50), (0.9, -0.9, -1.6), (0, 0, 0))
     return fs.Scene([globe(degree)], camera, background=(0.5, 0.5, 0.5))
 
 
 def all_effects(renderer: fs.Renderer) -> list[tuple[str, np.ndarray]]:
-    """A titled image of each of twelve effects, all of one shape."""
+    """Titled images of twelve effects, all of one shape."""
     marked = path_with_tags("exact")
     camera = marked.camera
     assert camera is not None
@@ -150,7 +150,7 @@ def all_effects(renderer: fs.Renderer) -> list[tuple[str, np.ndarray]]:
 
 
 def outputs_sheet(renderer: fs.Renderer, scene: fs.Scene) -> np.ndarray:
-    """Six outputs of one frame, two in a row, with the colour key of the right one."""
+    """Sheet of six outputs of one frame in rows of two, with the colour key of the right one."""
     frame = renderer.render(scene, outputs=("rgb", "normal", "depth", "distance", "label", "blended"))
     depth, distance = frame["depth"], frame["distance"]
     span = depth_span([depth, distance])
@@ -165,7 +165,7 @@ def outputs_sheet(renderer: fs.Renderer, scene: fs.Scene) -> np.ndarray:
 
 
 def light_sheet(renderer: fs.Renderer) -> np.ndarray:
-    """The examples of light on markers, and their first marker at four times the scale."""
+    """Sheet of the examples of light on markers, with their first marker enlarged four times."""
     rows = []
     for name in ("lit-tag", "shadow-tag", "glossy-tag"):
         scene = renderer.lit(fs.Scene.load(ROOT / "examples" / f"{name}.toml"))
@@ -182,7 +182,7 @@ def light_sheet(renderer: fs.Renderer) -> np.ndarray:
 
 
 def drawing_sheet(renderer: fs.Renderer) -> np.ndarray:
-    """A tilted drawing, and a corner of it from a twelfth of the distance."""
+    """Sheet of a tilted SVG drawing, and of its corner from a twelfth of the distance."""
     sign = fs.Scene(markers=[PlacedMarker(fs.marker(f"svg:{ROOT / 'examples/data/sign.svg'}"))])
     eye, panels = np.array((0.3, -0.2, -1.1)), []
     for name, target, away in (
@@ -196,14 +196,14 @@ def drawing_sheet(renderer: fs.Renderer) -> np.ndarray:
 
 
 def turned_marker(renderer: fs.Renderer, size: tuple[int, int], **settings) -> np.ndarray:
-    """A tilted AprilTag with a shape or wear."""
+    """Image of a tilted AprilTag with a shape or wear."""
     camera = fs.Camera.look_at(*size, math.radians(46), (0.12, -0.13, -0.27), (0, 0, 0.01))
     scene = fs.Scene(markers=[PlacedMarker(fs.marker("apriltag:36h11:5", 0.16, **settings))])
     return to_uint8(renderer.render(scene, camera, background=(0.45, 0.5, 0.55))["rgb"])
 
 
 def shapes_sheet(renderer: fs.Renderer) -> np.ndarray:
-    """A tag on each shape, and a part of two at four times the size."""
+    """Sheet of a tag on each shape, with details of two enlarged four times."""
     shapes = {
         "cylinder, radius 0.06": Cylinder(0.06),
         "cone, radius 0.09, taper 0.4": Cone(0.09, 0.4),
@@ -216,7 +216,7 @@ def shapes_sheet(renderer: fs.Renderer) -> np.ndarray:
 
 
 def wear_sheet(renderer: fs.Renderer) -> np.ndarray:
-    """A tag with each kind of wear."""
+    """Sheet of a tag with each kind of wear."""
     severities = {"bleed": 0.3, "coarseness": 0.4, "fading": 0.6, "dirt": 0.3, "drops": 0.3}
     severities |= {"scratches": 0.2, "tear": 0.2, "fold": 0.4, "cover": 0.2}
     panels = [
@@ -230,7 +230,7 @@ def wear_sheet(renderer: fs.Renderer) -> np.ndarray:
 
 
 def enlarged(image: np.ndarray) -> np.ndarray:
-    """The middle quarter of an image, each pixel as 4 x 4."""
+    """The middle of an image, a quarter of each side, enlarged four times."""
     h, w = image.shape[0] // 4, image.shape[1] // 4
     top, left = (image.shape[0] - h) // 2, (image.shape[1] - w) // 2
     return image[top : top + h, left : left + w].repeat(4, 0).repeat(4, 1)

@@ -1,8 +1,8 @@
-"""Error of EWA's linear projection of a 3D Gaussian: the table of docs/primitives.md.
+"""Measure the error of EWA's linear projection of a 3D Gaussian, for the table of docs/primitives.md.
 
     python benchmarks/ewa_error.py
 
-One sphere of opacity 1 by distance and angle off the axis, in the float64 reference renderer.
+Renders one opaque sphere at several distances and angles off the axis with the float64 reference renderer.
 """
 
 from __future__ import annotations

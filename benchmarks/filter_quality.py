@@ -2,8 +2,8 @@
 
     python benchmarks/filter_quality.py [--device opencl] [--image FILE.png]
 
-The code is frontal, over grey, with a thousand characters at level L. Each pixel of the ideal image is the
-exact mean of the texture over its area. `--image` writes a crop of each at 2 pixels per module, enlarged.
+The code has a thousand characters at level L, and is rendered frontally over grey. Each pixel of the ideal
+image is the exact mean of the texture over its area. `--image` writes enlarged crops at 2 pixels per module.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def camera_of(made: fs.Marker, px: float) -> fs.Camera:
 
 
 def area_sampled(made: fs.Marker, px: float, camera: fs.Camera) -> np.ndarray:
-    """Ideal image of the printed marker (h, w): every pixel is the exact mean over its area."""
+    """Ideal image of the printed marker (h, w), whose pixels are exact means over their areas."""
 
     def overlap(edges: np.ndarray, pixels: int) -> np.ndarray:
         left = np.arange(pixels)[:, None]

@@ -3,8 +3,8 @@ and with caches filled by the same scene.
 
     python benchmarks/first_frame.py [tag] [demo] [--device opencl] [--repeats 5] [--json FILE]
 
-Reported are the seconds from the start of Python to the image in NumPy, and of each part: start of Python,
-imports, construction of the scene with its markers, opening the device, upload and rendering with all
+The report has the seconds from the start of Python to the image in NumPy, and of each step: start of Python,
+imports, construction of the scene with its markers, opening the device, upload and rendering including all
 compilation. The caches of pyopencl, PoCL and NVIDIA's driver are redirected to temporary folders.
 """
 
@@ -46,7 +46,7 @@ print(*marks)
 
 
 def caches_in(folder: Path) -> dict[str, str]:
-    """Environment variables with all kernel caches below `folder`."""
+    """Environment variables that move all kernel caches into `folder`."""
     places = {
         "POCL_CACHE_DIR": str(folder / "pocl"),
         "XDG_CACHE_HOME": str(folder / "xdg"),
@@ -58,7 +58,7 @@ def caches_in(folder: Path) -> dict[str, str]:
 
 
 def first_frame(scene: str, device: str, folder: Path) -> dict[str, float]:
-    """Seconds of each part, and in `total`, of a new process that renders one frame."""
+    """Seconds of each step, and in `total`, of a new process that renders one frame."""
     begun = time.time()
     done = subprocess.run(
         [sys.executable, "-c", CHILD, scene, device], capture_output=True, text=True, env=caches_in(folder)
@@ -79,7 +79,7 @@ def warm(device: str, folder: Path) -> float:
 
 
 def measure(scenes: list[str], device: str, repeats: int) -> list[dict]:
-    """A record for each scene and state of the caches: medians, and the extremes of the total."""
+    """A record for each scene and state of the caches: medians, and minimum and maximum of the total."""
     records = []
     with tempfile.TemporaryDirectory() as name:
         top = Path(name)

@@ -64,7 +64,7 @@ def errors(backend: Backend, scenes: int, solid: float, quality: str | None) -> 
 
 
 def times(backend: Backend, scene: str, quality: str | None, repeats: int) -> dict[str, float | str]:
-    """Medians in milliseconds of a frame and its gradients, and of each stage."""
+    """Median milliseconds of a frame and its gradients, and of each stage."""
     cloud, camera = load_scene(scene)
     features, view = prepare(cloud, fs.Capture(camera, quality=quality))
     pipeline, resident = backend.differentiate(features), backend.upload(cloud)

@@ -3,11 +3,11 @@
     python benchmarks/growth.py growth.jsonl --device opencl
     python benchmarks/growth.py growth.jsonl more.jsonl --plot docs/images       plots measurements
 
-A plot for each series, log-log, a panel for each device (`pip install '.[bench]'`): whole frames are bold,
-stages thin; titles give the exponent of the frame's upper half.
+--plot writes a log-log chart for each series with a panel for each device (`pip install '.[bench]'`): bold
+lines for complete frames, thin lines for stages, and the exponent of the upper half of the curve.
 
 A series ends when a frame takes longer than --longest, or when the scene does not fit on the device. Each
-point is written when it is done; a stopped run resumes with the same file
+point is written immediately; an interrupted run resumes with the same file
 (fidsplat/experiments/sweep.py).
 """
 
@@ -94,7 +94,7 @@ def measure(point: Point, device: str, rates: Rates | None, repeats: int) -> dic
 
 
 def run(series: dict[str, list[Point]], device: str, repeats: int, longest: float, file: Path) -> list[dict]:
-    """Measure the points that are missing in the file; returns all records."""
+    """Measure points that the file lacks; returns all records."""
     renderer = fs.Renderer(device)
     info, backend = renderer.device, renderer.backend
     results = Results(file, run_facts(f"{info.title}, {info.version}", 0))
@@ -119,7 +119,7 @@ def run(series: dict[str, list[Point]], device: str, repeats: int, longest: floa
 
 
 def abscissa(record: dict) -> float:
-    """Abscissa of a record: x, but for the series `overdraw` the layers per pixel."""
+    """Abscissa of a record: x, or the layers per pixel for the series `overdraw`."""
     return record.get("layers_per_pixel", record["x"])
 
 
@@ -148,7 +148,7 @@ TITLES = {
 
 
 def plot(series: str, records: list[dict], file: Path) -> None:
-    """Plot a series: a panel for each device, all with one scale."""
+    """Plot a series with a panel for each device, all with the same scale."""
     from matplotlib import pyplot as plt
 
     plt.switch_backend("agg")

@@ -1,4 +1,4 @@
-"""Measure labelled images an hour: batches of views of one scene, with labels from the renderer.
+"""Measure labelled images per hour: batches of views of one scene, with labels from the renderer.
 
 python benchmarks/labelled_images.py                                     two cores, a minute
 python benchmarks/labelled_images.py --device opencl:nvidia --batch 64 --batches 8 --json figures.json
@@ -56,7 +56,7 @@ def views_of(name: str, count: int, width: int, height: int) -> tuple[fs.Scene, 
 
 
 def seconds_of(work: Callable[[], object], repeats: int) -> float:
-    """Median seconds of a call, after a first one that compiles."""
+    """Median seconds of a call, after a first call that compiles kernels."""
     taken = []
     for _ in range(repeats + 1):
         begun = time.perf_counter()
@@ -66,7 +66,7 @@ def seconds_of(work: Callable[[], object], repeats: int) -> float:
 
 
 def measure(renderer: fs.Renderer, name: str, batch: int, repeats: int, width: int, height: int) -> dict:
-    """Seconds of an image by step, and images an hour."""
+    """Seconds per image by step, and images per hour."""
     scene, cameras = views_of(name, batch, width, height)
     resident = renderer.upload(scene)
     captures = [

@@ -83,7 +83,7 @@ def mesh_error(renderer: fs.Renderer, kind: str, splats: int) -> tuple[str, ...]
     rays, found = scan.directions[chosen], scan.range[0][chosen]
 
     def cast(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Range of the mesh, 0 for none, and cosine of the angle of incidence."""
+        """Range of the mesh, 0 without intersection, and cosine of the angle of incidence."""
         eyes = np.tile(pose[:3, 3], (len(rays), 1))
         places, beams, hit = solid.ray.intersects_location(eyes, rays, multiple_hits=False)
         ranges, cosines = np.zeros((2, len(rays)))

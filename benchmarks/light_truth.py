@@ -3,8 +3,8 @@
 python benchmarks/light_truth.py -o light-truth                 `fidsplat experiment blender --install` before
 python benchmarks/light_truth.py -o light-truth --poses 1000 --samples 128 --case poses
 
-A marker hangs on the wall of a room of glowing panels, under a shelf, in our renderer as boxes, in Blender as
-planes. Existing images of Blender are kept, so that an interrupted run continues.
+A marker is on the wall of a room of glowing panels, under a shelf; fidsplat renders the panels as boxes,
+Blender as planes. Existing images of Blender are reused, so that an interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -59,12 +59,13 @@ class Case:
 
     @property
     def response(self) -> str:
-        """From Blender's values to display values."""
+        """Response that converts Blender's values to display values."""
         return "linear" if self.emits else "srgb"
 
     @property
     def colors(self) -> str:
-        """Response of the colours of our splats: pixels are means of light for poses, as Blender's."""
+        """Response of the splats' colours. For poses they are linear light, so that pixels average light as
+        Blender's do."""
         return "linear" if self.name == "poses" else "srgb"
 
     @property
@@ -93,7 +94,7 @@ def panels() -> list[tuple[np.ndarray, np.ndarray, tuple[float, float, float], n
 
 
 def cloud(response: str = "srgb") -> fs.SplatCloud:
-    """The panels as boxes."""
+    """Box splats of the panels."""
     parts = []
     for number, (middle, halves, radiance, _) in enumerate(panels()):
         lengths = np.linalg.norm(halves, axis=1)
@@ -128,20 +129,20 @@ def inside(camera: fs.Camera) -> bool:
 
 
 def resized(camera: fs.Camera, factor: float) -> fs.Camera:
-    """The camera with an image of another size."""
+    """The camera with an image scaled by a factor."""
     size = (round(camera.width * factor), round(camera.height * factor))
     numbers = (factor * value for value in (camera.fx, camera.fy, camera.cx, camera.cy))
     return fs.Camera.pinhole(*size, *numbers, camera.world_to_camera)
 
 
 def reduced(light: np.ndarray, factor: int) -> np.ndarray:
-    """A smaller image: means of linear light."""
+    """The image reduced by a factor, with means of linear light."""
     size = (light.shape[1] // factor, light.shape[0] // factor)
     return cv2.resize(light.astype(np.float32), size, interpolation=cv2.INTER_AREA)
 
 
 def cases(poses: int) -> list[Case]:
-    """All cases; the last one has views for detection rates."""
+    """All cases; the last case has the views for detection rates."""
     rng = np.random.default_rng(0)
     three = tuple(camera_at(rng, 320, 240, (3.0, 4.0)) for _ in range(3))
     sun = fs.Sun(direction=(0.25, 0.8, 0.75), intensity=4.0, angle=math.radians(2), samples=64)
@@ -163,7 +164,7 @@ def cases(poses: int) -> list[Case]:
 
 
 def scene_of(case: Case, camera: fs.Camera) -> fs.Scene:
-    """Our scene of a case."""
+    """Scene of a case for fidsplat."""
     light = fs.Lighting(
         roughness=case.roughness,
         view="any" if case.roughness is None else "camera",
@@ -179,7 +180,7 @@ def scene_of(case: Case, camera: fs.Camera) -> fs.Scene:
 
 
 def ours(case: Case, renderer: fs.Renderer) -> Iterator[np.ndarray]:
-    """Our images (h, w, 3) in display values; of poses in linear light."""
+    """Images (h, w, 3) of fidsplat in display values, or in linear light for poses."""
     scene, quality = None, fs.Quality(samples=1 if case.name == "poses" else 2)
     for camera in case.cameras:
         if scene is None or case.roughness is not None:  # gloss depends on the camera
@@ -188,7 +189,7 @@ def ours(case: Case, renderer: fs.Renderer) -> Iterator[np.ndarray]:
 
 
 def job_of(case: Case, folder: Path) -> dict:
-    """Blender's scene of a case."""
+    """Job of a case for the Blender worker."""
     made, steps = case.marker, 1 if case.shape is None else 96
     half = np.array(made.grid.shape[::-1]) * made.module / 2
     shares = np.linspace(-1, 1, steps + 1)
@@ -258,7 +259,7 @@ def radiance_errors(case: Case, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) 
 
 
 def smooth_errors(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> dict[str, float]:
-    """Relative errors of radiance where an image is smooth, of means over 5 x 5 pixels."""
+    """Relative errors of radiance in smooth areas of an image, for means over 5 x 5 pixels."""
     found = []
     for own, truth in pairs:
         mean, other = cv2.blur(truth.mean(-1), (5, 5)), cv2.blur(own.mean(-1).astype(np.float32), (5, 5))
@@ -296,7 +297,7 @@ def half_light(case: Case, camera: fs.Camera, image: np.ndarray) -> np.ndarray:
 
 
 def read_all(case: Case, images: Iterator[np.ndarray]) -> dict[str, list[float | None]]:
-    """Corner errors in pixels by detector for each image, None where the marker is not read."""
+    """Corner errors in pixels of each image by detector; None if the marker is not read."""
     made = case.marker
     names = readers(made.kind, made.family)
     found: dict[str, list[float | None]] = {name: [] for name in names}
@@ -395,7 +396,7 @@ def detection(case: Case, light: dict[str, list[np.ndarray]], factor: int) -> di
 
 
 def compare(case: Case, own: list[np.ndarray], truth: list[np.ndarray]) -> dict[str, Any]:
-    """Figures of a case: our images of `ours`, Blender's in linear light."""
+    """Measured figures of a case. own: images of `ours`. truth: Blender's images in linear light."""
     shown = [np.asarray(to_colors(image, case.response), np.float32) for image in truth]
     if case.name == "poses":
         light = {"ours": own, "Cycles": truth}

@@ -1,10 +1,10 @@
-"""Accuracy, time and covariance of `fs.localise` in the greenhouse, from starts at random around the truth.
+"""Measure accuracy, time and covariance of `fs.localise` in the greenhouse, from random initial poses.
 
     python benchmarks/localisation.py --repeats 100 [--distance 0.1 --degrees 5] [--noise 0.01] [--device D]
 
-Photographs are renders with another exposure for each channel, noise and 8 bits. Prints median errors, the
-share of poses within 20 mm, processor and wall time, and the mean of the squared errors normalised by the
-covariance, which is 6 for a calibrated covariance.
+Photographs are rendered images with another exposure for each channel, noise and 8 bits. Prints median
+errors, the share of poses within 20 mm, processor and wall time, and the mean of the squared errors
+normalised by the covariance, which is 6 for a calibrated covariance.
 """
 
 import math
@@ -98,19 +98,19 @@ def camera_at_random(random: np.random.Generator) -> fs.Camera:
 
 
 def radius(random: np.random.Generator, length: float) -> np.ndarray:
-    """A vector (3,) of this length."""
+    """Random vector (3,) of a length."""
     vector = random.normal(size=3)
     return length * vector / np.linalg.norm(vector)
 
 
 def photograph(image: np.ndarray, random: np.random.Generator, noise: float) -> np.ndarray:
-    """The image with another gain and offset, noise and 8 bits."""
+    """The image with another gain and offset, with noise and 8 bits."""
     exposed = image * random.uniform(0.6, 0.95, 3) + random.uniform(0.02, 0.05)
     return np.rint(np.clip(exposed + random.normal(0, noise, image.shape), 0, 1) * 255).astype(np.uint8)
 
 
 def changed(scene: fs.Scene, share: float) -> fs.SplatCloud:
-    """The splats of the scene with other brightnesses."""
+    """The scene's splats with changed brightness."""
     splats = scene.splats
     factors = 1 + share * np.random.default_rng(0).normal(size=(len(splats), 1))
     return fs.SplatCloud(

@@ -55,8 +55,8 @@ def categories(seed: int) -> dict[str, str]:
 
 
 def camera_at(made: Marker, edge_px: float, tilt: float) -> fs.Camera:
-    """A camera 4 code edges away; the marker is tilted back by `tilt` degrees, and `edge_px` pixels long at
-    0."""
+    """A camera at a distance of 4 code edges from a marker that is tilted back by `tilt` degrees; without
+    tilt the edge has `edge_px` pixels."""
     distance = 4.0 * made.size
     focal = edge_px * 4.0
     a = math.radians(tilt)
@@ -88,7 +88,7 @@ def ideal_image(made: Marker, camera: fs.Camera, background: float) -> tuple[np.
 
 
 def measure(renderer: fs.Renderer, made: Marker, edge_px: float, background: float, ideals: dict) -> dict:
-    """PSNR in dB of each of VIEWS."""
+    """PSNR in dB for each of VIEWS."""
     found = {}
     for name, (order, tilt) in VIEWS.items():
         camera = camera_at(made, edge_px, tilt)

@@ -1,4 +1,4 @@
-"""Shared parts of the measuring scripts: options, device facts, files and tables."""
+"""Functions of the measuring scripts: options, device facts, files and tables."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PROGRESS = Console(stderr=True)
 
 
 def options(about: str | None, device: str = "opencl", repeats: int | None = None) -> argparse.ArgumentParser:
-    """A parser with --device and --json, and --repeats if it has a default."""
+    """Parser with --device and --json, and with --repeats if its default is given."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default=device, help=f"see `fidsplat devices` (default: {device})")
     if repeats is not None:
@@ -39,7 +39,7 @@ def facts(renderer: fs.Renderer) -> dict[str, str]:
 
 
 def keep(figures: object, file: str | None) -> bool:
-    """Write records to a JSON file, if one is given. Returns whether they went to stdout."""
+    """Write records to a JSON file, if one is given. Returns whether the file is stdout."""
     text = json.dumps(figures, indent=1) + "\n"
     if file == "-":
         print(text, end="")

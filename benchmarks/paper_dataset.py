@@ -146,7 +146,7 @@ def write_dataset(
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("-o", "--out", type=Path, default=Path("fidsplat-dataset"))
     parser.add_argument("--truth", choices=TRUTHS, default="exact", help="renderer of the images")
     parser.add_argument("--blender", type=Path, default=Path("fidsplat-experiments/blender"))

@@ -53,7 +53,7 @@ def _middle(image: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("-o", "--out", type=Path, default=Path("devlog/results"))
     parser.add_argument("--device", default="auto")
     words = parser.parse_args()

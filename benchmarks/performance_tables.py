@@ -26,8 +26,8 @@ from fidsplat.util.files import atomic_write
 
 
 def load(files: Iterable[Path]) -> dict[str, list[dict]]:
-    """Records by kind. `peers`, `peer_batches` and `backends` hold pairs: ours and the peer's, or OpenCL's
-    and Warp's on one machine."""
+    """Records by kind. `peers`, `peer_batches` and `backends` contain pairs of records: of fidsplat and a
+    peer, or of OpenCL and Warp on one machine."""
     kinds = ("frames", "backends", "peers", "first", "growth", "batches", "peer_batches")
     found: dict[str, list[dict]] = {kind: [] for kind in kinds}
     for file in files:
@@ -92,7 +92,7 @@ def counts(record: dict) -> dict[str, str]:
 
 
 def peers(pair: tuple[dict, dict]) -> dict[str, str]:
-    """A peer and fidsplat in one run."""
+    """Frame times of a peer and of fidsplat in one run."""
     ours, its = pair
     return {
         "scene": its["scene"],
@@ -106,7 +106,7 @@ def peers(pair: tuple[dict, dict]) -> dict[str, str]:
 
 
 def backends(pair: tuple[dict, dict]) -> dict[str, str]:
-    """Two backends on one machine in one run; in brackets host time, and stages of the first."""
+    """Frame times of two backends in one run on one machine, with host times and stages of the first."""
     names = [record["device"].removesuffix(":0") for record in pair]
     of_stages = [record["stages_ms"] for record in pair]
     lists = {"project": ("project",), "sort and bin": ("sort", "bin"), "blend": ("blend", "resolve")}
@@ -127,7 +127,7 @@ def backends(pair: tuple[dict, dict]) -> dict[str, str]:
 
 
 def first(record: dict) -> dict[str, str]:
-    """First frame of a new process."""
+    """Times of the first frame of a new process."""
     low, high = record["range"]
     parts: dict[str, float] = {**record["seconds"]}
     total = parts.pop("total")
@@ -144,7 +144,7 @@ def first(record: dict) -> dict[str, str]:
 
 
 def batches(record: dict) -> dict[str, str]:
-    """Batches of views, and the same views rendered one by one."""
+    """Times of batches of views, and of the same views rendered one by one."""
     low, high = record["quartiles_us"]
     return {
         "views": f"{record['views']} of {record['width']} x {record['height']}",
@@ -159,7 +159,7 @@ def batches(record: dict) -> dict[str, str]:
 
 
 def peer_batches(pair: tuple[dict, dict]) -> dict[str, str]:
-    """Batches of a peer and of fidsplat in one run."""
+    """Times of batches of a peer and of fidsplat in one run."""
     ours, its = pair
     return {
         "views": f"{its['views']} of {its['width']} x {its['height']}",

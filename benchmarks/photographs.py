@@ -1,4 +1,4 @@
-"""`fidsplat capture` against photographs with known cameras: errors of scale, gravity and cameras.
+"""Measure `fidsplat capture` on photographs with known cameras: errors of scale, gravity and cameras.
 
     python benchmarks/photographs.py -o /tmp/photographs [--count 16] [--size 640 480] [--seed 0]
     python benchmarks/photographs.py -o /tmp/photographs --cycles 8 --iterations 1500 --size 480 360
@@ -63,7 +63,7 @@ def texture(rng: np.random.Generator, count: int) -> fs.SplatCloud:
     u, v = rng.uniform(-1, 1, (2, 3, count))
     floor = np.stack([1.8 + 3 * u[0], -1 + v[0], 0.004 + 0 * u[0]], 1)
     side = np.stack([1.8 + 1.8 * u[1], -0.203 + 0 * u[1], 0.24 + 0.24 * v[1]], 1)
-    for tag in (0.9, 2.7):  # not on the tags
+    for tag in (0.9, 2.7):  # keep the tags uncovered
         side = side[np.abs(side[:, :2] - (tag, -0.2)).max(1) > 0.2]
     wall = np.stack([1.8 + 4 * u[2], 1.2 + 0 * u[2], 1.2 + 1.2 * v[2]], 1)
     axes = ((1, 0, 0), (0, 1, 0)), ((1, 0, 0), (0, 0, 1)), ((1, 0, 0), (0, 0, 1))
@@ -84,7 +84,7 @@ def take(folder: Path, count: int, size: tuple[int, int], seed: int, readout: fl
     readout: seconds, of a camera that is moved by hand.
     """
     house, rng = Greenhouse(rows=1, plants=6, seed=seed), np.random.default_rng(seed)
-    # without the roof, whose posts are between the bench and the cameras
+    # omit the roof, whose posts are between the bench and the cameras
     clouds = (*house.scene.clouds[:3], texture(rng, 4000))
     scene = fs.Scene(clouds, markers=house.scene.markers, background=house.scene.background)
     renderer, found = fs.Renderer(), {}
@@ -105,7 +105,7 @@ def take(folder: Path, count: int, size: tuple[int, int], seed: int, readout: fl
 
 
 def _by_hand(camera: fs.Camera, rng: np.random.Generator):
-    """world_to_camera at a time, of a camera that moves to the side and turns."""
+    """Motion (world_to_camera) of a camera that moves sideways and rotates."""
     speed, turn = rng.normal(0, 0.3, 3), rng.normal(0, 0.12, 3)
 
     def pose(time: float) -> np.ndarray:
@@ -148,7 +148,7 @@ def mesh_of(clouds, rng: np.random.Generator) -> dict:
 
 
 def sheet_of(tag) -> dict:
-    """A placed marker as a sheet of paper."""
+    """Sheet of paper of a placed marker, for the Blender worker."""
     made = tag.marker
     half = np.array(made.grid.shape[::-1]) * made.module / 2
     at = np.array([(x, y, 0, 1) for y in (-half[1], half[1]) for x in (-half[0], half[0])])
@@ -207,7 +207,7 @@ def errors(scene: Path, truth: dict) -> dict[str, float]:
 
 
 def camera_errors(estimated: dict[str, fs.Camera], truth: dict) -> tuple[dict, np.ndarray, np.ndarray]:
-    """Errors of cameras, and the rigid alignment: rotation and translation."""
+    """Errors of cameras after a rigid alignment, with its rotation and translation."""
     true = {name: fs.Camera.pinhole(8, 8, 8, 8, 4, 4, np.array(truth["cameras"][name])) for name in estimated}
     names = sorted(estimated)
     found = np.array([estimated[name].position for name in names])
@@ -263,7 +263,8 @@ def true_dataset(options: argparse.Namespace, truth: dict, captured: Dataset) ->
 
 
 def train_all(options: argparse.Namespace, truth: dict) -> None:
-    """PSNR of held-out views by poses, drift of the scale by refinement, and errors of localisation."""
+    """Train with true and with estimated poses, with and without refinement; prints the PSNR of held-out
+    views, the drift of the scale, and errors of localisation."""
     renderer, captured = fs.Renderer(), load_dataset(options.o / "scene", hold_out=4)
     # not the pixels of tags, which have the background's colour
     shown = (v.mask & (v.image != 255 * np.array(v.background)).any(axis=2) for v in captured.held_out)
@@ -312,7 +313,7 @@ def train_all(options: argparse.Namespace, truth: dict) -> None:
 
 
 def _without_splats(scene: Path) -> Path:
-    """The scene file without the splats, which are not trained here."""
+    """Copy of the scene file without its splats, which this script does not train."""
     file = scene.with_name("tags.toml")
     file.write_text(scene.read_text().partition("[[splats]]")[0])
     return file

@@ -1,4 +1,4 @@
-"""Planned tags in the greenhouse: errors of the robot's drive with its own tags and with planned ones.
+"""Measure planned tags in the greenhouse: errors of the robot's drive with default and with planned tags.
 
 python benchmarks/plan_tags.py --rows 5 --plants 12 --counts 25 12
 """
@@ -18,7 +18,7 @@ from fidsplat.vision.tag_placement import position_error
 
 @dataclass(frozen=True)
 class PlannedDrive(Drive):
-    """A drive with other tags."""
+    """Drive with the planned tags instead of the default ones."""
 
     placed: tuple[PlacedMarker, ...] = ()
 

@@ -73,7 +73,7 @@ def disturbed(dataset: Dataset, angle: float, share: float) -> Dataset:
 
 
 def pose_errors(trainer: Trainer, given: Dataset) -> tuple[float, float]:
-    """Root mean square errors of the training poses [m], [degrees], after the best rigid alignment."""
+    """RMS errors of the training poses in metres and degrees, after the best rigid alignment."""
     found = np.array([view.camera.camera_to_world for view in trainer.views])
     true = np.array([view.camera.camera_to_world for view in given.views])
     # mean rotation between the two, then the mean shift

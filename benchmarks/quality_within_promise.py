@@ -38,7 +38,7 @@ FRAMES = 30
 
 @dataclass
 class BoundStatistics:
-    """Errors relative to a bound, and how often it was kept."""
+    """Errors relative to a bound, and the share of scenes within it."""
 
     worst: list[float] = field(default_factory=list)
     """error of each scene, divided by the bound"""
@@ -57,7 +57,7 @@ class BoundStatistics:
 
 
 def moved(scene: RandomScene) -> RandomScene:
-    """The scene with another camera."""
+    """The scene with a rotated and moved camera."""
     camera, (c, s) = scene.camera, (math.cos(math.radians(5)), math.sin(math.radians(5)))
     pose = np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]])
     pose[0, 3] = 0.1 * float(np.median(scene.cloud.means[:, 2]))

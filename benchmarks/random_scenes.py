@@ -22,7 +22,7 @@ HELD_OUT = 1_000_000
 
 @dataclass(frozen=True)
 class RandomScene:
-    """Splats, camera and background."""
+    """Splats, camera and background of a random scene."""
 
     cloud: SplatCloud
     camera: Camera

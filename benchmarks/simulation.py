@@ -1,4 +1,4 @@
-"""Measure a camera in a simulator: pose errors of tags, and environments per second.
+"""Measure cameras in a simulator: pose errors of tags, and environments per second.
 
 python benchmarks/simulation.py                       the figures of docs/simulation.md
 python benchmarks/simulation.py --device opencl:nvidia --environments 4096 --json figures.json

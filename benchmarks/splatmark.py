@@ -47,7 +47,7 @@ class Device:
 
 
 def load(files: Iterable[Path]) -> list[Device]:
-    """Devices of files of results."""
+    """Devices of results files."""
     found = []
     for file in files:
         content = json.loads(file.read_text("utf-8"))
@@ -62,7 +62,7 @@ def load(files: Iterable[Path]) -> list[Device]:
 
 @dataclass(frozen=True)
 class Entry:
-    """A renderer in a group of scenes."""
+    """Result of a renderer in a group of scenes."""
 
     renderer: str
     ratio: float
@@ -88,17 +88,17 @@ class Group:
 
     @property
     def complete(self) -> list[Entry]:
-        """Renderers within the error in every scene, the fastest first."""
+        """Renderers within the error in all scenes, sorted by time."""
         return [entry for entry in self.ranking if entry.scenes == len(self.scenes)]
 
     @property
     def winner(self) -> Entry | None:
-        """Fastest renderer within the error in every scene."""
+        """Fastest renderer within the error in all scenes."""
         return self.complete[0] if self.complete else None
 
     @property
     def next(self) -> tuple[str, float] | None:
-        """The next renderer, and its time over the winner's."""
+        """The second-fastest renderer, and its time relative to the winner's."""
         if len(self.complete) < 2:
             return None
         first, second = self.complete[:2]
@@ -116,7 +116,7 @@ def best_of(results: Iterable[dict[str, Any]], error: str) -> dict[tuple[str, st
 
 
 def ranked(results: list[dict[str, Any]], scenes: Sequence[str], error: str) -> tuple[Entry, ...]:
-    """Renderers of scenes: those within the error in more scenes first, then by time."""
+    """Renderers of scenes, sorted by the number of scenes within the error, then by time."""
     best = best_of((one for one in results if one["scene"] in scenes), error)
     fastest = {scene: min((v for (s, _), v in best.items() if s == scene), default=1.0) for scene in scenes}
     entries = []
@@ -226,7 +226,7 @@ def svg(results: list[dict[str, Any]], renderers: Sequence[str]) -> str:
 
 
 def charts(device: Device) -> dict[str, list[tuple[str, dict[str, Any], str]]]:
-    """Name, scene and chart of each scene, by regime, without series."""
+    """Name, facts and chart of each scene by regime, except series."""
     renderers = list(dict.fromkeys(one["renderer"] for one in device.results))
     found: dict[str, list[tuple[str, dict[str, Any], str]]] = {}
     for name, scene in device.scenes.items():
@@ -237,7 +237,7 @@ def charts(device: Device) -> dict[str, list[tuple[str, dict[str, Any], str]]]:
 
 
 def first_setting(device: Device) -> list[dict[str, Any]]:
-    """Results of each renderer's first setting, without series: costs beyond the time of a frame."""
+    """Results of each renderer's first setting, except series, for costs other than the frame time."""
     seen: dict[tuple[str, str], dict[str, Any]] = {}
     for one in device.results:
         if device.scenes[one["scene"]]["x"] is None:
@@ -246,7 +246,7 @@ def first_setting(device: Device) -> list[dict[str, Any]]:
 
 
 def page(files: Sequence[Path]) -> str:
-    """HTML of the page."""
+    """HTML of the site's page."""
     devices = load(files)
     groups = groups_of(devices)
     environment = jinja2.Environment(

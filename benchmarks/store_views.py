@@ -36,7 +36,7 @@ def path_of(city: City, folder: Path) -> Path:
 
 
 def placed(store: fs.Store, city: City, places: int, folder: Path) -> fs.Store:
-    """The city instanced on a grid of streets."""
+    """Store with instances of the city on a grid of streets."""
     if places == 1:
         return store
     side = math.ceil(math.sqrt(places))
@@ -47,7 +47,7 @@ def placed(store: fs.Store, city: City, places: int, folder: Path) -> fs.Store:
 
 
 def views(store: fs.Store, size: tuple[int, int]) -> dict[str, fs.Camera]:
-    """Cameras of an overview, above the roofs at one side, and in a street."""
+    """Cameras of three views: an overview, above the roofs at one side, and in a street."""
     low, high = store.bounds()
     middle, side = (low + high) / 2, float((high - low).max())
     street = np.array([middle[0], -1.7, low[2] - 4.0])
@@ -68,7 +68,8 @@ def further(camera: fs.Camera) -> fs.Camera:
 
 
 def timed(renderer: fs.Renderer, resident, capture: fs.Capture) -> tuple[np.ndarray, list[float], dict]:
-    """An image; seconds of it, of the next view and of that view repeated; and counts of the last frame."""
+    """Render a view, the next view, and the next view again; returns the first image, the seconds of each,
+    and the counts of the last frame."""
     seconds, images, frame = [], [], None
     next_view = capture.with_(camera=further(capture.camera))
     for one in (capture, next_view, next_view):

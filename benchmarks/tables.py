@@ -1,4 +1,5 @@
-"""Markdown tables of the pages, and fits of power laws. Imports no numerical package: mkdocs runs it too."""
+"""Markdown tables of the pages, and fits of power laws. Imports no numerical package, since mkdocs imports
+it."""
 
 from __future__ import annotations
 
@@ -35,5 +36,5 @@ def insert(page: str, name: str, text: str) -> str:
 
 
 def ms(value: float) -> str:
-    """Milliseconds with three digits."""
+    """Format milliseconds with three significant digits."""
     return f"{value:.3g}" if value < 1000 else f"{value:.0f}"

@@ -1,11 +1,12 @@
-"""Images per second and PSNR of tiled cameras: this renderer, mujoco_warp and Newton, in turns on one scene.
+"""Measure images per second and PSNR of tiled cameras: fidsplat, mujoco_warp and Newton, interleaved on one
+scene.
 
     python benchmarks/tiled_cameras.py --device warp:cpu --row few --repeats 3
     python benchmarks/tiled_cameras.py --device warp:cuda opencl:nvidia --row agents
 
-Needs `pip install 'fidsplat[tiled]'`. The scene is a closed room of flat splats without harmonics, since the
-others have none; their third scale is 1e-4 m. They have no low-pass filter, so it is off here, too. Images
-stay on the device. PSNR is of images of 8 bits, against every fragment in float64.
+Needs `pip install 'fidsplat[tiled]'`. The scene is a closed room of flat splats without spherical harmonics
+and low-pass filter, which the other renderers lack; their third scale is 1e-4 m. Images stay on the device.
+PSNR compares 8-bit images with all fragments blended in float64.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ COLOR = 0.28209479177387814
 
 
 class Tiled(NamedTuple):
-    """A renderer of all views."""
+    """Renderer of all views of a batch."""
 
     draw: Callable[[], object]
     """render, and wait for the device"""
@@ -111,7 +112,7 @@ def mujoco_warp(cloud: fs.SplatCloud, camera: fs.Camera, poses: np.ndarray, devi
 
 
 def newton(cloud: fs.SplatCloud, camera: fs.Camera, poses: np.ndarray, device: str, best: bool) -> Tiled:
-    """best: all fragments of a ray above 1/255, instead of its defaults."""
+    """Newton's renderer. best: composite all fragments of a ray above 1/255, instead of Newton's defaults."""
     import warp as wp
     from newton import Gaussian, ModelBuilder
     from newton.sensors import SensorCamera
@@ -208,7 +209,7 @@ def main() -> None:
 
 
 def pose_matrix(pose: np.ndarray) -> np.ndarray:
-    """(4, 4) of x y z and a quaternion w x y z."""
+    """Matrix (4, 4) of a pose x y z and a quaternion w x y z."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = quaternion_to_matrix(pose[3:]), pose[:3]
     return matrix

@@ -142,7 +142,7 @@ def markers_table(device: DeviceResults) -> Frame:
 
 
 def recommendations(devices: Sequence[DeviceResults]) -> list[dict[str, str]]:
-    """Cheapest setting with an invisible error on each device, for random scenes and for all scenes."""
+    """Fastest setting with an invisible error on each device, for random scenes and for all scenes."""
     found = []
     for device in devices:
         every = disk_scenes(device)
@@ -191,9 +191,9 @@ def compared(device: DeviceResults, point: Row, other: Row) -> str:
 
 
 def cheapest_within(device: DeviceResults, scenes: Iterable[str], bound: float) -> list[Row]:
-    """Rows of the cheapest setting with errors of at most a bound on all scenes; [] if there is none.
+    """Rows of the fastest setting with errors of at most a bound on all scenes; [] if there is none.
 
-    The cost is the product over scenes; errors within certificates do not count.
+    Settings are compared by the product of their times; errors within certificates do not count.
     """
     scenes = list(scenes)
     rows: Frame = pd.concat([device.same_definition(scene) for scene in scenes])

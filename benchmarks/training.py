@@ -26,7 +26,7 @@ WARM = 10
 
 
 def trainer_of(name: str, renderer: fs.Renderer, degree: int, steps: int) -> Trainer:
-    """A trainer without densification whose SH degree is reached after a few steps."""
+    """Trainer without densification, which reaches the SH degree after a few steps."""
     cloud, camera = load_scene(name)
     other, _ = load_scene(name, seed=1)
     aside = camera.world_to_camera.copy()

@@ -65,7 +65,7 @@ def main() -> None:
 
 
 def measured(session: Session, start: Viewpoint, rate: float, seconds: float) -> str:
-    """Measure a row of the table."""
+    """Measure a row of the table for a frame rate."""
     latencies, sizes, scales, rendering, encoding, arguments = [], [], [], [], [], 0.0
 
     def moving(viewpoint: Viewpoint, scale: float) -> Callable[[], None]:

@@ -1,6 +1,6 @@
 """Make the image of the viewer in docs/viewer.md: the demo scene in a headless Chromium.
 
-fidsplat demo && PYTHONPATH=.:tools python benchmarks/viewer_picture.py fidsplat-demo/scene.toml
+fidsplat demo && PYTHONPATH=.:tools python benchmarks/viewer_image.py fidsplat-demo/scene.toml
 docs/images/viewer.jpg"""
 
 import sys

@@ -1,4 +1,4 @@
-"""Base of the adapters of PyTorch renderers on an NVIDIA GPU; an adapter has `settings` and `draw`."""
+"""Base class of adapters of PyTorch renderers on an NVIDIA GPU; subclasses define `settings` and `draw`."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ C0 = 0.28209479177387814  # value of the constant spherical harmonic
 
 
 def pinned(adapter):
-    """Commit after the last @ of an adapter's requirements.txt, for packages without a version."""
+    """Commit in an adapter's requirements.txt (after the last @), for packages without a version."""
     text = Path(adapter).with_name("requirements.txt").read_text("utf-8")
     return text.rpartition("@")[2].partition("#")[0].strip()
 
@@ -20,7 +20,7 @@ class TorchAdapter:
 
     def __init__(self, renderer, version):
         if not torch.cuda.is_available():
-            raise RuntimeError("PyTorch finds no CUDA device")
+            raise RuntimeError("PyTorch must have a CUDA device, got none")
         self.facts = {"renderer": renderer, "version": version, "kind": "gpu"}
         self.facts["device"] = torch.cuda.get_device_properties(0).name
         self.facts["driver"] = f"PyTorch {torch.__version__}, CUDA {torch.version.cuda}"
@@ -46,7 +46,7 @@ class TorchAdapter:
         self.prepare()
 
     def prepare(self):
-        """Objects of the renderer for a scene, if it needs any."""
+        """Construct the renderer's objects for a scene, if there are any."""
 
     def render(self, setting, views):
         with torch.no_grad():

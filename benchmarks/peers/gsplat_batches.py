@@ -47,7 +47,7 @@ def on_gpu(array: np.ndarray) -> torch.Tensor:
 
 
 def peer(cloud: fs.SplatCloud, capture: fs.Capture, poses: np.ndarray) -> Callable[[int], torch.Tensor]:
-    """Function that renders all views by gsplat, for a number of cameras per call, and returns the first view
+    """Function that renders all views by gsplat with a number of cameras per call; it returns the first view
     (h, w, 3)."""
     camera, colors = capture.camera, cloud.colors
     if camera is None or colors is None:
@@ -88,7 +88,7 @@ def captures_of(capture: fs.Capture) -> list[fs.Capture]:
 
 
 def times_by_cameras(draw: Callable[[int], torch.Tensor]) -> dict[int, float]:
-    """Milliseconds of gsplat by cameras per call, as far as memory allows."""
+    """Milliseconds of gsplat by number of cameras per call, up to the limit of memory."""
     found = {}
     for cameras in CAMERAS:
         try:
@@ -102,7 +102,7 @@ def times_by_cameras(draw: Callable[[int], torch.Tensor]) -> dict[int, float]:
 
 
 def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
-    """Figures of one row per view: each of fidsplat's, and gsplat's after it."""
+    """Figures of a row per view: records of fidsplat, each followed by gsplat's."""
     row = ROWS[name]
     cloud, capture, poses = scene_of(row)
     resident, draw = renderer.upload(cloud), peer(cloud, capture, poses)

@@ -111,7 +111,7 @@ class Peer:
     def step(
         self, number: int, degree: int, before: Any = None, after: Any = None, optimise: bool = True
     ) -> None:
-        """One view: frame, loss, gradients, and optionally the optimisers.
+        """Train on one view: frame, loss, gradients, and optionally the optimisers.
 
         before, after: called with gsplat's data before and after the backward pass.
         """
@@ -177,8 +177,7 @@ class AuthorsPeer(Peer):
             scales=torch.exp(values["scales"][:, :2]),
             rotations=torch.nn.functional.normalize(values["quats"]),
         )
-        # its gradients by positions are relative to half images already: gsplat would multiply them by half
-        # the size
+        # gradients by positions are already relative to half the image size; gsplat would multiply them again
         meta = {"gradient_2dgs": screen, "width": 2, "height": 2, "n_cameras": 1, "gaussian_ids": None}
         return image.permute(1, 2, 0), meta | {"radii": radii[None, :, None].expand(1, count, 2)}
 
@@ -227,7 +226,7 @@ def finished(
 
 
 def steps(name: str, renderer: fs.Renderer, repeats: int, kinds: dict[str, type[Peer]]) -> dict[str, Any]:
-    """Median milliseconds of a step by each, interleaved."""
+    """Median milliseconds of a step of each renderer, interleaved."""
     trainer = trainer_of(name, renderer, 3, STEPS * (1 + repeats))
     splats = trainer._model.read()
     backend: Any = renderer.backend
@@ -244,7 +243,7 @@ def steps(name: str, renderer: fs.Renderer, repeats: int, kinds: dict[str, type[
 
 
 def train(dataset: Dataset, iterations: int, kind: type[Peer]) -> tuple[Peer, float]:
-    """A complete training by a peer, and its seconds."""
+    """Train a peer completely; returns the peer and the seconds."""
     settings = TrainSettings(iterations=iterations)
     peer = kind(initial_splats(dataset, settings), settings, dataset)
     strategy = gsplat.DefaultStrategy(

@@ -1,4 +1,4 @@
-"""Interleaved frames of fidsplat, gsplat and HiGS on one NVIDIA GPU, on random and captured scenes.
+"""Compare interleaved frames of fidsplat, gsplat and HiGS on one NVIDIA GPU, for random and captured scenes.
 
     python benchmarks/peers/higs.py r1m_1080p biker.compressed.ply playbot/0_0/meta.json --json higs.json
 

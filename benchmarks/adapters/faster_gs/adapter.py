@@ -1,5 +1,5 @@
-"""Faster-GS (FasterGSCudaBackend of nerficg-project/faster-gaussian-splatting): 3D Gaussians by EWA, one view
-in a call."""
+"""Adapter of Faster-GS (FasterGSCudaBackend of nerficg-project/faster-gaussian-splatting): 3D Gaussians by
+EWA, one view per call."""
 
 import numpy as np
 import torch

@@ -1,7 +1,7 @@
-"""gsplat's `rasterization_2dgs`: disks, one view in a call.
+"""Adapter of gsplat's `rasterization_2dgs`: disks, one view per call.
 
-Of several cameras in a call, 1.6 refuses unpacked ones (it expands opacities to a tensor that is not
-contiguous), and packed ones read colours by the index of a visible pair, beyond the colours of the splats.
+gsplat 1.6 fails for several cameras per call: unpacked, it expands opacities to a tensor that is not
+contiguous; packed, it indexes colours by visible pairs, beyond the number of splats.
 """
 
 import gsplat

@@ -1,4 +1,4 @@
-"""gsplat's `rasterization`: 3D Gaussians by EWA, all views of a batch in one call."""
+"""Adapter of gsplat's `rasterization`: 3D Gaussians by EWA, all views of a batch in one call."""
 
 import gsplat
 from torch_gpu import TorchAdapter

@@ -1,5 +1,5 @@
-"""HiGS, the inference renderer of gsplat 1.6 (built with BUILD_EXPERIMENTAL=1): 3D Gaussians by EWA in half
-precision, one view in a call."""
+"""Adapter of HiGS, the inference renderer of gsplat 1.6 (built with BUILD_EXPERIMENTAL=1): 3D Gaussians by
+EWA in half precision, one view per call."""
 
 import gsplat
 from gsplat.experimental.render.components.gaussian_inference_renderer import GaussianInferenceRenderer

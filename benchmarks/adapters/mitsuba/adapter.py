@@ -1,7 +1,9 @@
-"""Mitsuba 3: ray-traced ellipsoids on a processor. Needs LLVM; LLVM 15 aborts, 19 works (DRJIT_LIBLLVM_PATH).
+"""Adapter of Mitsuba 3: ray-traced ellipsoids on a processor. Requires LLVM 19 (DRJIT_LIBLLVM_PATH); 15
+aborts.
 
-A ray composites the maximum of each Gaussian along it, ordered by that point: our `ellipsoid="exact"` with
-`order="pixel"`. The plugin truncates at 3 standard deviations and at 64 fragments a pixel.
+A ray composites the maximum of each Gaussian along the ray, ordered by its position, as fidsplat does with
+`ellipsoid="exact"` and `order="pixel"`. The plugin truncates at 3 standard deviations and at 64 fragments per
+pixel.
 """
 
 import math

@@ -1,5 +1,5 @@
-"""PolySplat (LuoLongZan/PolySplat, its folder on PYTHONPATH): 3D Gaussians by EWA, 8-bit images, one view in
-a call; the principal point is the image centre. The pipeline is that of its own benchmark."""
+"""Adapter of PolySplat (LuoLongZan/PolySplat, its folder on PYTHONPATH): 3D Gaussians by EWA, 8-bit images,
+one view per call, principal point at the image centre. The pipeline is as in PolySplat's benchmark."""
 
 from types import SimpleNamespace
 

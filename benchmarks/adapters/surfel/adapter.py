@@ -1,4 +1,4 @@
-"""The 2DGS authors' rasterizer: disks, one view in a call; the principal point is the image centre."""
+"""Adapter of the 2DGS authors' rasterizer: disks, one view per call, principal point at the image centre."""
 
 import torch
 from diff_surfel_rasterization import GaussianRasterizationSettings, GaussianRasterizer
