@@ -1,4 +1,4 @@
-"""Direct image alignment: the camera pose at which a rendered scene matches an image.
+"""Direct image alignment: estimates the camera pose at which a rendered scene matches an image.
 
 Efficient second-order minimisation (Malis 2004) of robust photometric residuals, from coarse to fine. The
 Jacobian of a rendered pixel is its image gradient times the motion of its point, which the rendered depth
@@ -33,10 +33,10 @@ from fidsplat.util.errors import InputError
 from fidsplat.vision.pyramid import resized, smoothed, taps_of
 
 Render = Callable[[Camera], Any]
-"""a Frame with rgb and depth of a camera"""
+"""function that renders rgb and depth of a camera"""
 
 MAX_PIXELS = 20_000
-"""maximum number of pixels of a level; those of the largest gradients are used"""
+"""maximum number of pixels of a level; pixels with the largest gradients are used"""
 MIN_SIDE = 48
 """minimum side in pixels of the coarsest level"""
 MAX_LEVELS = 4
@@ -49,7 +49,7 @@ MIN_INLIERS = 0.6
 MIN_CORRELATION, MIN_CONTRAST, MIN_PIXELS = 0.7, 0.02, 12
 """normalised correlation of a matching block; minimum contrast and textured pixels of a block that counts"""
 MIN_BLOCKS = 24
-"""minimum number of which the matching blocks are a share: twice the unknowns"""
+"""minimum denominator of the share of matching blocks: twice the number of unknowns"""
 MIN_IMAGE_NOISE = 0.005
 """minimum noise of an image, display values"""
 _QUARTILE = 1.1
@@ -63,8 +63,8 @@ _DAMPING = 1e-3
 _SETTLED = 0.3
 """motion in pixels of a step that ends a stage"""
 _REPEATED, _REPEATED_PIXELS = 4.0, 0.01
-"""standard deviations of a last step above which it is repeated at its result; pixels, for an image without
-noise"""
+"""size of a last step above which another step follows: in standard deviations, and in pixels for an image
+without noise"""
 _LAST_STEPS = 6
 """maximum number of last steps"""
 _FULL_STEPS, _FULL_SETTLED = 12, 0.01
@@ -193,7 +193,7 @@ class _Stage:
         return self.kernels.sums(self.number, frame, at.fit._replace(noise=noise), **options)
 
     def pixels(self, motion: np.ndarray, sums: AlignmentSums) -> float:
-        """Motion of the pixels by a motion (6,) of the camera, approximately."""
+        """Approximate displacement of pixels by a motion (6,) of the camera."""
         turn, shift = motion[:3] @ motion[:3], motion[3:] @ motion[3:]
         return max(self.camera.fx, self.camera.fy) * math.sqrt(turn + shift * sums.inverse_depth)
 
@@ -220,16 +220,16 @@ def _minimise(at: _State, stage: _Stage, steps: int, settled: float = _SETTLED) 
 
 
 def _finish(at: _State, stage: _Stage) -> Alignment:
-    """The last steps, and if they do not converge, again after steps with Huber's loss: Tukey's ignores edges
-    that are more than a fraction of a pixel away, and is not convex."""
+    """Run the last steps; if they do not converge, run them again after steps with Huber's loss. Tukey's loss
+    is not convex, and ignores edges displaced by more than a fraction of a pixel."""
     found, settled = _last_steps(at, stage)
     return found if settled else _last_steps(_minimise(at, stage, _FULL_STEPS, _FULL_SETTLED), stage)[0]
 
 
 def _last_steps(at: _State, stage: _Stage) -> tuple[Alignment, bool]:
-    """Newton's method for Tukey's loss with a line search, and the covariance; and whether all steps
-    decreased the loss and converged. The derivative of the score is computed at the first step only. Infinite
-    covariance if the pixels do not determine the pose and its covariance."""
+    """Minimise Tukey's loss by Newton's method with a line search. Returns the alignment, with an infinite
+    covariance if the pixels do not determine it, and whether all steps decreased the loss and converged. The
+    derivative of the score is computed at the first step only."""
     at, best, settled, rejected = _State(at.pose, at.fit._replace(huber=False)), None, False, False
     step, inverse = np.zeros(6 + 2 * len(at.fit.gain)), None
     for _ in range(_LAST_STEPS):
@@ -260,9 +260,10 @@ def _last_steps(at: _State, stage: _Stage) -> tuple[Alignment, bool]:
 
 
 def _agreement(sums: AlignmentSums, noise: float) -> tuple[float, float]:
-    """Share of the blocks with contrast, or of MIN_BLOCKS if these are fewer, that match: their normalised
-    correlation (NCC) of image and render is above MIN_CORRELATION. And the reduced chi-squared of the blocks
-    that match, at least 1: its third quartile relative to that of noise alone.
+    """Share of matching blocks, and their reduced chi-squared. A block matches if the normalised correlation
+    (NCC) of image and render is above MIN_CORRELATION; the share is of the blocks with contrast, or of
+    MIN_BLOCKS if these are fewer. The chi-squared is its third quartile relative to that of noise alone, at
+    least 1.
 
     noise: standard deviation of the noise of the image, in units of the render.
     """
@@ -320,8 +321,8 @@ def _inverse(sums: AlignmentSums, bread: np.ndarray) -> np.ndarray | None:
 
 
 def _covariance(sums: AlignmentSums, inverse: np.ndarray) -> np.ndarray:
-    """(6, 6) sandwich estimate from the scores of blocks, as the jackknife that deletes one block (CR3,
-    MacKinnon and White 1985): residuals are smaller than errors where a block has leverage."""
+    """(6, 6) sandwich estimate from the scores of blocks, corrected for leverage by the delete-one-block
+    jackknife (CR3, MacKinnon and White 1985)."""
     count, size = len(sums.scores), len(inverse)
     matrices = np.zeros((count, size, size))
     for channel in range(sums.scores.shape[1]):
@@ -373,8 +374,8 @@ def _parameters(channel: int) -> list[int]:
 
 
 def _exposure_of(sums: AlignmentSums) -> tuple[np.ndarray, np.ndarray]:
-    """Changes (c,) of gains and offsets, to equal means and standard deviations of blurred images:
-    misalignment attenuates the gain of a regression."""
+    """Changes (c,) of gains and offsets that equalise the means and standard deviations of the blurred
+    images. A regression would underestimate the gain of misaligned images."""
     total = sums.matrix[:, 7, 7]
     values, residuals = sums.matrix[:, 6, 7] / total, sums.right[:, 7, 0] / total
     variance = np.maximum(sums.matrix[:, 6, 6] / total - values**2, 1e-12)
@@ -385,8 +386,8 @@ def _exposure_of(sums: AlignmentSums) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ignored(mask: np.ndarray | None, camera: Camera) -> np.ndarray | None:
-    """(h, w) float32, 1 for ignored pixels and outside the field of view, whose border does not move with the
-    camera; None for none."""
+    """Image (h, w) float32 with 1 for ignored pixels and outside the field of view, whose border does not
+    move with the scene; None without such pixels."""
     if mask is None and camera.lens is None:
         return None
     ignored = np.zeros((camera.height, camera.width), np.float32)

@@ -21,7 +21,8 @@ DESCRIPTOR_BLUR = 1.0
 
 
 def pose_of_markers(image: np.ndarray, scene: Scene, camera: Camera) -> tuple[Camera, list[str]] | None:
-    """The camera at its pose by the detected markers of a scene, and their names; None without any.
+    """Estimate the pose of a camera from detected markers of a scene; returns the camera and the markers'
+    names, or None without any.
 
     Tags and QR codes whose content occurs once in the scene are used.
     """
@@ -59,8 +60,8 @@ def most_similar(
 ) -> list[Camera]:
     """The candidates whose rendered views are most similar to an image, best first.
 
-    Similarity is the correlation of small blurred images, channel by channel, so that exposure and white
-    balance do not matter.
+    The similarity is the correlation of small blurred images by channel, which does not depend on exposure
+    and white balance.
 
     Args:
         image: (h, w, c) display values.

@@ -1,4 +1,4 @@
-"""`localise`: the pose of a camera in a scene from one image."""
+"""Localisation of a camera in a scene from one image."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TRIED = 3
 
 
 class NoInitialPose(InputError):
-    """No start, no marker of the scene in the image and no candidate."""
+    """Missing initial pose: no start, no marker of the scene in the image and no candidate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ def localise(
         image: (h, w, 3) or (h, w), uint8 or float display values.
         scene: the scene.
         start: initial pose, world_to_camera (4, 4) or (position, quaternion w, x, y, z), or a Camera there.
-            None: from the scene's markers in the image, else the best of `candidates`.
+            None: estimated from the scene's markers in the image, or else the best of `candidates`.
         camera: size, intrinsics and lens of the image; None: those of `start` if it is a Camera, else the
             scene's camera.
         candidates: cameras at possible poses, e.g. of the photographs of the scene.

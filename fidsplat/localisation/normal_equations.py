@@ -1,4 +1,4 @@
-"""Sums of direct image alignment in NumPy, for devices without kernels for them."""
+"""Sums over pixels for direct image alignment in NumPy, for devices without alignment kernels."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from fidsplat.vision.pyramid import convolved, resized
 
 
 def alignment_kernels(renderer: Renderer, resident: ResidentCloud) -> AlignmentKernels:
-    """Kernels of the device if it has them, else NumPy; also for stores, whose frames may be on the host."""
+    """Alignment kernels of the device, or else NumPy, as for stores, whose frames may be on the host."""
     if renderer.backend.has("alignment") and resident.data is resident.complete:
         return renderer.backend.alignment()
     return HostAlignment()
 
 
 class HostAlignment(AlignmentKernels):
-    """Sums on the host over the textured pixels of a stage, which are rows."""
+    """Sums on the host over the textured pixels of a stage."""
 
     def load(self, image: np.ndarray, stages: list[AlignmentStage], most: int) -> list[int]:
         """Prepare the image for its stages."""
@@ -180,8 +180,8 @@ def _slopes(image: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _nearest(depth: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(n,) inverse depths, the largest of a pixel and its neighbours: at an edge the gradient belongs to the
-    surface in front. 0 for the background."""
+    """Inverse depths (n,), 0 for the background: the largest of a pixel and its neighbours, as the gradient
+    at an edge is of the surface in front."""
     flat, width = depth.reshape(-1), depth.shape[1]
     inverse = np.zeros_like(flat)
     np.divide(1, flat, out=inverse, where=flat > 0)

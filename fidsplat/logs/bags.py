@@ -71,7 +71,7 @@ def log_messages(path: Path) -> Iterator[Message]:
 
 
 def _decompress(source: BinaryIO, target: BinaryIO, path: Path) -> None:
-    """Expand a zstd file of any number of frames. Raises InputError above the limit."""
+    """Decompress a zstd file of any number of frames; raise InputError above the limit."""
     size = 0
     with zstandard.ZstdDecompressor().stream_reader(source, read_across_frames=True) as stream:
         while part := stream.read(_STEP):
@@ -81,7 +81,7 @@ def _decompress(source: BinaryIO, target: BinaryIO, path: Path) -> None:
 
 
 def _decompressed(data: bytes, path: Path) -> bytes:
-    """Expand a message. Raises InputError above the limit."""
+    """Decompress a message; raise InputError above the limit."""
     limit = input_limit(len(data))
     with zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as stream:
         parts, size = [], 0

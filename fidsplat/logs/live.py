@@ -14,8 +14,8 @@ BACKLOG = 64
 
 
 class LiveLog(RobotLog):
-    """A RobotLog whose ROS 2 messages go to clients of a WebSocket server, to ROS 2 nodes, or both; a context
-    manager.
+    """A RobotLog that sends its ROS 2 messages to clients of a WebSocket server, to ROS 2 nodes, or both; a
+    context manager.
 
     Clients of the server are Foxglove (app.foxglove.dev, `ws://HOST:PORT`) and programs of the protocol
     `foxglove.sdk.v1`. ROS 2 nodes receive topics by rclpy where it is installed, else by Cyclone DDS.
@@ -63,7 +63,7 @@ class LiveLog(RobotLog):
 
 
 def _ros2_topics(store: Any, host: str) -> Any:
-    """Topics by ROS, or without it where this Python has no rclpy."""
+    """ROS 2 topics by rclpy if it is installed, or else by Cyclone DDS."""
     try:
         from fidsplat.logs.rclpy_topics import RclpyTopics
     except ImportError:

@@ -17,7 +17,7 @@ from fidsplat.util.errors import InputError
 
 
 class RclpyTopics:
-    """A `LogFile` whose messages a ROS 2 node publishes as they are; also subscribes to topics.
+    """A `LogFile` that publishes its messages by a ROS 2 node; also subscribes to topics.
 
     host: a loopback address sets ROS_AUTOMATIC_DISCOVERY_RANGE, unless it is set, to nodes of this machine.
 
@@ -66,7 +66,7 @@ class RclpyTopics:
 
 
 def _class(kind: str) -> Any:
-    """The Python class of a message type; None with a warning where ROS has no such package."""
+    """The Python class of a message type; None, with a warning, if the ROS package is missing."""
     package, folder, name = kind.split("/")
     try:
         return getattr(import_module(f"{package}.{folder}"), name)

@@ -1,4 +1,4 @@
-"""Images and poses of logs."""
+"""Reader of images and poses in logs."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class LogImage:
 
 
 def messages(path: str | os.PathLike[str], *topics: str) -> Iterator[tuple[str, Any]]:
-    """Topic and message of each message of a log in its order; of all topics if none is given."""
+    """Yield topic and content of each message of a log in order; of all topics if none is given."""
     file, store = path_of(path), typestore()
     with _as_input_error(file):
         for name, kind, _, data in log_messages(file):
@@ -60,8 +60,8 @@ def messages(path: str | os.PathLike[str], *topics: str) -> Iterator[tuple[str, 
 
 
 def log_images(path: str | os.PathLike[str], topic: str | None = None) -> Iterator[LogImage]:
-    """Colour images of a log in its order: rgb8, bgr8, rgba8, bgra8, mono8 and compressed. topic: topic to
-    read; None for all. Raises InputError if there are none."""
+    """Yield the colour images of a log in order: rgb8, bgr8, rgba8, bgra8, mono8 and compressed. topic: topic
+    to read; None for all. Raises InputError if there are none."""
     file, store, found = path_of(path), typestore(), False
     with _as_input_error(file):
         for name, kind, time, data in log_messages(file):

@@ -25,10 +25,10 @@ _POINT_FIELDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, 
 
 
 class RobotLog:
-    """A log that is written message by message, NAME.mcap or a rosbag2 folder (SQLite); a context manager.
+    """Writer of a log, NAME.mcap or a rosbag2 folder (SQLite), message by message; a context manager.
 
-    Times are in seconds and must not decrease within a topic. The log appears when the block ends without an
-    error.
+    Times are in seconds and must not decrease within a topic. The log is created when the block ends without
+    an error.
 
     Args:
         path: NAME.mcap, or a new folder.
@@ -75,8 +75,8 @@ class RobotLog:
     def image(
         self, time: float, camera: str, image: np.ndarray, output: str = "rgb", compress: str | None = None
     ) -> None:
-        """An output image as `/CAMERA/image_raw`, or `/CAMERA/OUTPUT/image_raw` for all but rgb: rgb8, 32FC1,
-        32FC3 or 32SC1.
+        """Write an output image as `/CAMERA/image_raw`, or `/CAMERA/OUTPUT/image_raw` for outputs other than
+        rgb: rgb8, 32FC1, 32FC3 or 32SC1.
 
         compress: "jpeg" or "png" writes rgb as `/CAMERA/image_raw/compressed` instead.
 
@@ -115,8 +115,9 @@ class RobotLog:
         )
 
     def camera_info(self, time: float, name: str, camera: Camera, output: str = "rgb") -> None:
-        """A camera's intrinsics and distortion as `/CAMERA/camera_info`, or `/CAMERA/OUTPUT/camera_info` for
-        all but rgb: plumb_bob, rational_polynomial or equidistant.
+        """Write a camera's intrinsics and distortion as `/CAMERA/camera_info`, or
+        `/CAMERA/OUTPUT/camera_info` for outputs other than rgb: plumb_bob, rational_polynomial or
+        equidistant.
 
         Raises:
             InputError: a lens without a ROS model.
@@ -132,7 +133,7 @@ class RobotLog:
         self._write(f"{_namespace(name, output)}/camera_info", time, message)
 
     def camera_pose(self, time: float, camera: str, pose: Any, base: Any = None) -> None:
-        """Pose of a camera in the scene (4, 4), with OpenCV's axes, as `/tf`.
+        """Write the pose of a camera in the scene (4, 4), with OpenCV's axes, as `/tf`.
 
         If the log has `up`, three transforms are written: world to scene, world to CAMERA_link (x forward,
         z up), and CAMERA_link to CAMERA_optical_frame. Otherwise one: world to CAMERA.
@@ -156,11 +157,12 @@ class RobotLog:
         self._transforms(time, *transforms)
 
     def clock(self, time: float) -> None:
-        """The time as `/clock`, for nodes that use it instead of their own."""
+        """Write the time as `/clock`, for nodes with `use_sim_time`."""
         self._write("/clock", time, self._of("rosgraph_msgs/msg/Clock")(self._stamp(time)))
 
     def transform(self, time: float, frame: str, pose: Any, parent: str | None = None) -> None:
-        """Pose of a frame in its parent (4, 4), by default the world, as `/tf`. A camera's frame has OpenCV's
+        """Write the pose of a frame in its parent (4, 4), by default the world, as `/tf`. A camera's frame
+        has OpenCV's
         axes, like ROS's optical frames."""
         given = _rigid(pose, f"the pose of {text('the name of a frame', frame)}")
         self._transforms(
@@ -171,8 +173,8 @@ class RobotLog:
         self, time: float, pose: Any, velocity: Any = (0, 0, 0), angular_velocity: Any = (0, 0, 0),
         frame: str = "base_link", topic: str = "/odom", covariance: Any = None,
     ) -> None:  # fmt: skip
-        """Pose of the body in the world (4, 4), velocities (3,) in m/s and rad/s in the body's axes, and the
-        covariance of the pose (6, 6)."""
+        """Write the odometry of a body: pose in the world (4, 4), velocities (3,) in m/s and rad/s in the
+        body's axes, and covariance of the pose (6, 6)."""
         position, turn = self._pose_parts(self._in_world(_rigid(pose, "the pose of odometry")))
         spread = np.zeros((6, 6)) if covariance is None else real_array("covariance", covariance)
         if spread.shape != (6, 6):
@@ -199,7 +201,7 @@ class RobotLog:
         frame: str = "imu_link",
         topic: str = "/imu/data_raw",
     ) -> None:
-        """An IMU message without orientation, named by REP-145. Angular velocity (3,) is in rad/s,
+        """Write an IMU message without orientation, named by REP-145. Angular velocity (3,) is in rad/s,
         acceleration (3,) in m/s^2; None: not measured."""
         vector, none = self._of("geometry_msgs/msg/Vector3"), np.zeros(9)
         unknown = np.array([-1.0, *np.zeros(8)])  # ROS's value for a missing reading
@@ -214,7 +216,7 @@ class RobotLog:
     def joint_states(
         self, time: float, names: Iterable[str], positions: Any, topic: str = "/joint_states"
     ) -> None:
-        """Positions of joints: radians, or metres of prismatic joints."""
+        """Write positions of joints: radians, or metres for prismatic joints."""
         named = list(items("names", names, str, "names of joints"))
         given = real_array("positions", positions, "a number for each joint")
         if given.shape != (len(named),) or not np.isfinite(given).all():
@@ -223,7 +225,8 @@ class RobotLog:
         self._write(topic, time, message(self._header(time, ""), named, given, np.zeros(0), np.zeros(0)))
 
     def points(self, time: float, lidar: str, cloud: np.ndarray, topic: str | None = None) -> None:
-        """Points of a scan (`Scan.cloud`) as `/LIDAR/points`: PointCloud2 in the frame LIDAR. `time` is the
+        """Write the points of a scan (`Scan.cloud`) as `/LIDAR/points`: PointCloud2 in the frame LIDAR.
+        `time` is the
         start of the scan; the field `time` of a point is in seconds after it.
 
         Raises:
@@ -247,8 +250,8 @@ class RobotLog:
         self._write(f"/{lidar}/points" if topic is None else topic, time, message)
 
     def detections(self, time: float, camera: str, found: Iterable[Detection]) -> None:
-        """Detections in an image as `/CAMERA/detections` (apriltag_msgs); the family of a QR code is its
-        payload."""
+        """Write the detections in an image as `/CAMERA/detections` (apriltag_msgs); the family of a QR code
+        is its payload."""
         point, tag = (self._of(f"apriltag_msgs/msg/{name}") for name in ("Point", "AprilTagDetection"))
         tags = []
         for code in items("found", found, Detection, "a list of Detection"):

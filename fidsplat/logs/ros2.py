@@ -36,7 +36,7 @@ _PRIMITIVES = {"bool": bool, "string": str, "char": types.uint8}
 
 
 class Ros2Topics:
-    """A `LogFile` whose messages are ROS 2 topics; also subscribes to topics.
+    """A `LogFile` that publishes its messages as ROS 2 topics over DDS; also subscribes to topics.
 
     Args:
         store: message types.

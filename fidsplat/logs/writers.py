@@ -1,4 +1,4 @@
-"""Writers of MCAP files and rosbag2 folders. An incomplete log is never left behind."""
+"""Writers of MCAP files and rosbag2 folders, which delete incomplete logs."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ DEPTH = 10
 
 
 class LogFile(Protocol):
-    """Writer of messages; the log appears when it is closed."""
+    """Writer of messages; closing it creates the log."""
 
     def write(self, topic: str, kind: str, time: int, data: bytes) -> None:
         """Write a message of a type (kind) as CDR, at a time in nanoseconds."""
@@ -112,7 +112,7 @@ def _target(path: str | os.PathLike[str], overwrite: bool) -> Path:
 
 
 class _Dropped(Exception):
-    """Discards a log."""
+    """Exception that discards a log."""
 
 
 class _McapFile:

@@ -1,7 +1,7 @@
-"""Markers: from text to bits, components, a minimum rectilinear partition, and splats.
+"""Markers of splats: parsing of specs, module grids, minimum rectilinear partitions, and mixtures of
+Gaussians.
 
-Importing this package is light: names are loaded on first use, and shapely, segno and OpenCV only when a
-marker needs them.
+Names of this package are imported on first use, and shapely, segno and OpenCV when a marker needs them.
 """
 
 from importlib import import_module

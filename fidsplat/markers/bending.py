@@ -49,7 +49,7 @@ def subdivide(
 ) -> Printed:
     """Halve rectangles until they deviate from a surface by at most a bound.
 
-    deviation: metres. whole: cut between whole cells, so that pieces of one cell may deviate more.
+    deviation: metres. whole: cut between cells only, so that pieces of one cell may deviate more.
 
     Raises InputError for more than `max_splats` pieces.
     """
@@ -112,7 +112,7 @@ def _rotated(pieces: np.ndarray, boxes: np.ndarray, angles: np.ndarray) -> np.nd
 def _deviations(
     printed: Printed, surface: SheetShape, boxes: np.ndarray, owner: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Maximum distances (n,) of rectangles from a surface, and (n, 2) those along their two axes."""
+    """Maximum distances of rectangles from a surface: (n,), and (n, 2) along the rectangles' axes."""
     module, middle = printed.module, np.array(printed.grid.shape[::-1]) / 2
     centre = ((boxes[:, :2] + boxes[:, 2:]) / 2 - middle) * module
     half = (boxes[:, 2:] - boxes[:, :2]) * (module / 2)
@@ -136,10 +136,11 @@ def bend(
 ) -> SplatCloud:
     """Move the splats of a flat sheet to the tangent planes of a surface.
 
-    half: half edges of the sheet in metres. deviation: that of the pieces, in metres. Boxes are extended by
+    half: half edges of the sheet in metres. deviation: deviation of the pieces from the surface [m]. Boxes
+    are extended by
     the largest distance between neighbouring planes. Splats up to `overlap` metres from the border of a
-    coplanar group are in both groups, so that no light passes between these; the copy is farther from the
-    viewer by the same distance, and so occluded elsewhere.
+    coplanar group are in both groups, so that there is no gap between the groups; the copy is farther from
+    the viewer by the same distance, and occluded elsewhere.
     """
     gap = GAP * deviation
     at = surface.frames(cloud.means[:, :2].astype(np.float64))

@@ -45,7 +45,8 @@ def _parse(text: str, head: str, rest: str) -> BoardSpec:
 
 
 def tag_places(spec: BoardSpec, side: int) -> list[tuple[int, int]]:
-    """Row and column, in modules, of the top left corner of each tag of ``side`` modules, in order of ids.
+    """Positions of the tags of a board by id: row and column, in modules, of the top left corner. side: edge
+    of a tag in modules.
 
     ChArUco: in the white squares, row by row. Grids: row by row from the top left, AprilGrids from the bottom
     left, with a corner square around them.
@@ -60,8 +61,8 @@ def tag_places(spec: BoardSpec, side: int) -> list[tuple[int, int]]:
 
 
 def _bits(spec: BoardSpec) -> tuple[Spec, np.ndarray]:
-    """Modules of a board: tags, with the chessboard of ChArUco (top left square dark), or AprilGrid's corner
-    squares."""
+    """Modules of a board: tags, and for ChArUco a chessboard whose top left square is dark, for AprilGrids
+    corner squares."""
     from fidsplat.images.tag_dictionaries import dictionary_bits, families, parse_family, predefined
 
     kind, family = parse_family(spec.family or "")

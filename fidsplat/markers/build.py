@@ -1,4 +1,4 @@
-"""Construction of markers: from a spec to splats."""
+"""Construction of the splats of a marker from its spec."""
 
 from __future__ import annotations
 
@@ -69,7 +69,8 @@ _SETTINGS = {
 
 
 class Rectangle(NamedTuple):
-    """One rectangle of a partition, in modules of the grid with quiet zone: x right, y down, half-open."""
+    """A rectangle of a partition: half-open ranges in modules of the grid with quiet zone, x right, y
+    down."""
 
     x0: float
     y0: float
@@ -167,8 +168,8 @@ class Marker(PickledByFields):
     def gaussians(self) -> SplatCloud:
         """The marker as Gaussians, for renderers and files without boxes.
 
-        This is `cloud`, except where the mixture is `exact`, which consists of boxes: then it is the mixture
-        `fitted` of the same marker.
+        The same as `cloud`, except for the mixture `exact` of boxes, for which it is the mixture `fitted` of
+        the same marker.
 
         Raises:
             InputError: more than `max_splats`.
@@ -192,7 +193,7 @@ class Marker(PickledByFields):
 
     @property
     def is_dark(self) -> np.ndarray:
-        """Which rectangles are nearer to black than to white, (n,) bool."""
+        """Mask (n,) of the rectangles that are nearer to black than to white."""
         limit = 0.5 if self.inks is None else self.palette.mean()
         return (self.palette.mean(1) < limit)[self.values]
 
@@ -205,20 +206,20 @@ class Marker(PickledByFields):
 
     @property
     def corners(self) -> np.ndarray:
-        """(4, 3) float64 metres, the code's outer corners as printed, of AprilTag 3 its border's: top left,
-        top right, bottom right, bottom left; on the surface of a bent marker.
+        """(4, 3) float64 metres: outer corners of the code, for AprilTag 3 of its border: top left, top
+        right, bottom right, bottom left as printed; on the surface of a bent marker.
         """
         return self.points(self.flat_corners)
 
     @property
     def flat_corners(self) -> np.ndarray:
-        """(4, 2) float64 metres, positions of `corners` on the flat sheet."""
+        """(4, 2) float64 metres: positions of `corners` on the flat sheet."""
         h, w = np.array(self.bits.shape) - 2 * self.outside
         x, y = w * self.module / 2, h * self.module / 2
         return np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
 
     def points(self, xy: np.ndarray) -> np.ndarray:
-        """Points (n, 3) float64 metres in the marker's frame of positions (n, 2) on its sheet, x right and y
+        """Points (n, 3) float64 in the marker's frame [m] of positions (n, 2) on its sheet [m], x right and y
         down from the centre.
 
         Raises:
@@ -264,8 +265,8 @@ def marker(
         levels, density, duplicates: of the mixture `paper` only, see `paper_template`; default 4, 3, False.
         template: of the mixtures `fitted` and (for `Marker.gaussians`) `exact` only: Gaussians of a
             rectangle, 1, 5, 9, 13, 25, 41, 121 or 562; default 25.
-        growth: modules, 0 to 1, by which a rectangle extends across a side that borders only its own colour,
-            against seams; default the value that the fitted templates were optimised with, and 0 for paper.
+        growth: overlap in modules, 0 to 1, of a rectangle across sides that border only its own colour,
+        against seams; default: the value for which the fitted templates are optimised, and 0 for paper.
         black, white: RGB of the dark and light modules in [0, 1], black darker than white; default (0, 0, 0)
             and (1, 1, 1). Printed ink and paper are nearer to (0.05, 0.05, 0.05) and (0.85, 0.85, 0.85).
         quality: defaults of mixture, levels, density, growth and template (`Quality.marker`); settings of
@@ -274,7 +275,7 @@ def marker(
             text "cylinder,radius=0.05"; not for facets.
         wear: print defects and wear, such as `fidsplat.markers.Wear(fading=0.4)`, or its text
             "fading=0.4,dirt=0.2,seed=3"; not for facets or drawings with slanted edges.
-        max_splats: maximum number of splats; an image of noise can need tens of millions.
+        max_splats: maximum number of splats; a noisy image may need tens of millions.
         progress: callback of the current task and its completed share, 0 to 1.
 
     Raises:
@@ -448,7 +449,7 @@ def _printed(grid: np.ndarray, parsed: Spec, quiet: int, module: float, palette:
 
 
 def _chosen(quality: MarkerQuality, mixture: str | None, given: dict[str, Any]) -> MarkerQuality:
-    """Quality settings, with the given ones (not None) replaced."""
+    """Quality settings with changes; None keeps a setting."""
     instance("quality", quality, MarkerQuality, "an fs.MarkerQuality, e.g. fs.Quality(...).marker")
     name = quality.mixture if mixture is None else text("mixture", mixture)
     if name == "refined":
@@ -471,7 +472,7 @@ def _chosen(quality: MarkerQuality, mixture: str | None, given: dict[str, Any]) 
 
 
 def _mixture(quality: MarkerQuality, duplicates: bool) -> tuple[tuple[Template, ...], float]:
-    """Templates and growth of a mixture; for `exact` those of its replacement by Gaussians."""
+    """Templates and growth of a mixture; for `exact`, those of `Marker.gaussians`."""
     if quality.mixture == "paper":
         whole = paper_template(quality.levels, quality.density, duplicates)
         templates, growth = (Template(math.inf, whole),), 0.0

@@ -98,7 +98,7 @@ def _encoding(text: str) -> str:
 
 
 def qr_capacity(version: int, level: str) -> int:
-    """Capacity in bytes of a QR code of a version (1 to 40) and level (L, M, Q, H) in byte mode."""
+    """Capacity in bytes of a QR code in byte mode, by version (1 to 40) and level (L, M, Q, H)."""
     from segno import consts
 
     bits = consts.SYMBOL_CAPACITY[version][consts.ERROR_MAPPING[level]]

@@ -1,4 +1,4 @@
-"""Cover of regions with slanted or curved edges by rectangles: rotated bands along the edges, whole modules
+"""Cover of regions with slanted or curved edges by rectangles: rotated bands along the edges, and modules
 inside.
 
 Bands of two colours share an edge, which is therefore as sharp as that of a box. The width of a band is the
@@ -30,7 +30,7 @@ SLACK = 1e-6
 
 
 class _Sides(NamedTuple):
-    """Pieces of the edges, and the rotation to the next edge at concave corners."""
+    """Pieces of the edges, and the rotation angle to the next edge at concave corners."""
 
     start: np.ndarray
     """(n, 2) modules"""
@@ -71,7 +71,7 @@ def cover(region: shapely.MultiPolygon, shape: tuple[int, int]) -> tuple[np.ndar
 
 
 def _modules(region: shapely.MultiPolygon, shape: tuple[int, int]) -> np.ndarray:
-    """Rectangles of whole modules over the interior without the bands: corners (n, 4, 2)."""
+    """Rectangles of modules over the interior without the bands, as corners (n, 4, 2)."""
     interior = _intersecting(shapely.buffer(region, -BAND), shape)
     boxes = partition(interior)
     x0, y0, x1, y1 = boxes[interior[boxes[:, 1], boxes[:, 0]] == 1].T.astype(np.float64)
@@ -97,7 +97,7 @@ def _intersecting(region: shapely.Geometry, shape: tuple[int, int]) -> np.ndarra
 
 
 def _bands(region: shapely.MultiPolygon) -> np.ndarray:
-    """Rectangles over the bands along the edges: corners (n, 4, 2)."""
+    """Rectangles over the bands along the edges, as corners (n, 4, 2)."""
     edges, sides = _sides(region)
     tree = shapely.STRtree(list(shapely.get_parts(shapely.linestrings(edges))))
     within = shapely.buffer(region, SLACK, join_style="mitre")

@@ -1,4 +1,4 @@
-"""Mixture `facets`: opaque Gaussians with straight edges, in the planes of a shallow dish.
+"""Mixture `facets`: opaque Gaussians in the planes of a shallow dish, which intersect in straight edges.
 
 With sorting by depth at each pixel, two opaque splats that intersect have a straight visible border at the
 line of intersection. Each module has a splat much larger than itself, in the plane of a facet of a shallow
@@ -77,7 +77,7 @@ def facet_cloud(spec: str, printed: Printed, progress: Progress) -> SplatCloud:
 
 
 def _lines(edge: int) -> np.ndarray:
-    """Positions of the borders of facets along an edge of some modules, from its centre."""
+    """Positions of the borders of facets along an edge of `edge` modules, from its centre."""
     rim = np.array([cut for cut in RIM if cut < edge])
     return np.unique(np.concatenate([np.arange(edge + 1), rim, edge - rim])) - edge / 2
 

@@ -33,8 +33,8 @@ def register(kind: Kind) -> None:
 
 
 def detectors(default: bool = False) -> dict[str, Detector]:
-    """Detectors of registered kinds and of those of installed packages, by kind. default: only those that
-    `detect` includes without families."""
+    """Detectors of the registered kinds, also of installed packages, by kind. default: only those that
+    `detect` uses without `families`."""
     load_plugins("fidsplat.markers", register)
     return {
         name: kind.detect
@@ -85,14 +85,15 @@ def bits_of(spec: Spec) -> tuple[Spec, np.ndarray]:
 
 
 def with_file(text: str, change: Callable[[str], str]) -> str:
-    """Replace the file in a spec, if it has one."""
+    """Change the file name in a spec by a function; other specs stay the same."""
     head, colon, rest = instance("a marker spec", text, str).partition(":")
     kind = _named(head)
     return head + colon + change(rest) if rest and kind is not None and kind.is_file else text
 
 
 def _named(head: str) -> Kind | None:
-    """The kind in the head of a spec, without options; that of an installed package if necessary."""
+    """The kind that the head of a spec names, with or without options; loads installed packages if
+    necessary."""
     names = (head.lower(), head.lower().partition("-")[0])
     if _kinds.keys().isdisjoint(names) and foreign_family(head) is None:
         load_plugins("fidsplat.markers", register)

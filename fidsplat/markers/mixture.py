@@ -106,12 +106,12 @@ def fitted_templates(size: int = MarkerQuality.template) -> tuple[Template, ...]
 
 
 def fitted_growth() -> float:
-    """Growth of rectangles in modules that the shipped templates were optimised with."""
+    """Growth of rectangles [modules] for which the shipped templates are optimised."""
     return _fitted()[1]
 
 
 def count_gaussians(aspect: np.ndarray, templates: tuple[Template, ...]) -> np.ndarray:
-    """Number of Gaussians that `place` makes of each of n rectangles, (n,) int64."""
+    """Number (n,) int64 of Gaussians of each rectangle in `place`."""
     parts = _parts(aspect, templates[-1].max_aspect)
     counts = np.array([len(t.gaussians) for t in templates])
     return parts * counts[_which(np.maximum(aspect, 1 / aspect) / parts, templates)]
@@ -172,7 +172,8 @@ def in_pieces(
 
 
 def _parts(aspect: np.ndarray, longest: float) -> np.ndarray:
-    """Minimum number of equal pieces, each at most `longest`, for rectangles of these aspect ratios."""
+    """Minimum number of equal pieces of aspect ratio at most `longest`, for rectangles of these aspect
+    ratios."""
     return np.maximum(np.ceil(np.maximum(aspect, 1 / aspect) * (1 - 1e-9) / longest), 1).astype(np.int64)
 
 

@@ -1,4 +1,4 @@
-"""Minimum rectilinear partition of both colours of a grid at once (Ferrari et al. 1984; the paper's
+"""Minimum rectilinear partition of the components of both colours of a grid (Ferrari et al. 1984; the paper's
 Algorithm 1).
 
 All arithmetic is on integers. A *unit edge* of a grid line is between two neighbouring cells; it is interior
@@ -13,9 +13,9 @@ vertices. A vertex is on at most one horizontal and one vertical chord, so the c
 share an end) are the vertices covered by both.
 
 The maximum independent set of chords follows from a maximum matching by Koenig's theorem. Images of noise
-have a million chords, nearly all in small trees. A vertex with one unmatched neighbour is matched to it,
-which keeps the matching maximum; vectorized rounds of this solve the trees. networkx's Hopcroft-Karp matches
-the rest, which has cycles.
+have a million chords, nearly all in small trees. Vectorised rounds of the Karp-Sipser reduction, which match
+a vertex to its only unmatched neighbour and keep the matching maximum, solve the trees. networkx's
+Hopcroft-Karp matches the components with cycles.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def chords(grid: np.ndarray, concave: np.ndarray) -> np.ndarray:
 
 
 def _cover(found: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Index of the horizontal chord that covers each vertex, ends included, or -1: `shape` int32."""
+    """Index of the horizontal chord that covers each vertex, ends included, or -1; int32 of shape `shape`."""
     owner = np.full(shape, -1, np.int32)
     length = found[:, 2] - found[:, 1] + 1
     which = np.repeat(np.arange(len(found), dtype=np.int32), length)
@@ -126,10 +126,10 @@ def partition(grid: np.ndarray) -> np.ndarray:
     minimum for each component: concave vertices - independent chords - holes + 1.
 
     After the independent chords, a cut starts at each remaining concave vertex and ends at the boundary or at
-    another cut (the paper's greedy completion). All of these cuts are horizontal and made at once: parallel
+    another cut (the paper's greedy completion). All these cuts are horizontal and independent: parallel
     segments cannot cross, and none can connect two such vertices, because a chord without conflicts would be
-    in the maximum set. The same rule makes the chosen horizontal chords, so only the vertical ones are
-    needed.
+    in the maximum set. The same rule yields the chosen horizontal chords, so that only the vertical ones are
+    passed on.
     """
     h, w = grid.shape
     concave = concave_vertices(grid)
@@ -173,7 +173,7 @@ def partition_colors(grid: np.ndarray) -> np.ndarray:
 
 def merge_runs(grid: np.ndarray) -> np.ndarray:
     """Partition of an (h, w) grid of any colours into merged runs, in one pass: equal runs of successive
-    rows, or of columns if these are fewer. It has a few per cent more rectangles than the minimum partition.
+    rows, or of columns if these are fewer; a few per cent more rectangles than the minimum.
     """
     across, down = _merged(grid), _merged(grid.T)[:, [1, 0, 3, 2]]
     return across if len(across) <= len(down) else down

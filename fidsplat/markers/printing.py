@@ -48,7 +48,7 @@ class Printed(NamedTuple):
 
 
 def refuse_more(spec: str, count: int, max_splats: int, words: str = "") -> None:
-    """Raise InputError for a marker of more splats than `max_splats`."""
+    """Raise InputError if a marker has more splats than `max_splats`."""
     if count > max_splats:
         raise InputError(
             f"{spec} must have at most {max_splats:,} splats, got {words}{count:,}; use a smaller image or a "
@@ -69,8 +69,7 @@ def box_cloud(printed: Printed, progress: Progress) -> SplatCloud:
 
 
 def without_slivers(printed: Printed) -> Printed:
-    """Remove slivers between touching curves of a drawing, each of which would need thousands of
-    Gaussians."""
+    """Remove slivers between touching curves of a drawing; each would need thousands of Gaussians."""
     if printed.angles is None:
         return printed
     sides = printed.boxes[:, 2:] - printed.boxes[:, :2]
@@ -128,7 +127,7 @@ def _cloud(
 
     ends: (n,) cumulative number of splats by rectangle. make: returns the splats of a range of rectangles:
     rows (m, 5) of position and scale in modules and opacity, and (m,) the rectangle of each. Two threads fill
-    the cloud part by part, so that memory stays near that of the cloud.
+    the cloud chunk by chunk, so that the peak of memory is near the size of the cloud.
     """
     module, angles = printed.module, printed.angles
     total = int(ends[-1])
@@ -186,8 +185,8 @@ LONG = 0.6
 def grow(grid: np.ndarray, rectangles: np.ndarray, growth: float) -> np.ndarray:
     """Extend rectangles of an (h, w) 0/1 grid across the sides that border only their own colour.
 
-    rectangles: (n, 4) ints x0, y0, x1, y1 in cells. growth: modules, 0 to 1, of short rectangles; `LONG` has
-    the growth of longer ones. Returns (n, 4) float64.
+    rectangles: (n, 4) ints x0, y0, x1, y1 in cells. growth: growth of short rectangles in modules, 0 to 1;
+    `LONG` is that of longer ones. Returns (n, 4) float64.
 
     A mixture fades towards its edges, which leaves a seam between rectangles of a component unless they
     overlap. Templates are scaled, so long rectangles fade over a longer distance and need a larger overlap.

@@ -30,7 +30,7 @@ MAX_NEIGHBORS = 5_000_000
 
 
 def refuse_tangles(rings: Rings, name: str | None) -> None:
-    """Raise InputError for outlines with too many crossings for polygons."""
+    """Raise InputError for outlines with more crossings than polygons can be made of."""
     pieces = np.concatenate(
         [np.zeros((0, 2, 2)), *(np.stack([ring, np.roll(ring, -1, 0)], 1) for ring in rings)]
     )
@@ -141,5 +141,5 @@ def modules(regions: tuple[shapely.MultiPolygon, ...], shape: tuple[int, int]) -
 
 
 def _polygons(region: shapely.Geometry) -> shapely.MultiPolygon:
-    """A region without the points and lines that cuts can leave."""
+    """The polygons of a region, without isolated points and lines that cuts produce."""
     return shapely.MultiPolygon([part for part in shapely.get_parts(region) if part.area])

@@ -48,7 +48,7 @@ class Frames(NamedTuple):
 
     @property
     def normals(self) -> np.ndarray:
-        """(n, 3) unit normals away from the viewer, as those of splats."""
+        """(n, 3) unit normals away from the viewer, as for splats."""
         return np.cross(self.along_x, self.along_y)
 
 
@@ -77,7 +77,7 @@ class SheetShape:
         raise NotImplementedError
 
     def longest(self, deviation: float) -> float:
-        """Maximum length across the axis of a piece whose deviation, in metres, is measured by samples."""
+        """Maximum length [m] across the axis of a piece, so that samples measure its deviation [m]."""
         return math.inf
 
     @property

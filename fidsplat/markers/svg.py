@@ -201,7 +201,7 @@ def _inherited(style: _Style, look: dict[str, str]) -> _Style:
 
 
 def _first(switch: ElementTree.Element) -> list[ElementTree.Element]:
-    """The rendered child of a <switch>: the first without required extension and language."""
+    """The rendered child of a <switch>: the first without a required extension or language."""
     asks = ("requiredExtensions", "systemLanguage")
     free = (
         child

@@ -1,8 +1,8 @@
-"""Print and wear of a marker: a fine grid of colours, changed by seeded effects of severity 0 to 1.
+"""Print defects and wear of a marker: seeded effects of severity 0 to 1 on a fine grid of colours.
 
 The modules are divided into cells. Each effect maps the colours of the cells to new ones; cells of one colour
-are then joined to rectangles. Every effect has random numbers of its own, so that the severity of one does
-not change the others.
+are then joined to rectangles. Every effect has its own random numbers, so that its severity does not change
+other effects.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def worn(spec: str, printed: Printed, wear: Wear) -> Printed:
 
 
 def _indexed(sheet: Sheet) -> tuple[np.ndarray, np.ndarray]:
-    """Cells as indices of a palette, `HOLE` without paper, and the palette (k, 3) float32."""
+    """Palette indices of the cells, `HOLE` without paper, and the palette (k, 3) float32."""
     colors = sheet.color[sheet.present]
     steps = 0
     while True:
@@ -346,7 +346,7 @@ def _noise(sheet: Sheet, wide: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def _ranks(sheet: Sheet, values: np.ndarray) -> np.ndarray:
-    """For each cell the share of the sheet's cells with a lower value, 0 to 1; 1 where there is no paper."""
+    """Rank of each cell: share of the sheet's cells with a lower value, 0 to 1; 1 without paper."""
     rank = np.ones(sheet.present.shape)
     order = np.argsort(values[sheet.present], kind="stable")
     own = np.empty(len(order))

@@ -1,1 +1,1 @@
-"""Photographs to a metric data set: frames of a video, structure from motion, scale and gravity from tags."""
+"""Metric data sets from photographs or video: structure from motion, with scale and gravity from tags."""

@@ -70,11 +70,11 @@ def adjust(cameras: Sequence[Camera], views: Sequence[TagView], sizes: Mapping[s
 
     Args:
         cameras: pinhole cameras in the unit of the model.
-        views: detections; of one tag at least in photographs from two positions.
+        views: detections; detections; at least one tag in photographs from two positions.
         sizes: edge of each tag in metres.
 
-    Raises InputError if no tag was detected from two positions, if a tag was at two places, or if the sizes
-    of two tags contradict each other.
+    Raises InputError if no tag is detected from two positions, if a tag has two positions, or if the sizes of
+    two tags contradict each other.
     """
     seen = {tag: [view for view in views if view.tag == tag] for tag in sizes}
     relative = {
@@ -139,7 +139,7 @@ def _tag_in_axes_of_world(camera: Camera, view: TagView, size: float) -> np.ndar
 
 
 def _first_unit(positions: np.ndarray, offsets: np.ndarray) -> float | None:
-    """Units of the model in a metre: the weighted median over pairs of photographs. None without a baseline.
+    """Model units per metre: the weighted median over pairs of photographs; None without a baseline.
 
     positions: (n, 3) of the cameras, in the unit of the model. offsets: (n, 3) to the tag, in metres.
     """
@@ -158,7 +158,7 @@ def _first_unit(positions: np.ndarray, offsets: np.ndarray) -> float | None:
 
 
 def _first_pose(corners: _Corners, tag: str, relative: np.ndarray, unit: float) -> np.ndarray:
-    """Initial pose of a tag: of its poses from single photographs, the one that fits all photographs best.
+    """Initial pose of a tag: among its poses from single photographs, the one that fits all photographs best.
 
     relative: (n, 4, 4) poses from each camera's position in metres.
     """
@@ -239,7 +239,7 @@ def _solve(
     unit: float,
     poses: Mapping[str, np.ndarray],
 ) -> tuple[float, dict[str, np.ndarray], float]:
-    """Units in a metre, poses, and the relative standard error of the unit."""
+    """Model units per metre, poses of the tags, and the relative standard error of the unit."""
     tags = list(dict.fromkeys(view.tag for view in views))
     corners, poses = _Corners(cameras, views, sizes, tags), {tag: poses[tag] for tag in tags}
     noise, damping = np.inf, 1e-4
@@ -289,8 +289,8 @@ def _moved(poses: Mapping[str, np.ndarray], tags: list[str], step: np.ndarray) -
 
 
 def _unit_error(images: np.ndarray, residuals: np.ndarray, derivatives: np.ndarray, noise: float) -> float:
-    """Standard error of the logarithm of the unit: the larger one of that for independent corners, and of
-    that for errors which the corners of a photograph share (sandwich estimate, photographs as clusters)."""
+    """Standard error of the logarithm of the unit: the larger of the estimate for independent corners and the
+    cluster-robust sandwich estimate with photographs as clusters."""
     sizes = np.linalg.norm(residuals, axis=-1)
     weights = np.minimum(1, HUBER * noise / np.maximum(sizes, 1e-12))
     weighted = derivatives * weights[..., None, None]

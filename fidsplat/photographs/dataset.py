@@ -1,4 +1,5 @@
-"""A data set for training from photographs with cameras: undistorted images, masks, model and scene file."""
+"""Writer of a training data set from photographs with cameras: undistorted images, masks, model and scene
+file."""
 
 from __future__ import annotations
 
@@ -77,7 +78,7 @@ def _image_name(name: str) -> str:
 
 
 def scaled(camera: Camera, width: int, height: int) -> Camera:
-    """The camera without its lens, of an image that was resized."""
+    """The camera of a resized image, without its lens."""
     x, y = width / camera.width, height / camera.height
     return replace(
         camera,

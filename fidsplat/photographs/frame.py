@@ -51,9 +51,9 @@ def world_frame(
 
     Args:
         scale: metres for each unit of the model.
-        tag: pose (4, 4) of the tag at the origin, whose x axis gives the direction of x.
-        vertical: whether the axis of this tag that is nearest to the cameras' up is vertical: the tag hangs
-            upright or sideways, or lies flat. Otherwise the cameras' horizontal axes give the vertical.
+        tag: pose (4, 4) of the tag that defines the origin and the direction of x.
+        vertical: whether the tag's axis nearest to the cameras' up direction is vertical. Otherwise the
+        cameras' horizontal axes determine the vertical.
         middle: (3,) origin in the model without a tag; by default the cameras' mean position.
     """
     up = camera_up(cameras)
@@ -72,8 +72,8 @@ def world_frame(
 
 
 def camera_up(cameras: Sequence[Camera]) -> np.ndarray:
-    """Unit vector of the vertical: perpendicular to the cameras' x axes, which people hold horizontally, by
-    least squares."""
+    """Unit vector of the vertical: the least-squares normal to the cameras' x axes, as people hold cameras
+    level."""
     across = np.array([camera.world_to_camera[0, :3] for camera in cameras])
     mean = -np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0)
     up = np.linalg.solve(across.T @ across / len(across) + PITCHED * np.eye(3), mean)

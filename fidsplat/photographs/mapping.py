@@ -1,7 +1,7 @@
 """Structure from motion by COLMAP (pycolmap): features, matches and incremental mapping.
 
-Features and matches are kept in COLMAP's database, photograph by photograph and pair by pair, so that an
-interrupted run continues.
+COLMAP's database stores features and matches, photograph by photograph and pair by pair, so that an
+interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Model:
 
 
 def require_pycolmap() -> Any:
-    """The module pycolmap, without its log. Raises InputError if it is not installed."""
+    """Import pycolmap and disable its log. Raises InputError if it is not installed."""
     try:
         import pycolmap  # type: ignore[import-not-found]
     except ImportError:
@@ -194,7 +194,7 @@ def read_model(folder: Path) -> Model:
 
 
 def unregistered(database: Path, registered: Sequence[str]) -> list[tuple[str, str]]:
-    """Names of photographs without a camera, and why."""
+    """Names of the photographs that were not registered, each with the reason."""
     pycolmap = require_pycolmap()
     with pycolmap.Database.open(database) as data:
         images = {image.image_id: image.name for image in data.read_all_images()}

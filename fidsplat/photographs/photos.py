@@ -99,7 +99,7 @@ def copy_frames(video: Path, folder: Path, count: int, progress: Progress) -> tu
 
 
 def camera_groups(folder: Path) -> list[list[str]]:
-    """Names of photographs by camera: those of one size and focal length have the same."""
+    """Names of photographs by camera: photographs of equal size and focal length share one."""
     groups: dict[tuple, list[str]] = {}
     for file in sorted(folder.iterdir()):
         data = read_input(file)

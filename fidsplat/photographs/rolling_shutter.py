@@ -1,4 +1,4 @@
-"""Detection of a rolling shutter: whether motion of the camera while rows are read out explains the features'
+"""Rolling-shutter detection: tests whether camera motion during the readout explains the features'
 reprojection errors."""
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ MIN_SHARE, MIN_DISPLACEMENT = 0.02, 0.15
 
 
 def readout_motion(model: Model) -> tuple[float, float]:
-    """Share of the squared reprojection errors, beyond chance, that a constant motion of each camera during
-    the readout of its rows explains; and the displacement from the first row to the last that it causes, the
-    median over the photographs in pixels.
+    """Estimate a constant motion of each camera during the readout. Returns the share of the squared
+    reprojection errors that it explains beyond chance, and its displacement between the first and the last
+    row [px], the median over the photographs.
 
-    A motion that is the same in all photographs is part of COLMAP's model, and is not found.
+    A motion that is equal in all photographs is part of COLMAP's model, and is not detected.
     """
     before = after = by_chance = 0.0
     displacements = []

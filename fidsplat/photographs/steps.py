@@ -1,4 +1,4 @@
-"""The steps from photographs to a metric data set. Finished steps are kept in the folder `work`."""
+"""Pipeline from photographs to a metric data set; the folder `work` stores completed steps."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def photographs_to_scene(
 
 
 def _step(folder: Path, make: Callable[[Path], None]) -> Path:
-    """Make the folder of a step, unless it exists: it gets its name only when it is complete."""
+    """Run a step, unless its folder exists; the folder is renamed to its final name after the step."""
     if not folder.exists():
         part = folder.with_name(f".{folder.name}.part")
         shutil.rmtree(part, ignore_errors=True)
@@ -156,7 +156,7 @@ def _step(folder: Path, make: Callable[[Path], None]) -> Path:
 
 
 def _work_folder(folder: Path, files: list[Path], settings: CaptureSettings, overwrite: bool) -> Path:
-    """The folder of finished steps. Raises InputError if it is of other photographs."""
+    """The folder of completed steps. Raises InputError if it belongs to other photographs."""
     work = folder / "work"
     stats = [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in files]
     inputs = {"files": stats, "lens": settings.lens, "frames": settings.frames if len(files) == 1 else None}

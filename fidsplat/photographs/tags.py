@@ -1,4 +1,4 @@
-"""Tags in photographs: detection, the region that a tag covers, and the inks of its print."""
+"""Tags in photographs: detection, boxes around them, and the inks of their print."""
 
 from __future__ import annotations
 
@@ -50,7 +50,8 @@ def parse_tags(texts: Sequence[str]) -> dict[str, Marker]:
 
 
 def same_tag(tags: Mapping[str, Marker], made: Marker) -> Marker | None:
-    """The tag with the content of a marker, whose spec may be written differently."""
+    """The tag with the same content as a marker, also if its spec is spelled differently; None without
+    one."""
     return next((each for each in tags.values() if content_of(each) == content_of(made)), None)
 
 
@@ -86,7 +87,7 @@ def detect_tags(
 
 
 def box_of(tag: PlacedMarker) -> np.ndarray:
-    """Matrix (4, 4) from the cube [-1, 1]^3 to a box around a tag: splats in it are of its print."""
+    """Matrix (4, 4) from the cube [-1, 1]^3 to a box around a tag, in which splats represent its print."""
     h, w = np.array(tag.marker.grid.shape) * tag.marker.module / 2
     return tag.pose @ np.diag([w, h, THICK * tag.marker.size, 1.0])
 
@@ -95,7 +96,7 @@ def module_colors(
     placed: PlacedMarker, image: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Median colours (3,) of the dark and the light modules in a photograph (h, w, 3) uint8, display values;
-    None where the modules are too small or too few are in the image."""
+    None if the modules are too small or too few are in the image."""
     made = placed.marker
     rows, columns = np.indices(made.bits.shape) + 0.5
     middle = np.array(made.bits.shape) / 2

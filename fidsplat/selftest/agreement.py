@@ -1,4 +1,4 @@
-"""Comparison of a device's images with the float64 reference: error, certificate, and excess over both.
+"""Comparison of a device's images with the float64 reference, with an error bound (certificate) per pixel.
 
 The tolerance of an output is declared in fidsplat/effects/catalogue.py. The reference adds a certificate per
 pixel: the change that float32 rounding may cause there, because a decision is at its threshold or a splat is
@@ -154,7 +154,7 @@ def _flips(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tup
 
 
 def trace(renderer: Renderer, spec: FrameSpec, shape=None) -> dict[str, np.ndarray]:
-    """Buffers between the stages of a device, and the outputs; `shape` replaces its build constants."""
+    """Buffers between the stages of a frame, and its outputs. shape: replaces the build constants."""
     features, view = spec.prepared()
     backend = renderer.backend
     if shape is not None and backend.has("probe"):
@@ -178,8 +178,8 @@ def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray],
 
 
 def out_of_order(traced: Mapping[str, np.ndarray], expected: np.ndarray) -> int:
-    """Number of splats of a trace that violate the expected depth order (visible,), in tile lists or
-    overall."""
+    """Number of splats of a trace that violate the expected depth order, in tile lists or overall. expected:
+    (visible,) indices in depth order."""
     if "lists" not in traced:
         return int((traced["order"] != expected).sum())
     rank = np.full(len(traced["keys"]), -1)

@@ -21,7 +21,7 @@ PARITY = ("gsplat", "surfel")
 
 
 def stack(opacities, colors=(0.0, 0.0, 0.0), step: float = 0.1, size: float = 5.0) -> SplatCloud:
-    """Fronto-parallel layers one behind the other, each with its opacity on the axis."""
+    """Stack of fronto-parallel layers, each with its opacity on the optical axis."""
     n = len(opacities)
     means = np.zeros((n, 3))
     means[:, 2] = 1.0 + step * np.arange(n)
@@ -29,7 +29,7 @@ def stack(opacities, colors=(0.0, 0.0, 0.0), step: float = 0.1, size: float = 5.
 
 
 def near_values(value: float, ulps) -> np.ndarray:
-    """Float32 numbers at some ulps from a value."""
+    """Float32 numbers at distances in ulp from a value."""
     bits = np.float32(value).view(np.int32) + np.asarray(ulps, np.int32)
     return bits.astype(np.int32).view(np.float32)
 

@@ -131,7 +131,7 @@ def run_check(
 
 
 def run_case(renderer: Renderer, case: Case, worst: Worst | None = None) -> tuple[CaseResult, Worst | None]:
-    """Run a case on a device; returns its result, and the worst of `worst` and the case's frames."""
+    """Run a case on a device; returns its result, and the worse of `worst` and the case's worst frame."""
     begun = time.perf_counter()
     result = CaseResult(case)
     try:

@@ -1,6 +1,6 @@
 """Digests of random scenes, equal on all devices with float64 and fused multiply-adds.
 
-A scene is determined by its seed. It is made with sums, products, quotients and roots only, which IEEE
+The seed determines a scene. It is computed by sums, products, quotients and roots alone, which IEEE
 arithmetic rounds equally on every processor.
 """
 
@@ -207,14 +207,14 @@ def digest_of(renderer: Renderer, seed: int) -> Digest:
 
 
 def stage_digests(renderer: Renderer, seed: int) -> dict[str, str]:
-    """Digests of results between the stages: numbers of the records of visible splats, keys, samples."""
+    """Digests of intermediate results: records of visible splats, sort keys, samples."""
     spec = scene_of(seed)
     data = trace(renderer, spec)
     return {name: _sha256(array)[:8] for name, array in stages_of(data, spec, renderer.backend).items()}
 
 
 def stages_of(data: Mapping[str, np.ndarray], spec: FrameSpec, backend: Backend) -> dict[str, np.ndarray]:
-    """Results between the stages of a trace, converted to a device-independent layout."""
+    """Intermediate results of a trace, converted to a device-independent layout."""
     keys, visible = data["keys"], data["keys"] != CULLED
     features, _ = spec.prepared()
     records = data["records"]

@@ -109,7 +109,8 @@ def _edge_on(generator: np.random.Generator, mean: np.ndarray) -> np.ndarray:
 
 
 def _coplanar(generator, chosen: np.ndarray, means: np.ndarray, quats: np.ndarray) -> np.ndarray:
-    """Move the chosen splats to a few planes z = const, rotated in them; returns group ids (n,)."""
+    """Move the chosen splats to a few planes z = const, with rotations in the plane; returns group ids
+    (n,)."""
     planes = np.full(len(means), -1)
     groups = generator.integers(0, 3, len(chosen))
     for group in range(3):

@@ -44,7 +44,7 @@ ODD = {
 
 
 def crowd() -> SplatCloud:
-    """A cloud in which the victim covers the image centre."""
+    """A cloud in which the splat `VICTIM` covers the image centre."""
     cloud = random_splats(40, 41, depth=(1.0, 5.0), scale=(0.03, 0.4), across=1.0)
     victim = splats([[0.05, 0.02, 1.2]], rotation((1, 1, 0), 30), (0.3, 0.2), 0.9, (0.2, 0.9, 0.4))
     before, after = subset_of(cloud, np.arange(VICTIM)), subset_of(cloud, np.arange(VICTIM, len(cloud)))

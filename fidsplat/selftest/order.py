@@ -82,7 +82,7 @@ def camera_path(
 
 
 def tag_and_large_splat(where: str) -> tuple[SplatCloud, SplatCloud]:
-    """A tag, and a large slanted splat that passes in front of it (`before`), `behind` it or `through` it.
+    """A tag, and a large slanted splat in front of it (`before`), `behind` it or intersecting it (`through`).
 
     `before` and `behind`: the centre of the splat is on the other side of the tag's plane, so that sorting by
     centres is wrong.
@@ -97,8 +97,8 @@ def tag_and_large_splat(where: str) -> tuple[SplatCloud, SplatCloud]:
 def composited_parts(
     renderer: Renderer, parts: Sequence[SplatCloud], camera: Camera, order: str = "auto"
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Images (h, w, 3) of coplanar groups or single splats: rendered together, and composited per pixel from
-    an image of each part by depth. Both are 0 where two depths agree to 1e-4.
+    """Two images (h, w, 3) of several clouds, each a coplanar group or a single splat: rendered together, and
+    composited per pixel by depth from an image of each cloud. Both are 0 where two depths agree to 1e-4.
     """
     # with a cut-off above 1/255 every rendered pixel has a depth
     quality = Quality(alpha_cutoff=1 / 250, transmittance_stop=0.0, order=order)
@@ -324,7 +324,8 @@ def crossing(count: int = 120) -> SplatCloud:
 
 
 def fan() -> SplatCloud:
-    """40 splats 2 m wide that share a line at 3 m: each is in front of every other one somewhere."""
+    """40 splats 2 m wide that intersect in one line at 3 m, so that each is partly in front of every other
+    one."""
     generator = np.random.default_rng(5)
     quats = np.array([rotation((0, 1, 0), angle) for angle in np.linspace(-75, 75, 40)])
     means = np.tile([0.0, 0.0, 3.0], (40, 1))

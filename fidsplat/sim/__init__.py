@@ -1,4 +1,4 @@
-"""Rendering for simulators: splats, markers and cameras attached to bodies, in many environments at once.
+"""Rendering for simulators: splats, markers and cameras on bodies, in batches of environments.
 
 `fidsplat.sim.mujoco` and `fidsplat.sim.gymnasium` need `pip install 'fidsplat[sim]'`.
 """

@@ -46,7 +46,7 @@ class Place:
         return Place(self.file, f"{self.path}/{name}" if self.path else name)
 
     def wrong(self, why: str) -> InputError:
-        """Error with the file, the element and the reason."""
+        """An InputError with the file, the element and the reason."""
         return InputError(f"{self.file}: {self.path}: {why}" if self.path else f"{self.file}: {why}")
 
 
@@ -77,7 +77,7 @@ def name_of(element: ElementTree.Element, place: Place) -> str:
 
 
 def numbers(text: str | None, count: int, place: Place) -> list[float]:
-    """Parse a text of `count` finite numbers."""
+    """Parse `count` finite numbers."""
     try:
         values = [float(word) for word in (text or "").split()]
     except ValueError:

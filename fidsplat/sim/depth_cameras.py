@@ -1,4 +1,5 @@
-"""Depth cameras: active stereo, time of flight and structured light, with the errors and holes of real ones.
+"""Simulated depth cameras: active stereo, time of flight and structured light, with the errors and holes of
+real devices.
 
 Each measures a rendered scene by its own principle: a matched pair of images with a projected pattern,
 phasors averaged over a pixel's footprint, or a disparity to a projector. Errors by distance, reflectance,
@@ -34,7 +35,7 @@ SHADOW = 0.02
 
 
 class DepthView(NamedTuple):
-    """What a depth camera receives from a scene."""
+    """Images of a scene from which a depth camera measures."""
 
     depth: np.ndarray
     """(h, w) float64 metres along z, 0 without a surface"""
@@ -72,7 +73,7 @@ class DepthCamera:
     def _measured(
         self, renderer: Renderer, scene: Scene, camera: Camera, rng: np.random.Generator
     ) -> np.ndarray:
-        """Depth (h, w) without limits of the range; 0 or NaN in holes."""
+        """Measured depth (h, w) without range limits; 0 or NaN in holes."""
         raise NotImplementedError
 
 
@@ -83,7 +84,7 @@ def _check_range(device: DepthCamera) -> None:
 
 @dataclass(frozen=True)
 class ActiveStereo(DepthCamera):
-    """Two infrared cameras and a projector of random dots between them; the left camera's depth.
+    """Active stereo: depth of the left of two infrared cameras, with a projector of random dots between them.
 
     The images of both cameras are rendered, lit by ambient light and the pattern, and matched by OpenCV's
     semi-global matching. The defaults are those of an Intel RealSense D435: its error is about 0.08 pixels of
@@ -150,11 +151,12 @@ class ActiveStereo(DepthCamera):
 
 @dataclass(frozen=True)
 class TimeOfFlight(DepthCamera):
-    """Amplitude-modulated light: the phase of the light that a pixel gathers.
+    """Time of flight: depth from the phase of amplitude-modulated light.
 
     The phasors of `samples` x `samples` rays are summed by their light, so that pixels on an edge measure a
     depth between both surfaces (flying pixels). The noise is shot noise of the gathered light and a constant.
-    Interreflections (multi-path) are left out. The defaults are those of an Azure Kinect, narrow field of
+    Interreflections (multi-path) are not simulated. The defaults are those of an Azure Kinect, narrow field
+    of
     view, unbinned (Toelgyessy et al. 2021: standard deviation by distance; the maker's range for 15 %
     reflectance).
     """
@@ -212,7 +214,7 @@ class TimeOfFlight(DepthCamera):
 
 @dataclass(frozen=True)
 class StructuredLight(DepthCamera):
-    """A camera and a projector of a known pattern at its side.
+    """Structured light: depth from a camera and a projector of a known pattern next to it.
 
     Depth is triangulated from a disparity in steps, with noise; points in the shadow of the projector, at
     grazing incidence or too dark have no depth, and edges are ragged by the size of the matched window. The
@@ -346,7 +348,7 @@ def _seen_from(other: Camera, camera: Camera, depth: np.ndarray) -> tuple[np.nda
 def _lit(
     projector: Camera, shadow: np.ndarray, x: np.ndarray, y: np.ndarray, depth: np.ndarray
 ) -> np.ndarray:
-    """Whether points are lit by a projector, by the depths that it sees."""
+    """Mask of the points that a projector lights, by the depths of its view."""
     column, row = np.floor(x).astype(int), np.floor(y).astype(int)
     inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < projector.width) & (row < projector.height)
     nearest = shadow[np.where(inside, row, 0), np.where(inside, column, 0)]

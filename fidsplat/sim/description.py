@@ -151,7 +151,8 @@ class _Sdf:
         name: str | None = None,
         pose: np.ndarray | None = None,
     ) -> None:
-        """Read one model, whose parent has the pose `at`. An include may give it another name and pose."""
+        """Read one model. at: pose of the parent. name, pose: of an include; they replace those of the
+        model."""
         own = name or name_of(model, place)
         place = place.within(own)
         self.models += 1

@@ -134,8 +134,8 @@ class TiledCamera:
             _ = self.data
 
     def reset(self, env_ids: Any = None, env_mask: Any = None) -> None:
-        """Set the time and the number of images of environments to 0; their images become outdated.
-        env_mask: (N,) bool, instead of env_ids."""
+        """Set the time and the image count of environments to 0, and mark their images as outdated. env_mask:
+        (N,) bool, instead of env_ids."""
         which = self._which(env_ids if env_mask is None else env_mask)
         self.frame[which] = self._times[which] = self._taken[which] = 0
         self._outdated[which] = True
@@ -223,7 +223,7 @@ class TiledCamera:
 
 
 def _host(value: Any, dtype: Any = np.float64) -> np.ndarray:
-    """An array of torch, Warp or Isaac Lab's `ProxyArray` as NumPy array on the host."""
+    """Convert an array of torch, Warp or Isaac Lab (`ProxyArray`) to NumPy, on the host."""
     value = getattr(value, "torch", value) if not isinstance(value, np.ndarray) else value
     if hasattr(value, "detach"):
         value = value.detach().cpu()

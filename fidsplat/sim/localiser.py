@@ -26,7 +26,7 @@ class Localiser:
 
     Wheels measure the distance, the gyroscope the rotation; corners of tags in an image and matches of scans
     correct the pose. The filter stores the covariance of the error state; a correction is added to the state
-    at once. A scan is matched to an earlier one, the reference, whose pose is a part of the error state
+    at once. A scan is matched to an earlier one, the reference, whose pose is part of the error state
     (stochastic cloning), since the errors of both poses are correlated.
 
     Args:
@@ -81,7 +81,7 @@ class Localiser:
         self.covariance[range(5), range(5)] += slip, slip, turn, walk, 1e-9 * abs(rolled)
 
     def set_reference(self) -> None:
-        """Make the current pose that of the reference scan."""
+        """Set the pose of the reference scan to the current pose."""
         clone = np.vstack([np.eye(5), np.eye(3, 5)])
         self.covariance = clone @ self.covariance[:5, :5] @ clone.T
         self._reference, self._reference_is_new = self.state[:3].copy(), True
@@ -152,7 +152,7 @@ def _pose(state: np.ndarray) -> np.ndarray:
 
 
 def _tilt(axis: int) -> np.ndarray:
-    """Rigid matrix of a small roll (0), pitch (1) or rise (2)."""
+    """Rigid matrix of a roll (0) or pitch (1) by `_STEP` radians, or of a rise (2) by `_STEP` metres."""
     quaternion = [1.0, 0.0, 0.0, 0.0]
     if axis == 2:
         return rigid_matrix((0, 0, _STEP))

@@ -40,7 +40,7 @@ _OUTPUTS = {
 class MujocoRig(SimulatorRig):
     """A rig with the cameras of a MuJoCo model and splats attached to its bodies.
 
-    Resolution, fovy, focal length, principal point and outputs are the model's; the near plane is at
+    Resolution, fovy, focal length, principal point and outputs are those of the model. The near plane is at
     0.01 m and there is no far plane, since MuJoCo scales both with the model.
 
     Args:

@@ -1,6 +1,6 @@
 """Poses (..., 7) float64 in the layout of simulators: x y z in metres and a unit quaternion w x y z.
 
-All arithmetic is element by element, so that a pose does not depend on the batch it is computed in.
+All arithmetic is element by element, so that the result for a pose does not depend on its batch.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ UNIT = 1e-3
 
 
 def check_poses(name: str, poses: Any, axes: tuple[str, ...]) -> np.ndarray:
-    """Validate poses of the shape (*axes, 7); returns float64 with normalized quaternions.
+    """Validate poses of the shape (*axes, 7), and return them as float64 with normalised quaternions.
 
     Raises:
         InputError: another shape, a number that is not finite, or a quaternion that is not of unit length;

@@ -1,4 +1,4 @@
-"""A rig: splats and cameras attached to the bodies of a simulator, rendered in many environments at once."""
+"""Rig: splats and cameras attached to the bodies of a simulator, rendered in batches of environments."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ class RigCamera:
 
 
 class Rig:
-    """Splats and cameras bound to bodies by name, rendered in every environment of a simulator.
+    """Splats and cameras attached to bodies by name, rendered in every environment of a simulator.
 
-    Splats with a label in `bodies` are given in the frame of their body, or at its `rest` pose; all others
-    are the static world that the environments share. One body may carry several labels.
+    Splats with a label in `bodies` are in the frame of their body, or in the world at its `rest` pose; all
+    others are static and shared by the environments. A body may have several labels.
 
     Args:
         scene: splats and markers, with quality, background, fog and sensor. Marker i has the label i + 1.
@@ -246,7 +246,7 @@ class Rig:
 
 
 class SimulatorRig(Rig):
-    """A rig that reads poses, and images of the geometry, from the state of a simulator."""
+    """Base of rigs that read poses and geometry from the state of a simulator."""
 
     def poses(self, state: Any) -> tuple[Any, Any]:
         """Poses of bodies and of cameras as for `Rig.render`; None: the cameras' mounts."""
@@ -271,9 +271,9 @@ class SimulatorRig(Rig):
         Args:
             state: state of the simulator, for the class.
             cameras, outputs, external_depths, mask: as in `Rig.render`.
-            meshes: whether the simulator's geometry is composited with the splats by depth; or what of it,
-                for the class. It is moved 2 mm away from the camera, so that markers on its surfaces are
-                visible.
+            meshes: whether the simulator's geometry is composited with the splats by depth, or a selection of
+            it as described by the class. It is moved 2 mm away from the camera, so that markers on its
+            surfaces are visible.
 
         Raises:
             InputError: as `Rig.render`; a state without poses; meshes with external_depths.

@@ -30,10 +30,11 @@ FLOOR = 0.2
 
 
 class ScanMatcher:
-    """Corrects a localiser by the motion since a reference scan, which is replaced as the robot moves on.
+    """Scan matcher that corrects a localiser by the motion since a reference scan, which is replaced as the
+    robot moves.
 
-    height: metres of the LiDAR above the floor, over the middle of the axle; it sways with the tilt of the
-    robot.
+    height: height of the LiDAR above the floor [m], over the middle of the axle; it moves with the robot's
+    tilt.
     """
 
     def __init__(self, height: float) -> None:
@@ -84,8 +85,8 @@ class ScanMatcher:
 def _information(found: Any, points: np.ndarray) -> np.ndarray:
     """Hessian (6, 6) of a match without information along the planes of points, such as in a corridor.
 
-    It has 1/2 for each point along its plane, as the Gaussians of points end, and about as much by noise of
-    the normals.
+    The Hessian has a spurious value of 1/2 for each point along its plane, as the Gaussians of points are
+    truncated, and about as much by noise of the normals.
     """
     turned = np.cross(points[:, None], np.eye(3)).swapaxes(1, 2)
     by = np.concatenate([turned, np.broadcast_to(-np.eye(3), turned.shape)], 2)

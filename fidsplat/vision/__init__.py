@@ -1,4 +1,4 @@
-"""Detection of markers in images, pose estimation, ground truth, and errors."""
+"""Marker detection, pose estimation, ground truth and error metrics."""
 
 import fidsplat.images  # noqa: F401  sets OpenCV's limits before cv2 is loaded
 

@@ -52,7 +52,7 @@ def align(
 
 
 def fit(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> float:
-    """Correlation of the pattern with the image, at most 1; -1 if it is undefined. Arguments: as in
+    """Correlation of the pattern with the image, at most 1; -1 if it is undefined. Arguments as for
     `align`."""
     window = _window(grey, corners, bits, _LARGE)
     if window is None:
@@ -166,8 +166,7 @@ class _Model:
 
 
 def _step(model: _Model, smooth: np.ndarray, homography: np.ndarray, blur: float, robust: bool):
-    """Gauss-Newton step (3, 3) X, which changes the homography H to H (I + X); None if it is
-    singular."""
+    """Gauss-Newton step X (3, 3) for the update H (I + X) of the homography H; None if singular."""
     keep, (s, t) = model.inside(homography)
     if keep.size < 16:
         return None
@@ -230,7 +229,7 @@ def _window(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, large: int)
 
 
 def _homography(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Homography (3, 3) between four points (4, 2) and four others; in float64, unlike OpenCV's."""
+    """Homography (3, 3) from four points (4, 2) to four others, in float64, unlike OpenCV's."""
     rows = []
     for (s, t), (x, y) in zip(source, target, strict=True):
         rows.append([s, t, 1, 0, 0, 0, -x * s, -x * t])

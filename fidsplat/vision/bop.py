@@ -27,7 +27,7 @@ class BopScene:
     """One scene of a BOP data set: rgb, depth and masks as images, intrinsics and poses as JSON. An object
     is a marker; its obj_id is its label.
 
-    The JSON files are written by `save`, or when a `with` block ends.
+    `save`, or the end of a `with` block, writes the JSON files.
 
     Args:
         folder: e.g. `dataset/train/000000`. `models/models_info.json`, which the scenes of a data set share,
@@ -158,7 +158,7 @@ def _model(marker: MarkerTruth) -> dict[str, Any]:
 
 
 def _known(path: Path) -> dict[str, dict[str, Any]]:
-    """Models written by other scenes."""
+    """Models in an existing models_info.json."""
     try:
         return from_json(read_text(path)) if path.exists() else {}
     except ValueError as error:

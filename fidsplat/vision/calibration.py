@@ -55,8 +55,8 @@ def find_board(image: np.ndarray, board: Marker) -> BoardView | None:
 def calibrate(views: Sequence[BoardView], start: Camera) -> Camera:
     """Estimate the intrinsics of a camera by `cv2.calibrateCamera` or `cv2.fisheye.calibrate`.
 
-    start: has the size and the kind of lens; none, `BrownConrady` (k1, k2, p1, p2, k3) or `Fisheye`. Its
-    values are not used.
+    start: camera of the image size and the lens model: none, `BrownConrady` (k1, k2, p1, p2, k3) or
+    `Fisheye`; its intrinsics are not used.
 
     Raises:
         InputError: fewer than three views, another lens, or views that OpenCV cannot calibrate from.
@@ -98,7 +98,7 @@ _PINHOLE_FLAGS = ("CALIB_FIX_K1", "CALIB_FIX_K2", "CALIB_FIX_K3", "CALIB_ZERO_TA
 
 
 def parameters(camera: Camera) -> dict[str, float]:
-    """Intrinsics and estimated lens coefficients by name; the first pixel has its centre at 0.5."""
+    """Intrinsics and estimated lens coefficients by name; the centre of the first pixel is at 0.5."""
     found = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
     lens = camera.lens
     return found | {name: getattr(lens, name) for name in ESTIMATED.get(type(lens), ())}

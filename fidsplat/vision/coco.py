@@ -19,8 +19,8 @@ CORNERS = ("top_left", "top_right", "bottom_right", "bottom_left")
 
 
 class CocoAnnotations:
-    """Annotations of many images: for each visible marker its box, mask and corners as keypoints, for
-    each named group of splats its box and mask.
+    """Annotations of many images: box, mask and corners (as keypoints) of each visible marker, box and mask
+    of each named group of splats.
 
     A category is the spec of a marker, e.g. `apriltag:36h11:5`, or the name of a group. In addition to COCO's
     fields an annotation of a marker has `camera_from_marker`, `visible`, `distance_m` and `tilt_deg`.

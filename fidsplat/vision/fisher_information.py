@@ -36,7 +36,8 @@ class CornerNoise:
 def pose_jacobian(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Derivative (n, 2, 6) of the pixels of world points (n, 3) by the pose of the camera.
 
-    The pose is moved by 3 metres and rotated by 3 radians in the camera's own axes, camera_to_world exp(xi).
+    The six numbers are a translation [m] and a rotation vector [rad] in the camera's axes, camera_to_world
+    exp(xi).
     """
     local = (np.asarray(points, np.float64) - camera.position) @ camera.world_to_camera[:3, :3].T
     if camera.lens is not None:
@@ -57,7 +58,7 @@ def pose_jacobian(camera: Camera, points: np.ndarray) -> np.ndarray:
 def corner_covariances(corners: np.ndarray, moved: np.ndarray, noise: CornerNoise) -> np.ndarray:
     """Covariances (n, 4, 2, 2) in square pixels of the corners (n, 4, 2) of tags.
 
-    moved: (n, 4, 2) pixels that each corner moves during the exposure.
+    moved: (n, 4, 2) motion of each corner during the exposure [px].
     """
     edges = np.roll(corners, -1, axis=1) - corners
     length = np.maximum(np.linalg.norm(edges, axis=2), 1e-9)
@@ -75,7 +76,7 @@ def tag_information(
 ) -> np.ndarray:
     """Fisher information (n, 6, 6) about the pose of a camera in the corners (n, 4, 3) of tags, in the world.
 
-    moved: (n, 4, 2) pixels that each corner moves during the exposure; None: nothing moves.
+    moved: (n, 4, 2) motion of each corner during the exposure [px]; None: no motion.
     """
     n = len(tags)
     flat = np.asarray(tags, np.float64).reshape(-1, 3)

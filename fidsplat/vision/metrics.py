@@ -45,12 +45,12 @@ def ssim(image: np.ndarray, truth: np.ndarray) -> float:
 
 
 def has_flip() -> bool:
-    """Whether the package flip-evaluator, for FLIP, is installed."""
+    """Whether FLIP is available (package flip-evaluator)."""
     return find_spec("flip_evaluator") is not None
 
 
 def metric_versions() -> dict[str, str]:
-    """Versions of the packages of metrics."""
+    """Versions of the packages that compute metrics, by name."""
     return {"flip-evaluator": version("flip-evaluator")} if has_flip() else {}
 
 

@@ -63,7 +63,7 @@ def plane_pose(points: np.ndarray, corners: np.ndarray, camera: Camera) -> np.nd
 def points_pose(points: np.ndarray, corners: np.ndarray, camera: Camera) -> np.ndarray:
     """Estimate the pose of a rigid body from four or more points, (n, 3) metres and (n, 2) pixels.
 
-    SQPnP (Terzakis and Lourakis 2020) has the initial poses.
+    SQPnP (Terzakis and Lourakis 2020) computes the initial poses.
     """
     return _pose(points * [1, -1, -1], corners, camera, cv2.SOLVEPNP_SQPNP)
 

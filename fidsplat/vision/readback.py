@@ -159,7 +159,7 @@ def means(readings: Sequence[Reading]) -> dict[str, Any]:
 
 
 def content_of(code: Detection | Marker) -> tuple:
-    """Kind and content, equal for a marker and its detection."""
+    """Kind and content of a code, equal for a marker and its detection."""
     if code.id is None:  # the family of a QR code is its version
         return code.kind, code.payload
     return code.kind, code.family, code.id

@@ -1,4 +1,4 @@
-"""Off-the-shelf detectors with their defaults, for experiments that compare their detections.
+"""Off-the-shelf detectors with their defaults, for comparisons.
 
 `detect` combines detectors and refines corners.
 """
@@ -84,7 +84,7 @@ def _locus(grey: np.ndarray, target: Target) -> Attempt:
 
 
 def _locus_detector(family: str) -> Any:
-    """The detector of this thread: two threads that share one abort the process."""
+    """A detector for each thread, as threads that share one abort the process."""
     import locus  # type: ignore[import-not-found]
 
     own = _of_thread.__dict__
@@ -116,7 +116,8 @@ def _zxing(grey: np.ndarray, target: Target, enlarged: tuple[float, float] = (1.
 
 
 def _zxing_tall(grey: np.ndarray, target: Target) -> Attempt:
-    """zxing-cpp after un-foreshortening: the rows that differ from the background, made larger and taller."""
+    """zxing-cpp on an image enlarged more in height than in width, against foreshortening, and cropped to
+    rows that differ from the background."""
     top, bottom = _content_rows(grey)
     part = np.ascontiguousarray(grey[top:bottom])
     moved = Target(target.kind, target.family, target.id, target.payload, target.corners - (0.0, top))

@@ -1,4 +1,4 @@
-"""Selection of places for tags by the information about a trajectory: greedy selection and local search.
+"""Tag placement by the Fisher information about a trajectory: greedy selection and local search.
 
 The objective is the log determinant of the information about all poses of a trajectory, relative to odometry
 alone. It is monotone and submodular (Krause et al. 2008), so the greedy selection reaches at least 1 - 1/e of
@@ -27,7 +27,7 @@ _MORE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Images of one tag along a trajectory."""
+    """Sightings of one tag from the poses of a trajectory."""
 
     poses: np.ndarray
     """(k,) indices of the poses"""
@@ -73,8 +73,9 @@ def odometry_covariance(
 
     Args:
         metres, radians: standard deviations of each axis after one metre, or one radian of rotation.
-        start: those of the first pose.
-        up: (3,) vertical of a floor that the camera moves on, without errors of height, roll and pitch.
+        start: standard deviations of the first pose.
+        up: (3,) vertical, for a camera that moves on a floor without errors of height, roll and pitch; None:
+        free motion.
     """
     count = len(poses)
     out = np.zeros((6 * count, 6 * count))

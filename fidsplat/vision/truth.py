@@ -105,10 +105,10 @@ def truth_of(frame: Mapping[str, np.ndarray], scene: Scene, camera: Camera | Non
 def at_shutter(
     frame: Any, scene: Scene, camera: Camera | None, shape: Sequence[int]
 ) -> tuple[Camera, list[PlacedMarker]]:
-    """Camera and markers of a scene at the time of the shutter, which the capture of a Frame has, else the
-    scene's.
+    """Camera and markers of a scene at the shutter time of the frame's capture, or else of the scene's
+    capture.
 
-    shape: shape of the image. `truth_of` explains the other arguments and the errors.
+    shape: shape of the image. Other arguments and errors: as for `truth_of`.
     """
     instance("scene", scene, Scene, remedy="fs.Scene([cloud]) makes one of splats")
     if camera is not None:
@@ -139,7 +139,7 @@ def marker_truth(placed: PlacedMarker, camera: Camera, label: np.ndarray | None 
 
 
 def groups_of(label: np.ndarray) -> dict[int, GroupTruth]:
-    """Masks and boxes of the labels of an image, (h, w) int32; -1 is the background."""
+    """Masks and boxes by label of a label image (h, w) int32; -1 is the background."""
     starts = np.ones(label.shape, bool)  # of the runs of equal labels in rows, which are fewer than pixels
     starts[:, 1:] = label[:, 1:] != label[:, :-1]
     at = np.flatnonzero(starts)

@@ -45,7 +45,7 @@ def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
 
 
 def undistort_masked(image: np.ndarray, camera: Camera, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Undistort an image to a pinhole of the same pose, size and focal length, for many images of one lens.
+    """Undistort an image to a pinhole of the same pose, size and focal length; the table of a lens is cached.
 
     Returns the image and (h, w) bool: pixels whose samples are all inside the image and its mask (h, w).
     """

@@ -1,4 +1,4 @@
-"""Sharpness and motion of a video's frames, and the choice of frames for structure from motion."""
+"""Selection of a video's frames for structure from motion, by sharpness and motion."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ def _motion(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def choose_frames(sharpness: np.ndarray, motion: np.ndarray, count: int) -> list[int]:
-    """Numbers of the frames to keep: the path of the motion is divided into at most `count` parts of equal
-    length, of `STEP` or less, and the sharpest frame of each part is taken.
+    """Numbers of the selected frames: the accumulated motion is divided into at most `count` intervals of
+    equal length, `STEP` or less, and the sharpest frame of each interval is selected.
 
-    Less than three for a camera that does not move.
+    Fewer than three for a camera that does not move.
     """
     path, count = np.cumsum(motion), whole_number("the number of frames", count, 3, 100_000)
     parts = 1 + int(path[-1] / STEP)

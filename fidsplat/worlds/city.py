@@ -67,7 +67,8 @@ class City:
 
     @cached_property
     def _walls(self) -> dict[str, np.ndarray]:
-        """Rectangles: corner (w, 3), two edges (w, 3) [m], colour (w, 3), whether they have windows (w,)."""
+        """Rectangles of the city: corner (w, 3), two edges (w, 3) [m], colour (w, 3), whether they have
+        windows (w,)."""
         generator = np.random.default_rng(self.seed)
         corners, across, up, colors, windows = (
             [[0.0, 0, 0]],

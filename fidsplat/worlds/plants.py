@@ -1,4 +1,4 @@
-"""Plants: meshes generated from a seed, and splat files; z up, the foot at the origin, in metres."""
+"""Plants: procedural meshes, and splat files; z up, the foot at the origin, in metres."""
 
 from __future__ import annotations
 
@@ -278,7 +278,8 @@ def _ball(middle: np.ndarray, radii: Sequence[float], colour: np.ndarray) -> Mes
 
 
 def _grid(points: np.ndarray, colour: np.ndarray, closed: bool = False) -> Mesh:
-    """Surface through a grid of points (rows, columns, 3); `closed` joins the last column to the first."""
+    """Surface through a grid of points (rows, columns, 3). closed: whether the last column joins the
+    first."""
     rows, columns = points.shape[:2]
     number = np.arange(rows * columns).reshape(rows, columns)
     if closed:

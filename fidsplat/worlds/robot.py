@@ -1,4 +1,4 @@
-"""Differential-drive robot in MuJoCo: drives along a path, with wheel odometry and a gyroscope."""
+"""Simulated drive of a differential-drive robot in MuJoCo, with wheel odometry and a gyroscope."""
 
 from __future__ import annotations
 
