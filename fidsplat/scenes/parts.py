@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from os import PathLike
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -224,7 +224,7 @@ def _all_of(values: Iterable, kind: type[T], name: str) -> tuple[T, ...]:
     if isinstance(values, kind):
         raise invalid(name, f"a list of {kind.__name__}", values, "put it into a list")
     try:
-        found = (values,) if isinstance(values, str) else tuple(values)
+        found: tuple[Any, ...] = (values,) if isinstance(values, str) else tuple(values)
     except TypeError:
         found = (values,)
     for value in found:
