@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -192,10 +193,13 @@ def scan_batch(
     request = ScanRequest.of(lidar, scene, label, Motion(), start)
     batch = renderer.render_batch(resident, request.capture(np.eye(4)), poses=poses)
     images = dict(batch)
-    return [
-        request.decoded({name: each[view] for name, each in images.items()}, pose[None], view)
-        for view, pose in enumerate(matrices)
-    ]
+
+    def decoded(view: int) -> Scan:
+        own = {name: each[view] for name, each in images.items()}
+        return request.decoded(own, matrices[view : view + 1], view)
+
+    with ThreadPoolExecutor() as pool:  # NumPy computes without the lock of Python
+        return list(pool.map(decoded, range(len(matrices))))
 
 
 def _resident(scene: Any, renderer: Renderer | None) -> tuple[Renderer, Any]:
