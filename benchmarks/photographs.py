@@ -29,7 +29,7 @@ from fidsplat.cameras.pose_offset import offset_camera
 from fidsplat.capture.sensor import Sensor
 from fidsplat.experiments.blender import default_environment, image_job, ready, run_worker
 from fidsplat.images.files import encode_image, read_image, to_uint8, write_png
-from fidsplat.splats.rotations import quaternion_to_matrix, rigid_matrix
+from fidsplat.splats.rotations import nearest_rotation, quaternion_to_matrix, rigid_matrix
 from fidsplat.train import Dataset, Trainer, TrainingView, load_dataset
 from fidsplat.train.masks import undistorted_view
 from fidsplat.train.view_refinement import alignment, moved
@@ -198,9 +198,9 @@ def errors(scene: Path, truth: dict) -> dict[str, float]:
     """Errors of a capture: scale in percent, gravity in degrees, cameras (ATE) and tags in millimetres after
     a rigid alignment of the cameras, and angles of the cameras in degrees."""
     estimated = fs.load_cameras(scene.parent / "sparse" / "0")
-    facts, turn, shift = camera_errors(estimated, truth)
+    facts, rotation, shift = camera_errors(estimated, truth)
     tags = [
-        np.linalg.norm(turn @ tag.pose[:3, 3] + shift - np.array(truth["tags"][tag.marker.spec])[:3, 3])
+        np.linalg.norm(rotation @ tag.pose[:3, 3] + shift - np.array(truth["tags"][tag.marker.spec])[:3, 3])
         for tag in fs.Scene.load(_without_splats(scene)).markers
     ]
     return facts | {"tags_mm": 1000 * float(np.max(tags))}
@@ -213,24 +213,22 @@ def camera_errors(estimated: dict[str, fs.Camera], truth: dict) -> tuple[dict, n
     found = np.array([estimated[name].position for name in names])
     known = np.array([true[name].position for name in names])
     a, b = found - found.mean(0), known - known.mean(0)
-    left, values, right = np.linalg.svd(b.T @ a)
-    signs = np.array([1, 1, np.linalg.det(left @ right)])
-    turn = left @ np.diag(signs) @ right
-    scale = float((values * signs).sum() / (a**2).sum())
-    shift = known.mean(0) - turn @ found.mean(0)
-    apart = np.linalg.norm(found @ turn.T + shift - known, axis=1)
+    rotation = nearest_rotation(b.T @ a)
+    scale = float((a @ rotation.T * b).sum() / (a**2).sum())
+    shift = known.mean(0) - rotation @ found.mean(0)
+    apart = np.linalg.norm(found @ rotation.T + shift - known, axis=1)
     angles = []
     for name in names:
-        delta = estimated[name].world_to_camera[:3, :3] @ turn.T @ true[name].world_to_camera[:3, :3].T
+        delta = estimated[name].world_to_camera[:3, :3] @ rotation.T @ true[name].world_to_camera[:3, :3].T
         angles.append(math.degrees(math.acos(min(1, (np.trace(delta) - 1) / 2))))
     facts = {
         "registered": len(names),
         "scale_percent": 100 * (1 / scale - 1),
-        "gravity_deg": math.degrees(math.acos(min(1, turn[2, 2]))),
+        "gravity_deg": math.degrees(math.acos(min(1, rotation[2, 2]))),
         "ate_mm": 1000 * float(np.sqrt((apart**2).mean())),
         "angle_deg": float(np.median(angles)),
     }
-    return facts, turn, shift
+    return facts, rotation, shift
 
 
 def true_dataset(options: argparse.Namespace, truth: dict, captured: Dataset) -> Dataset:

@@ -17,6 +17,7 @@ from measuring import PROGRESS, facts, keep, options, show
 
 import fidsplat as fs
 from fidsplat.cameras.pose_offset import offset_camera
+from fidsplat.splats.rotations import nearest_rotation
 from fidsplat.train import Dataset, Trainer, load_dataset
 
 
@@ -77,12 +78,11 @@ def pose_errors(trainer: Trainer, given: Dataset) -> tuple[float, float]:
     found = np.array([view.camera.camera_to_world for view in trainer.views])
     true = np.array([view.camera.camera_to_world for view in given.views])
     # mean rotation between the two, then the mean shift
-    left, _, right = np.linalg.svd(np.einsum("nij,nkj->ik", true[:, :3, :3], found[:, :3, :3]))
-    turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-    positions = found[:, :3, 3] @ turn.T
+    rotation = nearest_rotation(np.einsum("nij,nkj->ik", true[:, :3, :3], found[:, :3, :3]))
+    positions = found[:, :3, 3] @ rotation.T
     shifts = positions - true[:, :3, 3]
     shifts -= shifts.mean(axis=0)
-    rotations = np.einsum("nji,njk->nik", true[:, :3, :3], turn @ found[:, :3, :3])
+    rotations = np.einsum("nji,njk->nik", true[:, :3, :3], rotation @ found[:, :3, :3])
     angles = np.arccos(np.clip((np.trace(rotations, axis1=1, axis2=2) - 1) / 2, -1, 1))
     return float(np.sqrt((shifts**2).sum(1).mean())), math.degrees(float(np.sqrt((angles**2).mean())))
 

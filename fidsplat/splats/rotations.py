@@ -68,6 +68,12 @@ def _outer_product(r: np.ndarray) -> np.ndarray:
     )
 
 
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) nearest to a matrix (3, 3): orthogonal Procrustes problem."""
+    left, _, right = np.linalg.svd(matrix)
+    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+
+
 def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray, float, np.ndarray]:
     """Split a 4x4 similarity transform into rotation (3, 3), scale and translation (3,), float64.
 

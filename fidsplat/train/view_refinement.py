@@ -16,6 +16,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.cameras.pose_offset import offset_camera
+from fidsplat.splats.rotations import nearest_rotation
 from fidsplat.train.dataset import Dataset, TrainingView, depths
 from fidsplat.train.settings import TrainSettings
 from fidsplat.vision.pose import pose_error
@@ -180,8 +181,7 @@ def alignment(cameras: Sequence[Camera], targets: Sequence[Camera]) -> np.ndarra
         (one.world_to_camera[:3, :3], other.world_to_camera[:3, :3])
         for one, other in zip(cameras, targets, strict=True)
     ]
-    left, _, right = np.linalg.svd(np.sum([other.T @ one for one, other in pairs], axis=0))
-    rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    rotation = nearest_rotation(np.sum([other.T @ one for one, other in pairs], axis=0))
     centres, goals = (np.array([camera.position for camera in each]) for each in (cameras, targets))
     spread = (centres - centres.mean(axis=0)) @ rotation.T
     overlap = float((spread * (goals - goals.mean(axis=0))).sum())

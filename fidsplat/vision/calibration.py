@@ -13,6 +13,7 @@ from fidsplat.cameras import BrownConrady, Camera, Fisheye
 from fidsplat.images.tag_dictionaries import families, parse_family
 from fidsplat.markers import Marker, parse_spec
 from fidsplat.markers.boards import BoardSpec
+from fidsplat.splats.rotations import nearest_rotation
 from fidsplat.util.arguments import invalid
 from fidsplat.util.errors import InputError
 from fidsplat.vision.boards import ENOUGH, chess_corners
@@ -114,9 +115,8 @@ def projection_errors(estimate: Camera, truth: Camera) -> np.ndarray:
     pixels = np.column_stack([x.ravel(), y.ravel()])
     true, other = (_directions(camera, pixels) for camera in (truth, estimate))
     known = np.isfinite(true).all(1) & np.isfinite(other).all(1)
-    left, _, right = np.linalg.svd(other[known].T @ true[known])
-    turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-    projected = estimate.with_pose(np.eye(4)).project(true[known] @ turn.T)
+    rotation = nearest_rotation(other[known].T @ true[known])
+    projected = estimate.with_pose(np.eye(4)).project(true[known] @ rotation.T)
     errors = np.linalg.norm(projected - pixels[known], axis=1)
     return errors[np.isfinite(errors)]
 
