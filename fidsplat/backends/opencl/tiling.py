@@ -63,9 +63,9 @@ def cull(frame: DeviceFrame, big: int) -> None:
     `frame.projected`."""
     count, pool = frame.resident.count, frame.pool
     groups, items = -(-count // _KEPT_SPLATS), (_ITEMS,)
-    for name in ("splats", "keys", "windows"):  # of the previous frame; allocated later
-        frame.take(name, 0)
     frame.take("kept", 4 * MIN_BIG)
+    # before the first launch: a recorded launch must not bind buffers that are replaced later
+    _take_records(frame, min(pool.size("kept") // 4, count))
     frame.take("kept_bits", _KEPT_SPLATS // 8 * groups)
     frame.take("kept_counts", 4 * groups)
     arrays = {name: frame.resident.part(name, 0, count) for name in frame.source.cloud_arrays}
@@ -88,9 +88,7 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
     count, size = end - first, _splat_capacity(frame, end - first)
     if frame.shape.culls:
         size = frame.projected
-    frame.take("splats", size * frame.source.records["Splat"].itemsize)
-    frame.take("keys", KEYS * size)
-    windows = frame.take("windows", WINDOWS * size)
+    windows = _take_records(frame, size)
     if frame.view.band is not None and size:
         # the kernel writes no window for splats outside the band, so windows are first set to empty
         cl.enqueue_fill_buffer(frame.queue, windows, _NO_WINDOW, 0, WINDOWS * size)
@@ -100,6 +98,13 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
         count = size if frame.shape.culls else count
         items, group = (count, 64) if batch == 1 else (-(-count // batch), 1)
         frame.launch("project", "project", (items,), (group,), frame.views, count=count, **arrays)
+
+
+def _take_records(frame: DeviceFrame, size: int) -> cl.Buffer:
+    """Allocate records, keys and windows for `size` splats; returns the windows."""
+    frame.take("splats", size * frame.source.records["Splat"].itemsize)
+    frame.take("keys", KEYS * size)
+    return frame.take("windows", WINDOWS * size)
 
 
 def _splat_capacity(frame: DeviceFrame, count: int) -> int:
