@@ -92,7 +92,9 @@ class Bench:
         if self.suite:
             return self._run_suite()
         if self.quick or self.overwrite or self.adapters is not None:
-            raise InputError("--quick, --adapters and --overwrite need --suite; add it, or leave them out")
+            raise InputError(
+                "--quick, --adapters and --overwrite must be given with --suite; add it, or omit them"
+            )
         from rich.progress import Progress, TextColumn
 
         from fidsplat.experiments.bench.catalogue import BENCH_SCENES, scene_names
@@ -151,7 +153,9 @@ class Bench:
         from fidsplat.render.renderer import Renderer
 
         if self.scene or self.cameras or self.plot or self.json == "-":
-            raise InputError("--suite needs a FILE as --json, and no --scene, --cameras or --plot")
+            raise InputError(
+                "--suite must be given with a FILE as --json, without --scene, --cameras and --plot"
+            )
         usable = (info.name for info in devices() if info.usable and not info.always_float64)
         names = tuple(dict.fromkeys(self.device)) or tuple(usable)
         large = any(Renderer(name).device.kind == "gpu" for name in names)

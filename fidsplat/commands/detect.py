@@ -58,7 +58,7 @@ class Detect:
         from fidsplat.vision.readback import means
 
         if not self.images:
-            raise InputError("detection needs at least one IMAGE: an image, a folder of images, or a video")
+            raise InputError("IMAGE must be at least one image, folder of images or video, got none")
         for name in self.family:
             if name not in detectors():
                 parse_family(name)
@@ -96,8 +96,8 @@ class Detect:
             return
         if scene is not None and is_video(path):
             raise InputError(
-                f"--scene needs the camera's pose of each frame, which the video {path} lacks; give the "
-                "folder of the flight, or its log"
+                f"--scene must be given with images of known poses, got the video {path}; give the folder of "
+                "the flight, or its log"
             )
         folder = path_of(path)
         for name, image in read_images(folder / "rgb" if (folder / RECORD).is_file() else path):
@@ -116,8 +116,8 @@ class Detect:
                 pose = poses.get((one.frame, one.stamp))
                 if pose is None:
                     raise InputError(
-                        f"--scene needs a pose of {one.frame!r} in /tf at the time of {one.name}, which "
-                        f"{path} lacks; detect without --scene"
+                        f"{path} must have a pose of {one.frame!r} in /tf at the time of {one.name} for "
+                        "--scene, got none; detect without --scene"
                     )
                 then = scene_at(scene, pose, one.stamp / 1e9)
             yield one.name, one.image, then

@@ -142,7 +142,7 @@ class Merge:
             twice = f", {joined.repeated} of them repeated" if joined.repeated else ""
             lines.append(f"{target}: {joined.points} results of {len(files)} files{twice}")
         if not result:
-            raise InputError(f"no results of shards in {', '.join(self.folders) or 'no folder'}")
+            raise InputError(f"DIR must contain results of shards, got {', '.join(self.folders) or 'no DIR'}")
         return report(self.json, result, *lines)
 
 

@@ -87,7 +87,7 @@ class Fly(RenderInput):
 
         self.check()
         if self.workers is not None and (self.ray is None or self.workers < 1):
-            raise InputError(f"--workers must be at least 1 and needs --ray ADDRESS, got {self.workers}")
+            raise InputError(f"--workers must be at least 1 and given with --ray ADDRESS, got {self.workers}")
         if self.out.endswith(".mcap"):
             self.log, self.out = self.log or self.out, self.out.removesuffix(".mcap")
         check_rate(self.rate)

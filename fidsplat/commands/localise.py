@@ -54,7 +54,7 @@ class Localise:
         from fidsplat.scenes.sources import cameras_of
 
         if not self.images:
-            raise InputError("localisation needs at least one IMAGE: a photograph, a folder or a video")
+            raise InputError("IMAGE must be at least one photograph, folder or video, got none")
         if path_of(self.scene).suffix.lower() != ".toml":
             raise InputError(
                 "--scene must be a scene file (.toml) with the camera of the photographs, got "

@@ -69,7 +69,9 @@ def require_packages(
     """Raise InputError if packages of an extra are missing."""
     missing = [name for name in packages if find_spec(name) is None]
     if missing:
-        raise InputError(f"{what} needs {' and '.join(missing)}; pip install 'fidsplat[{extra}]'")
+        raise InputError(
+            f"{' and '.join(missing)} must be installed for {what}; pip install 'fidsplat[{extra}]'"
+        )
 
 
 def check_plot(name: str, *packages: str) -> None:

@@ -155,7 +155,7 @@ class Render(RenderInput):
     def _render(self, renderer: Renderer, scene: Scene, quality: Quality | str | None) -> Frame:
         """The frame; the slow reference device shows its progress."""
         if self.every is not None and not renderer.device.always_float64:
-            raise InputError(f"--every needs --device reference, got {renderer.device.name}")
+            raise InputError(f"--every must be given with --device reference, got {renderer.device.name}")
         if renderer.device.always_float64:
             with delayed_progress() as progress:
                 step = 1 if self.every is None else self.every
@@ -235,7 +235,8 @@ class Gallery:
 
         if not self.sources:
             raise InputError(
-                "a gallery needs at least one scene file (.toml) or splat file, e.g. examples/*.toml"
+                "scenes must be at least one scene file (.toml) or splat file, got none; give e.g. "
+                "examples/*.toml"
             )
         with delayed_progress() as progress:
             total, scenes = len(self.sources), []

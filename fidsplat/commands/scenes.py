@@ -84,9 +84,9 @@ def load_user_scenes(
     from fidsplat.scenes.sources import load_source
 
     if files and named:
-        raise InputError("--scene and --scenes exclude each other; give one of them")
+        raise InputError("--scene and --scenes must not be given together, got both; omit one")
     if cameras is not None and not files:
-        raise InputError("--cameras needs --scene FILE")
+        raise InputError("--cameras must be given with --scene FILE")
     path = None if cameras is None else load_trajectory(cameras)
     found: dict[str, BenchScene] = {}
     for name in files:

@@ -324,7 +324,7 @@ def load(folders: Sequence[Path]) -> dict[str, Summary]:
                 f"({type(error).__name__}: {error}); measure again with --overwrite"
             ) from error
     if not found:
-        raise InputError(f"no results in {where}; run fidsplat experiment all first, or give their folder")
+        raise InputError(f"results must be in {where}, got none; run fidsplat experiment all first")
     return found
 
 

@@ -69,8 +69,8 @@ class Results:
         for record in records:
             if differ := differences(record.run, run):
                 raise InputError(
-                    f"{file} holds results of another {' and '.join(differ)}; give another folder with -o, "
-                    "or --overwrite to measure again"
+                    f"results in {file} must be of the same {' and '.join(differ)}, got others; give another "
+                    "folder with -o, or --overwrite to measure again"
                 )
         # failed points are measured again, since the device may work now
         self.done = {record.name: record for record in records if not record.failed}
@@ -259,7 +259,7 @@ def merge(files: Sequence[Path], target: Path) -> Merged:
     repeated = 0
     for file in files:
         if not file.is_file():
-            raise InputError(f"{file} is not a file; give the .jsonl files of the shards")
+            raise InputError(f"results of shards must be .jsonl files, got {file}, which does not exist")
         for record in read_records(file):
             repeated += record.name in found
             found.setdefault(record.name, record)

@@ -151,8 +151,8 @@ def test_everything_quick_and_its_report(capsys, tmp_path, monkeypatch):
             "--blender must be a folder that `fidsplat experiment blender`",
         ),
         (["blender", "--view", "agx"], "unknown view 'agx'"),
-        (["merge", "nowhere"], "no results of shards in nowhere"),
-        (["report", "nowhere"], "no results in nowhere"),
+        (["merge", "nowhere"], "must contain results of shards, got nowhere"),
+        (["report", "nowhere"], "results must be in nowhere, got none"),
     ],
 )
 def test_wrong_arguments_are_one_line(capsys, tmp_path, monkeypatch, words, message):
@@ -177,7 +177,7 @@ def test_what_is_wrong_with_the_last_experiment_is_shown_before_the_first(capsys
     (tmp_path / "angles.jsonl").write_text(old)
     status, _, err = run(capsys, *words)
     assert status == 2
-    assert "angles.jsonl holds results of another versions and code" in err
+    assert "angles.jsonl must be of the same versions and code" in err
     status, _, err = run(capsys, *words, "--lpips", "--overwrite")
     assert status == 2
     assert "--lpips needs the package lpips" in err

@@ -185,7 +185,7 @@ def test_a_part_of_the_results_is_enough_and_none_is_an_error(tmp_path):
     write(tmp_path, "counts", COUNTS)
     text = make_report([tmp_path], tmp_path)[0].read_text()
     assert "Nothing was measured by `fidsplat experiment angles`." in text
-    with pytest.raises(fs.InputError, match=r"no results in .*run fidsplat experiment all first"):
+    with pytest.raises(fs.InputError, match=r"results must be in .*run fidsplat experiment all first"):
         make_report([tmp_path / "none"], tmp_path)
 
 

@@ -89,10 +89,10 @@ def test_a_point_that_was_refused_is_tried_again(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"device": "another device"}, "another device;"),
-        ({"seed": 1}, "another seed;"),
-        ({"code": "0" * 16}, "another code;"),
-        ({"versions": {"opencv": "6"}}, "another versions;"),
+        ({"device": "another device"}, "the same device,"),
+        ({"seed": 1}, "the same seed,"),
+        ({"code": "0" * 16}, "the same code,"),
+        ({"versions": {"opencv": "6"}}, "the same versions,"),
     ],
 )
 def test_results_of_other_circumstances_are_not_mixed(tmp_path, changes, named):
@@ -185,7 +185,7 @@ def test_merge_joins_shards_and_counts_repeats(tmp_path):
     assert merge(files, target) == (5, 1, ())
     assert {r.key["index"]: r.result["by"] for r in read_records(target)} == {0: 0, 1: 0, 2: 0, 3: 1, 4: 1}
     assert merge([target, *files], target) == (5, 6, ())
-    with pytest.raises(fs.InputError, match="is not a file"):
+    with pytest.raises(fs.InputError, match=r"must be \.jsonl files"):
         merge([tmp_path / "none.jsonl"], target)
 
 

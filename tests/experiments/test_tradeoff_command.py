@@ -124,9 +124,9 @@ def test_ones_own_scene_is_measured_from_each_of_its_poses(capsys, tmp_path, mon
     assert main(words) == 0  # nothing is left to do
     fs.save_ply(random_cloud(201, 0.2), "own.ply")
     assert main(words) == 2
-    assert "holds results of another scene; give another folder" in capsys.readouterr().err
+    assert "must be of the same scene, got others; give another folder" in capsys.readouterr().err
     assert main(["tradeoff", "--scene", "own.toml", "--scenes", "hard"]) == 2
-    assert "exclude each other" in capsys.readouterr().err
+    assert "must not be given together" in capsys.readouterr().err
 
 
 def test_several_devices_measure_into_folders_of_their_names(capsys, tmp_path, monkeypatch):

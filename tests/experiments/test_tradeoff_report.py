@@ -321,7 +321,7 @@ def test_other_results_are_refused_by_name(tmp_path):
 
 def test_a_folder_without_results_is_not_passed_over(tmp_path):
     write(tmp_path / "a", plain_records("hard"))
-    with pytest.raises(fs.InputError, match=r"no results in .*other"):
+    with pytest.raises(fs.InputError, match=r"results must be in .*other, got none"):
         load([tmp_path / "a", tmp_path / "other"])
 
 
@@ -344,4 +344,7 @@ def test_without_what_makes_reports_one_line_says_what_to_install(capsys, tmp_pa
     found = "fidsplat.commands.options.find_spec"
     monkeypatch.setattr(found, lambda name: None if name == "jinja2" else True)
     assert main(["experiment", "report", str(tmp_path)]) == 2
-    assert "a report needs jinja2; pip install 'fidsplat[experiments]'" in capsys.readouterr().err
+    assert (
+        "jinja2 must be installed for a report; pip install 'fidsplat[experiments]'"
+        in capsys.readouterr().err
+    )

@@ -327,8 +327,8 @@ def test_ones_own_scene_from_ones_own_cameras(tmp_path, monkeypatch, capsys):
     assert "own.toml: 50 splats, 24 x 18" in out
     assert "more with --scenes" not in out
     for wrong, why in (
-        (("--scene", "own.toml", "--scenes", "small"), "exclude each other"),
-        (("--cameras", "poses.tum"), "--cameras needs --scene FILE"),
+        (("--scene", "own.toml", "--scenes", "small"), "must not be given together"),
+        (("--cameras", "poses.tum"), "--cameras must be given with --scene FILE"),
     ):
         assert bench(*wrong) == 2
         assert why in capsys.readouterr().err

@@ -110,12 +110,12 @@ def test_a_run_resumes_and_measures_only_what_is_missing(tmp_path):
     assert [(one["scene"], one["renderer"]) for one in results[len(first) :: 2]] == [
         ("one", "other"), ("batch", "toy"), ("batch", "other")
     ]  # fmt: skip
-    with pytest.raises(InputError, match="results of another effort"):
+    with pytest.raises(InputError, match="must be of the same effort"):
         suite.Suite(file, SCENES, renderers, suite.QUICK, "a test")
     changed = json.loads(file.read_text())
     changed["run"]["code"] = "of another tree"
     file.write_text(json.dumps(changed))
-    with pytest.raises(InputError, match="results of another code"):
+    with pytest.raises(InputError, match="must be of the same code"):
         run(file, ("one",), renderers)
     assert len(run(file, ("one",), renderers, overwrite=True)) == 4
 
@@ -214,8 +214,8 @@ def test_energy_of_a_processor(tmp_path):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["--quick"], "need --suite"),
-        (["--suite", "--json", "-"], "needs a FILE as --json"),
+        (["--quick"], "must be given with --suite"),
+        (["--suite", "--json", "-"], "must be given with a FILE as --json"),
         (["--suite", "--scenes", "unifrm"], "did you mean 'uniform'"),
         (["--suite", "--scenes", "tags", "--adapters", "/proc"], "NAME/adapter.py, got /proc"),
     ],

@@ -296,7 +296,10 @@ def test_every_eighth_pixel_of_the_reference(scene, tmp_path, capsys):
     pixels = fs.Renderer("reference").render_every(8, loaded)["rgb"]
     np.testing.assert_array_equal(read_image(tmp_path / "some.png"), to_uint8(pixels))
     for words, why in (
-        (("--device", "opencl:pocl", "--every", "8"), "--every needs --device reference, got opencl:pocl"),
+        (
+            ("--device", "opencl:pocl", "--every", "8"),
+            "--every must be given with --device reference, got opencl:pocl",
+        ),
         (
             ("--device", "reference", "--every", "0"),
             "step must be a whole number from 1",

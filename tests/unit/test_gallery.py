@@ -53,7 +53,7 @@ def test_a_page_shows_scenes_with_their_outputs_and_text(here, capsys):
 
 def test_what_cannot_be_shown_is_reported(here, capsys):
     for words, why in (
-        ([], "a gallery needs at least one scene file"),
+        ([], "must be at least one scene file"),
         (["none.toml"], "none.toml"),
         (["a.png"], "got a.png"),
     ):

@@ -289,10 +289,10 @@ def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
     assert "<svg" in (tmp_path / "out/localise.svg").read_text()
     assert "| odometry |" in (tmp_path / "out/localise.md").read_text()
     assert main([*words, "--seed", "1"]) == 2
-    assert "localise.jsonl holds results of another seed" in capsys.readouterr().err
+    assert "localise.jsonl must be of the same seed" in capsys.readouterr().err
     whole = [word for word in words if word != "--quick"]
     assert main([*whole, "--rows", "1", "--plants", "3"]) == 2
-    assert "localise.jsonl holds results of another scene" in capsys.readouterr().err
+    assert "localise.jsonl must be of the same scene" in capsys.readouterr().err
     assert main([*words[:-1], "odometri"]) == 2
     said = capsys.readouterr().err
     assert "unknown variant 'odometri' (did you mean 'odometry'?)" in said
@@ -300,7 +300,7 @@ def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
     file = tmp_path / "out/localise.jsonl"
     file.write_text(file.read_text().replace(first["run"]["code"], "yesterday's"))
     assert main(words) == 2
-    assert "localise.jsonl holds results of another code" in capsys.readouterr().err
+    assert "localise.jsonl must be of the same code" in capsys.readouterr().err
     file.write_text("[]\n")
     assert main(words) == 2
     assert "localise.jsonl, line 1: not a result" in capsys.readouterr().err

@@ -164,7 +164,7 @@ def test_the_command_writes_a_mesh(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["a.glb", "--voxel", "0.1"], "need --mesh"),
+        (["a.glb", "--voxel", "0.1"], "must be given with --mesh"),
         (["a.spz", "--mesh"], "the suffix of a mesh must be .glb"),
         (["a.glb", "--mesh", "--voxel", "-1"], "voxel must be a positive length in metres, got -1"),
         (["a.glb", "--mesh", "--voxel", "1e-9"], "voxel must be at least"),

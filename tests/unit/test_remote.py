@@ -151,7 +151,7 @@ def test_unusable_options(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for words in (("--workers", "2"), ("--ray", "local", "--workers", "0")):
         assert main(["fly", "none.toml", *words]) == 2
-        assert "must be at least 1 and needs --ray ADDRESS" in capsys.readouterr().err
+        assert "must be at least 1 and given with --ray ADDRESS" in capsys.readouterr().err
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     from fidsplat.remote.ray_engine import ray_engine
 

@@ -367,4 +367,7 @@ def test_a_port_in_use_and_wrong_options_are_one_line(tmp_path, capsys, monkeypa
 def test_a_missing_package_names_its_extra(tmp_path, capsys, monkeypatch, package, options):
     monkeypatch.setattr("fidsplat.commands.options.find_spec", lambda name: None if name == package else name)
     assert main(["serve", str(tmp_path / "scene.toml"), *options]) == 2
-    assert f"fidsplat serve needs {package}; pip install 'fidsplat[live]'" in capsys.readouterr().err
+    assert (
+        f"{package} must be installed for fidsplat serve; pip install 'fidsplat[live]'"
+        in capsys.readouterr().err
+    )

@@ -308,8 +308,8 @@ class Suite:
         differ += [name for name in ("machine", "effort") if earlier["run"].get(name) != run[name]]
         if differ:
             raise InputError(
-                f"{self._file} holds results of another {' and '.join(differ)}; give another file, or "
-                "--overwrite to measure again"
+                f"results in {self._file} must be of the same {' and '.join(differ)}, got others; give "
+                "another file, or --overwrite to measure again"
             )
         self.found = earlier
 

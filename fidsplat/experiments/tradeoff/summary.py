@@ -66,14 +66,14 @@ def load(folders: Iterable[Path]) -> list[DeviceResults]:
         summaries = [summarise(own, rows_of, COLUMNS) for own in records.values()]
         summaries += [read_summary(file) for file in sorted(folder.glob("*.csv"))]
         if not summaries:
-            raise InputError(f"no results in {folder}; run fidsplat tradeoff -o {folder}, or leave it out")
+            raise InputError(f"results must be in {folder}, got none; run fidsplat tradeoff -o {folder}")
         for summary in summaries:
             by_device.setdefault(summary.runs[0]["device"], []).append(summary)
     devices = [DeviceResults(join(summaries, KEYS)) for summaries in by_device.values()]
     devices = [device for device in devices if device.scenes]
     if not devices:
         raise InputError(
-            f"no results in {', '.join(map(str, folders))}; run fidsplat tradeoff first, or give its folder"
+            f"results must be in {', '.join(map(str, folders))}, got none; run fidsplat tradeoff first"
         )
     return sorted(devices, key=lambda device: (device.kind != "cpu", device.name))
 
