@@ -14,7 +14,7 @@ from fidsplat.cameras import Camera, Trajectory, look_at_matrix
 from fidsplat.formats.collect import WINDOW, Rows
 from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.store.sources import Source
-from fidsplat.util.errors import InputError
+from fidsplat.util.arguments import whole_number
 
 MAX_SPLATS = 2_000_000_000
 PITCH = 24.0
@@ -44,9 +44,7 @@ class City:
 
     def __post_init__(self) -> None:
         for name, highest in (("splats", MAX_SPLATS), ("houses", 100), ("seed", 2**32 - 1)):
-            value, lowest = getattr(self, name), int(name != "seed")
-            if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
-                raise InputError(f"{name} of a city must be {lowest} to {highest:,}, got {value!r}")
+            whole_number(f"{name} of a city", getattr(self, name), int(name != "seed"), highest)
 
     @property
     def side(self) -> float:
@@ -56,12 +54,8 @@ class City:
     @property
     def source(self) -> Source:
         """Input of `build_store`."""
-        columns: dict = {
-            "means": ((3,), np.float32),
-            "quats": ((4,), np.float32),
-            "scales": ((2,), np.float32),
-        }
-        columns |= {"opacities": ((), np.float32), "colors": ((3,), np.float32)}
+        widths = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": (), "colors": (3,)}
+        columns = {name: (width, np.float32) for name, width in widths.items()}
         rows = Rows(Path(f"city of {self.splats:,}"), self.splats, columns, self._fill)
         return Source(rows, np.zeros(3), repr(self))
 
@@ -69,15 +63,8 @@ class City:
     def _walls(self) -> dict[str, np.ndarray]:
         """Rectangles of the city: corner (w, 3), two edges (w, 3) [m], colour (w, 3), whether they have
         windows (w,)."""
-        generator = np.random.default_rng(self.seed)
-        corners, across, up, colors, windows = (
-            [[0.0, 0, 0]],
-            [[self.side, 0, 0]],
-            [[0, 0, self.side]],
-            [],
-            [False],
-        )
-        colors.append([0.32, 0.31, 0.3])
+        generator, side = np.random.default_rng(self.seed), self.side
+        walls: list = [([0, 0, 0], [side, 0, 0], [0, 0, side], [0.32, 0.31, 0.3], False)]
         for i in range(self.houses):
             for j in range(self.houses):
                 height = float(generator.uniform(6, 24))
@@ -89,18 +76,11 @@ class City:
                     ([x + SIDE, 0, z + SIDE], [-SIDE, 0, 0]),
                     ([x, 0, z + SIDE], [0, 0, -SIDE]),
                 ):
-                    corners.append(at)
-                    across.append(edge)
-                    up.append([0, -height, 0])
-                    colors.append(color)
-                    windows.append(True)
-                corners.append([x, -height, z])
-                across.append([SIDE, 0, 0])
-                up.append([0, 0, SIDE])
-                colors.append(color * 0.5)
-                windows.append(False)
-        made = {"corner": corners, "across": across, "up": up, "color": colors}
-        return {name: np.array(rows, np.float64) for name, rows in made.items()} | {
+                    walls.append((at, edge, [0, -height, 0], color, True))
+                walls.append(([x, -height, z], [SIDE, 0, 0], [0, 0, SIDE], color * 0.5, False))
+        *rows, windows = zip(*walls, strict=True)
+        arrays = (np.array(row, np.float64) for row in rows)
+        return dict(zip(("corner", "across", "up", "color"), arrays, strict=True)) | {
             "windows": np.array(windows)
         }
 

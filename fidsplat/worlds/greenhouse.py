@@ -16,6 +16,7 @@ from fidsplat.markers import marker
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import rigid_matrix
+from fidsplat.util.arguments import whole_number
 from fidsplat.util.errors import InputError
 from fidsplat.worlds.plants import KINDS, disks
 
@@ -60,10 +61,7 @@ class GreenhouseSettings:
 
     def __post_init__(self) -> None:
         for name, highest in (("rows", MAX_COUNT), ("plants", MAX_COUNT), ("seed", 2**32 - 1)):
-            value = getattr(self, name)
-            lowest = 0 if name == "seed" else 1
-            if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
-                raise InputError(f"{name} of a greenhouse must be {lowest} to {highest}, got {value!r}")
+            whole_number(f"{name} of a greenhouse", getattr(self, name), int(name != "seed"), highest)
 
 
 @dataclass(frozen=True)

@@ -87,4 +87,4 @@ def test_the_command(tmp_path, capsys):
     assert main([*words, "--overwrite"]) == 0
     capsys.readouterr()
     assert main([*words[:3], "--rows", "0"]) == 2
-    assert "rows of a greenhouse must be 1 to 200, got 0" in capsys.readouterr().err
+    assert "rows of a greenhouse must be a whole number from 1 to 200, got 0" in capsys.readouterr().err
