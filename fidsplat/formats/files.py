@@ -100,7 +100,11 @@ def remedy_for(path: Path) -> str:
     suffix = path.suffix.lower()
     if path.is_dir():
         with suppress(OSError):
-            names = [file for file in sorted(path.iterdir()) if file.name in NAMED or file.suffix in FORMATS]
+            names = [
+                file
+                for file in sorted(path.iterdir())
+                if file.name in NAMED or file.suffix.lower() in FORMATS
+            ]
             return f"; name a file in the folder, such as {names[0]}" if names else ""
     if suffix in _UNREAD:
         return f"; {_UNREAD[suffix]}"
