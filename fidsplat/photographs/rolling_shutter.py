@@ -10,18 +10,18 @@ from fidsplat.vision.fisher_information import pose_jacobian
 
 MIN_FEATURES = 30
 """features of a photograph for an estimate"""
-MIN_SHARE, MIN_DISPLACEMENT = 0.02, 0.15
+MIN_SHARE, MIN_DISPLACEMENT = 0.008, 0.15
 """share of the errors' squares, and pixels, from which on a rolling shutter is reported"""
 
 
 def readout_motion(model: Model) -> tuple[float, float]:
     """Estimate a constant motion of each camera during the readout. Returns the share of the squared
-    reprojection errors that it explains beyond chance, and its displacement between the first and the last
-    row [px], the median over the photographs.
+    reprojection errors that it explains beyond chance by three standard deviations, and its displacement
+    between the first and the last row [px], the median over the photographs.
 
     A motion that is equal in all photographs is part of COLMAP's model, and is not detected.
     """
-    before = after = by_chance = 0.0
+    before = after = by_chance = variance = 0.0
     displacements = []
     for camera, track, pixels in zip(model.cameras, model.tracks, model.pixels, strict=True):
         points = model.points[track]
@@ -37,9 +37,11 @@ def readout_motion(model: Model) -> tuple[float, float]:
         motion = np.linalg.lstsq(flat / size, wanted, rcond=1e-6)[0] / size
         left = wanted - flat @ motion
         before, after = before + wanted @ wanted, after + left @ left
-        by_chance += 6 / len(wanted) * (wanted @ wanted)
+        own = wanted @ wanted / len(wanted)
+        by_chance, variance = by_chance + 6 * own, variance + 12 * own**2
         moved = by_pose @ motion
         displacements.append(float(np.median(np.linalg.norm(moved, axis=1))))
     if not displacements or before == 0:
         return 0.0, 0.0
-    return max(0.0, float(before - after - by_chance) / float(before)), float(np.median(displacements))
+    explained = float(before - after - by_chance) - 3 * float(variance) ** 0.5
+    return max(0.0, explained / float(before)), float(np.median(displacements))
