@@ -84,10 +84,7 @@ def take(folder: Path, count: int, size: tuple[int, int], seed: int, readout: fl
     readout: seconds, of a camera that is moved by hand.
     """
     house, rng = Greenhouse(rows=1, plants=6, seed=seed), np.random.default_rng(seed)
-    # omit the roof, whose posts are between the bench and the cameras
-    clouds = (*house.scene.clouds[:3], texture(rng, 4000))
-    scene = fs.Scene(clouds, markers=house.scene.markers, background=house.scene.background)
-    renderer, found = fs.Renderer(), {}
+    scene, renderer, found = textured(house, rng), fs.Renderer(), {}
     (folder / "photos").mkdir(parents=True, exist_ok=True)
     for i, camera in enumerate(cameras(count, *size, seed)):
         exposure = float(2 ** rng.normal(0, 0.2))
@@ -102,6 +99,45 @@ def take(folder: Path, count: int, size: tuple[int, int], seed: int, readout: fl
     truth = {"cameras": found, "tags": {tag.marker.spec: tag.pose.tolist() for tag in house.markers}}
     (folder / "truth.json").write_text(json.dumps(truth))
     return truth
+
+
+def textured(house: Greenhouse, rng: np.random.Generator) -> fs.Scene:
+    """The greenhouse with texture, without the roof, whose posts are between the bench and the cameras."""
+    clouds = (*house.scene.clouds[:3], texture(rng, 4000))
+    return fs.Scene(clouds, markers=house.scene.markers, background=house.scene.background)
+
+
+def take_video(folder: Path, count: int, size: tuple[int, int], seed: int, readout: float) -> dict:
+    """Render a video of 10 frames per second of a camera that is carried along the bench, with the sway of a
+    hand; returns the truth. readout: seconds of a rolling shutter."""
+    house, rng = Greenhouse(rows=1, plants=6, seed=seed), np.random.default_rng(seed)
+    scene, renderer, found, phases = textured(house, rng), fs.Renderer(), {}, rng.uniform(0, 6, 8)
+    width, height = size
+
+    def camera(time: float) -> fs.Camera:
+        share = 10 * time / count
+        sway = np.sin(2 * math.pi * time * np.array([0.9, 0.7, 1.6, 0.8, 1.1, 0.6]) + phases[:6])
+        x, y, z, across, up, roll = sway * (0.03, 0.03, 0.015, 0.05, 0.04, 0.03)
+        bob = 0.25 * math.sin(2.2 * time)
+        position = (0.3 + 3 * share + x, -1.5 - 0.3 * math.sin(math.pi * share) + y, 0.6 + bob + z)
+        target, above = (1.5 + 0.6 * share + across, 0, 0.55 + up), (math.sin(roll), 0, math.cos(roll))
+        pose = fs.Camera.look_at(width, height, 1.0, position, target, above).world_to_camera
+        f = 0.78 * width
+        return fs.Camera.pinhole(width, height, f, f, width / 2, height / 2, pose, lens=LENS)
+
+    folder.mkdir(parents=True, exist_ok=True)
+    video = cv2.VideoWriter(str(folder / "photos.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, size)
+    for i in range(count):
+        own = camera(i / 10)
+        capture = fs.Capture(own, sensor=Sensor(full_well=8000, read_noise=8, seed=i))
+        if readout:
+            motion = fs.Motion(camera=lambda time, begin=i / 10: camera(begin + time).world_to_camera)
+            capture = capture.with_(motion=motion, shutter=fs.Shutter(readout=readout))
+        frame = renderer.render(scene, capture).to_uint8()
+        video.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+        found[f"frame-{i:06d}.jpg"] = own.world_to_camera.tolist()
+    video.release()
+    return {"cameras": found, "tags": {tag.marker.spec: tag.pose.tolist() for tag in house.markers}}
 
 
 def _by_hand(camera: fs.Camera, rng: np.random.Generator):
@@ -326,6 +362,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--up", action="store_true", help="gravity by the first tag")
     parser.add_argument("--readout", type=float, default=0.0, help="seconds of a rolling shutter")
+    parser.add_argument("--video", action="store_true", help="a video of --count frames, 24 of them are used")
     parser.add_argument("--cycles", type=int, help="samples of Blender's Cycles, e.g. 32")
     parser.add_argument("--rate", type=float, default=5e-4, help="learning rate of poses")
     parser.add_argument("--iterations", type=int, default=0, help="train so many iterations")
@@ -333,10 +370,13 @@ def main() -> None:
     size = tuple(options.size)
     if options.cycles:
         truth = take_by_cycles(options.o, options.count, size, options.seed, options.cycles)
+    elif options.video:
+        truth = take_video(options.o, options.count, size, options.seed, options.readout)
     else:
         truth = take(options.o, options.count, size, options.seed, options.readout)
     scene, begun = options.o / "scene", time.perf_counter()
-    command = ["capture", str(options.o / "photos"), "-o", str(scene), "--overwrite", "--json"]
+    source = options.o / ("photos.mp4" if options.video else "photos")
+    command = ["capture", str(source), "--frames", "24", "-o", str(scene), "--overwrite", "--json"]
     command += [word for tag in TAGS for word in ("--tag", f"{tag}=0.16")]
     command += ["--up", TAGS[0]] if options.up else []
     command += ["--max-side", str(size[0] // 2)] if options.iterations else []
@@ -348,6 +388,7 @@ def main() -> None:
         "standard_error_percent": 100 * facts["scale_standard_error"],
         "corners_px": facts["corner_rms_px"],
     }
+    row |= {"readout_px": facts["readout_px"]}
     row |= {"reprojection_px": facts["reprojection_px"], "seconds": time.perf_counter() - begun}
     print("| " + " | ".join(row) + " |")
     print("| " + " | ".join(f"{value:.3g}" for value in row.values()) + " |", flush=True)

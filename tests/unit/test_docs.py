@@ -217,6 +217,7 @@ def test_slow_commands_work_as_printed(page, tmp_path, monkeypatch):
             monkeypatch.delitem(parsed, name)
     monkeypatch.setitem(PARSED_WORDS, "blender", "a download of 1 GB")
     monkeypatch.setitem(PARSED_WORDS, "plants", "needs Blender")
+    monkeypatch.setitem(PARSED_WORDS, "bench/splats.ply", "needs a folder of photographs")
     monkeypatch.setitem(PARSED_WORDS, "shards", "made by eight processes")
     test_code_blocks_work_as_printed(page, tmp_path, monkeypatch)
 
