@@ -20,13 +20,14 @@ KINDS = {
 
 @cache
 def struct_of_surroundings(kind: str):
-    """The struct of the parameters of this kind of background."""
+    """Struct of the parameters of a background: `gradient` or `panorama`."""
     return struct_of("Surroundings", "The background.", KINDS[kind])
 
 
 @cache
 def make_backdrop(kind: str, bent: bool):
-    """The kernel that adds this kind of background to the samples. bent: whether the camera has a lens."""
+    """Make the kernel that adds a background to the samples. kind: `gradient` or `panorama`. bent: whether
+    the camera has a lens."""
     Surroundings, rays = struct_of_surroundings(kind), make_rays(bent)
     Rays, ray_of = rays.Rays, rays.ray_of
 
@@ -63,7 +64,7 @@ def make_backdrop(kind: str, bent: bool):
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def backdrop(
-        first: int,  # sample of thread 0, of those of the pictures, view after view, row by row
+        first: int,  # sample of thread 0; samples are numbered view after view, row by row
         views: wp.array(dtype=View),
         surroundings: Surroundings,
         rays: Rays,
@@ -78,7 +79,7 @@ def make_backdrop(kind: str, bent: bool):
         if ray[0] == ray[0]:
             at = first_sample(number, view) + row * view.tiles_x * view.tile_w + column
             light = color[at]
-            # in the axes of the world
+            # in world axes
             r = wp.transpose(wp.mat33(view.rotation))
             added = behind(surroundings, wp.vec3(fma_dot(r[0], ray), fma_dot(r[1], ray), fma_dot(r[2], ray)))
             for channel in range(3):

@@ -1,6 +1,6 @@
 """Blending of tiles. On a GPU a block of threads renders a tile: records are staged in shared memory, and
-adjacent threads render a cell of 2 x 4 samples, of the staged splats that can touch it. On a CPU a thread
-renders a tile, splat by splat within its box. Both use the same functions of a sample.
+adjacent threads render a cell of 2 x 4 samples, from the staged splats that may overlap it. On a CPU a thread
+renders a tile, splat by splat within the splat's box. Both use the same functions of a sample.
 """
 
 from functools import cache
@@ -25,7 +25,7 @@ _NONE, _ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 
 def samples_each(effects: tuple[str, ...]) -> int:
-    """Samples per thread on a GPU: two in a column, which share the reading of a record; one with a lens, a
+    """Samples per thread on a GPU: two in a column, for which a record is read once; one with a lens, a
     k-buffer or coplanar layers.
     """
     return 2 if {"rays", "compose_pixel", "compose_coplanar"}.isdisjoint(effects) else 1
@@ -74,7 +74,7 @@ def make_blend(
 
     @wp.func
     def new_sample(x: int, y: int, number: int, rays: Rays, view: View):
-        """Initial state of a sample; one outside the image is finished."""
+        """Initial state of a sample; a sample outside the image is finished."""
         p = start(x, y, number, rays, view)
         if x >= view.width or y >= view.height:
             p.t = 0.0
@@ -88,7 +88,7 @@ def make_blend(
         coplanar_groups: wp.array(dtype=wp.int32),
         view: View,
     ) -> int:
-        """1 for a tile with splats of coplanar groups, which are the first of its list."""
+        """1 for a tile with splats of coplanar groups, which are first in its list; else 0."""
         exist = int(0)
         if first < end:
             if coplanar_groups[lists[first] % view.splats] >= 0:
@@ -97,7 +97,7 @@ def make_blend(
 
     @wp.func
     def observe(pixel: Pixel, s: Splat, c: Intersection, x: float, y: float, view: View):
-        """Apply the `fragment` functions of outputs to a listed splat, before it is composited."""
+        """Call the `fragment` functions of outputs for a listed splat before it is composited."""
         p, disc, opacity = pixel, float(wp.inf), float(0.0)
         if wp.static(screen):
             disc = c.screen
@@ -111,10 +111,10 @@ def make_blend(
     def blend_splat(
         pixel: Pixel,
         s: Splat,
-        column: wp.vec3,  # of the three forms, along the sample's column
+        column: wp.vec3,  # terms of the three forms that depend on the column only
         ray: wp.vec3,
         slopes: SLOPES,
-        x: float,  # from the anchor
+        x: float,  # position relative to the anchor
         y: float,
         place: int,
         lines: wp.array(dtype=wp.vec4),
@@ -253,9 +253,7 @@ def make_blend(
         lists: wp.array(dtype=wp.int32),
         samples: Samples,  # out
         bounds: wp.array(dtype=Bounds),
-        state: wp.array(
-            dtype=Pixel
-        ),  # the samples of one tile, from `state_first`: tiles of a launch come one after the other
+        state: wp.array(dtype=Pixel),  # samples of one tile from `state_first` on; scratch
         state_first: int,
     ):
         tile = band_first + wp.tid()

@@ -1,8 +1,9 @@
 """Backward pass of blending (fragment_backward.py has the formulas).
 
-Each tile evaluates its list forward again, for the transmittance in front of every CHUNK splats, then
-backward, a chunk at a time. For each of its splats it stores the sums over its samples in a separate slot.
-There are no atomics, so sums have a fixed order and results are bit-identical on every run.
+The list of each tile is evaluated forward again, for the transmittance in front of every CHUNK splats, then
+backward, a chunk at a time. For each splat, the sums over the tile's samples are stored in a slot of this
+(splat, tile) pair. There are no atomics, so sums have a fixed order and results are bit-identical on every
+run.
 
 On a GPU a block of threads processes a tile, one sample per thread; sums are computed over a warp by shuffles
 and over the warps in shared memory. On a CPU a thread processes a tile, splat by splat within its bounding
@@ -20,7 +21,7 @@ from .fragment_backward import make_fragments
 from .staging import with_numbers
 
 CHUNK = 32
-"""splats of a tile's list that are evaluated forward and then backward at once"""
+"""splats of a tile's list that are evaluated forward and then backward together"""
 BLOCK_W, BLOCK_H = 8, 4
 """rows and columns of samples of a warp, one sample per thread"""
 NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
@@ -48,13 +49,13 @@ _POOL = """
     return 0;
 #endif
 """
-# on the CPU the threads of a block run one after another, so they add to the slot in a fixed order
-_LEAVE = """
+# on the CPU the threads of a block run one after another, and add to the slot in a fixed order
+_SUM_OVER_WARP = """
 #if defined(__CUDA_ARCH__)
     float* parts = reinterpret_cast<float*>(__cvta_shared_to_generic(pool));
     parts += (place * WARPS + threadIdx.x / 32) * FIELDS;
     const int lane = threadIdx.x & 31;
-    if (!__any_sync(0xffffffffu, drawn)) {
+    if (!__any_sync(0xffffffffu, contributes)) {
         if (lane < FIELDS) parts[lane] = 0.0f;
         return;
     }
@@ -64,10 +65,10 @@ _LEAVE = """
         if (lane == 0) parts[field] = sum;
     }
 #else
-    if (drawn) for (int field = 0; field < FIELDS; field++) moments.data[slot][field] += values[field];
+    if (contributes) for (int field = 0; field < FIELDS; field++) moments.data[slot][field] += values[field];
 #endif
 """
-_GATHER = """
+_SUM_OVER_BLOCK = """
 #if defined(__CUDA_ARCH__)
     const float* parts = reinterpret_cast<const float*>(__cvta_shared_to_generic(pool));
     __syncthreads();
@@ -84,10 +85,10 @@ _GATHER = """
 
 @cache
 def make_slots(screen: bool):
-    """Make the kernel that computes the slot for the sums of each pair of a splat and a tile. screen: as in
+    """Make the kernel that computes the slot for the sums of each (splat, tile) pair. screen: see
     `make_bounds`.
 
-    A splat has as many slots as it has tiles, in their order, after those of the splats before it.
+    A splat has a slot per tile, in the order of the tiles, after the slots of preceding splats.
     """
     limits = make_bounds(screen)
 
@@ -95,7 +96,7 @@ def make_slots(screen: bool):
     def find_slots(
         first: int,
         views: wp.array(dtype=View),  # (1)
-        tiles: wp.array(dtype=wp.int32),  # (pairs) as they are listed
+        tiles: wp.array(dtype=wp.int32),  # (pairs) in the order of the lists
         lists: wp.array(dtype=wp.int32),
         windows: wp.array(dtype=wp.uint64),
         bounds: wp.array(dtype=Bounds),
@@ -129,8 +130,8 @@ def make_slots(screen: bool):
 def make_blend_backward(
     effects: tuple[str, ...], outputs: tuple[str, ...], losses: tuple[str, ...], on_gpu: bool, threads: int
 ) -> SimpleNamespace:
-    """Make the kernel, with the structs By (inputs), Loss (state of a sample) and Moments (results). effects,
-    outputs, on_gpu, threads: as in `make_blend`; losses: outputs with derivatives."""
+    """Make the kernel of the backward pass, and the structs By (inputs), Loss (state of a sample) and Moments
+    (results). effects, outputs, on_gpu, threads: see `make_blend`. losses: outputs with gradients."""
     made = make_fragments(effects, outputs, losses)
     By, Samples, Loss, Moments = made.By, made.Samples, made.Loss, made.Moments
     read, box_of, loss_at = made.read, made.box_of, made.loss_at
@@ -139,48 +140,50 @@ def make_blend_backward(
 
     @wp.func_native(with_numbers(_ANY_OF_BLOCK, numbers))
     def any_of_block(open: bool) -> bool:
-        """Whether any thread of the block says so; all wait for each other."""
+        """Whether `open` is true in any thread of the block; a barrier."""
         ...
 
     @wp.func_native(with_numbers(_ANY_OF_WARP, numbers))
     def any_of_warp(open: bool) -> bool:
-        """Whether any thread of the warp says so."""
+        """Whether `open` is true in any thread of the warp."""
         ...
 
     @wp.func_native(with_numbers(_POOL, numbers))
     def pool() -> wp.uint64:
-        """Where the warps' sums lie in shared memory."""
+        """Address of the sums of the warps in shared memory."""
         ...
 
-    @wp.func_native(with_numbers(_LEAVE, numbers))
-    def leave(
+    @wp.func_native(with_numbers(_SUM_OVER_WARP, numbers))
+    def sum_over_warp(
         pool: wp.uint64,
         place: int,
-        drawn: bool,
+        contributes: bool,
         values: Moments,
         moments: wp.array(dtype=Moments),
         slot: int,
     ):
-        """Sums a fragment's values over the warp; those of threads that have drawn nothing are 0."""
+        """Sum the values of a fragment over the warp; threads without a contribution (`contributes` is false) add
+        0."""
         ...
 
-    @wp.func_native(with_numbers(_GATHER, numbers))
-    def gather(
+    @wp.func_native(with_numbers(_SUM_OVER_BLOCK, numbers))
+    def sum_over_block(
         pool: wp.uint64,
         first: int,
         count: int,
         moments: wp.array(dtype=Moments),
         slots: wp.array(dtype=wp.int32),
     ):
-        """Sums what the warps have left of `count` splats of the list into their slots; all wait."""
+        """Sum the sums of all warps for `count` splats of the list into the slots of the splats; a
+        barrier."""
         ...
 
     chunk_of = wp.types.vector(CHUNK, wp.float32)
     options = {"module": "unique", "module_options": STRICT, "enable_backward": False}
 
     @wp.func
-    def beyond(light: float, opacity: float) -> float:
-        """The light behind a fragment; none behind one that ends the list."""
+    def transmittance_behind(light: float, opacity: float) -> float:
+        """Transmittance behind a fragment; 0 behind a fragment that terminates the sample (opacity -1)."""
         if opacity < 0.0:
             return 0.0
         return light - light * opacity
@@ -197,8 +200,10 @@ def make_blend_backward(
         slots: wp.array(dtype=wp.int32),
         by: By,
         samples: Samples,
-        checkpoints: wp.array(dtype=wp.float32),  # scratch: light in front of every CHUNK splats of a tile
-        moments: wp.array(dtype=Moments),  # out, 0 before
+        checkpoints: wp.array(
+            dtype=wp.float32
+        ),  # scratch: transmittance in front of every CHUNK splats of a tile
+        moments: wp.array(dtype=Moments),  # out, zeroed by the caller
     ):
         view = views[0]
         thread = wp.tid()
@@ -224,7 +229,7 @@ def make_blend_backward(
                 box = box_of(lines, lists[first + place])
                 if box[0] < left + BLOCK_W and box[1] > left and box[2] < top + BLOCK_H and box[3] > top:
                     s = read(lines, lists, first + place, view)
-                    light = beyond(light, opacity_at(s, x, y, light, view))
+                    light = transmittance_behind(light, opacity_at(s, x, y, light, view))
             chunks += 1
 
         parts = pool()
@@ -240,26 +245,27 @@ def make_blend_backward(
                 if box[0] < left + BLOCK_W and box[1] > left and box[2] < top + BLOCK_H and box[3] > top:
                     s = read(lines, lists, first + place, view)
                     opacity = opacity_at(s, x, y, light, view)
-                    light = beyond(light, opacity)
+                    light = transmittance_behind(light, opacity)
                     opacities[place] = opacity
             place = count
             while place > 0:
                 place -= 1
-                drawn = opacities[place] > 0.0
+                contributes = opacities[place] > 0.0
                 values = Moments()
-                if any_of_warp(drawn):
+                if any_of_warp(contributes):
                     s = read(lines, lists, first + place, view)
-                    if drawn:
+                    if contributes:
                         values, loss = back(
                             s, lists[first + place], x, y, lights[place], opacities[place], loss, log_ceiling,
                             lines, view,
                         )  # fmt: skip
-                leave(parts, place, drawn, values, moments, slots[first + place])
-            gather(parts, first, count, moments, slots)
+                sum_over_warp(parts, place, contributes, values, moments, slots[first + place])
+            sum_over_block(parts, first, count, moments, slots)
 
     @wp.func
     def reach(lines: wp.array(dtype=wp.vec4), index: int, x0: int, y0: int, view: View) -> wp.vec4i:
-        """Samples of the tile at (x0, y0) that the splat can touch, counted from there."""
+        """Box of the tile's samples that the splat may overlap, relative to the tile's first sample (x0,
+        y0)."""
         box = box_of(lines, index)
         return wp.vec4i(
             wp.max(box[0] - x0, 0),
@@ -269,7 +275,7 @@ def make_blend_backward(
         )
 
     @wp.func
-    def walk(
+    def attenuate(
         k: int,
         place: int,
         alive: int,
@@ -282,7 +288,8 @@ def make_blend_backward(
         fragments: wp.array(dtype=wp.vec2),
         view: View,
     ) -> int:
-        """Lets the splat lists[k] take its light, and keeps its fragments; how many samples stay alive."""
+        """Attenuate the samples of a tile by the splat lists[k], and store its fragments; returns the number
+        of samples that are not terminated."""
         s = read(lines, lists, k, view)
         area = reach(lines, lists[k], x0, y0, view)
         left = alive
@@ -293,7 +300,7 @@ def make_blend_backward(
                 opacity = opacity_at(s, x0 + column, y0 + row, light, view)
                 fragments[at * CHUNK + place] = wp.vec2(light, opacity)
                 if opacity != 0.0:
-                    lights[at] = beyond(light, opacity)
+                    lights[at] = transmittance_behind(light, opacity)
                     if not (lights[at] > view.stop):
                         left -= 1
         return left
@@ -311,10 +318,10 @@ def make_blend_backward(
         by: By,
         samples: Samples,
         checkpoints: wp.array(dtype=wp.float32),
-        moments: wp.array(dtype=Moments),  # out, 0 before
-        lights: wp.array(dtype=wp.float32),  # scratch of one tile, from `state_first` as blend_cpu has it
-        losses: wp.array(dtype=Loss),  # the same
-        fragments: wp.array(dtype=wp.vec2),  # the same, CHUNK for each sample: light and opacity
+        moments: wp.array(dtype=Moments),  # out, zeroed by the caller
+        lights: wp.array(dtype=wp.float32),  # scratch of one tile from `state_first` on, as in blend_cpu
+        losses: wp.array(dtype=Loss),  # scratch, as `lights`
+        fragments: wp.array(dtype=wp.vec2),  # scratch, CHUNK per sample: transmittance and opacity
         state_first: int,
     ):
         view = views[0]
@@ -332,41 +339,45 @@ def make_blend_backward(
                 alive += 1
         start, end = starts[tile], starts[tile + 1]
         own = (start / CHUNK + tile) * area
-        walked = start
-        while walked < end and alive > 0:
-            chunk, place = (walked - start) / CHUNK, (walked - start) % CHUNK
+        processed = start
+        while processed < end and alive > 0:
+            chunk, place = (processed - start) / CHUNK, (processed - start) % CHUNK
             if place == 0:
                 for k in range(area):
                     checkpoints[own + chunk * area + k] = lights[state_first + k]
-            alive = walk(walked, place, alive, x0, y0, state_first, lines, lists, lights, fragments, view)
-            walked += 1
+            alive = attenuate(
+                processed, place, alive, x0, y0, state_first, lines, lists, lights, fragments, view
+            )
+            processed += 1
 
-        reached = walked  # the last chunk's fragments are kept already
-        while walked > start:
-            chunk = (walked - 1 - start) / CHUNK
+        processed_end = processed  # the fragments of the last chunk are stored
+        while processed > start:
+            chunk = (processed - 1 - start) / CHUNK
             first = start + chunk * CHUNK
-            if walked < reached:
+            if processed < processed_end:
                 for k in range(area):
                     lights[state_first + k] = checkpoints[own + chunk * area + k]
                 for place in range(CHUNK):
-                    walk(first + place, place, 0, x0, y0, state_first, lines, lists, lights, fragments, view)
-            while walked > first:
-                walked -= 1
-                s = read(lines, lists, walked, view)
-                touched = reach(lines, lists[walked], x0, y0, view)
+                    attenuate(
+                        first + place, place, 0, x0, y0, state_first, lines, lists, lights, fragments, view
+                    )
+            while processed > first:
+                processed -= 1
+                s = read(lines, lists, processed, view)
+                touched = reach(lines, lists[processed], x0, y0, view)
                 total = Moments()
                 for row in range(touched[2], touched[3]):
                     for column in range(touched[0], touched[1]):
                         at = state_first + row * view.tile_w + column
-                        fragment = fragments[at * CHUNK + walked - first]
+                        fragment = fragments[at * CHUNK + processed - first]
                         if fragment[1] > 0.0:
                             values, loss = back(
-                                s, lists[walked], x0 + column, y0 + row, fragment[0], fragment[1],
+                                s, lists[processed], x0 + column, y0 + row, fragment[0], fragment[1],
                                 losses[at], log_ceiling, lines, view,
                             )  # fmt: skip
                             losses[at] = loss
                             total += values
-                moments[slots[walked]] = total
+                moments[slots[processed]] = total
 
     return SimpleNamespace(
         kernel=blend_backward_gpu if on_gpu else blend_backward_cpu, By=By, Loss=Loss, Moments=Moments

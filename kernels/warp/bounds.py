@@ -1,7 +1,7 @@
 """Image bounds of splats: an ellipse, or a box if the disk crosses the near plane; and the low-pass disc. The
 tiles of most splats are stored as a window: a bit mask of 8 x 4 tiles.
 
-Everything here is conservative; the test of each sample decides.
+All bounds are conservative; each sample has an exact test.
 """
 
 from functools import cache
@@ -31,10 +31,10 @@ class Bounds:
     shear: float
     half_width: float
     inverse_hy2: float  # 0: a box
-    tip: float  # height at which it is widest to the right
+    tip: float  # height of the rightmost point of the ellipse
     disc_x: float
     disc_y: float
-    disc_r: float  # below 0: no dot
+    disc_r: float  # radius of the low-pass disc; below 0: no disc
 
 
 @wp.func
@@ -60,7 +60,7 @@ def ellipse_bounds(x: float, y: float, half_x: float, half_y: float, shear: floa
     b.half_y = half_y * (1.0 + PAD_RELATIVE) + PAD
     b.shear = shear
     b.tip = tip
-    # the pad of the height shifts a sheared chord too
+    # padding the height also shifts a sheared chord
     b.half_width = across * (1.0 + PAD_RELATIVE) + PAD_RELATIVE * half_x + PAD * (1.0 + wp.abs(shear))
     b.inverse_hy2 = 1.0 / (b.half_y * b.half_y)
     b.disc_r = -1.0
@@ -69,7 +69,7 @@ def ellipse_bounds(x: float, y: float, half_x: float, half_y: float, shear: floa
 
 @wp.func
 def ones(count: int) -> wp.uint32:
-    """The lowest bits, 1 to 31 of them."""
+    """A word with the lowest `count` bits set, 1 to 31."""
     return (wp.uint32(1) << wp.uint32(count)) - wp.uint32(1)
 
 
@@ -81,11 +81,12 @@ def window_tile(corner: int, bit: int, view: View) -> int:
 
 @cache
 def make_bounds(screen: bool) -> SimpleNamespace:
-    """rows(bounds, height) and span(bounds, y0, y1, width), with or without the low-pass disc."""
+    """Make functions of bounds with or without the low-pass disc: rows, span, tile rows and spans, window
+    bits, and `touched`."""
 
     @wp.func
     def rows(b: Bounds, height: int):
-        """First and last row of samples, last excluded, whose centres can be reached."""
+        """Rows of samples [first, end) whose centres may be inside the bounds."""
         low = b.y - b.half_y
         high = b.y + b.half_y
         if wp.static(screen):
@@ -98,9 +99,7 @@ def make_bounds(screen: bool) -> SimpleNamespace:
 
     @wp.func
     def span(b: Bounds, y0: int, y1: int, width: int):
-        """First and last column, last excluded, of samples in rows y0 to y1, last excluded, that can be
-        reached.
-        """
+        """Columns [first, end) of samples in rows [y0, y1) that may be inside the bounds."""
         top = float(y0) + 0.5
         bottom = float(y1) - 0.5
         x0 = float(wp.inf)
@@ -146,16 +145,16 @@ def make_bounds(screen: bool) -> SimpleNamespace:
 
     @wp.func
     def window_bits(b: Bounds, left: int, columns: int, top: int, height: int, view: View) -> wp.uint32:
-        """Tiles that can be touched of those from column `left` and row `top` on, of a splat that touches no
-        others. 0 if they are more than a window has.
+        """Bits of the tiles that the bounds may overlap, in a window from column `left` and row `top` of
+        tiles that contains the bounds; 0 if the window is too small.
         """
         bits = wp.uint32(0)
         if columns <= WINDOW_W and height <= WINDOW_H:
             for row in range(height):
                 first, end = left, left + columns
-                if height > 1:  # else the columns are those of the row
+                if height > 1:  # a single row has exactly these columns
                     first, end = tile_span(b, top + row, view)
-                    # a chord between two rows of samples may be wider than those at the rows
+                    # a chord between two rows of samples may be wider than the chords at the rows
                     first, end = wp.max(first, left), wp.min(end, left + columns)
                 if first < end:
                     bits = bits | (ones(end - first) << wp.uint32(row * WINDOW_W + first - left))
@@ -163,7 +162,8 @@ def make_bounds(screen: bool) -> SimpleNamespace:
 
     @wp.func
     def touched(b: Bounds, left: int, columns: int, top: int, height: int, view: View):
-        """The same bits, and how many tiles can be touched, also of more than a window has."""
+        """Bits of `window_bits`, and the number of tiles that the bounds may overlap, also if they exceed the
+        window."""
         bits = window_bits(b, left, columns, top, height, view)
         tiles = population(bits)
         if tiles == 0:

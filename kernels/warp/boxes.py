@@ -19,7 +19,7 @@ LINES = wp.constant(10)
 """lines that bound a box in the image: its edges, the horizon of its plane, the near plane, the image's
 sides"""
 ACUTE = wp.constant(0.1)
-"""sine of an angle below which the tip of a corner may be far away"""
+"""sine of an angle below which a corner counts as acute, as its tip may be far away"""
 
 
 @wp.func
@@ -39,13 +39,15 @@ def ramp(form: float, by_x: float, by_y: float) -> float:
 
 @wp.func
 def along_ray(form: wp.vec3, slopes: SLOPES, k: int) -> float:
-    """Derivative of a form with these factors of a ray's X, Y, Z by the sample's column or row."""
+    """Derivative of a form, with factors of a ray's X, Y, Z, with respect to the sample's column (k = 0) or
+    row (1)."""
     return fma(form[2], slopes[k, 2], fma(form[1], slopes[k, 1], form[0] * slopes[k, 0]))
 
 
 @wp.func
 def between_curves(d: float, n: float, of_d: wp.vec3, of_n: wp.vec3, slopes: SLOPES) -> float:
-    """`between`, of forms with these factors of a ray's X, Y, Z, and with the ray's derivatives."""
+    """`between` behind a lens. of_d, of_n: factors of a ray's X, Y, Z in D and n. slopes: derivatives of the
+    ray."""
     d_x, d_y = along_ray(of_d, slopes, 0), along_ray(of_d, slopes, 1)
     n_x, n_y = along_ray(of_n, slopes, 0), along_ray(of_n, slopes, 1)
     low = ramp(fma(SQRT2, n, d), fma(SQRT2, n_x, d_x), fma(SQRT2, n_y, d_y))
@@ -78,8 +80,8 @@ def make_boxes(real) -> SimpleNamespace:
 
     @wp.func
     def corners(lines: lines_type, clear: bool):
-        """Box x0, x1, y0, y1 around the four corners of a quadrangle with lines 0, 1 opposite to each other
-        and 2, 3; and whether none of its corners is acute.
+        """Box x0, x1, y0, y1 around the corners of a quadrangle with opposite sides 0, 1 and 2, 3; and
+        whether no corner is acute.
         """
         box = vec4(real(wp.inf), -real(wp.inf), real(wp.inf), -real(wp.inf))
         blunt = clear
@@ -101,7 +103,7 @@ def make_boxes(real) -> SimpleNamespace:
 
     @wp.func
     def rim(lines: lines_type):
-        """Box around the polygon in which no line's form is below 0: around the part of each line in it."""
+        """Box around the polygon in which all forms are at least 0, from the segment of each line in it."""
         box = vec4(real(wp.inf), -real(wp.inf), real(wp.inf), -real(wp.inf))
         count = int(LINES)
         for k in range(count):
@@ -128,8 +130,8 @@ def make_boxes(real) -> SimpleNamespace:
 
     @wp.func
     def extent(tangent_u: vec3, tangent_v: vec3, p: vec3, su: real, sv: real, clear: bool, view: View):
-        """Bounds x0, x1, y0, y1 of the samples that a box can cover: up to half a sample outside of its
-        edges. x0 > x1 if there are none. clear: whether it is completely beyond the near plane.
+        """Bounds x0, x1, y0, y1 of the samples that a box may cover, up to half a sample outside of its
+        edges; x0 > x1 if there are none. clear: whether the box is completely beyond the near plane.
         """
         per_fx, per_fy = real(view.per_focal_x), real(view.per_focal_y)
         cx, cy = real(view.center_x), real(view.center_y)
@@ -139,7 +141,7 @@ def make_boxes(real) -> SimpleNamespace:
         d = normal * side
         u = wp.cross(tangent_v, p) * (side / su)
         v = wp.cross(p, tangent_u) * (side / sv)
-        # about the principal point
+        # relative to the principal point
         lines = lines_type()
         edge_count = int(4)
         for k in range(edge_count):
@@ -166,13 +168,13 @@ def make_boxes(real) -> SimpleNamespace:
 
     @wp.func
     def parallel(tangent_u: vec3, tangent_v: vec3, su: real, sv: real, x: real, y: real, view: View):
-        """`extent` where parallel rays show the centre at (x, y): the image of a larger rectangle, whose
-        sides are half a sample further out.
+        """`extent` for parallel rays, with the projected centre (x, y): bounds of a rectangle whose sides are
+        half a sample further out.
         """
         per_fx, per_fy = real(view.per_focal_x), real(view.per_focal_y)
         facing = wp.abs(tangent_u[0] * tangent_v[1] - tangent_u[1] * tangent_v[0])
         if not (facing > zero):
-            return vec4(one, zero, one, zero)  # edge-on: no ray meets it
+            return vec4(one, zero, one, zero)  # edge-on: no ray intersects it
         # metres of the plane per sample, across each pair of sides
         step_u = wp.length(vec2(tangent_v[1] * per_fx, tangent_v[0] * per_fy)) / facing
         step_v = wp.length(vec2(tangent_u[1] * per_fx, tangent_u[0] * per_fy)) / facing
@@ -183,12 +185,13 @@ def make_boxes(real) -> SimpleNamespace:
 
     @wp.func
     def spread(tangent_u: vec3, tangent_v: vec3, p: vec3, su: real, sv: real, step: real) -> vec2:
-        """Half of the sides [m] of a rectangle about p that holds the places where rays meet the plane whose
-        samples the box covers in part; step: how far a ray is from that of the next sample, at most.
+        """Half of the sides [m] of a rectangle around p that contains the intersections of the plane with the
+        rays of all partly covered samples. step: maximum distance of the rays of neighbouring samples.
 
-        There |u| <= s_u + s_u |grad F| / 2 D for F = D -+ n_u, with |s_u grad F| <= (s_u + |t_v x p|) step
-        and D >= |n p| / |P| of the place P; the same along v. |P| <= |p| + |u| + |v| is then a linear
-        inequality. Where it has no solution, near the plane's own horizon, all of the plane is taken.
+        For such a sample |u| <= s_u + s_u |grad F| / 2 D with F = D -+ n_u, |s_u grad F| <= (s_u + |t_v x p|)
+        step and D >= |n p| / |P|, P the intersection; the same along v. |P| <= |p| + |u| + |v| then is a
+        linear inequality. If it has no solution, near the plane's horizon, the rectangle is the complete
+        plane.
         """
         away = wp.length(p)
         grown = half * step / wp.abs(wp.dot(wp.cross(tangent_u, tangent_v), p))

@@ -16,22 +16,20 @@ def sample_fields(outputs: tuple[str, ...]) -> dict[str, type]:
 
 
 def light_of(outputs: tuple[str, ...]) -> frozenset[str]:
-    """Sample buffers that are averaged over the poses of a shutter."""
+    """Names of sample buffers that are averaged over the poses of a shutter."""
     return frozenset({"color"} | output.fields(output.having(outputs, "light"), "samples").keys())
 
 
 @cache
 def make_samples(fields: tuple[tuple[str, type], ...]):
-    """The struct of sample buffers with these fields, (rows columns) of the padded grid each."""
+    """Struct of sample buffers with these fields, each (rows columns) of the padded grid."""
     arrays = {name: wp.array(dtype=dtype) for name, dtype in fields}
     return struct_of("Samples", "Results of blending for each sample.", arrays)
 
 
 @cache
 def make_images(images: tuple[tuple[str, type], ...], outputs: tuple[str, ...]):
-    """The struct of output images, (h w channels) elements of these types each, and of the arrays that the
-    outputs read.
-    """
+    """Struct of output images, each (h w channels) of its type, and of the arrays that the outputs read."""
     fields = {
         **dict(images),
         **output.fields(outputs, "cloud_arrays"),

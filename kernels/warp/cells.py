@@ -1,5 +1,5 @@
-"""Culling by cells of a tile: which cells, of 2 x 4 samples, a splat can touch, as bits of a word. The test
-is conservative; the test of each sample decides.
+"""Culling by cells of a tile: bits of the cells, of 2 x 4 samples, that a splat may overlap. The test is
+conservative; each sample has an exact test.
 
 A disk has fragments where f = n_u^2 + n_v^2 - h D^2 <= 0, with h half the squared radius and n_u, n_v, D
 affine in the sample. Along a row, with a = (n_u, n_v, D) per x and b = (n_u, n_v, D) at x = 0,
@@ -32,14 +32,14 @@ _ONE, _TWO = wp.constant(wp.uint32(1)), wp.constant(wp.uint32(2))
 class Conic:
     """An ellipse, relative to the splat's anchor."""
 
-    known: bool  # else there is none, or the horizon is near, or rows or columns run along the splat
-    middle: float  # of chords: middle + slope y
+    known: bool  # false: no ellipse, or the horizon is near, or the splat is edge-on to rows or columns
+    middle: float  # midpoints of chords: middle + slope y
     slope: float
     y: float
     half_height: float
-    square: float  # of half chords: square - bend (y - its y)^2
+    square: float  # squared half chord of row r: square - bend (r - y)^2
     bend: float
-    tip: float  # height above y at which it is widest to the right
+    tip: float  # row of the rightmost point minus y
     pad: float
 
 
@@ -51,14 +51,14 @@ def half_chord(c: Conic, y: float) -> float:
 
 @cache
 def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
-    """Make the function that returns the cells of a tile that a splat can touch."""
+    """Make the function that returns the cells of a tile that a splat may overlap."""
     splats = make_splat(effects, outputs)
     Splat, screen, thick = splats.Splat, "lowpass_screen" in effects, EXACT in effects
     elliptic = "rays" not in effects and not any(name in effects for name in BOXES)
 
     @wp.func
     def conic_of(s: Splat, far_x: float, far_y: float):
-        """far_x, far_y: of the tile's samples from the anchor, at most."""
+        """Ellipse of a disk. far_x, far_y: maximum distance of the tile's samples from the anchor."""
         h = s.half_r2
         if wp.static(thick):
             # q <= h (D^2 + bulge q); near 1 the rounding of the difference exceeds _SLACK
@@ -76,7 +76,7 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
         steep = ux * ux + vx * vx
         bent = h * dx * dx
         inverse = 1.0 / (steep - bent)
-        # of a x b: at y = 0, and per y
+        # components of a x b: at y = 0, and per y
         ud, vd, uv = ux * d0 - dx * u0, vx * d0 - dx * v0, ux * v0 - vx * u0
         ud_y, vd_y, uv_y = ux * dy - dx * uy, vx * dy - dx * vy, ux * vy - vx * uy
         # q = q0 + 2 q1 y - q2 y^2
@@ -103,7 +103,7 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
 
     @wp.func
     def chord(c: Conic, y0: float, y1: float):
-        """Between which columns rows from y0 to y1 meet it."""
+        """Columns in which rows y0 to y1 overlap the ellipse."""
         low, high = -float(wp.inf), float(wp.inf)
         if c.known:
             if y0 - c.y > c.half_height or c.y - y1 > c.half_height:
@@ -117,7 +117,7 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
     @wp.func
     def touched(s: Splat, box: wp.vec4i, left: int, top: int, group: int, view: View) -> wp.uint32:
         """Bits of cells 32 group to 32 group + 31 of the tile whose first sample is (left, top), row by row.
-        box: samples that the splat can touch, first and end of columns, then of rows.
+        box: columns [first, end) and rows [first, end) of samples that the splat may overlap.
         """
         across = view.tile_w / CELL_W
         rows = 32 / across  # of cells of a group

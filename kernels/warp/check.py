@@ -1,5 +1,4 @@
-"""Arithmetic of the device for the self-test (`fidsplat check`): results of the functions that stages
-call."""
+"""Arithmetic of the device for the self-test (`fidsplat check`): results of the functions of the stages."""
 
 import warp as wp
 
@@ -71,7 +70,7 @@ def contraction(
 
 @wp.kernel(enable_backward=False)
 def not_a_number(x: wp.array(dtype=wp.float32), out: wp.array(dtype=wp.int32, ndim=2)):
-    """(4, n): x != x, isnan, fails every comparison, isinf."""
+    """Tests of x, (4, n): x != x, isnan, every comparison is false, isinf."""
     i = wp.tid()
     value = x[i]
     if value != value:

@@ -14,7 +14,7 @@ C0 = wp.constant(0.28209479177387814)
 
 @wp.func
 def basis_value(k: int, d: wp.vec3) -> float:
-    """The real spherical harmonic number k, 0 to 15, of a unit direction."""
+    """Real spherical harmonic number k, 0 to 15, of a unit direction."""
     x, y, z = d[0], d[1], d[2]
     if k == 0:
         return C0
@@ -51,7 +51,8 @@ def basis_value(k: int, d: wp.vec3) -> float:
 
 @cache
 def make_color(sh_terms: int, real):
-    """color_of(i, colors, away): away = centre - camera in world axes; sh_terms 0: plain colours."""
+    """Make color_of(i, colors, away), with away = centre - camera in world axes. sh_terms: 0 for plain
+    colours."""
     vec3 = wp.types.vector(3, real)
 
     @wp.func

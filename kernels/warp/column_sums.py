@@ -13,7 +13,7 @@ def add_rows(
     first: int,
     rows: int,
     columns: int,
-    stride: int,  # every so many rows are summed by one thread
+    stride: int,  # thread k sums rows k, k + stride, ...
     parts: wp.array(dtype=wp.float64),  # (rows, columns)
     sums: wp.array(dtype=wp.float64),  # (stride, columns) out
 ):
@@ -38,11 +38,11 @@ def background_parts(
     first: int,
     pixels: int,
     width: int,
-    stride: int,  # of the padded grid of samples
-    threads: int,  # that share the pixels
+    stride: int,  # samples per row of the padded grid
+    threads: int,  # number of threads
     color: wp.array(dtype=wp.vec4),  # samples: r, g, b, transmittance
     by_rgb: wp.array(dtype=wp.float32),  # (h w 3)
-    parts: wp.array(dtype=wp.float64),  # (threads, 3) out: derivatives by the background
+    parts: wp.array(dtype=wp.float64),  # (threads, 3) out: gradients with respect to the background
 ):
     thread = first + wp.tid()
     total = wp.vec3d()

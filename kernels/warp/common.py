@@ -13,7 +13,7 @@ STRICT = {
 CULLED = wp.constant(wp.uint32(0xFFFFFFFF))
 """key of a culled splat"""
 MIN_ALPHA = wp.constant(wp.float32(1.0 / 255.0))
-"""minimum coverage of a sample for label, depth, median depth and normal"""
+"""minimum alpha of a sample with a label, depth, median depth or normal"""
 
 
 _SIGN = wp.constant(wp.uint32(0x80000000))
@@ -22,20 +22,20 @@ _NONE = wp.constant(wp.uint32(0))
 
 @wp.struct
 class View:
-    """Uniforms of one view. Lengths are in metres, pixels are samples of the grid. Kernels have an array with
-    one for each rendered view; the integers are the same in all.
+    """Uniforms of one view, in metres and samples. Kernels read an array with one struct per rendered view;
+    integer fields are equal in all views.
     """
 
     rotation: wp.mat33d  # world to camera
     translation: wp.vec3d  # position of the cloud's origin in the camera frame
     eye: wp.vec3d  # the camera's centre relative to the cloud's origin, world axes
-    focal_x: wp.float64  # samples; of parallel rays samples per metre
+    focal_x: wp.float64  # samples; samples per metre for parallel rays
     focal_y: wp.float64
     center_x: wp.float64  # samples
     center_y: wp.float64
     near: wp.float64
     far: wp.float64
-    per_focal_x: wp.float64  # 1 / focal_x, as those below: to divide takes longer
+    per_focal_x: wp.float64  # 1 / focal_x and so on: a product is faster than a division
     per_focal_y: wp.float64
     per_near: wp.float64
     width: int
@@ -45,19 +45,21 @@ class View:
     tiles_x: int
     tiles_y: int
     samples: int  # per pixel and axis
-    per_pixel: float  # (pixels per sample)^2: from squared samples to squared pixels
+    per_pixel: float  # (pixels per sample)^2: converts squared samples to squared pixels
     log_cut: float
     ceiling: float
     stop: float
-    first_light: float  # transmittance that is left behind a first hit
+    first_light: float  # maximum transmittance behind a first hit
     fog_density: float  # 1 / metres
-    slopes: wp.vec4d  # of rays, -x, x, -y, y: EWA takes derivatives there where a centre lies further out
-    ray_step: wp.float64  # behind a lens, where there are boxes: from a ray to the next sample's, at most
-    splats: int  # of the cloud
+    slopes: (
+        wp.vec4d
+    )  # limits of -x, x, -y, y at z = 1, to which EWA clamps the centre of a splat before it linearises
+    ray_step: wp.float64  # maximum distance of the rays of neighbouring samples, for boxes behind a lens
+    splats: int  # number of splats of the cloud
     ray: wp.vec4  # a sample's ray is ((column - [2]) / [0], (row - [3]) / [1], 1), or (0, 0, 1) for distances
 
 
-# Hides from the compiler that the number is the same, so that it reloads uniforms from memory: a view has
+# An identity that the compiler cannot remove, so that uniforms are loaded from memory again: a view has
 # more numbers than a GPU thread has registers.
 @wp.func_native("""
     int same = number;
@@ -67,13 +69,13 @@ class View:
     return same;
 """)
 def reread(number: int) -> int:
-    """The number."""
+    """`number`, opaque to the compiler."""
     ...
 
 
 @wp.func
 def locate_tile(tile: int, views: wp.array(dtype=View)):
-    """View of a tile among the tiles of all views, and its column and row of tiles there."""
+    """View of a tile, numbered over all views, and the tile's column and row in the view."""
     view = views[0]
     row = tile / view.tiles_x
     return row / view.tiles_y, tile % view.tiles_x, row % view.tiles_y
@@ -81,12 +83,12 @@ def locate_tile(tile: int, views: wp.array(dtype=View)):
 
 @wp.func
 def first_sample(number: int, view: View) -> int:
-    """Where the samples of a view begin in sample buffers."""
+    """Index of a view's first sample in sample buffers."""
     return number * (view.tiles_x * view.tile_w) * (view.tiles_y * view.tile_h)
 
 
 def struct_of(name: str, words: str, fields: dict):
-    """A struct with these fields, name: type."""
+    """Make a struct with `fields` (name: type)."""
     return wp.struct(type(name, (), {"__annotations__": fields, "__doc__": words, "__module__": __name__}))
 
 
@@ -119,11 +121,11 @@ def fma_dot(a: wp.vec3, b: wp.vec3) -> float:
 #endif
 """)
 def line_of(lines: wp.array(dtype=wp.vec4), at: int) -> wp.vec4:
-    """lines[at], which nothing writes during the launch."""
+    """lines[at]; read-only during the launch."""
     ...
 
 
-# One 16-byte store on CUDA: each of four stores would touch all 32 records of a warp.
+# One 16-byte store on CUDA: each of four stores would write to all 32 records of a warp.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     reinterpret_cast<float4*>(lines.data)[at] = make_float4(value[0], value[1], value[2], value[3]);
@@ -138,8 +140,8 @@ def store_line(lines: wp.array(dtype=wp.vec4), at: int, value: wp.vec4):
 
 @wp.func
 def sortable(x: float) -> wp.uint32:
-    """Bits of a float in an order that unsigned comparison keeps, negative values included. No
-    depth is -0: it is a sum with a term of the view's, which is not.
+    """Bits of a float in an order that unsigned comparison preserves, negative values included. No depth is
+    -0: depth is a sum with a nonzero term of the view.
     """
     bits = wp.cast(x, wp.uint32)
     if (bits & _SIGN) != _NONE:
@@ -155,7 +157,7 @@ def sortable(x: float) -> wp.uint32:
 #endif
 """)
 def population(bits: wp.uint32) -> int:
-    """How many bits are set."""
+    """Number of set bits."""
     ...
 
 
@@ -167,26 +169,26 @@ def population(bits: wp.uint32) -> int:
 #endif
 """)
 def lowest(bits: wp.uint32) -> int:
-    """Number of the lowest bit that is set; there must be one."""
+    """Index of the lowest set bit of a nonzero word."""
     ...
 
 
 @wp.func
 def as_bits(low: int, high: int) -> float:
-    """Two numbers from 0 to 65535 in the bits of a float."""
+    """Pack two numbers from 0 to 65535 into the bits of a float."""
     return wp.cast((wp.uint32(high) << wp.uint32(16)) | wp.uint32(low), wp.float32)
 
 
 @wp.func
 def of_bits(bits: float):
-    """The two numbers of `as_bits`."""
+    """Unpack the two numbers of `as_bits`."""
     both = wp.cast(bits, wp.uint32)
     return int(both & wp.uint32(0xFFFF)), int(both >> wp.uint32(16))
 
 
 @wp.func
 def to_sample(x: float, limit: int) -> int:
-    """A sample's coordinate to int; clamped as a float, since conversions of huge values are undefined
-    .
+    """Convert a sample's coordinate to int, clamped as a float, since conversions of huge values are
+    undefined .
     """
     return int(wp.clamp(x, -1.0, float(limit) + 1.0))

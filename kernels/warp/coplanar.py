@@ -21,12 +21,12 @@ DARKEST = wp.constant(wp.float32(2.0**-24))
 
 
 NEARER = wp.constant(wp.float32(-(2.0**-16)))
-"""relative depth by which a layer counts as nearer than ungrouped splats in its plane"""
+"""relative depth bias that sorts a layer in front of ungrouped splats in its plane"""
 
 
 def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
-    """The structs Layer and Layers, and their functions: accumulate, accumulate_box; start, select, close,
-    admits, passed.
+    """Make the structs Layer and Layers, and their functions: accumulate, accumulate_box; start, select,
+    close, admits, passed.
     """
     log = fast_log if "arithmetic_fast" in effects else wp.log
     accumulators = output.functions(outputs, "accumulate")
@@ -70,15 +70,15 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
 
     @wp.func
     def depth(layer: Layer) -> float:
-        """Sort depth of the layer, nearer by slightly more than the rounding of depths, so that it is in
-        front of ungrouped splats in its plane.
+        """Sort depth of the layer, biased by slightly more than the rounding of depths, so that the layer is
+        in front of ungrouped splats in its plane.
         """
         z = layer.mean.z
         return fma(wp.abs(z), NEARER, z)
 
     @wp.func
     def close(layers: Layers):
-        """Complete the open layer, and keep it if it is the nearest of this pass."""
+        """Complete the open layer, and store it if it is the nearest of this pass."""
         after = layers
         if layers.open.tau > 0.0:
             z = depth(layers.open)
@@ -91,7 +91,7 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
 
     @wp.func
     def select(layers: Layers, group: int):
-        """Open the layer of the group of the current splat, -1 for none."""
+        """Open the layer of the current splat's group; group -1: no layer."""
         if group == layers.open.group:
             return layers
         after = close(layers)
@@ -105,7 +105,7 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
 
     @wp.func
     def passed(layers: Layers):
-        """State before the next pass; at an infinite depth if there is none."""
+        """State before the next pass, at an infinite depth after the last pass."""
         after = layers
         after.after_z = layers.next_z
         after.after_group = layers.next.group
@@ -114,8 +114,8 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
 
     @wp.func
     def accumulate(layer: Layer, attributes: Attributes, opacity: float):
-        """The layer with one more fragment: optical depths -ln(1 - opacity) add up."""
-        # an opaque fragment has the optical depth at which float32 leaves no light
+        """Add a fragment to a layer: optical depths -ln(1 - opacity) add up."""
+        # an opaque fragment has the optical depth at which float32 transmittance is 0
         tau = -log(wp.max(1.0 - opacity, DARKEST))
         if opacity < FAINT:
             tau = fma(0.5 * opacity, opacity, opacity)
@@ -125,14 +125,14 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
 
     @wp.func
     def accumulate_box(layer: Layer, attributes: Attributes, opacity: float):
-        """The layer with one more box: they lie side by side, so what they cover adds up."""
+        """Add a box to a layer: boxes do not overlap, so that their opacities add up."""
         after = with_fragment(layer, attributes, opacity)
         after.opacity = wp.min(after.tau, 1.0)
         return after
 
     @wp.func
     def with_fragment(layer: Layer, attributes: Attributes, tau: float):
-        """The layer with a fragment of optical depth tau that shows `attributes`."""
+        """Add a fragment with optical depth tau and `attributes` to a layer."""
         after = layer
         after.tau = layer.tau + tau
         share = float(0.0)

@@ -11,15 +11,15 @@ from .common import View
 
 @cache
 def make_disk(real) -> SimpleNamespace:
-    """Functions for bounds of a disk: perspective(a, b, p, radius, reach, view) and parallel. reach: half of
-    the disk's depth range.
+    """Make functions for bounds of a disk: perspective(a, b, p, radius, reach, view) and parallel. reach:
+    half of the disk's depth range.
     """
     vec2, vec3 = wp.types.vector(2, real), wp.types.vector(3, real)
     one, zero = real(1.0), real(0.0)
 
     @wp.func
     def extremes(a: real, b: real, p: real, depth: vec3, radius: real, near: real):
-        """Least and greatest (a u + b v + p) / (depth (u, v, 1)) on the arc u^2 + v^2 = radius^2 beyond
+        """Minimum and maximum of (a u + b v + p) / (depth (u, v, 1)) on the arc u^2 + v^2 = radius^2 beyond
         `near`.
 
         The ratio's derivative along the arc vanishes where e cos + f sin = -g.
@@ -47,10 +47,9 @@ def make_disk(real) -> SimpleNamespace:
 
     @wp.func
     def clipped(a: vec3, b: vec3, p: vec3, radius: real, reach: real, view: View):
-        """Box of the part of the disk beyond the near plane: of its arc, and of the chord in which the plane
-        cuts it.
+        """Box of the disk clipped at the near plane: around its arc and the chord at the plane.
 
-        The part is convex and depth is positive in it, so ratios are largest on its rim.
+        The clipped disk is convex and has positive depths, so that ratios are extreme on its border.
         """
         near = real(view.near)
         depth = vec3(a[2], b[2], p[2])
@@ -100,11 +99,11 @@ def make_disk(real) -> SimpleNamespace:
 
     @wp.func
     def conic(x: real, y: real, qxx: real, qyy: real, qxy: real):
-        """The ellipse around (x, y) that reaches sqrt(qxx) along x and sqrt(qyy) along y."""
+        """Ellipse around (x, y) with half extents sqrt(qxx) along x and sqrt(qyy) along y."""
         shear = zero
         if qyy > zero:
             shear = qxy / qyy
-        # the pad covers the rounding of float32
+        # padded for the rounding of float32
         half_x = wp.sqrt(float(qxx))
         tip = float(0.0)
         if half_x > 0.0:

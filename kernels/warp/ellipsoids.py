@@ -15,7 +15,7 @@ EWA = ("ellipsoid_ewa", "ellipsoid_ewa_antialiased")
 
 @cache
 def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
-    """Functions for the equivalent disk of a 3D Gaussian.
+    """Make functions for the equivalent disk of a 3D Gaussian.
 
     disk(a, b, facet, sizes, p, view): its tangents. surface: its normal. rim: radius of the disk
     that bounds the ellipsoid. reach: half of the ellipsoid's depth range. clipped: bounds of an ellipsoid
@@ -38,8 +38,8 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
         to W `towards` there, its unit normal, its area, and 1 / m, infinite if the camera is at the centre.
 
         With e the longest axis and W p = (g, h) along e and across it, the tangents are the images of (h, -g)
-        / m in the plane of both, and of the vector perpendicular to that plane. Neither takes a difference
-        along e, so needles do not cancel.
+        / m in the plane of both, and of the vector perpendicular to that plane. Neither has a difference
+        along e, so that nothing cancels for needles.
         """
         e0, e1, e2 = a, b, c
         s0, s1, s2 = sizes[0], sizes[1], sizes[2]
@@ -74,8 +74,8 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
 
     @wp.func
     def image(a: vec3, b: vec3, c: vec3, p: vec3, view: View):
-        """Scaled axes on the image: their columns and rows [samples]; samples per metre at the centre, and
-        the slopes of its ray, within the limits of the Jacobian."""
+        """Scaled axes projected to the image: columns and rows [samples]; samples per metre at the centre;
+        and slopes of the centre's ray, clamped to the limits of the Jacobian."""
         per_x, per_y = real(view.focal_x), real(view.focal_y)
         slope_x, slope_y = zero, zero
         if wp.static(not parallel):
@@ -101,9 +101,8 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
 
     @wp.func
     def ewa(a: vec3, b: vec3, c: vec3, p: vec3, view: View):
-        """Equivalent disk with ellipsoid="ewa", from scaled axes: half axes along x and of y along x and y of
-        a disk that faces the camera and has the widened image; the determinants of the covariance before and
-        after."""
+        """Equivalent disk with ellipsoid="ewa", from scaled axes: Cholesky factor of a disk that faces the
+        camera and has the widened image, and the determinants of the covariance before and after."""
         across, down, per = image(a, b, c, p, view)
         factor, before, after = widened(across, down, view)
         return vec3(factor[0] / per[0], factor[1] / per[1], factor[2] / per[1]), before, after
@@ -112,9 +111,8 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
     def disk(a: vec3, b: vec3, facet: vec3, sizes: vec3, p: vec3, view: View):
         """Equivalent disk, from scaled tangents, unit normal and three standard deviations.
 
-        Returns its scaled tangents and unit normal, the distance of its plane, the half axis that is
-        conjugate to the tangents, 1 / m^2, two factors of its area, and the term of ln(opacity), -inf if the
-        splat is culled.
+        Returns its scaled tangents and unit normal, the distance of its plane, the semi-axis conjugate to the
+        tangents, 1 / m^2, two factors of its area, and the term of ln(opacity), -inf for a culled splat.
         """
         c = facet * sizes[2]
         u, v, normal, offset, third = a, b, facet, zero, vec3()
@@ -124,7 +122,9 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
             if wp.static(parallel):
                 towards = vec3(zero, zero, one)
             u, v, normal, su, inverse_m = exact(a, b, c, sizes, towards)
-            if inverse_m < real(wp.inf):  # else the camera is at its centre, and no ray has a maximum ahead
+            if inverse_m < real(
+                wp.inf
+            ):  # infinite if the camera is at the centre, where no ray has a maximum ahead
                 log_share = zero
                 offset = wp.dot(normal, towards)
                 third = towards * inverse_m
@@ -159,13 +159,13 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
 
     @wp.func
     def rim(radius: real, inverse_m2: real) -> real:
-        """Radius of the disk that the cone around the ellipsoid touches; large if the camera is inside of it,
-        since all rays ahead can hit it then."""
+        """Radius of the disk that the cone around the ellipsoid touches; large if the camera is inside of the
+        ellipsoid, where all rays ahead may intersect it."""
         return radius / wp.sqrt(wp.max(one - radius * radius * inverse_m2 - within, real(1e-12)))
 
     @wp.func
     def reach(a: vec3, b: vec3, third: vec3, radius: real) -> real:
-        """Half of the ellipsoid's depth range; of fisheyes and panoramas a bound of its distance range."""
+        """Half of the ellipsoid's depth range; for fisheyes and panoramas, a bound of its distance range."""
         if wp.static(along_ray):
             return radius * wp.sqrt(wp.dot(a, a) + wp.dot(b, b) + wp.dot(third, third))
         else:
@@ -173,7 +173,7 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
 
     @wp.func
     def clipped(box: Bounds, a: vec3, b: vec3, p: vec3, third: vec3, inverse_m2: real, view: View) -> Bounds:
-        """Bounds of the part of an ellipsoid beyond the near plane, in a pinhole image.
+        """Image bounds of an ellipsoid clipped at the near plane, for a pinhole.
 
         The maxima along rays are on a similar ellipsoid whose diameter is the segment from the camera to the
         centre. The maxima beyond `near` project into the section of that ellipsoid at `near`.

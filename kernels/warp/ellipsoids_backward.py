@@ -1,5 +1,5 @@
 """Backward pass of the equivalent disks of 3D Gaussians (ellipsoids.py), in float64: from gradients with
-respect to the disk to those with respect to the axes and the centre of the Gaussian."""
+respect to the disk to gradients with respect to the axes and the centre of the Gaussian."""
 
 from functools import cache
 
@@ -13,7 +13,7 @@ _HALF, _ONE, _TWO, _FOUR, _WIDENING = (wp.constant(wp.float64(x)) for x in (0.5,
 
 @cache
 def make_ellipsoids_backward(effects: tuple[str, ...]):
-    """Make the function `backward` of these effects."""
+    """Make the function `backward` for the effects."""
     sharp, antialiased = EXACT in effects, "ellipsoid_ewa_antialiased" in effects
     ellipsoid = make_ellipsoids(effects, wp.float64)
 
@@ -107,7 +107,7 @@ def make_ellipsoids_backward(effects: tuple[str, ...]):
     @wp.func
     def normal(axes: wp.mat33d, sizes: wp.vec3d, p: wp.vec3d, by_facet: wp.vec3d):
         """Gradients of the normal (`ellipsoids.surface`) with respect to the unit axes, in rows, their
-        lengths, and the centre. A common factor of the lengths has none."""
+        lengths, and the centre. A common factor of the lengths has no gradient."""
         shortest = wp.min(wp.min(sizes[0], sizes[1]), sizes[2])
         share = wp.cw_div(wp.vec3d(shortest, shortest, shortest), sizes)
         share = wp.cw_mul(share, share)

@@ -1,4 +1,4 @@
-"""Exponentials and logarithms by sums and products, which all devices round equally. Blending uses them with
+"""Exponentials and logarithms by sums and products, which all devices round equally. Blending uses them for
 `arithmetic="fast"`, the per-splat set-up always.
 
 Polynomials and error bounds are those of kernels/opencl/slot/arithmetic_fast.cl and math.cl; results are
@@ -13,7 +13,7 @@ from .common import fma
 
 _LOG2_E, _LN2_HIGH, _LN2_LOW = wp.constant(1.44269504), wp.constant(-0.693359375), wp.constant(2.12194440e-4)
 _LN2 = wp.constant(6.93147181e-1)
-_ROUNDER = wp.constant(12582912.0)  # 1.5 * 2^23: a sum's last bits are the whole number
+_ROUNDER = wp.constant(12582912.0)  # 1.5 * 2^23: the last bits of a sum are the integer
 _LEAST = wp.constant(-87.0)
 _MANTISSA_BITS = wp.constant(wp.uint32(23))
 _MANTISSA = wp.constant(0x7FFFFF)
@@ -22,7 +22,7 @@ _ROOT_HALF = wp.constant(0x3F3504F3)  # bits of sqrt(1/2)
 
 @wp.func
 def fast_exp(x: float) -> float:
-    """e^x for x <= 0, within 2 units of the last place; below -87 it stays e^-87, 1.6e-38."""
+    """e^x for x <= 0, within 2 ulp; e^-87 = 1.6e-38 below -87."""
     y = wp.max(x, _LEAST)
     sum = fma(y, _LOG2_E, _ROUNDER)
     k = sum - _ROUNDER
@@ -37,7 +37,7 @@ def fast_exp(x: float) -> float:
 
 @wp.func
 def fast_log(x: float) -> float:
-    """ln x for normal x > 0, within 1 unit of the last place."""
+    """ln x for normal x > 0, within 1 ulp."""
     bits = wp.cast(x, wp.int32) - _ROOT_HALF
     m = wp.cast((bits & _MANTISSA) + _ROOT_HALF, wp.float32) - 1.0
     m2 = m * m

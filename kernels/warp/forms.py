@@ -1,10 +1,10 @@
 """The affine forms of a splat's record, which each sample evaluates for its ray.
 
-With rows T_u, T_v, T_w of the projection of tangents and centre, (n_u, n_v, D) =
-T_u x T_v + x (T_v x T_w) + y (T_w x T_u): kernels/opencl/splat.cl. All three are affine in the sample. They
-are scaled by one factor: D > 0 in front of the camera, the steepest slope is 1; n_u, n_v also by sqrt(1/2),
-so that (n_u^2 + n_v^2) / D^2 is rho / 2. Operations and their order are those of kernels/opencl/project.cl,
-so results are bit-identical.
+With rows T_u, T_v, T_w of the projection of tangents and centre, (n_u, n_v, D) = T_u x T_v + x (T_v x T_w) +
+y (T_w x T_u): kernels/opencl/splat.cl. All three are affine in the sample. A common factor makes D > 0 in
+front of the camera and the steepest slope 1; n_u and n_v also have the factor sqrt(1/2), so that (n_u^2 +
+n_v^2) / D^2 is rho / 2. Operations and their order are those of kernels/opencl/project.cl, so results are
+bit-identical.
 """
 
 import math
@@ -35,7 +35,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
     bent = camera is not None
     edged = not bent and any(name in effects for name in BOXES)
     flagged = bent and "footprint_mixed" in effects
-    """whether records have the edges of boxes; whether they tell boxes from Gaussians"""
+    """whether records have edges of boxes; whether they have a flag for boxes"""
     of_box, optics = make_boxes(real), make_optics(camera, real) if camera else None
     Lens = make_lens(camera)
     at_disc, at_depth, at_edges, at_ray, at_plane, at_flag, at_bulge = (
@@ -52,7 +52,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
         a: vec3,  # scaled tangents
         b: vec3,
         facet: vec3,  # unit normal
-        offset: real,  # of the plane from the camera's centre, along the normal
+        offset: real,  # distance of the plane from the camera's centre, along the normal
         p: vec3,
         su: real,  # su sv: area of the tangents
         sv: real,
@@ -60,13 +60,14 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
         center_y: real,
         in_front: bool,  # whether the centre is imaged
         boxed: bool,
-        itself: bool,  # whether it is filtered by its own footprint
+        itself: bool,  # whether the splat is filtered by its own footprint
         thick: bool,
-        inverse_m2: real,  # of an ellipsoid
+        inverse_m2: real,  # 1 / m^2 of a 3D Gaussian
         view: View,
         lens: Lens,
     ):
-        """The record without opacity, colour, box and what outputs add; whether any ray meets the splat."""
+        """Fill the record except opacity, colour, box and fields of outputs; returns whether a ray intersects
+        the splat."""
         record = words()
         fx, fy = real(view.focal_x), real(view.focal_y)
         # relative to the sample of the image that is nearest to the centre
@@ -103,7 +104,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
         met = steepest > zero and steepest < real(wp.inf)
         scale = wp.where(determinant < zero, -one, one) / steepest
         n_scale = scale * sqrt_half
-        # edge-on within rounding: no ray meets the plane, only the low-pass disc is rendered
+        # edge-on within rounding: no ray intersects the plane, and only the low-pass disc is rendered
         away = one
         if wp.static(not parallel):
             away = wp.sqrt(wp.dot(p, p))
@@ -133,7 +134,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
         if wp.static(flagged):
             record[at_flag] = wp.where(boxed, 1.0, 0.0)
         if wp.static(screen):
-            # far away if there is none
+            # far away without a low-pass disc
             record[at_disc] = wp.where(in_front and not itself, float(center_x - anchor_x), 1.0e18)
             record[at_disc + 1] = wp.where(in_front, float(center_y - anchor_y), 1.0e18)
         if wp.static(exact):

@@ -25,9 +25,10 @@ _FORMS = ("nu0", "nux", "nuy", "nv0", "nvx", "nvy", "d0", "dx", "dy", "log_opaci
 
 def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str, ...]:
     """Names of the sums (moments) that a fragment adds to for its splat: derivatives of the loss with respect
-    to each form and z_numerator, times 1, x and y relative to the anchor; to ln(opacity); to the colour; to
-    further numbers of the record. The derivative with respect to D is at constant z_numerator - z_center D,
-    to avoid cancellation with that of z_numerator; `make_project_backward` adds the rest in float64."""
+    to each form and z_numerator, times 1, x and y relative to the anchor; with respect to ln(opacity), the
+    colour, and other numbers of the record. The derivative with respect to D is at constant z_numerator -
+    z_center D, to avoid cancellation with that of z_numerator; `make_project_backward` adds the rest in
+    float64."""
     names = list(_FORMS)
     names += ("disc_x", "disc_y") if "lowpass_screen" in effects else ()
     names += ("z_numerator", "z_numerator_x", "z_numerator_y", "z_center") if "ray_depth" in effects else ()
@@ -74,7 +75,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
 
     @wp.func
     def box_of(lines: wp.array(dtype=wp.vec4), index: int) -> wp.vec4i:
-        """Samples that the splat can touch: first and end of columns, then of rows."""
+        """Box of samples that the splat may overlap: columns [first, end), then rows [first, end)."""
         left, end = of_bits(line_of(lines, index * each + box_line)[box_lane])
         top, bottom = of_bits(line_of(lines, index * each + rows_line)[rows_lane])
         return wp.vec4i(left, end, top, bottom)
@@ -117,7 +118,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
     @wp.func
     def opacity_at(s: Splat, column: int, row: int, light: float, view: View) -> float:
         """Opacity of a splat at a sample with transmittance `light`, with the decisions of the forward pass:
-        0 if it is not blended, -1 if it ends the sample's list without being blended."""
+        0 if it is not blended, -1 if it terminates the sample without being blended."""
         opacity = float(0.0)
         if light > view.stop:
             c = crossed(s, float(column) - s.d[3], float(row) - s.c[0], view)
@@ -137,11 +138,11 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         inverse_d: float,
         low_pass: float,
     ):
-        """Depth of a fragment, and its derivatives by z_numerator, z_center, and D at constant
-        z_numerator - z_center D; by q and by the low-pass's half rho `low_pass`, which may be the circle that
-        z_center + circle (z_numerator - z_center D) D / q is mirrored at. It leaves the splat's range by
-        rounding alone, and then has the centre's. The last result is the derivative by the bulge of a 3D
-        Gaussian, whose D and q in `c` are those of its disk times 1 + t, t = bulge q / D^2."""
+        """Depth of a fragment, and its derivatives with respect to z_numerator; z_center; D at constant
+        z_numerator - z_center D; q; `low_pass`, rho / 2 of the low-pass disc; and the bulge of a 3D Gaussian.
+        Beyond a circle, which may be the disc's, depth is z_center + circle (z_numerator - z_center D) D / q.
+        A depth that rounding moves out of the splat's range has the derivatives of the centre's depth. For a
+        3D Gaussian, D and q in `c` are D and q of its disk times 1 + t, t = bulge q / D^2."""
         place = index * each
         center = line_of(lines, place + zc_line)[zc_lane]
         reach = line_of(lines, place + zr_line)[zr_lane]
@@ -185,8 +186,8 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         lines: wp.array(dtype=wp.vec4),
         view: View,
     ):
-        """What a fragment of this opacity, that this much light comes to, adds to the derivatives by its
-        record; and the pixel's loss in front of it."""
+        """Contribution of a fragment to the derivatives with respect to its record, and the state of the
+        pixel in front of it. light: transmittance in front of the fragment."""
         loss = before
         x, y = float(column) - s.d[3], float(row) - s.c[0]
         c = crossed(s, x, y, view)
@@ -236,7 +237,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         loss.behind = fma(opacity, gain, loss.behind)
         by_log = weight * gain
         if not (s.u[3] - decides <= log_ceiling):
-            by_log = 0.0  # the ceiling holds it
+            by_log = 0.0  # clamped to the maximum alpha
 
         by_nu, by_nv, by_d = float(0.0), float(0.0), float(0.0)
         if on_plane:

@@ -1,4 +1,4 @@
-"""Intersection of a sample's ray with a splat: opacity and depth there."""
+"""Intersection of a sample's ray with a splat, and the opacity and depth of the fragment."""
 
 import math
 from functools import cache
@@ -20,7 +20,7 @@ HALF_RHO_OF_RANGE = wp.constant(wp.float32(math.log(255.0)))
 
 @cache
 def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
-    """The struct Intersection and functions column, cross, cross_ray, cross_slopes (None without boxes
+    """Make the struct Intersection and functions column, cross, cross_ray, cross_slopes (None without boxes
     behind a lens), is_box, opacity_of and depth_of.
     """
     Splat = make_splat(effects, outputs).Splat
@@ -31,14 +31,14 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
     )
     thick = EXACT in effects
     boxes = any(name in effects for name in BOXES)
-    curved, edged = boxes and bent, boxes and not bent  # their edges: from each sample's ray, from a record
+    curved, edged = boxes and bent, boxes and not bent  # edges from each sample's ray, or from a record
     exp = fast_exp if "arithmetic_fast" in effects else wp.exp
-    # q / d^2 is rho / 2; inside: the ray meets the disk within R and beyond the near plane
+    # q / d^2 is rho / 2; inside: the ray intersects the disk within R and beyond the near plane
     fields = {"d": wp.float32, "q": wp.float32, "inside": wp.bool, "contributes": wp.bool}
     # screen: squared distance from the projected centre in pixels, which is rho / 2 of the low-pass
     fields |= {"screen": wp.float32} if screen else {}
     fields |= {"z": wp.float32} if parallel else {}  # d times the depth
-    # cover: share of the sample that a box covers
+    # cover: coverage of the sample by a box
     fields |= {"cover": wp.float32} if boxes else {}
     Intersection = struct_of("Intersection", "Where the ray of a sample meets a splat.", fields)
     z_line, z_lane = layout.place("z_numerator")
@@ -115,7 +115,7 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
             if s.bulge > 0.0:
                 squared = fma(s.bulge, c.q, c.d * c.d)  # D^2 (1 + rho of the disk / m^2)
                 c.inside = c.q <= s.half_r2 * squared and c.d > 0.0 and squared <= s.v[3] * c.d
-                # as a disk has them: rho / 2 is q / d^2, the depth falls with 1 / d
+                # as for a disk: rho / 2 is q / d^2, and depth is proportional to 1 / d
                 inverse = 1.0 / c.d
                 c.d = squared * inverse
                 c.q = c.q * c.d * inverse
@@ -154,7 +154,7 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
 
         Outside of the circle rho = max(2 ln 255, rho of the low-pass disc) the intersection is reflected at
         the circle: the difference from the centre's depth is multiplied by the ratio of their rho. printed:
-        whether the splat has a coplanar group, whose depths are not reflected.
+        whether the splat is in a coplanar group, whose depths are not reflected.
         """
         at = index * each
         center = line_of(lines, at + zc_line)[zc_lane]

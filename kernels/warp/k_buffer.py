@@ -1,10 +1,10 @@
 """K-buffer: sorts the fragments of a sample by their depth at the ray.
 
-Lists are sorted by a lower bound of the fragment depths of each splat (`nearest`), rounded as in blending. So
-no later fragment is nearer than that of the current splat, and buffered fragments in front of it are
-composited by depth, ties in list order. When the buffer is full, the farthest fragment is dropped, with all
-behind it (`until`), and another pass over the list composites the dropped fragments (`after`), until none is
-left. The image does not depend on the size of the buffer.
+Lists are sorted by a lower bound of the fragment depths of each splat (`nearest`), rounded as in blending. No
+later fragment is nearer than `nearest` of the current splat, so that buffered fragments in front of it are
+composited by depth, ties in list order. When the buffer is full, the farthest fragment and all fragments
+behind it (`until`) are dropped, and another pass over the list composites them (`after`), until no fragment
+is dropped. The image does not depend on the size of the buffer.
 """
 
 from types import SimpleNamespace
@@ -34,9 +34,9 @@ def make_k_buffer_struct(size: int):
 
 
 def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace:
-    """start, of a Pixel with a `k_buffer`; take, of a fragment; end, of the list.
+    """Make functions of a Pixel with a `k_buffer`: start; take, for a fragment; end, for the end of the list.
 
-    attributes_of (lines, index, z): attributes of a splat's fragment at that depth.
+    attributes_of(lines, index, z): attributes of a splat's fragment at depth z.
     """
     last = size - 1
 
@@ -68,7 +68,7 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
 
     @wp.func
     def drop_from(pixel: Pixel, z: float, place: int):
-        """Drop entries at or behind this depth and list place, for the next pass."""
+        """Drop entries at or behind a depth and list position, for the next pass."""
         p = pixel
         p.k_buffer.until_z = z
         p.k_buffer.until = place
@@ -102,8 +102,8 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
         lists: wp.array(dtype=wp.int32),
         view: View,
     ):
-        """Insert a fragment when none nearer than `nearest` can follow: composite the nearest entry, or if
-        that is too early drop the furthest.
+        """Insert a fragment if no later fragment is nearer than `nearest`: composite the nearest entry, or
+        drop the farthest entry if the nearest is behind `nearest`.
         """
         p = pixel
         if p.k_buffer.z[0] > nearest and z > nearest:
@@ -170,7 +170,7 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
         lists: wp.array(dtype=wp.int32),
         view: View,
     ):
-        """After the last splat of the list: composite all entries, and start the next pass."""
+        """Composite all entries after the last splat of the list, and start the next pass."""
         p = composite_until(pixel, float(wp.inf), lines, lists, view)
         p.k_buffer.after_z = p.k_buffer.until_z
         p.k_buffer.after = p.k_buffer.until

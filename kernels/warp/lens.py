@@ -19,24 +19,24 @@ COEFFICIENTS = {
     "camera_fisheye": wp.vec4d,  # k1 to k4
 }
 """distortion coefficients of the lenses that have a map; in uniforms they precede the limit of the field of
-view, the square of the fold's radius or the largest angle
+view, squared radius at which the distortion folds back, or maximum angle
 """
 LENSES = (*COEFFICIENTS, "camera_equirectangular")
 
 
 @cache
 def make_lens(camera: str | None):
-    """The struct Lens, the inputs of the projection; empty for cameras without a lens."""
+    """Struct Lens, the inputs of the projection; empty for cameras without a lens."""
     fields = {"rays": wp.array(dtype=wp.vec3)}
     if camera in COEFFICIENTS:
         fields |= {
             "k": COEFFICIENTS[camera],
             "limit": wp.float64,
-            # first and last column and row of the samples in each cell; then grids of half as many a side
+            # first and last column and row of the samples in each cell; then grids of half the resolution
             "cells": wp.array(dtype=wp.vec4s),
-            "side": wp.int32,  # cells
+            "side": wp.int32,  # cells per side
             "low": wp.vec2d,  # corner of the first cell
-            "per_unit": wp.vec2d,  # cells
+            "per_unit": wp.vec2d,  # cells per unit of the chart
             "top": wp.int32,  # row of the map's image that is the first row of this band
         }
     return struct_of("Lens", "Inputs of the projection by a lens.", fields if camera else {})
@@ -44,7 +44,7 @@ def make_lens(camera: str | None):
 
 @cache
 def make_optics(camera: str, real) -> SimpleNamespace:
-    """Functions of a lens.
+    """Make functions of a lens.
 
     image(p, view, lens): image coordinates of a point, and whether it is in the field of view. anchor(x, y,
     imaged, p, view, lens): the ray to which a splat's forms are relative. Bounds in samples: mapped(x0, x1,
@@ -53,8 +53,7 @@ def make_optics(camera: str, real) -> SimpleNamespace:
     Lens = make_lens(camera)
     vec2, vec3 = wp.types.vector(2, real), wp.types.vector(3, real)
     zero, half, one, two, pi = real(0.0), real(0.5), real(1.0), real(2.0), real(math.pi)
-    # margins for the rounding of rays and of the per-sample test: relative; in radians or units of the chart;
-    # in cells
+    # margins for the rounding of rays and of the per-sample test: relative; radians or chart units; cells
     more, pad, margin = real(1.0002), real(1e-6), real(0.02)
 
     @wp.func
@@ -102,7 +101,7 @@ def make_optics(camera: str, real) -> SimpleNamespace:
                     samples = lens.cells[grid + j * side + i]
                     left, right = wp.min(left, int(samples[0])), wp.max(right, int(samples[1]))
                     top, bottom = wp.min(top, int(samples[2])), wp.max(bottom, int(samples[3]))
-        # without samples the box is inverted, which is empty
+        # without samples the box is inverted: empty
         return box_bounds(
             float(left) + 0.5, float(right) + 0.5, float(top - lens.top) + 0.5, float(bottom - lens.top) + 0.5
         )
@@ -160,8 +159,8 @@ def make_optics(camera: str, real) -> SimpleNamespace:
     def enclose_fisheye(a: vec3, b: vec3, p: vec3, radius: real, view: View, lens: Lens):
         """Bounds of a disk in a fisheye image, by the stereographic projection (X, Y) / (|r| + Z).
 
-        |r| is between the part of r along p and that part over the cosine of the cone's half angle. The
-        quotient is monotonic in |r|, so its extremes are at these two.
+        |r| is between the component of r along p and this component over the cosine of the cone's half angle.
+        The quotient is monotonic in |r|, so its extremes are at these two values.
         """
         away, w = wp.length(p), cone(a, b, p, radius)
         x0, x1, y0, y1 = real(wp.inf), -real(wp.inf), real(wp.inf), -real(wp.inf)
@@ -170,7 +169,7 @@ def make_optics(camera: str, real) -> SimpleNamespace:
             below = vec3(
                 a[2] + per_away * wp.dot(a, p), b[2] + per_away * wp.dot(b, p), p[2] + per_away * away * away
             )
-            # else the disk may contain the direction -z, which is at infinity
+            # otherwise the disk may contain the direction -z, which is at infinity
             if (
                 w < real(1.5)
                 and below[2] - radius * wp.sqrt(below[0] * below[0] + below[1] * below[1]) > real(1e-3) * away
@@ -219,7 +218,7 @@ def make_optics(camera: str, real) -> SimpleNamespace:
 
     @wp.func
     def anchor(column: int, row: int, imaged: bool, p: vec3, view: View, lens: Lens) -> wp.vec3:
-        """The ray of a sample; the direction of p if the centre is not imaged, or that sample has no ray."""
+        """Ray of a sample, or the direction of p if the centre is not imaged or the sample has no ray."""
         ray = lens.rays[row * view.width + column]
         if not (imaged and ray[0] == ray[0]):
             away = wp.length(p)

@@ -1,4 +1,4 @@
-"""The low-pass `pixel`: a splat convolved, in its own plane, with the footprint of a sample."""
+"""Low-pass filter `pixel`: convolution of a splat, in its plane, with the footprint of a sample."""
 
 from functools import cache
 
@@ -7,7 +7,7 @@ import warp as wp
 
 @cache
 def make_filter(real):
-    """widened(a, b, by_x, by_y, by_depth): low-pass filter of a Gaussian with scaled tangents a, b.
+    """Make widened(a, b, by_x, by_y, by_depth), the low-pass filter of a Gaussian with scaled tangents a, b.
 
     by_x, by_y, by_depth: gradients with respect to the point, at the centre, of the sample's column, of its
     row and of the logarithm of the depth (slopes.py).
@@ -25,7 +25,7 @@ def make_filter(real):
 
     @wp.func
     def widened(a: vec3, b: vec3, by_x: vec3, by_y: vec3, by_depth: vec3):
-        """L_uu, L_vu, L_vv and det C, which is not finite for an edge-on disk with parallel rays."""
+        """Returns L_uu, L_vu, L_vv and det C, which is not finite for an edge-on disk with parallel rays."""
         by_u = vec3(wp.dot(by_x, a), wp.dot(by_y, a), whole_depth * wp.dot(by_depth, a))
         by_v = vec3(wp.dot(by_x, b), wp.dot(by_y, b), whole_depth * wp.dot(by_depth, b))
         minors = wp.cross(by_u, by_v)

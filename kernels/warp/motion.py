@@ -12,17 +12,18 @@ from .common import struct_of
 class Pose:
     """Camera pose relative to one group of splats."""
 
-    rotation: wp.mat33d  # to camera
+    rotation: wp.mat33d  # group to camera
     translation: wp.vec3d  # position of the cloud's origin in the camera frame [m]
-    eye: wp.vec3d  # the camera's centre relative to the cloud's origin, axes of the group [m]
+    eye: wp.vec3d  # camera centre relative to the cloud's origin, in the axes of the group [m]
 
 
 @cache
 def make_motion(moves: bool) -> SimpleNamespace:
-    """The struct Moving, empty without motion, and group_of(moving, i): the group of a splat, -1 for none."""
+    """Make the struct Moving, empty without motion, and group_of(moving, i): the group of a splat, -1 for
+    none."""
     fields = {
         "labels": wp.array(dtype=wp.int32),  # (n)
-        "groups": wp.array(dtype=wp.int32),  # (groups) their labels
+        "groups": wp.array(dtype=wp.int32),  # (groups) label of each group
         "poses": wp.array(dtype=Pose),  # (views groups)
     }
     Moving = struct_of("Moving", "Moving groups and their poses.", fields if moves else {})

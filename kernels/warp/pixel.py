@@ -1,8 +1,8 @@
 """State of a sample and compositing of its fragments. Front to back, C = sum_k c_k alpha_k prod_{j<k} (1 -
 alpha_j).
 
-Fragments may be buffered until no nearer one can follow (k_buffer.py); coplanar ones are one layer
-(coplanar.py). An external depth image is an opaque surface: fragments at its depth or behind are invisible,
+Fragments may be buffered until no later fragment is nearer (k_buffer.py); coplanar fragments are one layer
+(coplanar.py). An external depth image is an opaque surface: fragments at or behind its depth are discarded,
 and it is composited last. State of outputs is declared in their files (output/).
 """
 
@@ -68,7 +68,8 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
 
     @wp.func
     def pixel_at(x: int, y: int, number: int, view: View) -> int:
-        """Number of the pixel that a sample of view `number` belongs to, view after view, row by row."""
+        """Index of the pixel of a sample of view `number`; pixels are numbered view after view, row by
+        row."""
         row = number * (view.height / view.samples) + y / view.samples
         return row * (view.width / view.samples) + x / view.samples
 
@@ -121,12 +122,12 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
 
     @wp.func
     def composite(pixel: Pixel, attributes: Attributes, opacity: float, view: View):
-        """Composite attributes in front of all that follows, if light is left."""
+        """Composite a fragment or layer in front of all later fragments, unless the pixel is terminated."""
         p = pixel
         if not (p.t > view.stop):
             return p
         if wp.static(exclusive):
-            # parity with gsplat and the 2DGS authors: the fragment that would end the pixel is dropped
+            # parity with gsplat and the 2DGS authors: the fragment that would terminate the pixel is dropped
             if p.t * (1.0 - opacity) <= view.stop:
                 p.finished = 1
                 return p
@@ -184,7 +185,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         if wp.static(layered):
             if p.layers.exist != 0:
                 if not (opacity > 0.0):
-                    return p  # of no optical depth: its mean would be 0 / 0
+                    return p  # without optical depth the mean of a layer would be 0 / 0
                 p.layers = select(p.layers, group)
                 if group >= 0:
                     attributes = attributes_at(color, z, lines, index)
@@ -203,7 +204,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
 
     @wp.func
     def end(pixel: Pixel, lines: wp.array(dtype=wp.vec4), lists: wp.array(dtype=wp.int32), view: View):
-        """After the last splat of the list: composite what is left of this pass, and start the next one."""
+        """Composite the rest of this pass after the last splat of the list, and start the next pass."""
         p = pixel
         dropped = bool(False)
         if wp.static(k_buffered):
@@ -222,7 +223,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
 
     @wp.func
     def cover(pixel: Pixel, x: int, y: int, number: int, rays: Rays, view: View):
-        """Composite the external opaque surface, with all transmittance that is left, even below the stop."""
+        """Composite the external opaque surface with the remaining transmittance, also below the stop."""
         p = pixel
         if p.opaque_z < wp.inf:
             attributes = Attributes()
@@ -260,7 +261,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
 
 
 def make_reader(layout: Layout, names: tuple[str, ...]):
-    """The function (lines, at) that reads these numbers of the record at line `at` as a vector."""
+    """Make the function (lines, at) that reads these numbers of the record at line `at` as a vector."""
     places = [layout.place(name) for name in names]
     vector = wp.types.vector(max(len(names), 1), wp.float32)
 

@@ -1,4 +1,4 @@
-"""The samples of a pixel, and their indices in sample buffers."""
+"""Samples of a pixel, and their indices in sample buffers."""
 
 import warp as wp
 
@@ -7,12 +7,12 @@ import warp as wp
 class PixelGrid:
     """The samples of one pixel."""
 
-    pixel: int  # of the images, view after view, row by row
-    here: int  # of the rendered views, view after view
-    row: int  # of all views, one after the other
-    splats: int  # of the cloud
-    first: int  # place of the first sample in a buffer
-    stride: int  # samples of a row of a buffer, its padding included
+    pixel: int  # index in the images, view after view, row by row
+    here: int  # index in the rendered views, view after view
+    row: int  # row of pixels, numbered over all views
+    splats: int  # number of splats of the cloud
+    first: int  # index of the first sample in a buffer
+    stride: int  # samples per row of a buffer, padding included
     side: int  # samples along a side
     count: int  # side^2
     mean: float  # 1 / count

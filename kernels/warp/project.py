@@ -20,14 +20,14 @@ from .records import Layout
 from .slopes import make_slopes
 from .splat_pose import make_splat_pose
 
-# [m]; invisible, and quotients stay above float32's denormals
+# [m]; invisible, and large enough that quotients are not float32 denormals
 SMALLEST_SCALE = wp.constant(wp.float32(1e-20))
 BLOCK = 128
 """threads of a block on a GPU"""
 LIMITS = (BLOCK, 5)  # threads per block, blocks at once: limits the kernel to 96 registers instead of 116
 GROUP_KEYS = wp.constant(wp.uint32(0x00800000))
-"""key of the first coplanar group; keys of groups are below those of all depths, so groups are first in
-lists"""
+"""sort key of the first coplanar group; keys of groups are below all keys of depths, so that groups are first
+in lists"""
 NONE, BITS = wp.constant(wp.uint32(0)), wp.constant(wp.uint64(32))
 
 
@@ -38,9 +38,8 @@ def make_project(
     """Make the projection kernel for the effects and outputs that affect the records of projected splats.
 
     Args:
-        sh_terms: SH coefficients per colour channel, 0 for plain colours.
-        every_bounds: write the tile bounds of all visible splats; otherwise only of those that touch more
-            tiles than the bit mask `windows` can hold.
+        sh_terms: SH coefficients per colour channel, 0 for plain colours. every_bounds: write the bounds of
+        all visible splats; otherwise only of splats whose tiles exceed the bit mask `windows`.
     """
     layout = Layout(effects, outputs)
     lines_each = layout.lines
@@ -67,9 +66,9 @@ def make_project(
     Moving = splat_pose.Moving
     camera = next((name for name in effects if name in LENSES), None)
     parallel = "camera_orthographic" in effects
-    ray_depths = camera in ("camera_fisheye", "camera_equirectangular")  # distances, not along z
+    ray_depths = camera in ("camera_fisheye", "camera_equirectangular")  # depths are distances
     mapped, bent = camera == "camera_brown_conrady", camera is not None
-    edged = boxes_too and not bent  # straight, as records have them
+    edged = boxes_too and not bent  # straight edges, which records contain
     optics = make_optics(camera, real) if camera else None
     Lens, forms = make_lens(camera), make_forms(effects, outputs, real)
     slopes_at = make_slopes("camera_orthographic" if parallel else camera, real)
@@ -79,7 +78,7 @@ def make_project(
     def bounds_of(
         a: vec3, b: vec3, p: vec3, radius: real, reach: real, x: real, y: real, view: View, lens: Lens
     ):
-        """Image bounds of a disk by any camera; x, y: projected centre for parallel rays."""
+        """Image bounds of a disk for any camera; x, y: projected centre for parallel rays."""
         if wp.static(parallel):
             return disk.parallel(a, b, x, y, radius, view)
         elif wp.static(ray_depths):
@@ -89,7 +88,7 @@ def make_project(
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=LIMITS)
     def project(
-        first: int,  # of thread 0, of the splats of the first view, then the next
+        first: int,  # splat of thread 0; splats are numbered view after view
         views: wp.array(dtype=View),
         moving: Moving,
         lens: Lens,
@@ -98,23 +97,23 @@ def make_project(
         scales: wp.array(dtype=wp.vec2),  # (n) [m]
         opacities: wp.array(dtype=wp.float32),  # (n)
         colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_terms)
-        coplanar_groups: wp.array(dtype=wp.int32),  # (n) index of the splat's plane; -1: none
-        boxes: wp.array(dtype=wp.int32),  # (n) 1: a box, of a cloud that has boxes and others
-        thickness: wp.array(dtype=wp.float32),  # (n) [m], of a cloud that has 3D Gaussians; 0: a disk
-        lines: wp.array(dtype=wp.vec4),  # (views n lines_each) out: records of splats that are visible
-        bounds: wp.array(dtype=Bounds),  # (views n) out: as `every_bounds` says
+        coplanar_groups: wp.array(dtype=wp.int32),  # (n) index of the splat's coplanar group; -1: none
+        boxes: wp.array(dtype=wp.int32),  # (n) 1: a box; for clouds with boxes and other splats
+        thickness: wp.array(dtype=wp.float32),  # (n) [m], for clouds with 3D Gaussians; 0: a disk
+        lines: wp.array(dtype=wp.vec4),  # (views n lines_each) out: records of visible splats
+        bounds: wp.array(dtype=Bounds),  # (views n) out: see `every_bounds`
         windows: wp.array(
             dtype=wp.uint64
-        ),  # (views n) out: bits of the tiles, below the window's first tile; 0: more
+        ),  # (views n) out: window's first tile, then bits of the tiles; 0: more tiles than a window
         keys: wp.array(dtype=wp.uint32),  # (views n) out: depth key, or CULLED
-        counts: wp.array(dtype=wp.int64),  # (views n) out: tiles that the splat can touch
+        counts: wp.array(dtype=wp.int64),  # (views n) out: number of tiles that the splat may overlap
         visible: wp.array(dtype=wp.int32),  # (views n) out: 1 or 0
     ):
         at = wp.tid() + first
         number = at / views[0].splats
         view = views[reread(number)]
         i = at - number * view.splats
-        # loaded together, before the first store, which the compiler assumes to alias them
+        # loaded before the first store, as the compiler assumes that a store may alias the arrays
         opacity, size = float(opacities[i]), wp.vec2(scales[i])
         quat, center = wp.vec4(quats[i]), wp.vec3(means[i])
         keys[at] = CULLED
@@ -138,7 +137,7 @@ def make_project(
         mean = vec3(real(center[0]), real(center[1]), real(center[2]))
         p = rotation * mean + translation
         facet = wp.cross(tangent_u, tangent_v)
-        offset = wp.dot(facet, p)  # of the plane from the camera's centre
+        offset = wp.dot(facet, p)  # signed distance of the plane from the camera's centre
         if wp.static(parallel):
             offset = facet[2]
         a, b = tangent_u * su, tangent_v * sv
@@ -147,14 +146,14 @@ def make_project(
             depth = wp.length(p)
 
         near = real(view.near)
-        itself = bool(False)  # whether it is filtered by its own footprint
+        itself = bool(False)  # whether the splat is filtered by its own footprint
         boxed = bool(wp.static(all_boxes))
         if wp.static(mixed):
             boxed = boxes[i] != 0
         if wp.static(boxes_too):
             itself = boxed
-        third = vec3()  # half axis of an ellipsoid that is conjugate to a and b
-        outward = vec3()  # its normal, if its disk has another
+        third = vec3()  # semi-axis of an ellipsoid conjugate to a and b
+        outward = vec3()  # normal of the ellipsoid's surface, if it differs from the disk's normal
         inverse_m2 = zero
         thick = bool(False)
         if wp.static(thick_too):
@@ -179,7 +178,7 @@ def make_project(
                     log_opacity -= float(half * ln(wide[3]))
                     half_r2 = log_opacity - view.log_cut
                     if not (half_r2 > 0.0):
-                        return  # to parallel rays edge-on too: infinitely thin, infinitely faint
+                        return  # also edge-on for parallel rays: infinitely thin and faint
                     a = wide[0] * a + wide[1] * b
                     b = wide[2] * b
                     su *= wide[0]
@@ -194,7 +193,7 @@ def make_project(
             if wp.static(boxes_too):
                 if boxed:
                     reach = su + sv
-        rim, rim_reach = radius, reach  # of the disk whose picture bounds what is visible
+        rim, rim_reach = radius, reach  # disk whose image bounds the visible fragments
         if wp.static(exact):
             if thick:
                 rim = ellipsoid.rim(radius, inverse_m2)
@@ -203,9 +202,9 @@ def make_project(
         if not (depth + reach >= near and depth - reach <= real(view.far)):
             return
 
-        # where it can be bounds_of
+        # image bounds
         fx, fy, cx, cy = real(view.focal_x), real(view.focal_y), real(view.center_x), real(view.center_y)
-        in_front = depth >= near  # or, of a lens, whether it is known where the centre falls
+        in_front = depth >= near  # for a lens, whether the centre has an image
         center_x, center_y = zero, zero
         if wp.static(parallel):
             center_x, center_y = fx * p[0] + cx, fy * p[1] + cy
@@ -269,7 +268,7 @@ def make_project(
         if tiles == 0:
             return
 
-        # loaded again, here and above, so that no registers hold them meanwhile
+        # loaded again, here and above, to save registers
         view = views[reread(number)]
         record, met = forms(
             a, b, facet, offset, p, su, sv, center_x, center_y,
@@ -297,7 +296,7 @@ def make_project(
             record[at_depth + 2] = float(depth_reach)
         key = float(depth)
         if wp.static(k_buffered):
-            key = float(middle) - float(depth_reach)  # as blending bounds depths
+            key = float(middle) - float(depth_reach)  # lower bound of the depths, as in blending
             record[at_nearest] = key
         if wp.static(surfaced):
             if thick:

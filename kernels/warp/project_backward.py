@@ -1,9 +1,10 @@
-"""Backward pass of the projection: from derivatives with respect to a splat's record, which its tiles have
-stored, to those with respect to mean, rotation, scales, opacity, colour and camera. Decisions are constant.
+"""Backward pass of the projection: from derivatives with respect to a splat's record, stored per tile, to
+derivatives with respect to mean, rotation, scales, opacity, colour and camera. Thresholds and order are held
+constant.
 
-With a = s_u t_u and b = s_v t_v, a ray r meets the splat where n_u = (b x p) r, n_v = (p x a) r, D = (a x b)
-r, up to a common factor, which has no effect. The moment over the rays g = sum dL/dn_u r gives the
-derivatives p x g with respect to b and g x b with respect to p, and so on.
+With a = s_u t_u and b = s_v t_v, a ray r has the forms n_u = (b x p) r, n_v = (p x a) r, D = (a x b) r, up to
+a common factor without effect. From the moment g = sum dL/dn_u r over rays follow the derivatives p x g with
+respect to b and g x b with respect to p; likewise for n_v and D.
 """
 
 import math
@@ -27,7 +28,7 @@ _SQRT_HALF = wp.constant(wp.float64(math.sqrt(0.5)))
 
 @wp.func
 def basis_slope(k: int, d: wp.vec3) -> wp.vec3:
-    """Gradient of `basis_value` by the direction."""
+    """Gradient of `basis_value` with respect to the direction."""
     x, y, z = d[0], d[1], d[2]
     if k == 1:
         return wp.vec3(0.0, -0.48860251190291992, 0.0)
@@ -69,8 +70,8 @@ def basis_slope(k: int, d: wp.vec3) -> wp.vec3:
 def make_project_backward(
     effects: tuple[str, ...], outputs: tuple[str, ...], names: tuple[str, ...], sh_terms: int
 ):
-    """Make the kernel. effects, outputs: those of the record; names: of its moments; sh_terms: coefficients
-    per colour, 0 for plain colours."""
+    """Make the kernel of the backward pass of the projection. effects, outputs: of the record. names: names
+    of the moments. sh_terms: SH coefficients per colour, 0 for plain colours."""
     layout = Layout(effects, outputs)
     each, fields = layout.lines, len(names)
     at = {name: place for place, name in enumerate(names)}
@@ -90,21 +91,23 @@ def make_project_backward(
         means: wp.array(dtype=wp.vec3),
         quats: wp.array(dtype=wp.vec4),
         scales: wp.array(dtype=wp.vec2),
-        thickness: wp.array(dtype=wp.float32),  # of a cloud that has 3D Gaussians; 0: a disk
+        thickness: wp.array(dtype=wp.float32),  # for clouds with 3D Gaussians; 0: a disk
         opacities: wp.array(dtype=wp.float32),
         colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_terms)
         lines: wp.array(dtype=wp.vec4),
         keys: wp.array(dtype=wp.uint32),
         counts: wp.array(dtype=wp.int64),
         ends_by_index: wp.array(dtype=wp.int64),
-        moments: wp.array(dtype=Moments),  # by slots
-        by_means: wp.array(dtype=wp.vec3),  # out, as all below; 0 of splats that are not drawn
+        moments: wp.array(dtype=Moments),  # by slot
+        by_means: wp.array(dtype=wp.vec3),  # out, as all arrays below; 0 for culled splats
         by_quats: wp.array(dtype=wp.vec4),
         by_scales: wp.array(dtype=wp.vec2),
-        by_thickness: wp.array(dtype=wp.float32),  # of a cloud that has 3D Gaussians
+        by_thickness: wp.array(dtype=wp.float32),  # for clouds with 3D Gaussians
         by_opacities: wp.array(dtype=wp.float32),
         by_colors: wp.array(dtype=wp.vec3),
-        screen: wp.array(dtype=wp.float32),  # norm of that by the projected centre, in half images
+        screen: wp.array(
+            dtype=wp.float32
+        ),  # norm of the gradient with respect to the projected centre, in half images
         by_cameras: wp.array(dtype=TEN),
     ):
         view = views[0]
@@ -130,13 +133,13 @@ def make_project_backward(
         # colour
         mean = wp.vec3d(wp.float64(means[i][0]), wp.float64(means[i][1]), wp.float64(means[i][2]))
         by_rgb = wp.vec3(float(total[10]), float(total[11]), float(total[12]))
-        by_ray = wp.vec3d()  # by the way from the eye to the centre, in the world's axes
+        by_ray = wp.vec3d()  # with respect to the vector from the eye to the centre, in world axes
         if wp.static(sh_terms == 0):
             by_colors[i] = by_rgb
         else:
-            drawn = line_of(lines, i * each + 3)  # ay, r, g, b: what is clamped at 0 has no derivative
+            clamped = line_of(lines, i * each + 3)  # ay, r, g, b; colours clamped at 0 have no derivative
             for channel in range(3):
-                if not (drawn[channel + 1] > 0.0):
+                if not (clamped[channel + 1] > 0.0):
                     by_rgb[channel] = 0.0
             away = mean - view.eye
             length = wp.length(away)
@@ -192,7 +195,7 @@ def make_project_backward(
         g_v = n_scale * (total[3] * ray + wp.vec3d(total[4] * per_x, total[5] * per_y, _ZERO))
         g_d = scale * (total[6] * ray + wp.vec3d(total[7] * per_x, total[8] * per_y, _ZERO))
         if wp.static(has_depth):
-            # by z_numerator - z_center D, with z_numerator = (a x b) p: small differences of large numbers
+            # by z_numerator - z_center D, z_numerator = (a x b) p: small differences of large numbers
             volume = scale * total[z_numerator]
             along = wp.vec3d(total[z_numerator + 1] * per_x, total[z_numerator + 2] * per_y, _ZERO)
             center = wp.float64(line_of(lines, i * each + zc_line)[zc_lane])
@@ -206,11 +209,11 @@ def make_project_backward(
         if wp.static(screen_filter):
             by_x, by_y = total[disc_x] * view.focal_x / p[2], total[disc_x + 1] * view.focal_y / p[2]
             by_p += wp.vec3d(by_x, by_y, -(by_x * p[0] + by_y * p[1]) / p[2])
-        # by the entries of the homography that place the centre, in half images
+        # with respect to the projected centre, in half images
         across = wp.float64(view.width) * by_p[0] * per_x
         down = wp.float64(view.height) * by_p[1] * per_y
         screen[i] = float(_HALF * p[2] * wp.sqrt(across * across + down * down))
-        # frames depend on fx x + cx z and fy y + cy z of a, b and p
+        # images depend on fx x + cx z and fy y + cy z of a, b and p
         by_fx = per_x * (by_a[0] * a[0] + by_b[0] * b[0] + by_p[0] * p[0])
         by_fy = per_y * (by_a[1] * a[1] + by_b[1] * b[1] + by_p[1] * p[1])
         by_cx = per_x * (by_a[0] * a[2] + by_b[0] * b[2] + by_p[0] * p[2])

@@ -1,4 +1,4 @@
-"""Rays of samples, from the view or from the buffer of a lens, and the external depth image."""
+"""Rays of samples, computed from the view or read from the buffer of a lens, and the external depth image."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -13,14 +13,14 @@ SLOPES = wp.types.matrix((2, 3), wp.float32)
 
 @cache
 def struct_of_rays(bent: bool, sloped: bool = False, opaque: bool = False):
-    """The struct Rays: empty if all rays follow from the view; with the derivatives of rays if `sloped`; with
-    an external depth image if `opaque`.
+    """Make the struct Rays: with the rays of a lens if `bent`, their derivatives if `sloped`, and an external
+    depth image if `opaque`.
     """
     fields = {}
-    if bent:  # X, Y, Z along the rows of samples; NaN outside of the field of view
+    if bent:  # X, Y, Z of each sample, row by row; NaN outside of the field of view
         fields |= {"rays": wp.array(dtype=wp.vec3)}
         fields |= {"slopes": wp.array(dtype=SLOPES)} if sloped else {}
-    if opaque:  # of each pixel, row by row, of all views or of each; a depth is infinite where there is none
+    if opaque:  # of each pixel, one image or one per view; depth is infinite without a surface
         fields |= {"external_depth": wp.array(dtype=wp.float32), "external_rgb": wp.array(dtype=wp.vec3)}
     return struct_of("Rays", "The samples' rays, and an external depth image.", fields)
 
@@ -29,13 +29,13 @@ def struct_of_rays(bent: bool, sloped: bool = False, opaque: bool = False):
 def make_rays(
     bent: bool, stretched: bool = False, sloped: bool = False, opaque: bool = False
 ) -> SimpleNamespace:
-    """Rays of samples: the struct Rays and its functions.
+    """Make the struct Rays of samples and its functions.
 
     ray_of(column, row, rays, view): the ray, NaN outside of the field of view. length_of(column, row, rays,
     view): the factor from depths to distances, 1 outside of the field of view.
 
-    bent: rays are read from the buffer of a lens. stretched: so are their lengths; else they follow from the
-    view. sloped: Rays has the derivatives of the rays. opaque: Rays has an external depth image.
+    bent: read rays from the buffer of a lens. stretched: read their lengths too; otherwise compute them from
+    the view. sloped, opaque: see `struct_of_rays`.
     """
     Rays = struct_of_rays(bent, sloped, opaque)
 
@@ -61,7 +61,7 @@ def make_rays(
     def length_of(column: int, row: int, rays: Rays, view: View) -> float:
         if wp.static(stretched):
             length = float(1.0)
-            # a tile can extend beyond the image
+            # tiles extend beyond the image
             if column < view.width and row < view.height:
                 own = per_depth(ray_of(column, row, rays, view))
                 if own == own:

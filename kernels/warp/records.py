@@ -27,19 +27,19 @@ _EXTRA = {
 
 
 class Layout:
-    """A record as lines of four floats: `lines` of them, and the place of each number.
+    """Layout of a record: number of lines of four floats, and position of each number.
 
-    nu0 + nux x + nuy y is n_u, likewise n_v and D, with x, y in samples from the centre of the anchor sample
-    (ax, ay); D is at most d_near beyond the near plane. disc_x, disc_y: projected centre from the anchor's;
-    z_numerator / D is the depth. columns and rows hold first and end, 16 bits each, of the box of samples
-    that it can touch. Behind a lens x, y, z are a sample's ray from the anchor's (ray_x, ray_y, ray_z), and
-    boxed is 1 of a box, 0 of another splat. For parallel rays plane_z0 + plane_zx x + plane_zy y is D times
-    the depth, with a minimum of plane_near. bulge is 2 / m^2 of a 3D Gaussian (ellipsoids.py), 0 of another
-    splat. The fields of outputs follow.
+    nu0 + nux x + nuy y is n_u, likewise n_v and D, with x, y in samples relative to the centre of the anchor
+    sample (ax, ay); D is at most d_near beyond the near plane. disc_x, disc_y: projected centre relative to
+    the anchor; z_numerator / D is the depth. columns and rows: [first, end) of the box of samples that the
+    splat may overlap, 16 bits each. Behind a lens x, y, z are a sample's ray minus the anchor's ray (ray_x,
+    ray_y, ray_z), and boxed is 1 for a box, else 0. For parallel rays plane_z0 + plane_zx x + plane_zy y is D
+    times the depth, with a minimum of plane_near. bulge: 2 / m^2 of a 3D Gaussian (ellipsoids.py), else 0.
+    Fields of outputs follow.
     """
 
     def __init__(self, effects: Iterable[str], outputs: Iterable[str] = ()) -> None:
-        # before the rest, so that they begin a line
+        # first, so that these fields start at a line
         whole = [name for effect in effects for name in _WHOLE.get(effect, ())]
         extra = [name for effect in effects for name in _EXTRA.get(effect, ())]
         if "rays" not in effects:
@@ -51,9 +51,9 @@ class Layout:
         self.lines = -(-len(self.names) // 4)
 
     def place(self, name: str) -> tuple[int, int]:
-        """Line and lane of a number; (0, 0) for one that this record has not, which no kernel then reads."""
+        """Line and lane of a number; (0, 0) for a number that the record lacks, which no kernel reads."""
         return divmod(self.word(name), 4)
 
     def word(self, name: str) -> int:
-        """Its place among all numbers; 0 for one that this record has not."""
+        """Index of a number in the record; 0 for a number that the record lacks."""
         return self.names.index(name) if name in self.names else 0

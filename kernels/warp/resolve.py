@@ -1,4 +1,4 @@
-"""Resolve stage: pixels from their samples: rgb over the background, and the images of outputs (output/)."""
+"""Resolve stage: pixels from their samples, for rgb over the background and for outputs (output/)."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ from .rays import make_rays
 def make_resolve(
     images: tuple[tuple[str, type], ...], outputs: tuple[str, ...], stretched: bool, samples: int
 ):
-    """Make the kernel for these output images and outputs, with samples x samples per pixel. stretched:
+    """Make the resolve kernel for output images and outputs, with samples x samples per pixel. stretched:
     whether ray lengths are read from the buffer of a lens.
     """
     Samples, Images = make_samples(tuple(sample_fields(outputs).items())), make_images(images, outputs)
@@ -36,9 +36,9 @@ def make_resolve(
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def resolve(
-        first_pixel: int,  # of thread 0, of those of the pictures, view after view, row by row
+        first_pixel: int,  # pixel of thread 0; pixels are numbered view after view, row by row
         views: wp.array(dtype=View),
-        batch_indices: wp.array(dtype=wp.int32),  # (views) place of each view's images among all
+        batch_indices: wp.array(dtype=wp.int32),  # (views) index of each view in the images
         background: wp.vec3,
         rays: Rays,
         samples: Samples,

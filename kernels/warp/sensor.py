@@ -1,4 +1,4 @@
-"""Sensor model: a kernel that applies the post-processing steps of post/ to each pixel, in order."""
+"""Sensor model: kernel of the post-processing steps of post/ for each pixel."""
 
 from functools import cache
 
@@ -19,11 +19,11 @@ def make_sensor(steps: tuple[str, ...]):
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def sensor(
-        first: int,  # pixel of thread 0, of the pictures, view after view
+        first: int,  # pixel of thread 0; pixels are numbered view after view
         settings: Settings,
-        width: int,  # of a picture
-        pixels: int,  # of a picture
-        batch_indices: wp.array(dtype=wp.int32),  # (views) place of each view's images among all
+        width: int,  # columns of an image
+        pixels: int,  # number of pixels of an image
+        batch_indices: wp.array(dtype=wp.int32),  # (views) index of each view in the images
         rgb: wp.array(dtype=wp.float32),  # (images h w 3) in and out
     ):
         place = wp.tid() + first

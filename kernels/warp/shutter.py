@@ -1,4 +1,4 @@
-"""Accumulation of sub-frames: the samples of all poses of a shutter are added up in the frame's buffers."""
+"""Accumulation of sub-frames: adds the samples of all poses of a shutter to the frame's buffers."""
 
 from functools import cache
 
@@ -9,14 +9,14 @@ from .common import STRICT
 
 @cache
 def make_expose(dtype):
-    """Make the kernel that adds a sub-frame's weighted sample buffer to that of the frame."""
+    """Make the kernel that adds a sub-frame's weighted sample buffer to the frame's buffer."""
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def expose(
         first: int,  # sample of thread 0
         weight: float,
         fresh: int,  # 1: overwrite the buffer, for the first sub-frame
-        start: int,  # sample of the frame that is the first of these rows
+        start: int,  # the frame's first sample in these rows
         raw: wp.array(dtype=dtype),
         exposed: wp.array(dtype=dtype),  # in and out
     ):

@@ -10,14 +10,14 @@ from .lens import LENSES, make_lens
 
 @cache
 def make_slopes(camera: str | None, real):
-    """slopes(p, view, lens): gradients by the point of its column and row [samples per metre]
-    and of the logarithm of the depth [1/m] (0 for parallel rays, which do not use it), and whether the point
-    is in the field of view. camera: a lens; None for a pinhole.
+    """Make slopes(p, view, lens): gradients, with respect to the point p, of its column and row [samples per
+    metre] and of the logarithm of its depth [1/m] (0 for parallel rays), and whether p is in the field of
+    view. camera: a lens; None for a pinhole.
     """
     Lens = make_lens(camera if camera in LENSES else None)
     vec3 = wp.types.vector(3, real)
     zero, one, two, three = (real(float(k)) for k in range(4))
-    polar = real(1e-6)  # a point nearer to a panorama's axis, relative to its distance, is at a pole
+    polar = real(1e-6)  # relative distance from a panorama's axis below which a point is at a pole
 
     @wp.func
     def slopes_pinhole(p: vec3, view: View, lens: Lens):
@@ -57,7 +57,7 @@ def make_slopes(camera: str | None, real):
 
     @wp.func
     def slopes_fisheye(p: vec3, view: View, lens: Lens):
-        """Away from the middle, by the angle from the axis, and around it."""
+        """Derivatives of a fisheye: radial, by the angle from the axis, and tangential."""
         across = wp.sqrt(p[0] * p[0] + p[1] * p[1])
         angle = wp.atan2(across, p[2])
         q = angle * angle
@@ -76,8 +76,8 @@ def make_slopes(camera: str | None, real):
 
     @wp.func
     def slopes_panorama(p: vec3, view: View, lens: Lens):
-        """Derivatives of a panorama. At a pole, where the longitude jumps, those of a point next to it
-        towards z."""
+        """Derivatives of a panorama. At a pole, where longitude is discontinuous, derivatives at a
+        neighbouring point towards z."""
         away2 = wp.dot(p, p)
         x, z = p[0], p[2]
         if x * x + z * z < polar * polar * away2:

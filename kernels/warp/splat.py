@@ -1,4 +1,4 @@
-"""The struct Splat: the parts of a splat's record that samples read, from global or shared memory."""
+"""Struct Splat: the fields of a splat's record that samples read, from global or shared memory."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -12,8 +12,8 @@ from .records import BOXES, Layout
 
 @cache
 def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
-    """Splat; reading(line), its readers from a function that loads the lines of records; read, of the splat
-    lists[k] in global memory.
+    """Make Splat; reading(line), which makes readers from a function that loads lines of records; and read,
+    for the splat lists[k] in global memory.
     """
     layout = Layout(effects, outputs)
     each = layout.lines
@@ -33,7 +33,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     splat |= {"plane": wp.vec4} if parallel else {}
     Splat = struct_of("Splat", "What of a record each sample needs.", splat)
     disc_line, disc_lane = layout.place("disc_x")
-    disc_y_lane = layout.place("disc_y")[1]  # of the same line
+    disc_y_lane = layout.place("disc_y")[1]  # on the same line
     edge_line = layout.place("edge_u0")[0]
     boxed_line, boxed_lane = layout.place("boxed")
     bulge_line, bulge_lane = layout.place("bulge")
@@ -41,7 +41,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     ray_line, plane_line = layout.place("nuz")[0], layout.place("plane_z0")[0]
 
     def reading(line) -> SimpleNamespace:
-        """load, of the splat lists[first + which], and box_of, the samples that it can touch."""
+        """Make load, for the splat lists[first + which], and box_of, for its box of samples."""
 
         @wp.func
         def load(
@@ -84,7 +84,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
             first: int,
             which: int,
         ) -> wp.vec4i:
-            """First and end of columns, then of rows."""
+            """Box of samples: columns [first, end), then rows [first, end)."""
             box = line(pool, lines, lists, first, which, box_line)
             left, right = of_bits(box[box_lane])
             top, bottom = of_bits(box[box_lane + 1])

@@ -13,7 +13,7 @@ from .records import BOXES
 
 @cache
 def make_splat_pose(effects: tuple[str, ...], real) -> SimpleNamespace:
-    """pose, tangents, depth_range, and the struct Moving of moving groups."""
+    """Make pose, tangents, depth_range, and the struct Moving of moving groups."""
     moves, k_buffered, layers = (
         name in effects for name in ("motion_groups", "compose_pixel", "compose_coplanar")
     )
@@ -27,8 +27,8 @@ def make_splat_pose(effects: tuple[str, ...], real) -> SimpleNamespace:
 
     @wp.func
     def pose(i: int, number: int, view: View, moving: Moving):
-        """Rotation and translation to the camera, and the camera's centre relative to the cloud's origin, in
-        the view of this number.
+        """Rotation and translation of splat i to the camera, and the camera's centre relative to the cloud's
+        origin, in view `number`.
         """
         rotation, translation, eye = mat33(view.rotation), vec3(view.translation), vec3(view.eye)
         if wp.static(moves):
@@ -40,7 +40,7 @@ def make_splat_pose(effects: tuple[str, ...], real) -> SimpleNamespace:
 
     @wp.func
     def tangents(rotation: mat33, q: wp.vec4):
-        """The first two columns of the rotation of a quaternion of any length, turned."""
+        """First two columns of the rotation of a quaternion of any length, multiplied by `rotation`."""
         w, x, y, z = real(q[0]), real(q[1]), real(q[2]), real(q[3])
         s = two / (w * w + x * x + y * y + z * z)
         tangent_u = rotation * vec3(one - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y))
@@ -49,29 +49,29 @@ def make_splat_pose(effects: tuple[str, ...], real) -> SimpleNamespace:
 
     @wp.func
     def depth_range(depth: real, reach: real, radius: real, near: real, plane: int, boxed: bool):
-        """Middle and half of the depth range of a splat's fragments. reach: half range of the rendered part;
-        plane: coplanar group, -1 for none."""
+        """Middle and half of the depth range of a splat's fragments. reach: half of the range within the
+        cut-off. plane: coplanar group, -1 for none."""
         middle, found = depth, reach
         if wp.static(screen):
             # the low-pass disc, which does not depend on the cut-off
             if not boxed:
                 found = reach * wp.max(one, range_radius / radius)
         if wp.static(k_buffered):
-            # fragments below 1/255 of the splat's opacity are clamped to the range of the others, so that the
-            # order does not depend on the cut-off
+            # depths of fragments below 1/255 of the splat's opacity are clamped, so that the order does not
+            # depend on the cut-off
             found = reach * (range_radius / radius)
             if wp.static(boxes_too):
                 if boxed:
                     found = reach
         if wp.static(layers):
-            # the plane out to a radius beyond every cut-off and low-pass
+            # the plane within a radius larger than every cut-off and low-pass
             if plane >= 0:
                 found = reach * (plane_radius / radius)
                 if wp.static(boxes_too):
                     if boxed:
                         found = reach * plane_radius
         if depth < near:
-            # fragments lie beyond `near`
+            # fragments are beyond `near`
             furthest = wp.max(near, depth + found)
             middle, found = half * (furthest + near), half * (furthest - near)
         return middle, found

@@ -1,8 +1,9 @@
-"""A batch of splats in a GPU block's shared memory: their records, and for each cell of the tile the list of
-those that can touch it (selected by cells.py).
+"""Batch of splats in a GPU block's shared memory: records, and for each cell of the tile a list of the splats
+that may overlap it (cells.py).
 
-Warp's own tiles have no 16-byte reads, shuffles or bytes in shared memory, so these few functions are CUDA.
-On the CPU, where a block is one thread, they read the records where they lie, and a cell's list is the batch.
+Warp's tiles have no 16-byte reads, shuffles or bytes in shared memory, so that these functions are in CUDA.
+On the CPU a block is one thread: records are read from global memory, and the list of a cell is the complete
+batch.
 """
 
 import re
@@ -114,7 +115,7 @@ _ALONE = """
 
 
 def with_numbers(text: str, numbers: dict[str, int]) -> str:
-    """The text with these names as their numbers."""
+    """Replace names by numbers in a text."""
     return re.sub("|".join(numbers), lambda name: str(numbers[name[0]]), text)
 
 
@@ -125,12 +126,12 @@ def alone() -> bool:
 
 
 def make_staging(layout: Layout, cells: int, items: int) -> SimpleNamespace:
-    """Functions that stage batches of records in shared memory: pool; for each batch stage, mark and listed;
-    place and line.
+    """Make functions that stage batches of records in shared memory: pool; stage, mark and listed, called for
+    each batch; place and line.
 
-    layout: of the records. cells: per tile. items: threads of a warp per cell.
+    layout: layout of the records. cells: cells per tile. items: threads of a warp per cell.
     """
-    # words of a list are in different banks
+    # padded, so that words of a list are in different banks
     numbers = {"SPLATS": STAGED, "LINES": layout.lines, "CELLS": cells, "ITEMS": items, "STRIDE": STAGED + 4}
 
     @wp.func_native(with_numbers(_POOL, numbers))
@@ -154,19 +155,19 @@ def make_staging(layout: Layout, cells: int, items: int) -> SimpleNamespace:
 
     @wp.func_native(with_numbers(_MARK, numbers))
     def mark(pool: wp.uint64, word: int, group: int, cells: wp.uint32):
-        """Bit mask of the cells 32 group to 32 group + 31 that a staged splat can touch, for splats 32 word
-        to 32 word + 31, one per thread of a warp.
+        """Store the cells 32 group to 32 group + 31 that a staged splat may overlap, as bits, for splats 32
+        word to 32 word + 31, one per thread of a warp.
         """
         ...
 
     @wp.func_native(with_numbers(_LISTED, numbers))
     def listed(pool: wp.uint64, length: int, cell: int) -> int:
-        """Number of splats of the batch that can touch the thread's cell; call it after `mark`."""
+        """Number of splats of the batch that may overlap the thread's cell; call it after `mark`."""
         ...
 
     @wp.func_native(with_numbers(_PLACE, numbers))
     def place(pool: wp.uint64, cell: int, k: int) -> int:
-        """Which of the staged splats is the k-th of them."""
+        """Index in the batch of the k-th splat in the list of a cell."""
         ...
 
     @wp.func_native(with_numbers(_LINE, numbers))

@@ -8,11 +8,11 @@ from .common import STRICT
 @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
 def unpack_surfaces(
     packed: wp.array2d(dtype=wp.uint32),  # (views, pixels) 8 bits per colour
-    depths: wp.array2d(dtype=wp.float32),  # along z
+    depths: wp.array2d(dtype=wp.float32),  # [m] along z
     ids: wp.array2d(dtype=wp.int32),  # negative where there is no surface
-    red: wp.uint32,  # shift of red; green is at 8
-    label: int,  # of id 0, from where labels go down
-    offset: float,  # metres away from the camera
+    red: wp.uint32,  # bit of red: 0 or 16; green is at bit 8
+    label: int,  # label of id 0; id i has label - i
+    offset: float,  # [m] added to depths
     rgb: wp.array2d(dtype=wp.vec3),  # out
     depth: wp.array2d(dtype=wp.float32),  # out
     labels: wp.array2d(dtype=wp.int32),  # out

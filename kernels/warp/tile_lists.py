@@ -1,4 +1,4 @@
-"""Tile binning: visible splats in depth order, then their pairs with tiles in that order.
+"""Tile binning: visible splats in depth order, then (splat, tile) pairs in that order.
 
 Warp's scan and stable radix sort run between these kernels: visible splats are sorted by key (ties by index,
 since they are compacted in that order), then pairs by tile (ties by depth, since they are emitted in that
@@ -25,7 +25,7 @@ def compact(
     visible: wp.array(dtype=wp.int32),  # (n)
     offsets: wp.array(dtype=wp.int32),  # (n) inclusive sums of visible
     totals: wp.array(dtype=wp.int64),  # (2) visible splats, pairs
-    capacity: int,  # of the outputs, at most n; further splats are dropped
+    capacity: int,  # size of the outputs, at most n; excess splats are dropped
     sorted_keys: wp.array(dtype=wp.uint32),  # out: keys of visible splats, by index, then CULLED
     order: wp.array(dtype=wp.int32),  # out: indices of visible splats
 ):
@@ -45,9 +45,9 @@ def gather(
     order: wp.array(dtype=wp.int32),
     counts: wp.array(dtype=wp.int64),
     totals: wp.array(dtype=wp.int64),  # (2) visible splats, pairs
-    capacity: int,  # in splats
-    pairs: int,  # and so many pairs
-    lengths: wp.array(dtype=wp.int64),  # out: counts in depth order; all 0 where a capacity is too small
+    capacity: int,  # capacity in splats
+    pairs: int,  # capacity in pairs
+    lengths: wp.array(dtype=wp.int64),  # out: counts in depth order; all 0 if a capacity is too small
 ):
     k = wp.tid() + first
     lengths[k] = wp.int64(0)
@@ -61,10 +61,10 @@ def find_starts(
     pairs: int,
     band_first: int,
     tiles: wp.array(dtype=wp.int32),  # sorted
-    starts: wp.array(dtype=wp.int32),  # out: where each tile's list begins
+    starts: wp.array(dtype=wp.int32),  # out: start of each tile's list
 ):
     tile = band_first + first + wp.tid()
-    # Warp's search returns at most its last index, so its end is one further
+    # Warp's search returns at most its last index, so the range has one more element
     starts[tile] = wp.lower_bound(tiles, 0, pairs + 1, tile)
 
 
@@ -81,19 +81,19 @@ def sum_up(
 
 @wp.func
 def window_of(window: wp.uint64):
-    """First tile of a window, and the bits of the splat's tiles; 0 if its bounds must be read."""
+    """First tile of a window, and the bits of the splat's tiles; 0 if the tiles exceed a window."""
     return int(window >> wp.uint64(32)), wp.uint32(window & wp.uint64(0xFFFFFFFF))
 
 
 @wp.func
 def first_tile(index: int, view: View) -> int:
-    """First tile of the view of a splat."""
+    """First tile of a splat's view."""
     return index / view.splats * (view.tiles_x * view.tiles_y)
 
 
 @cache
 def make_lists(screen: bool) -> SimpleNamespace:
-    """count, histogram and emit, with or without the low-pass disc in the bounds."""
+    """Make count, histogram and emit, with or without the low-pass disc in the bounds."""
     limits = make_bounds(screen)
 
     @wp.func
@@ -109,7 +109,9 @@ def make_lists(screen: bool) -> SimpleNamespace:
         order: wp.array(dtype=wp.int32),
         windows: wp.array(dtype=wp.uint64),
         bounds: wp.array(dtype=Bounds),
-        tile_totals: wp.array(dtype=wp.int32),  # out: lengths of lists; sums of integers have no order
+        tile_totals: wp.array(
+            dtype=wp.int32
+        ),  # out: lengths of lists; integer sums do not depend on the order of additions
     ):
         view = views[0]
         index = order[wp.tid() + first]
@@ -173,7 +175,7 @@ def make_lists(screen: bool) -> SimpleNamespace:
         pairs: int,  # capacity of the outputs
         end_tile: int,  # number of tiles
         tiles: wp.array(dtype=wp.int32),  # out: pairs in depth order, then end_tile
-        lists: wp.array(dtype=wp.int32),  # out: their splats
+        lists: wp.array(dtype=wp.int32),  # out: splat of each pair
     ):
         k = wp.tid() + first
         rest = int(ends[capacity - 1]) + k

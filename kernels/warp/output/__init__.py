@@ -1,6 +1,6 @@
-"""Outputs, one file each. A file declares an `Output`: fields and functions that it adds to the stages.
+"""Outputs, one file each. A file declares an `Output`: fields and functions that are added to the stages.
 
-A file is found by its name. Kernels of frames without an output contain nothing of it.
+Files are found by their names. Kernels contain only the code of requested outputs.
 """
 
 from __future__ import annotations
@@ -17,69 +17,72 @@ from typing import Any
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
-    """Additions of an output, or of a part shared by several outputs, to the stages; by default none.
+    """Code that an output, or a file shared by several outputs, adds to the stages; none by default.
 
     Fields are name: type. Functions are Warp's; their parameters are given here. `pixel`, `attributes`,
     `layer`, `samples` and `out` are structs with the fields of all outputs of a frame, so their types are
-    `Any`; a function whose first parameter is such a struct, or a record, returns it changed.
+    `Any`. A function whose first parameter is such a struct, or a record, returns the changed struct or
+    record.
     """
 
     needs: tuple[str, ...] = ()
-    """other files here whose fields this one reads"""
+    """other files of this folder whose fields this file reads"""
     depth: bool = False
     """whether `attributes.z`, the depth of the fragment [m], is read"""
     length: bool = False
-    """whether ray lengths are read, which convert depths to distances"""
+    """whether the lengths of rays are read, which convert depths to distances"""
 
     record: tuple[str, ...] = ()
     """numbers that are added to a splat's record"""
     project: Any = None
-    """(record, at, normal, height): stores them in record[at], record[at + 1] ...; normal: of the splat's
-    plane in the camera frame; height: signed height of the camera above it [m]"""
+    """(record, at, normal, height): stores these numbers in record[at], record[at + 1] ...; normal: normal of
+    the splat's plane in the camera frame; height: signed distance of the camera from the plane [m]"""
 
     attributes: Mapping[str, Any] = field(default_factory=dict)
-    """of a fragment, and of a layer: the mean of its fragments by optical depth"""
+    """fields of a fragment; for a layer, their means weighted by optical depth"""
     read_attributes: Any = None
-    """(attributes, numbers, index): numbers: the vector of those of the record; index: of the splat"""
+    """(attributes, numbers, index): sets the fields; numbers: vector of the numbers in `record`; index: index
+    of the splat"""
     layer: Mapping[str, Any] = field(default_factory=dict)
     """state of a layer in addition to the means `layer.mean` of its fragments' attributes"""
     accumulate: Any = None
-    """(layer, attributes, tau, share): adds a fragment of optical depth tau, which is this share of the
-    layer's, to a layer"""
+    """(layer, attributes, tau, share): adds a fragment to a layer; tau: optical depth of the fragment; share:
+    tau as a fraction of the layer's optical depth"""
 
     state: Mapping[str, Any] = field(default_factory=dict)
     """fields added to the state of a sample while its list is composited; initially 0"""
     start: Any = None
-    """(pixel, length, view): sets other initial values; length: of the sample's ray, 1 unless `length`"""
+    """(pixel, length, view): sets other initial values; length: length of the sample's ray if `length`, else
+    1"""
     fragment: Any = None
-    """(pixel, s, c, x, y, disc, opacity, view): a splat of the tile's list before it is composited, whether
-    it contributes to the sample or not (c.contributes); x, y: from the anchor; disc: squared distance from
-    the projected centre in pixels, infinite without a low-pass; opacity: 0 if it does not contribute"""
+    """(pixel, s, c, x, y, disc, opacity, view): called for every splat of the tile's list before it is
+    composited, also if it does not contribute (c.contributes); x, y: position relative to the anchor; disc:
+    squared distance from the projected centre in pixels, infinite without a low-pass; opacity: 0 if the splat
+    does not contribute"""
     composite: Any = None
-    """(pixel, attributes, weight, view): a fragment or a layer of this weight, before `pixel.t`
-    changes"""
+    """(pixel, attributes, weight, view): called for a fragment or layer before it attenuates `pixel.t`"""
     cover: Any = None
-    """(attributes): attributes of an external opaque surface, where they are not 0"""
+    """(attributes): sets attributes of an external opaque surface that are not 0"""
     clear: Any = None
-    """(pixel): for samples of which less than 1/255 is covered"""
+    """(pixel): called for samples with an alpha below 1/255"""
     samples: Mapping[str, Any] = field(default_factory=dict)
     """sample buffers between blending and resolving, by the type of an element"""
     store: Any = None
-    """(pixel, at, samples): fills them"""
+    """(pixel, at, samples): writes the sample buffers"""
     light: bool = False
     """whether these buffers are averaged over sub-frames, like colours; otherwise they are from one pose"""
 
     cloud_arrays: Mapping[str, Any] = field(default_factory=dict)
-    """arrays of the cloud that resolving reads as out.NAME, by the type of an element"""
+    """arrays of the cloud that the resolve stage reads as out.NAME, by the type of an element"""
     view_arrays: Mapping[str, Any] = field(default_factory=dict)
-    """arrays of the view (`View.array`), likewise"""
+    """arrays of the view (`View.array`) that the resolve stage reads as out.NAME"""
     background_share: Any = None
     """(grid, samples): share of the background that is visible in addition to the transmittance"""
     resolve: Any = None
-    """(grid, samples, lengths, out): a pixel of the output image out.NAME from its samples; lengths: a
-    vector with a float for each of them, of rays if `length`"""
+    """(grid, samples, lengths, out): writes a pixel of the output image out.NAME; lengths: vector with the
+    ray length of each sample if `length`"""
     over: str = ""
-    """the output whose resolved image `resolve` changes, if it has no image of its own"""
+    """output whose resolved image `resolve` changes, for files without an image"""
 
 
 def known() -> frozenset[str]:
@@ -88,7 +91,7 @@ def known() -> frozenset[str]:
 
 
 def declared(name: str) -> Output:
-    """The declaration in the file of this name."""
+    """Declaration in the file of this name."""
     return import_module(f".{name}", __name__).OUTPUT
 
 
@@ -105,12 +108,12 @@ def with_needed(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def having(names: Iterable[str], *parts: str) -> tuple[str, ...]:
-    """Names of files that declare at least one of these parts."""
+    """Names of files that declare at least one of these fields of `Output`."""
     return tuple(name for name in names if any(getattr(declared(name), part) for part in parts))
 
 
 def fields(names: Iterable[str], part: str) -> dict[str, Any]:
-    """Fields of a part, of all files.
+    """Merge a field of `Output` of all files.
 
     Raises:
         ValueError: two of them declare one name.
@@ -119,21 +122,24 @@ def fields(names: Iterable[str], part: str) -> dict[str, Any]:
     for name in names:
         own = getattr(declared(name), part)
         if twice := union.keys() & own.keys():
-            raise ValueError(f"the Warp output {name} declares {part} {min(twice)!r}, which another has too")
+            raise ValueError(
+                f"{part} of the Warp output {name} must have new names, got {min(twice)!r}, which another "
+                "output declares"
+            )
         union |= own
     return union
 
 
 def functions(names: Iterable[str], part: str) -> tuple[Any, ...]:
-    """Functions of a part, of all files that have one."""
+    """Functions of a field of `Output`, of all files that declare one."""
     return tuple(getattr(declared(name), part) for name in having(names, part))
 
 
 def digest(names: Iterable[str]) -> str:
-    """16 hexadecimal digits of these files' text, for the name of a kernel that calls their functions.
+    """Hash of the text of files, 16 hexadecimal digits, for the name of a kernel that calls their functions.
 
-    Warp caches a compiled kernel by the text of all functions that it calls, except those that are called
-    from a tuple in a loop, as functions of outputs are: changes of them would not be noticed.
+    Warp caches a compiled kernel by the text of the functions that it calls, except functions in a tuple,
+    such as the functions of outputs: without the hash, changes of these would have no effect.
     """
     text = hashlib.blake2b(digest_size=8)
     for name in names:

@@ -1,4 +1,4 @@
-"""Alpha: 1 less the transmittance of all splats."""
+"""Alpha: 1 - transmittance of all splats."""
 
 from typing import Any
 

@@ -1,5 +1,5 @@
-"""Depth of the first hit [m]: where the transmittance falls below the first-hit threshold; the minimum
-over the samples of a pixel, 0 if none is hit."""
+"""Depth of the first hit [m]: where the transmittance falls below the first-hit threshold. The minimum over
+the samples of a pixel; 0 if no sample has a hit."""
 
 from typing import Any
 

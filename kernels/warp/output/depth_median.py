@@ -1,5 +1,5 @@
-"""Median depth [m]: where the transmittance of a sample falls below one half; for a pixel the lower median of
-its samples that have one, 0 if none has."""
+"""Median depth [m]: where the transmittance of a sample falls below one half; for a pixel, the lower median
+over its samples with a median depth, 0 without such samples."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ def start(pixel: Any, length: float, view: View):
 @wp.func
 def composite(pixel: Any, attributes: Any, weight: float, view: View):
     p = pixel
-    # faint ones count together
+    # a run of faint fragments is represented by its last fragment
     if p.t > 0.5 and p.median_light - (p.t - weight) >= MIN_ALPHA:
         p.depth_median = attributes.z
         p.median_light = p.t - weight
@@ -34,7 +34,7 @@ def store(pixel: Any, at: int, samples: Any):
 
 @wp.func
 def sorted_in(values: Any, count: int, value: float):
-    """`count` values in order and one more."""
+    """Insert a value into `count` sorted values."""
     after = values
     place = count
     while place > 0 and after[wp.max(place - 1, 0)] > value:
@@ -46,8 +46,8 @@ def sorted_in(values: Any, count: int, value: float):
 
 @wp.func
 def median_of(grid: PixelGrid, samples: Any, lengths: Any, stretched: bool) -> float:
-    """The lower median of the pixel's samples that have a median depth, along their rays if `stretched`; 0 if
-    none has one."""
+    """Lower median over the samples of a pixel with a median depth, along their rays if `stretched`; 0
+    without such samples."""
     medians = type(lengths)()
     hits = int(0)
     for k in range(grid.count):
@@ -69,7 +69,7 @@ def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
 
 OUTPUT = Output(
     depth=True,
-    # median_light: left behind the fragment that counted last
+    # median_light: transmittance behind the last represented fragment
     state={"depth_median": wp.float32, "median_light": wp.float32},
     start=start,
     composite=composite,

@@ -1,4 +1,4 @@
-"""Distance to the first hit along the pixel's rays [m]: the nearest of its samples."""
+"""Distance to the first hit along the pixel's rays [m]: the minimum over its samples."""
 
 from typing import Any
 

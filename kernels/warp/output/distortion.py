@@ -1,8 +1,9 @@
-"""Depth distortion, the spread of a sample's fragments in depth: sum over pairs of w_i w_j (m_i -
-m_j)^2, m = constant - INVERSE_DEPTH / z the depth in a depth buffer from 0.2 to 100 m (the 2DGS authors'
-loss). What is nearer counts as at 0.2 m.
+"""Depth distortion, the spread of a sample's fragments in depth: sum over pairs of w_i w_j (m_i - m_j)^2, m =
+constant - INVERSE_DEPTH / z the depth in a depth buffer from 0.2 to 100 m (the 2DGS authors' loss). Depths
+below 0.2 m are clamped to 0.2 m.
 
-It is W sum w m^2 - (sum w m)^2, whatever the zero of m: that is the first fragment's, so that little cancels.
+Computed as W sum w m^2 - (sum w m)^2, which does not depend on the origin of m; with the first fragment as
+origin little cancels.
 """
 
 from typing import Any
@@ -47,7 +48,9 @@ def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
 
 OUTPUT = Output(
     depth=True,
-    state={"spread": wp.vec4},  # the first's -m, sum w, sum w m, sum w m^2, the last two from the first's m
+    state={
+        "spread": wp.vec4
+    },  # -m of the first fragment, sum w, sum w m, sum w m^2; m of sums relative to the first fragment
     composite=composite,
     samples={"distortion": wp.vec4},
     store=store,

@@ -1,5 +1,5 @@
-"""Fog: the colour of a fragment is blended with the fog's colour by its distance along the ray. It has no
-output image: it changes rgb."""
+"""Fog: blends the colour of a fragment with the fog's colour by its distance along the ray. It changes rgb
+and has no output image."""
 
 from typing import Any
 
@@ -36,7 +36,7 @@ def store(pixel: Any, at: int, samples: Any):
 
 @wp.func
 def background_share(grid: PixelGrid, samples: Any) -> float:
-    """Share of the background in a pixel: fog has the background colour."""
+    """Share of the background in a pixel, as the fog has the background colour."""
     fogged = float(0.0)
     for k in range(grid.count):
         fogged += samples.fogged[sample_at(grid, k)]
@@ -46,7 +46,7 @@ def background_share(grid: PixelGrid, samples: Any) -> float:
 OUTPUT = Output(
     depth=True,
     length=True,
-    # fog_slope: -density, per metre of depth; fogged: sum of weights times what the fog hides
+    # fog_slope: -density, per metre of depth; fogged: sum of weights times absorbed share
     state={"fog_slope": wp.float32, "fogged": wp.float32},
     start=start,
     composite=composite,

@@ -1,5 +1,5 @@
-"""The splat with the largest weight, read by `label` and `splat_id`; -1 for none, and if an external depth
-image has the largest weight. It has no output image."""
+"""Splat with the largest weight, read by `label` and `splat_id`; -1 for none, or if the external depth image
+has the largest weight. It has no output image."""
 
 from typing import Any
 
@@ -64,7 +64,7 @@ def store(pixel: Any, at: int, samples: Any):
 
 @wp.func
 def heaviest_of(grid: PixelGrid, samples: Any) -> int:
-    """Index in the cloud of the splat with the largest weight in any sample of the pixel."""
+    """Index in the cloud of the splat with the largest weight over the samples of the pixel."""
     weight = float(0.0)
     which = int(-1)
     for k in range(grid.count):

@@ -1,4 +1,4 @@
-"""The label of the splat with the largest weight; -1 if none is visible."""
+"""Label of the splat with the largest weight; -1 without a visible splat."""
 
 from typing import Any
 

@@ -1,4 +1,5 @@
-"""Unit normal towards the camera, in its frame: the weighted mean of the fragments; 0 if none is visible."""
+"""Unit normal towards the camera, in the camera frame: the weighted mean of the fragments; 0 without a
+visible fragment."""
 
 from typing import Any
 
@@ -11,7 +12,8 @@ from . import Output
 
 @wp.func
 def project(record: Any, at: int, normal: Any, height: Any):
-    """The camera is on one side of the whole plane, so the sign is the splat's."""
+    """Store the normal towards the camera: one sign per splat, as the camera is on one side of the complete
+    plane."""
     r = record
     one = type(height)(1.0)
     towards = wp.where(height > type(height)(0.0), -one, one)
@@ -56,7 +58,7 @@ def store(pixel: Any, at: int, samples: Any):
 
 @wp.func
 def sum_of(grid: PixelGrid, samples: Any):
-    """The sum of the pixel's normals, and one over its length, or 0."""
+    """Sum of the pixel's normals, and the reciprocal of its length, or 0."""
     sum = wp.vec3()
     for k in range(grid.count):
         sum += samples.normal[sample_at(grid, k)]

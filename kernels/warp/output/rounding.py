@@ -1,5 +1,5 @@
 """Upper bound of the float32 rounding error of a pixel's colour, per unit of colour, in frames without a
-transmittance stop. kernels/opencl/output/rounding.cl is the same; fidsplat/render/certified_error.py has the
+transmittance stop. Equal to kernels/opencl/output/rounding.cl; fidsplat/render/certified_error.py has the
 derivation."""
 
 from typing import Any
@@ -12,7 +12,7 @@ from ..pixel_grid import PixelGrid, sample_at
 from . import Output
 
 UNIT = wp.constant(2.0**-24)
-OF_FORM = wp.constant(4.0 * 2.0**-24)  # of a form, relative to its terms
+OF_FORM = wp.constant(4.0 * 2.0**-24)  # rounding error of a form, relative to its terms
 
 
 @wp.func

@@ -1,4 +1,4 @@
-"""The index of the splat with the largest weight; -1 if none is visible."""
+"""Index of the splat with the largest weight; -1 without a visible splat."""
 
 from typing import Any
 

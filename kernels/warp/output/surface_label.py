@@ -1,5 +1,4 @@
-"""The label of the external depth image, if its surface has the largest weight. It changes the output
-`label`."""
+"""Label of the external depth image, if its surface has the largest weight. It changes the output `label`."""
 
 from typing import Any
 

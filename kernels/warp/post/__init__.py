@@ -1,6 +1,5 @@
-"""Sensor steps, one file each, which declares a `Step`. They change rgb pixel by pixel after resolving.
-
-A file is found by its name.
+"""Sensor steps, one file each, which declares a `Step`. They change rgb pixel by pixel after resolving. Files
+are found by their names.
 """
 
 from __future__ import annotations
@@ -14,14 +13,14 @@ from typing import Any
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """A step: its inputs, and its function of a channel of a pixel."""
+    """Sensor step: its inputs, and its function of one channel of a pixel."""
 
     uniforms: tuple[str, ...] = ()
-    """numbers of the view (`View.uniform`) which fill `numbers`, in this order"""
+    """groups of uniforms of the view (`View.uniform`) that fill `numbers`, in this order"""
     numbers: Mapping[str, Any] = field(default_factory=dict)
-    """name in `s`: type"""
+    """number in `s`: type"""
     arrays: Mapping[str, Any] = field(default_factory=dict)
-    """arrays of the view (`View.array`): name in `s`: type of an element"""
+    """array of the view (`View.array`) in `s`: type of an element"""
     apply: Any
     """(v, x, y, channel, s): returns the channel's value after the step; s: a struct with the numbers and
     arrays of all steps"""
@@ -33,5 +32,5 @@ def known() -> frozenset[str]:
 
 
 def declared(name: str) -> Step:
-    """The declaration in the file of this name."""
+    """Declaration in the file of this name."""
     return import_module(f".{name}", __name__).STEP

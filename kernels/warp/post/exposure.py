@@ -1,4 +1,4 @@
-"""Exposure: light times a number."""
+"""Exposure: scales the light."""
 
 from typing import Any
 

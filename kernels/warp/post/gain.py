@@ -1,4 +1,4 @@
-"""Gain: the measured value, noise included, times a number."""
+"""Gain: amplifies the signal and its noise."""
 
 from typing import Any
 

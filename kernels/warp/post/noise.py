@@ -1,4 +1,5 @@
-"""Noise: a variate of mean 0, whose variance grows with the light, by hashing pixel, channel and seed."""
+"""Shot noise and read noise: a normal variate from a hash of pixel, channel and seed, with a variance that
+grows with the light."""
 
 from typing import Any
 
@@ -14,7 +15,7 @@ _WORDS = wp.types.vector(4, wp.uint32)
 
 @wp.func
 def pcg4d(x: wp.uint32, y: wp.uint32, z: wp.uint32, w: wp.uint32) -> _WORDS:
-    """Four hashed words of four counters (Jarzynski and Olano 2020, pcg4d)."""
+    """Hash pcg4d of four counters (Jarzynski and Olano 2020)."""
     v = _WORDS(x, y, z, w) * _FACTOR
     for i in range(4):
         v[i] = v[i] + _ADDED
@@ -32,7 +33,7 @@ def pcg4d(x: wp.uint32, y: wp.uint32, z: wp.uint32, w: wp.uint32) -> _WORDS:
 @wp.func
 def variate(x: int, y: int, channel: int, seed: wp.uint32) -> float:
     """Approximately normal random number of mean 0 and variance 1: the sum of twelve uniform 16-bit numbers,
-    added as integers, so that all devices return the same.
+    added as integers, so that it is equal on all devices.
     """
     total = int(0)
     for part in range(2):

@@ -1,4 +1,4 @@
-"""Quantisation to the integer values of a sensor."""
+"""Quantisation to the steps of the analogue-to-digital converter."""
 
 from typing import Any
 

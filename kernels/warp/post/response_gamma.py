@@ -1,4 +1,4 @@
-"""Response: a power of the light."""
+"""Response curve v^(1 / gamma)."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Response: the curve of sRGB (IEC 61966-2-1)."""
+"""Response curve of sRGB (IEC 61966-2-1)."""
 
 from typing import Any
 

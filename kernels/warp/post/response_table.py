@@ -1,4 +1,4 @@
-"""Response: linear interpolation in a table of values at equal steps of light from 0 to 1."""
+"""Response curve from a table at equal steps of light from 0 to 1, with linear interpolation."""
 
 from typing import Any
 

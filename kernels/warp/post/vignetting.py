@@ -1,4 +1,4 @@
-"""Vignetting: light fades away from the principal point by a polynomial of the squared distance."""
+"""Vignetting: a factor that is a polynomial of the squared distance from the principal point."""
 
 from typing import Any
 
