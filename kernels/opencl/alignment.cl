@@ -59,7 +59,7 @@ kernel void align_blur(
     }
 }
 
-// Add a work-group's histogram to that of all groups.
+// Add a work-group's histogram to the histogram of all groups.
 static inline void add_bins(local uint *own, global uint *counts) {
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint k = get_local_id(0); k < BINS; k += ITEMS)
@@ -113,7 +113,7 @@ static inline float residuals_of(
 
 #define EXPOSURE const float gain[3] = {gain_red, gain_green, gain_blue}, offset[3] = {offset_red, offset_green, offset_blue}
 
-// Index space: any number of work-groups of ITEMS, by rows. Adds the numbers of textured pixels by their error.
+// Index space: any number of work-groups of ITEMS, by rows. Adds the errors of textured pixels to a histogram.
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_errors(
 //@@ arguments align_errors
 ) {

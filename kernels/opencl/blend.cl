@@ -41,7 +41,7 @@ static inline Attributes fragment_attributes(const Splat *s, Crossing c, vfloat 
     return attributes;
 }
 
-// Composites a fragment in front of everything behind it, where `mask` is set and the pixel is not terminated.
+// Composites a fragment in front of all later fragments, where `mask` is set and the pixel is not terminated.
 static inline void composite(Pixel *pixel, const Attributes *attributes, vfloat opacity, vint mask, const BlendConstants *constants) {
     vint live = mask & VMASK(pixel->t > constants->stop);
 //@@ stop

@@ -135,7 +135,7 @@ static inline float lane_sum(vfloat v) {
     float4 x = w.lo + w.hi;
     return (x.x + x.z) + (x.y + x.w);
 }
-// The same sums of several vectors at once, in one vector.
+// Sums over the lanes of several vectors, in one vector.
 #define FOLD_HALVES(a, b) ((vfloat)((a).lo + (a).hi, (b).lo + (b).hi))
 #define FOLD_FOURS(a, b) ((vfloat)((a).lo.lo, (a).hi.lo, (b).lo.lo, (b).hi.lo) + (vfloat)((a).lo.hi, (a).hi.hi, (b).lo.hi, (b).hi.hi))
 #define FOLD_TWOS(a, b) ((vfloat)((a).s014589cd, (b).s014589cd) + (vfloat)((a).s2367abef, (b).s2367abef))

@@ -1,5 +1,5 @@
 // Conservative screen-space bounds of a splat: the ellipse of the R-sigma disk (a box where the disk crosses the near plane)
-// and, by hook, the support of the low-pass filter. The per-pixel test decides.
+// and, by hook, the support of the low-pass filter. The per-pixel test is exact.
 
 //@@ struct Bounds
 // Margin for the rounding of the float fields and of the per-pixel test, in samples.

@@ -121,7 +121,7 @@ kernel void project(
     real3_ facet = cross3(a, b);        // unit normal
     real offset = dot3(facet, p);       // signed distance of the plane from the camera centre
 //@@ camera_offset
-    // before fmax, which would hide a NaN
+    // tested before fmax, which discards NaN
     if (!(scale_uv.x >= 0.0f && scale_uv.x < INFINITY && scale_uv.y >= 0.0f && scale_uv.y < INFINITY)) return;
     real su = fmax(scale_uv.x, MIN_SCALE), sv = fmax(scale_uv.y, MIN_SCALE);
     a.x *= su; a.y *= su; a.z *= su;

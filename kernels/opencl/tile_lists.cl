@@ -168,7 +168,7 @@ static inline void list_big_splat(const BigSplats *splats, uint k, const TileRec
     }
 }
 
-// The same for every `groups`-th of the first `big_count` big splats, by a complete group: a team for each splat, then all teams for
+// Lists every `groups`-th of the first `big_count` big splats, by a complete group: a team for each splat, then all teams for
 // each splat of very many tiles. deferred: scratch.
 static inline void list_big_splats(const BigSplats *splats, uint group, uint groups, uint big_count, const Band *band,
                                    global uint *restrict cursors, global uint2 *restrict pairs, local uint (*deferred)[TEAM_DEFERRED + 1]) {

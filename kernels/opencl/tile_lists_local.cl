@@ -86,7 +86,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tally_local(
         if (pair_counts[place] != 0) atomic_add(tallies + area_tile(&area, place, tiles_x), pair_counts[place]);
 }
 
-// Index space: that of tally_local.
+// Index space: as tally_local.
 // Reads: windows, keys, starts. Consumes: cursors of the band. Writes: pairs; adds to counts' number of visible splats.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
 //@@ arguments emit_local

@@ -162,8 +162,7 @@ def make_blend_backward(
         moments: wp.array(dtype=Moments),
         slot: int,
     ):
-        """Sum the values of a fragment over the warp; threads without a contribution (`contributes` is false) add
-        0."""
+        """Sum the values of a fragment over the warp; other threads add 0."""
         ...
 
     @wp.func_native(with_numbers(_SUM_OVER_BLOCK, numbers))

@@ -25,7 +25,7 @@ def make_ellipsoids_backward(effects: tuple[str, ...]):
         2 / m^2.
 
         The disk's tangents a, b and p / m are the images of unit vectors e1, e2, e3 under V, whose columns
-        are the scaled axes; V^-1 p = m e3. The splat depends on a a^T + b b^T only, so that e1 and e2 turn
+        are the scaled axes; V^-1 p = m e3. The splat depends on a a^T + b b^T only, so that e1 and e2 rotate
         with e3.
         """
         shortest = wp.min(wp.min(sizes[0], sizes[1]), sizes[2])

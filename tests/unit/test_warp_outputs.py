@@ -155,5 +155,8 @@ def test_two_outputs_that_keep_a_field_of_one_name_are_distinguished(beside):
     text = "import warp as wp\nfrom . import Output\nOUTPUT = Output(state={'normal': wp.float32})\n"
     beside("output", "taken", text)
     output = runtime.kernels("output")
-    with pytest.raises(ValueError, match="output taken declares state 'normal', which another has too"):
+    with pytest.raises(
+        ValueError,
+        match="state of the Warp output taken must have new names, got 'normal', which another output",
+    ):
         output.fields(output.with_needed(("normal", "taken")), "state")

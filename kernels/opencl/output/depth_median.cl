@@ -3,7 +3,7 @@
 // the lower median over its samples that have one.
 //@ state
     vfloat depth_median;
-    vfloat median_light;    // transmittance behind the fragment that counted last
+    vfloat median_light;    // transmittance behind the last represented fragment
 //@ start
     pixel->depth_median = 0.0f;
     pixel->median_light = 1.0f;

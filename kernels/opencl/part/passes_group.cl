@@ -26,7 +26,7 @@ static inline wide pass_from(const Pixel *pixel) {
     do {
 //@ pass_end
         barrier(CLK_LOCAL_MEM_FENCE);
-        if (item == 0) next_from = 0xFFFFFFFFu;     // of no depth
+        if (item == 0) next_from = 0xFFFFFFFFu;     // no further pass
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int row = 0; row < ROWS; row++)
             if (px < width && py + row < height && pass_finish(&pixels[row], splats, &constants))

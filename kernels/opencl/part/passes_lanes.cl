@@ -4,5 +4,5 @@
 //@ pass_end
         alive = 0;
         for (int block = 0; block < BLOCKS; block++)
-            if ((on_picture >> block & 1u) && VANY(pass_finish(&pixels[block], splats, &constants))) alive |= 1u << block;
+            if ((in_image >> block & 1u) && VANY(pass_finish(&pixels[block], splats, &constants))) alive |= 1u << block;
     } while (alive);

@@ -32,8 +32,8 @@ kernel void blend(
     for (int block = 0; block < (empty ? 1 : BLOCKS); block++) pixel_start(&pixels[block]);
 //@@ lanes_start
 //@@ pixels_start
-    const uint on_picture = empty ? 0 : blocks_within(0, min(width - x0, TILE_W), 0, min(height - y0, TILE_H));
-    uint alive = on_picture;      // blocks that are not terminated
+    const uint in_image = empty ? 0 : blocks_within(0, min(width - x0, TILE_W), 0, min(height - y0, TILE_H));
+    uint alive = in_image;      // blocks that are not terminated
 
 //@@ pass
 //@@ tile_loop

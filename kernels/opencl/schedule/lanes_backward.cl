@@ -148,8 +148,8 @@ kernel void blend_backward(
         // forward: transmittance in front of each chunk; the last chunk's fragments stay on the tape
         Pixel pixels[BLOCKS];
         for (int block = 0; block < BLOCKS; block++) pixel_start(&pixels[block], (vfloat)1.0f);
-        const uint on_picture = blocks_within(0, min(width - tile.x0, TILE_W), 0, min(height - tile.y0, TILE_H));
-        uint alive = on_picture, position = start, first = start, chunk = 0;
+        const uint in_image = blocks_within(0, min(width - tile.x0, TILE_W), 0, min(height - tile.y0, TILE_H));
+        uint alive = in_image, position = start, first = start, chunk = 0;
         global float *own = checkpoints + (size_t)(start / CHUNK + number) * CHECKPOINT_FLOATS;
         tape->length = 0;
         for (; position < end && alive; position++) {
@@ -189,7 +189,7 @@ kernel void blend_backward(
                 chunk--;
                 first = ((global const uint *)own)[(size_t)chunk * CHECKPOINT_FLOATS + TILE_W * TILE_H];
                 tape->length = 0;
-                alive = on_picture;
+                alive = in_image;
                 for (int block = 0; block < BLOCKS; block++) {
                     pixel_start(&pixels[block], VLOAD(own + (size_t)chunk * CHECKPOINT_FLOATS + block * LANES));
                     if (!VANY(VMASK(pixels[block].t > constants.stop))) alive &= ~(1u << block);

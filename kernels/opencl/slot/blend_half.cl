@@ -16,7 +16,7 @@ static inline vfloat round_half(vfloat x) {
     return VSELECT(normal, (x + 0.75f) - 0.75f, VMASK(fabs(x) < 0x1p-14f));
 }
 
-// Nearest half of a * b + c for halves. The product is exact; the sum is rounded to odd, so that the second rounding decides as one.
+// Nearest half of a * b + c for halves. The product is exact; the sum is rounded to odd, so that two roundings equal one.
 static inline vfloat fma_half(vfloat a, vfloat b, vfloat c) {
     vfloat product = a * b, sum = product + c, other = sum - product;
     vfloat rest = (product - (sum - other)) + (c - other);

@@ -1,12 +1,12 @@
 // 3D Gaussians by their maximum along each ray (devlog/primitives.md). Let W whiten the covariance, p be the centre, m = |W p|, and
 // t the angle between W p and W r for a ray r from the camera. The minimum squared distance on the ray is rho = (m sin t)^2. The
 // ray intersects the disk through p that is perpendicular to W p after whitening at rho_disk = (m tan t)^2. The Gaussian is thus
-// rendered as that disk, whose tangents a, b and p / m are conjugate half axes of the ellipsoid, with
+// rendered as that disk, whose tangents a, b and p / m are conjugate semi-axes of the ellipsoid, with
 //     rho = rho_disk / (1 + rho_disk / m^2),   depth = depth of the disk / (1 + rho_disk / m^2).
 // m is the only additional field of the record. Nothing cancels for needles, for flat Gaussians (m large: disks) or at a
 // distance. The cone around the R-ellipsoid touches the disk of radius R / sqrt(1 - R^2 / m^2).
 //@ functions
-// From scaled axes a, b, c of lengths `lengths`: tangents, unit normal and area |a x b| of the disk seen along `towards`. Returns
+// From scaled axes a, b, c of lengths `lengths`: tangents, unit normal and area |a x b| of the disk for the ray `towards`. Returns
 // 1 / m, or infinity if there is no such disk.
 static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths, real3_ *a, real3_ *b, real3_ *facet, real *area) {
     real3_ axes[3] = {*a, *b, c};
@@ -20,7 +20,7 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
     real g0 = dot3(e0, towards) / s0 * w0, g1 = dot3(e1, towards) / s1 * w1, g2 = dot3(e2, towards) / s2 * w2;
     real h = sqrt(g1 * g1 + g2 * g2), m = sqrt(g0 * g0 + h * h);       // `hypot` differs between devices
     if (!(m > 0)) return INFINITY;
-    // along the longest axis any two perpendicular ones are valid
+    // if `towards` is along the longest axis, any two perpendicular axes are valid
     real along = h / m, back = g0 / m, k1 = h > 0 ? g1 / h : 1, k2 = h > 0 ? g2 / h : 0;
     real3_ u = {e0.x * along - back * (k1 * e1.x + k2 * e2.x), e0.y * along - back * (k1 * e1.y + k2 * e2.y),
                 e0.z * along - back * (k1 * e1.z + k2 * e2.z)};
@@ -36,7 +36,7 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
 }
 //@ lowpass_make
     real inverse_m2 = 0;                                // 1 / m^2
-    real3_ third = {0, 0, 0};                           // half axis conjugate to a and b
+    real3_ third = {0, 0, 0};                           // semi-axis conjugate to a and b
     if (THICK_HERE) {
         real3_ towards = p;
         bool parallel = false;
@@ -56,7 +56,7 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
     if (THICK_HERE) {
         reach = radius * sqrt(a.z * a.z + b.z * b.z + third.z * third.z);
 //@@ camera_ellipsoid_reach
-        // clamped for a camera inside; the margin exceeds rounding
+        // clamped for a camera inside of the ellipsoid; the margin exceeds rounding
         radius /= sqrt(fmax(1 - radius * radius * inverse_m2 - (SETUP_FP64 ? REAL(1e-15) : REAL(1e-6)), REAL(1e-12)));
     }
 //@ camera_box

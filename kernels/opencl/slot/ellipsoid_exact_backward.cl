@@ -33,7 +33,7 @@
 //@ ellipsoid_backward
     if (THICK_HERE) {
         // a, b and p / m are the images of unit vectors e1, e2, e3 under V, whose columns are the scaled axes; y = V^-1 p = m e3. Only
-        // a a^T + b b^T counts, so that e1 and e2 turn with e3.
+        // a a^T + b b^T counts, so that e1 and e2 rotate with e3.
         const real3_ axes[3] = {unit_a, unit_b, facet};
         const real min_length = fmin(fmin(su, sv), sw);
         const int i0 = su >= sv && su >= sw ? 0 : sv >= sw ? 1 : 2, i1 = (i0 + 1) % 3, i2 = (i0 + 2) % 3;

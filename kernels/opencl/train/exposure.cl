@@ -11,9 +11,9 @@ kernel void apply_exposure(
     vstore3(gain * vload3(i, rgb) + offset, i, exposed);
 }
 
-// Index space: any number of work-groups of EXPOSURE_ITEMS, each with a contiguous piece of the pixels. Reads: the render. Updates:
-// by_rgb, from the gradient by the exposed render to that by the render. Writes: each work-group's sums of the gradients by the gains'
-// logarithms and the offsets, in a fixed order (deterministic).
+// Index space: any number of work-groups of EXPOSURE_ITEMS, each with a contiguous range of pixels. Reads: the render. Updates: by_rgb, from
+// the gradient with respect to the exposed render to the gradient with respect to the render. Writes: sums per work-group of the gradients with
+// respect to the gains' logarithms and the offsets, in a fixed order (deterministic).
 kernel __attribute__((reqd_work_group_size(EXPOSURE_ITEMS, 1, 1))) void exposure_backward(
 //@@ arguments exposure_backward
 ) {

@@ -119,7 +119,7 @@ kernel void loss_columns_backward(
 }
 
 // Index space: any number of work-groups of SUM_ITEMS. Reads: images 0, 1 and 10, zero margins included. Writes: each work-group's
-// sums of |a - b|, (a - b)^2 and the SSIM, in a fixed order (deterministic). A group sums a contiguous piece of the images, for
+// sums of |a - b|, (a - b)^2 and the SSIM, in a fixed order (deterministic). A group sums a contiguous range of the images, for
 // locality on CPUs.
 #define SUM_ITEMS 128
 kernel __attribute__((reqd_work_group_size(SUM_ITEMS, 1, 1))) void loss_sums(
