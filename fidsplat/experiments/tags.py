@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -183,7 +183,17 @@ def own_detector(text: str) -> Detector:
         ) from error
     if not callable(function):
         raise InputError(f"--detector must name a function, got {text!r}, a {type(function).__name__}")
-    return cast(Detector, function)
+
+    def checked(grey: np.ndarray) -> list[tuple[str, np.ndarray]]:
+        try:
+            return [(str(spec), np.reshape(quad, (4, 2))) for spec, quad in function(grey)]
+        except Exception as error:
+            raise InputError(
+                f"--detector {text} must return pairs of a spec and corners (4, 2), got "
+                f"{type(error).__name__}: {error}"
+            ) from error
+
+    return checked
 
 
 def attempt_by(function: Detector, grey: np.ndarray, target: Target) -> Attempt:

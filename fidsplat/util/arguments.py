@@ -173,7 +173,7 @@ def from_fields(what: str, kind: type[T], values: dict[str, Any]) -> T:
     """An instance of a dataclass from values by field name; a missing field is an error."""
     for field in fields(kind):  # type: ignore[arg-type]
         if field.default is MISSING and field.default_factory is MISSING and field.name not in values:
-            raise InputError(f"{what}: {field.name} must be given, got none")
+            raise InputError(f"{what}: {field.name} must be given, got none; add {field.name}=...")
     return kind(**values)
 
 
