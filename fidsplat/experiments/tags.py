@@ -176,7 +176,7 @@ def own_detector(text: str) -> Detector:
     if "" not in sys.path:
         sys.path.insert(0, "")
     try:
-        function = getattr(importlib.import_module(module), name)
+        function: Any = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise InputError(
             f"--detector must be module:function that can be imported, got {text!r}: {error}"

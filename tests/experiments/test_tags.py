@@ -190,7 +190,7 @@ def test_a_missing_package_is_named(capsys, tmp_path, monkeypatch):
 
 
 def test_a_failing_detector_of_the_user_is_named():
-    with pytest.raises(fs.InputError, match="--detector math:sqrt must return pairs .*, got TypeError: "):
+    with pytest.raises(fs.InputError, match=r"--detector math:sqrt must return pairs .*, got TypeError: "):
         own_detector("math:sqrt")(np.zeros((4, 4), np.uint8))
 
 
