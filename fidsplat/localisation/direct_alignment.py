@@ -328,7 +328,8 @@ def _covariance(sums: AlignmentSums, inverse: np.ndarray) -> np.ndarray:
     for channel in range(sums.scores.shape[1]):
         own = np.array(_parameters(channel))
         matrices[:, own[:, None], own] += sums.matrices[:, channel]
-    others = 1.000001 * np.eye(size) - inverse @ matrices  # 1.000001: one block may determine the pose alone
+    # more than 1: a single block may determine the pose, which makes the difference singular
+    others = 1.000001 * np.eye(size) - inverse @ matrices
     errors = np.linalg.solve(others, (_scores(sums) @ inverse.T)[:, :, None])[:, :6, 0]
     return errors.T @ errors * (count - 1) / count
 

@@ -137,7 +137,7 @@ def _check_chunks(file: Path, stream: BinaryIO) -> None:
     summary, need = make_reader(stream).get_summary(), 0
     if summary is not None and summary.chunk_indexes:
         for index in summary.chunk_indexes:
-            stream.seek(index.chunk_start_offset + 9)  # after its opcode and length
+            stream.seek(index.chunk_start_offset + 9)  # skips the opcode and the length
             chunk = Chunk.read(ReadDataStream(stream))
             check_expansion(file, _expanded(chunk), "a chunk", len(chunk.data))
     else:

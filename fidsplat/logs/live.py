@@ -101,7 +101,7 @@ class _Server:
             self._server = foxglove.start_server(
                 name="fidsplat", host=host, port=port, context=self._context, message_backlog_size=BACKLOG
             )
-        except Exception as error:  # its own class, which is not public
+        except Exception as error:  # Foxglove's class is not public
             raise InputError(
                 f"cannot listen on {host}, port {port}: {error}; give another --host or --port"
             ) from None

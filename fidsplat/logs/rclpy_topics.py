@@ -32,7 +32,7 @@ class RclpyTopics:
         try:
             self._context.init()
             self._node = rclpy.create_node("fidsplat", context=self._context)
-        except Exception as error:  # of the middleware, by its own classes
+        except Exception as error:  # the middlewares raise various classes
             raise InputError(f"cannot start a ROS 2 node: {error}; check the settings of ROS") from None
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
@@ -50,7 +50,7 @@ class RclpyTopics:
         """Messages of a topic since the last call, oldest first; the first call subscribes to it."""
         if topic not in self._received:
             messages = self._received[topic]
-            # a function of Python, whose signature rclpy reads
+            # rclpy inspects the signature, which a built-in method lacks
             self._node.create_subscription(_class(kind), topic, lambda one: messages.append(one), DEPTH)
         for _ in range(DEPTH):
             self._executor.spin_once(timeout_sec=0)

@@ -162,8 +162,7 @@ class RobotLog:
 
     def transform(self, time: float, frame: str, pose: Any, parent: str | None = None) -> None:
         """Write the pose of a frame in its parent (4, 4), by default the world, as `/tf`. A camera's frame
-        has OpenCV's
-        axes, like ROS's optical frames."""
+        has OpenCV's axes, like ROS's optical frames."""
         given = _rigid(pose, f"the pose of {text('the name of a frame', frame)}")
         self._transforms(
             time, (self.world, frame, self._in_world(given)) if parent is None else (parent, frame, given)
@@ -226,8 +225,7 @@ class RobotLog:
 
     def points(self, time: float, lidar: str, cloud: np.ndarray, topic: str | None = None) -> None:
         """Write the points of a scan (`Scan.cloud`) as `/LIDAR/points`: PointCloud2 in the frame LIDAR.
-        `time` is the
-        start of the scan; the field `time` of a point is in seconds after it.
+        `time` is the start of the scan; the field `time` of a point is in seconds after it.
 
         Raises:
             InputError: not a structured array of numbers.

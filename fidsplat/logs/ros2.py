@@ -72,11 +72,11 @@ class Ros2Topics:
         if topic not in self._writers:
             self._writers[topic] = DataWriter(self._participant, *self._topic(topic, kind))
         sample = object.__new__(self._type(kind))
-        sample.serialize = lambda use_version_2: data  # CDR already
+        sample.serialize = lambda use_version_2: data  # the data is serialised already
         try:
             self._writers[topic].write(sample, time)
         except DDSException as error:
-            if error.code != DDSException.DDS_RETCODE_TIMEOUT:  # of a subscriber that does not respond
+            if error.code != DDSException.DDS_RETCODE_TIMEOUT:  # no error: a subscriber does not respond
                 raise OSError(str(error)) from error
 
     def received(self, topic: str, kind: str) -> list[Any]:

@@ -25,7 +25,7 @@ SAMPLES = 5
 """samples of the distance along each edge of a rectangle"""
 
 MARGIN = 0.9
-"""share of the bound that the samples may have"""
+"""maximum deviation at samples as a share of the bound, which the deviation between samples may reach"""
 
 TURN = np.radians(30)
 """Maximum rotation of the normal within a coplanar group. A layer has no order, so that the two sides of a
@@ -137,10 +137,9 @@ def bend(
     """Move the splats of a flat sheet to the tangent planes of a surface.
 
     half: half edges of the sheet in metres. deviation: deviation of the pieces from the surface [m]. Boxes
-    are extended by
-    the largest distance between neighbouring planes. Splats up to `overlap` metres from the border of a
-    coplanar group are in both groups, so that there is no gap between the groups; the copy is farther from
-    the viewer by the same distance, and occluded elsewhere.
+    are extended by the largest distance between neighbouring planes. Splats up to `overlap` metres from the
+    border of a coplanar group are in both groups, so that there is no gap between the groups; the copy is
+    farther from the viewer by the same distance, and occluded elsewhere.
     """
     gap = GAP * deviation
     at = surface.frames(cloud.means[:, :2].astype(np.float64))

@@ -266,7 +266,7 @@ def marker(
         template: of the mixtures `fitted` and (for `Marker.gaussians`) `exact` only: Gaussians of a
             rectangle, 1, 5, 9, 13, 25, 41, 121 or 562; default 25.
         growth: overlap in modules, 0 to 1, of a rectangle across sides that border only its own colour,
-        against seams; default: the value for which the fitted templates are optimised, and 0 for paper.
+            against seams; default: the value for which the fitted templates are optimised, and 0 for paper.
         black, white: RGB of the dark and light modules in [0, 1], black darker than white; default (0, 0, 0)
             and (1, 1, 1). Printed ink and paper are nearer to (0.05, 0.05, 0.05) and (0.85, 0.85, 0.85).
         quality: defaults of mixture, levels, density, growth and template (`Quality.marker`); settings of

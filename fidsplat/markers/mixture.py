@@ -48,8 +48,8 @@ def paper_template(levels: int = 4, density: int = 3, duplicates: bool = False) 
         density: rho of the paper, a whole number of copies of the "early" levels; here all but the last (none
             with one level).
         duplicates: the paper mirrors the first quadrant across both axes, which duplicates the first
-        Gaussians of the arms, on the axes. True keeps the duplicates, 2^(L+2) + 4 L - 11 Gaussians at density
-        1; False omits them, 2^(L+2) - 7.
+            Gaussians of the arms, on the axes. True keeps the duplicates, 2^(L+2) + 4 L - 11 Gaussians at
+            density 1; False omits them, 2^(L+2) - 7.
 
     Raises:
         InputError: levels or density out of range.

@@ -53,7 +53,7 @@ def world_frame(
         scale: metres for each unit of the model.
         tag: pose (4, 4) of the tag that defines the origin and the direction of x.
         vertical: whether the tag's axis nearest to the cameras' up direction is vertical. Otherwise the
-        cameras' horizontal axes determine the vertical.
+            cameras' horizontal axes determine the vertical.
         middle: (3,) origin in the model without a tag; by default the cameras' mean position.
     """
     up = camera_up(cameras)

@@ -105,16 +105,12 @@ class Table:
     def number(self, key: str, default: Any = _MISSING, infinite: bool = False) -> Any:
         """A finite float, or with `infinite` also an infinite one, or the default."""
         value = self._get(key, default)
-        if key not in self._values:
-            return value
-        return self._number(key, value, infinite)
+        return self._number(key, value, infinite) if key in self._values else value
 
     def numbers(self, key: str, count: int, default: Any = _MISSING) -> Any:
         """A tuple of ``count`` finite floats, or the default."""
         value = self._get(key, default)
-        if key not in self._values:
-            return value
-        return self._vector(key, value, count)
+        return self._vector(key, value, count) if key in self._values else value
 
     def any_numbers(self, key: str, default: Any = _MISSING) -> Any:
         """A tuple of finite floats of any length, or the default."""

@@ -101,7 +101,7 @@ class ActiveStereo(DepthCamera):
     """largest factor of the automatic exposure"""
     noise: float = 0.047
     """standard deviation of the noise of the exposed images, relative to full scale"""
-    most: int = 128
+    max_disparity: int = 128
     """largest disparity in pixels, a multiple of 16; limits the nearest distance"""
     near: float = 0.1
     far: float = 10.0
@@ -111,25 +111,25 @@ class ActiveStereo(DepthCamera):
         number("baseline", self.baseline, "a positive length in metres", 1e-6)
         for name in ("pattern", "ambient", "exposure", "noise"):
             number(name, getattr(self, name), "0 to 1000 of full scale", 0, 1000)
-        if whole_number("most", self.most, 16, 1024) % 16:
-            raise InputError(f"most must be a multiple of 16 pixels, got {self.most}")
+        if whole_number("max_disparity", self.max_disparity, 16, 1024) % 16:
+            raise InputError(f"max_disparity must be a multiple of 16 pixels, got {self.max_disparity}")
         _check_range(self)
 
     def _measured(
         self, renderer: Renderer, scene: Scene, camera: Camera, rng: np.random.Generator
     ) -> np.ndarray:
         # the nearest surface that can be matched is in the view of the projector
-        reach = max(self.near, camera.fx * self.baseline / self.most)
+        reach = max(self.near, camera.fx * self.baseline / self.max_disparity)
         middle = _projector(camera, self.baseline / 2, reach)
         cameras = (camera, _shifted(camera, self.baseline), middle)
         views = [_view(renderer, scene, each) for each in cameras]
-        dots = rng.integers(0, 2, (1024, 1024))  # of the device's laser; other frames have others
+        dots = rng.integers(0, 2, (1024, 1024))  # the device's pattern; each frame has another one
         lights = [self._light(views[i], cameras[i], middle, views[2].depth, dots) for i in (0, 1)]
         middle_half = lights[0][tuple(slice(n // 4, n - n // 4) for n in lights[0].shape)]
         exposure = min(MEAN / max(float(middle_half.mean()), 1e-9), self.exposure)
         noisy = [exposure * light + rng.normal(0, self.noise, light.shape) for light in lights]
         images = [np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8) for image in noisy]
-        disparity = disparity_of(images[0], images[1], self.most)
+        disparity = disparity_of(images[0], images[1], self.max_disparity)
         # surfaces of the two cameras are matched, never the empty background
         found = (disparity > 0) & (views[0].depth > 0)
         return np.where(found, camera.fx * self.baseline / np.where(found, disparity, 1), 0)
@@ -138,7 +138,7 @@ class ActiveStereo(DepthCamera):
         self, view: DepthView, camera: Camera, projector: Camera, shadow: np.ndarray, dots: np.ndarray
     ) -> np.ndarray:
         """Light (h, w) that one camera receives. shadow: depths of the projector's view."""
-        x, y, depth = _seen_from(projector, camera, view.depth)
+        x, y, depth = _projected_to(projector, camera, view.depth)
         lit = _lit(projector, shadow, x, y, depth)
         (i, a), (j, b) = (np.divmod(np.where(lit, at / DOT, 0.0), 1) for at in (y, x))
         i, j = i.astype(int) % (len(dots) - 1), j.astype(int) % (len(dots) - 1)
@@ -156,8 +156,7 @@ class TimeOfFlight(DepthCamera):
     The phasors of `samples` x `samples` rays are summed by their light, so that pixels on an edge measure a
     depth between both surfaces (flying pixels). The noise is shot noise of the gathered light and a constant.
     Interreflections (multi-path) are not simulated. The defaults are those of an Azure Kinect, narrow field
-    of
-    view, unbinned (Toelgyessy et al. 2021: standard deviation by distance; the maker's range for 15 %
+    of view, unbinned (Toelgyessy et al. 2021: standard deviation by distance; the maker's range for 15 %
     reflectance).
     """
 
@@ -168,10 +167,10 @@ class TimeOfFlight(DepthCamera):
     frequency: float = 100e6
     """hertz: frequency of the modulation, which determines depths of mixed pixels"""
     faintest: float = 0.15 / 3.86**2
-    """least light of a measured pixel: reflectance times cosine of incidence, divided by the squared
+    """minimum light of a measured pixel: reflectance times cosine of incidence, divided by the squared
     distance"""
     brightest: float = 4.0
-    """most light of a pixel, beyond which it saturates"""
+    """maximum light of a pixel, above which it saturates"""
     samples: int = 3
     """rays of a pixel along an edge"""
     near: float = 0.25
@@ -233,7 +232,7 @@ class StructuredLight(DepthCamera):
     steepest: float = 70.0
     """degrees: largest angle of incidence"""
     faintest: float = 0.05 / 4.0**2
-    """least light of a measured pixel: reflectance times cosine of incidence, divided by the squared
+    """minimum light of a measured pixel: reflectance times cosine of incidence, divided by the squared
     distance"""
     near: float = 0.4
     far: float = 4.5
@@ -252,7 +251,7 @@ class StructuredLight(DepthCamera):
     ) -> np.ndarray:
         projector = _projector(camera, self.baseline, max(self.near, 0.1))
         view, shadow = (_view(renderer, scene, each) for each in (camera, projector))
-        x, y, depth = _seen_from(projector, camera, view.depth)
+        x, y, depth = _projected_to(projector, camera, view.depth)
         light = view.grey * view.cosine / np.maximum(view.depth, 0.05) ** 2
         valid = _lit(projector, shadow.depth, x, y, depth) & (light >= self.faintest)
         valid &= view.cosine >= math.cos(math.radians(self.steepest))
@@ -337,7 +336,9 @@ def _pooled(values: np.ndarray, samples: int) -> np.ndarray:
     return values.reshape(h // samples, samples, w // samples, samples).mean((1, 3))
 
 
-def _seen_from(other: Camera, camera: Camera, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _projected_to(
+    other: Camera, camera: Camera, depth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels x, y and depth (h, w) in another camera of the points of a depth image; cameras are parallel."""
     shift = (camera.world_to_camera - other.world_to_camera)[0, 3]
     x, y = np.moveaxis(camera.pixel_centres, -1, 0)

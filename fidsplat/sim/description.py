@@ -55,7 +55,7 @@ class Description:
 def read_description(
     path: str | os.PathLike[str],
     models: Iterable[str | os.PathLike[str]] = (),
-    most_models: int = 10_000,
+    max_models: int = 10_000,
 ) -> Description:
     """Read the cameras and links of an SDF or URDF file.
 
@@ -67,7 +67,7 @@ def read_description(
         path: the file, or a model's folder with model.sdf in it.
         models: folders that are searched for `model://NAME` before those of the environment variables
             GZ_SIM_RESOURCE_PATH and SDF_PATH and the file's folder.
-        most_models: maximum number of models of an SDF file with all includes; a few lines can include
+        max_models: maximum number of models of an SDF file with all includes; a few lines can include
             millions.
 
     Raises:
@@ -86,7 +86,7 @@ def read_description(
         folders = [Path(folder) for folder in models]
         for variable in ("GZ_SIM_RESOURCE_PATH", "SDF_PATH"):
             folders += [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
-        reader = _Sdf(found, folders, most_models)
+        reader = _Sdf(found, folders, max_models)
         reader.group(root, "", IDENTITY, place, ())
         for world in root.findall("world"):
             reader.group(world, "", IDENTITY, place.within("world"), ())
@@ -99,7 +99,7 @@ def read_description(
 class _Sdf:
     found: Description
     folders: list[Path]
-    most_models: int
+    max_models: int
     models: int = 0
     parsed: dict[Path, tuple[ElementTree.Element, Place]] = field(default_factory=dict)
     """cached files of includes"""
@@ -156,10 +156,10 @@ class _Sdf:
         own = name or name_of(model, place)
         place = place.within(own)
         self.models += 1
-        if self.models > self.most_models:
+        if self.models > self.max_models:
             raise place.wrong(
-                f"the file must have at most {self.most_models:,} models with its includes, got more; "
-                "read_description(..., most_models=N) allows N"
+                f"the file must have at most {self.max_models:,} models with its includes, got more; "
+                "read_description(..., max_models=N) allows N"
             )
         if prefix.count("::") >= DEEPEST:
             raise place.wrong(f"models must be nested at most {DEEPEST} deep, got more; flatten them")

@@ -116,7 +116,7 @@ class TiledCamera:
         if self._outdated.any():
             self._render(bodies, self._world_poses(bodies))
         poses, camera = self._world_poses(bodies), self._camera
-        tensor = next(iter(self._tensors.values())).new_empty(0).float().new_tensor  # on their device
+        tensor = next(iter(self._tensors.values())).new_empty(0).float().new_tensor  # on the images' device
         order = 3 + self._from_wxyz
         world, ros, opengl = (tensor(compose(poses, inverse(axes))[:, order]) for axes in _FROM_ROS.values())
         matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]

@@ -140,7 +140,7 @@ class MujocoRig(SimulatorRig):
             _, model, context = self._contexts
             mjw.refit_bvh(model, data, context)
             mjw.render(model, data, context)
-            pairs = context.seg_data  # of an id and a type of object
+            pairs = context.seg_data  # (id, type of object)
             ids = wp.array(
                 ptr=pairs.ptr, dtype=wp.int32, shape=pairs.shape, strides=pairs.strides, device=pairs.device
             )
@@ -175,7 +175,7 @@ class MujocoRig(SimulatorRig):
             visual.quality.offsamples = 0
             try:
                 self._renderers[width, height] = mujoco.Renderer(self._model, height, width)
-            except Exception as error:  # of OpenGL, by its platform
+            except Exception as error:  # OpenGL platforms raise various classes
                 raise InputError(
                     f"meshes need OpenGL, which MuJoCo could not open ({error}); without a display set "
                     "MUJOCO_GL=egl or MUJOCO_GL=osmesa before MuJoCo is imported"

@@ -272,8 +272,8 @@ class SimulatorRig(Rig):
             state: state of the simulator, for the class.
             cameras, outputs, external_depths, mask: as in `Rig.render`.
             meshes: whether the simulator's geometry is composited with the splats by depth, or a selection of
-            it as described by the class. It is moved 2 mm away from the camera, so that markers on its
-            surfaces are visible.
+                it as described by the class. It is moved 2 mm away from the camera, so that markers on its
+                surfaces are visible.
 
         Raises:
             InputError: as `Rig.render`; a state without poses; meshes with external_depths.

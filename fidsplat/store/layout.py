@@ -147,24 +147,22 @@ def read_header(folder: Path) -> Header:
 
 
 def _check(header: Header) -> None:
+    tables = isinstance(header.columns, dict) and isinstance(header.dropped, dict)
     counts = (header.splats, header.rows, header.pinned, header.chunk, header.sh_degree, header.nodes_crc)
-    if not all(type(value) is int for value in counts):
-        raise ValueError("a count is not a whole number")
-    if not 0 <= header.splats <= header.rows <= _MAX_ROWS or not 0 < header.chunk <= MAX_CHUNK:
-        raise ValueError("a count is out of range")
-    if not (0 <= header.pinned <= header.splats and -1 <= header.sh_degree <= 3):
-        raise ValueError("a count is out of range")
-    if not isinstance(header.columns, dict) or not isinstance(header.dropped, dict):
-        raise ValueError("the columns or the omitted splats are not a table")
-    if not all(type(value) is int for value in header.dropped.values()):
-        raise ValueError("the numbers of omitted splats are not whole numbers")
-    if not all(isinstance(text, str) for text in (header.identity, *header.sources)):
-        raise ValueError("a name is not text")
+    if not tables or not all(type(value) is int for value in (*counts, *header.dropped.values())):
+        raise ValueError("columns or dropped is not a table, or counts are not whole numbers")
     if (
-        len(header.origin) != 3
-        or not np.isfinite(header.origin).all()
-        or np.abs(header.origin).max() > LARGEST
+        not 0 <= header.pinned <= header.splats <= header.rows <= _MAX_ROWS
+        or not 0 < header.chunk <= MAX_CHUNK
+        or not -1 <= header.sh_degree <= 3
     ):
+        raise ValueError("a count is out of range")
+    if not all(
+        isinstance(text, str)
+        for text in (header.identity, *([header.store] if header.store is not None else []), *header.sources)
+    ):
+        raise ValueError("a name is not text")
+    if len(header.origin) != 3 or not np.abs(header.origin).max() <= LARGEST:
         raise ValueError("the origin is not a point")
     types = _TYPES | {"colors" if header.sh_degree < 0 else "sh": ("<f2", "<f4")}
     for name, kind in header.columns.items():
@@ -178,8 +176,6 @@ def _check(header: Header) -> None:
         raise ValueError(f"ellipsoids must be none, some or all, got {header.ellipsoids!r}")
     if header.ellipsoids != "none" and "thickness" not in header.columns:
         raise ValueError("3D Gaussians need a column thickness")
-    if not isinstance(header.store, (str, type(None))):
-        raise ValueError("the path of the instanced store is not text")
 
 
 def shapes_of(sh_degree: int) -> dict[str, tuple[int, ...]]:

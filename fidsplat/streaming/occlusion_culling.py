@@ -31,7 +31,7 @@ _MAX_GROWTH = 2.0
 _MAX_VISIBLE = 0.7
 """share of visible splats above which all splats of a view are rendered"""
 _PROBE_SHARE, _PROBE_SPLATS = 4, 4_000_000
-"""occlusion culling is not abandoned before a pass has a quarter of the view's splats, and this number"""
+"""minimum size of a pass after which culling may be abandoned: 1 / 4 of the view's splats, and a number"""
 _PAUSE = 16
 """number of views without occlusion culling after a view with little occlusion"""
 _SAMPLES_PER_TILE, _MOTION_SLACK = 4, 4.0

@@ -159,14 +159,10 @@ class TrainSettings:
         for name, (minimum, maximum) in _COUNTS.items():
             number = whole_number(f"training: {name}", getattr(self, name), minimum, maximum)
             object.__setattr__(self, name, number)
-        if not isinstance(self.strategy, str) or self.strategy not in STRATEGIES:
-            raise InputError(
-                f"training: strategy must be one of {', '.join(STRATEGIES)}, got {self.strategy!r}"
-            )
-        if not isinstance(self.primitive, str) or self.primitive not in PRIMITIVES:
-            raise InputError(
-                f"training: primitive must be one of {', '.join(PRIMITIVES)}, got {self.primitive!r}"
-            )
+        for name, known in (("strategy", STRATEGIES), ("primitive", PRIMITIVES)):
+            value = getattr(self, name)
+            if not isinstance(value, str) or value not in known:
+                raise InputError(f"training: {name} must be one of {', '.join(known)}, got {value!r}")
         if not isinstance(self.quality, str):  # checkpoints store it as text
             raise InputError(f"training: quality must be text such as 'surfel', got {self.quality!r}")
         Quality.of(self.quality)

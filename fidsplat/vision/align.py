@@ -20,7 +20,7 @@ TOLERANCE = 0.25
 MIN_CORRELATION = 0.7
 _POINTS = 3  # the pattern is averaged over 3 x 3 points of each pixel
 _LARGE = 150_000  # pixels above which the image is downsampled before the comparison
-_SMALL = 10_000  # the same for a grid search
+_SMALL = 10_000  # the same limit for a grid search
 _COARSE_MODULE = 4.0  # pixels: smallest module after downsampling
 # the code spans [-1, 1], so that the fitted parameters have similar magnitudes
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float64)

@@ -36,7 +36,7 @@ def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
 
     Raises:
         InputError: corners of another shape, a size of 0 or less, or an orthographic camera, where the
-        distance of a marker is undetermined.
+            distance of a marker is undetermined.
     """
     corners, edge = real_array("corners", corners), real_array("size", size)
     if corners.shape != (4, 2):

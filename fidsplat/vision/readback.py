@@ -77,7 +77,7 @@ def read_back(
         frame: a `Frame` with `rgb`, and with `label` if `Reading.visible` is to include occlusion; or
             images by name; or (h, w, 3) uint8, or float in [0, 1].
         scene, camera: as in `truth_of`: the poses of camera and markers are those of the frame's capture, or
-        of the scene's capture for other images.
+            of the scene's capture for other images.
         families: tag families to detect, see `detect`; by default those of the scene's markers.
 
     Raises:

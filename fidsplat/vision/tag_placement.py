@@ -75,7 +75,7 @@ def odometry_covariance(
         metres, radians: standard deviations of each axis after one metre, or one radian of rotation.
         start: standard deviations of the first pose.
         up: (3,) vertical, for a camera that moves on a floor without errors of height, roll and pitch; None:
-        free motion.
+            free motion.
     """
     count = len(poses)
     out = np.zeros((6 * count, 6 * count))

@@ -63,7 +63,7 @@ def _sample_positions(
     """Remap table for undistortion, (2, h, w) float32: x and y in the distorted image."""
     at = np.empty((2, height, width), np.float32)
     rays = np.stack([(np.arange(width) + 0.5 - cx) / fx, np.empty(width), np.ones(width)], axis=1)
-    for row in range(height):  # in parts: photographs have millions of pixels
+    for row in range(height):  # row by row, for bounded memory
         rays[:, 1] = (row + 0.5 - cy) / fy
         with np.errstate(over="ignore"):
             at[:, row] = (lens.image(rays) * (fx, fy) + (cx - 0.5, cy - 0.5)).T

@@ -235,11 +235,11 @@ def test_includes_that_double_and_models_that_nest(tmp_path):
         twice = f"<include><uri>m{k + 1}.sdf</uri><name>a</name></include>" * 2
         inner = twice.replace("<name>a", "<name>b", 1) if k < 25 else '<link name="l"/>'
         (tmp_path / f"m{k}.sdf").write_text(f'<sdf version="1.9"><model name="m">{inner}</model></sdf>')
-    with pytest.raises(fs.InputError, match=r"at most 10,000 models .* most_models=N"):
+    with pytest.raises(fs.InputError, match=r"at most 10,000 models .* max_models=N"):
         read_description(tmp_path / "m0.sdf")
     assert len(read_description(tmp_path / "m18.sdf").bodies) == 2**7
     with pytest.raises(fs.InputError, match="at most 50 models"):
-        read_description(tmp_path / "m18.sdf", most_models=50)
+        read_description(tmp_path / "m18.sdf", max_models=50)
     deep = '<model name="m">' * 20_000 + "</model>" * 20_000
     (tmp_path / "deep.sdf").write_text(f'<sdf version="1.9">{deep}</sdf>')
     with pytest.raises(fs.InputError, match="nested at most 32 deep"):

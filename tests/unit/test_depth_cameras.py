@@ -125,8 +125,8 @@ def test_active_stereo_matches_its_pattern(renderer):
 def test_wrong_depth_cameras_are_refused(renderer):
     with pytest.raises(fs.InputError, match=r"unknown depth camera 'd453' .did you mean 'd435'"):
         depth_camera("d453")
-    with pytest.raises(fs.InputError, match="most must be a multiple of 16"):
-        ActiveStereo(most=50)
+    with pytest.raises(fs.InputError, match="max_disparity must be a multiple of 16"):
+        ActiveStereo(max_disparity=50)
     with pytest.raises(fs.InputError, match="far must be a distance in metres above near"):
         TimeOfFlight(near=2.0, far=1.0)
     with pytest.raises(fs.InputError, match="pinhole without lens"):
