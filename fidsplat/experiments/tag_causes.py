@@ -88,15 +88,10 @@ def placed_in(scene: str, spec: str) -> PlacedMarker:
 
 
 @lru_cache(32)
-def _lit(placed: PlacedMarker, light: Lighting) -> PlacedMarker:
+def _changed(placed: PlacedMarker, light: Lighting | None = None, **parts: Any) -> PlacedMarker:
+    """The marker in a light, or with a shape or wear."""
     made = placed.marker
-    return replace(placed, marker=marker_of(made.spec, made.size, True), light=light)
-
-
-@lru_cache(32)
-def _changed(placed: PlacedMarker, shape: SheetShape | None = None, wear: Wear | None = None) -> PlacedMarker:
-    made = placed.marker
-    return replace(placed, marker=marker_of(made.spec, made.size, False, shape, wear))
+    return replace(placed, marker=marker_of(made.spec, made.size, light is not None, **parts), light=light)
 
 
 @lru_cache(8)
@@ -272,8 +267,8 @@ def _noise(view: View, electrons: float) -> View:
     return view.exposed(full_well=electrons)
 
 
-def _underexposed(view: View, share: float) -> View:
-    return view.exposed(exposure=share, full_well=10_000.0, read_noise=5.0)
+def _underexposed(view: View, share: float, gain: float = 1.0) -> View:
+    return view.exposed(exposure=share, full_well=10_000.0, read_noise=5.0, gain=gain)
 
 
 def _overexposed(view: View, factor: float) -> View:
@@ -317,7 +312,7 @@ def _direction(placed: PlacedMarker, vector: tuple[float, float, float]) -> tupl
 
 def _backlight(view: View, share: float) -> View:
     """Make the marker darker than its surroundings, to which the camera is exposed."""
-    return replace(view, placed=_lit(view.placed, Lighting(exposure=share)))
+    return replace(view, placed=_changed(view.placed, Lighting(exposure=share)))
 
 
 def _shadow(view: View, ratio: float) -> View:
@@ -330,7 +325,7 @@ def _shadow(view: View, ratio: float) -> View:
         Sun(direction=_direction(view.placed, sun), intensity=ratio * math.pi / facing),
         Sun(direction=_direction(view.placed, (0, 0, 1)), intensity=1.1 * math.pi, angle=2.0, samples=6),
     )
-    return replace(view, placed=_lit(view.placed, light), cover=cover, lights=lights)
+    return replace(view, placed=_changed(view.placed, light), cover=cover, lights=lights)
 
 
 @cache
@@ -354,7 +349,7 @@ def _planks(size: float, number: int) -> tuple[SplatCloud, tuple[float, float, f
 
 def _glare(view: View, ratio: float) -> View:
     """Add a lamp that a laminated marker reflects into the camera."""
-    placed = _lit(view.placed, Lighting("lights", roughness=0.25, view="camera"))
+    placed = _changed(view.placed, Lighting("lights", roughness=0.25, view="camera"))
     distance = view.edges * placed.marker.size
     towards = placed.pose[:3, :3].T @ (view.camera.position - placed.pose[:3, 3])
     offset = 0.25 * placed.marker.size * view.rng.uniform(-1, 1, 2)  # middle of the highlight
@@ -367,7 +362,7 @@ def _glare(view: View, ratio: float) -> View:
 
 def _dusk(view: View, share: float) -> View:
     """Reduce the light, and compensate it by gain."""
-    return view.exposed(exposure=share, full_well=10_000.0, read_noise=5.0, gain=1 / share)
+    return _underexposed(view, share, 1 / share)
 
 
 def _flare(view: View, share: float) -> View:
@@ -378,18 +373,19 @@ def _flare(view: View, share: float) -> View:
 def _cylinder(view: View, degrees: float) -> View:
     radius = view.placed.marker.size / math.radians(max(degrees, 1e-5))
     axis = "xy"[view.seed % 2]
-    return replace(view, placed=_changed(view.placed, Cylinder(radius, axis=axis)))
+    return replace(view, placed=_changed(view.placed, shape=Cylinder(radius, axis=axis)))
 
 
 def _crumpled(view: View, height: float) -> View:
     size = view.placed.marker.size
     sheet = Crumpled(height * size, size, seed=view.seed % VARIANTS)
-    return replace(view, placed=_changed(view.placed, sheet))
+    return replace(view, placed=_changed(view.placed, shape=sheet))
 
 
 def _box_edge(view: View, share: float) -> View:
     size, axis = view.placed.marker.size, "xy"[view.seed % 2]
-    return replace(view, placed=_changed(view.placed, BoxEdge(0.03 * size, (0.5 - share) * size, axis=axis)))
+    edge = BoxEdge(0.03 * size, (0.5 - share) * size, axis=axis)
+    return replace(view, placed=_changed(view.placed, shape=edge))
 
 
 def _faded(view: View, contrast: float) -> View:

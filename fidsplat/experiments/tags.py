@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -176,7 +176,7 @@ def own_detector(text: str) -> Detector:
     if "" not in sys.path:
         sys.path.insert(0, "")
     try:
-        function: Any = getattr(importlib.import_module(module), name)
+        function = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise InputError(
             f"--detector must be module:function that can be imported, got {text!r}: {error}"
@@ -186,7 +186,7 @@ def own_detector(text: str) -> Detector:
 
     def checked(grey: np.ndarray) -> list[tuple[str, np.ndarray]]:
         try:
-            return [(str(spec), np.reshape(quad, (4, 2))) for spec, quad in function(grey)]
+            return [(str(spec), np.reshape(quad, (4, 2))) for spec, quad in cast(Detector, function)(grey)]
         except Exception as error:
             raise InputError(
                 f"--detector {text} must return pairs of a spec and corners (4, 2), got "
