@@ -393,7 +393,7 @@ class _Sheet(NamedTuple):
     @property
     def _deviation(self) -> float:
         """Deviation of the pieces; copies of pieces at the borders of coplanar groups are farther by `GAP`
-        times it."""
+        times this deviation."""
         own = None if self.surface is None else self.surface.deviation
         return (self.size / FINE if own is None else own) / (1 + GAP)
 

@@ -279,9 +279,9 @@ class Crumpled(SheetShape):
     """
 
     height: float
-    """metres: maximum difference of height, at most a tenth of `length`"""
+    """maximum difference of height [m], at most a tenth of `length`"""
     length: float
-    """metres: mean distance of creases"""
+    """mean distance of creases [m]"""
     seed: int = 0
     kind: ClassVar[str] = "crumpled"
     limits: ClassVar[dict[str, tuple]] = {"length": _POSITIVE}

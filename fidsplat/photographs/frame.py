@@ -47,7 +47,7 @@ def world_frame(
     vertical: bool = False,
     middle: np.ndarray | None = None,
 ) -> WorldFrame:
-    """The world frame.
+    """Determine the world frame: gravity, origin and scale.
 
     Args:
         scale: metres for each unit of the model.

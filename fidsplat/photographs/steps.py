@@ -49,13 +49,13 @@ class Captured:
     adjustment: Adjustment | None
     tags: tuple[PlacedMarker, ...]
     undetected: tuple[str, ...]
-    """tags that no photograph has"""
+    """specs of tags that no photograph contains"""
     missing: tuple[tuple[str, str], ...]
-    """photographs without a camera, and why"""
+    """photographs without a camera, each with the reason"""
     metric: bool
     """whether lengths are in metres"""
     readout: float
-    """pixels that rows are displaced by motion during the readout; 0 unless a rolling shutter is likely"""
+    """displacement of rows by motion during the readout [px]; 0 unless a rolling shutter is likely"""
 
 
 def photographs_to_scene(

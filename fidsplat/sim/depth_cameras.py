@@ -28,7 +28,7 @@ DOT = 3.0
 """pixels between the random values of the projected pattern"""
 
 MEAN = 0.35
-"""mean of the middle of the exposed images of active stereo, relative to full scale"""
+"""target mean of the central half of the images of active stereo, relative to full scale"""
 
 SHADOW = 0.02
 """relative difference of depths from which a point is in the shadow of the projector"""
@@ -312,7 +312,7 @@ def _shifted(camera: Camera, right: float) -> Camera:
 
 
 def _projector(camera: Camera, right: float, near: float) -> Camera:
-    """Projector to the right of a camera; its view contains that of the camera from a depth on."""
+    """Projector to the right of a camera; its view contains the camera's view beyond the depth `near`."""
     moved = _shifted(camera, right)
     margin = math.ceil(camera.fx * abs(right) / near)
     return replace(moved, width=moved.width + 2 * margin, cx=moved.cx + margin)

@@ -21,7 +21,7 @@ from fidsplat.util.files import atomic_write
 
 
 def grid_poses(counts: Sequence[int], pitch: Sequence[float]) -> list[np.ndarray]:
-    """Poses (4, 4) on a grid along the world's axes, from the identity on.
+    """Poses (4, 4) on a grid along the world's axes; the first is the identity.
 
     counts: numbers of instances along x, y, z. pitch: distances between them [m].
     """

@@ -25,8 +25,8 @@ _EPSILON = 1e-12
 """epsilon of Adam, small against gradients, which are means over pixels"""
 _AT_ORIGIN = Camera.pinhole(4, 4, 4, 4, 2, 2)
 INTRINSICS_EVERY = 10
-"""iterations between two steps of the intrinsics, by the sums of their gradients: views of one camera need
-the gradients of each other, for which a GPU would have to wait in each iteration"""
+"""iterations between two steps of the intrinsics, by sums of gradients. A step needs the gradients of all
+views of a camera, for which a GPU would have to wait in each iteration"""
 
 
 class _Adam:

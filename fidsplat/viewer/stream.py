@@ -27,7 +27,7 @@ class Pace:
     scale: float = 0.5
 
     def update(self, seconds: float, scale: float) -> None:
-        """Adapt the scale to the time of an image with a scale."""
+        """Adapt the scale by the measured time of an image. scale: scale of this image."""
         aim = scale * (0.9 / self.rate / max(seconds, 1e-6)) ** 0.5
         # half of the change, since other processes may have slowed this image
         self.scale = min(1.0, max(MIN_SCALE, (self.scale + aim) / 2))

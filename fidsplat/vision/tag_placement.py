@@ -228,7 +228,7 @@ def local_search(
                     best, most = int(k), found
             if best == chosen[place]:
                 continue
-            # a downdate loses digits that precise tags have gained
+            # computed anew, as downdates lose digits after precise tags
             tried = [*chosen[:place], best, *chosen[place + 1 :]]
             exact, moved = _with(covariance, candidates, tried, objective)
             if exact > value:
