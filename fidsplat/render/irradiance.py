@@ -58,19 +58,19 @@ class LightField:
     def measured(
         rows: int,
         levels: tuple[int, ...],
-        places: np.ndarray,
+        positions: np.ndarray,
         radiance_at: Callable[[np.ndarray], np.ndarray],
         normal: np.ndarray,
         step: float,
     ) -> LightField:
         """Refine the grid until the error of interpolated irradiance is at most `step` times its maximum.
 
-        levels: numbers of panoramas along a side; the last level is used without a check. places: (m, 2) on
-        the marker. radiance_at: function of places (k, 2) that returns (k, d, 3). normal: (3,) for the
+        levels: numbers of panoramas along a side; the last is used unchecked. positions: (m, 2) on
+        the marker. radiance_at: function of positions (k, 2) that returns (k, d, 3). normal: (3,) for the
         compared irradiance.
         """
         field = LightField(*panorama_directions(rows))
-        field.low, field.high = places.min(axis=0), places.max(axis=0)
+        field.low, field.high = positions.min(axis=0), positions.max(axis=0)
         weights = cosine_weights(normal, field.directions, field.angles)
         known: dict[tuple[float, float], np.ndarray] = {}
         for level in levels:
@@ -93,18 +93,18 @@ class LightField:
                 break
         return field
 
-    def _between(self, places: np.ndarray) -> Iterator[Neighbour]:
-        """Grid indices (y, x) and weights of the four measurements around each place (m, 2)."""
+    def _between(self, positions: np.ndarray) -> Iterator[Neighbour]:
+        """Grid indices (y, x) and weights of the four measurements around each position (m, 2)."""
         size = np.array(self.radiance.shape[1::-1]) - 1
         span = np.where(self.high > self.low, self.high - self.low, 1)
-        for (y, x), share in neighbours(*(np.clip((places - self.low) / span, 0, 1) * size).T):
+        for (y, x), share in neighbours(*(np.clip((positions - self.low) / span, 0, 1) * size).T):
             yield (np.minimum(y, size[1]), np.minimum(x, size[0])), share
 
-    def interpolated(self, values: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Values (rows, columns, ...) of the grid at places (m, 2)."""
+    def interpolated(self, values: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """Values (rows, columns, ...) of the grid at positions (m, 2)."""
         return sum(  # type: ignore[return-value]
             values[index] * share.reshape(-1, *[1] * (values.ndim - 2))
-            for index, share in self._between(places)
+            for index, share in self._between(positions)
         )
 
     @property
@@ -122,11 +122,11 @@ class LightField:
         for (row, column), share in neighbours(u, v):
             yield (np.clip(row, 0, rows - 1), column % columns), share
 
-    def arriving(self, directions: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Radiance (m, k, 3) from directions (m, k, 3) at places (m, 2), interpolated in both."""
+    def arriving(self, directions: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """Radiance (m, k, 3) from directions (m, k, 3) at positions (m, 2), interpolated in both."""
         found = np.zeros(directions.shape)
         for pixel, share in self._pixels(directions):
-            for (row, column), near in self._between(places):
+            for (row, column), near in self._between(positions):
                 here = self._images[row[:, None], column[:, None], *pixel]
                 found += here * (share * near[:, None])[..., None]
         return found
@@ -138,10 +138,10 @@ class LightField:
             for pixel, share in self._pixels(directions)
         )
 
-    def irradiance(self, normal: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Irradiance (m, 3) of surfaces with a normal (3,) at places (m, 2)."""
+    def irradiance(self, normal: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """Irradiance (m, 3) of surfaces with a normal (3,) at positions (m, 2)."""
         weights = cosine_weights(normal, self.directions, self.angles)
-        return self.interpolated(np.einsum("d,yxdc->yxc", weights, self.radiance), places)
+        return self.interpolated(np.einsum("d,yxdc->yxc", weights, self.radiance), positions)
 
 
 def _difference(one: np.ndarray, other: np.ndarray) -> float:

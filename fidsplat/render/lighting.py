@@ -101,8 +101,8 @@ class _Surroundings:
 
     def refuse_inside(self, number: int, light: PointLight) -> None:
         """Raise InputError for a light that reaches no marker and has splats near it on all sides."""
-        place = np.array(light.position)
-        (frame,) = self.panoramas(place[None], 16, 1e-4, outputs=("alpha", "depth_median"))
+        position = np.array(light.position)
+        (frame,) = self.panoramas(position[None], 16, 1e-4, outputs=("alpha", "depth_median"))
         near = max(light.radius, _WALL)
         blocked = (np.asarray(frame["alpha"]) > 0.5) & (np.asarray(frame["depth_median"]) < near)
         if blocked.mean() > 0.7:
@@ -209,11 +209,11 @@ def _points(placed: PlacedMarker, light: Lighting) -> _Points:
 
 
 def _measured(placed: PlacedMarker, light: Lighting, points: _Points, around: _Surroundings) -> _Light:
-    surface, places = points.surface, points.local[:, :2]
+    surface, positions = points.surface, points.local[:, :2]
     field = _field(placed, light, points, around)
-    irradiance = np.empty((len(places), 3))
+    irradiance = np.empty((len(positions), 3))
     for rows in _by_normal(surface.normals):
-        irradiance[rows] = field.irradiance(surface.normals[rows[0]], places[rows])
+        irradiance[rows] = field.irradiance(surface.normals[rows[0]], positions[rows])
     shown = []
     for number, one in enumerate(around.lights):
         extent = around.extent(placed.pose[:3, 3])
@@ -230,12 +230,12 @@ def _measured(placed: PlacedMarker, light: Lighting, points: _Points, around: _S
 
 def _field(placed: PlacedMarker, light: Lighting, points: _Points, around: _Surroundings) -> LightField:
     """Radiance around the marker from splats and background. Raises InputError if it is black."""
-    surface, places = points.surface, points.local[:, :2]
+    surface, positions = points.surface, points.local[:, :2]
 
-    def radiance_at(wanted: np.ndarray) -> np.ndarray:
-        nearest = np.array([np.argmin(((places - place) ** 2).sum(axis=1)) for place in wanted])
+    def radiance_at(requested: np.ndarray) -> np.ndarray:
+        nearest = np.array([np.argmin(((positions - position) ** 2).sum(axis=1)) for position in requested])
         local = points.local[nearest].copy()
-        local[:, :2] = wanted  # grid points between splats are on the marker's sheet
+        local[:, :2] = requested  # grid points between splats are on the marker's sheet
         at = local @ placed.pose[:3, :3].T + placed.pose[:3, 3]
         at = at + max(surface.clearance, 1e-6) * surface.normals[nearest]
         parts: dict[str, Any] = {"outputs": ("rgb", "alpha")}
@@ -259,7 +259,7 @@ def _field(placed: PlacedMarker, light: Lighting, points: _Points, around: _Surr
         return LightField.uniform(light.ambient or (0.0, 0.0, 0.0))
     normal = unit(surface.normals.mean(axis=0))
     levels = tuple(count for count in GRIDS if 3 <= count <= light.panoramas) or (light.panoramas,)
-    field = LightField.measured(light.rows, levels, places, radiance_at, normal, light.step)
+    field = LightField.measured(light.rows, levels, positions, radiance_at, normal, light.step)
     if light.ambient is None and field.radiance.max() < _DARK:
         raise InputError(
             f"the panorama at marker {placed.label}, {placed.marker.spec}, must not be black, got no light; "
@@ -347,17 +347,17 @@ def _from_camera(
 
 
 def _highlights(
-    places: np.ndarray,
+    positions: np.ndarray,
     normals: np.ndarray,
     viewers: np.ndarray,
     shiny: Gloss,
     shown: list[tuple[LightPoint, np.ndarray]],
 ) -> np.ndarray:
-    """Reflections (n, v, 3) of lights at places (n, 3) towards viewers (n, v, 3)."""
+    """Reflections (n, v, 3) of lights at positions (n, 3) towards viewers (n, v, 3)."""
     found = np.zeros(viewers.shape)
     cosine = np.einsum("nvc,nc->nv", viewers, normals)
     for point, seen in shown:
-        towards, power = point.arriving(places)
+        towards, power = point.arriving(positions)
         reflected = gloss(cosine, viewers, towards, normals, shiny)
         found += reflected[..., None] * (power * seen[:, None])[:, None]
     return found
@@ -375,7 +375,7 @@ def _from_anywhere(
     """Spherical harmonics (p, 16, 3), in the axes of the world, of the colours of parts."""
     assert light.roughness is not None
     shiny, rotation = Gloss(light.roughness, light.reflectance), placed.pose[:3, :3]
-    places = (means + cloud.origin) @ rotation.T + placed.pose[:3, 3]
+    positions = (means + cloud.origin) @ rotation.T + placed.pose[:3, 3]
     normals = -quaternion_to_matrix(cloud.quats)[owner, :, 2] @ rotation.T
     sh = np.empty((len(owner), 16, 3))
     for same in _by_normal(normals, _SAME):
@@ -388,7 +388,7 @@ def _from_anywhere(
             rows = same[start : start + _CHUNK]
             shown = [(point, one[rows]) for point, one in arriving.points]
             viewers = np.broadcast_to(views, (len(rows), *views.shape))
-            total = _highlights(places[rows], normals[rows], viewers, shiny, shown)
+            total = _highlights(positions[rows], normals[rows], viewers, shiny, shown)
             total += factor[:, None] * diffuse[rows, None]
             total += arriving.field.interpolated(mirrored, means[rows, :2])
             sh[rows] = fit_harmonics(views, light.displayed(total))

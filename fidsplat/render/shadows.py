@@ -40,7 +40,7 @@ class LightPoint(NamedTuple):
     """A point of a light, from which a shadow map is rendered."""
 
     light: Light
-    place: np.ndarray
+    position: np.ndarray
     """(3,) position; for a sun the direction of its light"""
     share: float
 
@@ -48,8 +48,8 @@ class LightPoint(NamedTuple):
         """Unit directions (m, 3) to the light, and unshadowed irradiance (m, 3) of facing surfaces."""
         power = self.share * self.light.power
         if isinstance(self.light, Sun):
-            return np.broadcast_to(-self.place, points.shape), np.broadcast_to(power, points.shape)
-        towards = self.place - points
+            return np.broadcast_to(-self.position, points.shape), np.broadcast_to(power, points.shape)
+        towards = self.position - points
         distance = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
         towards, irradiance = towards / distance, power / distance**2
         if isinstance(self.light, SpotLight):
@@ -113,13 +113,13 @@ def _camera(point: LightPoint, points: np.ndarray, pitch: float, extent: float) 
     side = inner + 2 * _MARGIN
     if isinstance(point.light, Sun):
         pose = look_at_matrix(
-            middle - (extent + 2 * reach) * point.place, middle, perpendicular(point.place)[0]
+            middle - (extent + 2 * reach) * point.position, middle, perpendicular(point.position)[0]
         )
         return Camera.orthographic(side, side, 2 * reach * side / inner, pose, near=1e-6)
-    away = float(np.linalg.norm(middle - point.place))
+    away = float(np.linalg.norm(middle - point.position))
     tangent = min(reach / np.sqrt(max(away**2 - reach**2, 1e-12)), _WIDEST)
     focal = inner / (2 * tangent)
-    pose = look_at_matrix(point.place, middle, perpendicular(unit(middle - point.place))[0])
+    pose = look_at_matrix(point.position, middle, perpendicular(unit(middle - point.position))[0])
     return Camera.pinhole(side, side, focal, focal, side / 2, side / 2, pose, near=min(1e-3, away / 10))
 
 

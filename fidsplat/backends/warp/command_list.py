@@ -16,7 +16,7 @@ from fidsplat.backends.warp.workspace import Workspace
 
 BLOCK = 256
 """default threads per block on a GPU"""
-_MIN_PIECE = 2048
+_MIN_THREADS = 2048
 """minimum threads of one part of a CPU launch; smaller parts cost more time than they save"""
 _MIN_TILES = 4
 """minimum tiles of one part of a CPU launch"""
@@ -73,7 +73,7 @@ class Launcher:
         """timed: measure the stages. divided: divide CPU launches over threads."""
         self._wp, self.timed = load(), timed
         self._device, self._workers, self._cache = cache.device, cache.workers, cache
-        self.pieces = 8 * cache.threads if divided else 1
+        self.parts = 8 * cache.threads if divided else 1
         """number of parts of a CPU launch: several per thread, for load balancing"""
         self._stream = None if self._workers else self._device.stream  # the caller may switch it later
         self._marks: list[tuple[str | None, Any]] = []
@@ -81,11 +81,11 @@ class Launcher:
     def launch(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
         """Launch `count` threads of a kernel whose first parameter is the index of its first thread."""
         args = _arguments(kernel, given, 1)
-        pieces = 1 if self._workers is None else min(self.pieces, -(-count // _MIN_PIECE))
-        if pieces == 1:
+        parts = 1 if self._workers is None else min(self.parts, -(-count // _MIN_THREADS))
+        if parts == 1:
             self._cache.launch(kernel, count, [0, *args], block)
             return
-        cuts = [count * k // pieces for k in range(pieces + 1)]
+        cuts = [count * k // parts for k in range(parts + 1)]
         self._run(kernel, [(end - first, [first, *args]) for first, end in pairwise(cuts)])
 
     def launch_undivided(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
@@ -95,23 +95,23 @@ class Launcher:
     def launch_tiles(self, kernel: Any, first: int, end: int, area: int, given: Mapping[str, Any]) -> None:
         """Launch a CPU thread per tile. The kernel's first parameter is the first tile of a part of the
         launch, its last parameter the offset of the `area` samples of state of this part."""
-        pieces = min(self.pieces, -(-(end - first) // _MIN_TILES))
-        cuts = [first + (end - first) * k // pieces for k in range(pieces + 1)]
+        parts = min(self.parts, -(-(end - first) // _MIN_TILES))
+        cuts = [first + (end - first) * k // parts for k in range(parts + 1)]
         args = _arguments(kernel, {**given, "state_first": 0}, 1)[:-1]
         spans = enumerate(pairwise(cuts))
         self._run(kernel, [(b - a, [a, *args, k * area]) for k, (a, b) in spans])
 
-    def _run(self, kernel: Any, pieces: list[tuple[int, list[Any]]]) -> None:
+    def _run(self, kernel: Any, parts: list[tuple[int, list[Any]]]) -> None:
         """Launch the parts of a kernel launch, each with its number of threads and arguments."""
         wp, device = self._wp, self._device
 
-        def run(piece: tuple[int, list[Any]]) -> None:
-            wp.launch(kernel, *piece, device=device, record_tape=False)
+        def run(part: tuple[int, list[Any]]) -> None:
+            wp.launch(kernel, *part, device=device, record_tape=False)
 
-        if len(pieces) == 1:
-            self._cache.launch(kernel, *pieces[0])
+        if len(parts) == 1:
+            self._cache.launch(kernel, *parts[0])
         elif self._workers is not None:
-            list(self._workers.map(run, pieces))  # raises the exception of a part
+            list(self._workers.map(run, parts))  # raises the exception of a part
 
     def read_back(self, totals: Any, host: Any) -> list[int]:
         """Copy a few integers from the device through the array `host` of the same length, and wait."""

@@ -242,7 +242,7 @@ class DeviceFrame:
                 program.blend, count, given | {"band_first": first}, program.blend_block
             )
             return
-        given["state"] = self._take("state", self.launcher.pieces * area, program.state)
+        given["state"] = self._take("state", self.launcher.parts * area, program.state)
         self.launcher.launch_tiles(program.blend, first, end, area, given)
 
     def resolve(self, into: ImageArrays, launcher: Launcher) -> None:

@@ -122,7 +122,7 @@ class _Backward:
             given = self._given | {"band_first": 0}
             self._launcher.launch_undivided(kernel, tiles * area, given, area)
             return
-        states = self._launcher.pieces * area
+        states = self._launcher.parts * area
         self._given["lights"] = self._take("lights", states, wp.float32)
         self._given["losses"] = self._take("losses", states, made.blend.Loss)
         self._given["fragments"] = self._take("fragments", states * chunk, wp.vec2)
