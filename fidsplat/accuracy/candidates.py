@@ -57,11 +57,6 @@ class Candidate:
         """A copy with the settings in `PORTABLE` only: equally accurate unless this one blends in float64."""
         return replace(self, settings={k: value for k, value in self.settings.items() if k in PORTABLE})
 
-    @property
-    def expected_error(self) -> float:
-        """Expected error in a scene similar to the measured scenes; not a bound."""
-        return MARGIN * self.error_max
-
 
 @cache
 def load(kind: str) -> tuple[Candidate, ...]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fidsplat.accuracy import candidates
-from fidsplat.accuracy.candidates import Candidate, Choice
+from fidsplat.accuracy.candidates import MARGIN, Candidate, Choice
 from fidsplat.accuracy.search import CandidateSearch, SceneMeasurement, p90_ms
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
@@ -168,7 +168,7 @@ class SceneClass:
         """
         quality = candidate.quality(base)
         omitted = self.layers * quality.alpha_cutoff + quality.transmittance_stop
-        return self.colors * (omitted + candidate.expected_error)
+        return self.colors * (omitted + MARGIN * candidate.error_max)
 
     def __str__(self) -> str:
         return f"for colours of a range of {self.colors:g} and at most {self.layers} faint layers at a pixel"

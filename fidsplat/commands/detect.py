@@ -78,7 +78,11 @@ class Detect:
             return 0
         _print_codes(results)
         if scene is not None:
-            rows += [("", *_mean_row(mean["means"]))] if len(readings) > 1 else []
+            if len(readings) > 1:
+                average = mean["means"]
+                rows.append(
+                    ("", "mean", f"{average['found']} of {average['markers']}", "", *_errors(average))
+                )
             errors = ("distance [m]", "position [mm]", "angle [deg]", "corners [px]")
             heads = ("image", "marker", "found", *errors)
             first = int(len(results) == 1)  # a single image needs no column for its name
@@ -161,26 +165,21 @@ def _load_scene(path: str) -> "Scene":
 
 def _print_codes(results: list[dict[str, Any]]) -> None:
     """Print the codes of all images, with a column for the image if there are several."""
-    single = len(results) == 1
-    title = results[0]["image"] if single else f"{len(results)} images"
-    rows = [
-        (*(() if single else (result["image"],)), code["name"], _corners(code["corners"]))
-        for result in results
-        for code in result["detections"]
-    ]
+    first = int(len(results) == 1)  # a single image needs no column for its name
+    title = results[0]["image"] if first else f"{len(results)} images"
+    rows = []
+    for result in results:
+        for code in result["detections"]:
+            corners = " ".join(f"({x:.2f}, {y:.2f})" for x, y in code["corners"])
+            rows.append((result["image"], code["name"], corners)[first:])
     if not rows:
         console(False).print(f"no code found in {title}; --family selects other tags", markup=False)
         return
-    heads = ("code", "corners [px]") if single else ("image", "code", "corners [px]")
-    print_table(console(False), title, heads, rows)
+    print_table(console(False), title, ("image", "code", "corners [px]")[first:], rows)
 
 
 def _describe(code) -> dict[str, Any]:
     return {key: getattr(code, key) for key in ("name", "kind", "family", "id", "payload", "corners")}
-
-
-def _corners(corners) -> str:
-    return " ".join(f"({x:.2f}, {y:.2f})" for x, y in corners)
 
 
 _ERRORS = (("position_error_mm", 2), ("angle_error_deg", 3), ("corner_error_px", 3))
@@ -200,10 +199,6 @@ def _bundle_row(reading: "BundleReading") -> tuple[str, ...]:
     facts = reading.as_dict() | {"corner_error_px": None}
     found = f"{facts['found']} of {facts['markers']}"
     return (f"bundle {facts['bundle']}", found, f"{facts['distance_m']:.3f}", *_errors(facts))
-
-
-def _mean_row(mean: dict[str, Any]) -> tuple[str, ...]:
-    return ("mean", f"{mean['found']} of {mean['markers']}", "", *_errors(mean))
 
 
 def _errors(facts: dict[str, Any]) -> tuple[str, ...]:

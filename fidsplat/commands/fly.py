@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from fidsplat.commands.options import Json, Overwrite, writable_file
+from fidsplat.commands.options import Json, Overwrite, parse_numbers, writable_file
 from fidsplat.commands.output import console, report, show_progress
 from fidsplat.commands.scenes import RenderInput, Size
 from fidsplat.util.errors import InputError
@@ -100,7 +100,11 @@ class Fly(RenderInput):
             path = load_trajectory(self.trajectory, self.file_rate, self.smooth)
         scene = self.load(size=self.size)
         path = path or _camera_motion(self.source, scene, self.smooth)
-        times = path.sampled(self.rate).times if self.times is None else _parse_times(self.times)
+        times = (
+            path.sampled(self.rate).times
+            if self.times is None
+            else parse_numbers("--times", self.times, "seconds")
+        )
         flight = Flight(scene, path, times, scene.capture.with_(outputs=self.outputs, quality=self.quality))
         bop = None if self.bop is None else self._open_bop(self.bop, flight)
         with self._engine(flight) as (title, render):
@@ -190,15 +194,6 @@ def _camera_motion(source: str, scene: Scene, smooth: bool) -> Trajectory:
         )
     inverse = scene.camera_motion.inverse()
     return Trajectory(inverse.times, inverse.poses, smooth)
-
-
-def _parse_times(text: str) -> list[float]:
-    try:
-        return [float(word) for word in text.split(",")]
-    except ValueError:
-        raise InputError(
-            f"--times must be seconds separated by commas, got {text!r}; write for example 0,0.5,1"
-        ) from None
 
 
 def write_log(folder: FlightFolder, path: str, overwrite: bool, compress: str | None = None) -> Iterator[int]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from fidsplat.commands.options import Device, Json
+from fidsplat.commands.options import Device, Json, parse_numbers
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
@@ -60,7 +60,9 @@ class Localise:
                 "--scene must be a scene file (.toml) with the camera of the photographs, got "
                 f'{self.scene}; write one with [camera] and [[splats]] file = "{self.scene}"'
             )
-        start = None if self.start is None else _pose(self.start)
+        start = None
+        if self.start is not None:
+            start = parse_numbers("--start", self.start, "7 numbers X,Y,Z,QW,QX,QY,QZ", 7)
         with delayed_progress() as progress:
             scene = fs.Scene.load(self.scene, progress=progress)
         camera = scene.camera
@@ -83,7 +85,7 @@ class Localise:
                     found = fs.localise(
                         image,
                         scene,
-                        None if start is None else camera.with_pose(camera_to_world=start),
+                        None if start is None else camera.with_pose(camera_to_world=(start[:3], start[3:])),
                         candidates=[*previous, *candidates],
                         renderer=renderer,
                         resident=resident,
@@ -120,17 +122,6 @@ def _row(facts: dict[str, Any]) -> tuple[str, ...]:
         f"{100 * facts['inliers']:.0f} %",
         facts["start"],
     )
-
-
-def _pose(text: str) -> tuple[list[float], list[float]]:
-    """Position and quaternion of the option --start."""
-    try:
-        numbers = [float(word) for word in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 7:
-        raise InputError(f"--start must be 7 numbers X,Y,Z,QW,QX,QY,QZ separated by commas, got {text!r}")
-    return numbers[:3], numbers[3:]
 
 
 def _write(out: str, results: dict[str, Localisation | None], camera: Camera) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -42,6 +43,18 @@ def check_request(outputs: tuple[str, ...] | None, quality: str | None) -> None:
     from fidsplat.effects import select
 
     select(fs.SplatCloud.empty(), fs.Capture(outputs=outputs or "rgb", quality=fs.Quality.of(quality)))
+
+
+def parse_numbers(option: str, text: str, form: str, amount: int | None = None) -> list[float]:
+    """Finite numbers separated by commas. Raises InputError if `text` is not of this form or has not `amount`
+    numbers."""
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not numbers or amount not in (None, len(numbers)) or not all(map(math.isfinite, numbers)):
+        raise InputError(f"{option} must be {form} separated by commas, got {text!r}")
+    return numbers
 
 
 def writable_file(path: str | Path) -> Path:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from fidsplat.commands.options import Device, Json, Overwrite
+from fidsplat.commands.options import Device, Json, Overwrite, parse_numbers
 from fidsplat.commands.output import console, delayed_progress, print_json, print_table, report
 from fidsplat.experiments.city_demo import CityDemoSettings
 from fidsplat.store.build_plan import BuildSettings
@@ -94,11 +94,12 @@ class Place:
         if self.poses is not None:
             poses = list(fs.load_trajectory(self.poses).poses)
         else:
-            counts, pitch = (
-                _parse_triple("--grid", self.grid, int),
-                _parse_triple("--pitch", self.pitch, float),
-            )
-            poses = grid_poses(counts, pitch)
+            assert self.grid is not None
+            counts = parse_numbers("--grid", self.grid, "3 whole numbers", 3)
+            if any(n < 1 or n % 1 for n in counts):
+                raise InputError(f"--grid must be whole numbers of at least 1, got {self.grid!r}")
+            pitch = parse_numbers("--pitch", self.pitch, "3 lengths in metres", 3)
+            poses = grid_poses([int(n) for n in counts], pitch)
         store = fs.Store(fs.place_store(self.source, self.out, poses, overwrite=self.overwrite))
         facts = {"store": str(store.path), "places": store.instances, "splats": len(store)}
         words = f"{counted(len(store), 'splats')} at {counted(store.instances, 'places')}: {store.path}"
@@ -107,17 +108,6 @@ class Place:
 
 def _splats(store: fs.Store) -> str:
     return f"{counted(len(store), 'splats')} in {counted(store.chunks, 'chunks')}"
-
-
-def _parse_triple(name: str, text: str | None, kind: type) -> list:
-    try:
-        values = [kind(word) for word in str(text).split(",")]
-        if len(values) != 3 or (kind is int and min(values) < 1) or not all(abs(v) < 1e9 for v in values):
-            raise ValueError
-    except ValueError:
-        what = "three whole numbers of at least 1" if kind is int else "three lengths in metres"
-        raise InputError(f"{name} must be {what}, got {text!r}; write for example 10,1,2") from None
-    return values
 
 
 @dataclass

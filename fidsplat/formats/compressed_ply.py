@@ -16,6 +16,7 @@ import numpy as np
 from fidsplat.formats.collect import BLOCK, Rows
 from fidsplat.formats.ply_header import Header
 from fidsplat.splats.harmonics import C0
+from fidsplat.splats.rotations import with_largest_component
 from fidsplat.util.errors import InputError
 
 CHUNK = 256
@@ -88,9 +89,11 @@ def _unpack(rows: np.ndarray, chunks: np.ndarray, coloured: bool) -> dict[str, n
 
     position, scale = (_unit_fractions(rows[f"packed_{name}"], 11, 10, 11) for name in ("position", "scale"))
     color = _unit_fractions(rows["packed_color"], 8, 8, 8, 8)
+    rotations = rows["packed_rotation"]
+    three = (_unit_fractions(rotations, 10, 10, 10) - 0.5) * np.sqrt(2.0)
     return {
         "means": between("", "xyz", position),
-        "quats": _quaternions(rows["packed_rotation"]),
+        "quats": with_largest_component(three, rotations >> 30),
         "scales": np.exp(between("_scale", "xyz", scale)),
         "opacities": color[:, 3],
         "dc": ((between("", "rgb", color[:, :3]) if coloured else color[:, :3]) - 0.5) / C0,
@@ -127,18 +130,6 @@ def _unit_fractions(words: np.ndarray, *widths: int) -> np.ndarray:
         mask = (1 << width) - 1
         columns.append(((words >> shift) & mask) / mask)
     return np.stack(columns, axis=1)
-
-
-def _quaternions(words: np.ndarray) -> np.ndarray:
-    small = (_unit_fractions(words, 10, 10, 10) - 0.5) * np.sqrt(2.0)
-    large = np.sqrt(np.maximum(0.0, 1.0 - (small * small).sum(axis=1)))
-    quats = np.empty((len(words), 4))
-    for which in range(4):
-        rows = np.flatnonzero(words >> 30 == which)
-        others = [i for i in range(4) if i != which]
-        quats[rows, which] = large[rows]
-        quats[rows[:, None], others] = small[rows]
-    return quats
 
 
 def _bands(rows: np.ndarray, rest: int) -> np.ndarray:

@@ -21,6 +21,7 @@ import numpy as np
 
 from fidsplat.formats.plain import cloud_of, coefficients, refuse_boxes, three_scales, world_means
 from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import with_largest_component
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, open_input, read_input, write_file
 from fidsplat.util.limits import check_expansion
@@ -188,13 +189,7 @@ def _quaternions(path: Path, pixels: np.ndarray) -> np.ndarray:
     largest = pixels[:, 3].astype(np.int64) - 252
     if (largest < 0).any():
         raise InputError(f"{path}: the alpha of a rotation must be 252 to 255, got {int(pixels[:, 3].min())}")
-    three = (pixels[:, :3] / 255.0 * 2 - 1) / np.sqrt(2)
-    quats = np.zeros((len(pixels), 4))
-    for k in range(4):
-        rows = largest == k
-        quats[np.ix_(rows, [i for i in range(4) if i != k])] = three[rows]
-        quats[rows, k] = np.sqrt(np.maximum(0, 1 - (three[rows] ** 2).sum(axis=1)))
-    return quats
+    return with_largest_component((pixels[:, :3] / 255.0 * 2 - 1) / np.sqrt(2), largest)
 
 
 def save_sog(cloud: SplatCloud, path: Path) -> None:

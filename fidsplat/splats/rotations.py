@@ -134,6 +134,14 @@ def pose_matrix(pose: Any, name: str) -> Any:
     return rigid_matrix(parts[0], parts[1])
 
 
+def with_largest_component(three: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """Unit quaternions (n, 4) of three components (n, 3) and the index (n,) of the fourth, which is >= 0."""
+    quats = np.empty((len(three), 4))
+    quats[np.arange(4) != largest[:, None]] = three.ravel()
+    quats[np.arange(len(three)), largest] = np.sqrt(np.maximum(0, 1 - (three**2).sum(axis=1)))
+    return quats
+
+
 def rigid_matrix(position, quaternion=(1.0, 0.0, 0.0, 0.0), scale: float = 1.0) -> np.ndarray:
     """4x4 float64 matrix: scale, then rotation by a quaternion (w, x, y, z) of any length but 0, then
     translation."""
