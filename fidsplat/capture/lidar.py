@@ -184,7 +184,7 @@ class Lidar:
             ("dropouts", 0.0, 1.0, "a share from 0 to 1"),
         ):
             number(f"lidar {name}", getattr(self, name), requirement, low, high)
-        if not self.detection_range > 0:
+        if not isinstance(self.detection_range, int | float) or not self.detection_range > 0:
             raise invalid("lidar detection_range", "metres, above 0", self.detection_range)
         whole_number("lidar rays", self.rays, 1, 256)
         whole_number("lidar bands", self.bands, 1, MAX_SIZE)
@@ -198,7 +198,9 @@ class Lidar:
         if not kinds or len(set(kinds)) < len(kinds):
             raise invalid("lidar returns", "one or more different kinds of return", self.returns)
         object.__setattr__(self, "returns", kinds)
+        instance("lidar reflectivity", self.reflectivity, dict, "a dict of numbers by label")
         for label, value in self.reflectivity.items():
+            whole_number("a label of lidar reflectivity", label, -(2**31), 2**31 - 1)
             number(f"lidar reflectivity of label {label}", value, "a number of at least 0", 0.0, 1e9)
         if self.pattern.beams * self.rays > MAX_BEAMS or (
             isinstance(self.pattern, Spinning) and self.pattern.rings * self.rays > MAX_SIZE

@@ -150,7 +150,7 @@ def scan(
         scene: splats and markers, or a cloud uploaded by `renderer`.
         lidar: a Lidar, or the name of a preset.
         pose: world_from_lidar, (4, 4) or (position, quaternion w, x, y, z), of a sensor with x forward, y
-            left and z up; None: at the scene's camera.
+            left and z up; None: at the scene's camera at `start`.
         renderer: None: one for the scene's device.
         motion: `Motion(camera=...)` has the pose lidar_from_world at a time, instead of `pose`; `groups`
             moves splats. None: the scene's groups move as its motion states.
@@ -245,7 +245,8 @@ class ScanRequest:
         lidar = self.lidar
         camera = lidar.camera(self.start, self.moving)
         if self.motion.camera is None:
-            camera = camera.with_pose(camera_to_world=_pose_of(pose, self.base.camera))
+            scene_camera = self.base.camera and self.base.motion.moved(self.base.camera, self.start)
+            camera = camera.with_pose(camera_to_world=_pose_of(pose, scene_camera))
         elif pose is not None:
             raise InputError("the lidar must have either pose or motion.camera, got both; leave one out")
         quality = replace(
@@ -381,6 +382,6 @@ def _measure(found: dict[str, np.ndarray], lidar: Lidar, random: np.random.Gener
     if lidar.noise or lidar.noise_growth:
         noise = random.standard_normal(ranges.shape, np.float32)
         ranges += noise * (lidar.noise + lidar.noise_growth * ranges)
-        kept &= ranges > 0
+        kept &= (ranges >= lidar.near) & (ranges <= lidar.far)
     for name, values in found.items():
         values[~kept] = -1 if name == "label" else 0

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from fidsplat.cameras import Camera
+from fidsplat.cameras import Camera, Motion
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.sensor import LUMINANCE, Sensor
 from fidsplat.images.stereo import disparity_of
@@ -296,7 +296,10 @@ def depth_camera(name: str, **pose: Any) -> tuple[DepthCamera, Camera]:
 def _view(renderer: Renderer, scene: Scene, camera: Camera) -> DepthView:
     """Depth, reflectance and incidence of a camera's image."""
     outputs = ("rgb", "depth_median", "normal")
-    capture: Capture = replace(scene.capture, camera=camera, outputs=outputs, sensor=Sensor(), fog=None)
+    motion = Motion(None, scene.capture.motion.groups)  # the cameras of a device differ in their poses
+    capture: Capture = replace(
+        scene.capture, camera=camera, motion=motion, outputs=outputs, sensor=Sensor(), fog=None
+    )
     frame = renderer.render(scene, capture)
     rays = camera.rays(camera.pixel_centres.reshape(-1, 2)).reshape(camera.height, camera.width, 3)
     cosine = -(frame["normal"] * rays).sum(2) / np.linalg.norm(rays, axis=2)

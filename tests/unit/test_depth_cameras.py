@@ -81,6 +81,17 @@ def test_structured_light_follows_the_published_error_and_casts_a_shadow(rendere
     assert not tilted[:, 40:56].any()
 
 
+def test_the_given_camera_replaces_the_motion_of_the_scene(renderer):
+    """A step, whose shadow shows the projector beside the camera."""
+    scene = fs.Scene([board(1.0, left=0.0), board(1.5)])
+    back = np.eye(4)
+    back[2, 3] = 0.5
+    moving = replace(scene, camera=pinhole(580.0), camera_motion=fs.Trajectory([0.0, 1.0], [back, back]))
+    for device in (TimeOfFlight(), StructuredLight(), ActiveStereo()):
+        expected, found = (device.measure(renderer, each, pinhole(580.0)) for each in (scene, moving))
+        np.testing.assert_array_equal(found, expected)
+
+
 def test_disparities_of_shifted_noise_are_unbiased():
     """A band-limited texture, shifted by fractions of a pixel in closed form."""
     rng = np.random.default_rng(0)

@@ -161,6 +161,15 @@ def test_a_moving_rosette_has_fewer_poses_than_beams(device):
     assert late.max() <= 3 * 0.1 / (2 * 10) + 1e-9
 
 
+def test_a_scan_without_a_pose_is_at_the_moving_camera_at_its_start(device):
+    camera = fs.Camera.pinhole(8, 8, 8, 8, 4, 4)
+    motion = fs.Trajectory([0.0, 1.0], [np.eye(4), turned(0, 0, 0, (0, 0, -1.0))])  # camera_from_world
+    scene = fs.Scene([plane((0, 0, 1), 4.0, 6.0)], camera=camera, camera_motion=motion)
+    for time, distance in ((0.0, 4.0), (1.0, 3.0)):
+        found = fs.scan(scene, IDEAL, renderer=device, start=time)
+        assert np.nanmedian(found.points[..., 0]) == pytest.approx(distance, rel=1e-5)
+
+
 def test_a_batch_equals_single_scans(renderer, room):
     poses = np.array([[0.1, 0.2, 0.3, 0.8, 0, 0, 0.6], [-0.5, 0.3, 0.0, 0, 0.6, 0.8, 0]])
     lidar = replace(IDEAL, noise=0.02, dropouts=0.1)
@@ -229,6 +238,8 @@ def test_noise_and_drop_outs_follow_their_settings(device):
     assert abs(scaled.mean()) < 0.07
     np.testing.assert_array_equal(noisy, fs.scan(scene, lidar, np.eye(4), renderer=device).range)
     assert (noisy != fs.scan(scene, replace(lidar, seed=1), np.eye(4), renderer=device).range).any()
+    bounded = fs.scan(scene, replace(lidar, noise=0.5, near=4.9, far=5.3), np.eye(4), renderer=device).range
+    assert 4.9 <= bounded[bounded > 0].min() < bounded.max() <= 5.3
     lost = fs.scan(scene, replace(lidar, dropouts=0.25), np.eye(4), renderer=device).range
     assert (lost[hit] == 0).mean() == pytest.approx(0.25, abs=0.04)
 
@@ -345,6 +356,9 @@ def test_messages_have_the_points(device, tmp_path):
         (lambda: Rosette(2.0, (1.0, 2.0)), "half_angle must be"),
         (lambda: replace(IDEAL, returns=("middle",)), "unknown return"),
         (lambda: replace(IDEAL, far=0.01), "lidar far must be metres, above near"),
+        (lambda: replace(IDEAL, detection_range="far"), "detection_range must be metres, above 0, got 'far'"),
+        (lambda: replace(IDEAL, reflectivity=[0.1]), "reflectivity must be a dict"),
+        (lambda: replace(IDEAL, reflectivity={"leaf": 0.1}), "label of lidar reflectivity must be a whole"),
         (lambda: RayTable(np.zeros((2, 2, 3))), "must have a ray"),
         (lambda: RayTable(np.tile([0, 0, -1.0], (2, 2, 1))), "1 degree from -z"),
         (lambda: fs.scan(plane((1, 0, 0), 1, 1, 2), IDEAL), "pose must be given"),
