@@ -88,10 +88,10 @@ def colmap_arguments(camera: Any, pose: Any) -> PinholeArguments:
             "e.g. by colmap image_undistorter"
         )
     kind, names = _COLMAP[model]
-    own = len(parameters) - len(names)
-    if own not in (3, 4):
+    own = 3 if "SIMPLE" in model or model.startswith("RADIAL") else 4  # f, cx, cy or fx, fy, cx, cy
+    if len(parameters) != own + len(names):
         raise InputError(
-            f"the parameters of COLMAP's model {model} must be f or fx, fy, then cx, cy"
+            f"the parameters of COLMAP's model {model} must be {'f' if own == 3 else 'fx, fy'}, cx, cy"
             f"{''.join(f', {name}' for name in names)}, got {len(parameters)} numbers"
         )
     lens = kind(**dict(zip(names, parameters[own:], strict=True)))

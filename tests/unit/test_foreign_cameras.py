@@ -166,6 +166,11 @@ def _changed(**changes):
             lambda: fs.Camera.from_colmap(("OPENCV", 64, 48, [50, 32, 24])),
             "parameters of COLMAP's model OPENCV",
         ),
+        (lambda: fs.Camera.from_colmap(("PINHOLE", 64, 48, [50, 32, 24])), "must be fx, fy, cx, cy, got 3"),
+        (
+            lambda: fs.Camera.from_colmap(("RADIAL", 64, 48, [50, 51, 32, 24, 0.1, 0.0])),
+            "must be f, cx, cy, k1, k2, got 6",
+        ),
         (lambda: fs.Camera.from_nerfstudio("transforms.json"), "fs.load_cameras reads files"),
         (lambda: fs.Camera.from_nerfstudio(_transforms(), 2), "from 0 to 1 or a file_path.*got 2"),
         (lambda: fs.Camera.from_nerfstudio(_transforms() | {"w": "wide"}), "w and h must be"),
