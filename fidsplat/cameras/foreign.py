@@ -132,15 +132,11 @@ def nerfstudio_arguments(transforms: Any, frame: Any) -> PinholeArguments:
             f"w and h must be the size of the images in pixels, got {given.get('w')!r} and {given.get('h')!r}"
         ) from None
     try:
-        if "fl_x" in given:
-            fx = float(given["fl_x"])
-        else:
-            angle = float(given["camera_angle_x"])
-            if not 0 < angle < math.pi:
-                raise InputError(f"camera_angle_x must be between 0 and pi radians, got {angle:g}")
-            fx = width / 2 / math.tan(angle / 2)
-        fy = float(given.get("fl_y", fx))
+        fx = _focal_length(given, "x", width)
+        fy = _focal_length(given, "y", height) if given.keys() & {"fl_y", "camera_angle_y"} else fx
         cx, cy = float(given.get("cx", width / 2)), float(given.get("cy", height / 2))
+    except InputError:  # a ValueError too
+        raise
     except (KeyError, TypeError, ValueError, OverflowError):
         raise InputError(
             "fl_x, or camera_angle_x, must be a finite number, got "
@@ -150,6 +146,15 @@ def nerfstudio_arguments(transforms: Any, frame: Any) -> PinholeArguments:
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3], world_to_camera[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
     return PinholeArguments(width, height, fx, fy, cx, cy, world_to_camera, _nerfstudio_lens(given))
+
+
+def _focal_length(given: Mapping[str, Any], axis: str, pixels: int) -> float:
+    if f"fl_{axis}" in given:
+        return float(given[f"fl_{axis}"])
+    angle = float(given[f"camera_angle_{axis}"])
+    if not 0 < angle < math.pi:
+        raise InputError(f"camera_angle_{axis} must be between 0 and pi radians, got {angle:g}")
+    return pixels / 2 / math.tan(angle / 2)
 
 
 def ros_arguments(info: Any, world_to_camera: Any, rectified: bool) -> PinholeArguments:

@@ -93,6 +93,19 @@ def test_cameras_of_nerfstudio(tmp_path):
     np.testing.assert_array_equal(loaded["images/0.png"].world_to_camera, camera.world_to_camera)
 
 
+def test_focal_lengths_by_the_angles_of_both_axes():
+    """As instant-ngp: each axis by its focal length or angle, the vertical one by default as the other."""
+    angles = {"camera_angle_x": 2 * np.arctan(320 / 500), "camera_angle_y": 2 * np.arctan(240 / 510)}
+    transforms = {key: value for key, value in _transforms().items() if not key.startswith("fl_")} | angles
+    camera = fs.Camera.from_nerfstudio(transforms)
+    np.testing.assert_allclose((camera.fx, camera.fy), (500, 510))
+    del transforms["camera_angle_y"]
+    camera = fs.Camera.from_nerfstudio(transforms)
+    np.testing.assert_allclose((camera.fx, camera.fy), (500, 500))
+    with pytest.raises(fs.InputError, match="camera_angle_y must be between"):
+        fs.Camera.from_nerfstudio(transforms | {"camera_angle_y": 0})
+
+
 def test_an_own_flight_is_read_back_as_cameras(tmp_path):
     camera = fs.Camera.pinhole(64, 48, 50.0, 51.0, 30.0, 25.0)
     poses = np.array([np.eye(4), np.linalg.inv(POSE)])
