@@ -46,10 +46,10 @@ class PlanTags:
         from fidsplat.scenes.sources import load_source
 
         require_packages("the map", ("matplotlib",))
+        path = fs.load_trajectory(self.trajectory)
         folder = writable_folder(self.out)
         if (folder / "scene.toml").exists() and not self.overwrite:
             raise InputError(f"{folder / 'scene.toml'} already exists; give another folder, or --overwrite")
-        path = fs.load_trajectory(self.trajectory)
         with delayed_progress() as progress:
             scene = load_source(self.source)
             renderer = fs.Renderer(self.device or scene.device)

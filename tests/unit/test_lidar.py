@@ -291,6 +291,9 @@ def test_directions_of_a_spinning_lidar_turn_clockwise_from_behind():
 def test_files_of_points(device, tmp_path, ending):
     found = fs.scan(plane((1, 0, 0), 3.0, 6.0, label=4), IDEAL, np.eye(4), label=True, renderer=device)
     cloud = found.cloud()
+    xyz = np.stack([cloud[axis] for axis in "xyz"], 1)
+    elevations = np.arcsin(xyz[:, 2] / np.linalg.norm(xyz, axis=1))
+    np.testing.assert_allclose(elevations, np.array(UNEVEN)[cloud["ring"]], atol=1e-5)
     file = tmp_path / f"scan.{ending}"
     found.save(file)
     if ending == "npy":
@@ -305,7 +308,7 @@ def test_files_of_points(device, tmp_path, ending):
     else:
         trimesh = pytest.importorskip("trimesh", reason="trimesh reads the file")
         vertices = np.asarray(trimesh.load(file, process=False).vertices)
-        np.testing.assert_allclose(vertices, np.stack([cloud[axis] for axis in "xyz"], 1), atol=1e-6)
+        np.testing.assert_allclose(vertices, xyz, atol=1e-6)
         return
     assert read.dtype.names == cloud.dtype.names
     assert len(cloud) == (found.range > 0).sum() > 10

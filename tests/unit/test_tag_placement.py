@@ -352,3 +352,9 @@ def test_a_folder_that_cannot_be_written_is_reported_before_the_search(hall, tmp
     (tmp_path / "file").touch()
     given = ["plan-tags", hall / "scene.toml", "--trajectory", hall / "path.tum"]
     assert "cannot write into the folder" in fails(capsys, *given, "-o", tmp_path / "file" / "p")[1]
+
+
+def test_a_missing_trajectory_leaves_no_folder(hall, tmp_path, capsys):
+    given = ["plan-tags", hall / "scene.toml", "--trajectory", tmp_path / "no.tum", "-o", tmp_path / "p"]
+    assert "no.tum" in fails(capsys, *given)[1]
+    assert not (tmp_path / "p").exists()
