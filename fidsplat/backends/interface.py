@@ -77,8 +77,8 @@ class ResidentData(ABC):
     def color_range(self) -> tuple[float, float]:
         """Lower and upper bound of every channel of every splat, from any direction."""
         raise InputError(
-            "the splats must be in host memory for the output 'error', got adopted device arrays; render "
-            "a SplatCloud, or leave out the output 'error'"
+            "the splats must be in host memory for the output 'error', got device arrays (Renderer.adopt); "
+            "render a SplatCloud, or leave out 'error'"
         )
 
 

@@ -129,7 +129,7 @@ class RayRaster:
 
     @property
     def uniforms(self) -> tuple[float, ...]:
-        """Uniforms of the kernels: of the lens, of the map, and the first row."""
+        """Kernel uniforms: parameters of the lens, grid of the pyramid of bounds (`map`), first row."""
         if self.lens.kind == "equirectangular":
             return self.lens.uniforms
         low_x, low_y, *rest = map(float, self.map[1])

@@ -19,14 +19,14 @@ def twist(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     translation = start[:3, :3].T @ (end[:3, 3] - start[:3, 3])
     axis = _rotation_vector(rotation)
     # the velocity that integrates to `translation` over the complete rotation
-    return np.concatenate([axis, np.linalg.solve(_integral(axis), translation)])
+    return np.concatenate([axis, np.linalg.solve(_left_jacobian(axis), translation)])
 
 
 def exponential(motion: np.ndarray) -> np.ndarray:
     """The rigid motion (4, 4) along a twist (6,) in time 1 (exponential of SE(3))."""
     pose = np.eye(4)
     pose[:3, :3] = rotation_matrix(motion[:3])
-    pose[:3, 3] = _integral(motion[:3]) @ motion[3:]
+    pose[:3, 3] = _left_jacobian(motion[:3]) @ motion[3:]
     return pose
 
 
@@ -49,8 +49,8 @@ def rotation_matrix(axis: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sinc(angle / math.pi) * skew + half * half / 2 * skew @ skew
 
 
-def _integral(axis: np.ndarray) -> np.ndarray:
-    """Integral (3, 3) of the rotation matrices of s times the axis, over s from 0 to 1."""
+def _left_jacobian(axis: np.ndarray) -> np.ndarray:
+    """Left Jacobian (3, 3) of SO(3) at a rotation vector v: integral of exp(s [v]x) over s from 0 to 1."""
     angle, skew = float(np.linalg.norm(axis)), _skew(axis)
     half = np.sinc(angle / 2 / math.pi)
     third = 1 / 6 - angle**2 / 120 if angle < 1e-3 else (1 - np.sinc(angle / math.pi)) / angle**2

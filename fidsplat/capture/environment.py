@@ -83,7 +83,8 @@ class Panorama(PickledByFields):
         if wrong := np.count_nonzero(~np.isfinite(image)):
             which = f"the panorama {self.file}" if self.file else "the panorama"
             raise InputError(
-                f"background: {which} must have finite numbers, got {wrong:,} others; replace them"
+                f"background: {which} must be finite, got {wrong:,} values that are NaN or infinite; "
+                "replace them"
             )
         image.flags.writeable = False
         object.__setattr__(self, "image", image)

@@ -70,7 +70,7 @@ class Spinning:
         return np.stack(rays, 2).reshape(-1, 3)
 
     def fractions(self) -> np.ndarray:
-        """(beams,) times of the beams as shares of the scan; the lasers of a column fire together."""
+        """(beams,) time of each beam as a fraction of the scan; the lasers of a column fire together."""
         return np.repeat((np.arange(self.columns) + 0.5) / self.columns, self.rings)
 
     def ring_of(self) -> np.ndarray:
@@ -115,7 +115,7 @@ class Rosette:
         return np.stack([np.cos(away), aside * left, aside * up], 1)
 
     def fractions(self) -> np.ndarray:
-        """(points,) times of the beams as shares of the scan."""
+        """(points,) time of each beam as a fraction of the scan."""
         return (np.arange(self.points) + 0.5) / self.points
 
     def ring_of(self) -> np.ndarray:

@@ -74,10 +74,11 @@ Cameras = Annotated[str | None, "FILE: camera-to-world poses for --scene (docs/f
 def load_user_scenes(
     files: tuple[str, ...], cameras: str | None, named: tuple[str, ...], most_views: int | None = None
 ) -> dict[str, BenchScene]:
-    """Scenes of --scene, rendered from poses of --cameras, by default at most 8; empty without --scene.
+    """Benchmark scenes of the --scene files, with a view for each pose of --cameras, by default at most 8
+    views of a scene, evenly distributed. Empty without --scene.
 
     Raises:
-        InputError: --scenes in addition, --cameras without --scene, or an unreadable file.
+        InputError: --scene and --scenes, --cameras without --scene, or an unreadable file.
     """
     from fidsplat.experiments.bench.catalogue import MOST_VIEWS, own_scenes
     from fidsplat.formats import load_trajectory
@@ -86,7 +87,9 @@ def load_user_scenes(
     if files and named:
         raise InputError("--scene and --scenes must not be given together, got both; omit one")
     if cameras is not None and not files:
-        raise InputError("--cameras must be given with --scene FILE")
+        raise InputError(
+            "--cameras must be given together with --scene FILE, got no --scene; add it, or omit --cameras"
+        )
     path = None if cameras is None else load_trajectory(cameras)
     found: dict[str, BenchScene] = {}
     for name in files:

@@ -86,7 +86,10 @@ def read_summary(file: Path) -> Summary:
         raise InputError(f"cannot read {file}: {error}") from error
     runs = [one["run"] for one in facts if "run" in one]
     if "run" not in rows or not runs:
-        raise InputError(f"{file} must be a summary of fidsplat's results, got another file; give its folder")
+        raise InputError(
+            f"{file} must be a summary that `fidsplat experiment` wrote, got another CSV file; "
+            "give another folder"
+        )
     return Summary(rows, runs, [one["note"] for one in facts if "note" in one])
 
 

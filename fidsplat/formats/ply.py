@@ -100,8 +100,8 @@ def _plain_rows(header: Header) -> Rows:
             _widen(arrays["scales"], arrays["opacities"], rows[FILTER])
         if "coplanar_groups" in arrays and (lowest := arrays["coplanar_groups"].min(initial=-1)) < -1:
             raise InputError(
-                f"{header.path}: the property plane must be an id of 0 or more, or -1 for a splat without a "
-                f"group, got {lowest}"
+                f"{header.path}: the property 'plane' (coplanar group) must be an id of 0 or more, or -1 "
+                f"for none, got {lowest}; correct it, or remove the property"
             )
 
     return Rows(header.path, element.count, columns, fill)

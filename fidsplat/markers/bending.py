@@ -49,7 +49,8 @@ def subdivide(
 ) -> Printed:
     """Halve rectangles until they deviate from a surface by at most a bound.
 
-    deviation: metres. whole: cut between cells only, so that pieces of one cell may deviate more.
+    deviation: metres. whole: cut only at edges of modules; a rectangle of one module is not cut, even if it
+    deviates more.
 
     Raises InputError for more than `max_splats` pieces.
     """

@@ -227,7 +227,7 @@ class Marker(PickledByFields):
         """
         at = real_array("xy", xy, "(n, 2) metres on the sheet")
         if at.ndim != 2 or at.shape[1] != 2:
-            raise InputError(f"xy must be (n, 2) metres on the sheet, got the shape {at.shape}")
+            raise InputError(f"xy must be an array (n, 2) in metres, got the shape {at.shape}")
         return surface_frames(self.shape, np.asarray(at, np.float64)).points
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -62,15 +64,14 @@ def parse_spec(text: str) -> Spec:
         raise InputError(f"a marker spec must be text ({_forms()}), got {text!r}")
     head, colon, rest = text.partition(":")
     if not colon:
-        raise InputError(f"a marker spec must be one of {_forms()}, got {text!r}")
+        raise InputError(f"a marker spec must be one of {_forms()}, got {text!r}{_hint(text)}")
     kind = _named(head)
     foreign = foreign_family(head) if kind is None else None
     if foreign is not None:
         head, rest = foreign[0], f"{foreign[1]}:{rest}"
         kind = _kinds[head]
     if kind is None:
-        hint = did_you_mean(head, _kinds)
-        raise InputError(f"unknown kind of marker {head.lower()!r}{hint}; write {_forms()}")
+        raise InputError(f"unknown kind of marker {head.lower()!r}{_hint(text)}; write {_forms()}")
     return kind.parse(text, head, rest)
 
 
@@ -98,6 +99,24 @@ def _named(head: str) -> Kind | None:
     if _kinds.keys().isdisjoint(names) and foreign_family(head) is None:
         load_plugins("fidsplat.markers", register)
     return _kinds.get(names[0]) or _kinds.get(names[1])
+
+
+def _hint(text: str) -> str:
+    """The most similar kind, or spec of a tag, as a question in brackets; empty if none is similar."""
+    from fidsplat.images.tag_dictionaries import families
+
+    specs = {
+        f"{prefix}{name}": f"{kind}:{name}"
+        for kind in ("apriltag", "aruco")
+        for name in families(kind)
+        for prefix in ("tag" if kind == "apriltag" else "dict_", kind, "")
+    }
+    found = re.fullmatch(r"(.*?)(?:[:,_ ](\d+))?", text.lower()[:100], re.DOTALL)
+    head, tag_id = (text.lower(), None) if found is None or text.lower() in specs else found.groups()
+    near = difflib.get_close_matches(head, [*_kinds, *specs], 1, 0.7)
+    if near and near[0] in specs:
+        return f" (did you mean '{specs[near[0]]}:{tag_id or 'ID'}'?)"
+    return did_you_mean(text.partition(":")[0], _kinds)
 
 
 def _forms() -> str:

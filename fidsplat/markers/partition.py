@@ -172,8 +172,8 @@ def partition_colors(grid: np.ndarray) -> np.ndarray:
 
 
 def merge_runs(grid: np.ndarray) -> np.ndarray:
-    """Partition of an (h, w) grid of any colours into merged runs, in one pass: equal runs of successive
-    rows, or of columns if these are fewer; a few per cent more rectangles than the minimum.
+    """Partition an (h, w) grid of any colours into rectangles: merge equal runs of successive rows, or of
+    successive columns if that needs fewer rectangles; a few per cent more than the minimum.
     """
     across, down = _merged(grid), _merged(grid.T)[:, [1, 0, 3, 2]]
     return across if len(across) <= len(down) else down

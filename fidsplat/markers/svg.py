@@ -135,8 +135,10 @@ def _view(root: ElementTree.Element, name: str | None) -> tuple[float, float, fl
         box = [0.0, 0.0, *(float(side[0]) for side in sides if side)]
     if len(box) != 4 or not (min(box[2:]) >= 1 / FARTHEST and np.abs(box).max() <= FARTHEST):
         raise InputError(
-            f"{name} must have a viewBox, or width and height, above 0 and at most {FARTHEST:g}, got "
-            f"{' '.join(f'{side:g}' for side in box[2:]) or 'none'}"
+            f"{name} must have a viewBox, or width and height, with sides from {1 / FARTHEST:g} to "
+            f"{FARTHEST:g} and a corner within {FARTHEST:g} of 0, got "
+            f"{' '.join(f'{side:g}' for side in box) if len(box) > 2 else 'none'}; "
+            "set viewBox='0 0 WIDTH HEIGHT'"
         )
     return box[0], box[1], box[2], box[3]
 
@@ -188,8 +190,8 @@ def _shapes(
         if not all((np.abs(ring) <= FARTHEST).all() for ring in moved):
             farthest = max(float(np.abs(ring).max(initial=0)) for ring in moved)
             raise InputError(
-                f"{name}: <{tag}> must be within {FARTHEST:g} modules of the drawing, got {farthest:g}; "
-                "shrink it"
+                f"{name}: the coordinates of <{tag}> must be at most {FARTHEST:g} modules, got {farthest:g}; "
+                "move the shape closer to the viewBox"
             )
         yield moved, _color(style.color if style.fill == "currentColor" else style.fill, name), style.rule
 

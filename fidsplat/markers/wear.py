@@ -209,7 +209,7 @@ def _bled(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
         if distance[i] > reach.max():
             break
         shifted = np.s_[most + dy[i] : most + dy[i] + h, most + dx[i] : most + dx[i] + w]
-        # half a cell: the distance between the centres of cells is larger than that to the edge of the ink
+        # 0.5 cells: the edge of the ink is half a cell nearer than the centre of the inked cell
         spread = todo & padded[shifted] & (distance[i] - 0.5 <= reach)
         color[spread] = colors[shifted][spread]
         todo &= ~spread

@@ -37,8 +37,8 @@ class Worker:
         if self._do is None:
             if (here := identity()) != caller:
                 raise InputError(
-                    f"the worker on {socket.gethostname()} must have fidsplat {caller[0]}, code {caller[1]}, "
-                    f"got {here[0]}, code {here[1]}; install the same there"
+                    f"the worker on {socket.gethostname()} must have fidsplat {caller[0]} with code "
+                    f"{caller[1]}, got {here[0]} with code {here[1]}; install the same version there"
                 )
             self._do = make()
         return self._do

@@ -23,9 +23,10 @@ class Frame(ImageMapping):
     Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median`, `depth_first` (h, w)
     metres along z, `distance`, `distance_median`, `distance_first` metres along the ray; `normal` (h, w, 3)
     unit, camera frame, towards the camera, `normal_world` the same in the world's axes; `label`, `splat_id`
-    (h, w) int32; `blended` (h, w) int32; `error` (h, w), an upper bound of |rgb - ideal|
-    (fidsplat/render/certified_error.py). In pixels with an alpha below 1/255 (`_first` outputs: below
-    `Quality.first_hit`) `label` and `splat_id` are -1, and depths, distances and normals are 0.
+    (h, w) int32; `blended` (h, w) int32, number of composited splats; `error` (h, w), an upper bound of
+    |rgb - ideal| (fidsplat/render/certified_error.py). In pixels with an alpha below 1/255 (`_first`
+    outputs: below `Quality.first_hit`) `label` and `splat_id` are -1, and depths, distances and
+    normals are 0.
     """
 
     _noun = "frame"
@@ -38,14 +39,16 @@ class Frame(ImageMapping):
         error: ErrorImage | None = None,
         index: int = 0,
     ) -> None:
-        """error: the output `error`, if it is requested. Other arguments: see `ImageMapping`."""
+        """images: the backend's images; index: position of this view in them. capture: the rendered request.
+        ids: indices of the splats in the scene, for `splat_id`. error: image of certified errors, computed
+        when it is read; None if it was not requested."""
         super().__init__(images, capture.outputs, ids, index)
         self._error, self.capture = error, capture
         """The capture of this frame. `read_back` and `truth_of` use its camera, shutter and motion."""
 
     @property
     def images(self) -> Images:
-        """The backend's images, for kernels of the backend; this frame is the first of them."""
+        """The backend's images, for kernels of the backend; the frames of a batch share them."""
         return self._images
 
     def to_uint8(self) -> np.ndarray:

@@ -41,9 +41,10 @@ def scene_mesh(
     below one half are empty. Surfaces that are thinner than two voxels and visible from both sides are lost.
 
     Args:
-        cameras: views; by default 64 views from a sphere around the scene. voxel: metres; by default a 200th
-        of the longest side of the scene. renderer: by default one on the scene's device. progress: called
-        with the name of the current step and its completed fraction.
+        cameras: views; by default 64 views from a sphere around the scene.
+        voxel: metres; by default a 200th of the longest side of the scene.
+        renderer: by default one on the scene's device.
+        progress: called with the name of the current step and its completed fraction.
 
     Raises:
         InputError: no splats; a voxel size that is not positive or too small.

@@ -113,7 +113,7 @@ class Renderer:
     def lit(self, scene: Scene) -> Scene:
         """The scene with the colours of markers with `light` computed; `upload` and `render` call it.
 
-        A scene that is rendered again is not computed again.
+        The result is cached for each scene.
 
         Raises:
             InputError: the light of a marker cannot be computed, e.g. its surroundings are black.
@@ -139,8 +139,8 @@ class Renderer:
         """Use splats in arrays on the device, without a copy.
 
         Shapes and units are those of SplatCloud, float32 (labels int32): wp.array, or objects with DLPack
-        (torch, CuPy, JAX); NumPy arrays are copied. With scales (n, 3) splats are 3D Gaussians, disks where
-        the third is 0. Arrays are read when a frame is rendered, so a simulation may move the splats
+        (torch, CuPy, JAX); NumPy arrays are copied. Scales (n, 3) make 3D Gaussians, disks
+        where the third is 0. Arrays are read when a frame is rendered, so a simulation may move the splats
         between frames. Quaternions need no unit length; invalid splats (a value that is not finite, a scale
         below 0) are not rendered. `means` are relative to `origin` (3,), a world position.
 
@@ -168,9 +168,10 @@ class Renderer:
         """Render one frame: `render(scene, Capture(camera, ...))`, or the fields of a capture as arguments.
 
         Args:
-            scene: splats to render. capture: camera and settings, or only a camera; by default the capture of
-            the scene or of its ResidentCloud. outputs, quality, and by name the other fields
-            (`CaptureFields`): replace fields of the capture.
+            scene: splats to render.
+            capture: camera and settings, or only a camera; by default the capture of the scene or of its
+                ResidentCloud.
+            outputs, quality, and by name the other fields (`CaptureFields`): replace fields of the capture.
 
         Raises:
             InputError: no camera, an unknown output or preset, a frame that is too large, a cloud
@@ -290,8 +291,8 @@ class Renderer:
         """Render one cloud many times: one Frame for each capture or camera, in order.
 
         The cloud is uploaded once, kernels and buffers are reused, and an asynchronous device renders the
-        next frame while the caller uses the previous one. Arguments and errors: see `render` (a motion of the
-        camera replaces each camera's pose). An error is raised after all frames before it.
+        next frame while the caller uses the previous one. Arguments and errors: see `render`; a motion of the
+        camera replaces the pose of each camera. An error of a capture is raised after the frames before it.
         """
         # converted once, as the first frame would exhaust an iterator
         outputs = None if outputs is None else output_names(outputs)
@@ -320,18 +321,18 @@ class Renderer:
         """Render many views of one cloud at once. View i is bit-identical to `render` of that view.
 
         Exception: with stores and `Quality.detail_error` above 0, all views use the finest level of detail
-        that a view needs.
+        that any of them needs.
 
         Args:
-            scene: splats to render; a ResidentCloud is not uploaded again. captures: one Capture or Camera
-            for each view, with equal size and effects; or one for all views. A Camera replaces the camera of
-            the scene's capture, as in `render`. poses: (views, 7) float64, camera to world: x y z in metres
-            and a quaternion w x y z of any length
-                but 0. They replace the cameras' own poses.
+            scene: splats to render; a ResidentCloud is not uploaded again.
+            captures: one Capture or Camera for each view, with equal size and effects; or one for all views.
+                A Camera replaces the camera of the scene's capture, as in `render`.
+            poses: (views, 7) float64, camera to world: x y z in metres and a quaternion w x y z of any
+                length but 0. They replace the cameras' own poses.
             groups: {label: (views, 7)}: motion of the splats of that label in the world, relative to their
                 positions in the cloud (`Motion.groups`).
             mask: (views,) bool: views with False are not rendered; their images are 0, and -1 in `label` and
-            `splat_id`.
+                `splat_id`.
 
         Raises:
             InputError: as `render`; numbers of views, sizes, outputs or effects that differ; arrays of

@@ -181,9 +181,9 @@ class TrainSettings:
                 off = not any(getattr(self, switch) for switch in switches)
                 if off and getattr(self, name) != getattr(TrainSettings, name):
                     raise InputError(
-                        f"training: {' or '.join(switches)} must be on for a {name}, got {name} = "
-                        f"{getattr(self, name):g} without; add --{switches[0].replace('_', '-')}, or "
-                        f"{switches[0]}=True"
+                        f"training: {name} must be its default {getattr(TrainSettings, name):g} without "
+                        f"{' or '.join(switches)}, got {getattr(self, name):g}; add "
+                        f"--{switches[0].replace('_', '-')}, or {switches[0]}=True"
                     )
         if not self.dssim_weight <= 1:
             raise InputError(f"training: dssim_weight must be from 0 to 1, got {self.dssim_weight!r}")

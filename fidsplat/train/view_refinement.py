@@ -30,8 +30,9 @@ views of a camera, for which a GPU would have to wait in each iteration"""
 
 
 class _Adam:
-    """Adam for rows of `size` numbers in two groups; a group shares a mean square, so that the direction of
-    a step does not depend on the choice of axes."""
+    """Adam for vectors of `size` parameters, one (row) per view or camera, of two groups each: rotation and
+    translation, focal lengths and centre, or gains and offsets. The second moment is averaged over a group,
+    so that the direction of a step does not depend on the choice of axes."""
 
     def __init__(self, rows: int, size: int, settings: TrainSettings) -> None:
         self._betas = settings.beta1, settings.beta2

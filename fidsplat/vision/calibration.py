@@ -84,7 +84,8 @@ def calibrate(views: Sequence[BoardView], start: Camera) -> Camera:
             )
     except cv2.error as error:
         raise InputError(
-            f"views must be tilted differently to calibrate from, got {error.err}; add views"
+            f"views must show the board at different tilts, got views that OpenCV cannot calibrate "
+            f"({error.err}); add views at other tilts"
         ) from None
     lens = None
     if start.lens is not None:

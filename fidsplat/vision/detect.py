@@ -21,8 +21,8 @@ from fidsplat.vision.align import align, fit
 from fidsplat.vision.apriltag_library import read_tags
 
 # One family for each common grid size; less than one in 300 random dark squares decodes as a tag of these
-# families. 16h5 (1 in 30), the families of 1000 and 36h10 cost more time or have more false positives: only
-# on request.
+# families. Only on request, since they take more time or have more false positives: 16h5 (1 in 30), 36h10
+# and the families of 1000 tags (4x4_1000 to 7x7_1000).
 DEFAULT_FAMILIES = ("36h11", "25h9", "4x4_50", "5x5_100", "6x6_250", "7x7_250")
 
 MIN_SIDE = 8

@@ -52,7 +52,7 @@ INLINE void bounds_span(const Bounds *b, float y0, float y1, float *x0, float *x
     *x1 = -INFINITY;
     float low = fmax(y0 - b->ey, -b->hy), high = fmin(y1 - b->ey, b->hy);
     if (low <= high) {
-        // 4e-7: margin for rounding, since 1 - Y^2 / hy^2 cancels at the tips
+        // 4e-7: margin for rounding, since 1 - y^2 / hy^2 (y: right or left) cancels where |y| is close to hy
         float right = clamp(b->tip, low, high), left = clamp(-b->tip, low, high);
         float wr = FAST_SQRT(fmax(1.0f - right * right * b->inverse_hy2, 0.0f) + 4e-7f);
         float wl = FAST_SQRT(fmax(1.0f - left * left * b->inverse_hy2, 0.0f) + 4e-7f);

@@ -150,7 +150,7 @@ def make_blend_backward(
 
     @wp.func_native(with_numbers(_POOL, numbers))
     def pool() -> wp.uint64:
-        """Address of the sums of the warps in shared memory."""
+        """Address in shared memory of the partial sums of each warp."""
         ...
 
     @wp.func_native(with_numbers(_SUM_OVER_WARP, numbers))

@@ -1,5 +1,5 @@
-"""Image bounds of splats: an ellipse, or a box if the disk crosses the near plane; and the low-pass disc. The
-tiles of most splats are stored as a window: a bit mask of 8 x 4 tiles.
+"""Image bounds of splats: an ellipse, or a box if the splat crosses the near plane; and the circle of the
+low-pass filter. The tiles of most splats are stored as a window: a bit mask of 8 x 4 tiles.
 
 All bounds are conservative; each sample has an exact test.
 """

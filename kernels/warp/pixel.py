@@ -241,7 +241,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
 
     @wp.func
     def finish(pixel: Pixel):
-        """Finish a pixel after the last fragment."""
+        """Reset depths, normals and ids of a pixel with an alpha below 1/255, after its last fragment."""
         p = pixel
         if 1.0 - p.t < MIN_ALPHA:
             for k in range(wp.static(len(clears))):

@@ -1,4 +1,4 @@
-"""Resolve stage: pixels from their samples, for rgb over the background and for outputs (output/)."""
+"""Resolve stage: average samples to pixels, composite rgb over the background, resolve outputs (output/)."""
 
 from functools import cache
 

@@ -148,8 +148,10 @@ def make_staging(layout: Layout, cells: int, items: int) -> SimpleNamespace:
         length: int,
         open: bool,
     ) -> bool:
-        """Copy the records of lists[first : first + length], at most STAGED, to shared memory. Returns false,
-        for the complete block, if no thread in it is open.
+        """Copy the records of lists[first : first + length], at most STAGED, to shared memory. A barrier.
+
+        open: whether a pixel of this thread is unfinished. Returns false in all threads, without a copy, if
+        all pixels of the block are finished.
         """
         ...
 

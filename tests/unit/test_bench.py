@@ -328,7 +328,7 @@ def test_ones_own_scene_from_ones_own_cameras(tmp_path, monkeypatch, capsys):
     assert "more with --scenes" not in out
     for wrong, why in (
         (("--scene", "own.toml", "--scenes", "small"), "must not be given together"),
-        (("--cameras", "poses.tum"), "--cameras must be given with --scene FILE"),
+        (("--cameras", "poses.tum"), "--cameras must be given together with --scene FILE"),
     ):
         assert bench(*wrong) == 2
         assert why in capsys.readouterr().err

@@ -77,6 +77,10 @@ def test_april_grids():
         ("gridboard:0x5:4x4_50", "must have 1 to 64 columns and rows"),
         ("gridboard:5x5:4x4_51", "unknown tag family"),
         ("gridboard:8x8:4x4_50", "needs 64 tags, but 4x4_50 has 50"),
+        ("tga36h11:5", "did you mean 'apriltag:36h11:5'"),
+        ("4x4_50", "did you mean 'aruco:4x4_50:ID'"),
+        ("tag36h11,5", "did you mean 'apriltag:36h11:5'"),
+        ("charcuo:7x5:4x4_50", "did you mean 'charuco'"),
         ("aprilgrid:6x6:4x4_50", "the family of an AprilGrid must be AprilTags, got 'aprilgrid:6x6:4x4_50';"),
     ],
 )

@@ -349,7 +349,9 @@ def test_a_plane_that_is_not_an_int32_is_someone_elses(tmp_path):
 
 def test_a_plane_below_minus_one_is_an_error_that_names_the_file(tmp_path):
     columns = {name: 1.0 for name in PLAIN} | {"plane": [0, -7]}
-    with pytest.raises(fs.InputError, match=r"a\.ply: the property plane must be .*, got -7"):
+    with pytest.raises(
+        fs.InputError, match=r"a\.ply: the property 'plane' \(coplanar group\) must be .*, got -7"
+    ):
         fs.load_ply(write(tmp_path / "a.ply", columns, 2, {"plane": "<i4"}))
 
 

@@ -151,7 +151,7 @@ def test_workers_with_other_code_are_refused(cluster, monkeypatch):
     identities = iter([("1", "here"), ("1", "there")])
     monkeypatch.setattr("fidsplat.remote.ray_engine.identity", lambda: next(identities))
     with (
-        pytest.raises(fs.InputError, match="must have fidsplat 1, code here, got 1, code there"),
+        pytest.raises(fs.InputError, match="must have fidsplat 1 with code here, got 1 with code there"),
         ray_engine("local", work(str)),
     ):
         pass

@@ -238,5 +238,7 @@ def test_rates_need_their_switches():
     for switch in ("refine_poses", "refine_intrinsics"):
         assert TrainSettings(pose_rate=1e-3, **{switch: True}).pose_rate == 1e-3
     for rate in ("pose_rate", "exposure_rate_end"):
-        with pytest.raises(fs.InputError, match=rf"must be on for a {rate}, got {rate} = 0.1 without; add"):
+        with pytest.raises(
+            fs.InputError, match=rf"{rate} must be its default .* without .*, got 0.1; add --"
+        ):
             TrainSettings(**{rate: 0.1})

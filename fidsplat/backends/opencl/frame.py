@@ -140,6 +140,7 @@ def render_in_chunks(frame: DeviceFrame) -> None:
 
 
 def blend(frame: DeviceFrame, band: TileBand) -> None:
+    """Submit the blend kernel for a band of tiles; GPUs start with the longest lists."""
     group = frame.shape.blend_items
     given: dict[str, Any] = {"band_first": band.first}
     if frame.shape.schedule == "group":

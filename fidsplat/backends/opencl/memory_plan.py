@@ -142,11 +142,12 @@ def plan_of(
     """Plan a frame of `count` splats.
 
     Args:
-        record_bytes: bytes of the struct `Splat`. upload_bytes: bytes per splat copied for each frame; 0 if
-        the cloud
-            stays.
-        fixed_bytes: bytes of sample buffers, outputs, tables, and the cloud if it stays on the device.
-        budget: maximum total bytes. largest: maximum bytes of one buffer.
+        record_bytes: bytes of the struct `Splat`.
+        upload_bytes: bytes per splat that are copied for each frame; 0 if the cloud is resident.
+        fixed_bytes: bytes of sample buffers, outputs, tables, and of a resident cloud.
+        lists: tile-binning strategy.
+        budget: maximum total bytes.
+        largest: maximum bytes of one buffer.
     """
     direct = count * (record_bytes + KEYS + WINDOWS + (SORTED if lists == "ordered" else 0))
     pairs = budget // 8

@@ -56,7 +56,7 @@ Launch: TypeAlias = tuple[str, tuple[int, ...], tuple[int, ...], list[Any]]
 
 
 class ResidentArrays(Resident):
-    """Splats in training as a cloud to render, without labels and coplanar groups."""
+    """Device arrays of splats in training as a resident cloud, without labels and coplanar groups."""
 
     has_coplanar_groups, footprint, immutable = False, "gaussian", False
 

@@ -60,8 +60,11 @@ class Workspace:
 
     @contextmanager
     def rendering(self) -> Iterator[None]:
-        """A context with exclusive use of the device. Raises DeviceError on failure, after all queues are
-        idle, since a CPU may be reading a cloud's arrays."""
+        """A context with exclusive use of the device. After an exception it waits for all queues, because
+        kernels on a CPU may still read a cloud's host arrays.
+
+        Raises DeviceError if an OpenCL call failed.
+        """
         with self.lock:
             try:
                 yield

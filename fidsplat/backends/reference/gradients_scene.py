@@ -213,7 +213,8 @@ def _unclamped(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
 def _rgb_backward(
     parameters: Parameters, eye: np.ndarray, by_rgb: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of the colours with respect to SH or colours, and to the rays (n, 3)."""
+    """Gradients of the loss with respect to SH coefficients or colours, and to the vectors from the camera
+    centre to the means (n, 3). by_rgb: (n, 3) gradient with respect to the rendered colours."""
     if parameters.sh is None:
         return by_rgb, np.zeros_like(by_rgb)
     directions, length = _directions(parameters.means - eye)

@@ -140,7 +140,8 @@ class WarpPipeline(Pipeline):
     def _render(self, resident: Resident, views: ViewBatch, into: ImageArrays) -> Rendered:
         """Render views, without waiting if a frame with the same key is cached."""
         workspace, view = self.workspace, views.view
-        # frames of adopted arrays must wait, as the arrays may change before a frame is rendered again
+        # frames of the user's own device arrays (`adopt`) must wait for their counts: a frame that overflows
+        # its buffers is rendered again, and by then the user may have changed the arrays
         if not workspace.asynchronous or view.sub_frames or resident.adopted or not resident.count:
             return self._render_counted(resident, views, into)[1]
         cached = self._cached.get(resident, {}).get((view.width, view.height, len(views)))

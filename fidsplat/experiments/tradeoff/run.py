@@ -1,4 +1,4 @@
-"""Trade-off as a sweep: its points in order of information, and their measurement."""
+"""Sweep of the trade-off of time and error: its points, most informative first, and their measurement."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def scene_names(names: Iterable[str], quick: bool = False) -> tuple[str, ...]:
 
 
 def views_of(name: str) -> tuple[str, ...]:
-    """Names of a scene's views: the scene's name, or a marker at each tilt."""
+    """Names of a scene's views: its own name, or `NAME@TILT` for each tilt of a marker."""
     return tuple(f"{name}@{tilt}" for tilt in TILTS) if name in MARKERS else (name,)
 
 

@@ -181,10 +181,10 @@ def beyond_certificates(difference: np.ndarray, scene: TradeScene, quality: Qual
 
 
 def compare_marker(image: np.ndarray, scene: TradeScene) -> dict:
-    """Compare a marker with the ideal area-sampled texture.
+    """Compare a rendered marker with its ideal area-sampled texture.
 
     Returns `ideal_psnr` in dB, `corners_px` (RMS of corner errors; None if the marker is not detected), and
-    the number of `rectangles` of the partition.
+    the number of `rectangles` into which the marker is divided.
     """
     marker = scene.marker
     assert marker is not None

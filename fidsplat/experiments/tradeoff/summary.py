@@ -79,7 +79,7 @@ def load(folders: Iterable[Path]) -> list[DeviceResults]:
 
 
 class DeviceResults:
-    """Results of a device, without presets whose settings have changed since."""
+    """Results of a device, without presets that were changed after their measurement."""
 
     def __init__(self, summary: Summary) -> None:
         run, rows = summary.runs[0], summary.rows

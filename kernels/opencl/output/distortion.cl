@@ -1,7 +1,7 @@
 // distortion (h, w): depth distortion of 2DGS, sum over pairs of w_i w_j (m_i - m_j)^2 with m the depth-buffer value for planes at
 // 0.2 and 100 m: m = constant - INVERSE_DEPTH / z. Depths below 0.2 m are clamped: 1 / z is unbounded, and one edge-on disk
-// would dominate the loss. Computed as W sum w m^2 - (sum w m)^2, which does not depend on the origin of m; with the first
-// fragment as origin little cancels.
+// would dominate the loss. Computed as W sum w m^2 - (sum w m)^2, which does not depend on the origin of m. The first
+// fragment is the origin, so that little cancels.
 //@ compose_types
 #define INVERSE_DEPTH WIDE(0.2004008016032064)  // 0.2 * 100 / (100 - 0.2)
 #define SPREAD_NEAR WIDE(0.2)

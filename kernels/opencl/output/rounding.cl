@@ -1,9 +1,9 @@
 // rounding (h, w): upper bound of the float32 rounding error in rgb, per unit of colour, for frames without a transmittance stop;
-// part of the output `error` (fidsplat/render/certified_error.py has the derivation). By interval arithmetic on a fragment's forms,
-// as in fidsplat/backends/reference/error_bounds.py: opacity is between `low` and `high`, and colour changes by at most the
-// transmittance times the larger of high - opacity and opacity - low. Fragments that rounding may discard (at the near plane, at the
-// horizon of the splat's plane, at the splat's rim) count, so all listed fragments are evaluated. Each blended fragment adds
-// 1.5 UNIT for the rounding of transmittance and colour sum (step 4 of the derivation).
+// part of the output `error` (derivation: fidsplat/render/certified_error.py). Interval arithmetic on the affine forms of the
+// ray-splat intersection, as in fidsplat/backends/reference/error_bounds.py, bounds a fragment's opacity by `low` and `high`. The
+// colour changes by at most the transmittance times the larger of high - opacity and opacity - low. The bound includes fragments that
+// rounding may discard (at the near plane, at the horizon of the splat's plane, at the edge of the footprint), so all listed fragments
+// are evaluated. Each blended fragment adds 1.5 UNIT for the rounding of transmittance and colour sum (step 4 of the derivation).
 //@ state
     vfloat rounding;
 //@ start

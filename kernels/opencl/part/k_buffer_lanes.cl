@@ -104,7 +104,8 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
         if (!reads && deferred_count > 0) rest_nearest = fmin(rest_nearest, key_depth((uint)(deferred[deferred_count - 1] >> 32)));
 //@@ chunk_of_layers_sorted
         for (uint which = 0; which < length; which++) listed[which] = lists[places[which]];
-        // per splat: its blocks, and its minimum depth in each block, whose last bits hold its index in the chunk
+        // touched[splat]: bit mask of the blocks that it overlaps. keys[splat][block]: its minimum depth in the block, whose low bits
+        // are replaced by the splat's index in the chunk.
         int touched[CHUNK] __attribute__((aligned(64))), keys[CHUNK][BLOCKS] __attribute__((aligned(64)));
         uint behind = 0;
         for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
@@ -155,7 +156,7 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
                 for (int lane = 0; lane < min(count - first, LANES); lane++) sorted[((int *)&places)[lane]] = unsorted[first + lane];
             }
             sorted[count] = 0x7F800000;         // infinity
-            wide nearest[CHUNK + LANES];        // lower bound of the depths that follow
+            wide nearest[CHUNK + LANES];        // nearest[k]: lower bound of the depths of all fragments after splat k
             for (int first = 0; first < count; first += LANES)
                 VSTORE(VMIN(VAS_FLOAT(in_order(VLOAD(sorted + first + 1) & -CHUNK)), (vfloat)rest_nearest), nearest + first);
             vfloat depths[CHUNK];               // per pixel, for splats before `evaluated`
@@ -226,7 +227,8 @@ static inline vint entry_before(const Entry *one, const Entry *other) {
     return VMASK(one->z < other->z) | (VMASK(one->z == other->z) & VMASK(one->place < other->place));
 }
 
-// Enqueues the fragments pushed out of `farthest`. If the queue is full, the farthest fragments of all are dropped.
+// Enqueues the fragments pushed out of `farthest`. If the queue is full, each lane evicts its farthest fragment and sets `until`: the
+// next pass composites from there on.
 static inline void k_buffer_enqueue(KBuffer *k_buffer, Entry *own) {
     Queue *queue = k_buffer->queue;
     own->z = VSELECT(own->z, (vfloat)EMPTY_Z, VMASK(own->z == NO_FRAGMENT));

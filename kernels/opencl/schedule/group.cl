@@ -7,8 +7,8 @@
 // Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, for complete
 // tiles.
 
-// Whether pixels consist of colours, transmittance and a flag of termination. Fragments outside of the mask are then blended with weight
-// 0: without a branch for them, the instructions of the rows overlap.
+// Whether a pixel has only colour, transmittance and a flag of termination. Fragments outside of the mask are then blended with weight 0
+// instead of skipped: without a branch, the rows of a work-item are executed in parallel (instruction-level parallelism).
 #define COLOURS_ONLY (sizeof(Pixel) <= 5 * sizeof(vfloat))
 
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(

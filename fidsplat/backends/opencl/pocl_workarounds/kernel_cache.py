@@ -52,8 +52,8 @@ def _is_complete_bitcode(stream: BinaryIO, size: int) -> bool:
         return False
     at = 4
     while at < size:
-        # an abbreviation id in 2 bits, the block's id and the width of ids in it: one word for all blocks
-        # that LLVM has at the top level; then the number of words
+        # Header ENTER_SUBBLOCK of the format: abbreviation id (2 bits), block id, and new abbreviation width,
+        # 32 bits in all for LLVM's top-level blocks; then the length of the block in words
         stream.seek(at)
         head = stream.read(8)
         if len(head) < 8 or head[0] & 3 != _ENTER_SUBBLOCK:
