@@ -90,7 +90,7 @@ kernel void project(
     uint at = number * count + i;
     view += number;
     KEY = CULLED;
-//@@ kept
+//@@ unculled
 //@@ splat_view
 
     // read before the first test, so that memory latency is paid once; arrays are aligned for vector loads (Resident)
@@ -250,7 +250,7 @@ INLINE void write_splat(
 #undef record
 #undef bounds
 #endif
-#if BATCH > 1 || defined(KEPT)
+#if BATCH > 1 || defined(UNCULLED)
 // Key of a splat that is culled by its bounding sphere; 0 for others.
 #undef RETURN_CULLED
 #define RETURN_CULLED return CULLED

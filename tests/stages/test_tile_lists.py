@@ -140,7 +140,7 @@ def test_splats_culled_before_projection(backend, monkeypatch):
         rendered[-1] += [pipeline.render_view(resident, view) for view in (*views, *views)]
         for images in rendered[-1]:
             images.read("rgb")
-    culled = own.pool.size("kept") // 4
+    culled = own.pool.size("unculled") // 4
     assert 4096 < culled < 9000
     assert own.pool.size("splats") == culled * pipeline.source.records["Splat"].itemsize
     for images, expected in zip(*rendered, strict=True):

@@ -31,7 +31,15 @@ from fidsplat.backends.opencl.declare import (
     output_argument,
 )
 from fidsplat.backends.opencl.effect_layouts import LAYOUTS, extension_layout
-from fidsplat.backends.opencl.layout import BOUNDS, GROUP_KERNELS, KEPT_KERNELS, KERNELS, MOMENTS, SPLAT, VIEW
+from fidsplat.backends.opencl.layout import (
+    BOUNDS,
+    GROUP_KERNELS,
+    KERNELS,
+    MOMENTS,
+    SPLAT,
+    UNCULLED_KERNELS,
+    VIEW,
+)
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.effects import FeatureSet, Output
 from fidsplat.effects.extensions import EXTENSIONS
@@ -78,7 +86,7 @@ _EFFECT_ARGUMENTS = {
         name: name
         for name in ("project", "emit", "blend", "backdrop", "resolve", "project_backward", "project_step")
     },
-    **{"blend_checkpoints": "blend_backward", "blend_backward": "blend_backward", "find_kept": "project"},
+    **{"blend_checkpoints": "blend_backward", "blend_backward": "blend_backward", "find_unculled": "project"},
 }
 """fields of `Layout` with the arguments that effects add to these kernels"""
 
@@ -170,7 +178,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     if shape.batch > 1 or shape.culls:
         files += _frustum_parts(layouts)
     if shape.culls:
-        files.append("part/kept_splats.cl")
+        files.append("part/unculled_splats.cl")
     if fused:
         files.append("part/resolve_fused.cl")
     if shape.lists == "tiled":
@@ -263,7 +271,7 @@ def _dialect(shape: DeviceShape, scalars: Scalars, slots: Iterable[str] = ()) ->
 def kernels_of(shape: DeviceShape) -> Mapping[str, tuple[Argument, ...]]:
     """The arguments of each kernel in the schedule of a shape."""
     kernels = KERNELS | GROUP_KERNELS if shape.schedule == "group" else KERNELS
-    return kernels | KEPT_KERNELS if shape.culls else kernels
+    return kernels | UNCULLED_KERNELS if shape.culls else kernels
 
 
 @cache

@@ -354,9 +354,11 @@ GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
 }
 """Kernels with other arguments in the group schedule, where a work-group shares a tile."""
 
-KEPT_KERNELS: dict[str, tuple[Argument, ...]] = {
-    "project": takes(KERNELS["project"], "in uint kept  // splats that are projected"),
-    "find_kept": takes(KERNELS["project"], "in uint kept", "out uint kept_bits kept_counts"),
-    "list_kept": takes("uint capacity", "in uint kept_bits kept_counts", "out uint kept tallies"),
+UNCULLED_KERNELS: dict[str, tuple[Argument, ...]] = {
+    "project": takes(KERNELS["project"], "in uint unculled  // splats that are projected"),
+    "find_unculled": takes(KERNELS["project"], "in uint unculled", "out uint unculled_bits unculled_counts"),
+    "list_unculled": takes(
+        "uint capacity", "in uint unculled_bits unculled_counts", "out uint unculled tallies"
+    ),
 }
 """Kernels with frustum culling before projection."""

@@ -35,7 +35,7 @@ class DeviceShape:
     batch: int = 1
     """splats that a work-item of the project stage sets up, vectorised if more than 1 (`lanes`)"""
     culls: bool = False
-    """whether splats outside of the frustum are culled before projection (part/kept_splats.cl, `tiled`)"""
+    """whether splats outside the frustum are culled before projection (part/unculled_splats.cl, `tiled`)"""
     dialect: str = ""
     """file of kernels/opencl/dialect/ with a vendor's instructions; empty: portable, bit-identical kernels"""
 

@@ -32,8 +32,8 @@ _ITEMS = 256
 _START_TILES, _START_SHARES = 512, 32
 """tiles per work-group of the kernel `tile_starts`, and maximum number of work-groups, each of which reads
 all list lengths"""
-_KEPT_SPLATS = 4096
-"""splats per work-group of the kernels of part/kept_splats.cl"""
+_UNCULLED_SPLATS = 4096
+"""splats per work-group of the kernels of part/unculled_splats.cl"""
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 
 
@@ -62,28 +62,28 @@ def cull(frame: DeviceFrame, big: int) -> None:
     """List the splats of the cloud that are not culled by their bounding spheres, and set
     `frame.projected`."""
     count, pool = frame.resident.count, frame.pool
-    groups, items = -(-count // _KEPT_SPLATS), (_ITEMS,)
-    frame.take("kept", 4 * MIN_BIG)
+    groups, items = -(-count // _UNCULLED_SPLATS), (_ITEMS,)
+    frame.take("unculled", 4 * MIN_BIG)
     # before the first launch: a recorded launch must not bind buffers that are replaced later
-    _take_records(frame, min(pool.size("kept") // 4, count))
-    frame.take("kept_bits", _KEPT_SPLATS // 8 * groups)
-    frame.take("kept_counts", 4 * groups)
+    _take_records(frame, min(pool.size("unculled") // 4, count))
+    frame.take("unculled_bits", _UNCULLED_SPLATS // 8 * groups)
+    frame.take("unculled_counts", 4 * groups)
     arrays = {name: frame.resident.part(name, 0, count) for name in frame.source.cloud_arrays}
-    frame.launch("project", "find_kept", (groups * _ITEMS,), items, frame.views, count=count, **arrays)
+    frame.launch("project", "find_unculled", (groups * _ITEMS,), items, frame.views, count=count, **arrays)
     while True:
-        frame.projected = min(pool.size("kept") // 4, count)
-        frame.launch("project", "list_kept", (groups * _ITEMS,), items, capacity=frame.projected)
+        frame.projected = min(pool.size("unculled") // 4, count)
+        frame.launch("project", "list_unculled", (groups * _ITEMS,), items, capacity=frame.projected)
         if not frame.waits:
             break
         found = int(frame.read("tallies", np.uint32, (TALLIES,))[VISIBLE])
         if found <= frame.projected:
             break
-        frame.take("kept", 4 * min(found * 17 // 16, count))
+        frame.take("unculled", 4 * min(found * 17 // 16, count))
         allocate_tallies(frame, TALLIES + frame.tiles, big)
 
 
 def project(frame: DeviceFrame, first: int, end: int) -> None:
-    """Project splats [first, end), or of these the splats of `cull`: write their records, sort keys and tile
+    """Project splats [first, end), or only those that passed `cull`: write their records, sort keys and tile
     windows."""
     count, size = end - first, _splat_capacity(frame, end - first)
     if frame.shape.culls:

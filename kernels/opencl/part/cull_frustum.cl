@@ -1,5 +1,5 @@
 // Frustum culling by the bounding sphere of a splat, before the exact bounds: on CPUs, and for large clouds on GPUs
-// (kept_splats.cl). The frustum's side planes are moved outwards by `margin` samples, the reach of the low-pass and the padding
+// (unculled_splats.cl). The frustum's side planes are moved outwards by `margin` samples, the reach of the low-pass and the padding
 // of bounds. Not for boxes: edges that meet at a sharp angle are filtered far beyond their corner.
 //@ cull_frustum
 #ifndef BOX_HERE
