@@ -37,7 +37,7 @@ def test_differences_are_not_rounded_to_float32():
     ("image", "want", "message"),
     [
         (np.zeros((2, 3)), np.zeros((3, 2)), r"shape \(3, 2\) .* got \(2, 3\)"),
-        (np.zeros((0, 3)), np.zeros((0, 3)), "must have values"),
+        (np.zeros((0, 3)), np.zeros((0, 3)), "must not be empty"),
         (np.array([1.0, np.nan]), np.zeros(2), "image must be finite, got 1 of 2"),
         (np.zeros(2), np.array([np.inf, np.nan]), "reference must be finite, got 2 of 2"),
     ],

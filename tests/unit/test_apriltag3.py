@@ -88,7 +88,7 @@ def test_spellings_of_other_projects(foreign, ours):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("apriltags:36h11:5", "unknown kind of marker 'apriltags' (did you mean 'apriltag'?)"),
+        ("apriltags:36h11:5", "unknown kind of marker 'apriltags' (did you mean 'apriltag:36h11:5'?)"),
         ("apriltag:standart41h12:5", "(did you mean 'standard41h12'?)"),
         ("tag36h12:5", "did you mean"),
         ("tagStandard41h12:2115", "ids must be 0 to 2114, got 2115"),

@@ -134,7 +134,7 @@ def test_training_reads_the_data_set_without_the_tags(captured):
     file = out / "dataset.json"
     notes = file.read_text()
     file.write_text('{"boxes": [[1, 2]]}')
-    with pytest.raises(fs.InputError, match=r"boxes of .* must be a list of an invertible matrix"):
+    with pytest.raises(fs.InputError, match=r'boxes of .* must be a list of ."matrix": invertible'):
         load_dataset(out)
     file.write_text(notes)
 

@@ -128,8 +128,11 @@ def test_the_scenes_camera_is_at_the_time_of_the_shutter(renderer):
     [
         ({"pixel": (159.0, 1.0)}, "the surface must .*got"),
         ({"pixel": (161.0, 1.0)}, r"pixel must be \(x, y\) in the image, 0 to 160"),
-        ({"pixel": (80.0, 60.0), "ray": (AT, NORMAL)}, "a pixel or a ray, got both"),
-        ({}, "a pixel or a ray, got neither"),
+        (
+            {"pixel": (80.0, 60.0), "ray": (AT, NORMAL)},
+            "exactly one of pixel and ray must be given, got both",
+        ),
+        ({}, "exactly one of pixel and ray must be given, got neither"),
         ({"pixel": (80.0, 60.0), "radius": -1.0}, "radius must be a positive length"),
         ({"pixel": (80.0, 60.0), "radius": "1"}, "radius must be a positive length"),
         ({"ray": (AT, (0.0, 0.0, 0.0))}, r"direction \(3,\), not 0"),

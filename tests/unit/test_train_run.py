@@ -453,7 +453,7 @@ def test_mcmc_begins_with_splats_that_learn_their_size(dataset):
 def test_settings_and_devices_that_cannot_be_used_are_named(dataset):
     with pytest.raises(fs.InputError, match="did you mean 'iterations'"):
         Trainer(dataset, fs.Renderer("reference"), iteration=3)
-    with pytest.raises(fs.InputError, match="samples must be 1 in a differentiable frame"):
+    with pytest.raises(fs.InputError, match="samples must be 1 for gradients, got 2"):
         Trainer(dataset, fs.Renderer("reference"), iterations=1, quality="surfel,samples=2").step()
 
 
