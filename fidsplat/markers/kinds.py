@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Callable
 
@@ -12,7 +11,7 @@ from fidsplat.images.family_names import foreign_family
 from fidsplat.markers import boards, codes, stag, svg
 from fidsplat.markers.spec import Detector, Kind, Spec
 from fidsplat.util.arguments import instance, invalid
-from fidsplat.util.errors import InputError, did_you_mean
+from fidsplat.util.errors import InputError, closest, did_you_mean
 from fidsplat.util.plugins import load_plugins
 
 _kinds = {kind.name: kind for module in (codes, stag, svg, boards) for kind in module.KINDS}
@@ -111,11 +110,11 @@ def _hint(text: str) -> str:
         for name in families(kind)
         for prefix in ("tag" if kind == "apriltag" else "dict_", kind, "")
     }
-    found = re.fullmatch(r"(.*?)(?:[:,_ ](\d+))?", text.lower()[:100], re.DOTALL)
-    head, tag_id = (text.lower(), None) if found is None or text.lower() in specs else found.groups()
-    near = difflib.get_close_matches(head, [*_kinds, *specs], 1, 0.7)
-    if near and near[0] in specs:
-        return f" (did you mean '{specs[near[0]]}:{tag_id or 'ID'}'?)"
+    name = text[:100].lower()
+    head = name if name in specs else re.sub(r"[:,_ ]\d+$", "", name)
+    near = closest(head, [*_kinds, *specs], 0.7)
+    if near in specs:
+        return f" (did you mean '{specs[near]}:{name[len(head) + 1 :] or 'ID'}'?)"
     return did_you_mean(text.partition(":")[0], _kinds)
 
 

@@ -60,8 +60,13 @@ def unknown(what: str, name: object, known: Iterable[str], within: str = "", lik
 
 def did_you_mean(name: object, known: Iterable[str], likeness: float = 0.6) -> str:
     """The most similar known name as a question in brackets, after a space; empty if none is similar."""
-    near = difflib.get_close_matches(str(name)[:100].lower(), list(known), 1, likeness)
-    return f" (did you mean {near[0]!r}?)" if near else ""
+    near = closest(str(name), known, likeness)
+    return "" if near is None else f" (did you mean {near!r}?)"
+
+
+def closest(name: str, known: Iterable[str], likeness: float = 0.6) -> str | None:
+    """The most similar known name, None if none is similar; known names are in lower case."""
+    return next(iter(difflib.get_close_matches(name[:100].lower(), list(known), 1, likeness)), None)
 
 
 def bytes_words(size: float) -> str:
