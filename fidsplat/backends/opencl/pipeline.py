@@ -80,7 +80,7 @@ class OpenCLPipeline(Pipeline):
 
     def render_view(self, resident: Resident, view: View) -> OpenCLImages:
         """Render one view. A frame whose command list is cached is replayed, on a GPU without waiting."""
-        if self.shape.batch > 1 and resident.count < MIN_BATCHED:
+        if self._is_too_small_to_batch(resident):
             return self._unbatched.render_view(resident, view)
         with self.workspace.rendering():
             key = self._key(view)
@@ -104,7 +104,7 @@ class OpenCLPipeline(Pipeline):
     def render(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
         if views.is_single:
             return self.render_view(resident, views.one(0))
-        if self.shape.batch > 1 and resident.count < MIN_BATCHED:
+        if self._is_too_small_to_batch(resident):
             return self._unbatched.render(resident, views)
         workspace, rendered = self.workspace, []
         with workspace.rendering():
@@ -131,7 +131,7 @@ class OpenCLPipeline(Pipeline):
     def render_complete(self, resident: Resident, view: View) -> DeviceFrame:
         """Render one frame; returns its buffers, which are valid until the next frame. Raises DeviceError if
         it exceeds the memory budget without chunks and bands."""
-        if self.shape.batch > 1 and resident.count < MIN_BATCHED:
+        if self._is_too_small_to_batch(resident):
             return self._unbatched.render_complete(resident, view)
         with self.workspace.rendering():
             plan, frame = self._planner.frame(resident, view), None
@@ -257,6 +257,10 @@ class OpenCLPipeline(Pipeline):
     def _with_lists(self, lists: str) -> OpenCLPipeline:
         """The pipeline with another tile-binning strategy."""
         return self._other(self.features, replace(self.shape, lists=lists, culls=False))
+
+    def _is_too_small_to_batch(self, resident: Resident) -> bool:
+        """Whether compiling the vectorised set-up would take longer than it saves, for a small cloud."""
+        return self.shape.batch > 1 and resident.count < MIN_BATCHED
 
     @cached_property
     def _culls(self) -> bool:
