@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import Camera
+from fidsplat.cameras.foreign import OPENGL
 from fidsplat.formats.ply import save_ply
 from fidsplat.formats.sog import save_sog
 from fidsplat.scenes.scene import Scene
@@ -37,8 +38,6 @@ _FILES = {
 MAX_SPLATS = 8_000_000
 """maximum number of splats of a page, as browsers limit a text to about half a gigabyte"""
 _GLTF_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
-_OPENGL_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])
-"""from camera axes with y up and z backward to axes with y down and z forward, or back"""
 
 
 def save_page(scene: Scene, path: str | os.PathLike[str], title: str = "fidsplat") -> None:
@@ -96,7 +95,7 @@ def _in_script(text: str) -> str:
 def _view(means: np.ndarray, camera: Camera) -> dict[str, Any]:
     """Pose, field of view and clipping of a camera, in PlayCanvas' axes."""
     world_to_camera = np.asarray(camera.world_to_camera, np.float64)
-    pose = _GLTF_AXES @ np.linalg.inv(world_to_camera) @ _OPENGL_CAMERA
+    pose = _GLTF_AXES @ np.linalg.inv(world_to_camera) @ OPENGL
     depths = means @ world_to_camera[2, :3] + world_to_camera[2, 3]
     front = depths[depths > 0]
     middle = float(np.median(front)) if len(front) else 1.0
