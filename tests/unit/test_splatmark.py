@@ -28,13 +28,13 @@ def result(name: str, renderer: str, setting: str, median: float, error: float) 
     }
     errors = {"largest_error": error, "mean_error": error / 10, "psnr_db": 40.0}
     return {"scene": name, "renderer": renderer, "setting": setting, "frames": 3, "memory_bytes": 2**20} | {
-        "memory_of": "process", "claim": {}, "load_ms": 1.0, **times, **errors
+        "memory_of": "process", "load_ms": 1.0, **times, **errors
     }  # fmt: skip
 
 
 @pytest.fixture
 def file(tmp_path):
-    facts = {"version": "1", "device": "a CPU", "kind": "cpu", "driver": "d"}
+    facts = {"version": "1", "device": "a CPU", "kind": "cpu", "driver": "d", "settings": {}}
     results = [
         result("r1", "a", "exact", 4.0, 1e-5), result("r1", "a", "coarse", 1.0, 0.1),
         result("r2", "a", "exact", 9.0, 0.0), result("h", "a", "exact", 50.0, 1e-3),
@@ -46,7 +46,7 @@ def file(tmp_path):
     ]  # fmt: skip
     scenes = {name: scene("uniform") for name in UNIFORM} | {"h": scene("haze")}
     content = {
-        "schema": 1,
+        "schema": 2,
         "run": {"date": "2026-11-28", "machine": "m", "commit": None, "command": "bench & more"},
         "scenes": scenes | {name: scene("scaling", float(name.split("@")[1])) for name in POINTS},
         "renderers": {name: facts for name in ("a", "b", "half")} | {"none": {"skipped": "no GPU"}},
@@ -84,7 +84,7 @@ def test_the_page_answers_first_and_escapes_names(file, tmp_path):
     assert "bench &amp; more" in page
     assert "skipped: no GPU" in page
     assert page.count("<svg") == 3
-    assert json.loads((tmp_path / "site" / file.name).read_text())["schema"] == 1
+    assert json.loads((tmp_path / "site" / file.name).read_text())["schema"] == 2
 
 
 def test_the_readme_has_a_line_for_each_regime(file):

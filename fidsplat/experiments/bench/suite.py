@@ -37,7 +37,7 @@ from fidsplat.util.provenance import run_facts
 from fidsplat.util.timing import Clock, Timer, quartiles, time_interleaved
 from fidsplat.vision.readback import means, read_back
 
-SCHEMA = 1
+SCHEMA = 2
 """version of the results' format"""
 TOO_SLOW = 10_000.0
 """milliseconds of a submission above which a renderer is skipped"""
@@ -71,7 +71,7 @@ class Effort:
     """maximum number of views with compared images"""
 
 
-FULL, QUICK = Effort(40, 3.0), Effort(7, 1.0, min_rounds=1, fast=250.0, slow=250.0, compared_views=1)
+FULL, QUICK = Effort(40, 2.5, compared_views=2), Effort(7, 1.0, min_rounds=1, fast=250.0, slow=250.0, compared_views=1)
 
 
 class RendererProcess:
@@ -196,8 +196,15 @@ class Measurement:
         )
         return {name: ms for name, ms in taken.items() if name != "ms"}
 
-    def first(self, references: References, file: Path) -> np.ndarray:
-        """Render the first frames; adds times and errors to `result`, returns the first image (h, w, 3)."""
+    def first(self, references: References, claim: Mapping[str, Any], file: Path) -> np.ndarray:
+        """Render the first frames; adds times and errors to `result`, returns the first image (h, w, 3).
+
+        Args:
+            claim: fields of `Quality` that define the image.
+            file: file by which the process returns images.
+
+        Raises AdapterError.
+        """
         taken, images, memory = [], [], {}
         for view in references.chosen:
             taken.append(self.process.frame(self.setting, [view])["ms"])
@@ -206,7 +213,7 @@ class Measurement:
         self.second_ms = self.timer.run()
         if self.timer.error:
             raise AdapterError(self.timer.error)
-        off = np.abs(np.stack(images) - references.image(self.result["claim"]))
+        off = np.abs(np.stack(images) - references.image(claim))
         if not np.isfinite(off).all():
             raise AdapterError(f"{self.setting}: the image has values that are not finite")
         self.result |= {
@@ -343,8 +350,11 @@ class Suite:
         """Process of a renderer; started on first use, or again after its end."""
         if name not in self._processes:
             process = self._processes[name] = self._openers[name]()
-            facts = {"skipped": process.skipped} if process.skipped else process.facts
-            self.found["renderers"][name] = facts
+            self.found["renderers"][name] = (
+                {"skipped": process.skipped}
+                if process.skipped
+                else {**process.facts, "settings": process.settings}
+            )
         return self._processes[name]
 
     def _measure(self, name: str, missing: Sequence[str], report: Callable[[str], None]) -> None:
@@ -430,9 +440,9 @@ class Suite:
             return []
         loaded = process.ask("load", file=str(file))
         for setting, claims in settings.items():
-            result = {"scene": name, "renderer": renderer, "setting": setting, "claim": claims[views.kind]}
+            result = {"scene": name, "renderer": renderer, "setting": setting}
             one = Measurement(process, setting, result | loaded, submissions)
-            image = one.first(references, file.with_name("image.npy"))
+            image = one.first(references, claims[views.kind], file.with_name("image.npy"))
             if views.scene is not None:
                 readings, _ = read_back(np.clip(image, 0, 1), views.scene, views.camera)
                 one.result["tags"] = means(readings)
