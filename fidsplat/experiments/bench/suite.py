@@ -71,7 +71,8 @@ class Effort:
     """maximum number of views with compared images"""
 
 
-FULL, QUICK = Effort(40, 2.5, compared_views=2), Effort(7, 1.0, min_rounds=1, fast=250.0, slow=250.0, compared_views=1)
+FULL = Effort(40, 2.5, compared_views=2)
+QUICK = Effort(7, 1.0, min_rounds=1, fast=250.0, slow=250.0, compared_views=1)
 
 
 class RendererProcess:
