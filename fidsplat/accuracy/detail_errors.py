@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import date
 from typing import Any
 
@@ -21,6 +21,7 @@ from fidsplat.store.store import Store
 from fidsplat.streaming.level_of_detail import select
 from fidsplat.util.arguments import settings_with
 from fidsplat.util.errors import InputError
+from fidsplat.util.progress import Progress, no_progress
 
 SIZES = tuple(2.0 ** (k / 2) for k in range(-8, 3))
 """measured cell sizes in samples, 1/16 to 2"""
@@ -31,7 +32,7 @@ def measure_detail(
     store: Store,
     renderer: Renderer,
     settings: DetailSettings | None = None,
-    progress: Callable[[str, float], object] = lambda words, share: None,
+    progress: Progress = no_progress,
     **changes: Any,
 ) -> list[DetailErrors]:
     """Measure errors by cell size from random poses around and inside a store, and save them in its folder.

@@ -8,7 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.util.arguments import LARGEST, PickledByFields, array_of, as_float, invalid, python_scalars
+from fidsplat.util.arguments import (
+    LARGEST,
+    PickledByFields,
+    array_of,
+    python_scalars,
+    three_numbers,
+)
 from fidsplat.util.errors import InputError
 
 MAX_PANORAMA = 16384
@@ -196,14 +202,3 @@ def background_of(value: Any) -> Background:
             "fs.Panorama(array)"
         )
     return three_numbers("background", value)
-
-
-def three_numbers(name: str, value: Any) -> tuple[float, float, float]:
-    """Validated tuple of three finite floats."""
-    try:
-        x, y, z = map(as_float, value)
-    except (TypeError, ValueError):
-        x = y = z = math.nan
-    if not (abs(x) <= LARGEST and abs(y) <= LARGEST and abs(z) <= LARGEST):
-        raise invalid(name, f"three finite numbers, at most {LARGEST:g}", value)
-    return x, y, z

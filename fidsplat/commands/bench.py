@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fidsplat.commands.options import Devices, check_plot, writable_file
+from fidsplat.commands.options import Devices, check_plot
 from fidsplat.commands.output import (
     console,
     delayed_progress,
@@ -17,7 +17,7 @@ from fidsplat.commands.output import (
 from fidsplat.commands.scenes import Cameras, UserScenes, load_user_scenes
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import write_file
+from fidsplat.util.files import writable_file, write_file
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from fidsplat.commands.options import Device, Json, Overwrite, new_file, repeatable, require_packages
+from fidsplat.commands.options import Device, Json, Overwrite, repeatable, require_packages
 from fidsplat.commands.output import console, json_text, print_lines, report, run_sweeps, show_progress
 from fidsplat.experiments.calibrate import CalibrationSettings
 from fidsplat.experiments.tags import TagSettings
+from fidsplat.util.files import new_file
 
 
 @dataclass

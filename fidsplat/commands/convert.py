@@ -9,10 +9,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from fidsplat.commands.options import Device, Json, Overwrite, new_file
+from fidsplat.commands.options import Device, Json, Overwrite
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import existing
+from fidsplat.util.files import existing, new_file
 
 
 @dataclass

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from fidsplat.commands.options import Device, Json, require_packages
+from fidsplat.commands.options import Device, Json, log_is_complete, require_packages
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.experiments.localise import Drive
 
@@ -69,11 +69,8 @@ class Localise:
             check_video(self.video)
         _ = drive.house  # validates the settings before a device is opened
         renderer = fs.Renderer(self.device)
-        log_is_complete, source = False, digest_of((drive, renderer.device.title, fs.__version__))
-        if self.log is not None:
-            from fidsplat.logs import check_log
-
-            log_is_complete = check_log(self.log, self.overwrite, source)
+        source = digest_of((drive, renderer.device.title, fs.__version__))
+        has_log = log_is_complete(self.log, self.overwrite, source)
         done = 0
 
         def step(name: str, share: float) -> None:
@@ -88,7 +85,7 @@ class Localise:
                 step(record.key["variant"], 0.0)
         found, device = found_of(sweep.results), renderer.device.title
         page = write_report(folder, drive, device, found)
-        self._record(drive, renderer, None if log_is_complete else source)
+        self._record(drive, renderer, None if has_log else source)
         rows, length = table_of(found), found[names[0]]["length_m"]
         rows = rows.iloc[:, :7]  # the width of a terminal; the page has all columns
         return report(

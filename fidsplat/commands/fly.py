@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from fidsplat.commands.options import Json, Overwrite, parse_numbers, writable_file
+from fidsplat.commands.options import Json, Overwrite, log_is_complete, parse_numbers
 from fidsplat.commands.output import console, report, show_progress
 from fidsplat.commands.scenes import RenderInput, Size
 from fidsplat.util.errors import InputError
+from fidsplat.util.files import writable_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -108,7 +109,7 @@ class Fly(RenderInput):
         flight = Flight(scene, path, times, scene.capture.with_(outputs=self.outputs, quality=self.quality))
         bop = None if self.bop is None else self._open_bop(self.bop, flight)
         with self._engine(flight) as (title, render):
-            log_is_complete = self._log_is_complete(flight.key(title))
+            has_log = log_is_complete(self.log, self.overwrite, flight.key(title))
             folder = FlightFolder(self.out, flight, title, self.overwrite, self.source)
             begun = time.perf_counter()
             left = len(folder.remaining())
@@ -117,7 +118,7 @@ class Fly(RenderInput):
         sheet = folder.write_sheet()
         if self.video is not None:
             list(show_progress("video", folder.write_video(self.video, self.rate), len(flight)))
-        if self.log is not None and not log_is_complete:
+        if self.log is not None and not has_log:
             frames = write_log(folder, self.log, self.overwrite, self.compress)
             list(show_progress("log", frames, len(flight)))
         if self.coco is not None:
@@ -142,14 +143,6 @@ class Fly(RenderInput):
         if "rgb" not in outputs:
             raise InputError(f"--bop must have rgb among --outputs, got {','.join(outputs)}")
         return BopScene(path)
-
-    def _log_is_complete(self, source: str) -> bool:
-        """Whether an interrupted run of the same flight has already written the log."""
-        if self.log is None:
-            return False
-        from fidsplat.logs import check_log
-
-        return check_log(self.log, self.overwrite, source)
 
     @contextmanager
     def _engine(self, flight: Flight) -> Iterator[tuple[str, Callable[[FlightFolder], Iterator[int]]]]:

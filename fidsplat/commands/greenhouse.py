@@ -4,8 +4,7 @@ from dataclasses import dataclass, field
 
 from fidsplat.commands.options import Json, Overwrite
 from fidsplat.commands.output import report
-from fidsplat.util.errors import InputError
-from fidsplat.util.files import path_of, writable_folder, write_file
+from fidsplat.util.files import path_of, refuse_existing, writable_folder, write_file
 from fidsplat.worlds.greenhouse import Greenhouse as World
 from fidsplat.worlds.greenhouse import GreenhouseSettings
 
@@ -41,8 +40,7 @@ class Greenhouse:
         made = World(**vars(settings), stock=stock)
         folder = path_of(self.out)
         scene_file, model = folder / "greenhouse.toml", folder / "greenhouse.xml"
-        if scene_file.exists() and not self.overwrite:
-            raise InputError(f"{scene_file} already exists; give another folder, or --overwrite")
+        refuse_existing(scene_file, self.overwrite)
         scene = made.scene
         writable_folder(folder)
         write_file(model, made.mjcf())

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from fidsplat.commands.options import Json, Overwrite, new_file
+from fidsplat.commands.options import Json, Overwrite
 from fidsplat.commands.output import delayed_progress, report
 from fidsplat.util.arguments import changes_of
 from fidsplat.util.errors import InputError
+from fidsplat.util.files import new_file
 
 if TYPE_CHECKING:
     import fidsplat as fs

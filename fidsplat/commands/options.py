@@ -12,7 +12,7 @@ import tyro
 
 from fidsplat.util.arguments import Bytes
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import ordinary_file, path_of, writable_folder
+from fidsplat.util.files import writable_file
 
 repeatable = tyro.conf.configure(tyro.conf.UseAppendAction)
 """decorator of a command whose options with several values are repeated, with one value each"""
@@ -57,21 +57,13 @@ def parse_numbers(option: str, text: str, form: str, amount: int | None = None) 
     return numbers
 
 
-def writable_file(path: str | Path) -> Path:
-    """The path of a file that can be written. Raises InputError if it cannot."""
-    file = path_of(path)
-    if file.is_dir():
-        raise InputError(f"the output must be a file, got the folder {file}; name a file in it")
-    writable_folder(file.parent)
-    return ordinary_file(file)
+def log_is_complete(path: str | None, overwrite: bool, source: str) -> bool:
+    """Whether an earlier run of the same source has written a log; False without a log."""
+    if path is None:
+        return False
+    from fidsplat.logs import check_log  # here, since it needs other packages
 
-
-def new_file(path: str | Path, overwrite: bool) -> Path:
-    """The path of a writable file that does not exist yet or may be replaced. Raises InputError otherwise."""
-    file = writable_file(path)
-    if file.exists() and not overwrite:
-        raise InputError(f"{file} already exists; give another name, or --overwrite")
-    return file
+    return check_log(path, overwrite, source)
 
 
 def require_packages(

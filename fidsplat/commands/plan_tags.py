@@ -9,8 +9,7 @@ import tyro
 from fidsplat.commands.options import Device, Json, Overwrite, require_packages
 from fidsplat.commands.output import delayed_progress, report
 from fidsplat.experiments.plan_tags import PlanSettings
-from fidsplat.util.errors import InputError
-from fidsplat.util.files import writable_folder
+from fidsplat.util.files import refuse_existing, writable_folder
 
 
 @dataclass
@@ -48,8 +47,7 @@ class PlanTags:
         require_packages("the map", ("matplotlib",))
         path = fs.load_trajectory(self.trajectory)
         folder = writable_folder(self.out)
-        if (folder / "scene.toml").exists() and not self.overwrite:
-            raise InputError(f"{folder / 'scene.toml'} already exists; give another folder, or --overwrite")
+        refuse_existing(folder / "scene.toml", self.overwrite)
         with delayed_progress() as progress:
             scene = load_source(self.source)
             renderer = fs.Renderer(self.device or scene.device)

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import tyro
 
-from fidsplat.commands.options import Json, Overwrite, new_file
+from fidsplat.commands.options import Json, Overwrite
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.commands.scenes import SceneDevice
 from fidsplat.scenes.sources import StartPose
+from fidsplat.util.files import new_file
 
 
 @dataclass

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from fidsplat.commands.options import Device, Json, new_file, require_packages, writable_file
+from fidsplat.commands.options import Device, Json, require_packages
 from fidsplat.commands.output import console, delayed_progress, print_lines, progress_bar, report
 from fidsplat.train.settings import TrainSettings
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import path_of
+from fidsplat.util.files import new_file, path_of, writable_file
 
 if TYPE_CHECKING:
     from fidsplat.train import Step, Trainer, ViewScore

@@ -6,7 +6,6 @@ GPL.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
@@ -190,7 +189,7 @@ def run_worker(
     with tempfile.TemporaryDirectory() as work:
         file, log = Path(work) / "job.json", Path(work) / "stderr.txt"
         job = {**job, "threads": threads or os.cpu_count() or 1, "objects": missing}
-        file.write_text(json.dumps(job), "utf-8")
+        write_json(file, job)
         environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
         with open(log, "wb") as errors:
             process = subprocess.Popen(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from fidsplat.store.build import build_store
 from fidsplat.store.store import Store
 from fidsplat.util.arguments import whole_number
 from fidsplat.util.files import writable_folder
+from fidsplat.util.progress import Progress, no_progress
 from fidsplat.worlds.city import City, flight
 
 IMAGE_ERROR = 1 / 255
@@ -44,7 +44,7 @@ def write_city(
     settings: CityDemoSettings,
     device: str | None = None,
     overwrite: bool = False,
-    progress: Callable[[str, float], None] = lambda words, share: None,
+    progress: Progress = no_progress,
 ) -> tuple[Store, Path]:
     """Write city.fss, and city.toml with a flight and markers; returns the store and the scene file."""
     from fidsplat.accuracy.detail_errors import measure_detail

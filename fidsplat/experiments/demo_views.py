@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from fidsplat.images.files import write_png
 from fidsplat.scenes import Scene
 from fidsplat.util.arguments import whole_number
 from fidsplat.util.files import writable_folder, write_json
+from fidsplat.util.progress import Progress
 from fidsplat.worlds.yard import FOV_X, demo_scene
 
 POINTS = 6000
@@ -52,7 +53,7 @@ def write_demo_views(
     folder: str | Path,
     settings: DemoViewSettings | None = None,
     device: str | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Path:
     """Render the demo scene from many poses and write a data set for training.
 

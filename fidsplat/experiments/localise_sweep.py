@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
@@ -22,14 +22,13 @@ from fidsplat.formats import load_trajectory, save_trajectory
 from fidsplat.logs import RobotLog, check_log
 from fidsplat.render.renderer import Renderer
 from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.progress import Progress
 from fidsplat.util.provenance import digest_of, run_facts
 from fidsplat.worlds.robot import Run
 
 RESULTS, REPORT, CHART = "localise.jsonl", "localise.md", "localise.svg"
 Found = Mapping[str, Mapping[str, Any]]
 """results by variant"""
-Progress = Callable[[str, float], object]
-"""callback with the name of a variant and the completed share of its images"""
 _PLOTTED = ("odometry", "paper", "exact", "no tags", "no wheels")
 """variants with a plotted trajectory"""
 _SPANS = (

@@ -12,7 +12,6 @@ import numpy as np
 
 from fidsplat.cameras import Camera, Trajectory
 from fidsplat.capture.sensor import Sensor
-from fidsplat.formats import Progress
 from fidsplat.images.tag_dictionaries import families, parse_family
 from fidsplat.markers import Marker, marker
 from fidsplat.render.renderer import Renderer
@@ -22,6 +21,7 @@ from fidsplat.scenes.surface import Surface
 from fidsplat.scenes.up import scene_up
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import write_json
+from fidsplat.util.progress import Progress, no_progress
 from fidsplat.vision.fisher_information import CornerNoise, tag_information
 from fidsplat.vision.tag_placement import (
     Objective,
@@ -210,7 +210,7 @@ class Survey:
         renderer: Renderer,
         progress: Progress | None = None,
     ) -> None:
-        self.report = progress or (lambda step, share: None)
+        self.report = progress or no_progress
         self._scene, self._settings, camera = scene, settings, _camera(scene)
         count = settings.poses if len(path) > 1 else 1
         times = np.linspace(float(path.times[0]), float(path.times[-1]), count)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from fidsplat.train import Step, Trainer, TrainSettings, load_dataset
 from fidsplat.util.arguments import whole_number
 from fidsplat.util.errors import InputError, unknown
 from fidsplat.util.files import from_json, read_text, writable_folder, write_json
+from fidsplat.util.progress import Progress, no_progress
 from fidsplat.util.provenance import code_hash
 from fidsplat.worlds.plants import GOLDEN, KINDS, Mesh
 
@@ -32,8 +33,6 @@ _LOW, _HIGH = math.radians(-15), math.radians(60)
 """range of camera elevations"""
 _MIN_OPACITY = 0.05
 """minimum opacity of trained splats"""
-Progress = Callable[[str, float], None]
-"""callback with the current step and its completed share"""
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def write_plants(
     folder: Path,
     environment: Path,
     device: str | None = None,
-    progress: Progress = lambda step, share: None,
+    progress: Progress = no_progress,
 ) -> Iterator[tuple[Path, float | None]]:
     """Make missing plants; yields each PLY file, and the mean PSNR of held-out views if it was trained now.
 

@@ -17,7 +17,7 @@ from fidsplat.experiments.setup import CATEGORIES, COLLECTIONS, PROTOCOLS
 from fidsplat.experiments.summary import Frame, Row, Summary, join, provenance, read_summary, summarise
 from fidsplat.experiments.sweep import Record, folder_records
 from fidsplat.experiments.views import LINEAR, TRUTHS
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, damaged_data
 
 _READERS = {"apriltag": ("pupil", "aruco"), "qr": ("zxing-tall", "zxing", "cv2")}
 """detectors of each kind, sorted by their limit on the ideal texture; the first available one is reported"""
@@ -309,20 +309,13 @@ def load(folders: Sequence[Path]) -> dict[str, Summary]:
     for name, kind in KINDS.items():
         records = [record for folder in folders for record in folder_records(folder, name)]
         summaries = [read_summary(file) for folder in folders if (file := folder / f"{name}.csv").is_file()]
-        try:
+        with damaged_data(f"a result of {name} in {where}", "measure again with --overwrite"):
             if records:
                 summaries.insert(0, summarise(records, kind.rows, (*kind.keys, "amount", *kind.columns)))
             if summaries:
                 found[name] = join(summaries, kind.keys)
                 rows = found[name].rows
                 rows[list(kind.columns)] = rows[list(kind.columns)].apply(pd.to_numeric)
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(
-                f"results of {name} in {where} are damaged or of another version of fidsplat "
-                f"({type(error).__name__}: {error}); measure again with --overwrite"
-            ) from error
     if not found:
         raise InputError(f"results must be in {where}, got none; run fidsplat experiment all first")
     return found

@@ -18,7 +18,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fidsplat.util.errors import FidsplatError, InputError
+from fidsplat.util.errors import FidsplatError, InputError, os_errors
 from fidsplat.util.files import atomic_write, from_json, ordinary_file, read_text, writable_folder
 
 Key = dict[str, Any]
@@ -89,16 +89,11 @@ class Results:
         """
         record = Record(key, rounded(result), self.run)
         text = _line(record) if self.run == self._last_run else _header(self.run) + _line(record)
-        try:
-            with open(self.file, "a", encoding="utf-8") as stream:
-                stream.write(text)
-                stream.flush()
-                os.fsync(stream.fileno())
-        except OSError as error:
-            raise InputError(
-                f"cannot write {self.file}: {error.strerror or error}; earlier results stay, and the same "
-                "command resumes from them"
-            ) from error
+        remedy = "earlier results stay, and the same command resumes from them"
+        with os_errors(f"cannot write {self.file}", remedy), open(self.file, "a", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
         self._last_run = self.run
         self.done[record.name] = record
         return record

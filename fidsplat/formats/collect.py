@@ -7,12 +7,12 @@ the count that the file declares.
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from fidsplat.splats.arrays import find_defects, with_thinnest_last
 from fidsplat.util import interrupts
+from fidsplat.util.progress import Progress
 
 PADDED_LOG_SCALE = np.log(1e-6)
 """log of the third scale that marks a disk, for tools that require three scales; as SuperSplat writes it"""
@@ -22,8 +22,6 @@ BLOCK = 2048
 """rows per block of a window: few enough that records and arrays stay in a core's cache"""
 _INITIAL_CAPACITY = 1_000_000  # splats
 
-Progress = Callable[[str, float], Any]
-"""callback with the current task and its completed share, 0 to 1"""
 _CHECKED = ("means", "quats", "scales", "opacities", "sh", "colors")
 
 

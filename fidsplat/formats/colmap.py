@@ -14,7 +14,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.splats.rotations import matrix_to_quaternion, quaternion_to_matrix
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, error_prefix
 from fidsplat.util.files import read_input, read_text, writable_folder, write_file
 
 _PINHOLE = 1  # id of the camera model PINHOLE: fx, fy, cx, cy
@@ -151,10 +151,8 @@ def load_colmap(folder: Path) -> ColmapModel:
         # a quaternion of length 0 becomes NaN, which Camera rejects
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             matrix[:3, :3], matrix[:3, 3] = quaternion_to_matrix(np.array(pose[:4])), pose[4:]
-        try:
+        with error_prefix(f"{folder}: image {name}"):
             cameras.append(Camera.from_colmap(lenses[number], matrix))
-        except InputError as error:
-            raise InputError(f"{folder}: image {name}: {error}") from error
     values = np.array(found, np.float64).reshape(-1, 6)
     return ColmapModel(
         tuple(name for name, _, _ in views),

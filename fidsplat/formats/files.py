@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.formats.collect import Progress
 from fidsplat.formats.gltf import load_gltf, save_gltf
 from fidsplat.formats.ply import load_ply, save_ply
 from fidsplat.formats.sog import load_sog, load_sog_folder, save_sog, save_sog_folder
@@ -23,6 +22,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.arguments import instance
 from fidsplat.util.errors import InputError, unknown
 from fidsplat.util.files import path_of, read_input
+from fidsplat.util.progress import Progress
 
 
 @dataclass(frozen=True)

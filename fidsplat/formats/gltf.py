@@ -30,7 +30,7 @@ from fidsplat.formats.plain import (
 )
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import rigid_matrix
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, damaged_data
 from fidsplat.util.files import from_json, read_input, write_file
 from fidsplat.util.limits import check_expansion
 
@@ -54,13 +54,8 @@ def load_gltf(path: Path) -> SplatCloud:
     """
     data = content(path, (b"glTF", b"{", codecs.BOM_UTF8))
     document, binary = _parts(path, data)
-    try:
-        reader = _Reader(path, document, binary)
-        clouds = reader.clouds()
-    except InputError:
-        raise
-    except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError) as error:
-        raise InputError(f"{path}: the glTF file is damaged ({type(error).__name__}: {error})") from None
+    with damaged_data(f"{path}: the glTF file"):
+        clouds = _Reader(path, document, binary).clouds()
     if not clouds:
         used = ", ".join(map(str, document.get("extensionsUsed") or ["none"]))
         raise InputError(

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from fidsplat.formats.gltf import gltf_document, pack_glb
-from fidsplat.util.errors import InputError
+from fidsplat.formats.ply_header import header_bytes
+from fidsplat.util.errors import InputError, required_package
 from fidsplat.util.files import write_file
 from fidsplat.util.response import to_light
 
@@ -165,11 +166,11 @@ def _ply(mesh: TriangleMesh) -> bytes:
             rows[name] = rounded[:, k]
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
     faces["count"], faces["corners"] = 3, mesh.faces
-    types = {"<f4": "float", "|u1": "uchar"}
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    lines += [f"property {types[rows.dtype[name].str]} {name}" for name in rows.dtype.names or ()]
-    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
-    return "\n".join(lines).encode() + rows.tobytes() + faces.tobytes()
+    header = header_bytes(
+        ("vertex", len(rows), {name: rows.dtype[name].str[1:] for name in rows.dtype.names or ()}),
+        ("face", len(faces), {"vertex_indices": "list uchar int"}),
+    )
+    return header + rows.tobytes() + faces.tobytes()
 
 
 def _obj(mesh: TriangleMesh) -> bytes:
@@ -189,7 +190,5 @@ def _stl(mesh: TriangleMesh) -> bytes:
 def _package(module: str) -> Any:
     from importlib import import_module
 
-    try:
+    with required_package(module, "mesh"):
         return import_module(module)
-    except ImportError:
-        raise InputError(f"{module} must be installed for this mesh; pip install 'fidsplat[mesh]'") from None

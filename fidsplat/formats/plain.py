@@ -10,7 +10,7 @@ from fidsplat.splats.arrays import find_defects
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import C0
 from fidsplat.util import interrupts
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, error_prefix
 from fidsplat.util.files import open_input, read_input
 
 PADDED = np.float32(1e-6)
@@ -85,10 +85,8 @@ def cloud_of(
         given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
         valid, _ = find_defects({name: np.asarray(array, np.float32) for name, array in given.items()})
         coplanar_groups = coplanar_groups[valid]
-    try:
+    with error_prefix(str(path)):
         return cloud.with_coplanar_groups(coplanar_groups)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def content(path: Path, magic: tuple[bytes, ...]) -> bytes:

@@ -5,16 +5,17 @@ import warnings
 
 import numpy as np
 
-from fidsplat.formats.collect import BLOCK, PADDED_LOG_SCALE, Progress, Rows, collect
+from fidsplat.formats.collect import BLOCK, PADDED_LOG_SCALE, Rows, collect
 from fidsplat.formats.compressed_ply import compressed_rows, is_compressed
 from fidsplat.formats.plain import refuse_boxes
-from fidsplat.formats.ply_header import Element, Header, read_header
+from fidsplat.formats.ply_header import Element, Header, header_bytes, read_header
 from fidsplat.splats.arrays import drop_report
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import C0
 from fidsplat.util.arguments import flag, instance
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
+from fidsplat.util.progress import Progress
 
 ORIGIN_COMMENT = "fidsplat origin"
 """prefix of the header comment with the three coordinates of the origin"""
@@ -189,36 +190,22 @@ def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool 
             "flatten them by cloud.flattened()"
         )
     rest = 0 if cloud.sh is None else 3 * (cloud.sh.shape[1] - 1)
-    names = [
-        *"xyz",
-        "nx",
-        "ny",
-        "nz",
-        *(f"f_dc_{i}" for i in range(3)),
-        *(f"f_rest_{i}" for i in range(rest)),
-    ]
-    names += [
-        "opacity",
-        "scale_0",
-        "scale_1",
-        *([] if native_2dgs else ["scale_2"]),
-        *(f"rot_{i}" for i in range(4)),
-    ]
-    whole = {"label": cloud.labels} if cloud.labels.any() else {}
+    names = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest))]
+    names += ["opacity", "scale_0", "scale_1", *([] if native_2dgs else ["scale_2"])]
+    names += [f"rot_{i}" for i in range(4)]
+    integers = {"label": cloud.labels} if cloud.labels.any() else {}
     if cloud.coplanar_groups is not None:
-        whole["plane"] = cloud.coplanar_groups
+        integers["plane"] = cloud.coplanar_groups
     column = {name: i for i, name in enumerate(names)}
-    lines = ["ply", "format binary_little_endian 1.0"]
-    if cloud.origin.any():
-        lines.append(f"comment {ORIGIN_COMMENT} {' '.join(repr(float(v)) for v in cloud.origin)}")
-    lines += [f"element vertex {len(cloud)}", *(f"property float {name}" for name in names)]
-    lines += [*(f"property int {name}" for name in whole), "end_header", ""]
+    origin = f"{ORIGIN_COMMENT} {' '.join(repr(float(v)) for v in cloud.origin)}"
+    properties = dict.fromkeys(names, "f4") | dict.fromkeys(integers, "i4")
+    header = header_bytes(("vertex", len(cloud), properties), comments=[origin] if cloud.origin.any() else [])
     with atomic_write(path) as stream:
-        stream.write("\n".join(lines).encode("ascii"))
+        stream.write(header)
         for start in range(0, len(cloud), _BLOCK):
             part = slice(start, start + _BLOCK)
             n = len(cloud.means[part])
-            rows = np.zeros((n, len(names) + len(whole)), "<f4")
+            rows = np.zeros((n, len(names) + len(integers)), "<f4")
             rows[:, 0:3] = cloud.means[part]
             dc = column["f_dc_0"]
             if cloud.sh is not None:
@@ -232,7 +219,7 @@ def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool 
             if not native_2dgs:
                 rows[:, first + 2] = _log_thickness(cloud, part)
             rows[:, column["rot_0"] : column["rot_0"] + 4] = cloud.quats[part]
-            for place, numbers in enumerate(whole.values(), len(names)):
+            for place, numbers in enumerate(integers.values(), len(names)):
                 rows.view("<i4")[:, place] = numbers[part]
             stream.write(rows.data)
 

@@ -1,8 +1,10 @@
-"""Header of a binary little-endian PLY file, validated against the file size before data is mapped."""
+"""Header of a binary little-endian PLY file: written, or validated against the file size before data is
+mapped."""
 
 import os
 import re
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice, takewhile
 from pathlib import Path
@@ -33,6 +35,23 @@ _TYPES = {
     "float32": "<f4",
     "float64": "<f8",
 }
+
+
+_TYPE_NAMES = {kind[1:]: name for name, kind in reversed(_TYPES.items())}
+"""names of types that all programs read, by code of NumPy"""
+
+
+def header_bytes(*elements: tuple[str, int, Mapping[str, str]], comments: Sequence[str] = ()) -> bytes:
+    """Header of a binary little-endian PLY file.
+
+    elements: name, number of rows, and types of the properties by name: codes of NumPy such as f4 and u1, or
+    "list TYPE TYPE".
+    """
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    for name, count, properties in elements:
+        lines.append(f"element {name} {count}")
+        lines += [f"property {_TYPE_NAMES.get(kind, kind)} {key}" for key, kind in properties.items()]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,14 @@ import os
 
 import numpy as np
 
+from fidsplat.formats.ply_header import header_bytes
 from fidsplat.util.arguments import invalid
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, path_of
 
 ENDINGS = (".pcd", ".ply", ".npy")
-_PLY_TYPES = {
-    **{"f4": "float", "f8": "double", "u1": "uchar", "i1": "char", "u2": "ushort", "i2": "short"},
-    **{"u4": "uint", "i4": "int"},
-}
+_TYPES = ("f4", "f8", "u1", "i1", "u2", "i2", "u4", "i4")
+"""codes of NumPy for types of fields"""
 
 
 def check_points_file(path: str | os.PathLike[str]) -> None:
@@ -36,7 +35,7 @@ def save_points(points: np.ndarray, path: str | os.PathLike[str]) -> None:
     little = np.dtype([(name, points.dtype[name].newbyteorder("<")) for name in names])
     codes = [little[name].str[1:] for name in names]
     for name, code in zip(names, codes, strict=True):
-        if code not in _PLY_TYPES:
+        if code not in _TYPES:
             raise InputError(
                 f"fields of points must be numbers of 1 to 4 bytes or float64, got {name} {code}"
             )
@@ -45,31 +44,24 @@ def save_points(points: np.ndarray, path: str | os.PathLike[str]) -> None:
         if kind == ".npy":
             np.save(file, points)
             return
-        file.write(
-            (_pcd_header if kind == ".pcd" else _ply_header)(names, codes, len(points)).encode("ascii")
-        )
+        fields = dict(zip(names, codes, strict=True))
+        vertex = ("vertex", len(points), fields)
+        file.write(_pcd_header(fields, len(points)) if kind == ".pcd" else header_bytes(vertex))
         file.write(points.astype(little).tobytes())
 
 
-def _pcd_header(names: tuple[str, ...], codes: list[str], count: int) -> str:
-    kinds = [code[0].upper() for code in codes]
+def _pcd_header(fields: dict[str, str], count: int) -> bytes:
     lines = (
         "# .PCD v0.7 - Point Cloud Data file format",
         "VERSION 0.7",
-        f"FIELDS {' '.join(names)}",
-        f"SIZE {' '.join(code[1:] for code in codes)}",
-        f"TYPE {' '.join(kinds)}",
-        f"COUNT {' '.join('1' for _ in names)}",
+        f"FIELDS {' '.join(fields)}",
+        f"SIZE {' '.join(code[1:] for code in fields.values())}",
+        f"TYPE {' '.join(code[0].upper() for code in fields.values())}",
+        f"COUNT {' '.join('1' for _ in fields)}",
         f"WIDTH {count}",
         "HEIGHT 1",
         "VIEWPOINT 0 0 0 1 0 0 0",
         f"POINTS {count}",
         "DATA binary",
     )
-    return "\n".join(lines) + "\n"
-
-
-def _ply_header(names: tuple[str, ...], codes: list[str], count: int) -> str:
-    fields = (f"property {_PLY_TYPES[code]} {name}" for name, code in zip(names, codes, strict=True))
-    lines = ("ply", "format binary_little_endian 1.0", f"element vertex {count}", *fields, "end_header")
-    return "\n".join(lines) + "\n"
+    return ("\n".join(lines) + "\n").encode("ascii")

@@ -22,7 +22,7 @@ import numpy as np
 from fidsplat.formats.plain import cloud_of, coefficients, refuse_boxes, three_scales, world_means
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import with_largest_component
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, damaged_data
 from fidsplat.util.files import atomic_write, from_json, open_input, read_input, write_file
 from fidsplat.util.limits import check_expansion
 
@@ -72,14 +72,9 @@ def neighbour(path: Path, name: str) -> Path:
 
 
 def _read(path: Path, part: Parts) -> SplatCloud:
-    try:
-        # numbers beyond float32 become invalid splats, which `cloud_of` drops
-        with np.errstate(over="ignore", invalid="ignore"):
-            return _cloud(path, part)
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: the SOG file is damaged ({type(error).__name__}: {error})") from None
+    # numbers beyond float32 become invalid splats, which `cloud_of` drops
+    with damaged_data(f"{path}: the SOG file"), np.errstate(over="ignore", invalid="ignore"):
+        return _cloud(path, part)
 
 
 def _cloud(path: Path, part: Parts) -> SplatCloud:

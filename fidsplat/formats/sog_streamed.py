@@ -15,7 +15,7 @@ import numpy as np
 from fidsplat.formats.sog import load_sog_folder, neighbour, save_sog_folder
 from fidsplat.splats.arrays import all_scales
 from fidsplat.splats.cloud import SplatCloud
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, damaged_data
 from fidsplat.util.files import from_json, read_input, writable_folder, write_json
 from fidsplat.util.limits import check_total
 
@@ -78,7 +78,7 @@ class StreamedSog:
 
 def read_streamed(path: Path) -> StreamedSog:
     """Read a lod-meta.json without its splats. Raises InputError for a damaged file or another version."""
-    try:
+    with damaged_data(f"{path}: the streamed SOG"):
         meta = from_json(read_input(path, _MAX_META))
         if meta.get("version", 1) != 1:
             raise InputError(
@@ -91,10 +91,6 @@ def read_streamed(path: Path) -> StreamedSog:
         files = tuple(neighbour(path, name) for name in meta["filenames"])
         environment = neighbour(path, meta["environment"]) if meta.get("environment") else None
         leaves = tuple(_leaves(path, meta["tree"], levels, len(files)))
-    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: the streamed SOG is damaged ({type(error).__name__}: {error})") from None
     if not any(0 in leaf for leaf in leaves):
         raise InputError(f"{path} must have splats of level 0, got none")
     return StreamedSog(path, levels, files, leaves, environment)

@@ -23,7 +23,7 @@ from fidsplat.cameras.trajectory import check_rate
 from fidsplat.formats.colmap import has_colmap, image_poses, load_colmap, save_colmap
 from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.util.arguments import instance
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, error_prefix
 from fidsplat.util.files import from_json, path_of, read_input, read_text, write_file
 
 MAX_BYTES = 2**28
@@ -67,10 +67,8 @@ def load_trajectory(path: str | os.PathLike[str], rate: float = RATE, smooth: bo
             times, poses = _lines(file, text)
     if not len(poses):
         raise InputError(f"a trajectory must have at least one pose, got none in {file}")
-    try:
+    with error_prefix(str(file)):
         return Trajectory(np.arange(len(poses)) / rate if times is None else times, np.array(poses), smooth)
-    except InputError as error:
-        raise InputError(f"{file}: {error}") from error
 
 
 def save_trajectory(
@@ -302,8 +300,6 @@ def load_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
         raise InputError(f"cannot read {found[0]} as a transforms.json: {error}") from None
     cameras = {}
     for number, name in enumerate(names):
-        try:
+        with error_prefix(f"{found[0]}: {name}"):
             cameras[name] = Camera.from_nerfstudio(transforms, number)
-        except InputError as error:
-            raise InputError(f"{found[0]}: {name}: {error}") from error
     return cameras

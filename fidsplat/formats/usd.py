@@ -29,7 +29,7 @@ from fidsplat.formats.plain import (
 )
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util import interrupts
-from fidsplat.util.errors import InputError, bytes_words
+from fidsplat.util.errors import InputError, bytes_words, required_package
 from fidsplat.util.files import atomic_path, open_input, regular_file, utf8_path
 from fidsplat.util.limits import VARIABLE, input_limit
 
@@ -233,7 +233,7 @@ def _field(prim: Any) -> dict[str, np.ndarray]:
 
 
 def _pxr() -> Any:
-    try:
+    with required_package("usd-core 26.3 or newer", "usd"):
         import pxr.Gf  # type: ignore[import-not-found]
         import pxr.Sdf  # type: ignore[import-not-found]
         import pxr.Tf  # type: ignore[import-not-found]
@@ -241,6 +241,4 @@ def _pxr() -> Any:
         import pxr.UsdGeom  # type: ignore[import-not-found]
         import pxr.UsdVol  # type: ignore[import-not-found]
         import pxr.Vt  # type: ignore[import-not-found]
-    except ImportError:
-        raise InputError("usd-core 26.3 or newer must be installed; pip install 'fidsplat[usd]'") from None
     return pxr

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, required_package
 from fidsplat.util.files import atomic_path, ordinary_file, writable_folder
 
 
@@ -21,10 +21,8 @@ def check_video(path: str | os.PathLike[str]) -> Path:
             f"a video file must have the suffix .mp4, got {file}; use {file.with_suffix('.mp4')}"
         )
     writable_folder(file.parent)
-    try:
+    with required_package("imageio-ffmpeg", "video"):
         import imageio_ffmpeg  # type: ignore[import-not-found]  # noqa: F401
-    except ImportError:
-        raise InputError("imageio-ffmpeg must be installed; pip install 'fidsplat[video]'") from None
     return file
 
 

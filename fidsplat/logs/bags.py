@@ -10,11 +10,11 @@ from pathlib import Path, PurePath
 from typing import Any, BinaryIO
 from urllib.parse import quote
 
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, required_package
 from fidsplat.util.files import open_input, read_input, regular_file
 from fidsplat.util.limits import check_expansion, input_limit
 
-try:
+with required_package("packages for logs", "logs"):
     import lz4.frame
     import zstandard
     from mcap.data_stream import ReadDataStream
@@ -22,8 +22,6 @@ try:
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
     from ruamel.yaml import YAML  # rosbags' own reader neither limits expansion nor quotes names
-except ImportError as error:
-    raise InputError(f"logs need more packages ({error}); pip install 'fidsplat[logs]'") from None
 
 MAX_METADATA = 2**20
 """largest metadata.yaml in bytes, as a Python parser reads it"""

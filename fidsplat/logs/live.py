@@ -7,7 +7,7 @@ from typing import Any
 from fidsplat.logs.robot_log import RobotLog
 from fidsplat.logs.writers import LogFile
 from fidsplat.util.arguments import text, whole_number
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, required_package
 
 BACKLOG = 64
 """messages that wait for a slow client; the oldest are dropped"""
@@ -89,12 +89,8 @@ class _Server:
     """A `LogFile` that sends its messages to clients of Foxglove's protocol."""
 
     def __init__(self, store: Any, host: str, port: int) -> None:
-        try:
+        with required_package("foxglove-sdk", "live"):
             import foxglove
-        except ImportError as error:
-            raise InputError(
-                f"Foxglove's protocol needs another package ({error}); pip install 'fidsplat[live]'"
-            ) from None
         self._store, self._foxglove, self._context = store, foxglove, foxglove.Context()
         self._channels: dict[str, Any] = {}
         try:

@@ -16,7 +16,7 @@ from fidsplat.images.files import decode_rgb
 from fidsplat.logs.bags import log_messages
 from fidsplat.logs.writers import typestore
 from fidsplat.splats.rotations import rigid_matrix
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, os_errors
 from fidsplat.util.files import path_of
 from fidsplat.vision.detect import Detection
 
@@ -108,9 +108,8 @@ def log_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int], np.ndarray]
 @contextmanager
 def _as_input_error(file: Path) -> Iterator[None]:
     try:
-        yield
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
+        with os_errors(f"cannot read {file}"):
+            yield
     except InputError:
         raise
     except Exception as error:  # errors of five packages that read, decompress and decode

@@ -16,8 +16,17 @@ from fidsplat.images.files import encode_image, pixels_of, to_uint8
 from fidsplat.logs.reader import SCENE
 from fidsplat.logs.writers import LogFile, log_file, typestore
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion, pose_matrix
-from fidsplat.util.arguments import instance, invalid, items, number, real_array, text
-from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.arguments import (
+    direction,
+    instance,
+    invalid,
+    items,
+    number,
+    real_array,
+    text,
+    three_numbers,
+)
+from fidsplat.util.errors import InputError, os_errors, unknown
 from fidsplat.vision.detect import Detection
 
 _POINT_FIELDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
@@ -67,10 +76,8 @@ class RobotLog:
         return self
 
     def __exit__(self, kind: type | None, *_: Any) -> None:
-        try:
+        with os_errors(f"cannot write {self._path}"):
             self._file.close(kind is None)
-        except OSError as error:
-            raise InputError(f"cannot write {self._path}: {error.strerror or error}") from error
 
     def image(
         self, time: float, camera: str, image: np.ndarray, output: str = "rgb", compress: str | None = None
@@ -182,7 +189,8 @@ class RobotLog:
         vector, point = self._of("geometry_msgs/msg/Vector3"), self._of("geometry_msgs/msg/Point")
         body = self._of("geometry_msgs/msg/Pose")(point(*position), turn)
         twist = self._of("geometry_msgs/msg/Twist")(
-            vector(*_three("velocity", velocity)), vector(*_three("angular_velocity", angular_velocity))
+            vector(*three_numbers("velocity", velocity)),
+            vector(*three_numbers("angular_velocity", angular_velocity)),
         )
         message = self._of("nav_msgs/msg/Odometry")(
             self._header(time, self.world),
@@ -206,8 +214,8 @@ class RobotLog:
         unknown = np.array([-1.0, *np.zeros(8)])  # ROS's value for a missing reading
         message = self._of("sensor_msgs/msg/Imu")(
             self._header(time, frame), self._of("geometry_msgs/msg/Quaternion")(0.0, 0.0, 0.0, 1.0),
-            unknown, vector(*_three("angular_velocity", angular_velocity)), none,
-            vector(*_three("acceleration", (0, 0, 0) if acceleration is None else acceleration)),
+            unknown, vector(*three_numbers("angular_velocity", angular_velocity)), none,
+            vector(*three_numbers("acceleration", (0, 0, 0) if acceleration is None else acceleration)),
             unknown if acceleration is None else none,
         )  # fmt: skip
         self._write(topic, time, message)
@@ -308,10 +316,8 @@ class RobotLog:
         self._last[topic] = time
         kind = message.__msgtype__
         data = bytes(self._store.serialize_cdr(message, kind))
-        try:
+        with os_errors(f"cannot write {self._path}"):
             self._file.write(topic, kind, _nanoseconds(time), data)
-        except OSError as error:
-            raise InputError(f"cannot write {self._path}: {error.strerror or error}") from error
 
 
 def _namespace(camera: str, output: str) -> str:
@@ -320,10 +326,7 @@ def _namespace(camera: str, output: str) -> str:
 
 def _upright(up: Any) -> np.ndarray:
     """The smallest rotation (4, 4) that maps a direction to the z axis."""
-    axis = real_array("up", up, "three finite numbers, not all 0")
-    if axis.shape != (3,) or not np.isfinite(axis).all() or not np.any(axis):
-        raise invalid("up", "three finite numbers, not all 0", up)
-    x, y, z = axis / np.linalg.norm(axis)
+    x, y, z = direction("up", up)
     pose = np.eye(4)
     if z < -1 + 1e-12:  # half a turn about x
         pose[:3, :3] = np.diag([1, -1, -1])
@@ -343,13 +346,6 @@ def _encoding(output: str, channels: int) -> str:
 
 def _nanoseconds(time: float) -> int:
     return round(number("a log's time", time, "seconds from 0 to 2^31", 0.0, 2**31 - 1) * 1e9)
-
-
-def _three(name: str, value: Any) -> list[float]:
-    numbers = real_array(name, value, "three numbers")
-    if numbers.shape != (3,) or not np.isfinite(numbers).all():
-        raise invalid(name, "three finite numbers", value)
-    return numbers.tolist()
 
 
 def _rigid(pose: Any, name: str) -> np.ndarray:

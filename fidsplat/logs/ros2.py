@@ -7,9 +7,9 @@ import os
 from typing import Any
 
 from fidsplat.logs.writers import DEPTH, DEPTHS
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, required_package
 
-try:
+with required_package("cyclonedds", "live"):
     from cyclonedds import idl
     from cyclonedds.core import DDSException
     from cyclonedds.domain import Domain, DomainParticipant
@@ -19,8 +19,6 @@ try:
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
     from cyclonedds.util import duration
-except ImportError as error:
-    raise InputError(f"ROS 2 topics need another package ({error}); pip install 'fidsplat[live]'") from None
 
 BLOCKING = duration(milliseconds=100)
 """longest wait for a subscriber; then a message is dropped"""

@@ -13,17 +13,15 @@ from typing import Any, Protocol
 
 from fidsplat.logs.bags import bag_metadata
 from fidsplat.util.arguments import flag, text
-from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, path_of, printable, writable_folder
+from fidsplat.util.errors import InputError, os_errors, required_package
+from fidsplat.util.files import atomic_write, path_of, printable, refuse_existing, writable_folder
 
-try:
+with required_package("packages for logs", "logs"):
     from mcap.reader import make_reader
     from mcap.writer import Writer as McapWriter
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as BagWriter
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-except ImportError as error:
-    raise InputError(f"logs need more packages ({error}); pip install 'fidsplat[logs]'") from None
 
 _APRILTAG = {
     "Point": "float64 x\nfloat64 y",
@@ -68,10 +66,8 @@ _METADATA = "fidsplat.source"
 def log_file(path: str | os.PathLike[str], store: Any, overwrite: bool, source: str) -> LogFile:
     """A writer of an MCAP file for NAME.mcap, else of a rosbag2 folder. source: see `RobotLog`."""
     target = _target(path, overwrite)
-    try:
+    with os_errors(f"cannot write {target}"):
         return (_McapFile if target.suffix == ".mcap" else _Bag)(target, store, source)
-    except OSError as error:
-        raise InputError(f"cannot write {target}: {error.strerror or error}") from error
 
 
 def check_log(path: str | os.PathLike[str], overwrite: bool, source: str) -> bool:
@@ -99,8 +95,7 @@ def _source_of(path: Path) -> str | None:
 
 def _target(path: str | os.PathLike[str], overwrite: bool) -> Path:
     target = path_of(path)
-    if target.exists() and not overwrite:
-        raise InputError(f"{target} already exists; give another name, or --overwrite")
+    refuse_existing(target, overwrite)
     if target.exists() and target.is_dir() != (target.suffix != ".mcap"):
         kind = "folder" if target.is_dir() else "file"
         raise InputError(f"{target} must be a log to be overwritten, got another {kind}; give another name")

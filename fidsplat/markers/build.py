@@ -26,7 +26,6 @@ from fidsplat.markers.partition import minimum_rectangles, partition_colors
 from fidsplat.markers.printing import (
     MAX_SPLATS,
     Printed,
-    Progress,
     aspect_of,
     box_cloud,
     gaussian_cloud,
@@ -52,6 +51,7 @@ from fidsplat.util.errors import InputError, unknown
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon
 from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.progress import Progress
 
 Ink = tuple[float, float, float]
 _INKS: tuple[Ink, Ink] = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))

@@ -14,9 +14,10 @@ from __future__ import annotations
 import numpy as np
 
 from fidsplat.images.apriltag3 import HOLE
-from fidsplat.markers.printing import Printed, Progress
+from fidsplat.markers.printing import Printed
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError
+from fidsplat.util.progress import Progress
 
 DISH = 0.005
 """depth of the dish between its centre and the centres of its longest edges, relative to these edges"""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from fidsplat.markers.mixture import Template, count_gaussians, place
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError
+from fidsplat.util.progress import Progress
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon
@@ -23,9 +24,6 @@ SLIVER = 1 / 64
 
 CHUNK = 1 << 18
 """Splats of a part: bounds the memory of float64 temporaries."""
-
-Progress = Callable[[str, float], Any]
-"""Callback of the current task and its completed share, 0 to 1."""
 
 
 class Printed(NamedTuple):

@@ -3,7 +3,6 @@ file."""
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,12 +15,12 @@ from fidsplat.formats.colmap import save_colmap
 from fidsplat.images.files import encode_image, read_image, write_png
 from fidsplat.images.visualize import resize_to_width
 from fidsplat.markers import marker
-from fidsplat.photographs.mapping import Progress
 from fidsplat.photographs.tags import box_of, module_colors
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.scenes.scene import Scene
 from fidsplat.train.boxes import EDGE, marker_mask, outside_boxes
-from fidsplat.util.files import atomic_write
+from fidsplat.util.files import atomic_write, write_json
+from fidsplat.util.progress import Progress
 from fidsplat.vision.undistort import undistort_masked
 
 SPLATS = "splats.ply"
@@ -119,12 +118,11 @@ def write_model(
     """
     boxes = [box_of(tag) for tag in tags]
     free = outside_boxes(points, boxes)
-    with atomic_write(folder / "dataset.json") as stream:
-        table = [
-            {"matrix": box.tolist(), "visible": [_image_name(name) for name in seen]}
-            for box, seen in zip(boxes, visible, strict=True)
-        ]
-        stream.write(json.dumps({"boxes": table}).encode())
+    table = [
+        {"matrix": box.tolist(), "visible": [_image_name(name) for name in photographs]}
+        for box, photographs in zip(boxes, visible, strict=True)
+    ]
+    write_json(folder / "dataset.json", {"boxes": table})
     save_colmap(
         folder / "sparse" / "0", [_image_name(name) for name in names], cameras, points[free], colors[free]
     )

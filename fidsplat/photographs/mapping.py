@@ -10,7 +10,7 @@ import contextlib
 import os
 import shutil
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -20,9 +20,9 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.photographs.settings import LENSES
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, required_package
+from fidsplat.util.progress import Progress
 
-Progress = Callable[[str, float], None]
 EXHAUSTIVE = 80
 """up to this number of images all pairs are matched; beyond, a video's frames with their neighbours"""
 NEIGHBOURS, STRIDE = 12, 10
@@ -65,10 +65,8 @@ class Model:
 
 def require_pycolmap() -> Any:
     """Import pycolmap and disable its log. Raises InputError if it is not installed."""
-    try:
+    with required_package("pycolmap", "capture"):
         import pycolmap  # type: ignore[import-not-found]
-    except ImportError:
-        raise InputError("capture needs pycolmap; pip install 'fidsplat[capture]'") from None
     pycolmap.logging.minloglevel = 3
     with contextlib.suppress(ValueError):  # outside of the main thread
         # its import replaces the handler by one that prints a stack trace

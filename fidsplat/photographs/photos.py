@@ -17,9 +17,9 @@ from fidsplat.images.files import (
     read_image,
     read_images,
 )
-from fidsplat.photographs.mapping import Progress
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import read_input
+from fidsplat.util.progress import Progress
 from fidsplat.vision.video_frames import choose_frames, measure_frames
 
 MIN_PHOTOS = 3

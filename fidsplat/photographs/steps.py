@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +15,6 @@ from fidsplat.photographs.dataset import scaled, write_images, write_model
 from fidsplat.photographs.frame import WorldFrame, world_frame
 from fidsplat.photographs.mapping import (
     Model,
-    Progress,
     extract,
     map_incrementally,
     match,
@@ -30,7 +28,8 @@ from fidsplat.photographs.settings import CaptureSettings
 from fidsplat.photographs.tags import detect_tags, parse_tags, same_tag
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.util.errors import InputError, unknown
-from fidsplat.util.files import atomic_write, from_json, path_of, read_text, writable_folder
+from fidsplat.util.files import from_json, path_of, read_text, writable_folder, write_json
+from fidsplat.util.progress import Progress, no_progress
 
 INPUTS = "inputs.json"
 SNAP = 0.02
@@ -75,7 +74,7 @@ def photographs_to_scene(
 
     Raises InputError if a photograph cannot be read, if too few can be registered, or if tags contradict.
     """
-    settings, report = settings or CaptureSettings(), progress or (lambda words, share: None)
+    settings, report = settings or CaptureSettings(), progress or no_progress
     tags = parse_tags(settings.tag)
     up = None if settings.up is None else same_tag(tags, marker(settings.up, 1.0))
     if settings.up is not None and up is None:
@@ -165,8 +164,7 @@ def _work_folder(folder: Path, files: list[Path], settings: CaptureSettings, ove
     work.mkdir(exist_ok=True)
     known = work / INPUTS
     if not known.exists():
-        with atomic_write(known) as stream:
-            stream.write(json.dumps(inputs).encode())
+        write_json(known, inputs)
     elif from_json(read_text(known)) != inputs:
         raise InputError(
             f"{folder} must be a new folder or of the same photographs and lens, got others; give another "

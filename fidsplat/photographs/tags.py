@@ -11,9 +11,9 @@ from fidsplat.cameras import Camera
 from fidsplat.images.files import read_image
 from fidsplat.markers import Marker, marker
 from fidsplat.photographs.adjustment import TagView
-from fidsplat.photographs.mapping import Progress
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.util.errors import InputError
+from fidsplat.util.progress import Progress
 from fidsplat.vision.detect import detect
 from fidsplat.vision.readback import content_of, families_of
 

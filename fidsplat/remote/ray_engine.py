@@ -11,7 +11,7 @@ from typing import Any
 from fidsplat import __version__
 from fidsplat.remote.queue import WorkerLost
 from fidsplat.util import interrupts
-from fidsplat.util.errors import FidsplatError, InputError
+from fidsplat.util.errors import FidsplatError, InputError, required_package
 from fidsplat.util.provenance import code_hash
 
 Make = Callable[[], Callable[[Any], Any]]
@@ -172,8 +172,6 @@ def ray_engine(address: str, make: Make, workers: int | None = None) -> Iterator
 
 
 def _ray() -> Any:
-    try:
+    with required_package("Ray", "ray"):
         import ray  # type: ignore[import-not-found]
-    except ImportError:
-        raise InputError("--ray needs Ray; pip install 'fidsplat[ray]', here and on the workers") from None
     return ray

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.formats.collect import Progress
 from fidsplat.formats.meshes import TriangleMesh
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.surface import median_depth
@@ -18,6 +17,7 @@ from fidsplat.scenes import Scene
 from fidsplat.splats.statistics import guess_up
 from fidsplat.util.arguments import items, number
 from fidsplat.util.errors import InputError
+from fidsplat.util.progress import Progress, no_progress
 
 VIEWS, SIDE, FOV = 64, 512, math.radians(50.0)
 """views around a scene: their number, pixels per side and field of view"""
@@ -68,7 +68,7 @@ def scene_mesh(
             "cameras must have at least one camera, got none; leave them out for views around the scene"
         )
     renderer = Renderer(scene.device) if renderer is None else renderer
-    report: Callable[[str, float], object] = progress or (lambda step, share: None)
+    report: Callable[[str, float], object] = progress or no_progress
     still = median_depth(scene.capture, "rgb", "normal")
     field = DistanceField(voxel, (low + high) / 2)
     images = []

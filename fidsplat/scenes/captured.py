@@ -12,6 +12,7 @@ from threading import Thread
 from fidsplat.util.downloads import download
 from fidsplat.util.errors import InputError, unknown
 from fidsplat.util.files import from_json, user_cache
+from fidsplat.util.progress import Progress, no_progress
 
 MIRROR = "FIDSPLAT_SCENES"
 """environment variable with a folder or URL that replaces the address of the files"""
@@ -54,7 +55,7 @@ def captured_scenes() -> dict[str, CapturedScene]:
     return {name: CapturedScene(name, **fields) for name, fields in table.items()}
 
 
-def fetch_scene(name: str, progress: Callable[[str, float], None] = lambda *_: None) -> Path:
+def fetch_scene(name: str, progress: Progress = no_progress) -> Path:
     """Path of a captured scene in the user's cache; downloads it on first use, from `MIRROR` if it is set.
 
     progress: called with the current step and its share done, 0 to 1.

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from fidsplat.capture.environment import three_numbers
 from fidsplat.capture.sensor import GAMMAS
 from fidsplat.scenes.table import Table, names_of
 from fidsplat.util.arguments import (
@@ -20,6 +19,7 @@ from fidsplat.util.arguments import (
     number,
     parse_settings,
     python_scalars,
+    three_numbers,
     whole_number,
 )
 from fidsplat.util.errors import InputError, unknown

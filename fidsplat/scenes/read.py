@@ -15,7 +15,7 @@ from fidsplat.cameras import Camera, Trajectory, look_at_matrix
 from fidsplat.capture.environment import Fog
 from fidsplat.capture.quality import MarkerQuality, Quality, setting_types
 from fidsplat.capture.sensor import Sensor
-from fidsplat.formats import Progress, load_splats
+from fidsplat.formats import load_splats
 from fidsplat.markers.surfaces import SHAPES, SheetShape
 from fidsplat.markers.wear import Wear
 from fidsplat.scenes.camera import POSE, TABLES, read_focal_lengths, read_keyframes, read_lens, read_shutter
@@ -30,6 +30,7 @@ from fidsplat.store.store import Store
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of, read_input
 from fidsplat.util.limits import check_total
+from fidsplat.util.progress import Progress
 
 MAX_BYTES = 16 * 2**20
 MAX_PARTS = 8

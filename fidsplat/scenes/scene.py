@@ -10,7 +10,6 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.capture.quality import Quality
-from fidsplat.formats import Progress
 from fidsplat.scenes.parts import PlacedMarker, SceneParts
 from fidsplat.scenes.read import read_scene
 from fidsplat.scenes.surface import Surface
@@ -18,6 +17,7 @@ from fidsplat.scenes.up import scene_up
 from fidsplat.scenes.write import write_scene
 from fidsplat.util.arguments import instance
 from fidsplat.util.markup import Summarised, point
+from fidsplat.util.progress import Progress
 
 if TYPE_CHECKING:
     from fidsplat.markers import Marker

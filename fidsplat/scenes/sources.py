@@ -11,7 +11,6 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.capture.quality import Quality
-from fidsplat.formats.collect import Progress
 from fidsplat.formats.files import FORMATS, NAMED, load_splats, remedy_for
 from fidsplat.formats.trajectories import load_cameras, load_trajectory
 from fidsplat.scenes.scene import Scene
@@ -22,6 +21,7 @@ from fidsplat.store.layout import SUFFIX
 from fidsplat.store.store import Store
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
+from fidsplat.util.progress import Progress
 
 WIDTH, HEIGHT, FOV_X = 1280, 720, math.radians(60.0)
 ELEVATION = math.radians(15.0)

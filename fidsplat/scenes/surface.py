@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.util.arguments import number, real_array
+from fidsplat.util.arguments import direction, number
 from fidsplat.util.errors import InputError
 
 TOLERANCE = 0.1
@@ -51,10 +51,7 @@ class Surface:
         """
         lift = LIFT + 2 * self.roughness if lift is None else number("lift", lift)
         for up in ups:
-            given = real_array("up", up, "three numbers")
-            if given.shape != (3,) or not np.isfinite(given).all() or not given.any():
-                raise InputError(f"up must be three finite numbers, not all 0, got {up!r}")
-            top = given / np.linalg.norm(given)
+            top = direction("up", up)
             top = top - (top @ self.normal) * self.normal
             if np.linalg.norm(top) >= LEVEL:
                 break

@@ -9,12 +9,10 @@ import numpy as np
 from fidsplat.effects import Output, declared_output
 from fidsplat.images.files import to_uint8
 from fidsplat.sim.rig import Rig
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, required_package
 
-try:
+with required_package("Gymnasium", "sim"):
     import gymnasium as _gymnasium  # type: ignore[import-not-found]
-except ImportError as error:
-    raise InputError(f"cannot import Gymnasium ({error}); pip install 'fidsplat[sim]'") from None
 
 gymnasium: Any = _gymnasium  # type checkers do not know its names where it is not installed
 spaces = gymnasium.spaces

@@ -18,12 +18,10 @@ from fidsplat.sim.rig import RigCamera, SimulatorRig
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrices_to_quaternions, quaternion_multiply
 from fidsplat.util.arguments import instance, whole_number
-from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.errors import InputError, required_package, unknown
 
-try:
+with required_package("MuJoCo", "sim"):
     import mujoco as _mujoco  # type: ignore[import-not-found]
-except ImportError as error:
-    raise InputError(f"cannot import MuJoCo ({error}); pip install 'fidsplat[sim]'") from None
 
 mujoco: Any = _mujoco  # type checkers do not know its names
 

@@ -15,13 +15,11 @@ from fidsplat.sim.poses import OPENGL, compose
 from fidsplat.sim.rig import RigCamera, SimulatorRig
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.arguments import instance
-from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.errors import InputError, required_package, unknown
 
-try:
+with required_package("Newton", "tiled"):
     import newton as _newton  # type: ignore[import-not-found]
     import warp as _warp  # type: ignore[import-not-found]
-except ImportError as error:
-    raise InputError(f"cannot import Newton ({error}); pip install 'fidsplat[tiled]'") from None
 
 newton: Any = _newton  # type checkers do not know their names
 wp: Any = _warp

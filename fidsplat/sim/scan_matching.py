@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 
 from fidsplat.sim.localiser import TILT, Localiser
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import required_package
 
-try:
+with required_package("small_gicp", "sim"):
     import small_gicp
-except ImportError as error:
-    raise InputError(f"scan matching needs another package ({error}); pip install 'fidsplat[sim]'") from None
 
 KEY_DISTANCE, KEY_TURN = 1.0, 0.5
 """metres and radians from a reference scan to the next"""

@@ -6,7 +6,6 @@ written. Progress is saved, so that an interrupted build resumes. `BuildPlan.mem
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections import Counter, deque
@@ -19,18 +18,18 @@ from typing import Any, cast
 
 import numpy as np
 
-from fidsplat.formats.collect import Progress
 from fidsplat.store.build_plan import ON_PLANE, BuildPlan, BuildSettings, plan_build
 from fidsplat.store.columns import ColumnFiles, enclose, node_record
 from fidsplat.store.layout import NODE, Header, npy_header, write_nodes
 from fidsplat.store.merge import REDUCTION, merged
 from fidsplat.store.sources import Source, open_sources, splats_of
-from fidsplat.store.staging import clear, refuse_existing, staged, store_folder
+from fidsplat.store.staging import check_replaceable, clear, staged, store_folder
 from fidsplat.store.streamed import import_streamed, is_streamed
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import callback, settings_with
 from fidsplat.util.errors import InputError, bytes_words
-from fidsplat.util.files import atomic_write, from_json, path_of, read_input
+from fidsplat.util.files import from_json, path_of, read_input, write_json
+from fidsplat.util.progress import Progress, no_progress
 
 _SAVE_EVERY = 16
 """number of windows or merged nodes after which progress is saved"""
@@ -65,9 +64,9 @@ def build_store(
     """
     progress = callback("progress", progress)
     folder = store_folder(out)
-    refuse_existing(folder, overwrite)
+    check_replaceable(folder, overwrite)
     settings = settings_with(BuildSettings, settings, changes)
-    progress = progress or (lambda words, share: None)
+    progress = progress or no_progress
     if is_streamed(inputs):
         one = inputs if isinstance(inputs, (str, os.PathLike)) else inputs[0]
         import_streamed(path_of(cast("str", one)), folder, progress)
@@ -132,8 +131,7 @@ class _Build:
 
     def _save(self, **done: Any) -> None:
         self.state |= done
-        with atomic_write(self.folder / "state.json") as stream:
-            stream.write(json.dumps(self.state).encode())
+        write_json(self.folder / "state.json", self.state)
 
     def _in_order(
         self,

@@ -44,11 +44,8 @@ class BuildSettings:
     """type of colours and SH: float32 or float16"""
 
     def __post_init__(self) -> None:
-        chunk, memory = self.chunk, self.memory
-        if isinstance(chunk, bool) or not isinstance(chunk, int) or not 64 <= chunk <= MAX_CHUNK:
-            raise InputError(f"chunk must be a whole number of splats from 64 to {MAX_CHUNK}, got {chunk!r}")
-        if isinstance(memory, bool) or not isinstance(memory, int) or memory < _MIN_MEMORY:
-            raise InputError(f"memory must be at least {_MIN_MEMORY >> 20} MiB, got {memory!r}")
+        whole_number("chunk", self.chunk, 64, MAX_CHUNK)
+        whole_number("memory", self.memory, _MIN_MEMORY, 2**63)
         flag("levels", self.levels)
         if not isinstance(self.colors, str) or self.colors not in COLORS:
             raise InputError(f"colors must be one of {', '.join(COLORS)}, got {self.colors!r}")

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from fidsplat.capture.quality import LOWPASS
-from fidsplat.store.layout import header_crc
-from fidsplat.util.arguments import Names
+from fidsplat.store.layout import header_crc, write_checked
+from fidsplat.util.arguments import Names, whole_number
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, from_json, read_input
+from fidsplat.util.files import from_json, read_input
 
 FILE = "detail.json"
 MARGIN = 3.0
@@ -31,8 +30,7 @@ class DetailSettings:
     """seed of the viewpoints"""
 
     def __post_init__(self) -> None:
-        if isinstance(self.views, bool) or not isinstance(self.views, int) or not 1 <= self.views <= 10_000:
-            raise InputError(f"views must be a whole number from 1 to 10,000, got {self.views!r}")
+        whole_number("views", self.views, 1, 10_000)
         if unknown := set(self.lowpass) - set(LOWPASS):
             raise InputError(f"lowpass must be one or more of {', '.join(LOWPASS)}, got {min(unknown)!r}")
 
@@ -79,9 +77,7 @@ def save_detail_errors(folder: Path, identity: str, measured: Sequence[DetailErr
     every = [*load_detail_errors(folder, identity), *measured]
     known = {(one.lowpass, one.level): one for one in every}
     rows = [vars(one) for _, one in sorted(known.items())]
-    with atomic_write(folder / FILE) as stream:
-        content = {"identity": identity, "details": rows}
-        stream.write(json.dumps(content | {"crc": header_crc(content)}, indent=1).encode())
+    write_checked(folder / FILE, {"identity": identity, "details": rows})
 
 
 def load_detail_errors(folder: Path, identity: str) -> list[DetailErrors]:

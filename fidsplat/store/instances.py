@@ -13,11 +13,11 @@ import numpy as np
 
 from fidsplat.splats.rotations import check_similarity, pose_matrix
 from fidsplat.store.layout import MAX_SPLATS, PLACES
-from fidsplat.store.staging import clear, refuse_existing, staged, store_folder
+from fidsplat.store.staging import check_replaceable, clear, staged, store_folder
 from fidsplat.store.store import Store
 from fidsplat.util.arguments import real_array
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write
+from fidsplat.util.npy import save_npy
 
 
 def grid_poses(counts: Sequence[int], pitch: Sequence[float]) -> list[np.ndarray]:
@@ -78,11 +78,10 @@ def place_store(
             f"a scene must have at most {MAX_SPLATS:,} splats, got {len(given)} times {len(source):,}"
         )
     folder = store_folder(out)
-    refuse_existing(folder, overwrite)
+    check_replaceable(folder, overwrite)
     with staged(folder) as part:
         clear(part)
-        with atomic_write(part / PLACES) as stream:
-            np.save(stream, given)
+        save_npy(part / PLACES, given)
         header = replace(
             source.header,
             splats=len(source) * len(given),

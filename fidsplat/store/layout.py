@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 
 from fidsplat.util.arguments import LARGEST
-from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write, from_json, open_input, read_input
+from fidsplat.util.errors import InputError, os_errors
+from fidsplat.util.files import from_json, open_input, read_input, write_json
 from fidsplat.util.limits import check_holes
-from fidsplat.util.npy import load_npy
+from fidsplat.util.npy import load_npy, save_npy
 
 FORMAT, VERSION = "fidsplat store", 1
 SUFFIX = ".fss"
@@ -104,13 +104,16 @@ class Header:
 
     def save(self, folder: Path) -> None:
         """Write the header, as the last file of a store: a folder without it is not a store."""
-        content = {"format": FORMAT, "version": VERSION, **asdict(self)}
-        with atomic_write(folder / HEADER) as stream:
-            stream.write(json.dumps(content | {"crc": header_crc(content)}, indent=1).encode())
+        write_checked(folder / HEADER, {"format": FORMAT, "version": VERSION, **asdict(self)})
+
+
+def write_checked(file: Path, content: dict[str, Any]) -> None:
+    """Write a JSON object with its checksum `crc`."""
+    write_json(file, content | {"crc": header_crc(content)}, indent=1)
 
 
 def header_crc(content: Mapping[str, Any]) -> int:
-    """CRC-32 of the fields of a header except the checksum."""
+    """CRC-32 of the fields of a JSON object except the checksum."""
     rest = {name: value for name, value in content.items() if name != "crc"}
     return zlib.crc32(json.dumps(rest, sort_keys=True).encode())
 
@@ -237,16 +240,13 @@ def map_column(folder: Path, name: str, kind: str, shape: tuple[int, ...], start
     if not shape[0]:
         return np.empty(shape, kind)
     check_holes(file)
-    try:
+    with os_errors(f"cannot map {file} into memory"):  # for instance by a limit on the address space
         return np.memmap(file, kind, "r", NPY_HEADER, shape).view(np.ndarray)
-    except OSError as error:  # for instance by a limit on the address space
-        raise InputError(f"cannot map {file} into memory: {error.strerror or error}") from error
 
 
 def write_nodes(folder: Path, nodes: np.ndarray) -> int:
     """Write the index and return the CRC-32 of its records."""
-    with atomic_write(folder / NODES) as stream:
-        np.save(stream, nodes)
+    save_npy(folder / NODES, nodes)
     return zlib.crc32(nodes.tobytes())
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from fidsplat.store.layout import HEADER, SUFFIX
 from fidsplat.util.arguments import flag
-from fidsplat.util.errors import InputError
-from fidsplat.util.files import path_of, writable_folder
+from fidsplat.util.errors import InputError, os_errors
+from fidsplat.util.files import path_of, refuse_existing, writable_folder
 
 
 def store_folder(out: str | os.PathLike[str]) -> Path:
@@ -25,10 +25,9 @@ def store_folder(out: str | os.PathLike[str]) -> Path:
     return folder
 
 
-def refuse_existing(folder: Path, overwrite: bool) -> None:
+def check_replaceable(folder: Path, overwrite: bool) -> None:
     """Raise InputError if a path exists, unless it is a store or an empty folder and `overwrite` is set."""
-    if not flag("overwrite", overwrite) and folder.exists():
-        raise InputError(f"{folder} exists already; give another name, or --overwrite")
+    refuse_existing(folder, flag("overwrite", overwrite))
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} exists and is not a store; give another name")
     if folder.exists() and any(folder.iterdir()) and not (folder / HEADER).exists():
@@ -43,7 +42,7 @@ def staged(folder: Path) -> Iterator[Path]:
     """
     part = folder.with_name(f".{folder.name}.part")
     writable_folder(part)
-    try:
+    with os_errors(f"cannot write {folder}", "free some space, then run the same command"):
         descriptor = os.open(part, os.O_RDONLY)
         try:
             if not _locked(descriptor, part):
@@ -52,10 +51,6 @@ def staged(folder: Path) -> Iterator[Path]:
             _rename(part, folder)
         finally:
             os.close(descriptor)
-    except OSError as error:
-        raise InputError(
-            f"cannot write {folder}: {error.strerror or error}; free some space, then run the same command"
-        ) from error
 
 
 def clear(folder: Path) -> None:

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from fidsplat.capture.quality import Quality
-from fidsplat.formats.collect import Progress
 from fidsplat.splats.arrays import find_defects
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion
@@ -25,6 +24,7 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import kind_of, path_of
 from fidsplat.util.markup import Summarised, point
 from fidsplat.util.npy import load_npy
+from fidsplat.util.progress import Progress
 
 
 class Store(Summarised):

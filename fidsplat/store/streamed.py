@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.formats.collect import Progress
 from fidsplat.formats.sog_streamed import META, read_streamed, save_streamed
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import colors_of_degree
@@ -21,6 +20,7 @@ from fidsplat.store.store import Store
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
+from fidsplat.util.progress import Progress
 
 _LEAF = 2**18
 """maximum splats of a leaf of streamed SOG, unless a chunk has more"""

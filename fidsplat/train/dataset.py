@@ -11,9 +11,8 @@ from functools import cached_property
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.capture.environment import three_numbers
 from fidsplat.train.random_numbers import Purpose, uniform
-from fidsplat.util.arguments import instance, invalid, items, real_array, text, whole_number
+from fidsplat.util.arguments import instance, invalid, items, real_array, text, three_numbers, whole_number
 from fidsplat.util.errors import InputError
 
 FAR = 1e4

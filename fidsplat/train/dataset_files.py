@@ -3,7 +3,7 @@ transforms.json."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from fidsplat.train.transforms import DatasetContents, check_other_image, has_tr
 from fidsplat.util.arguments import callback, flag, whole_number
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, path_of, read_text
+from fidsplat.util.progress import Progress, no_progress
 
 METADATA = ("dataset.json", "marker.json")
 """files of fidsplat's data sets with the fields `background`, one display value or three, and `boxes`"""
@@ -25,7 +26,6 @@ _MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 HOLD_OUT, MIN_VIEWS_TO_HOLD_OUT = 8, 16
 """in data sets of at least 16 views without a test set, every eighth view is held out"""
 
-Progress = Callable[[str, float], None]
 Background = tuple[float, float, float]
 
 
@@ -61,7 +61,7 @@ def load_dataset(
     if hold_out is not None and whole_number("--hold-out", hold_out, 0, 2**31) == 1:
         raise InputError(f"--hold-out must be 0 (none), or 2 or more (every n-th view), got {hold_out}")
     random_points = whole_number("--random-points", random_points, 0, MAX_POINTS)
-    report = callback("progress", progress) or (lambda words, share: None)
+    report = callback("progress", progress) or no_progress
     chosen = Masks(None if masks is None else path_of(masks), flag("alpha_masks", alpha_masks))
     if chosen.folder is not None and not chosen.folder.is_dir():
         raise InputError(f"--masks must be a folder of masks NAME.png, got {chosen.folder}")

@@ -16,12 +16,10 @@ from fidsplat.capture.capture import Capture
 from fidsplat.render.renderer import Renderer
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import C0
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, required_package
 
-try:
+with required_package("PyTorch", "torch"):
     import torch as _torch  # type: ignore[import-not-found]
-except ImportError as error:
-    raise InputError(f"PyTorch must be installed, got {error}; pip install 'fidsplat[torch]'") from None
 
 torch: Any = _torch  # untyped, since it may not be installed
 _INPUTS = ("means", "quats", "scales", "opacities", "colors", "sh", "background", "pose")

@@ -22,7 +22,6 @@ from fidsplat.capture.quality import Quality
 from fidsplat.effects import FeatureSet, select
 from fidsplat.effects.differentiable import with_distortion
 from fidsplat.formats import save_ply
-from fidsplat.formats.collect import Progress
 from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
@@ -44,6 +43,7 @@ from fidsplat.util import interrupts
 from fidsplat.util.arguments import callback, instance, invalid, items, settings_with
 from fidsplat.util.errors import DeviceError, InputError
 from fidsplat.util.files import ordinary_file, writable_folder
+from fidsplat.util.progress import Progress
 
 _SURFACE = ("rgb", "alpha", "depth", "normal")
 """outputs of frames with normal consistency in the loss"""

@@ -3,7 +3,6 @@ transforms_train.json and transforms_test.json. Poses are camera to world with O
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
@@ -15,8 +14,9 @@ from fidsplat.formats.ply_header import read_header
 from fidsplat.images.files import read_on_background
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.masks import Masks, undistorted_view
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, error_prefix
 from fidsplat.util.files import from_json, path_of, read_text
+from fidsplat.util.progress import Progress
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")
@@ -41,7 +41,7 @@ def has_transforms(path: Path) -> bool:
     return named or any((path / name).is_file() for name in _NAMES)
 
 
-def load_transforms(path: Path, progress: Callable[[str, float], None], masks: Masks) -> DatasetContents:
+def load_transforms(path: Path, progress: Progress, masks: Masks) -> DatasetContents:
     """Read the views and points of transforms.json; images with alpha are composited over black.
 
     Views in its val_filenames and test_filenames, and in transforms_test.json next to it, are held out.
@@ -71,9 +71,7 @@ def _table(file: Path) -> dict[str, Any]:
     return table
 
 
-def _views(
-    file: Path, table: dict, progress: Callable[[str, float], None], label: str, masks: Masks
-) -> list[TrainingView]:
+def _views(file: Path, table: dict, progress: Progress, label: str, masks: Masks) -> list[TrainingView]:
     views: list[TrainingView] = []
     others: set[tuple[int, int]] = set()
     for number, frame in enumerate(table["frames"]):
@@ -136,10 +134,8 @@ def check_other_image(image: Path, others: set[tuple[int, int]]) -> None:
 
 def _camera(what: str, table: dict, number: int, image: np.ndarray) -> Camera:
     height, width = image.shape[:2]
-    try:
+    with error_prefix(what):
         return Camera.from_nerfstudio({"w": width, "h": height} | table, number)
-    except InputError as error:
-        raise InputError(f"{what}: {error}") from error
 
 
 def _points(file: Path, table: dict) -> tuple[np.ndarray, np.ndarray]:

@@ -62,6 +62,28 @@ def number(
     return found
 
 
+def three_numbers(name: str, value: Any) -> tuple[float, float, float]:
+    """Validated tuple of three finite floats."""
+    try:
+        x, y, z = map(as_float, value)
+    except (TypeError, ValueError):
+        x = y = z = math.nan
+    if not (abs(x) <= LARGEST and abs(y) <= LARGEST and abs(z) <= LARGEST):
+        raise invalid(name, f"three finite numbers, at most {LARGEST:g}", value)
+    return x, y, z
+
+
+def direction(name: str, value: Any) -> np.ndarray:
+    """Validated direction: a unit vector (3,) float64 of three finite numbers, not all 0."""
+    try:
+        vector = np.array(three_numbers(name, value))
+    except InputError:
+        vector = np.zeros(3)
+    if not vector.any():
+        raise invalid(name, "three finite numbers, not all 0", value)
+    return vector / np.linalg.norm(vector)
+
+
 def whole_number(what: str, value: Any, low: int, high: int) -> int:
     """Check that a value is a whole number within [low, high], and return it as an int."""
     try:

@@ -1,7 +1,8 @@
 """Errors for users; the command line prints them as one line with an exit status."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 LONGEST = 2000
 """maximum number of characters of a message; longer ones are cut in the middle"""
@@ -40,6 +41,48 @@ class UnknownDeviceError(DeviceError):
     """An unknown device name. Exit status 2."""
 
     exit_status = 2
+
+
+@contextmanager
+def os_errors(action: str, remedy: str = "") -> Iterator[None]:
+    """Convert an OSError within the block to an InputError "ACTION: reason; REMEDY", e.g. for "cannot write
+    FILE"."""
+    try:
+        yield
+    except OSError as error:
+        reason = f"{action}: {error.strerror or error}"
+        raise InputError(f"{reason}; {remedy}" if remedy else reason) from error
+
+
+@contextmanager
+def error_prefix(prefix: str) -> Iterator[None]:
+    """Add a prefix, such as the name of a file, to an InputError within the block."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{prefix}: {error}") from error
+
+
+@contextmanager
+def damaged_data(what: str, remedy: str = "") -> Iterator[None]:
+    """Convert errors of Python within the block, which parses a file, to an InputError "WHAT is damaged;
+    REMEDY"."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError) as error:
+        reason = f"{what} is damaged ({type(error).__name__}: {error})"
+        raise InputError(f"{reason}; {remedy}" if remedy else reason) from None
+
+
+@contextmanager
+def required_package(what: str, extra: str) -> Iterator[None]:
+    """Convert an ImportError within the block to an InputError that names fidsplat's extra."""
+    try:
+        yield
+    except ImportError as error:
+        raise InputError(f"{what} must be installed, got: {error}; pip install 'fidsplat[{extra}]'") from None
 
 
 def unknown(what: str, name: object, known: Iterable[str], within: str = "", likeness: float = 0.6) -> str:

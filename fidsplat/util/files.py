@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from fidsplat.util import interrupts
-from fidsplat.util.errors import DeviceError, InputError
+from fidsplat.util.errors import DeviceError, InputError, os_errors
 from fidsplat.util.limits import check_expansion
 
 MAX_NAME, MAX_PATH = 255, 4095
@@ -58,6 +58,28 @@ def ordinary_file(path: str | os.PathLike[str]) -> Path:
     return target
 
 
+def writable_file(path: str | os.PathLike[str]) -> Path:
+    """The path of a file that can be written. Raises InputError if it cannot."""
+    file = path_of(path)
+    if file.is_dir():
+        raise InputError(f"the output must be a file, got the folder {file}; name a file in it")
+    writable_folder(file.parent)
+    return ordinary_file(file)
+
+
+def new_file(path: str | os.PathLike[str], overwrite: bool) -> Path:
+    """The path of a writable file that does not exist yet or may be replaced. Raises InputError otherwise."""
+    file = writable_file(path)
+    refuse_existing(file, overwrite)
+    return file
+
+
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Raise InputError for an existing file or folder, unless it may be replaced."""
+    if path.exists() and not overwrite:
+        raise InputError(f"{path} already exists; give another name, or --overwrite")
+
+
 _KINDS = {
     stat.S_IFREG: "a file",
     stat.S_IFDIR: "a folder",
@@ -71,10 +93,8 @@ _KINDS = {
 def existing(path: str | os.PathLike[str]) -> Path:
     """The path of a file or folder that exists. Raises InputError."""
     file = path_of(path)
-    try:
+    with os_errors(f"cannot read {file}"):
         file.stat()
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
     return file
 
 
@@ -98,11 +118,9 @@ def kind_of(path: Path) -> str:
 def open_input(path: str | os.PathLike[str]) -> BinaryIO:
     """Open an input file for binary reading. Raises InputError if it is not a regular file."""
     file = regular_file(path)
-    try:
+    with os_errors(f"cannot read {file}"):
         # O_NONBLOCK: if a pipe has replaced the file since the check, opening it does not block
         return os.fdopen(os.open(file, os.O_RDONLY | os.O_CLOEXEC | getattr(os, "O_NONBLOCK", 0)), "rb")
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
 
 
 def read_input(path: str | os.PathLike[str], max_bytes: int | None = None, first: int | None = None) -> bytes:
@@ -114,10 +132,8 @@ def read_input(path: str | os.PathLike[str], max_bytes: int | None = None, first
             raise InputError(f"{path} must have at most {max_bytes:,} bytes, got {size:,}; give another file")
         if first is None:
             check_expansion(path_of(path), size, "its length")
-        try:
+        with os_errors(f"cannot read {path}"):
             return stream.read(-1 if first is None else min(first, size))
-        except OSError as error:
-            raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 
 
 def read_text(path: str | os.PathLike[str], errors: str = "strict") -> str:
@@ -196,36 +212,28 @@ def atomic_path(path: str | os.PathLike[str], suffix: str = "") -> Iterator[Path
     suffix: suffix of the temporary name."""
     interrupts.check()
     target = ordinary_file(path)
-    try:
+    with os_errors(f"cannot write {target}"):
         descriptor, name = tempfile.mkstemp(
             prefix=f".{target.name}.", suffix=f".part{suffix}", dir=target.parent
         )
-    except OSError as error:
-        raise InputError(f"cannot write {target}: {error.strerror or error}") from error
-    try:
-        os.close(descriptor)
-        with utf8_path(Path(name)) as part:
-            yield part
-        os.chmod(name, 0o666 & ~_umask())
-        os.replace(name, target)
-    except BaseException as error:
-        os.unlink(name)
-        if isinstance(error, OSError):
-            raise InputError(f"cannot write {target}: {error.strerror or error}") from error
-        raise
+        try:
+            os.close(descriptor)
+            with utf8_path(Path(name)) as part:
+                yield part
+            os.chmod(name, 0o666 & ~_umask())
+            os.replace(name, target)
+        except BaseException:
+            os.unlink(name)
+            raise
 
 
 def writable_folder(path: str | os.PathLike[str]) -> Path:
     """Create a folder with its parents, and check that it is writable."""
     folder = path_of(path)
-    try:
+    with os_errors(f"cannot write into the folder {folder}", "choose another output folder"):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-    except OSError as error:
-        raise InputError(
-            f"cannot write into the folder {folder}: {error.strerror or error}; choose another output folder"
-        ) from error
     return folder
 
 

@@ -1,4 +1,4 @@
-"""Safe readers of untrusted .npy and .npz files.
+"""Safe readers of untrusted .npy and .npz files, and an atomic writer.
 
 `numpy.load` allocates the size that a header declares, may skip the checksums of a .npz file, and raises
 arbitrary errors for a damaged header. These readers allocate at most the size of the file.
@@ -15,7 +15,7 @@ from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
 import numpy as np
 
-from fidsplat.util.files import open_input
+from fidsplat.util.files import atomic_write, open_input
 
 _MAGIC = b"\x93NUMPY\x01\x00"
 
@@ -24,6 +24,12 @@ def load_npy(file: Path) -> np.ndarray:
     """Read the array of a .npy file, read-only. Raises ValueError for damaged data or Python objects."""
     with open_input(file) as stream:
         return _array(stream.read())
+
+
+def save_npy(file: Path, array: np.ndarray) -> None:
+    """Write an array as a .npy file, atomically."""
+    with atomic_write(file) as stream:
+        np.save(stream, array)
 
 
 def load_npz(file: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:

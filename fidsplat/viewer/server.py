@@ -26,7 +26,7 @@ from fidsplat.scenes import Scene
 from fidsplat.scenes.write import marker_block
 from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.util.arguments import settings_with
-from fidsplat.util.errors import FidsplatError, InputError
+from fidsplat.util.errors import FidsplatError, InputError, required_package
 from fidsplat.util.markup import escaped
 from fidsplat.viewer.controls import NO_TARGET, Controls
 from fidsplat.viewer.guard import guarded
@@ -398,10 +398,8 @@ def _silent() -> contextlib.AbstractContextManager[Any]:
 
 
 def _viser() -> Any:
-    try:
+    with required_package("viser", "viewer"):
         import viser
-    except ImportError:
-        raise InputError("the viewer needs viser; pip install 'fidsplat[viewer]'") from None
     logging.getLogger("websockets").setLevel(logging.CRITICAL)  # browsers may disconnect at any time
     return viser
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera, Trajectory
 from fidsplat.splats.rotations import rigid_matrix
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, required_package
 
 WHEEL, TRACK = 0.08, 0.3
 """metres: radius of a wheel, distance between the wheels"""
@@ -99,10 +99,8 @@ def camera_at(camera: Camera, robot: np.ndarray) -> Camera:
 
 def _mujoco() -> Any:
     """The package, without type information. Raises InputError if it is missing."""
-    try:
+    with required_package("MuJoCo", "sim"):
         import mujoco  # here, since only a drive needs it  # type: ignore[import-not-found]
-    except ImportError as error:
-        raise InputError(f"the robot needs MuJoCo ({error}); pip install 'fidsplat[sim]'") from None
     return mujoco
 
 

@@ -266,7 +266,7 @@ def test_a_table_with_words_for_numbers_is_one_line(tmp_path):
     whole = (Path(__file__).parents[2] / "devlog" / "results" / "counts.csv").read_text().splitlines()
     assert ",48,52," in whole[3]
     (tmp_path / "counts.csv").write_text("\n".join([*whole[:3], whole[3].replace(",48,52,", ",x,52,")]))
-    with pytest.raises(fs.InputError, match=r"results of counts .* are damaged .* measure again"):
+    with pytest.raises(fs.InputError, match=r"a result of counts .* is damaged .* measure again"):
         load([tmp_path])
 
 

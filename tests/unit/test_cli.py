@@ -388,5 +388,5 @@ def test_experiments_need_mujoco_only_to_drive(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     monkeypatch.delitem(sys.modules, "fidsplat.worlds.robot", raising=False)
     robot = importlib.import_module("fidsplat.worlds.robot")  # as all experiments do
-    with pytest.raises(InputError, match=r"the robot needs MuJoCo .*fidsplat\[sim\]"):
+    with pytest.raises(InputError, match=r"MuJoCo must be installed.*fidsplat\[sim\]"):
         robot.drive("", np.array([(0.0, 0.0), (1.0, 0.0)]))

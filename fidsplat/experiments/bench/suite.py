@@ -33,6 +33,7 @@ from fidsplat.render.renderer import Renderer
 from fidsplat.util import interrupts
 from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.files import atomic_write, from_json, read_text
+from fidsplat.util.progress import Progress
 from fidsplat.util.provenance import run_facts
 from fidsplat.util.timing import Clock, Timer, quartiles, time_interleaved
 from fidsplat.vision.readback import means, read_back
@@ -44,7 +45,6 @@ TOO_SLOW = 10_000.0
 SHORT = 50.0
 """milliseconds: shorter frames follow untimed frames, since other processes use device and caches in
 between"""
-Progress = Callable[[str, float], None]
 
 
 class AdapterError(FidsplatError):
