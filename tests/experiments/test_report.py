@@ -229,9 +229,7 @@ def test_a_gap_is_not_concealed_by_where_reading_ends(tmp_path):
 
 def test_results_of_another_version_are_one_line(tmp_path):
     (tmp_path / "views.jsonl").write_text('{"run": {}}\n{"key": {"category": "small"}, "result": {}}\n')
-    with pytest.raises(
-        fs.InputError, match=r"of another version of fidsplat \(KeyError: '\w+'\); measure again"
-    ):
+    with pytest.raises(fs.InputError, match=r"is damaged \(KeyError: '\w+'\); measure again"):
         make_report([tmp_path], tmp_path)
 
 
