@@ -80,7 +80,7 @@ def main() -> None:
     renderer = fs.Renderer(options.device)
     device = renderer.backend.device  # a wp.Device
     arrays, tag, first = scene_arrays(device)
-    resident = renderer.adopt(**arrays)  # no copy: frames have the current content of the arrays
+    resident = renderer.wrap_arrays(**arrays)  # no copy: frames have the current content of the arrays
     rest = [wp.array(getattr(tag, name), dtype=dtype, device=device) for name, dtype in _REST.items()]
     camera = fs.Camera.look_at(320, 240, 0.9, position=(0.15, -0.15, -0.5), target=(0, 0, 0))
 

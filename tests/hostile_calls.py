@@ -131,7 +131,7 @@ def _robot_log(folder: Path) -> Call:
 
 
 CALLS: dict[str, Callable[[Path], Call]] = {
-    "SplatCloud.reach": lambda _: (CLOUD.reach, {"sigmas": 3.0}, None),
+    "SplatCloud.half_extents": lambda _: (CLOUD.half_extents, {"sigmas": 3.0}, None),
     "Camera.project of several": lambda _: (fs.Camera.equirectangular(24, 12).project, {"points": MEANS}, None),
     "Fisheye.image": lambda _: (fs.Fisheye(0.1).image, {"points": MEANS}, None),
     "Fisheye.rays": lambda _: (fs.Fisheye(0.1).rays, {"image": MEANS[:, :2]}, None),
@@ -164,8 +164,8 @@ CALLS: dict[str, Callable[[Path], Call]] = {
         fs.ExternalDepth, {"rgb": np.ones((16, 24, 3)), "depth": np.ones((16, 24)), "label": 0},
         lambda external_depth: RENDERER.render(CLOUD, CAMERA, external_depth=external_depth),
     ),
-    "Renderer.render_every": lambda _: (
-        RENDERER.render_every, {"step": 4, "scene": CLOUD, "capture": CAMERA, "outputs": ("rgb",), "quality": None, "progress": None}, None
+    "Renderer.render_subsampled": lambda _: (
+        RENDERER.render_subsampled, {"step": 4, "scene": CLOUD, "capture": CAMERA, "outputs": ("rgb",), "quality": None, "progress": None}, None
     ),
     "Renderer.render_band": lambda _: (
         RENDERER.render_band, {"band": (2, 4), "scene": CLOUD, "capture": CAMERA, "outputs": ("rgb",), "quality": None}, None

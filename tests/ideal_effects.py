@@ -74,7 +74,7 @@ def _samples(placed: PlacedMarker, view: View) -> np.ndarray:
     y, x = np.mgrid[: view.height, : view.width] + 0.5
     light = np.empty((view.height, view.width, 3))
     light[:] = view.background
-    if view.surroundings is not None:
+    if view.environment_map is not None:
         light = background_at(view, x.ravel(), y.ravel())[0].reshape(light.shape)
     window = _window(placed, view)
     x, y = x[window].ravel(), y[window].ravel()

@@ -12,7 +12,7 @@ from fidsplat.backends.view import FAR_EYE, View, rotated
 
 _SHARED = (
     *("width", "height", "samples", "log_cut", "ceiling", "stop", "background", "first_light", "sensor"),
-    *("fog_density", "surroundings", "external_depth", "along_ray", "parallel"),
+    *("fog_density", "environment_map", "external_depth", "along_ray", "parallel"),
 )
 _OWN = ("focal_x", "focal_y", "center_x", "center_y", "near", "far", "slopes")
 _FIRST = np.zeros(1, np.uint32)

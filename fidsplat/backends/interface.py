@@ -77,8 +77,8 @@ class ResidentData(ABC):
     def color_range(self) -> tuple[float, float]:
         """Lower and upper bound of every channel of every splat, from any direction."""
         raise InputError(
-            "the splats must be in host memory for the output 'error', got device arrays (Renderer.adopt); "
-            "render a SplatCloud, or leave out 'error'"
+            "the splats must be in host memory for the output 'error', got arrays on the device "
+            "(Renderer.wrap_arrays); render a SplatCloud, or leave out 'error'"
         )
 
 
@@ -99,7 +99,7 @@ class Chunk:
 
 class Images(ABC):
     """Output images of one or several views, on the device until they are read. Views that are masked out
-    have the value `Output.blank`."""
+    have the value `Output.empty_value`."""
 
     views: int = 1
     """number of views, including masked-out views"""
@@ -179,8 +179,8 @@ class SeparateImages(Images):
             return self._images[index].read(name, 0)
         shape = self._size if output.channels == 1 else (*self._size, output.channels)
         if index is not None:
-            return np.full(shape, output.blank, output.dtype)
-        made = np.full((self.views, *shape), output.blank, output.dtype)
+            return np.full(shape, output.empty_value, output.dtype)
+        made = np.full((self.views, *shape), output.empty_value, output.dtype)
         for number, images in self._images.items():
             made[number] = images.read(name, 0)
         return made
@@ -234,7 +234,7 @@ class Pipeline(ABC):
         rendered = {index: self.render_view(resident, views.one(number)) for number, index in each}
         return SeparateImages(rendered, views, resident.count)
 
-    def render_every(
+    def render_subsampled(
         self, resident: Any, view: View, step: int, progress: Callable[[float], object] | None = None
     ) -> Images:
         """Render every step-th pixel in both directions, from the first: (ceil(h / step), ceil(w / step))
@@ -300,8 +300,8 @@ class Backend(ABC):
     info: DeviceInfo
     shape: Any = None
     """build constants of the kernels, such as the tile size"""
-    renders_pixels: bool = False
-    """whether pipelines implement `Pipeline.render_every`"""
+    renders_subsampled: bool = False
+    """whether pipelines implement `Pipeline.render_subsampled`"""
     pair_budget: int = 2**30 - 1
     """maximum number of (splat, tile) pairs in the tile lists at once; tests lower it"""
     memory_bytes: int = 0
@@ -336,9 +336,9 @@ class Backend(ABC):
         """Limit the device memory of a frame and its cloud to `budget` bytes."""
         raise InputError(self.lacks("have a memory budget", f"leave out memory_budget={budget}"))
 
-    def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> ResidentData:
+    def wrap_arrays(self, arrays: Mapping[str, Any], origin: np.ndarray) -> ResidentData:
         """Use arrays that are already on the device (`means`, `quats`, ...) as a cloud, without a copy."""
-        raise InputError(self.lacks("adopt arrays", "use a Warp device, or a SplatCloud"))
+        raise InputError(self.lacks("wrap arrays", "use a Warp device, or a SplatCloud"))
 
     def chunk_cache(self, scene: Any) -> Any:
         """A device cache of the chunks of a `streaming.device_chunks.DeviceChunks`

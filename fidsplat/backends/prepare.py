@@ -78,7 +78,7 @@ def view_of(capture: Capture, origin: np.ndarray) -> View:
         return replace(view, groups=groups) if groups else view
 
     whole = at(shutter.time)
-    if not capture.exposed:
+    if not capture.has_sub_frames:
         return whole
     sub_frames, samples = [], capture.quality.samples
     for top, end, middle in shutter.bands(whole.height // samples):

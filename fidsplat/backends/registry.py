@@ -20,7 +20,7 @@ FAMILIES = {
 }
 """module of each family; further entries add families"""
 
-FIRST = "auto"
+AUTO = "auto"
 """name that opens the best device of the first family in `ORDER` that has a usable device"""
 ORDER = ("opencl", "warp")
 
@@ -33,7 +33,7 @@ def open_backend(name: str) -> Backend:
     UnknownDeviceError if no device matches, and DeviceError if it cannot be used."""
     family, _, selector = str(name).strip().partition(":")
     family = family.lower()
-    if (family, selector) == (FIRST, ""):
+    if (family, selector) == (AUTO, ""):
         return _open_first()
     if family not in FAMILIES:
         raise UnknownDeviceError(

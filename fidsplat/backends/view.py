@@ -64,7 +64,8 @@ class View:
     sensor: Sensor = _NO_SENSOR
     fog_density: float = 0.0
     """fog density per metre"""
-    surroundings: Gradient | Panorama | None = None
+    environment_map: Gradient | Panorama | None = None
+    """background that depends on the ray's direction"""
     external_depth: ExternalDepth | None = None
     """external depth image: an opaque surface among the splats; in a batch possibly one for each view"""
     raster: RayRaster | None = None
@@ -108,13 +109,13 @@ class View:
             self,
             height=end - top,
             center_y=self.center_y - top,
-            raster=None if self.raster is None else self.raster.cropped(top, end),
+            raster=None if self.raster is None else self.raster.rows(top, end),
             groups=tuple((label, view.rows(top, end)) for label, view in self.groups),
         )
 
-    def uniform(self, name: str) -> tuple[Any, ...]:
+    def uniforms_of(self, name: str) -> tuple[Any, ...]:
         """Uniforms of an effect, by the name of their group."""
-        around = self.surroundings
+        environment = self.environment_map
         match name:
             case "ray" if self.along_ray or self.parallel:
                 # depths are distances along the ray already
@@ -123,9 +124,9 @@ class View:
                 return self.focal_x, self.focal_y, self.center_x, self.center_y
             case "rotation":
                 return tuple(self.rotation.ravel().tolist())
-            case "gradient" if isinstance(around, Gradient):
-                up = np.array(around.up) / np.linalg.norm(around.up)
-                return (*around.top, *around.bottom, *up.tolist())
+            case "gradient" if isinstance(environment, Gradient):
+                up = np.array(environment.up) / np.linalg.norm(environment.up)
+                return (*environment.top, *environment.bottom, *up.tolist())
             case "panorama_size":
                 height, width = self.array("panorama").shape[:2]
                 return np.int32(width), np.int32(height)
@@ -135,7 +136,7 @@ class View:
             case "first_light" | "fog_density":
                 return (getattr(self, name),)
             case _:
-                return self.sensor.uniform(name)
+                return self.sensor.uniforms_of(name)
 
     def array(self, name: str) -> np.ndarray:
         """An array of an effect by its name: int32 for labels, else float32."""
@@ -143,8 +144,8 @@ class View:
             return getattr(self.external_depth, name.removeprefix("external_"))
         if name == "row_rotations":
             return self.row_rotations.astype(np.float32)
-        if name == "panorama" and isinstance(self.surroundings, Panorama):
-            return self.surroundings.image
+        if name == "panorama" and isinstance(self.environment_map, Panorama):
+            return self.environment_map.image
         return np.asarray(self.sensor.response, np.float32)
 
     @classmethod
@@ -155,7 +156,7 @@ class View:
         camera = camera or capture.camera
         if camera is None:
             raise InputError(NO_CAMERA)
-        quality, backdrop = capture.quality, capture.backdrop
+        quality, background = capture.quality, capture.rendered_background
         n = quality.samples
         if max(camera.width, camera.height) * n > MAX_GRID:
             raise InputError(
@@ -168,7 +169,7 @@ class View:
                 f"external_depth must have the camera's {camera.width} x {camera.height} pixels, got "
                 f"{' x '.join(map(str, reversed(external.depth.shape)))}; render it with this camera"
             )
-        plain = isinstance(backdrop, tuple)
+        plain = isinstance(background, tuple)
         rotation = camera.world_to_camera[:3, :3]
         # subtract before the rotation: rotating large coordinates loses precision (devlog/hard-cases.md, B5)
         eye = camera.position - np.asarray(origin, dtype=np.float64)
@@ -200,11 +201,11 @@ class View:
             log_cut=float(np.float32(math.log(quality.alpha_cutoff))),
             ceiling=float(np.float32(quality.opacity_ceiling)),
             stop=float(np.float32(quality.transmittance_stop)),
-            background=backdrop if plain else (0.0, 0.0, 0.0),
+            background=background if plain else (0.0, 0.0, 0.0),
             first_light=float(np.float32(1 - quality.first_hit)),
             sensor=capture.sensor,
             fog_density=0.0 if capture.fog is None else capture.fog.density,
-            surroundings=None if plain else backdrop,
+            environment_map=None if plain else background,
             external_depth=external,
             raster=raster,
             slopes=slopes,

@@ -7,7 +7,7 @@ import numpy as np
 from fidsplat.splats.rotations import matrix_to_quaternion
 
 
-def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
+def interpolate(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
     """Interpolate along the screw motion from one rigid pose (4, 4) to another; share: 0 to 1."""
     return start @ exponential(twist(start, end) * share)
 

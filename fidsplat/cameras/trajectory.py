@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from fidsplat.cameras.screw import between, exponential, twist
+from fidsplat.cameras.screw import exponential, interpolate, twist
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion, pose_matrix, rigid_matrix
 from fidsplat.util.arguments import PickledByFields, as_float, flag, invalid, number, real_array
 from fidsplat.util.errors import InputError
@@ -80,11 +80,11 @@ class Trajectory(PickledByFields):
         start, end, duration = self.poses[after - 1], self.poses[after], times[after] - times[after - 1]
         share = float((time - times[after - 1]) / duration)
         if not self.smooth:
-            return between(start, end, share)
+            return interpolate(start, end, share)
         curve = [start, start @ exponential(self._velocities[after - 1] * (duration / 3))]
         curve += [end @ exponential(self._velocities[after] * (-duration / 3)), end]
         while len(curve) > 1:  # de Casteljau's algorithm with screw motions instead of lines
-            curve = [between(a, b, share) for a, b in itertools.pairwise(curve)]
+            curve = [interpolate(a, b, share) for a, b in itertools.pairwise(curve)]
         return curve[0]
 
     @cached_property

@@ -64,17 +64,17 @@ class Capture(PickledByFields):
                 put(self, name, _DEFAULTS[name])
 
     @cached_property
-    def foggy(self) -> bool:
+    def has_fog(self) -> bool:
         """Whether there is fog with a density above 0."""
         return self.fog is not None and self.fog.density > 0
 
     @cached_property
-    def backdrop(self) -> Background:
+    def rendered_background(self) -> Background:
         """Background behind all splats: the colour of the fog, or the background if there is no fog."""
-        return self.fog.color if self.fog is not None and self.foggy else self.background
+        return self.fog.color if self.fog is not None and self.has_fog else self.background
 
     @cached_property
-    def exposed(self) -> bool:
+    def has_sub_frames(self) -> bool:
         """Whether the frame has several sub-frames."""
         if self.motion.is_still:
             return False

@@ -147,7 +147,7 @@ class Sensor:
         return tuple(name for name, active in found if active)
 
     @property
-    def meters(self) -> bool:
+    def needs_metering(self) -> bool:
         """Whether exposure, white balance or glare must be measured in a small frame."""
         glare = self.veiling_glare > 0 and not self.glare_light
         return glare or self.auto_exposure > 0 or self.white_balance == "grey"
@@ -155,7 +155,7 @@ class Sensor:
     def metered(self, colors: np.ndarray) -> Sensor:
         """The sensor with fixed exposure, white balance and glare, measured in an image (h, w, 3) that was
         rendered without a sensor."""
-        if not self.meters:
+        if not self.needs_metering:
             return self
         mean = to_light(colors, self.decode).reshape(-1, 3).mean(axis=0)
         glare = self.glare_light or tuple(mean.tolist())
@@ -169,7 +169,7 @@ class Sensor:
         changes = {"exposure": exposure, "auto_exposure": 0.0, "white_balance": balance}
         return replace(self, glare_light=glare if self.veiling_glare > 0 else (), **changes)
 
-    def uniform(self, name: str) -> tuple[Any, ...]:
+    def uniforms_of(self, name: str) -> tuple[Any, ...]:
         """Kernel arguments of a step, in order."""
         match name:
             case "noise":

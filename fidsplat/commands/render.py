@@ -159,7 +159,7 @@ class Render(RenderInput):
         if renderer.device.always_float64:
             with delayed_progress() as progress:
                 step = 1 if self.every is None else self.every
-                return renderer.render_every(
+                return renderer.render_subsampled(
                     step, scene, None, self.outputs, quality, lambda share: progress("rendering", share)
                 )
         with console(self.json).status("rendering"):

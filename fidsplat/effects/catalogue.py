@@ -32,7 +32,7 @@ class Output:
     discontinuous: bool = False
     """whether the value jumps where a decision changes: pixels that the reference marks by `NAME_may_flip`
     are not compared; other pixels may differ by the tolerance or by the reference's `NAME_bound`"""
-    blank: int = 0
+    empty_value: int = 0
     """value of a pixel without splats"""
     public: bool = True
     """whether captures can request it; False for outputs of measurement and training"""
@@ -63,7 +63,7 @@ _COLOR: dict[str, Any] = {"tolerance": 2e-5}
 _NORMAL: dict[str, Any] = {"channels": 3, "display": "normal", "tolerance": 2e-5}
 _DEPTH: dict[str, Any] = {"display": "depth", "tolerance": 1e-4, "relative": True}
 _DEPTH_OF_ONE: dict[str, Any] = _DEPTH | {"discontinuous": True}
-_ID: dict[str, Any] = {"dtype": "int32", "display": "label", "discontinuous": True, "blank": -1}
+_ID: dict[str, Any] = {"dtype": "int32", "display": "label", "discontinuous": True, "empty_value": -1}
 
 _PLAIN = (
     *("camera_pinhole", "camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
@@ -111,7 +111,7 @@ IMAGES: dict[str, Output] = {
 """all output images of backends"""
 OUTPUTS = {name: output for name, output in IMAGES.items() if output.public}
 """outputs that backends render and captures can request"""
-COMPOSED = {
+DERIVED_OUTPUTS = {
     "error": Output(
         "error", 1, "float32", "certified upper bound of the error of rgb (docs/accuracy.md)", "count"
     ),
@@ -122,4 +122,4 @@ COMPOSED = {
 def declared_output(name: str) -> Output:
     """Declaration of an output, including internal outputs."""
     effect = CATALOGUE.get(name)
-    return effect.output if effect is not None and effect.output else {"rgb": RGB, **COMPOSED}[name]
+    return effect.output if effect is not None and effect.output else {"rgb": RGB, **DERIVED_OUTPUTS}[name]

@@ -35,15 +35,15 @@ _REMEDIES = {
 
 def check_differentiable(features: FeatureSet) -> None:
     """Raise InputError, with a remedy, for the first effect of a frame without a gradient."""
-    for name in features.slots:
+    for name in features.effects:
         if name not in DIFFERENTIABLE:
             remedy = _REMEDIES[name.partition("_")[0]]
             raise InputError(f"effects must be differentiable, got {name}; use {remedy}")
     if features.samples > 1:
         raise InputError(f"samples must be 1 for gradients, got {features.samples}; use samples=1")
-    if features.posts:
+    if features.post_steps:
         raise InputError(
-            f"a differentiable frame must have no fog or sensor, got {features.posts[0]}; use a capture "
+            f"a differentiable frame must have no fog or sensor, got {features.post_steps[0]}; use a capture "
             "without them"
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from fidsplat.effects.catalogue import CATALOGUE, COMPOSED, IMAGES, OUTPUTS, Effect, Output
+from fidsplat.effects.catalogue import CATALOGUE, DERIVED_OUTPUTS, IMAGES, OUTPUTS, Effect, Output
 from fidsplat.util.arguments import instance
 from fidsplat.util.errors import InputError
 from fidsplat.util.plugins import load_plugins
@@ -54,6 +54,6 @@ def load_extensions() -> None:
 def outputs_help() -> str:
     """Table of all outputs that captures can request, including installed packages', with a line for each."""
     load_extensions()
-    outputs = (*OUTPUTS.values(), *COMPOSED.values())
+    outputs = (*OUTPUTS.values(), *DERIVED_OUTPUTS.values())
     width = max(len(output.name) for output in outputs) + 2
     return "\n".join(f"  {output.name:{width}}{output.summary}" for output in outputs)

@@ -10,7 +10,7 @@ from fidsplat.cameras.lenses import Lens, camera_effect
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.environment import Gradient, Panorama
 from fidsplat.capture.quality import Quality
-from fidsplat.effects.catalogue import CATALOGUE, COMPOSED, OUTPUTS, RGB, Output
+from fidsplat.effects.catalogue import CATALOGUE, DERIVED_OUTPUTS, OUTPUTS, RGB, Output
 from fidsplat.effects.extensions import EXTENSIONS, load_extensions
 from fidsplat.splats.traits import CloudTraits
 from fidsplat.util.errors import InputError, unknown
@@ -23,7 +23,7 @@ class FeatureSet:
     """Effects of a frame, as names and small integers, so that it can be a cache key. Numbers that change
     from view to view (intrinsics, poses, thresholds, background) are uniforms instead."""
 
-    slots: tuple[str, ...]
+    effects: tuple[str, ...]
     """One effect per kind in fixed order: camera, color, ellipsoids (optional), lowpass, stop, external depth
     (optional), compose, footprint, background, arithmetic; then optional ones."""
     outputs: tuple[str, ...]
@@ -31,13 +31,13 @@ class FeatureSet:
     sh_degree: int
     samples: int
     setup_precision: str
-    posts: tuple[str, ...] = ()
+    post_steps: tuple[str, ...] = ()
     """Steps on rgb after blending, in order: fog, then sensor steps."""
 
     @cached_property
     def names(self) -> frozenset[str]:
         """Names of all effects, including outputs that are inputs of other outputs."""
-        return frozenset((*self.slots, *(image.name for image in self.images[1:]), *self.posts))
+        return frozenset((*self.effects, *(image.name for image in self.images[1:]), *self.post_steps))
 
     @cached_property
     def images(self) -> tuple[Output, ...]:
@@ -58,12 +58,12 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
     Raises InputError for an unknown output or incompatible effects."""
     _load_extensions_of(capture)
     for name in capture.outputs:
-        if name not in (*OUTPUTS, *COMPOSED):
-            raise InputError(unknown("output", name, (*OUTPUTS, *COMPOSED)))
-    quality, background = capture.quality, capture.backdrop
+        if name not in (*OUTPUTS, *DERIVED_OUTPUTS):
+            raise InputError(unknown("output", name, (*OUTPUTS, *DERIVED_OUTPUTS)))
+    quality, background = capture.quality, capture.rendered_background
     lens = None if capture.camera is None else capture.camera.lens
     ellipsoid = _ellipsoid(cloud, quality, lens)
-    if capture.external_depth is not None and capture.exposed:
+    if capture.external_depth is not None and capture.has_sub_frames:
         shutter = capture.shutter
         raise InputError(
             "a capture with external_depth must have a shutter with exposure_time=0 and readout=0, got "
@@ -76,8 +76,8 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
     double = quality.blend_precision == "float64"
     half = quality.blend_precision == "float16"
     if double:
-        _refuse_float64(lens, capture.foggy)
-    if half and capture.foggy:
+        _refuse_float64(lens, capture.has_fog)
+    if half and capture.has_fog:
         raise InputError(
             "blend_precision must be 'float32' with fog, whose light is summed in float32, got 'float16'; "
             "use blend_precision='float32'"
@@ -87,7 +87,7 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
     # spherical harmonics of degree 0 do not depend on the view: RGB colours (`SplatCloud.plain_colors`)
     sh_degree = max(cloud.sh_degree, 0)
     return FeatureSet(
-        slots=(
+        effects=(
             camera_effect(lens),
             "color_sh" if sh_degree else "color_rgb",
             *((f"ellipsoid_{ellipsoid}",) if ellipsoid else ()),
@@ -102,15 +102,15 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
             # float64 blending requires precise functions; half precision suffices with approximate ones
             f"arithmetic_{'precise' if double else 'approximate' if half else quality.arithmetic}",
             *(("motion_groups",) if capture.motion.groups else ()),
-            *(("shutter_exposure",) if capture.exposed else ()),
-            *(("shutter_rows",) if capture.exposed and in_spheres else ()),
+            *(("shutter_exposure",) if capture.has_sub_frames else ()),
+            *(("shutter_rows",) if capture.has_sub_frames and in_spheres else ()),
             *(("blend_double",) if double else ("blend_half",) if half else ()),
         ),
-        outputs=tuple(sorted({*capture.outputs} - {"rgb", *COMPOSED})),
+        outputs=tuple(sorted({*capture.outputs} - {"rgb", *DERIVED_OUTPUTS})),
         sh_degree=sh_degree,
         samples=quality.samples,
         setup_precision=quality.setup_precision,
-        posts=(*(("fog",) if capture.foggy else ()), *capture.sensor.steps),
+        post_steps=(*(("fog",) if capture.has_fog else ()), *capture.sensor.steps),
     )
 
 
@@ -118,7 +118,7 @@ def _load_extensions_of(capture: Capture) -> None:
     """Load extensions if the capture requests an unknown name. Raises InputError for an unknown sensor step,
     or for a wrong number of its values."""
     steps = capture.sensor.extra
-    if not {*capture.outputs, *steps} <= {*OUTPUTS, *COMPOSED, *EXTENSIONS}:
+    if not {*capture.outputs, *steps} <= {*OUTPUTS, *DERIVED_OUTPUTS, *EXTENSIONS}:
         load_extensions()
     for name, values in steps.items():
         step = EXTENSIONS.get(name)
@@ -132,7 +132,7 @@ def _load_extensions_of(capture: Capture) -> None:
 
 def with_termination_depths(features: FeatureSet) -> FeatureSet:
     """Add the termination depth of each tile, for occlusion culling of stores."""
-    return replace(features, slots=(*features.slots, "termination_depths"))
+    return replace(features, effects=(*features.effects, "termination_depths"))
 
 
 def _composing(cloud: CloudTraits, order: str, one_depth_each: bool) -> str:
@@ -153,10 +153,10 @@ def _ellipsoid(cloud: CloudTraits, quality: Quality, lens: Lens | None) -> str:
     return quality.ellipsoid if lens is None or isinstance(lens, Orthographic) else "exact"
 
 
-def _refuse_float64(lens: Lens | None, foggy: bool) -> None:
+def _refuse_float64(lens: Lens | None, has_fog: bool) -> None:
     """Raise InputError for float64 blending of float32 rays, which limit its accuracy."""
-    if foggy or not (lens is None or isinstance(lens, Orthographic)):
-        what = "the fog's" if foggy or lens is None else f"a {lens.kind} lens's"
+    if has_fog or not (lens is None or isinstance(lens, Orthographic)):
+        what = "the fog's" if has_fog or lens is None else f"a {lens.kind} lens's"
         raise InputError(
             f"blend_precision='float64' must have rays in float64, got {what} rays in float32; use "
             "blend_precision='float32', or a pinhole without fog"

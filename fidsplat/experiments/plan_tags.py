@@ -15,7 +15,7 @@ from fidsplat.capture.sensor import Sensor
 from fidsplat.images.tag_dictionaries import families, parse_family
 from fidsplat.markers import Marker, marker
 from fidsplat.render.renderer import Renderer
-from fidsplat.render.surface import median_depth, surface_of
+from fidsplat.render.surface import median_depth_capture, surface_of
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.surface import Surface
 from fidsplat.scenes.up import scene_up
@@ -390,7 +390,7 @@ def _smaller(camera: Camera) -> Camera:
 
 
 def _depth_frames(scene: Scene, cameras: Sequence[Camera], renderer: Renderer):
-    still = median_depth(scene.capture)
+    still = median_depth_capture(scene.capture)
     captures = [replace(still, camera=_smaller(camera)) for camera in cameras]
     return renderer.render_views(renderer.upload(scene), captures)
 

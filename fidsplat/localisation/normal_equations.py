@@ -30,7 +30,7 @@ from fidsplat.vision.pyramid import convolved, resized
 
 def alignment_kernels(renderer: Renderer, resident: ResidentCloud) -> AlignmentKernels:
     """Alignment kernels of the device, or else NumPy, as for stores, whose frames may be on the host."""
-    if renderer.backend.has("alignment") and resident.data is resident.complete:
+    if renderer.backend.has("alignment") and resident.data is resident.all_splats:
         return renderer.backend.alignment()
     return HostAlignment()
 

@@ -171,7 +171,7 @@ def _groups(
     borders = [] if way is None else _borders(surface, way, -extent, extent)
     if way is None or len(borders) == 2:
         return every, np.zeros(len(cloud), np.int32), np.zeros(len(cloud), bool)
-    middle, reach = cloud.means[:, :2] @ way, cloud.reach(2.0)[:, :2] @ np.abs(way)
+    middle, reach = cloud.means[:, :2] @ way, cloud.half_extents(2.0)[:, :2] @ np.abs(way)
     own = np.searchsorted(borders[1:-1], middle)
     rows = [
         np.flatnonzero((middle + reach > low - overlap) & (middle - reach < high + overlap) | (own == number))

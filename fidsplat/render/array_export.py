@@ -14,9 +14,8 @@ from fidsplat.util.errors import InputError, MissingOutputError
 if TYPE_CHECKING:
     from fidsplat.render.certified_error import ErrorImage
 
-SceneIds = Callable[[], np.ndarray] | None
-"""Function that returns, for each splat on the device, its index in the scene, (n,) int32; None if both
-indices are equal."""
+SceneIndices = Callable[[], np.ndarray] | None
+"""function that returns the index in the scene of each device splat, (n,) int32; None: equal indices"""
 
 
 class ImageMapping(Mapping[str, np.ndarray]):
@@ -31,11 +30,10 @@ class ImageMapping(Mapping[str, np.ndarray]):
     """the output `error`, if it is requested"""
 
     def __init__(
-        self, images: Images, outputs: tuple[str, ...], ids: SceneIds, index: int | None = None
+        self, images: Images, outputs: tuple[str, ...], scene_indices: SceneIndices, index: int | None = None
     ) -> None:
-        """ids: scene indices of the splats on the device, for `splat_id`. index: position of the view in
-        `images`; None: all views."""
-        self._images, self._process, self._ids, self._index = images, os.getpid(), ids, index
+        """scene_indices: for `splat_id`. index: position of the view in `images`; None: all views."""
+        self._images, self._pid, self._scene_indices, self._index = images, os.getpid(), scene_indices, index
         self._arrays: dict[str, np.ndarray] = {}
         self.outputs = outputs
         """Names of the images, in the requested order."""
@@ -43,10 +41,10 @@ class ImageMapping(Mapping[str, np.ndarray]):
     def __getitem__(self, name: str) -> np.ndarray:
         self._check(name)
         if name not in self._arrays:
-            check_process(self._process, self._noun)
+            check_process(self._pid, self._noun)
             computed = self._error if name == "error" else None
             image = self._images.read(name, self._index) if computed is None else computed.read()
-            self._arrays[name] = image = with_scene_ids(name, image, self._ids)
+            self._arrays[name] = image = with_scene_indices(name, image, self._scene_indices)
             image.flags.writeable = False  # cached
         return self._arrays[name]
 
@@ -67,7 +65,7 @@ class ImageMapping(Mapping[str, np.ndarray]):
             InputError: an output that was not requested, or the backend shares no arrays.
         """
         self._check(name)
-        check_process(self._process, self._noun)
+        check_process(self._pid, self._noun)
         if self._is_computed(name):
             what = "splat_id of a store" if name == "splat_id" else f"the output {name!r}"
             raise InputError(f"{what} must be read on the host, got device_array; use {self._noun}[{name!r}]")
@@ -76,7 +74,7 @@ class ImageMapping(Mapping[str, np.ndarray]):
     @property
     def timings(self) -> Mapping[str, float]:
         """Milliseconds on the device by stage, for all views together: project, sort, bin, blend, resolve;
-        `error`: all stages of the second rendering for the output `error`.
+        `error`: all stages of the reference image of the output `error`.
 
         On a GPU a replayed frame is rendered again to measure them, since timing each launch would slow down
         all frames. Empty if its cloud has been released.
@@ -107,8 +105,8 @@ class ImageMapping(Mapping[str, np.ndarray]):
             )
 
     def _is_computed(self, name: str) -> bool:
-        """Whether the host computes an image, so that the device has no array of it."""
-        return name == "error" or (name == "splat_id" and self._ids is not None)
+        """Whether an image is computed on the host, so that the device has no array of it."""
+        return name == "error" or (name == "splat_id" and self._scene_indices is not None)
 
     def _is_shared(self, name: str) -> bool:
         return self._images.shares_arrays and not self._is_computed(name)
@@ -153,27 +151,27 @@ class ImageMapping(Mapping[str, np.ndarray]):
         return self._exported().__dlpack_device__()
 
     def _exported(self) -> Any:
-        """The images of the only output as an array that exports DLPack."""
+        """An array that exports DLPack, of the only output."""
         name = self._only_output()
         if self._is_shared(name):
             return self.device_array(name)
         return self[name].copy()  # NumPy does not export read-only arrays by DLPack
 
     def _only_output(self) -> str:
-        """The name of the only output."""
+        """Name of the only output. Raises InputError for several outputs."""
         if len(self.outputs) != 1:
             raise InputError(
                 f"the {self._noun} must have one output, got {len(self.outputs)} ({', '.join(self.outputs)});"
-                f" take one by its name, for example {self._noun}['rgb']"
+                f" access one by its name, for example {self._noun}['rgb']"
             )
         return self.outputs[0]
 
 
-def with_scene_ids(name: str, image: np.ndarray, ids: SceneIds) -> np.ndarray:
-    """The output image; in `splat_id`, scene indices replace device indices, except -1."""
-    if name != "splat_id" or ids is None:
+def with_scene_indices(name: str, image: np.ndarray, scene_indices: SceneIndices) -> np.ndarray:
+    """Replace device indices by scene indices in `splat_id`, except -1; other outputs are unchanged."""
+    if name != "splat_id" or scene_indices is None:
         return image
-    return np.append(ids(), np.int32(-1))[image]
+    return np.append(scene_indices(), np.int32(-1))[image]
 
 
 def check_process(opened_by: int, what: str) -> None:

@@ -3,8 +3,8 @@
 The ideal is the image without approximations: no alpha cut-off, no transmittance stop, no opacity ceiling,
 exact arithmetic. Low-pass, order, samples and the near plane are part of its definition.
 
-The renderer renders twice: rgb with the requested quality, and an approximation Q of the ideal. Q has no stop
-and no ceiling, and the cut-off e = `OMITTED` / n, with n the number of splats. Then
+The renderer renders twice: rgb with the requested quality, and a reference image Q, which approximates the
+ideal. Q has no stop and no ceiling, and the cut-off e = `MAX_OMITTED` / n, with n the number of splats. Then
 
     |rgb - ideal| <= |rgb - Q| + |Q - ideal|,
 
@@ -14,7 +14,7 @@ where the first term is measured, for any requested quality, and the second is b
    front of fragment k and B_k the colour behind it, a mean of colours and background. Replacing the opacities
    of Q by exact ones, one after the other from the back, moves a colour by at most sum_k T_k |d alpha_k| R,
    with T_k of Q and R the range of the colours.
-2. A fragment that Q omits has an opacity below e. There are at most n per pixel: n e R = `OMITTED` R. The
+2. A fragment that Q omits has an opacity below e. There are at most n per pixel: n e R = `MAX_OMITTED` R. The
    radius of a footprint grows with sqrt(ln(1 / e)), so that Q has about twice the fragments of the default.
 3. Interval arithmetic over the rounding of the ray-splat intersection bounds the opacity of a fragment of Q,
    also where rounding decides whether the fragment exists (at the near plane, at the horizon of the splat's
@@ -49,11 +49,11 @@ from fidsplat.capture.quality import Quality
 from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import InputError
 
-OMITTED = 2.0**-23
-"""maximum sum of the opacities of all fragments that the second rendering omits"""
+MAX_OMITTED = 2.0**-23
+"""maximum sum of the opacities of a pixel's fragments that the reference image omits"""
 _SLACK = 1.01
 """relative safety margin for the rounding of the bounds"""
-_UNIT = 2.0**-24
+_UNIT_ROUNDOFF = 2.0**-24
 """unit roundoff of float32"""
 
 _BOUNDED = frozenset(
@@ -66,7 +66,7 @@ _BOUNDED = frozenset(
 )
 """effects whose float32 rounding is bounded by the kernels"""
 
-_OPTIONS = {
+_REMEDIES = {
     "camera": ("a distorted or non-pinhole camera", "a pinhole camera"),
     "ellipsoid_exact": ("3D Gaussians with ellipsoid='exact'", "ellipsoid='ewa'"),
     "lowpass_pixel": ("lowpass='pixel'", "lowpass='screen'"),
@@ -84,18 +84,18 @@ _OPTIONS = {
     ),
     "blend_double": ("blend_precision='float64'", "blend_precision='float32'"),
 }
-"""option that requests an effect, and the supported alternative, by the prefix of the effect's name"""
-_SENSOR = {"noise": "full_well", "quantise": "bits", "response": "response"}
+"""option that requests an unbounded effect, and the alternative to use, by the prefix of the effect's name"""
+_SENSOR_ARGUMENTS = {"noise": "full_well", "quantise": "bits", "response": "response"}
 """arguments of `Sensor` whose names differ from the names of their steps, by the prefix of the step"""
 
 
 def cutoff_of(splats: int) -> float:
-    """Alpha cut-off for which the opacities of omitted fragments have a sum of at most `OMITTED`."""
-    return OMITTED / max(splats, 1)
+    """Alpha cut-off for which the opacities of omitted fragments have a sum of at most `MAX_OMITTED`."""
+    return MAX_OMITTED / max(splats, 1)
 
 
 def ideal_quality(quality: Quality, cutoff: float) -> Quality:
-    """The quality of the second rendering: a smaller cut-off, no stop, no ceiling and a float64 set-up."""
+    """The quality of a reference image: a smaller cut-off, no stop, no ceiling and a float64 set-up."""
     return quality.with_(
         alpha_cutoff=cutoff,
         detail_error=0.0,
@@ -107,8 +107,8 @@ def ideal_quality(quality: Quality, cutoff: float) -> Quality:
 
 
 @dataclass(frozen=True)
-class Ideal:
-    """Features and view of the second rendering, which approximates the ideal image, and its error bound."""
+class ErrorReference:
+    """Features and view of a reference image, which approximates the ideal image, and its error bound."""
 
     features: FeatureSet
     view: View
@@ -123,27 +123,27 @@ class ErrorImage:
     """The output `error` of a frame, computed on first use."""
 
     rgb: Images
-    second: Images
-    ideal: Ideal
+    reference_image: Images
+    reference: ErrorReference
 
     def read(self) -> np.ndarray:
         """Compute the error bound, (h, w) float32."""
-        measured = np.abs(self.rgb.read_float64("rgb", 0) - self.second.read_float64("rgb", 0)).max(axis=2)
-        bound = np.full(measured.shape, self.ideal.relative_bound)
-        if "rounding" in self.ideal.features.outputs:
-            bound += _SLACK * self.second.read("rounding", 0)
-        return np.nextafter(
-            (measured + self.ideal.color_bound * bound).astype(np.float32), np.float32(np.inf)
-        )
+        rgb, reference = (images.read_float64("rgb", 0) for images in (self.rgb, self.reference_image))
+        measured = np.abs(rgb - reference).max(axis=2)
+        bound = np.full(measured.shape, self.reference.relative_bound)
+        if "rounding" in self.reference.features.outputs:
+            bound += _SLACK * self.reference_image.read("rounding", 0)
+        error = measured + self.reference.color_bound * bound
+        return np.nextafter(error.astype(np.float32), np.float32(np.inf))
 
     @property
     def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device of the second rendering."""
-        return {"error": sum(self.second.timings.values())}
+        """Milliseconds on the device of the reference image."""
+        return {"error": sum(self.reference_image.timings.values())}
 
 
-def ideal_of(data: Any, capture: Capture, backend: Backend) -> Ideal:
-    """Prepare the second rendering of an uploaded cloud: its features, view and error bound. Raises
+def error_reference(data: Any, capture: Capture, backend: Backend) -> ErrorReference:
+    """Prepare the reference image of an uploaded cloud: its features, view and error bound. Raises
     InputError for an effect without a bound."""
     _refuse_unbounded(capture)
     if not isinstance(data, ResidentData):
@@ -159,51 +159,52 @@ def ideal_of(data: Any, capture: Capture, backend: Backend) -> Ideal:
     for color in _colors_behind(view):
         low, high = min(low, float(np.min(color))), max(high, float(np.max(color)))
     color_bound = max(high - low, abs(low), abs(high))
-    return Ideal(features, view, color_bound, _SLACK * (_UNIT * sums + OMITTED))
+    return ErrorReference(features, view, color_bound, _SLACK * (_UNIT_ROUNDOFF * sums + MAX_OMITTED))
 
 
 def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -> tuple[FeatureSet, View]:
-    """Features and view of the second rendering: float32 with the output `rounding`, or else float64."""
-    plain = capture.with_(outputs=("rgb",), quality=quality)
+    """Features and view of the reference image: float32 with the output `rounding`, or else float64."""
+    capture = capture.with_(outputs=("rgb",), quality=quality)
     info = backend.info
     if info.always_float64:
-        return prepare(data, plain)
+        return prepare(data, capture)
     if not info.float64:
         raise InputError(
             f"the device of the output 'error' must have float64, got {info.name}; use another device"
         )
-    bounded = quality.with_(blend_precision="float32")
-    if bounded.arithmetic == "approximate":
-        bounded = bounded.with_(arithmetic="fast")
-    features, view = prepare(data, replace(plain, quality=bounded))
-    unbounded = sorted({*features.slots} - _BOUNDED)
+    single = quality.with_(blend_precision="float32")
+    if single.arithmetic == "approximate":
+        single = single.with_(arithmetic="fast")
+    features, view = prepare(data, replace(capture, quality=single))
+    unbounded = sorted({*features.effects} - _BOUNDED)
     if not unbounded and quality.blend_precision != "float64":
         return replace(features, outputs=("rounding",)), view
     float32_rays = any(name.startswith("background_") for name in unbounded)
     with suppress(InputError):
-        double = prepare(data, replace(plain, quality=quality.with_(blend_precision="float64")))
+        double = prepare(data, replace(capture, quality=quality.with_(blend_precision="float64")))
         if not float32_rays and not backend.unsupported(double[0]):
             return double
-    options = dict(_option_of(name) for name in unbounded or ["blend_double"])
-    got, instead = (" and ".join(words) for words in (options, options.values()))
+    alternatives = dict(_remedy_of(name) for name in unbounded or ["blend_double"])
+    options, remedies = (" and ".join(words) for words in (alternatives, alternatives.values()))
     raise InputError(
         f"the output 'error' must be requested with effects whose rounding is bounded on {info.name}, got "
-        f"{got}; render with {instead}, leave out the output 'error', or use device='reference'"
+        f"{options}; render with {remedies}, leave out the output 'error', or use device='reference'"
     )
 
 
-def _option_of(effect: str) -> tuple[str, str]:
-    return next((words for prefix, words in _OPTIONS.items() if effect.startswith(prefix)), (effect, "less"))
+def _remedy_of(effect: str) -> tuple[str, str]:
+    words = (words for prefix, words in _REMEDIES.items() if effect.startswith(prefix))
+    return next(words, (effect, "less"))
 
 
 def _refuse_unbounded(capture: Capture) -> None:
     """Raise InputError if an effect of the capture has no bound on any device."""
     camera = capture.camera
-    if capture.foggy:
+    if capture.has_fog:
         effect, remedy = "fog", "without fog"
     elif capture.sensor.steps:
         step = capture.sensor.steps[0]
-        name = next((name for prefix, name in _SENSOR.items() if step.startswith(prefix)), step)
+        name = next((name for prefix, name in _SENSOR_ARGUMENTS.items() if step.startswith(prefix)), step)
         effect, remedy = f"a sensor with {name}={getattr(capture.sensor, name)!r}", "with fs.Sensor()"
     elif camera is not None and math.isfinite(camera.far):
         # whether `far` culls a splat depends on the cut-off
@@ -218,7 +219,7 @@ def _refuse_unbounded(capture: Capture) -> None:
 
 def _colors_behind(view: View) -> list[Any]:
     """Colours of the background and of the external depth image."""
-    match view.surroundings:
+    match view.environment_map:
         case Gradient(top=top, bottom=bottom):
             behind = [top, bottom]
         case Panorama(image=image):

@@ -10,7 +10,7 @@ import numpy as np
 from fidsplat.backends.interface import HostImages, Images
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.views import Views
-from fidsplat.render.array_export import ImageMapping, SceneIds, check_process, with_scene_ids
+from fidsplat.render.array_export import ImageMapping, SceneIndices, check_process, with_scene_indices
 from fidsplat.render.certified_error import ErrorImage
 from fidsplat.streaming.bands import BandData
 from fidsplat.util.arguments import invalid, whole_number
@@ -35,33 +35,33 @@ class Frame(ImageMapping):
         self,
         images: Images,
         capture: Capture,
-        ids: SceneIds = None,
+        scene_indices: SceneIndices = None,
         error: ErrorImage | None = None,
         index: int = 0,
     ) -> None:
-        """images: the backend's images; index: position of this view in them. capture: the rendered request.
-        ids: indices of the splats in the scene, for `splat_id`. error: image of certified errors, computed
+        """images: the backend's images; index: position of this view in them. capture: what was rendered.
+        scene_indices: indices of the splats in the scene, for `splat_id`. error: the output `error`, computed
         when it is read; None if it was not requested."""
-        super().__init__(images, capture.outputs, ids, index)
+        super().__init__(images, capture.outputs, scene_indices, index)
         self._error, self.capture = error, capture
         """The capture of this frame. `read_back` and `truth_of` use its camera, shutter and motion."""
 
     @property
     def images(self) -> Images:
-        """The backend's images, for kernels of the backend; the frames of a batch share them."""
+        """The backend's images; the frames of a batch share them."""
         return self._images
 
     def to_uint8(self) -> np.ndarray:
         """`rgb` as 8-bit colours, (h, w, 3) uint8: clamped to [0, 1], times 255, rounded to the nearest; NaN
-        becomes 0. The device converts the image if it can, so that a quarter of the bytes is copied. The
-        result is bit-identical to a conversion of `frame["rgb"]` on the host.
+        becomes 0. The device converts the image if it can, so that a quarter of the bytes is copied; a
+        conversion on the host is bit-identical.
 
         Raises:
             InputError: `rgb` was not requested.
         """
         self._check("rgb")
         if "rgb" not in self._arrays:
-            check_process(self._process, "frame")
+            check_process(self._pid, "frame")
             converted = self._images.read_uint8("rgb", self._index or 0)
             if converted is not None:
                 return converted
@@ -70,9 +70,9 @@ class Frame(ImageMapping):
         return to_uint8(self["rgb"])
 
     def __repr__(self) -> str:
-        took = sum(self.timings.values())
+        ms = sum(self.timings.values())
         splats = f", {self.stats['splats']:,} splats" if "splats" in self.stats else ""
-        return f"Frame({', '.join(self.outputs)}{splats}, {took:.1f} ms)"
+        return f"Frame({', '.join(self.outputs)}{splats}, {ms:.1f} ms)"
 
     def _repr_png_(self) -> bytes:
         """PNG for notebooks: rgb, or else the first output in false colours."""
@@ -97,16 +97,16 @@ class Frame(ImageMapping):
         images, index = self._images, self._index or 0
         if name == "error":
             images, index = HostImages({name: self[name][None]}, {}, {}), 0
-        complete = images.empty(name)
+        empty = images.empty(name)
         if into is None:
-            into = complete
-        elif not isinstance(into, np.ndarray) or (into.shape, into.dtype) != (complete.shape, complete.dtype):
-            raise invalid("into", f"an array {complete.shape} of {complete.dtype}", into)
+            into = empty
+        elif not isinstance(into, np.ndarray) or (into.shape, into.dtype) != (empty.shape, empty.dtype):
+            raise invalid("into", f"an array {empty.shape} of {empty.dtype}", into)
         whole_number("the end of the rows", end, 0, len(into))
         whole_number("the first row", first, 0, end)
         images.read_rows(name, first, end, into, index)
         if name == "splat_id":
-            into[first:end] = with_scene_ids(name, into[first:end], self._ids)
+            into[first:end] = with_scene_indices(name, into[first:end], self._scene_indices)
         return into
 
     @property
@@ -138,8 +138,8 @@ class FrameBatch(ImageMapping):
 
     _noun = "batch"
 
-    def __init__(self, images: Images, views: Views, ids: SceneIds = None) -> None:
-        super().__init__(images, views.captures[0].outputs, ids)
+    def __init__(self, images: Images, views: Views, scene_indices: SceneIndices = None) -> None:
+        super().__init__(images, views.captures[0].outputs, scene_indices)
         self._views, self.views = views, images.views
         """Number of views, including masked ones."""
 
@@ -155,11 +155,12 @@ class FrameBatch(ImageMapping):
             InputError: the number of the view is out of range.
         """
         number = whole_number("number of the view", number, 0, self.views - 1)
-        return Frame(self._images, self._views.capture(number), self._ids, index=number)
+        return Frame(self._images, self._views.capture(number), self._scene_indices, index=number)
 
     def __reduce__(self):
         """Pickle and copy as NumPy arrays."""
-        views = replace(self._views, captures=tuple(one.picklable() for one in self._views.captures))
+        captures = tuple(capture.picklable() for capture in self._views.captures)
+        views = replace(self._views, captures=captures)
         return _host_batch, (dict(self), dict(self.timings), dict(self.stats), views)
 
 
@@ -172,13 +173,13 @@ def _host_batch(
 def stack_bands(bands: Iterable[BandData], render: Callable[[BandData], Frame]) -> Frame:
     """Render bands of rows and stack them to one frame.
 
-    The device renders one band after another, so that it stores the splats of one band only. Each band is
-    copied to the host while the next is rendered. A single band stays on the device.
+    The device stores the splats of one band at a time. Each band is copied to the host while the next is
+    rendered. A single band stays on the device.
     """
     arrays: dict[str, np.ndarray] = {}
     timings: dict[str, float] = {}
     stats: dict[str, int] = {}
-    last: tuple[Frame, tuple[int, int]] | None = None
+    previous: tuple[Frame, tuple[int, int]] | None = None
 
     def finish(frame: Frame) -> None:
         frame.wait()
@@ -192,15 +193,15 @@ def stack_bands(bands: Iterable[BandData], render: Callable[[BandData], Frame]) 
             arrays[name] = frame.read_rows(name, *rows, arrays.get(name))
 
     for band in bands:
-        if last is not None:
-            finish(last[0])
+        if previous is not None:
+            finish(previous[0])
         frame = render(band)
-        if last is not None:
-            copy_rows(*last)
-        last = frame, band.rows
-    assert last is not None  # there is at least one band
+        if previous is not None:
+            copy_rows(*previous)
+        previous = frame, band.rows
+    assert previous is not None  # there is at least one band
     if not arrays:
-        return last[0]
-    finish(last[0])
-    copy_rows(*last)
-    return _host_frame(arrays, timings, stats, last[0].capture)
+        return previous[0]
+    finish(previous[0])
+    copy_rows(*previous)
+    return _host_frame(arrays, timings, stats, previous[0].capture)

@@ -11,7 +11,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.formats.meshes import TriangleMesh
 from fidsplat.render.renderer import Renderer
-from fidsplat.render.surface import median_depth
+from fidsplat.render.surface import median_depth_capture
 from fidsplat.render.tsdf import DistanceField
 from fidsplat.scenes import Scene
 from fidsplat.splats.statistics import guess_up
@@ -69,7 +69,7 @@ def scene_mesh(
         )
     renderer = Renderer(scene.device) if renderer is None else renderer
     report: Callable[[str, float], object] = progress or no_progress
-    still = median_depth(scene.capture, "rgb", "normal")
+    still = median_depth_capture(scene.capture, "rgb", "normal")
     field = DistanceField(voxel, (low + high) / 2)
     images = []
     frames = renderer.render_views(renderer.upload(scene), [replace(still, camera=one) for one in views])

@@ -13,7 +13,7 @@ import numpy as np
 
 from fidsplat.backends.interface import DeviceInfo, Images, Pipeline
 from fidsplat.backends.prepare import prepare, prepare_batch
-from fidsplat.backends.registry import FIRST, open_backend
+from fidsplat.backends.registry import AUTO, open_backend
 from fidsplat.backends.view import NO_CAMERA, View
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture, CaptureFields, output_names
@@ -23,7 +23,7 @@ from fidsplat.capture.sensor import Sensor
 from fidsplat.capture.views import Views, views_of
 from fidsplat.effects.differentiable import check_gradients, with_distortion
 from fidsplat.render.array_export import check_process
-from fidsplat.render.certified_error import ErrorImage, ideal_of
+from fidsplat.render.certified_error import ErrorImage, error_reference
 from fidsplat.render.differentiable_frame import DifferentiableFrame
 from fidsplat.render.frame import Frame, FrameBatch, stack_bands
 from fidsplat.render.lighting import lit_scene
@@ -33,26 +33,28 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.store.store import Store
 from fidsplat.streaming.bands import BandData
-from fidsplat.streaming.residency import Residency, one_ahead
+from fidsplat.streaming.residency import Residency, double_buffered
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import invalid, whole_number
 from fidsplat.util.errors import InputError, unknown
 
 _DEFAULT_CAPTURE = Capture()
-METERED = 96
-"""width [pixels] of the small frame in which exposure is metered for a sensor"""
+Subsampling = tuple[int, Callable[[float], object] | None] | None
+"""arguments `step` and `progress` of `Pipeline.render_subsampled`; None: all pixels"""
+METERING_WIDTH = 96
+"""width [pixels] of the small frame in which the light is measured for a sensor"""
 
 
 def default_device() -> str:
     """Default device: the environment variable FIDSPLAT_DEVICE, else `auto`."""
-    return os.environ.get("FIDSPLAT_DEVICE", "").strip() or FIRST
+    return os.environ.get("FIDSPLAT_DEVICE", "").strip() or AUTO
 
 
 class Renderer:
     """Renders splats on one device. Compiled pipelines and scratch buffers are reused from frame to frame.
 
-    Threads may share a renderer, which renders their frames one after another; a forked process opens its
-    own.
+    A renderer is thread-safe: it renders the frames of several threads one after another. A forked process
+    must open its own renderer.
 
     Args:
         device: "opencl" (the best OpenCL device), "opencl:NAME" (part of a platform's or a GPU's name, or
@@ -69,7 +71,7 @@ class Renderer:
 
     def __init__(self, device: str | None = None, memory_budget: int | None = None) -> None:
         self.backend = open_backend(default_device() if device is None else device)
-        self._process, self._lock = os.getpid(), threading.Lock()
+        self._pid, self._lock = os.getpid(), threading.Lock()
         self._lit: WeakKeyDictionary[Scene, Scene] = WeakKeyDictionary()
         if memory_budget is not None:
             if isinstance(memory_budget, bool) or not isinstance(memory_budget, int) or memory_budget <= 0:
@@ -98,7 +100,7 @@ class Renderer:
 
         The result has the scene's capture. Chunks of a store are read when a view needs them.
         """
-        check_process(self._process, "Renderer")
+        check_process(self._pid, "Renderer")
         capture = scene.capture if isinstance(scene, Scene) else _DEFAULT_CAPTURE
         scene = self.lit(scene) if isinstance(scene, Scene) else scene
         stored = Scene(stores=(scene,)) if isinstance(scene, Store) else scene
@@ -111,9 +113,9 @@ class Renderer:
             return ResidentCloud(self.backend, self.backend.upload(cloud), capture, cloud.labels)
 
     def lit(self, scene: Scene) -> Scene:
-        """The scene with the colours of markers with `light` computed; `upload` and `render` call it.
+        """Compute the colours of markers that have `light`; `upload` and `render` call it.
 
-        The result is cached for each scene.
+        Returns the scene with these colours, cached for each scene.
 
         Raises:
             InputError: the light of a marker cannot be computed, e.g. its surroundings are black.
@@ -124,7 +126,7 @@ class Renderer:
             self._lit[scene] = lit_scene(scene, self)
         return self._lit[scene]
 
-    def adopt(
+    def wrap_arrays(
         self,
         *,
         means: Any,
@@ -136,7 +138,7 @@ class Renderer:
         labels: Any = None,
         origin: Iterable[float] = (0.0, 0.0, 0.0),
     ) -> ResidentCloud:
-        """Use splats in arrays on the device, without a copy.
+        """Wrap arrays on the device as a cloud, without a copy.
 
         Shapes and units are those of SplatCloud, float32 (labels int32): wp.array, or objects with DLPack
         (torch, CuPy, JAX); NumPy arrays are copied. Scales (n, 3) make 3D Gaussians, disks
@@ -145,16 +147,16 @@ class Renderer:
         below 0) are not rendered. `means` are relative to `origin` (3,), a world position.
 
         Raises:
-            InputError: the backend adopts no arrays, or one has the wrong shape, type or device.
+            InputError: the backend cannot wrap arrays, or one has the wrong shape, type or device.
         """
-        check_process(self._process, "Renderer")
+        check_process(self._pid, "Renderer")
         if (colors is None) == (sh is None):
             raise InputError("exactly one of colors (n, 3) and sh (n, k, 3) must be given, got both or none")
         arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
         arrays |= {"colors": colors} if sh is None else {"sh": sh}
         arrays |= {} if labels is None else {"labels": labels}
         with self._lock:
-            data = self.backend.adopt(arrays, np.asarray(tuple(origin), dtype=np.float64))
+            data = self.backend.wrap_arrays(arrays, np.asarray(tuple(origin), dtype=np.float64))
         return ResidentCloud(self.backend, data, _DEFAULT_CAPTURE)
 
     def render(
@@ -163,7 +165,7 @@ class Renderer:
         capture: Capture | Camera | None = None,
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
-        **parts: Unpack[CaptureFields],
+        **fields: Unpack[CaptureFields],
     ) -> Frame:
         """Render one frame: `render(scene, Capture(camera, ...))`, or the fields of a capture as arguments.
 
@@ -171,14 +173,14 @@ class Renderer:
             scene: splats to render.
             capture: camera and settings, or only a camera; by default the capture of the scene or of its
                 ResidentCloud.
-            outputs, quality, and by name the other fields (`CaptureFields`): replace fields of the capture.
+            outputs, quality, **fields: replace these fields of the capture (`CaptureFields`).
 
         Raises:
             InputError: no camera, an unknown output or preset, a frame that is too large, a cloud
                 uploaded by another renderer.
             DeviceError: the device fails or lacks memory.
         """
-        requested = _capture_of(scene, capture, outputs=outputs, quality=quality, **parts)
+        requested = _capture_of(scene, capture, outputs=outputs, quality=quality, **fields)
         return self._render(self._resident(scene), requested)
 
     def render_differentiable(
@@ -189,7 +191,7 @@ class Renderer:
         quality: Quality | str | None = None,
         *,
         distortion: bool = False,
-        **parts: Unpack[CaptureFields],
+        **fields: Unpack[CaptureFields],
     ) -> DifferentiableFrame:
         """Render one frame whose `backward` returns gradients; the images are bit-identical to `render`.
 
@@ -201,8 +203,8 @@ class Renderer:
 
         Args:
             scene: disks with colours or spherical harmonics; no store.
-            capture, outputs, quality, and the other parts by name: as in `render`. Outputs are some of `rgb`,
-                `alpha`, `depth` and `normal`; docs/gradients.md lists the supported effects.
+            capture, outputs, quality, **fields: as in `render`. Outputs are some of `rgb`, `alpha`, `depth`
+                and `normal`; docs/gradients.md lists the supported effects.
             distortion: render the image `distortion` (h, w) too: sum over pairs of a pixel's splats of
                 w_i w_j (m_i - m_j)^2, m the depth in a depth buffer, the depth distortion of 2DGS.
 
@@ -210,7 +212,7 @@ class Renderer:
             InputError: as `render`; an effect or an output without a gradient.
             DeviceError: the device has no gradients, fails, or lacks the memory to render without bands.
         """
-        requested = _capture_of(scene, capture, outputs=outputs, quality=quality, **parts)
+        requested = _capture_of(scene, capture, outputs=outputs, quality=quality, **fields)
         resident = self._resident(scene)
         if isinstance(resident.data, Residency):
             raise InputError(
@@ -225,7 +227,7 @@ class Renderer:
             images = pipeline.forward(resident.data, view)
         return DifferentiableFrame(images, requested, pipeline, self._lock, distortion)
 
-    def render_every(
+    def render_subsampled(
         self,
         step: int,
         scene: Scene | SplatCloud | ResidentCloud,
@@ -234,7 +236,7 @@ class Renderer:
         quality: Quality | str | None = None,
         progress: Callable[[float], object] | None = None,
     ) -> Frame:
-        """Render every step-th pixel in both directions, bit-identical to `render`.
+        """Render only every step-th pixel in both directions, bit-identical to these pixels of `render`.
 
         Only the device "reference" supports this.
 
@@ -249,11 +251,11 @@ class Renderer:
         whole_number("step", step, 1, 2**31 - 1)
         requested = _capture_of(scene, capture, outputs=outputs, quality=quality)
         resident = self._resident(scene)
-        if not self.backend.renders_pixels:
+        if not self.backend.renders_subsampled:
             raise InputError(
                 self.backend.lacks("render subsets of pixels", "use device='reference', or render")
             )
-        return self._render(resident, requested, every=(step, progress))
+        return self._render(resident, requested, subsampling=(step, progress))
 
     def render_band(
         self,
@@ -286,7 +288,7 @@ class Renderer:
         captures: Iterable[Capture | Camera],
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
-        **parts: Unpack[CaptureFields],
+        **fields: Unpack[CaptureFields],
     ) -> Iterator[Frame]:
         """Render one cloud many times: one Frame for each capture or camera, in order.
 
@@ -294,20 +296,22 @@ class Renderer:
         next frame while the caller uses the previous one. Arguments and errors: see `render`; a motion of the
         camera replaces the pose of each camera. An error of a capture is raised after the frames before it.
         """
-        # converted once, as the first frame would exhaust an iterator
+        # read once: an iterator of names would be exhausted by the first frame
         outputs = None if outputs is None else output_names(outputs)
-        background = parts.get("background")
+        background = fields.get("background")
         if background is not None:
-            parts["background"] = background_of(background)
+            fields["background"] = background_of(background)
         try:
             remaining = iter(captures)
         except TypeError:
             raise invalid("captures", "a list of Capture or Camera", captures) from None
         resident = self._resident(scene)
-        requested = (_capture_of(scene, one, outputs=outputs, quality=quality, **parts) for one in remaining)
+        requested = (
+            _capture_of(scene, capture, outputs=outputs, quality=quality, **fields) for capture in remaining
+        )
         if isinstance(resident.data, Residency):
             requested = resident.data.prefetched(requested)
-        yield from one_ahead(self._render(resident, one) for one in requested)
+        yield from double_buffered(self._render(resident, capture) for capture in requested)
 
     def render_batch(
         self,
@@ -341,11 +345,11 @@ class Renderer:
         """
         resident = self._resident(scene)
         try:
-            given = [captures] if isinstance(captures, (Capture, Camera)) else list(captures)
+            items = [captures] if isinstance(captures, (Capture, Camera)) else list(captures)
         except TypeError:
             raise invalid("captures", "a list of Capture or Camera", captures) from None
-        requested = [_capture_of(scene, one) for one in given]
-        if any("error" in one.outputs for one in requested):
+        requested = [_capture_of(scene, item) for item in items]
+        if any("error" in capture.outputs for capture in requested):
             raise InputError(
                 f"the output 'error' must be rendered one capture at a time, got a batch of {len(requested)}"
                 "; call render() for each capture, or leave out the output 'error'"
@@ -363,20 +367,22 @@ class Renderer:
 
     def _render_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
         interrupts.check()
-        if any(capture.sensor.meters for capture in views.captures):
+        if any(capture.sensor.needs_metering for capture in views.captures):
             metered = (self._metered(resident, views.capture(number)) for number in range(len(views)))
             views = Views(tuple(metered), mask=views.mask)
-        features, batch = prepare_batch(resident.complete, views)
+        features, batch = prepare_batch(resident.all_splats, views)
         with self._lock:
             rendered = (batch.one(number) for number in range(len(batch)))
-            data, ids = resident.gather(rendered, features, (capture.quality for capture in views.captures))
+            data, scene_indices = resident.gather(
+                rendered, features, (capture.quality for capture in views.captures)
+            )
             shape = self.backend.frame_shape(batch.view, len(batch))
             images = self.backend.pipeline(features, shape).render(data, batch)
-        return FrameBatch(images, views, ids)
+        return FrameBatch(images, views, scene_indices)
 
     def _resident(self, scene: Scene | SplatCloud | Store | ResidentCloud) -> ResidentCloud:
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
-        check_process(self._process, "Renderer")
+        check_process(self._pid, "Renderer")
         if resident.backend is not self.backend:
             raise InputError(
                 "the cloud must be uploaded by this Renderer, got one of another Renderer; upload it again"
@@ -386,11 +392,11 @@ class Renderer:
     def _metered(self, resident: ResidentCloud, capture: Capture) -> Capture:
         """The capture with sensor settings metered in a small frame."""
         camera = capture.camera
-        if not capture.sensor.meters or camera is None:
+        if not capture.sensor.needs_metering or camera is None:
             return capture
-        if capture.external_depth is None and camera.width > METERED:
-            height = max(1, round(camera.height * METERED / camera.width))
-            camera = camera.with_size(METERED, height)
+        if capture.external_depth is None and camera.width > METERING_WIDTH:
+            height = max(1, round(camera.height * METERING_WIDTH / camera.width))
+            camera = camera.with_size(METERING_WIDTH, height)
         plain = capture.with_(camera=camera, outputs=("rgb",), sensor=Sensor())
         colors = self._render(resident, plain)["rgb"]
         return capture.with_(sensor=capture.sensor.metered(np.asarray(colors)))
@@ -400,53 +406,53 @@ class Renderer:
         resident: ResidentCloud,
         capture: Capture,
         band: tuple[int, int] | None = None,
-        every: tuple[int, Callable[[float], object] | None] | None = None,
+        subsampling: Subsampling = None,
     ) -> Frame:
-        """Render one frame. band: rows of pixels; None: all. every: arguments of `Pipeline.render_every`."""
+        """Render one frame. band: rows of pixels [first, end); None: all."""
         interrupts.check()
         capture = self._metered(resident, capture)
-        features, view = prepare(resident.complete, capture)
+        features, view = prepare(resident.all_splats, capture)
         if band is not None:
-            view = _banded(view, band)
-        ideal = ideal_of(resident.data, capture, self.backend) if "error" in capture.outputs else None
+            view = _restricted(view, band)
+        bounded = "error" in capture.outputs
+        reference = error_reference(resident.data, capture, self.backend) if bounded else None
         with self._lock:  # scratch buffers and kernel arguments belong to one frame at a time
             shape, data = self.backend.frame_shape(view), resident.data
             pipeline = self.backend.pipeline(features, shape)
             if not isinstance(data, Residency):
-                images = _rendered(pipeline, data, view, every)
-                if ideal is None:
+                images = _images_of(pipeline, data, view, subsampling)
+                if reference is None:
                     return Frame(images, capture)
-                ideal_view = ideal.view if band is None else _banded(ideal.view, band)
-                ideal_images = _rendered(
-                    self.backend.pipeline(ideal.features, shape), data, ideal_view, every
-                )
-                return Frame(images, capture, error=ErrorImage(images, ideal_images, ideal))
+                view = reference.view if band is None else _restricted(reference.view, band)
+                pipeline = self.backend.pipeline(reference.features, shape)
+                reference_images = _images_of(pipeline, data, view, subsampling)
+                return Frame(images, capture, error=ErrorImage(images, reference_images, reference))
 
             def render_band(band: BandData) -> Frame:
-                images = band.images or _rendered(pipeline, band.data, band.view, every)
-                return Frame(images, capture, band.ids)
+                images = band.images or _images_of(pipeline, band.data, band.view, subsampling)
+                return Frame(images, capture, band.scene_indices)
 
             return stack_bands(data.bands(view, features, capture.quality, pipeline), render_band)
 
 
-def _rendered(
-    pipeline: Pipeline, data: Any, view: View, every: tuple[int, Callable[[float], object] | None] | None
-) -> Images:
-    return pipeline.render_view(data, view) if every is None else pipeline.render_every(data, view, *every)
+def _images_of(pipeline: Pipeline, data: Any, view: View, subsampling: Subsampling) -> Images:
+    if subsampling is None:
+        return pipeline.render_view(data, view)
+    return pipeline.render_subsampled(data, view, *subsampling)
 
 
-def _banded(view: View, band: tuple[int, int]) -> View:
-    """The view restricted to these rows of pixels."""
+def _restricted(view: View, band: tuple[int, int]) -> View:
+    """The view restricted to rows of pixels [first, end)."""
     return replace(view, band=(band[0] * view.samples, band[1] * view.samples))
 
 
-def _capture_of(scene: Any, capture: Capture | Camera | None, **parts: Any) -> Capture:
+def _capture_of(scene: Any, capture: Capture | Camera | None, **fields: Any) -> Capture:
     """The given capture, or by default the scene's capture, with the given fields replaced."""
     if not isinstance(capture, Capture):
         if capture is not None:
-            parts["camera"] = capture
+            fields["camera"] = capture
         capture = scene.capture if isinstance(scene, (Scene, ResidentCloud)) else _DEFAULT_CAPTURE
-    requested = capture.with_(**parts)
+    requested = capture.with_(**fields)
     if requested.camera is None:
         raise InputError(NO_CAMERA)
     return requested

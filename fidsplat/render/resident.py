@@ -13,7 +13,7 @@ from fidsplat.backends.view import View
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
 from fidsplat.effects import FeatureSet
-from fidsplat.render.array_export import SceneIds
+from fidsplat.render.array_export import SceneIndices
 from fidsplat.streaming.residency import Residency
 from fidsplat.util.errors import InputError
 
@@ -30,8 +30,8 @@ class ResidentCloud:
         labels: np.ndarray | None = None,
     ) -> None:
         self.backend, self.data, self._labels = backend, data, labels
-        self.complete: Any = data.scene if isinstance(data, Residency) else data
-        """the complete scene: splats on the device, or stores that are only partly on the device"""
+        self.all_splats: Any = data.scene if isinstance(data, Residency) else data
+        """all splats of the scene: on the device, or, for stores, only partly on the device"""
         self.capture = capture
         """capture of the uploaded scene, the default of `render`"""
 
@@ -56,8 +56,8 @@ class ResidentCloud:
 
     def gather(
         self, views: Iterable[View], features: FeatureSet, qualities: Iterable[Quality]
-    ) -> tuple[Any, SceneIds]:
-        """Upload the splats that these views need; returns them and their scene indices."""
+    ) -> tuple[Any, SceneIndices]:
+        """Upload the splats that these views need. Returns them and their scene indices."""
         if isinstance(self.data, Residency):
             return self.data.gather(list(views), features, qualities)
         return self.data, None

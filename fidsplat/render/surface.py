@@ -67,7 +67,7 @@ def surface_at(
 
         renderer = Renderer(scene.device)
     uploaded = renderer.upload(scene) if resident is None else resident
-    still = median_depth(capture)
+    still = median_depth_capture(capture)
 
     def depth_of(patch: Camera) -> np.ndarray:
         return renderer.render(uploaded, still.with_(camera=patch))["depth_first"]
@@ -114,7 +114,7 @@ def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = 
     return _fitted(patch, window, at, pixels / step, metres)
 
 
-def median_depth(capture: Capture, *outputs: str) -> Capture:
+def median_depth_capture(capture: Capture, *outputs: str) -> Capture:
     """Capture of the median depth `depth_first` and other outputs at the time of the shutter, without effects
     of sensor and air."""
     quality = replace(capture.quality, samples=1, first_hit=MEDIAN)

@@ -139,7 +139,7 @@ def _extent(cloud: SplatCloud | Store) -> tuple[np.ndarray, np.ndarray]:
         return -np.ones(3), np.ones(3)
     if isinstance(cloud, Store):  # by the boxes of its chunks, which are small compared with the scene
         return cloud.bounds(REACH)
-    reach = cloud.reach(REACH)
+    reach = cloud.half_extents(REACH)
     share = 0.5 if len(cloud) >= MANY else 0.0
     low = np.percentile(cloud.means - reach, share, axis=0)
     high = np.percentile(cloud.means + reach, 100 - share, axis=0)

@@ -76,7 +76,7 @@ def _space(output: Output, size: tuple[int, int]) -> Any:
     """Gymnasium space of an output image."""
     shape = size if output.channels == 1 else (*size, output.channels)
     if output.dtype == "int32":
-        return spaces.Box(output.blank, np.iinfo(np.int32).max, shape, np.int32)
+        return spaces.Box(output.empty_value, np.iinfo(np.int32).max, shape, np.int32)
     low, high = (-1.0, 1.0) if output.display == "normal" else (0.0, np.inf)
     return spaces.Box(low, high, shape, np.float32)
 

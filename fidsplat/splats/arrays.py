@@ -107,7 +107,7 @@ def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
     raise InputError(f"{name} must have the shape {wanted}, got shape {array.shape}")
 
 
-def check_scale(colors: np.ndarray) -> np.ndarray:
+def check_color_range(colors: np.ndarray) -> np.ndarray:
     """Raise InputError for colours from 0 to 255, as 1 is white."""
     if colors.dtype == np.uint8 and colors.size and colors.max() > 1:
         raise InputError("colors must have 1 as white, got bytes up to 255; give colors / 255")
@@ -143,7 +143,7 @@ def _is_frozen(array) -> bool:
     return array is None
 
 
-def as_single(array: np.ndarray) -> np.ndarray:
+def as_float32(array: np.ndarray) -> np.ndarray:
     """A C-ordered float32 array that no other code can change; an overflow becomes inf."""
     if array.dtype == F32 and array.flags.c_contiguous and _is_frozen(array):
         return array
@@ -168,7 +168,7 @@ def choose_origin(means: np.ndarray, single: np.ndarray, scales: np.ndarray) -> 
         return single, zero
     step = 2.0 ** np.floor(np.log2(reach))
     origin = np.round((low / 2 + high / 2) / step) * step
-    return as_single(means - origin), origin
+    return as_float32(means - origin), origin
 
 
 def unit_quaternions(quats: np.ndarray) -> np.ndarray:

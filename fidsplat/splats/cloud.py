@@ -10,10 +10,10 @@ import numpy as np
 from fidsplat.splats.arrays import (
     F32,
     OPTIONAL,
-    as_single,
+    as_float32,
+    check_color_range,
     check_one_footprint,
     check_origin,
-    check_scale,
     check_shape,
     choose_origin,
     drop_report,
@@ -104,7 +104,7 @@ class SplatCloud(PickledByFields, Summarised):
         if (colors is None) == (sh is None):
             raise InputError("exactly one of colors (n, 3) and sh (n, k, 3) must be given, got both or none")
         if colors is not None:
-            arrays["colors"] = check_scale(real_numbers("colors", colors))
+            arrays["colors"] = check_color_range(real_numbers("colors", colors))
             shapes["colors"] = (n, 3)
         else:
             arrays["sh"] = real_numbers("sh", sh)
@@ -117,7 +117,7 @@ class SplatCloud(PickledByFields, Summarised):
             check_shape(name, array, shapes[name])
         new_labels = whole_numbers(labels, n)
 
-        single = {name: as_single(array) for name, array in {"means": given, **arrays}.items()}
+        single = {name: as_float32(array) for name, array in {"means": given, **arrays}.items()}
         keep, dropped = find_defects(single)
         if keep is not None:
             single = {name: array[keep] for name, array in single.items()}
@@ -125,8 +125,8 @@ class SplatCloud(PickledByFields, Summarised):
             new_labels = new_labels[keep]
             warnings.warn(drop_report(dropped, n, source), stacklevel=2)
         if thick:
-            single["thickness"] = as_single(single["scales"][:, 2])
-            single["scales"] = as_single(single["scales"][:, :2])
+            single["thickness"] = as_float32(single["scales"][:, 2])
+            single["scales"] = as_float32(single["scales"][:, :2])
         self._finish(given, single, new_labels, origin, dropped)
 
     @classmethod
@@ -148,7 +148,7 @@ class SplatCloud(PickledByFields, Summarised):
         and either sh or colors. dropped: counts of a reader."""
         cloud = object.__new__(cls)
         single = {"quats": quats, "scales": scales, "opacities": opacities, "colors": colors, "sh": sh}
-        single["means"] = means if means.dtype == F32 else as_single(means)
+        single["means"] = means if means.dtype == F32 else as_float32(means)
         if thickness is not None:
             single["thickness"] = thickness
         cloud._finish(
@@ -243,10 +243,10 @@ class SplatCloud(PickledByFields, Summarised):
         corners. Raises InputError for an empty cloud."""
         if not len(self):
             raise InputError("the cloud must have at least one splat to have bounds, got none")
-        reach = self.reach(3.0)
+        reach = self.half_extents(3.0)
         return (self.means - reach).min(axis=0) + self.origin, (self.means + reach).max(axis=0) + self.origin
 
-    def reach(self, sigmas: float) -> np.ndarray:
+    def half_extents(self, sigmas: float) -> np.ndarray:
         """Half extents (n, 3) float64 [m] along the world axes: Gaussians to `sigmas`, boxes to corners."""
         sigmas = number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
         rotations = quaternion_to_matrix(self.quats)
@@ -286,16 +286,16 @@ class SplatCloud(PickledByFields, Summarised):
         rotation, scale, translation = check_similarity(pose_matrix(matrix, "the transform"), "the transform")
         local = self.means @ (scale * rotation).T
         if self.origin.any():
-            means, origin = as_single(local), scale * rotation @ self.origin + translation
+            means, origin = as_float32(local), scale * rotation @ self.origin + translation
         else:
             world = local + translation
-            means, origin = choose_origin(world, as_single(world), self.scales * scale)
+            means, origin = choose_origin(world, as_float32(world), self.scales * scale)
         quats = unit_quaternions(quaternion_multiply(matrix_to_quaternion(rotation), self.quats).astype(F32))
         sh = self.sh
         if sh is not None and sh.shape[1] > 1:
             sh = rotation_of_coefficients(self.sh_degree, rotation).astype(F32) @ sh
-        scales = as_single(self.scales * scale)
-        thickness = None if self.thickness is None else as_single(self.thickness * scale)
+        scales = as_float32(self.scales * scale)
+        thickness = None if self.thickness is None else as_float32(self.thickness * scale)
         within = all(rows_beyond(array, LARGEST) is None for array in (means, scales))
         if not (within and (scales > 0).all()):
             raise InputError(
@@ -376,7 +376,7 @@ class SplatCloud(PickledByFields, Summarised):
         joined["origin"] = first.origin
         if any(not np.array_equal(cloud.origin, first.origin) for cloud in filled):
             world = np.concatenate([cloud.world_means() for cloud in filled])
-            joined["means"], joined["origin"] = choose_origin(world, as_single(world), joined["scales"])
+            joined["means"], joined["origin"] = choose_origin(world, as_float32(world), joined["scales"])
         degree = max(cloud.sh_degree for cloud in filled)
         if degree < 0:
             colors, sh = np.concatenate([cloud.colors for cloud in filled if cloud.colors is not None]), None

@@ -36,8 +36,8 @@ class BandData:
     """pixels [first, end)"""
     view: View
     data: ResidentData | None
-    ids: Callable[[], np.ndarray]
-    """returns the scene indices (n,) int32 of its splats"""
+    scene_indices: Callable[[], np.ndarray]
+    """function that returns the indices in the scene of its splats, (n,) int32"""
     images: Images | None = None
 
 

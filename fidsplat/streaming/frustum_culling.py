@@ -109,7 +109,7 @@ def cutoff_radius(view: View) -> float:
     return PADDING * math.sqrt(2.0 * (math.log(MAX_OPACITY) - view.log_cut))
 
 
-def ewa_reach(view: View, features: FeatureSet, radius: float, reach: np.ndarray) -> np.ndarray | None:
+def ewa_extent(view: View, features: FeatureSet, radius: float, reach: np.ndarray) -> np.ndarray | None:
     """Extent (n,) of EWA footprints around projected centres, in samples times depth [m]; None without EWA.
 
     EWA projects by the derivative at the centre, so that a footprint can be larger than the projected splat.
@@ -134,7 +134,7 @@ def _in_pose_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.n
     deep = disks if extent.depths == radius else CameraBoxes(view, *boxes(extent.depths))
     visible &= extent.nearest(view, deep) <= view.far * (1 + _ROUNDING)
     if view.raster is None:
-        wide = ewa_reach(view, features, radius, reach)
+        wide = ewa_extent(view, features, radius, reach)
         for normal, offset in _pinhole_sides(view, margin):
             inside = disks.beyond(normal) + offset >= 0
             if wide is not None:
@@ -144,7 +144,7 @@ def _in_pose_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.n
     lens = view.raster.lens
     if isinstance(lens, Equirectangular | RayTable):
         return visible
-    step = view.raster.step * margin
+    step = view.raster.max_ray_derivative * margin
     if isinstance(lens, Fisheye):
         if _widened(features):
             step = _max_ray_rotation(view) * max(margin, extent.depths * _ACROSS + 2.0)

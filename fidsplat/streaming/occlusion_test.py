@@ -14,7 +14,7 @@ from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.store.chunked_splats import ChunkedSplats, NodeMasks
-from fidsplat.streaming.frustum_culling import PADDING, Boxes, CameraBoxes, Extent, ewa_reach
+from fidsplat.streaming.frustum_culling import PADDING, Boxes, CameraBoxes, Extent, ewa_extent
 
 _RANGE = 3.33
 """standard deviations within which a splat's depth varies between pixels (slot/compose_pixel.cl)"""
@@ -102,7 +102,7 @@ def _projected_extent(
     assert extent is not None  # the caller has checked `is_supported`
     radius, margin = extent.radius, extent.margin
     low, high = _projected(view, *boxes(radius))
-    wide = ewa_reach(view, features, radius, reach[:, None])
+    wide = ewa_extent(view, features, radius, reach[:, None])
     if wide is not None:
         low_center, high_center = _projected(view, *boxes(0.0))
         if not view.parallel:

@@ -30,8 +30,9 @@ from fidsplat.util.errors import FidsplatError
 T = TypeVar("T")
 
 
-def one_ahead(items: Iterator[T]) -> Iterator[T]:
-    """Yield each item after the next one is computed; raise an error after the items before it."""
+def double_buffered(items: Iterator[T]) -> Iterator[T]:
+    """Double buffering: yield each item after the next one is computed. An error is raised after the items
+    before it."""
     previous: list[T] = []
     while True:
         try:
@@ -54,7 +55,7 @@ class Residency:
         self._current: tuple[Selection, int, ResidentData] | None = None
         self._splitter, self._occlusion = BandSplitter(), OcclusionCulling()
         self._prefetch_thread: threading.Thread | None = None
-        self.nodes = 0
+        self.node_count = 0
         """number of nodes from which the last views were rendered"""
 
     @property
@@ -77,11 +78,11 @@ class Residency:
             data = self._data(band.selection, first_id)
             return pipeline.fits(data, band.view)
 
-        def ids_of(bands: Sequence[Band]) -> Callable[[], np.ndarray]:
-            self.nodes += sum(len(band.selection) for band in bands)
+        def scene_indices_of(bands: Sequence[Band]) -> Callable[[], np.ndarray]:
+            self.node_count += sum(len(band.selection) for band in bands)
             return lambda: np.concatenate([self.scene.ids(band.selection) for band in bands])
 
-        self.nodes = 0
+        self.node_count = 0
         backend = self._backend
         if not self._occlusion.is_worthwhile(full):
             self._occlusion.skip_view()
@@ -95,10 +96,10 @@ class Residency:
             rendered = self._occlusion.render(full, fits, render_band, backend.copy_tiles)
             if rendered is not None:
                 bands, images = rendered
-                yield BandData(full.rows, full.view, None, ids_of(bands), images)
+                yield BandData(full.rows, full.view, None, scene_indices_of(bands), images)
                 return
         for band in self._splitter.split(full, fits):
-            yield BandData(band.rows, band.view, self._data(band.selection), ids_of([band]))
+            yield BandData(band.rows, band.view, self._data(band.selection), scene_indices_of([band]))
 
     def gather(
         self, views: Sequence[View], features: FeatureSet, qualities: Iterable[Quality]
@@ -108,7 +109,7 @@ class Residency:
         Returns the splats, and a function that returns their scene indices (n,) int32.
         """
         selection = select(self.scene, views, features, self.scene.cell_sizes(*qualities))
-        self.nodes = len(selection)
+        self.node_count = len(selection)
         return self._data(selection), partial(self.scene.ids, selection)
 
     def _data(self, selection: Selection, first_id: int = 0) -> ResidentData:
@@ -125,29 +126,30 @@ class Residency:
         return self._backend.has("termination_depths") and occlusion_test.is_supported(view, features)
 
     def prefetched(self, captures: Iterator[Capture]) -> Iterator[Capture]:
-        """Yield the captures, each while the chunks of the next one are prefetched."""
+        """Yield captures; while the caller renders one, the chunks of the next one are prefetched."""
 
-        def started() -> Iterator[Capture]:
+        def after_start_of_prefetch() -> Iterator[Capture]:
             for number, capture in enumerate(captures):
                 if number:
                     self._prefetch(capture)
                 yield capture
 
         try:
-            yield from one_ahead(started())
+            yield from double_buffered(after_start_of_prefetch())
         finally:
             if self._prefetch_thread is not None:  # the caller may close the device next
                 self._prefetch_thread.join()
 
     def _prefetch(self, capture: Capture) -> None:
-        """Load the chunks of a view in a thread, unless one is running; rendering reports its errors."""
+        """Load the chunks of a view in a thread, unless one is running. Its errors are ignored: rendering
+        raises them again."""
         features, view = prepare(self.scene, capture)
         cell_sizes = self.scene.cell_sizes(capture.quality)
         if self._prefetch_thread is not None and self._prefetch_thread.is_alive():
             return
         can_cull = self._can_cull(view, features)
 
-        def work() -> None:
+        def load_chunks() -> None:
             with suppress(FidsplatError, OSError, MemoryError):
                 band = Band.of(self.scene, view, features, cell_sizes)
                 if can_cull and self._occlusion.is_worthwhile(band, views_later=1):
@@ -157,5 +159,5 @@ class Residency:
                 else:
                     self._cache.prefetch(self.chunks.of(band.selection, self._cache.applies_poses))
 
-        self._prefetch_thread = threading.Thread(target=work, name="fidsplat-prefetch", daemon=True)
+        self._prefetch_thread = threading.Thread(target=load_chunks, name="fidsplat-prefetch", daemon=True)
         self._prefetch_thread.start()

@@ -75,7 +75,7 @@ def render(
         if capture.camera is None:
             raise InputError("capture must have a camera for a pose, got none; give fs.Capture(camera)")
         capture = replace(capture, camera=offset_camera(capture.camera, offset))
-    frame = renderer.render_differentiable(renderer.adopt(**given), capture)
+    frame = renderer.render_differentiable(renderer.wrap_arrays(**given), capture)
     images = {name: wp.clone(frame.device_array(name), requires_grad=True) for name in capture.outputs}
 
     def backward() -> None:

@@ -19,7 +19,7 @@ from fidsplat.backends.opencl.program import build
 from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
 from fidsplat.cli import main
 from fidsplat.effects import CATALOGUE, OUTPUTS, Effect, Output, declared_output, select
-from fidsplat.effects.catalogue import COMPOSED
+from fidsplat.effects.catalogue import DERIVED_OUTPUTS
 from fidsplat.effects.extensions import outputs_help
 from fidsplat.render.output_files import save_output
 from fidsplat.selftest.agreement import compare
@@ -137,8 +137,8 @@ class Negative(fs.Sensor):
     def steps(self):
         return (*super().steps, "negative")
 
-    def uniform(self, name):
-        return (2.0,) if name == "negative" else super().uniform(name)
+    def uniforms_of(self, name):
+        return (2.0,) if name == "negative" else super().uniforms_of(name)
 
 
 @pytest.fixture
@@ -208,7 +208,7 @@ def test_an_output_is_compared_listed_and_written_as_it_is_declared(toys, tmp_pa
 def test_help_of_render_lists_all_outputs(capsys):
     assert main(["render", "--help"]) == 0
     listed = capsys.readouterr().out
-    for name in (*OUTPUTS, *COMPOSED):
+    for name in (*OUTPUTS, *DERIVED_OUTPUTS):
         assert declared_output(name).summary[:40] in " ".join(listed.replace("│", " ").split()), name
 
 

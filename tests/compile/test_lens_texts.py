@@ -57,7 +57,9 @@ def test_values_without_effect_select_nothing(renderer):
     # nor does a shutter without motion
     renderer.render(cloud, nothing, quality=PLAIN, shutter=fs.Shutter(exposure_time=0.1, readout=0.2))
     added = set(renderer.backend._pipelines) - before
-    assert not any("shutter" in slot or "motion" in slot for features, _ in added for slot in features.slots)
+    assert not any(
+        "shutter" in effect or "motion" in effect for features, _ in added for effect in features.effects
+    )
 
 
 def test_record_sizes_of_lenses():

@@ -114,5 +114,5 @@ def test_instructions_of_a_vendor_change_what_the_quality_allows(renderer):
 
 def test_blending_in_float64_takes_the_library_s():
     double = FAST.with_(blend_precision="float64")
-    assert "arithmetic_precise" in select(AROUND, fs.Capture(quality=double)).slots
-    assert "arithmetic_fast" in select(AROUND, fs.Capture(quality=FAST)).slots
+    assert "arithmetic_precise" in select(AROUND, fs.Capture(quality=double)).effects
+    assert "arithmetic_fast" in select(AROUND, fs.Capture(quality=FAST)).effects

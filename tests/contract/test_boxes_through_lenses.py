@@ -103,7 +103,7 @@ def widened(camera):
     if camera.lens.kind == "orthographic":
         return np.zeros((camera.height, camera.width), bool)
     raster = raster_of(camera.lens, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    width = np.linalg.norm(raster.slopes, axis=(2, 3))
+    width = np.linalg.norm(raster.ray_derivatives, axis=(2, 3))
     return width > 10 * np.nanmedian(width)
 
 

@@ -13,7 +13,7 @@ from brute_force import ideal
 import fidsplat as fs
 from fidsplat.effects.catalogue import CATALOGUE
 from fidsplat.render import certified_error
-from fidsplat.render.certified_error import OMITTED, ideal_of
+from fidsplat.render.certified_error import MAX_OMITTED, error_reference
 from fidsplat.util.errors import InputError
 
 HAZE = fs.Camera.pinhole(64, 48, 60.0, 60.0, 32.0, 24.0)
@@ -115,7 +115,9 @@ def test_an_opacity_ceiling_is_counted(renderer):
 
 def test_float32_rounding_is_counted(renderer):
     """Nothing is left out of this image but digits: more than resolving and omitted fragments explain."""
-    quality = fs.Quality(lowpass="none", transmittance_stop=0.0, alpha_cutoff=OMITTED, arithmetic="precise")
+    quality = fs.Quality(
+        lowpass="none", transmittance_stop=0.0, alpha_cutoff=MAX_OMITTED, arithmetic="precise"
+    )
     frame, off = check(renderer, needle(), HAZE, quality)
     assert off.max() > 2e-5
     assert frame["error"].max() < 5e-3
@@ -137,7 +139,7 @@ def test_the_schedule_of_gpus_bounds_the_same(renderer):
     cloud, camera, quality, background = anything(2)
     backend, capture = renderer.backend, fs.Capture(camera, OUTPUTS, quality, background=background)
     data = backend.upload(cloud)
-    plan = ideal_of(data, capture, backend)
+    plan = error_reference(data, capture, backend)
     own, groups = (
         backend.pipeline(plan.features, shape).render_view(data, plan.view)
         for shape in (backend.shape, backend.shapes("schedule")["groups"])
@@ -271,7 +273,7 @@ def test_every_effect_without_a_bound_has_words():
     """Effects of the catalogue that a scene may request, outputs and steps of sensors left out."""
     kinds = ("camera", "color", "ellipsoid", "lowpass", "compose", "footprint", "background", "shutter")
     names = {name for name in CATALOGUE if name.startswith(kinds)} | {"external_depth", "blend_double"}
-    words = {name: certified_error._option_of(name)[0] for name in names - certified_error._BOUNDED}
+    words = {name: certified_error._remedy_of(name)[0] for name in names - certified_error._BOUNDED}
     assert {name for name, said in words.items() if said == name} == set()
 
 

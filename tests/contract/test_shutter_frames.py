@@ -170,7 +170,7 @@ def test_what_bands_leave_out_by_its_sphere_renders_nothing_there(renderer, lowp
     capture = fs.Capture(camera, ALL_OUTPUTS, quality, BACKGROUND, MOTION, shutter)
     features, view = prepare(cloud, capture)
     assert "shutter_rows" in features.names
-    without = replace(features, slots=tuple(name for name in features.slots if name != "shutter_rows"))
+    without = replace(features, effects=tuple(name for name in features.effects if name != "shutter_rows"))
     backend = renderer.backend
     one, other = (
         backend.pipeline(each).render_view(backend.upload(cloud), view) for each in (features, without)

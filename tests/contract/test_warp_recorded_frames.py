@@ -88,7 +88,7 @@ def test_adopted_arrays_are_waited_for(renderer, ahead):
     arrays = {
         name: getattr(CLOUD, name).copy() for name in ("means", "quats", "scales", "opacities", "colors")
     }
-    resident = renderer.adopt(**arrays)
+    resident = renderer.wrap_arrays(**arrays)
     for capture in (CAPTURE.with_(camera=ELSEWHERE), CAPTURE):
         assert pictures(ahead, lambda capture=capture: renderer.render(resident, capture)["rgb"]) == 1
 

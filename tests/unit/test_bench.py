@@ -380,7 +380,7 @@ def test_ones_own_scene_with_everything_it_requests(tmp_path, monkeypatch, capsy
     assert result["rooflines_ms"] == {}
     less = without_effects(scene, scene.capture)
     assert less["lens"].capture.camera.lens is None
-    assert not less["shutter"].capture.exposed
+    assert not less["shutter"].capture.has_sub_frames
     assert less["outputs"].capture.outputs == ("rgb",)
     assert len(less["markers"].cloud()) == 20
     assert all(one.cloud() is None for name, one in less.items() if name != "markers")
@@ -395,7 +395,7 @@ def test_a_scenes_shutter_moves_along_the_cameras(tmp_path, monkeypatch):
     first = scenes["own.toml@0"].capture
     np.testing.assert_allclose(np.linalg.inv(first.motion.camera_at(0.5))[:3, 3], (0.15, 0, 0), atol=1e-12)
     np.testing.assert_allclose(scenes["own.toml@1"].make()[1].position, (0.3, 0, 0), atol=1e-12)
-    assert first.exposed
+    assert first.has_sub_frames
 
 
 def test_the_table_shows_the_share_of_each_effect():

@@ -61,11 +61,11 @@ def test_a_copy_keeps_what_is_not_changed():
 
 
 @pytest.mark.parametrize(
-    ("fog", "backdrop"),
+    ("fog", "expected"),
     [(None, GREY), (fs.Fog(0.0, (1, 0, 0)), GREY), (fs.Fog(0.1, (1, 0, 0)), (1.0, 0.0, 0.0))],
 )
-def test_fog_hides_the_background(fog, backdrop):
-    assert fs.Capture(background=GREY, fog=fog).backdrop == backdrop
+def test_fog_hides_the_background(fog, expected):
+    assert fs.Capture(background=GREY, fog=fog).rendered_background == expected
 
 
 def test_a_scene_and_its_resident_cloud_have_the_same_capture():

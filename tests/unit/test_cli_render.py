@@ -293,7 +293,7 @@ def test_every_eighth_pixel_of_the_reference(scene, tmp_path, capsys):
     facts = said(capsys)
     assert (facts["width"], facts["height"]) == (20, 15)
     loaded = fs.Scene.load(scene)
-    pixels = fs.Renderer("reference").render_every(8, loaded)["rgb"]
+    pixels = fs.Renderer("reference").render_subsampled(8, loaded)["rgb"]
     np.testing.assert_array_equal(read_image(tmp_path / "some.png"), to_uint8(pixels))
     for words, why in (
         (

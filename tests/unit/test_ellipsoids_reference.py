@@ -190,6 +190,8 @@ def test_lenses_have_exact_ellipsoids():
     cloud = one(np.random.default_rng(0), (0, 0, 1), (0, 0, 2))
     for camera, name in ((PINHOLE, "ellipsoid_ewa"), (fisheye, "ellipsoid_exact")):
         features = select(cloud, fs.Capture(camera, quality=fs.Quality()))
-        assert name in features.slots
-        assert ("lowpass_none" in features.slots) == (camera is PINHOLE)
-    assert not [name for name in select(cloud.flattened(), fs.Capture(PINHOLE)).slots if "ellipsoid" in name]
+        assert name in features.effects
+        assert ("lowpass_none" in features.effects) == (camera is PINHOLE)
+    assert not [
+        name for name in select(cloud.flattened(), fs.Capture(PINHOLE)).effects if "ellipsoid" in name
+    ]

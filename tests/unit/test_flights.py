@@ -165,7 +165,7 @@ def test_the_shutter_sees_the_camera_move(here):
     """Images of a flight are blurred along it, each about its own time."""
     flight = small_flight(shutter=fs.Shutter(exposure_time=0.2, sub_poses=2))
     capture = flight.captures[1]
-    assert capture.exposed
+    assert capture.has_sub_frames
     assert capture.shutter.time == 0.5
     assert capture.camera is not None
     for time in capture.shutter.times(0.5):

@@ -87,9 +87,9 @@ def test_surroundings_that_cannot_be(make, words):
 
 def test_a_gradient_between_equal_colours_is_that_colour():
     grey = (0.4, 0.5, 0.6)
-    assert fs.Capture(background=fs.Gradient(grey, grey, (1, 0, 0))).backdrop == grey
+    assert fs.Capture(background=fs.Gradient(grey, grey, (1, 0, 0))).rendered_background == grey
     other = fs.Gradient(grey, (0.4, 0.5, 0.7), (1, 0, 0))
-    assert fs.Capture(background=other).backdrop is other
+    assert fs.Capture(background=other).rendered_background is other
 
 
 def test_steps_come_in_the_order_of_the_light():
@@ -106,7 +106,7 @@ def test_an_image_is_exposed_by_its_light():
 
     def seen(**sensor):
         frame = renderer.render(empty, camera, background=color, sensor=fs.Sensor(decode="srgb", **sensor))
-        assert not frame.capture.sensor.meters
+        assert not frame.capture.sensor.needs_metering
         return frame["rgb"][50, 100]
 
     luminance = [0.2126, 0.7152, 0.0722]

@@ -57,7 +57,7 @@ def test_a_frame_of_one_output_is_an_array():
     assert np.array(one).flags.writeable  # a copy
     assert cv2.cvtColor(np.asarray(one), cv2.COLOR_RGB2GRAY).shape == (16, 24)
     with pytest.raises(
-        fs.InputError, match=r"must have one output, got 2 \(rgb, depth\); take one by its name"
+        fs.InputError, match=r"must have one output, got 2 \(rgb, depth\); access one by its name"
     ):
         np.asarray(frame("rgb", "depth"))
 

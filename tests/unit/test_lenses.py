@@ -143,7 +143,7 @@ def test_the_map_knows_every_sample(lens):
     """Any rectangle of the chart: the boxes of the cells that it meets hold all samples whose rays lie in
     it."""
     raster = RayRaster(lens, 90, 70, 60.0, 60.0, 45.0, 35.0)
-    boxes, (low_x, low_y, scale_x, scale_y, cells) = raster.map
+    boxes, (low_x, low_y, scale_x, scale_y, cells) = raster.bounds_pyramid
     x, y = raster.chart(raster.rays)
     generator, first = np.random.default_rng(3), 0
     size = int(cells)
@@ -271,8 +271,8 @@ def test_slopes_of_a_raster_are_the_differences_of_its_rays(lens):
     raster = RayRaster(lens, *size, *numbers)
     x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
     places = np.stack([x.ravel(), y.ravel()], 1)
-    slopes = raster.slopes.reshape(-1, 2, 3)
-    assert raster.cropped(10, 20).slopes.tobytes() == raster.slopes[10:20].tobytes()
+    slopes = raster.ray_derivatives.reshape(-1, 2, 3)
+    assert raster.rows(10, 20).ray_derivatives.tobytes() == raster.ray_derivatives[10:20].tobytes()
     furthest = 0.0
     for axis, step in enumerate(0.1 * np.eye(2)):
         image = [(places + sign * step - numbers[2:]) / numbers[:2] for sign in (1, -1)]
@@ -281,7 +281,7 @@ def test_slopes_of_a_raster_are_the_differences_of_its_rays(lens):
         assert seen.mean() > 0.6
         np.testing.assert_allclose(slopes[seen, axis], want[seen], atol=3e-5)
         furthest = max(furthest, np.linalg.norm(want[seen], axis=1).max())
-    assert raster.step > furthest * 0.999
+    assert raster.max_ray_derivative > furthest * 0.999
 
 
 @pytest.mark.parametrize(
@@ -297,7 +297,7 @@ def test_rays_of_a_raster_go_through_the_centres_of_its_samples(camera):
     """Back on the image they are there, to what float32 rounds. No comparison with the reference asks that:
     it has the same rays."""
     raster = RayRaster(camera.lens, 90, 70, camera.fx, camera.fy, camera.cx, camera.cy)
-    for rows in (raster, raster.cropped(30, 50)):
+    for rows in (raster, raster.rows(30, 50)):
         seen = np.isfinite(rows.rays[..., 0])
         assert seen.mean() > 0.5
         back = camera.project(rows.rays[seen].astype(float))
@@ -313,4 +313,4 @@ SIDES = {(90, 70): 32, (20, 64): 32, (63, 9): 16, (1500, 4): 512}
 def test_maps_have_a_cell_for_two_pixels_of_the_longer_side(size):
     """The largest power of two, `CELLS` at most: with fewer cells bounds are loose and binning is slow."""
     raster = RayRaster(Fisheye(), *size, 60.0, 60.0, size[0] / 2, size[1] / 2)
-    assert raster.map[1][4] == SIDES[size]
+    assert raster.bounds_pyramid[1][4] == SIDES[size]

@@ -9,7 +9,7 @@ from agreement import random_splats
 
 import fidsplat as fs
 from fidsplat.backends.prepare import view_of
-from fidsplat.cameras.screw import between
+from fidsplat.cameras.screw import interpolate
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import quaternion_to_matrix
 
@@ -30,14 +30,14 @@ def test_between_two_poses_is_one_screw_motion(angle):
     generator = np.random.default_rng(1)
     start = random_pose(generator)
     end = start @ random_pose(generator, angle)
-    steps = [between(start, end, k / 4) for k in range(5)]
+    steps = [interpolate(start, end, k / 4) for k in range(5)]
     np.testing.assert_allclose(steps[0], start, atol=1e-12)
     np.testing.assert_allclose(steps[4], end, atol=1e-9)
     first = np.linalg.inv(steps[0]) @ steps[1]
     for a, b in itertools.pairwise(steps):
         np.testing.assert_allclose(np.linalg.inv(a) @ b, first, atol=1e-9)
-    np.testing.assert_allclose(between(end, start, 0.25), steps[3], atol=1e-8)
-    inverse = between(np.linalg.inv(start), np.linalg.inv(end), 0.25)
+    np.testing.assert_allclose(interpolate(end, start, 0.25), steps[3], atol=1e-8)
+    inverse = interpolate(np.linalg.inv(start), np.linalg.inv(end), 0.25)
     np.testing.assert_allclose(np.linalg.inv(inverse), steps[1], atol=1e-8)
 
 
@@ -48,7 +48,7 @@ def test_a_trajectory_rests_before_and_after():
     assert (path(-5.0) == poses[0]).all()
     assert (path(9.0) == poses[2]).all()
     np.testing.assert_allclose(path(1.0), poses[1], atol=1e-12)
-    np.testing.assert_allclose(path(2.5), between(poses[1], poses[2], 0.75), atol=1e-12)
+    np.testing.assert_allclose(path(2.5), interpolate(poses[1], poses[2], 0.75), atol=1e-12)
 
 
 def test_a_camera_that_moves_is_elsewhere():

@@ -84,8 +84,8 @@ def test_a_device_caches_the_visible_chunks_of_its_band(store, two):
     one = fs.Renderer("opencl")
     alone = one.upload(store)
     one.render(alone, look())
-    each = [one.data.nodes for one in given]
-    assert max(each) < alone.data.nodes <= sum(each)
+    each = [one.data.node_count for one in given]
+    assert max(each) < alone.data.node_count <= sum(each)
 
 
 def test_views_are_distributed_and_returned_in_order(store, two):

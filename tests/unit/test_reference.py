@@ -92,19 +92,19 @@ def test_every_third_pixel_is_that_of_the_whole_image(monkeypatch, exposed):
     )
     renderer, cloud, shares = fs.Renderer("reference"), random_splats(40, 3), []
     whole = renderer.render(cloud, capture)
-    some = renderer.render_every(3, cloud, capture, progress=shares.append)
+    some = renderer.render_subsampled(3, cloud, capture, progress=shares.append)
     for name in some.outputs:
         np.testing.assert_array_equal(some[name], whole[name][::3, ::3])
     assert some["rgb"].shape == (6, 7, 3)
     assert shares == sorted(shares)
     assert len(shares) > 3
     assert shares[-1] == pytest.approx(1)
-    assert renderer.render_every(100, cloud, capture)["label"].shape == (1, 1)
+    assert renderer.render_subsampled(100, cloud, capture)["label"].shape == (1, 1)
 
 
 def test_partial_frames_that_cannot_be_rendered():
     camera = fs.Camera.look_at(20, 16, 1.0, (0, 0, -2), (0, 0, 0))
     with pytest.raises(fs.InputError, match=r"step must be .* got 0"):
-        fs.Renderer("reference").render_every(0, random_splats(4, 3), camera)
+        fs.Renderer("reference").render_subsampled(0, random_splats(4, 3), camera)
     with pytest.raises(fs.InputError, match="render subsets of pixels, got opencl:pocl"):
-        fs.Renderer("opencl:pocl").render_every(2, random_splats(4, 3), camera)
+        fs.Renderer("opencl:pocl").render_subsampled(2, random_splats(4, 3), camera)

@@ -195,9 +195,9 @@ def test_bounds_of_boxes_are_those_of_their_corners():
     cloud = cloud_of().with_boxes(mixed)
     axes = quaternion_to_matrix(cloud.quats)[:, :, :2] * cloud.scales[:, None, :]
     corners = np.einsum("nij,jt->nti", axes, [[-1, 1, 1, -1], [-1, -1, 1, 1]]) + cloud.means[:, None]
-    apart = fs.SplatCloud.concatenate([cloud]).reach(3.0)
+    apart = fs.SplatCloud.concatenate([cloud]).half_extents(3.0)
     np.testing.assert_allclose((corners.max(1) - cloud.means)[mixed], apart[mixed], atol=1e-6)
-    np.testing.assert_array_equal(apart[~mixed], cloud_of().reach(3.0)[~mixed])
+    np.testing.assert_array_equal(apart[~mixed], cloud_of().half_extents(3.0)[~mixed])
     made = fs.marker("qr:hello", size=0.21, mixture="exact")
     pose = rigid_matrix((1, 2, 3), (1, 0.3, -0.5, 0.2))
     rows, columns = made.grid.shape

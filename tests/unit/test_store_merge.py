@@ -30,7 +30,7 @@ def test_merging_preserves_opacity_times_area_and_position():
     given = 2 * 0.01**2 + (means[:, :2] ** 2).sum(axis=1)
     assert np.average(square, weights=light) == pytest.approx(given.mean(), rel=1e-5)
     spread = made["scales"].max(axis=1) ** 2
-    assert (np.abs(fs.SplatCloud(**made).reach(1.0)[:, 2]) < 1e-6).all()
+    assert (np.abs(fs.SplatCloud(**made).half_extents(1.0)[:, 2]) < 1e-6).all()
     assert spread.max() < size**2
 
 

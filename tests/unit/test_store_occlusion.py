@@ -117,10 +117,10 @@ def test_occluded_chunks_are_not_read(town, culling):
     resident = renderer.upload(town)
     for _ in renderer.render_views(resident, PATH[:2]):
         pass
-    features, view = prepare(resident.complete, fs.Capture(PATH[1]))
-    seen = select(resident.complete, [view], features)
+    features, view = prepare(resident.all_splats, fs.Capture(PATH[1]))
+    seen = select(resident.all_splats, [view], features)
     assert len(resident.data._cache._slots) < 0.95 * len(seen)
-    assert resident.data.nodes < 0.95 * len(seen)
+    assert resident.data.node_count < 0.95 * len(seen)
 
 
 def test_a_repeated_view_is_rendered_in_one_pass(town, culling, monkeypatch):

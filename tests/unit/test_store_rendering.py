@@ -74,7 +74,7 @@ def test_views_read_visible_chunks_only(stores, reference, name):
         for output in ours:
             assert np.array_equal(ours[output], whole[output]), output
         assert whole["rgb"].any()
-        read, every = resident.data.nodes, store.chunks
+        read, every = resident.data.node_count, store.chunks
         assert 0 < read <= every
         if name in ("pinhole", "distorted", "pixel", "aside"):
             assert read < 0.75 * every

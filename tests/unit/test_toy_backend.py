@@ -41,7 +41,7 @@ class Backend(interface.Backend):
         return Cloud(cloud)
 
     def unsupported(self, features):
-        lacking = {*features.outputs, *features.posts, *features.slots[8:]} - {"alpha"}
+        lacking = {*features.outputs, *features.post_steps, *features.effects[8:]} - {"alpha"}
         return f"toy has no {', '.join(sorted(lacking))}" if lacking else ""
 
     def pipeline(self, features, shape=None):
@@ -91,10 +91,10 @@ def test_it_is_listed_and_renders(toy):
 def test_a_missing_effect_is_an_error_that_names_both(toy):
     with pytest.raises(fs.DeviceError, match="toy has no depth"):
         toy.render(CLOUD, CAMERA, "depth")
-    with pytest.raises(fs.InputError, match="device must adopt arrays, got toy"):
-        toy.adopt(means=1, quats=1, scales=1, opacities=1, colors=1)
+    with pytest.raises(fs.InputError, match="device must wrap arrays, got toy"):
+        toy.wrap_arrays(means=1, quats=1, scales=1, opacities=1, colors=1)
     with pytest.raises(fs.InputError, match="device must render subsets of pixels, got toy"):
-        toy.render_every(2, CLOUD, CAMERA)
+        toy.render_subsampled(2, CLOUD, CAMERA)
     with pytest.raises(fs.DeviceError, match="device must have gradients, got toy"):
         toy.backend.differentiate(None)
     with pytest.raises(fs.InputError, match="a device that shares its arrays"):

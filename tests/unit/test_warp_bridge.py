@@ -161,9 +161,9 @@ def test_other_libraries_share_the_memory(renderer, name):
     assert library.address(both) == batch.device_array("rgb").ptr
     np.testing.assert_array_equal(np.from_dlpack(both)[1], rgb)
     if name == "numpy":
-        return  # adopted NumPy arrays are copied
+        return  # NumPy arrays are copied
     splats = {part: library.make(np.array(getattr(cloud, part))) for part in TYPES}
-    resident = renderer.adopt(**splats)
+    resident = renderer.wrap_arrays(**splats)
     np.testing.assert_array_equal(renderer.render(resident, capture)["rgb"], rgb)
     if name != "jax":  # whose arrays are immutable
         splats["colors"].numpy()[:] = 0.0

@@ -92,8 +92,8 @@ def test_nothing_is_said_on_stdout_or_stderr():
 
 
 def test_an_effect_that_warp_lacks_is_an_error_that_names_both(renderer):
-    slots = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
-    features = FeatureSet(slots, ("overdraw",), 0, 1, "float64")
+    effects = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
+    features = FeatureSet(effects, ("overdraw",), 0, 1, "float64")
     with pytest.raises(
         fs.DeviceError, match=rf"{renderer.device.name} .* has no overdraw; use an OpenCL device"
     ):
@@ -163,8 +163,8 @@ def test_other_backends_say_that_they_share_nothing(reference):
     frame = reference.render(CLOUD, CAMERA)
     with pytest.raises(fs.InputError, match="warp:cpu"):
         frame.device_array("rgb")
-    with pytest.raises(fs.InputError, match="adopt arrays, got reference"):
-        reference.adopt(means=0, quats=0, scales=0, opacities=0, colors=0)
+    with pytest.raises(fs.InputError, match="wrap arrays, got reference"):
+        reference.wrap_arrays(means=0, quats=0, scales=0, opacities=0, colors=0)
 
 
 def test_adopted_arrays_render_what_the_cloud_renders(renderer):
@@ -176,14 +176,14 @@ def test_adopted_arrays_render_what_the_cloud_renders(renderer):
     }
     plain = {name: getattr(CLOUD, name) for name in vectors}
     for arrays in (vectors, rows, plain):
-        assert np.array_equal(renderer.render(renderer.adopt(**arrays), CAMERA)["rgb"], expected)
+        assert np.array_equal(renderer.render(renderer.wrap_arrays(**arrays), CAMERA)["rgb"], expected)
 
 
 def test_a_resident_cloud_reports_its_memory(renderer):
     words = 3 + 4 + 2 + 1 + 3 + 1  # means, quats, scales, opacities, colors, labels
     assert renderer.upload(CLOUD).memory_bytes == 4 * words * len(CLOUD)
     arrays = arrays_of(CLOUD, renderer.backend.device)
-    assert renderer.adopt(**arrays).memory_bytes == 4 * words * len(CLOUD)
+    assert renderer.wrap_arrays(**arrays).memory_bytes == 4 * words * len(CLOUD)
     harmonic = random_splats(10, seed=3, sh_degree=2).with_coplanar_groups(np.arange(10) // 2)
     assert renderer.upload(harmonic).memory_bytes == 4 * (words + 24 + 1) * 10
 
@@ -191,10 +191,10 @@ def test_a_resident_cloud_reports_its_memory(renderer):
 def test_adopted_labels_harmonics_and_origins(renderer):
     cloud = random_splats(100, seed=3, depth=(1, 4), scale=(0.02, 0.4), sh_degree=2)
     names = ("means", "quats", "scales", "opacities", "sh", "labels")
-    resident = renderer.adopt(**{name: getattr(cloud, name) for name in names})
+    resident = renderer.wrap_arrays(**{name: getattr(cloud, name) for name in names})
     frame, expected = (renderer.render(what, CAMERA, ("rgb", "label")) for what in (resident, cloud))
     assert all(np.array_equal(frame[name], expected[name]) for name in frame)
-    moved = renderer.adopt(**{name: getattr(cloud, name) for name in names}, origin=(1e6, 0, 0))
+    moved = renderer.wrap_arrays(**{name: getattr(cloud, name) for name in names}, origin=(1e6, 0, 0))
     view = fs.Camera.look_at(64, 48, 1.0, (1e6, 0.0, -0.1), (1e6, 0.0, 3.0))
     assert np.allclose(renderer.render(moved, view)["rgb"], expected["rgb"], atol=1e-5)
 
@@ -210,12 +210,12 @@ def test_adopted_splats_with_three_scales(renderer):
     rows = vectors | {"scales": wp.array(scales, dtype=wp.float32, device=device)}
     plain = {name: getattr(CLOUD, name) for name in vectors} | {"scales": scales}
     for arrays in (vectors, rows, plain):
-        resident = renderer.adopt(**arrays)
+        resident = renderer.wrap_arrays(**arrays)
         assert np.array_equal(renderer.render(resident, CAMERA)["rgb"], expected)
         words = 3 + 4 + 3 + 1 + 3 + 1
         assert resident.memory_bytes == 4 * words * len(CLOUD)
 
-    resident = renderer.adopt(**vectors)
+    resident = renderer.wrap_arrays(**vectors)
     broken = {5: np.nan, 6: np.inf, 7: -0.1}
     scales[list(broken), 2] = list(broken.values())
     vectors["scales"].assign(scales)
@@ -229,7 +229,7 @@ def test_adopted_splats_with_three_scales(renderer):
 
 def test_moving_an_adopted_array_moves_the_splats(renderer):
     arrays = arrays_of(CLOUD, renderer.backend.device)
-    resident = renderer.adopt(**arrays)
+    resident = renderer.wrap_arrays(**arrays)
     before = renderer.render(resident, CAMERA)["rgb"].copy()
     moved = CLOUD.means + np.float32([0.2, 0, 0])
     arrays["means"].assign(wp.array(moved, dtype=wp.vec3, device="cpu"))
@@ -248,7 +248,7 @@ def test_adopted_values_that_are_not_finite_leave_no_trace(renderer, name, value
     without = {each: array[keep] for each, array in arrays.items()}
     arrays[name][7] = value
     frame, expected = (
-        renderer.render(renderer.adopt(**a), CAMERA, ("rgb", "alpha")) for a in (arrays, without)
+        renderer.render(renderer.wrap_arrays(**a), CAMERA, ("rgb", "alpha")) for a in (arrays, without)
     )
     assert all(np.array_equal(frame[plane], expected[plane]) for plane in frame)
 
@@ -282,7 +282,7 @@ def test_arrays_that_cannot_be_adopted(renderer, changes, words):
         for name, value in changes.items()
     }
     with pytest.raises(fs.InputError, match=words):
-        renderer.adopt(**{**arrays_of(CLOUD, device), **changes})
+        renderer.wrap_arrays(**{**arrays_of(CLOUD, device), **changes})
 
 
 def test_numpy_sees_the_image_of_a_cpu_through_dlpack():
@@ -310,13 +310,13 @@ def test_gpu_planes_are_tensors_on_the_same_device(library):
     names = ("means", "quats", "scales", "opacities", "colors")
     there = {name: module.asarray(getattr(CLOUD, name).copy()) for name in names}
     there = {name: each.cuda() for name, each in there.items()} if library == "torch" else there
-    assert np.array_equal(renderer.render(renderer.adopt(**there), CAMERA)["rgb"], frame["rgb"])
+    assert np.array_equal(renderer.render(renderer.wrap_arrays(**there), CAMERA)["rgb"], frame["rgb"])
 
 
 @pytest.mark.skipif(not GPUS, reason="no CUDA device for Warp here")
 def test_arrays_of_another_device_are_refused():
     with pytest.raises(fs.InputError, match=r"means must be on cuda.*, the device of this renderer, got cpu"):
-        fs.Renderer(GPUS[0]).adopt(**arrays_of(CLOUD, "cpu"))
+        fs.Renderer(GPUS[0]).wrap_arrays(**arrays_of(CLOUD, "cpu"))
 
 
 def test_debug_builds_are_launched_by_one_thread(monkeypatch):
@@ -329,15 +329,15 @@ def test_debug_builds_are_launched_by_one_thread(monkeypatch):
 def test_warp_pipelines_share_kernels_that_mean_the_same():
     """A stage is compiled once for all feature sets that it cannot tell apart."""
     backend = warp_device.open_device("cpu")
-    slots = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
+    effects = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
     one, two = (
-        backend.pipeline(FeatureSet(slots, outputs, 0, n, "float64"))
+        backend.pipeline(FeatureSet(effects, outputs, 0, n, "float64"))
         for outputs, n in (((), 1), (("alpha",), 2))
     )
     assert one.program.project is two.program.project
     assert one.program.blend is two.program.blend
     assert one.program.resolve is not two.program.resolve
-    assert one is backend.pipeline(FeatureSet(slots, (), 0, 1, "float64"))
+    assert one is backend.pipeline(FeatureSet(effects, (), 0, 1, "float64"))
 
 
 @pytest.mark.parametrize("device", ["warp:cpu", CUDA])

@@ -69,7 +69,7 @@ def apply(v: float, x: int, y: int, channel: int, s: Any) -> float:
 
 STEP = Step(apply=apply)
 '''
-SLOTS = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
+EFFECTS = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
 CAMERA = fs.Camera.pinhole(25, 17, 20.0, 20.0, 12.5, 8.5)
 
 
@@ -95,11 +95,11 @@ def beside(tmp_path, monkeypatch):
     return put
 
 
-def rendered(outputs, posts):
+def rendered(outputs, post_steps):
     """rgb and these outputs."""
     backend = fs.Renderer("warp:cpu").backend
     cloud = two_splats()
-    pipeline = backend.pipeline(FeatureSet(SLOTS, outputs, 0, 1, "float64", posts))
+    pipeline = backend.pipeline(FeatureSet(EFFECTS, outputs, 0, 1, "float64", post_steps))
     view = View.of(fs.Capture(CAMERA), cloud.origin)
     images = pipeline.render_view(backend.upload(cloud), view)
     return {name: images.read(name, 0) for name in ("rgb", *outputs)}
@@ -115,7 +115,7 @@ def make_anew(stage, monkeypatch):
 
 
 def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch, tmp_path):
-    features = FeatureSet(SLOTS, ("strongest",), 0, 1, "float64", ("negative",))
+    features = FeatureSet(EFFECTS, ("strongest",), 0, 1, "float64", ("negative",))
     backend = fs.Renderer("warp:cpu").backend
     output = Output("strongest", 1, "float32", tolerance=1e-3)
     monkeypatch.setitem(CATALOGUE, "strongest", replace(CATALOGUE["alpha"], name="strongest", output=output))

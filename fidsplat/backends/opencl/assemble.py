@@ -149,19 +149,19 @@ class Source:
 
 def layouts_of(features: FeatureSet) -> dict[str, Layout]:
     """Layouts of all effects and of the parts that they require, in the order of their text."""
-    chosen = [*features.slots, *features.outputs, *features.posts]
+    chosen = [*features.effects, *features.outputs, *features.post_steps]
     for name in EXTENSIONS.keys() & {*chosen} - LAYOUTS.keys():
         LAYOUTS[name] = extension_layout(EXTENSIONS[name])
     parts: set[str] = set()
     todo = chosen.copy()
     while todo:
         needed = list(LAYOUTS[todo.pop()].parts)
-        for slot in chosen:
+        for effect in chosen:
             for k, part in enumerate(needed):
-                needed[k] = dict(LAYOUTS[part].behind).get(slot, part)
+                needed[k] = dict(LAYOUTS[part].behind).get(effect, part)
         todo += set(needed) - parts
         parts.update(needed)
-    names = (*features.slots, *sorted(parts), *features.outputs, *features.posts)
+    names = (*features.effects, *sorted(parts), *features.outputs, *features.post_steps)
     return {name: LAYOUTS[name] for name in names}
 
 
@@ -172,7 +172,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     separate = {"rays", "shutter_exposure", "shutter_rows"}
     fused = features.samples == 1 and "background_constant" in layouts and separate.isdisjoint(layouts)
     files = [layout.file for layout in layouts.values() if layout.file]
-    files += [*_dialect(shape, _scalars(features), features.slots), "part/resolve_pixel.cl"]
+    files += [*_dialect(shape, _scalars(features), features.effects), "part/resolve_pixel.cl"]
     if "blend_half" not in layouts:
         files.append("part/blend_float.cl")
     if shape.batch > 1 or shape.culls:
@@ -245,9 +245,9 @@ def _assemble_backward(
     name: str, stages: Sequence[str], features: FeatureSet, shape: DeviceShape, parts: Sequence[str] = ()
 ) -> Source:
     layouts = layouts_of(features) | {part: LAYOUTS[part] for part in parts}
-    # the backward pass needs the forward text of slots, but only the derivatives of outputs
-    files = [layout.file for layout in layouts_of(replace(features, outputs=(), posts=())).values()]
-    files += _dialect(shape, _scalars(features), features.slots)
+    # the backward pass needs the forward text of effects, but only the derivatives of outputs
+    files = [layout.file for layout in layouts_of(replace(features, outputs=(), post_steps=())).values()]
+    files += _dialect(shape, _scalars(features), features.effects)
     files += [layout.backward_file for layout in layouts.values()]
     files += [LAYOUTS[part].file for part in parts]
     kernels = kernels_of(shape)
@@ -259,13 +259,13 @@ def _assemble_backward(
     return assembler.source({name: [stage.format(shape.schedule) for stage in stages]})
 
 
-def _dialect(shape: DeviceShape, scalars: Scalars, slots: Iterable[str] = ()) -> list[str]:
+def _dialect(shape: DeviceShape, scalars: Scalars, effects: Iterable[str] = ()) -> list[str]:
     """Files with a vendor's instructions for float32 fragments: one for all frames, then the files of
-    slots."""
+    effects."""
     if not shape.dialect or scalars.wide != "float":
         return []
     own = {"arithmetic_approximate": "_exp", "blend_half": "_half"}
-    return [f"dialect/{shape.dialect}{suffix}.cl" for suffix in ("", *(own[n] for n in slots if n in own))]
+    return [f"dialect/{shape.dialect}{suffix}.cl" for suffix in ("", *(own[n] for n in effects if n in own))]
 
 
 def kernels_of(shape: DeviceShape) -> Mapping[str, tuple[Argument, ...]]:
@@ -321,7 +321,7 @@ def backward_chunk(features: FeatureSet, shape: DeviceShape) -> int:
 
 def _scalars(features: FeatureSet) -> Scalars:
     real = "double" if features.setup_precision == "float64" else "float"
-    return Scalars(real, "double" if "blend_double" in features.slots else "float")
+    return Scalars(real, "double" if "blend_double" in features.effects else "float")
 
 
 def numbers_of(features: FeatureSet, shape: DeviceShape) -> dict[str, int]:

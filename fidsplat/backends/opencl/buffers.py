@@ -197,15 +197,15 @@ class RayBuffers:
         if (rows, columns) not in sizes:
             sizes[rows, columns] = {"rays": self._planar("rays", raster.rays, rows, columns)}
             if raster.lens.kind != "equirectangular":
-                maps = self._held.setdefault(raster.whole or raster, {}).setdefault((0, 0), {})
+                maps = self._held.setdefault(raster.full_raster or raster, {}).setdefault((0, 0), {})
                 if "ray_map" not in maps:
-                    maps["ray_map"] = self._put("ray_map", raster.map[0])
+                    maps["ray_map"] = self._put("ray_map", raster.bounds_pyramid[0])
                 sizes[rows, columns]["ray_map"] = maps["ray_map"]
         buffers = sizes[rows, columns]
         if slopes and "ray_slopes" not in buffers:
-            flat = raster.slopes.reshape(raster.height, raster.width, 6)
+            flat = raster.ray_derivatives.reshape(raster.height, raster.width, 6)
             buffers["ray_slopes"] = self._planar("ray_slopes", flat, rows, columns)
-            buffers["ray_step"] = self._put("ray_step", np.array([raster.step], np.float32))
+            buffers["ray_step"] = self._put("ray_step", np.array([raster.max_ray_derivative], np.float32))
         return buffers
 
     def _planar(self, name: str, array: np.ndarray, rows: int, columns: int) -> cl.Buffer:
@@ -220,7 +220,9 @@ class RayBuffers:
         rows = sum(-(-raster.height // tile_height) * tile_height for raster in rasters)
         one = next(iter(rasters))
         each = 36 if slopes else 12
-        return each * rows * columns + (one.map[0].nbytes if one.lens.kind != "equirectangular" else 0)
+        return each * rows * columns + (
+            one.bounds_pyramid[0].nbytes if one.lens.kind != "equirectangular" else 0
+        )
 
     def _put(self, name: str, array: np.ndarray) -> cl.Buffer:
         buffer = self._pool.fresh(name, array.nbytes)

@@ -121,7 +121,7 @@ class OpenCLBackend(Workspace, Backend):
         images.copy_tiles(other, tiles)
 
     def unsupported(self, features: FeatureSet) -> str:
-        if self.info.float64 or "blend_double" not in features.slots:
+        if self.info.float64 or "blend_double" not in features.effects:
             return ""
         return (
             f"{self.info.title} has no float64 (cl_khr_fp64) for blend_precision='float64'; use "

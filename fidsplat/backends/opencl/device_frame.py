@@ -213,7 +213,7 @@ class DeviceFrame:
                 return values[name]
         if argument.source == "uniform":  # only kernels of gradients
             group, index = argument.uniform
-            return self.view.uniform(group)[index]
+            return self.view.uniforms_of(group)[index]
         return self.put(name, self.view.array(name))
 
     def take(self, name: str, size: int) -> cl.Buffer:

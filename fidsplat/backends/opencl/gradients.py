@@ -309,7 +309,7 @@ class TileGradients:
             **{"screen": (count,)},
             **{name: (k,) for name, k in _SUMS.items()},
         }
-        if "color_sh" in features.slots:
+        if "color_sh" in features.effects:
             shapes["sh"] = (count, (features.sh_degree + 1) ** 2, 3)
         else:
             shapes["colors"] = (count, 3)

@@ -33,8 +33,8 @@ _KERNELS: WeakKeyDictionary[Workspace, tuple[cl.Kernel, int]] = WeakKeyDictionar
 def lease_images(
     workspace: Workspace, outputs: tuple[Output, ...], views: ViewBatch
 ) -> list[tuple[str, cl.Buffer]]:
-    """Buffers for the output images of a batch, (views, h, w, channels) each. Masked views are blank. Raises
-    DeviceError if they exceed the memory budget, or one exceeds the largest buffer of the device."""
+    """Buffers for the output images of a batch, (views, h, w, channels) each; `Output.empty_value` in masked
+    views. Raises DeviceError if they exceed the memory budget, or one the largest buffer of the device."""
     pixels = views.total * views.size[0] * views.size[1]
     bytes_of = {one.name: 4 * pixels * one.channels for one in outputs}
     largest = max(bytes_of, key=bytes_of.__getitem__)
@@ -50,8 +50,8 @@ def lease_images(
         buffer = workspace.pool.lease(name, bytes_of[output.name])
         leased.append((name, buffer))
         if len(views) < views.total:
-            blank = np.full(1, output.blank, output.dtype)
-            cl.enqueue_fill_buffer(workspace.queue, buffer, blank, 0, bytes_of[output.name])
+            empty = np.full(1, output.empty_value, output.dtype)
+            cl.enqueue_fill_buffer(workspace.queue, buffer, empty, 0, bytes_of[output.name])
     return leased
 
 

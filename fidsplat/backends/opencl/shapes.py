@@ -70,13 +70,13 @@ def small_frame_shape(own: DeviceShape) -> DeviceShape:
 
 def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:
     """`shape` with the tiles and the schedule that these features require."""
-    if "blend_double" in features.slots and shape.schedule == "lanes":
+    if "blend_double" in features.effects and shape.schedule == "lanes":
         # float64 kernels are not vectorised
         shape = replace(shape, schedule="group", lanes=1, tile_width=16, tile_height=16, k_buffer_size=8)
-    if shape.schedule == "group" or "camera_pinhole" not in features.slots:
+    if shape.schedule == "group" or "camera_pinhole" not in features.effects:
         # the set-up of lenses has loops and branches that compilers do not vectorise
         shape = replace(shape, batch=1)
-    if not {"compose_pixel", "compose_coplanar_pixel"}.isdisjoint(features.slots):
+    if not {"compose_pixel", "compose_coplanar_pixel"}.isdisjoint(features.effects):
         # the k-buffer needs the registers of a second pixel
         shape = replace(shape, rows=1)
     return shape

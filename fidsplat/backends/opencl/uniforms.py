@@ -25,7 +25,7 @@ def numbers_of(view: View, source: Source) -> dict[str, Any]:
     """All scalar kernel arguments of a view, by name."""
     numbers: dict[str, Any] = scalars_of(view)
     for group, names in source.uniform_groups.items():
-        values = view.uniform(group)
+        values = view.uniforms_of(group)
         for index, name in names.items():
             numbers[name] = values[index]
     return numbers

@@ -63,7 +63,7 @@ def open_device(selector: str = "") -> ReferenceBackend:
 
 
 class ReferenceBackend(Backend):
-    renders_pixels = True
+    renders_subsampled = True
 
     def __init__(self) -> None:
         self.info = devices()[0]
@@ -102,9 +102,9 @@ class ReferencePipeline(Pipeline):
         self.features, self._progress = features, _Progress()
 
     def render_view(self, resident: ReferenceCloud, view: View) -> HostImages:
-        return self.render_every(resident, view, 1)
+        return self.render_subsampled(resident, view, 1)
 
-    def render_every(
+    def render_subsampled(
         self,
         resident: ReferenceCloud,
         view: View,

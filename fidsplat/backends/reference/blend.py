@@ -51,7 +51,7 @@ def composite(
     }
     out["covered"] = 1 - final >= MIN_ALPHA
     out["covered_may_flip"] = np.abs(1 - final - MIN_ALPHA) <= out["certificate"] + error_bounds.STOP
-    if "fog" in features.posts:
+    if "fog" in features.post_steps:
         reach = -view.fog_density * ray_lengths(x, y, view)[:, None]
         left = np.exp(reach * z)
         out["rgb"] = _sum(weight * left, ordered.colors)
@@ -59,7 +59,7 @@ def composite(
         with np.errstate(invalid="ignore"):
             moved = np.abs(np.exp(reach * np.maximum(span.z_low, 0)) - np.exp(reach * span.z_high))
         out["certificate"] += (weight * moved).sum(1)
-    if view.surroundings is not None:
+    if view.environment_map is not None:
         behind, moved = background_at(view, x, y)
         out["rgb"] = out["rgb"] + final[:, None] * behind
         out["behind_bound"] = final * moved

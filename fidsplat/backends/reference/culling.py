@@ -73,5 +73,5 @@ def _steps(view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Upper bound of the change of each coordinate (3,) from a sample to its neighbours."""
     if view.raster is None:
         return np.array([0.0, 1.0, 1.0])
-    slopes = np.nan_to_num(view.raster.slopes[y.astype(int), x.astype(int)].astype(np.float64))
+    slopes = np.nan_to_num(view.raster.ray_derivatives[y.astype(int), x.astype(int)].astype(np.float64))
     return np.hypot(slopes[:, 0], slopes[:, 1]).max(0)

@@ -84,7 +84,7 @@ class FrozenFrame:
         # constant projected covariance, as in 3DGS
         z = placed.p[:, 2]
         across = z[:, None] * slopes.p[:, :2] / (view.focal_x, view.focal_y)
-        if "ellipsoid_exact" not in self._features.slots:
+        if "ellipsoid_exact" not in self._features.effects:
             across = np.where(placed.scales[:, 2:] > 0, 0.0, across)
         by_center = slopes.center + across
         screen = 0.5 * np.sign(z) * np.hypot(view.width * by_center[:, 0], view.height * by_center[:, 1])

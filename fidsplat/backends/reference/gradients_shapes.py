@@ -51,10 +51,10 @@ def shapes_of(
     flat, solid = np.flatnonzero(~thick), np.flatnonzero(thick)
     rays = rays_of(view, x, y)[0][:, None, :]
     found: list[tuple[np.ndarray, Shapes]] = [(flat, _Disks(placed.select(flat), rays, view))]
-    if len(solid) and "ellipsoid_exact" in features.slots:
+    if len(solid) and "ellipsoid_exact" in features.effects:
         found.append((solid, _Ellipsoids(placed.select(solid), rays, view)))
     elif len(solid):
-        antialiased = "ellipsoid_ewa_antialiased" in features.slots
+        antialiased = "ellipsoid_ewa_antialiased" in features.effects
         found.append((solid, _Projected(placed.select(solid), view, antialiased, x, y)))
     return found
 

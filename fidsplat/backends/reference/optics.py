@@ -127,7 +127,9 @@ def edges_of(view: View, forms: np.ndarray, x: np.ndarray, y: np.ndarray) -> tup
     if view.raster is None:
         steep = [np.hypot(*(forms[1:, :, 2] + sign * forms[1:, :, axis])) for axis, sign in sides]
         return 1 / np.maximum(np.stack(steep), 1e-300), np.zeros((4, 1))
-    slopes = np.nan_to_num(view.raster.slopes[y.astype(int), x.astype(int)].astype(np.float64))  # (k, 2, 3)
+    slopes = np.nan_to_num(
+        view.raster.ray_derivatives[y.astype(int), x.astype(int)].astype(np.float64)
+    )  # (k, 2, 3)
     edges, terms = [], []
     for axis, sign in sides:
         form = forms[:, :, 2] + sign * forms[:, :, axis]

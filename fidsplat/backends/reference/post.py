@@ -16,7 +16,7 @@ _ROUND = 2e-6
 def background_at(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Background colours (k, 3) at samples with grid positions x, y (k,), 0 without a ray, and their error
     bounds (k,)."""
-    around = view.surroundings
+    around = view.environment_map
     assert around is not None
     rays, valid = rays_of(view, x, y)
     rays = np.where(valid[:, None], rays, 1.0) @ view.rotation
@@ -79,31 +79,31 @@ def _step(name: str, value: np.ndarray, view: View, x: np.ndarray, y: np.ndarray
         case "decode_srgb":
             return to_light(value, "srgb")
         case "veiling_glare":
-            rest, *light = sensor.uniform("veiling_glare")
+            rest, *light = sensor.uniforms_of("veiling_glare")
             return value * rest + np.array(light)
         case "saturation":
             return np.minimum(value, sensor.saturation)
         case "white_balance":
-            return value * np.array(sensor.uniform("white_balance"))
+            return value * np.array(sensor.uniforms_of("white_balance"))
         case "exposure" | "gain":
             return value * getattr(sensor, name)
         case "vignetting":
-            center_x, center_y, scale = view.uniform("vignette_center")
+            center_x, center_y, scale = view.uniforms_of("vignette_center")
             r2 = ((x + 0.5 - center_x) ** 2 + (y + 0.5 - center_y) ** 2) * scale**2
-            a, b, c = sensor.uniform("vignetting")
+            a, b, c = sensor.uniforms_of("vignetting")
             return value * np.maximum(1 + a * r2 + b * r2**2 + c * r2**3, 0)[:, None]
         case "noise":
-            shot, read, seed = sensor.uniform("noise")
+            shot, read, seed = sensor.uniforms_of("noise")
             return value + np.sqrt(np.maximum(value, 0) * shot + read) * variates(x, y, int(seed))
         case "response_gamma":
-            return inside ** sensor.uniform("inverse_gamma")[0]
+            return inside ** sensor.uniforms_of("inverse_gamma")[0]
         case "response_srgb":
             return to_colors(inside, "srgb")
         case "response_table":
             curve = np.asarray(sensor.response, np.float32)
             return np.interp(inside, np.linspace(0, 1, len(curve)), curve)
         case "quantise":
-            levels = sensor.uniform("quantise_steps")[0]
+            levels = sensor.uniforms_of("quantise_steps")[0]
             return np.rint(inside * levels) / levels
     raise AssertionError(name)
 

@@ -27,11 +27,11 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
     out = {"rgb": samples["rgb"].mean(1) + t[:, None] * view.background, "certificate": bound.mean(1)}
     if "fogged" in samples:
         out["rgb"] += samples["fogged"].mean(1)[:, None] * view.background
-    if features.posts or view.surroundings is not None:
-        steps = tuple(step for step in features.posts if step != "fog")
+    if features.post_steps or view.environment_map is not None:
+        steps = tuple(step for step in features.post_steps if step != "fog")
         most = max(1.0, float(np.abs(out["rgb"]).max(initial=1.0)), float(np.abs(view.background).max()))
-        unsure = out["certificate"] * max(most, max_value(view.surroundings))
-        if view.surroundings is not None:
+        unsure = out["certificate"] * max(most, max_value(view.environment_map))
+        if view.environment_map is not None:
             unsure = unsure + samples["behind_bound"].mean(1)
         columns, rows = (np.floor(center / view.samples).astype(int) for center in (center_x, center_y))
         out["rgb"], out["certificate_rgb"] = apply_sensor(out["rgb"], unsure, steps, view, columns, rows)

@@ -39,8 +39,8 @@ class Setup:
             log_opacity = np.log(cloud.opacities.astype(np.float64)) + shape.faint
         box = np.zeros(len(cloud), bool) if cloud.boxes is None else cloud.boxes
         thick = np.zeros(len(cloud), bool) if cloud.thickness is None else cloud.thickness > 0
-        unfiltered = box | (thick & ("ellipsoid_exact" not in features.slots))
-        if "lowpass_pixel" in features.slots:
+        unfiltered = box | (thick & ("ellipsoid_exact" not in features.effects))
+        if "lowpass_pixel" in features.effects:
             filtered = ~unfiltered & (depth >= view.near)
             a, b, grown = _filtered(a, b, p, view, filtered)
             area = area * grown
@@ -57,13 +57,13 @@ class Setup:
             reach = np.hypot(reach, shape.third[:, 2])
         radius = np.sqrt(np.maximum(2 * half_r2, 0))
         # the disc of the low-pass applies at any cut-off
-        within = np.maximum(radius, _RANGE_RADIUS if "lowpass_screen" in features.slots else 0.0) * reach
+        within = np.maximum(radius, _RANGE_RADIUS if "lowpass_screen" in features.effects else 0.0) * reach
         within = np.where(box, box_reach, within)
         reach = np.where(box, box_reach, radius * reach)
         visible = (half_r2 > 0) & (depth + reach >= view.near) & (depth - reach <= view.far)
-        self.by_depth = not {"compose_pixel", "compose_coplanar_pixel"}.isdisjoint(features.slots)
+        self.by_depth = not {"compose_pixel", "compose_coplanar_pixel"}.isdisjoint(features.effects)
         """whether fragments are composited by their own depth"""
-        layered = not {"compose_coplanar", "compose_coplanar_pixel"}.isdisjoint(features.slots)
+        layered = not {"compose_coplanar", "compose_coplanar_pixel"}.isdisjoint(features.effects)
         groups = group_index(cloud) if layered else np.full(len(cloud), -1, np.int32)
         # depths must not depend on the cut-off
         radius = np.where(groups >= 0, _PLANE_RADIUS, np.where(box, 1.0, _RANGE_RADIUS))
@@ -120,8 +120,8 @@ class Setup:
         """rounding error of a form in float32, relative to its terms"""
         self.colors = _colors(cloud, order, outward[order])
         self.normal = shape.surface[order] * np.where(height > 0, -1.0, 1.0)[:, None]
-        self.screen = "lowpass_screen" in features.slots
-        self.exclusive = "stop_exclusive" in features.slots
+        self.screen = "lowpass_screen" in features.effects
+        self.exclusive = "stop_exclusive" in features.effects
         self.coplanar_groups = groups[order] if layered else None
         """dense index of the group whose layer a splat is part of, -1 for none, or None without layers"""
         self.coplanar = groups[order] >= 0
@@ -187,10 +187,10 @@ def _shapes(
     third = np.maximum(cloud.thickness[thick].astype(np.float64), np.float32(1e-20))
     scales = np.column_stack([scale[thick], third])
     axes = np.stack([unit_a, unit_b, np.cross(unit_a, unit_b)], axis=1)[thick]
-    if "ellipsoid_exact" in features.slots:
+    if "ellipsoid_exact" in features.effects:
         own = ellipsoids.exact(axes, scales, p[thick], view)
     else:
-        own = ellipsoids.ewa(axes, scales, p[thick], view, "ellipsoid_ewa_antialiased" in features.slots)
+        own = ellipsoids.ewa(axes, scales, p[thick], view, "ellipsoid_ewa_antialiased" in features.effects)
         # undefined otherwise
         own.faint = np.where(p[thick, 2] >= view.near, own.faint, -np.inf)
     for name, values in vars(own).items():

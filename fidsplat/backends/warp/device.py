@@ -72,7 +72,7 @@ class WarpBackend(Workspace, Backend):
     def upload(self, cloud: SplatCloud) -> Resident:
         return Resident.of(cloud, self.pool)
 
-    def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> Resident:
+    def wrap_arrays(self, arrays: Mapping[str, Any], origin: np.ndarray) -> Resident:
         return Resident.around(arrays, origin, self.pool)
 
     def unsupported(self, features: FeatureSet) -> str:

@@ -72,9 +72,9 @@ class WarpImages(Images):
         self.rendered: list[Rendered] = []
 
     def blank(self) -> None:
-        """Fill the images of all views with the blank value, as some views are masked out."""
+        """Fill the images of all views with their empty value, as some views are masked out."""
         for name, output in self._outputs.items():
-            self.arrays[name].fill_(output.blank)
+            self.arrays[name].fill_(output.empty_value)
 
     def device_array(self, name: str, index: int | None = None) -> Any:
         for part in self.rendered:

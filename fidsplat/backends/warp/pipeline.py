@@ -140,9 +140,9 @@ class WarpPipeline(Pipeline):
     def _render(self, resident: Resident, views: ViewBatch, into: ImageArrays) -> Rendered:
         """Render views, without waiting if a frame with the same key is cached."""
         workspace, view = self.workspace, views.view
-        # frames of the user's own device arrays (`adopt`) must wait for their counts: a frame that overflows
+        # frames of the user's own arrays (`wrap_arrays`) must wait for their counts: a frame that overflows
         # its buffers is rendered again, and by then the user may have changed the arrays
-        if not workspace.asynchronous or view.sub_frames or resident.adopted or not resident.count:
+        if not workspace.asynchronous or view.sub_frames or resident.wraps_arrays or not resident.count:
             return self._render_counted(resident, views, into)[1]
         cached = self._cached.get(resident, {}).get((view.width, view.height, len(views)))
         if cached is None:
@@ -229,7 +229,7 @@ class WarpPipeline(Pipeline):
         budgets = workspace.memory_budget, workspace.pair_budget, reserved
         states = workspace.pool.state, cached.inputs.state
         external = view.external_depth and view.external_depth.depth.shape
-        return cached.capacity, budgets, states, view.raster, view.surroundings, labels, external
+        return cached.capacity, budgets, states, view.raster, view.environment_map, labels, external
 
     def _update_capacity(self, resident: Resident, views: ViewBatch, visible: int, pairs: int) -> None:
         kinds, kind = self._cached.setdefault(resident, {}), (views.view.width, views.view.height, len(views))

@@ -16,7 +16,7 @@ from fidsplat.effects.differentiable import GRADIENT_OUTPUTS
 from fidsplat.effects.extensions import EXTENSIONS
 from fidsplat.util.errors import DeviceError
 
-SLOTS = frozenset(
+EFFECTS = frozenset(
     {"camera_pinhole", "camera_orthographic", "color_rgb", "color_sh"}
     | {"camera_brown_conrady", "camera_fisheye", "camera_equirectangular"}
     | {"lowpass_none", "lowpass_screen", "lowpass_pixel", "stop_inclusive", "stop_exclusive"}
@@ -46,12 +46,12 @@ _SAMPLE = (*_RECORD, "stop_exclusive", "arithmetic_fast", "rays_length", "extern
 
 def known() -> frozenset[str]:
     """All supported effects."""
-    return SLOTS | kernels("output").known() | kernels("post").known()
+    return EFFECTS | kernels("output").known() | kernels("post").known()
 
 
 def unsupported(features: FeatureSet, name: str) -> str:
     """Error message naming unsupported effects; empty if there are none. name: name of the device."""
-    effects = {*features.slots, *features.outputs, *features.posts} - known()
+    effects = {*features.effects, *features.outputs, *features.post_steps} - known()
     for own in (EXTENSIONS[effect] for effect in effects & EXTENSIONS.keys()):
         if own.warp is not None:
             kernels("post" if own.output is None else "output").__path__.append(str(own.warp))
@@ -76,9 +76,9 @@ class _Needs:
     @classmethod
     def of(cls, features: FeatureSet) -> _Needs:
         output = kernels("output")
-        posts, effects = set(features.posts), set(features.slots)
+        post_steps, effects = set(features.post_steps), set(features.effects)
         surface = {"surface_label"} if "external_depth" in effects and "label" in features.outputs else set()
-        outputs = output.with_needed((*features.outputs, *(posts & output.known()), *surface))
+        outputs = output.with_needed((*features.outputs, *(post_steps & output.known()), *surface))
         measured = output.having(output.having(outputs, "start"), "length")
         if not effects.isdisjoint(kernels("lens").LENSES):
             effects.add("rays")
@@ -92,7 +92,7 @@ class _Needs:
         with_depth = {"compose_pixel", "compose_coplanar", "external_depth"}
         if not effects.isdisjoint(with_depth) or output.having(outputs, "depth"):
             effects.add("ray_depth")
-        steps = tuple(name for name in features.posts if name in kernels("post").known())
+        steps = tuple(name for name in features.post_steps if name in kernels("post").known())
         blending = output.having(outputs, "attributes", "state", "samples")
         return cls(frozenset(effects), outputs, blending, steps)
 
@@ -228,7 +228,7 @@ class SensorKernel:
     def settings(self, view: View, pool: ArrayPool) -> Any:
         filled = self._settings()
         for step in self._steps:
-            numbers = [number for name in step.uniforms for number in view.uniform(name)]
+            numbers = [number for name in step.uniforms for number in view.uniforms_of(name)]
             for field, number in zip(step.numbers, numbers, strict=True):
                 setattr(filled, field, number)
             for name, dtype in step.arrays.items():

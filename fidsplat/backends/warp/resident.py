@@ -1,4 +1,4 @@
-"""Clouds on a Warp device: uploaded, or adopted arrays."""
+"""Clouds on a Warp device: uploaded, or wrapped arrays."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ class Resident(ResidentData):
     ) -> None:
         self.arrays, self.count, self.origin = arrays, count, origin
         self.memory_bytes = sum(map(nbytes, arrays.values()))
-        """bytes on the device, including adopted arrays"""
+        """bytes on the device, including wrapped arrays"""
         self.sh_degree, self.has_coplanar_groups = sh_degree, "coplanar_groups" in arrays
         self.footprint, self.ellipsoids = footprint, ellipsoids
-        self.adopted = False
+        self.wraps_arrays = False
         """whether the caller may change the arrays"""
 
     def color_range(self) -> tuple[float, float]:
@@ -78,7 +78,7 @@ class Resident(ResidentData):
                 raise InputError(f"{name} must have {expected} elements for {count} means, got {array.size}")
         sh_degree = int(np.sqrt(terms)) - 1 if terms else -1
         resident = cls(arrays, count, origin, sh_degree, ellipsoids=ellipsoids)
-        resident.adopted = True
+        resident.wraps_arrays = True
         return resident
 
 

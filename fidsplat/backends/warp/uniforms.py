@@ -40,12 +40,12 @@ def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> n
         filled[name] = derived[name] if name in derived else getattr(view, name)
     for name in ("focal_x", "focal_y", "near"):
         filled[f"per_{name}"] = 1.0 / filled[name]
-    filled["ray"] = view.uniform("ray")
+    filled["ray"] = view.uniforms_of("ray")
     if not (view.along_ray or view.parallel):  # otherwise depths are distances
         own = (filled["focal_x"], filled["focal_y"], filled["center_x"], filled["center_y"])
         filled["ray"] = np.stack(own, axis=1)
     if sloped and view.raster:
-        filled["ray_step"] = view.raster.step
+        filled["ray_step"] = view.raster.max_ray_derivative
     return filled
 
 
@@ -77,7 +77,7 @@ def rays_of(
     rays.rays = arrays["rays"][first:]
     if sloped:
         if "slopes" not in arrays:
-            slopes = (raster.whole or raster).slopes.reshape(-1, 2, 3)
+            slopes = (raster.full_raster or raster).ray_derivatives.reshape(-1, 2, 3)
             arrays["slopes"] = _fresh("ray slopes", slopes, kernels("rays").SLOPES, workspace)
         rays.slopes = arrays["slopes"][first:]
     return rays
@@ -132,11 +132,11 @@ def _empty(kind: Any) -> Any:
 
 
 def surroundings_of(view: View, workspace: Workspace) -> Any:
-    wp, behind = load(), view.surroundings
+    wp, behind = load(), view.environment_map
     kind = "gradient" if isinstance(behind, Gradient) else "panorama"
     filled = kernels("background").struct_of_surroundings(kind)()
     if isinstance(behind, Gradient):
-        numbers = view.uniform("gradient")
+        numbers = view.uniforms_of("gradient")
         filled.top, filled.bottom, filled.up = (wp.vec3(*numbers[k : k + 3]) for k in (0, 3, 6))
     elif isinstance(behind, Panorama):
         filled.image = _panorama(behind, workspace)
@@ -145,9 +145,9 @@ def surroundings_of(view: View, workspace: Workspace) -> Any:
 
 def memory_bytes(view: View, workspace: Workspace) -> int:
     """Bytes of the arrays of a view's lens, panorama and external depth image."""
-    around, raster, external, size = view.surroundings, view.raster, view.external_depth, 0
+    around, raster, external, size = view.environment_map, view.raster, view.external_depth, 0
     if raster is not None:
-        size += sum(map(nbytes, workspace.lenses.get(raster.whole or raster, {}).values()))
+        size += sum(map(nbytes, workspace.lenses.get(raster.full_raster or raster, {}).values()))
     if isinstance(around, Panorama):
         size += around.image.nbytes
     if external is not None:
@@ -157,12 +157,12 @@ def memory_bytes(view: View, workspace: Workspace) -> int:
 
 def _arrays(raster: RayRaster, workspace: Workspace) -> dict[str, Any]:
     """Device arrays of a lens's rays."""
-    wp, raster = load(), raster.whole or raster
+    wp, raster = load(), raster.full_raster or raster
     cached = workspace.lenses.setdefault(raster, {})
     if not cached:
         cached["rays"] = _fresh("rays", raster.rays.reshape(-1, 3), wp.vec3, workspace)
         if raster.lens.kind != "equirectangular":
-            cached["cells"] = _fresh("ray map", raster.map[0], wp.vec4s, workspace)
+            cached["cells"] = _fresh("ray map", raster.bounds_pyramid[0], wp.vec4s, workspace)
     return cached
 
 
