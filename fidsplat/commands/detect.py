@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from fidsplat.commands.options import Json
-from fidsplat.commands.output import console, delayed_progress, print_json, print_table
+from fidsplat.commands.output import console, print_json, print_table
+from fidsplat.commands.scenes import load_scene_file
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
 
@@ -62,7 +63,7 @@ class Detect:
         for name in self.family:
             if name not in detectors():
                 parse_family(name)
-        scene = None if self.scene is None else _load_scene(self.scene)
+        scene = None if self.scene is None else load_scene_file(self.scene, "for the poses of its markers")
         results: list[dict[str, Any]] = []
         readings: list[Reading] = []
         rows: list[tuple[str, ...]] = []
@@ -151,16 +152,6 @@ class Detect:
         if bundles:
             facts["bundles"] = [bundle.as_dict() for bundle in bundles]
         return facts, readings, bundles
-
-
-def _load_scene(path: str) -> "Scene":
-    import fidsplat as fs
-
-    with delayed_progress() as progress:
-        scene = fs.Scene.load(path, progress=progress)
-    if scene.camera is None:
-        raise InputError(f"{path} must have a [camera] table for the poses of its markers, got none; add one")
-    return scene
 
 
 def _print_codes(results: list[dict[str, Any]]) -> None:

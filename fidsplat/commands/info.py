@@ -10,6 +10,7 @@ import tyro
 
 from fidsplat.commands.options import Json
 from fidsplat.commands.output import delayed_progress, report
+from fidsplat.util.markup import point
 
 
 @dataclass
@@ -54,9 +55,6 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     rows += [("left out", f"{count:,}: {why}") for why, count in facts["left_out"].items()]
     if not facts["splats"]:
         return rows
-
-    def point(values) -> str:
-        return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
 
     scales, opacities = (" / ".join(f"{v:.3g}" for v in facts[key]) for key in ("scales", "opacities"))
     shares = " / ".join(map(str, SHARES))

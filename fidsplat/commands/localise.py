@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from fidsplat.commands.options import Device, Json, parse_numbers
-from fidsplat.commands.output import console, delayed_progress, report
+from fidsplat.commands.output import console, report
+from fidsplat.commands.scenes import load_scene_file
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
 
@@ -63,13 +64,9 @@ class Localise:
         start = None
         if self.start is not None:
             start = parse_numbers("--start", self.start, "7 numbers X,Y,Z,QW,QX,QY,QZ", 7)
-        with delayed_progress() as progress:
-            scene = fs.Scene.load(self.scene, progress=progress)
+        scene = load_scene_file(self.scene, "of the photographs")
         camera = scene.camera
-        if camera is None:
-            raise InputError(
-                f"{self.scene} must have a [camera] table, the camera of the photographs, got none; add one"
-            )
+        assert camera is not None
         if self.out is not None:
             check_trajectory_file(self.out, camera)
         candidates = [] if self.candidates is None else cameras_of(self.candidates, scene)

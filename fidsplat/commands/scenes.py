@@ -60,6 +60,17 @@ class RenderInput(SceneInput):
         check_request(self.outputs, self.quality)
 
 
+def load_scene_file(path: str, purpose: str) -> Scene:
+    """Load a scene file that has a camera, with a progress bar. purpose: use of the camera, for the error."""
+    import fidsplat as fs
+
+    with delayed_progress() as progress:
+        scene = fs.Scene.load(path, progress=progress)
+    if scene.camera is None:
+        raise InputError(f"{path} must have a [camera] table {purpose}, got none; add one")
+    return scene
+
+
 Size = Annotated[
     tuple[int, int] | None,
     "WIDTH HEIGHT: pixels of the image (default: the scene's; for a splat file 1280 720)",

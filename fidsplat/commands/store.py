@@ -101,8 +101,8 @@ class Place:
             pitch = parse_numbers("--pitch", self.pitch, "3 lengths in metres", 3)
             poses = grid_poses([int(n) for n in counts], pitch)
         store = fs.Store(fs.place_store(self.source, self.out, poses, overwrite=self.overwrite))
-        facts = {"store": str(store.path), "places": store.instances, "splats": len(store)}
-        words = f"{counted(len(store), 'splats')} at {counted(store.instances, 'places')}: {store.path}"
+        facts = {"store": str(store.path), "instances": store.instances, "splats": len(store)}
+        words = f"{counted(len(store), 'splats')} at {counted(store.instances, 'instances')}: {store.path}"
         return report(self.json, facts, words)
 
 
@@ -136,8 +136,8 @@ def report_store(path: str, as_json: bool) -> int:
 
 def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [("splats", f"{facts['splats']:,} ({facts['kind']}), SH degree {facts['sh_degree']}")]
-    if facts["placed"] is not None:
-        rows.append(("places", f"{facts['places']:,} of {facts['placed']}"))
+    if facts["instanced_store"] is not None:
+        rows.append(("instances", f"{facts['instances']:,} of {facts['instanced_store']}"))
     rows += [("chunks", f"{facts['chunks']:,}"), ("files", f"{facts['bytes'] / 2**20:.1f} MiB")]
     rows += [("made of", ", ".join(facts["sources"]))] if facts["sources"] else []
     rows += [("left out", f"{count:,}: {why}") for why, count in facts["left_out"].items()]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Executor, Future
 
@@ -62,17 +61,13 @@ def measure_angles(point: dict, markers: MarkerRenderer, seed: int, pool: Execut
         grey = to_uint8(image)
         return [attempt(name, grey, target) for name in names]
 
-    pending: deque[Future] = deque()
-    attempts: list[list[Attempt]] = []
-    for tilt in parse_tilts(point["tilts"]):
+    def submitted(tilt: float) -> Future[list[Attempt]]:
         camera = protocol.camera(tilt)
         if in_pool:
-            pending.append(pool.submit(lambda camera: detect(render(camera), camera), camera))
-        else:
-            pending.append(pool.submit(detect, render(camera), camera))
-        while len(pending) > 2 * workers:  # bounds memory
-            attempts.append(interrupts.result_of(pending.popleft()))
-    attempts += [interrupts.result_of(future) for future in pending]
+            return pool.submit(lambda: detect(render(camera), camera))
+        return pool.submit(detect, render(camera), camera)
+
+    attempts = interrupts.ordered_results(map(submitted, parse_tilts(point["tilts"])), 2 * workers)
     return {
         "spec": spec if category.kind == "apriltag" else made.family,
         "readers": {

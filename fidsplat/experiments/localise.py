@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -193,16 +192,10 @@ class Drive:
     ) -> Iterator[tuple[np.ndarray, list[Detection]]]:
         """Images and their detected tags. Detection runs in threads during rendering."""
         workers = os.cpu_count() or 1
-        pending = deque()
         with ThreadPoolExecutor(workers) as pool:
-            for image in self.images(variant, run, renderer):
-                pending.append((image, pool.submit(detect, image, (FAMILY,), qr=False)))
-                if len(pending) > 2 * workers:
-                    image, found = pending.popleft()
-                    yield image, interrupts.result_of(found)
-            while pending:
-                image, found = pending.popleft()
-                yield image, interrupts.result_of(found)
+            work = lambda image: (image, detect(image, (FAMILY,), qr=False))  # noqa: E731
+            futures = (pool.submit(work, image) for image in self.images(variant, run, renderer))
+            yield from interrupts.ordered_results(futures, 2 * workers)
 
     def detections(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[list[Detection]]:
         """Detected tags of each image."""

@@ -11,8 +11,8 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.capture.quality import Quality
 from fidsplat.capture.sensor import Sensor
-from fidsplat.experiments.plane import from_srgb, plane_image
-from fidsplat.experiments.setup import BACKGROUND, COLLECTIONS, PLANE
+from fidsplat.experiments.plane import plane_image
+from fidsplat.experiments.setup import BACKGROUND, BACKGROUND_LIGHT, COLLECTIONS, PLANE
 from fidsplat.markers import marker
 from fidsplat.render.renderer import Renderer
 from fidsplat.util.errors import InputError, unknown
@@ -110,7 +110,7 @@ class MarkerRenderer:
             raise InputError(f"a folder of trained models must be given for the method {method}, got none")
         resident = renderer.upload(cloud)
         linear = in_linear_light(method)
-        ground = from_srgb(BACKGROUND) if linear else BACKGROUND
+        ground = BACKGROUND_LIGHT if linear else BACKGROUND
         sensor = Sensor(response="srgb") if linear else None
 
         def render(camera: Camera) -> np.ndarray:

@@ -13,7 +13,6 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.util.errors import InputError
-from fidsplat.util.response import to_colors, to_light
 
 
 def plane_image(
@@ -126,13 +125,3 @@ def _pieces(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     who, t = who[order], t[order]
     same = who[1:] == who[:-1]
     return who[:-1][same], t[:-1][same], t[1:][same]
-
-
-def srgb(light: np.ndarray) -> np.ndarray:
-    """Convert linear light in [0, 1] to display values (IEC 61966-2-1)."""
-    return to_colors(np.clip(light, 0.0, 1.0), "srgb")
-
-
-def from_srgb(value: float) -> float:
-    """Convert a display value in [0, 1] to linear light."""
-    return float(to_light(np.array(value), "srgb"))

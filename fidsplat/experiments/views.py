@@ -18,12 +18,21 @@ from fidsplat.experiments.methods import (
     in_linear_light,
     with_linear_light,
 )
-from fidsplat.experiments.plane import from_srgb, plane_image, srgb
-from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS, TEST_VIEWS, Category, novel_cameras
+from fidsplat.experiments.plane import plane_image
+from fidsplat.experiments.setup import (
+    BACKGROUND,
+    BACKGROUND_LIGHT,
+    CATEGORIES,
+    PROTOCOLS,
+    TEST_VIEWS,
+    Category,
+    novel_cameras,
+)
 from fidsplat.images.files import read_image, to_uint8
 from fidsplat.markers import marker
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
+from fidsplat.util.response import to_colors
 from fidsplat.vision.metrics import flip, has_flip, psnr, ssim
 
 NAME = "views"
@@ -139,4 +148,5 @@ def exact_view(spec: str, camera: Camera, linear: bool) -> np.ndarray:
     module = PROTOCOLS["fixed-plane"].module(grid.shape[0])
     if not linear:
         return plane_image(grid, module, camera, background=BACKGROUND)
-    return srgb(plane_image(grid, module, camera, background=from_srgb(BACKGROUND)))
+    light = plane_image(grid, module, camera, background=BACKGROUND_LIGHT)
+    return to_colors(np.clip(light, 0.0, 1.0), "srgb")

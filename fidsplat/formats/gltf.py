@@ -24,6 +24,7 @@ from fidsplat.formats.plain import (
     cloud_of,
     coefficients,
     content,
+    neighbour,
     refuse_boxes,
     three_scales,
     world_means,
@@ -330,10 +331,7 @@ class _Reader:
                 return base64.b64decode(uri.partition(",")[2], validate=True)
             except binascii.Error:
                 raise InputError(f"{self._path}: buffer {number} is damaged: it is not base64") from None
-        folder = self._path.parent.resolve()
-        file = (folder / unquote(uri)).resolve()
-        if "://" in uri or not file.is_relative_to(folder):
-            raise InputError(f"files of {self._path} must be in its folder, got {uri!r}")
+        file = neighbour(self._path, unquote(uri))
         views = [view for view in self._document["bufferViews"] if view["buffer"] == number]
         size = max(int(view.get("byteOffset", 0)) + int(view["byteLength"]) for view in views)
         return read_input(file, first=max(size, 0))  # only the referenced bytes of a larger file

@@ -99,3 +99,16 @@ def content(path: Path, magic: tuple[bytes, ...]) -> bytes:
         while head.isspace():
             head = stream.read(1 << 16)
     return read_input(path) if head.lstrip().startswith(magic) else head
+
+
+def neighbour(path: Path, name: str) -> Path:
+    """A file in the folder of `path` or below it. Raises InputError for a name outside it."""
+    folder = path.parent.resolve()
+    try:
+        file = (folder / name).resolve()
+        inside = file.is_relative_to(folder)
+    except (OSError, ValueError, RuntimeError):  # a name with NUL, a loop of symbolic links
+        inside = False
+    if not inside:
+        raise InputError(f"files of {path} must be in its folder, got {name!r}")
+    return file

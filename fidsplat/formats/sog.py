@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.formats.plain import cloud_of, coefficients, refuse_boxes, three_scales, world_means
+from fidsplat.formats.plain import cloud_of, coefficients, neighbour, refuse_boxes, three_scales, world_means
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import with_largest_component
 from fidsplat.util.errors import InputError, damaged_data
@@ -56,19 +56,6 @@ def load_sog(path: Path) -> SplatCloud:
 def load_sog_folder(path: Path) -> SplatCloud:
     """Read a meta.json and the images in its folder. Raises InputError for a damaged or incomplete scene."""
     return _read(path, lambda name, maximum: read_input(neighbour(path, name), maximum))
-
-
-def neighbour(path: Path, name: str) -> Path:
-    """A file in the folder of `path` or below it. Raises InputError for a name outside it."""
-    folder = path.parent.resolve()
-    try:
-        file = (folder / name).resolve()
-        inside = file.is_relative_to(folder)
-    except (OSError, ValueError, RuntimeError):  # a name with NUL, a loop of symbolic links
-        inside = False
-    if not inside:
-        raise InputError(f"files of {path} must be in its folder, got {name!r}")
-    return file
 
 
 def _read(path: Path, part: Parts) -> SplatCloud:

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.formats.sog import load_sog_folder, neighbour, save_sog_folder
+from fidsplat.formats.plain import neighbour
+from fidsplat.formats.sog import load_sog_folder, save_sog_folder
 from fidsplat.splats.arrays import all_scales
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError, damaged_data

@@ -1,16 +1,16 @@
 """Out-of-core build of a store: a bucket sort by Morton code, then levels of detail from the bottom up.
 
 Inputs are read once, in windows of rows, and distributed over bucket files; each bucket is then sorted and
-written. Progress is saved, so that an interrupted build resumes. `BuildPlan.memory` limits the memory.
+written. Progress is saved, so that an interrupted build resumes. `BuildSettings.memory` limits the memory.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from hashlib import sha256
 from pathlib import Path
@@ -142,13 +142,8 @@ class _Build:
     ) -> Iterator[Any]:
         """Run `work` in threads, and yield results in the order of inputs. max_pending: maximum number of
         pending results."""
-        waiting: deque[Future] = deque()
-        for one in inputs:
-            waiting.append(pool.submit(work, one))
-            if len(waiting) > (self.workers if max_pending is None else max_pending - 1):
-                yield interrupts.result_of(waiting.popleft())
-        while waiting:
-            yield interrupts.result_of(waiting.popleft())
+        pending = self.workers if max_pending is None else max_pending - 1
+        return interrupts.ordered_results((pool.submit(work, one) for one in inputs), pending)
 
     # inputs to buckets
 
@@ -223,7 +218,7 @@ class _Build:
         rows = np.memmap(self._bucket(number), plan.record, "r", 0, (count,)).view(np.ndarray)
         order = np.argsort(rows["code"].copy(), kind="stable")
         records = []
-        for part in np.array_split(order, -(-count // plan.chunk)):
+        for part in np.array_split(order, -(-count // plan.settings.chunk)):
             taken = rows[part]
             splats = {name: np.ascontiguousarray(taken[name]) for name in self.columns.kinds}
             records.append(node_record(splats, first))
@@ -246,13 +241,13 @@ class _Build:
 
     def _levels(self, pool: ThreadPoolExecutor) -> None:
         """Build levels of detail, four nodes to one, up to a single node of few splats."""
-        while self.plan.levels:
+        while self.plan.settings.levels:
             nodes, level, done = self._nodes(), self.state["level"], self.state["merged"]
             groups = _groups(nodes, level, self.pinned)
             if not groups or (len(groups[0]) == 1 and _is_root(nodes, level)):
                 return
             rows = int(nodes["first"][-1] + nodes["count"][-1])
-            pending = min(self.workers, max(1, self.plan.memory // self.plan.merge_bytes))
+            pending = min(self.workers, max(1, self.plan.settings.memory // self.plan.merge_bytes))
             work = self._in_order(pool, self._merged, (nodes[group] for group in groups[done:]), pending)
             for number, (parent, size) in enumerate(work, done + 1):
                 node = node_record(parent, rows)
@@ -289,7 +284,7 @@ class _Build:
             splats=splats,
             rows=rows,
             pinned=self.pinned,
-            chunk=plan.chunk,
+            chunk=plan.settings.chunk,
             origin=tuple(plan.origin.tolist()),
             sh_degree=plan.sh_degree,
             columns=kinds,

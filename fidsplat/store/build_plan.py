@@ -58,10 +58,7 @@ class BuildPlan:
     """Columns, order and windows of a build."""
 
     sources: tuple[Source, ...]
-    chunk: int
-    memory: int
-    """approximate bytes that the build may use"""
-    levels: bool
+    settings: BuildSettings
     sh_degree: int
     columns: dict[str, str]
     origin: np.ndarray
@@ -84,7 +81,7 @@ class BuildPlan:
     def merge_bytes(self) -> int:
         """Maximum memory to merge nodes into one of the next level."""
         each, share = _MERGE_BYTES
-        return int(REDUCTION * min(self.chunk, self.rows) * (each + share * self.splat_bytes))
+        return int(REDUCTION * min(self.settings.chunk, self.rows) * (each + share * self.splat_bytes))
 
     @cached_property
     def record(self) -> np.dtype:
@@ -100,7 +97,7 @@ class BuildPlan:
     @cached_property
     def windows(self) -> list[tuple[int, tuple[int, int]]]:
         """Windows in which inputs are read: (number of the input, rows [first, end))."""
-        step = max(1, self.memory // (24 * self.record.itemsize) // WINDOW) * WINDOW
+        step = max(1, self.settings.memory // (24 * self.record.itemsize) // WINDOW) * WINDOW
         step = min(step, 4 * WINDOW)
         parts = [spans(source.rows.count, step) for source in self.sources]
         return [(number, span) for number, own in enumerate(parts) for span in own]
@@ -108,8 +105,11 @@ class BuildPlan:
     @property
     def disk_bytes(self) -> int:
         """Approximate maximum disk space of a build: bucket records, columns, levels of detail."""
-        columns = self.splat_bytes * 4 // 3 if self.levels else self.splat_bytes
-        return self.rows * (self.record.itemsize + columns) + self.rows // self.chunk * 2 * NODE.itemsize
+        columns = self.splat_bytes * 4 // 3 if self.settings.levels else self.splat_bytes
+        return (
+            self.rows * (self.record.itemsize + columns)
+            + self.rows // self.settings.chunk * 2 * NODE.itemsize
+        )
 
     @cached_property
     def digest(self) -> str:
@@ -117,7 +117,8 @@ class BuildPlan:
         sha = hashlib.sha256()
         for source in self.sources:
             sha.update(printable(f"{source.stamp} {source.rows.count} {source.first_group}\n").encode())
-        own = (self.chunk, self.memory, self.levels, self.sh_degree, self.columns, self.grid)
+        chosen = self.settings.chunk, self.settings.memory, self.settings.levels
+        own = (*chosen, self.sh_degree, self.columns, self.grid)
         sha.update(repr(own).encode() + self.origin.tobytes() + self.splitters.tobytes())
         return sha.hexdigest()
 
@@ -125,10 +126,10 @@ class BuildPlan:
 def plan_build(sources: Sequence[Source], settings: BuildSettings | None = None) -> BuildPlan:
     """Plan a build. Raises InputError for a chunk that the memory does not allow, or too many splats."""
     settings = settings or BuildSettings()
-    chunk, memory, levels, sh_degree = settings.chunk, settings.memory, settings.levels, settings.sh_degree
+    chunk, memory = settings.chunk, settings.memory
     degree = max(map(degree_of, sources))
-    if sh_degree is not None:
-        degree = min(degree, sh_degree) or -1
+    if settings.sh_degree is not None:
+        degree = min(degree, settings.sh_degree) or -1
     kinds = {"means": "<f4", "quats": "<f4", "scales": "<f4", "opacities": "<f4"}
     kinds["colors" if degree < 0 else "sh"] = "<f4" if settings.colors == "float32" else "<f2"
     given = [source.rows for source in sources]
@@ -147,8 +148,8 @@ def plan_build(sources: Sequence[Source], settings: BuildSettings | None = None)
     codes = np.sort(grid.codes(means))
     splitters = codes[len(codes) * np.arange(1, buckets) // buckets] if len(codes) else codes
     splitters = np.unique(splitters)
-    plan = BuildPlan(tuple(sources), chunk, memory, levels, degree, kinds, origin, grid, splitters)
-    if levels and plan.merge_bytes > memory:
+    plan = BuildPlan(tuple(sources), settings, degree, kinds, origin, grid, splitters)
+    if settings.levels and plan.merge_bytes > memory:
         most, needed = memory * min(chunk, rows) // plan.merge_bytes, plan.merge_bytes / 2**20
         raise InputError(
             f"chunk must be at most {most:,} for levels of detail in {memory / 2**20:,.0f} MiB of memory, "

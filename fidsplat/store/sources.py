@@ -49,15 +49,12 @@ def open_sources(inputs: Sequence[str | os.PathLike[str] | Source]) -> list[Sour
 
 
 def _open(file: Path) -> Source:
-    if format_of(file).name == "PLY":
-        rows, origin = ply_rows(file)
-        status = file.stat()
-        stamp = f"{file.resolve()} {status.st_size} {status.st_mtime_ns}"
-        return Source(rows, np.zeros(3) if origin is None else origin, stamp)
-    status = file.stat() if file.exists() else None
-    cloud = load_splats(file)
+    status = file.stat() if file.exists() else None  # a missing file is reported by its reader
     stamp = "" if status is None else f"{file.resolve()} {status.st_size} {status.st_mtime_ns}"
-    return source_of(cloud, file, stamp)
+    if format_of(file).name != "PLY":
+        return source_of(load_splats(file), file, stamp)
+    rows, origin = ply_rows(file)
+    return Source(rows, np.zeros(3) if origin is None else origin, stamp)
 
 
 def source_of(cloud: SplatCloud, name: Path, stamp: str) -> Source:

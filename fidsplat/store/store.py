@@ -115,8 +115,8 @@ class Store(Summarised):
         header, nodes = self.header, self.nodes
         kinds = {"none": "2D", "all": "3D", "some": "2D and 3D"}
         facts = {"store": str(self.path), "splats": len(self), "kind": kinds[self.ellipsoids]}
-        facts |= {"sh_degree": max(self.sh_degree, 0), "chunks": self.chunks, "places": self.instances}
-        facts |= {"placed": header.store, "bytes": self.nbytes, "columns": dict(header.columns)}
+        facts |= {"sh_degree": max(self.sh_degree, 0), "chunks": self.chunks, "instances": self.instances}
+        facts |= {"instanced_store": header.store, "bytes": self.nbytes, "columns": dict(header.columns)}
         facts |= {"sources": list(header.sources), "left_out": dict(header.dropped), "levels": []}
         for level in np.unique(nodes["level"]).tolist():
             own = nodes[nodes["level"] == level]

@@ -16,7 +16,7 @@ import time
 TYPE_CHECKING = False  # not imported from typing: this module is loaded first, before slow imports
 if TYPE_CHECKING:
     import subprocess
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from concurrent.futures import Future
     from types import FrameType
     from typing import IO, Any, TypeVar
@@ -94,6 +94,20 @@ def result_of(future: Future[T]) -> T:
     while not wait([future], PERIOD).done:
         check()
     return future.result()
+
+
+def ordered_results(futures: Iterable[Future[T]], pending: int) -> Iterator[T]:
+    """Results of tasks in their order, which an iterable submits one by one; at most `pending` tasks are
+    submitted in advance. Signals interrupt the waiting."""
+    from collections import deque
+
+    waiting: deque[Future[T]] = deque()
+    for future in futures:
+        waiting.append(future)
+        if len(waiting) > pending:
+            yield result_of(waiting.popleft())
+    while waiting:
+        yield result_of(waiting.popleft())
 
 
 def sleep(seconds: float) -> None:

@@ -15,10 +15,11 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.experiments import blender
-from fidsplat.experiments.plane import from_srgb, plane_image, srgb
-from fidsplat.experiments.setup import BACKGROUND, CATEGORIES
+from fidsplat.experiments.plane import plane_image
+from fidsplat.experiments.setup import BACKGROUND, BACKGROUND_LIGHT, CATEGORIES
 from fidsplat.images.files import read_image
 from fidsplat.markers import marker
+from fidsplat.util.response import to_colors
 from fidsplat.vision.metrics import psnr
 
 DATA = Path(__file__).parent / "data"
@@ -56,7 +57,8 @@ def ours(name: str, finer: int = 1, border: int = 0) -> np.ndarray:
     module = EDGE / grid.shape[0]
     if view == "raw":
         return plane_image(grid, module, camera, background=BACKGROUND)
-    return srgb(plane_image(grid, module, camera, background=from_srgb(BACKGROUND)))
+    light = plane_image(grid, module, camera, background=BACKGROUND_LIGHT)
+    return to_colors(np.clip(light, 0, 1), "srgb")
 
 
 def finely(camera: Camera, finer: int, border: int) -> Camera:

@@ -7,7 +7,8 @@ import pytest
 import shapely
 
 import fidsplat as fs
-from fidsplat.experiments.plane import from_srgb, plane_image
+from fidsplat.experiments.plane import plane_image
+from fidsplat.util.response import to_light
 
 GRID = np.random.default_rng(5).integers(0, 2, (7, 9)).astype(np.uint8)
 MODULE = 0.2
@@ -120,7 +121,6 @@ def test_means_do_not_depend_on_how_the_image_is_cut():
 
 
 def test_display_values_are_straight_where_they_are_dark():
-    """To both sides of where the curve begins, 0.04045 (IEC 61966-2-1)."""
-    assert from_srgb(0.04) == pytest.approx(0.04 / 12.92)
-    assert from_srgb(0.041) == pytest.approx(((0.041 + 0.055) / 1.055) ** 2.4)
-    assert from_srgb(0.0031) == pytest.approx(0.0031 / 12.92)
+    """On both sides of the threshold of the sRGB curve, 0.04045 (IEC 61966-2-1)."""
+    light = to_light(np.array([0.04, 0.041, 0.0031]), "srgb")
+    assert light == pytest.approx([0.04 / 12.92, ((0.041 + 0.055) / 1.055) ** 2.4, 0.0031 / 12.92])
