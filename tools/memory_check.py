@@ -105,8 +105,8 @@ def run_frames() -> int:
         """Pool that releases no buffers: oclgrind reuses addresses, and reports a larger new buffer as
         uninitialized."""
 
-        def fresh(self, name, size):
-            buffers.append(super().fresh(name, size))
+        def allocate(self, name, size):
+            buffers.append(super().allocate(name, size))
             return buffers[-1]
 
     wrong = 0

@@ -61,12 +61,12 @@ static inline void bin_splats(global const uint *restrict order, global const ui
     }
 }
 
-// Reads: order, tallies' number of visible splats, windows, big_bounds. Writes: this chunk's row of table.
+// Reads: order, counters' number of visible splats, windows, big_bounds. Writes: this chunk's row of table.
 kernel void bin_count(
 //@@ arguments bin_count
 ) {
     if (get_global_id(0) >= CHUNKS) return;
-    const Chunk c = chunk_of(tallies[get_global_id(1) * TALLIES + TALLY_VISIBLE], width, height, table);
+    const Chunk c = chunk_of(counters[get_global_id(1) * COUNTERS + COUNTER_VISIBLE], width, height, table);
     order += get_global_id(1) * count;
     for (int tile = 0; tile < c.tiles_x * c.tiles_y; tile++) c.row[tile] = 0;
     bin_splats(order, windows, big_capacity, big_bounds, &c, 0);
@@ -77,7 +77,7 @@ kernel void bin_emit(
 //@@ arguments bin_emit
 ) {
     if (get_global_id(0) >= CHUNKS) return;
-    const Chunk c = chunk_of(tallies[get_global_id(1) * TALLIES + TALLY_VISIBLE], width, height, table);
+    const Chunk c = chunk_of(counters[get_global_id(1) * COUNTERS + COUNTER_VISIBLE], width, height, table);
     order += get_global_id(1) * count;
     int before = (int)get_global_id(1) * c.tiles_x * c.tiles_y;    // tiles of preceding views
     const Emission e = {band_first - before, band_end - before, starts[band_first], starts + before, lists};

@@ -1,32 +1,32 @@
 // Compaction for clouds that are projected in chunks: appends the visible splats of a chunk to those of preceding chunks, in
-// order. The chunk is cut into CHUNKS pieces; the host adds up their counts.
+// order. The chunk is cut into CHUNKS blocks; the host adds up their counts.
 
-// Index space: one work-item per piece. Reads: keys. Writes: piece_counts[0 .. CHUNKS): splats of the piece in this band,
-// piece_counts[CHUNKS .. 2 * CHUNKS): splats of the piece in any band.
+// Index space: one work-item per block. Reads: keys. Writes: block_counts[0 .. CHUNKS): splats of the block in this band,
+// block_counts[CHUNKS .. 2 * CHUNKS): splats of the block in any band.
 kernel void pack_count(
 //@@ arguments pack_count
 ) {
-    uint piece = get_global_id(0);
-    if (piece >= CHUNKS) return;
-    uint each = (count + CHUNKS - 1) / CHUNKS;
-    uint from = min(piece * each, count), to = min(from + each, count), packed = 0, visible = 0;
+    uint block = get_global_id(0);
+    if (block >= CHUNKS) return;
+    uint block_size = (count + CHUNKS - 1) / CHUNKS;
+    uint from = min(block * block_size, count), to = min(from + block_size, count), packed = 0, visible = 0;
     for (uint k = from; k < to; k++) {
         packed += keys[k] < OUT_OF_BAND;
         visible += keys[k] != CULLED;
     }
-    piece_counts[piece] = packed;
-    piece_counts[CHUNKS + piece] = visible;
+    block_counts[block] = packed;
+    block_counts[CHUNKS + block] = visible;
 }
 
-// Index space: one work-item per piece. Reads: piece_offsets (output index of each piece), splats, keys, windows.
+// Index space: one work-item per block. Reads: block_offsets (output index of each block), splats, keys, windows.
 // Writes: splats_out, keys_out, windows_out.
 kernel void pack_move(
 //@@ arguments pack_move
 ) {
-    uint piece = get_global_id(0);
-    if (piece >= CHUNKS) return;
-    uint each = (count + CHUNKS - 1) / CHUNKS;
-    uint from = min(piece * each, count), to = min(from + each, count), offset = piece_offsets[piece];
+    uint block = get_global_id(0);
+    if (block >= CHUNKS) return;
+    uint block_size = (count + CHUNKS - 1) / CHUNKS;
+    uint from = min(block * block_size, count), to = min(from + block_size, count), offset = block_offsets[block];
     for (uint k = from; k < to; k++)
         if (keys[k] < OUT_OF_BAND) {
             splats_out[offset] = splats[k];

@@ -34,6 +34,6 @@ typedef float real;
 #define CULLED 0xFFFFFFFFu   // sort key of a culled splat
 #define OUT_OF_BAND 0xFFFFFFFEu  // sort key of a splat that is visible only in another band of rows
 
-// Indices in the buffer `tallies`: numbers of visible splats, of splat-tile pairs (64 bits each) and of big splats; then one
+// Indices in the buffer `counters`: numbers of visible splats, of splat-tile pairs (64 bits each) and of big splats; then one
 // count per tile, or the same counters of the next view.
-enum { TALLY_VISIBLE = 0, TALLY_PAIRS = 2, TALLY_BIG = 6, TALLIES = 8 };
+enum { COUNTER_VISIBLE = 0, COUNTER_PAIRS = 2, COUNTER_BIG = 6, COUNTERS = 8 };

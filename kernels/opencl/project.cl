@@ -3,7 +3,7 @@
 // Index space: one work-item per splat and view. `view` has one record per view; `splats`, `keys` and `windows` have `count` per view.
 // Reads:  view, means, quats, scales, opacities, and the inputs of the colour effect and of the outputs.
 // Writes: splats[at], windows[at] (tile bits) of visible splats; keys[at]: depth key, CULLED or OUT_OF_BAND; big, big_bounds
-//         and their number in tallies: splats that overlap more tiles than a window has.
+//         and their number in counters: splats that overlap more tiles than a window has.
 //
 // The setup is computed in `real` (double where the device has it) from float inputs.
 
@@ -230,7 +230,7 @@ INLINE void write_splat(
 #endif
     if (window == 0) {
         // in any order, since lists are sorted later
-        corner = atomic_inc(tallies + TALLY_BIG);
+        corner = atomic_inc(counters + COUNTER_BIG);
         if (corner < big_capacity) {
             big[corner] = at;
             big_bounds[corner] = bounds;

@@ -1,4 +1,4 @@
-// Prefix sums of a stable counting sort without atomics: a list is cut into CHUNKS contiguous pieces, and each piece counts its
+// Prefix sums of a stable counting sort without atomics: a list is cut into CHUNKS contiguous blocks, and each block counts its
 // bins in its own row of table[CHUNKS][bins]. These kernels turn the counts into offsets.
 
 // Index space: one work-item per bin and list.
@@ -19,13 +19,13 @@ kernel void scan_chunks(
 }
 
 // Index space: one work-group of SCAN_ITEMS for each list.
-// Reads: totals[bins]. Writes: starts[bins + 1], exclusive prefix; the list's tallies [slot] and [slot + 1], the sum in 64 bits.
+// Reads: totals[bins]. Writes: starts[bins + 1], exclusive prefix; the list's counters [counter] and [counter + 1], the sum in 64 bits.
 kernel void scan_bins(
 //@@ arguments scan_bins
 ) {
     local ulong partial[SCAN_ITEMS + 1];
     uint item = get_local_id(0), number = get_global_id(1);
-    totals += number * bins; starts += number * (bins + 1); tallies += number * TALLIES;
+    totals += number * bins; starts += number * (bins + 1); counters += number * COUNTERS;
     uint each = (bins + SCAN_ITEMS - 1) / SCAN_ITEMS;
     uint from = min(item * each, bins), to = min(from + each, bins);
     ulong sum = 0;
@@ -41,8 +41,8 @@ kernel void scan_bins(
         }
         partial[SCAN_ITEMS] = running;
         starts[bins] = (uint)running;
-        tallies[slot] = (uint)running;
-        tallies[slot + 1] = (uint)(running >> 32);
+        counters[counter] = (uint)running;
+        counters[counter + 1] = (uint)(running >> 32);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     sum = partial[item];

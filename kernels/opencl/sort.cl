@@ -11,10 +11,10 @@ kernel void sort_count(
     uint chunk = get_global_id(0), number = get_global_id(1);
     if (chunk >= CHUNKS) return;
     keys += number * count;
-    tallies += number * TALLIES;
+    counters += number * COUNTERS;
     global uint *row = table + ((size_t)number * CHUNKS + chunk) * RADIX_BINS;
     for (uint bin = 0; bin < RADIX_BINS; bin++) row[bin] = 0;
-    uint length = first ? count : tallies[TALLY_VISIBLE], each = (length + CHUNKS - 1) / CHUNKS;
+    uint length = first ? count : counters[COUNTER_VISIBLE], each = (length + CHUNKS - 1) / CHUNKS;
     uint from = min(chunk * each, length), to = min(from + each, length);
     for (uint k = from; k < to; k++)
         if (keys[k] != CULLED) row[(keys[k] >> shift) & (RADIX_BINS - 1)]++;
@@ -28,10 +28,10 @@ kernel void sort_scatter(
     uint chunk = get_global_id(0), number = get_global_id(1), before = number * count;
     if (chunk >= CHUNKS) return;
     keys += before; indices += before; keys_out += before; indices_out += before;
-    tallies += number * TALLIES;
+    counters += number * COUNTERS;
     starts += number * (RADIX_BINS + 1);
     global uint *row = table + ((size_t)number * CHUNKS + chunk) * RADIX_BINS;
-    uint length = first ? count : tallies[TALLY_VISIBLE], each = (length + CHUNKS - 1) / CHUNKS;
+    uint length = first ? count : counters[COUNTER_VISIBLE], each = (length + CHUNKS - 1) / CHUNKS;
     uint from = min(chunk * each, length), to = min(from + each, length);
     for (uint k = from; k < to; k++) {
         uint key = keys[k];

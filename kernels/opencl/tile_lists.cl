@@ -25,15 +25,15 @@ enum { COUNT_BIG = 0, COUNT_PAIRS = 1, COUNT_VISIBLE = 3 };
 static inline uint length_class(uint length) { return SCAN_ITEMS - 1 - min(length / 4, SCAN_ITEMS - 1u); }
 
 // Lengths of the lists of four tiles from `first` on; 0 from tile `end` on.
-static inline uint4 tile_lengths(global const uint *tallies, uint first, uint end) {
+static inline uint4 tile_lengths(global const uint *counters, uint first, uint end) {
     uint length[4];
-    for (uint k = 0; k < 4; k++) length[k] = first + k < end ? tallies[TALLIES + first + k] : 0;
+    for (uint k = 0; k < 4; k++) length[k] = first + k < end ? counters[COUNTERS + first + k] : 0;
     return (uint4)(length[0], length[1], length[2], length[3]);
 }
 
 // Index space: work-groups of SCAN_ITEMS. The first one orders the tiles; each of the others computes the starts of its share of the
 // tiles. Each adds up the lengths of all lists itself, so that none waits for another.
-// Reads: tallies. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles] (the same), counts, to which `emit` adds the number of visible
+// Reads: counters. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles] (the same), counts, to which `emit` adds the number of visible
 // splats; tile_order[tiles]: tiles by the classes of their lists, so that blending begins with the longest, in any order within a class.
 // All lists are empty if there are more pairs than `capacity`, unless that is 2^32 - 1.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
@@ -46,18 +46,18 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
     if (group == 0) {
         classes[item] = 0;
         barrier(CLK_LOCAL_MEM_FENCE);
-        for (uint tile = item; tile < tiles; tile += SCAN_ITEMS) atomic_inc(classes + length_class(tallies[TALLIES + tile]));
+        for (uint tile = item; tile < tiles; tile += SCAN_ITEMS) atomic_inc(classes + length_class(counters[COUNTERS + tile]));
         barrier(CLK_LOCAL_MEM_FENCE);
         classes[item] = (uint)scan_group(partial, item, classes[item], &total);
         barrier(CLK_LOCAL_MEM_FENCE);
         for (uint tile = item; tile < tiles; tile += SCAN_ITEMS)
-            tile_order[atomic_inc(classes + length_class(tallies[TALLIES + tile]))] = tile;
+            tile_order[atomic_inc(classes + length_class(counters[COUNTERS + tile]))] = tile;
         return;
     }
     uint share = (tiles + 4 * shares - 1) / (4 * shares) * 4, from = min((group - 1) * share, tiles);
     uint to = min(from + share, tiles);
     for (uint first = 4 * item; first < tiles; first += 4 * SCAN_ITEMS) {
-        uint4 lengths = tile_lengths(tallies, first, tiles);
+        uint4 lengths = tile_lengths(counters, first, tiles);
         ulong sum = (ulong)lengths.x + lengths.y + lengths.z + lengths.w;
         pairs += sum;
         if (first < from) before += sum;
@@ -67,7 +67,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
     bool fits = capacity == 0xFFFFFFFFu || pairs <= capacity;
     for (uint round = from; round < to; round += 4 * SCAN_ITEMS) {
         uint first = round + 4 * item;
-        uint4 lengths = tile_lengths(tallies, first, to);
+        uint4 lengths = tile_lengths(counters, first, to);
         uint length[4] = {lengths.x, lengths.y, lengths.z, lengths.w};
         uint place = (uint)(before + scan_group(partial, item, (ulong)lengths.x + lengths.y + lengths.z + lengths.w, &total));
         for (uint k = 0; k < 4 && first + k < to; k++) {
@@ -79,7 +79,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
     }
     if (from == 0 && item == 0) {
         starts[tiles] = fits ? (uint)pairs : 0;
-        counts[COUNT_BIG] = tallies[TALLY_BIG];
+        counts[COUNT_BIG] = counters[COUNTER_BIG];
         counts[COUNT_VISIBLE] = 0;   // added up by `emit`
         counts[COUNT_PAIRS] = (uint)pairs;
         counts[COUNT_PAIRS + 1] = (uint)(pairs >> 32);
@@ -191,16 +191,16 @@ static inline void list_big_splats(const BigSplats *splats, uint group, uint gro
         }
 }
 
-// Adds the tiles of big splats to the tallies.
+// Adds the tiles of big splats to the counters.
 // Index space: any number of work-groups; each processes every n-th splat.
-// Reads: tallies' number of big splats, big, big_bounds.
-kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void tally_big(
-//@@ arguments tally_big
+// Reads: counters' number of big splats, big, big_bounds.
+kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void count_big(
+//@@ arguments count_big
 ) {
     local uint deferred[TEAMS][TEAM_DEFERRED + 1];
     const BigSplats shared = {count, width, height, big, big_bounds};
     const Band no_pairs = {0, 0, INT_MAX, 0, 0};
-    list_big_splats(&shared, get_group_id(0), get_num_groups(0), min(tallies[TALLY_BIG], big_capacity), &no_pairs, tallies + TALLIES, 0, deferred);
+    list_big_splats(&shared, get_group_id(0), get_num_groups(0), min(counters[COUNTER_BIG], big_capacity), &no_pairs, counters + COUNTERS, 0, deferred);
 }
 
 // Writes the (splat, key) pairs of all tiles of a band.
@@ -260,7 +260,7 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
 
 // Sorts each tile's list by (depth key, splat); all keys differ.
 // Index space: work-groups of SORT_ITEMS, one per tile of the band.
-// Reads: starts. Consumes: pairs. Writes: lists; tallies, zeroed for the next frame if `clear`.
+// Reads: starts. Consumes: pairs. Writes: lists; counters, zeroed for the next frame if `clear`.
 //
 // A list is bucket-sorted by depth if its pairs, or their indices within the list, fit local memory. Longer and short lists, and those
 // with an overfull bucket, go through a bitonic network; every comparator moves the smaller key to the front, as if the list were
@@ -400,8 +400,8 @@ kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
     uint start = starts[tile] - starts[band_first], length = starts[tile + 1] - starts[tile];
     global ulong *list = pairs + start;
     if (clear && item == 0) {
-        tallies[TALLIES + tile] = 0;
-        if (tile == 0) tallies[TALLY_BIG] = 0;
+        counters[COUNTERS + tile] = 0;
+        if (tile == 0) counters[COUNTER_BIG] = 0;
     }
     if (length > SHORT && length <= SORT_INDEXED && bucket_sort(list, length, items, &buckets, lists + start)) return;
     uint padded = 1;

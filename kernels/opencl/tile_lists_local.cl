@@ -64,29 +64,29 @@ static inline void count_pairs(const Share *share, const Area *area, global cons
 }
 
 // Index space: for each view a work-group for every GROUP_SPLATS splats.
-// Reads: windows, keys. Adds to: tallies.
-kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tally_local(
-//@@ arguments tally_local
+// Reads: windows, keys. Adds to: counters.
+kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void count_local(
+//@@ arguments count_local
 ) {
     local uint pair_counts[LOCAL_TILES];
     local int extents[4];
     const Share share = share_of(count);
     int tiles = tiles_of(width, height), tiles_x = (width + TILE_W - 1) / TILE_W;
-    tallies += TALLIES + get_group_id(1) * (uint)tiles;
+    counters += COUNTERS + get_group_id(1) * (uint)tiles;
     const Area area = area_of(&share, tiles, tiles_x, windows, keys, extents);
     if (area.tiles > LOCAL_TILES) {      // too many tiles for local memory
         for (uint splat = share.first + get_local_id(0); splat < share.end; splat += SCAN_ITEMS) {
             if (keys[splat] == CULLED) continue;
-            for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1) atomic_inc(tallies + window_tile(window, tiles_x));
+            for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1) atomic_inc(counters + window_tile(window, tiles_x));
         }
         return;
     }
     count_pairs(&share, &area, windows, keys, pair_counts);
     for (int place = get_local_id(0); place < area.tiles; place += SCAN_ITEMS)
-        if (pair_counts[place] != 0) atomic_add(tallies + area_tile(&area, place, tiles_x), pair_counts[place]);
+        if (pair_counts[place] != 0) atomic_add(counters + area_tile(&area, place, tiles_x), pair_counts[place]);
 }
 
-// Index space: as tally_local.
+// Index space: as count_local.
 // Reads: windows, keys, starts. Consumes: cursors of the band. Writes: pairs; adds to counts' number of visible splats.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
 //@@ arguments emit_local

@@ -183,7 +183,7 @@ TAKEN = {
         "emit": (17, 8, 18708),
         "project": (14, 12, 0),
         "sort_tiles": (6, 4, 20556),
-        "tally_big": (7, 3, 272),
+        "count_big": (7, 3, 272),
         "tile_starts": (7, 5, 12288),
     },
 }

@@ -12,8 +12,8 @@ from agreement import random_splats
 from combined import LENSES, combination, everything
 
 import fidsplat as fs
-from fidsplat.backends.opencl.assemble import Source, assemble, layouts_of
-from fidsplat.backends.opencl.declare import Layout, Samples, member, uniforms
+from fidsplat.backends.opencl.assemble import KernelSource, assemble, layouts_of
+from fidsplat.backends.opencl.declare import Layout, SampleBuffer, member, uniforms
 from fidsplat.backends.opencl.effect_layouts import LAYOUTS
 from fidsplat.backends.opencl.program import build
 from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
@@ -32,7 +32,7 @@ SETS = {
 }
 
 
-def offsets_on(backend, source: Source) -> dict[str, dict[str, int]]:
+def offsets_on(backend, source: KernelSource) -> dict[str, dict[str, int]]:
     """Offsets on the device by record and field, and under "" the size of the record."""
     structs = re.findall(
         r"typedef struct[^{]*\{[^}]*\} (?:View|Splat|Bounds);", source.programs["frame"].compiled
@@ -160,7 +160,9 @@ def toys(monkeypatch, tmp_path):
     monkeypatch.setitem(OUTPUTS, "nearest", output)
     monkeypatch.setitem(CATALOGUE, "negative", Effect("negative"))
     nearest = Layout(
-        str(tmp_path / "nearest.cl"), parts=("ray_depth",), samples=(Samples("float", "nearest_raw"),)
+        str(tmp_path / "nearest.cl"),
+        parts=("ray_depth",),
+        sample_buffers=(SampleBuffer("float", "nearest_raw"),),
     )
     monkeypatch.setitem(LAYOUTS, "nearest", nearest)
     negative = Layout(str(tmp_path / "negative.cl"), resolve=uniforms("negative", "float white"))

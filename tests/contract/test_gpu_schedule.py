@@ -101,7 +101,7 @@ def draw_with_guarded_rays():
         assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(guard), mmap.PAGESIZE, nobody) == 0
         return wp.array(ptr=guard - length, dtype=dtype, shape=(size,), device="cpu")
 
-    backend.pool.fresh = before_a_guard
+    backend.pool.allocate = before_a_guard
     image = PICTURES["distortion"]()
     features, view = prepare(image.cloud, image.capture)
     pipeline = backend.pipeline(features, backend.shapes("schedule")["groups"])

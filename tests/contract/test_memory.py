@@ -279,11 +279,9 @@ def test_a_plan_counts_all_memory_of_a_frame(opencl, monkeypatch, machine, mebib
     """Everything that is new on the device, the cloud and a lens's rays included."""
     own = machine(opencl, mebibytes * 2**20)
     pool, taken, planned = own.backend.pool, [], []
-    fresh, release_others = pool.fresh, pool.release_others
-    monkeypatch.setattr(pool, "fresh", lambda what, size: taken.append((what, size)) or fresh(what, size))
-    monkeypatch.setattr(
-        pool, "release_others", lambda kind, *way: planned.append(way[0]) or release_others(kind, *way)
-    )
+    fresh, trim = pool.allocate, pool.trim
+    monkeypatch.setattr(pool, "allocate", lambda what, size: taken.append((what, size)) or fresh(what, size))
+    monkeypatch.setattr(pool, "trim", lambda kind, *way: planned.append(way[0]) or trim(kind, *way))
     some = random_splats(60000, seed=3, depth=(1.0, 6.0), scale=(1e-3, 1e-2), sh_degree=1)
     some = some.with_boxes(np.arange(60000) < 30000) if name == "boxes before a lens" else some
     quality = fs.Quality(alpha_cutoff=1 / 255)
@@ -361,16 +359,16 @@ def test_neither_frames_nor_kernels_keep_a_cloud(opencl):
 
 def test_a_leased_buffer_has_the_size_that_was_requested(opencl):
     pool = fs.Renderer(opencl.device.name).backend.pool
-    pool.give_back([("plane", pool.fresh("plane", 64)), ("plane", pool.fresh("plane", 64))])
-    assert pool.lease("plane", 4096).size == 4096
-    kept = pool.fresh("plane", 4096)
-    pool.give_back([("plane", kept)])
-    assert pool.lease("plane", 4096) is kept
+    pool.release([("plane", pool.allocate("plane", 64)), ("plane", pool.allocate("plane", 64))])
+    assert pool.acquire("plane", 4096).size == 4096
+    kept = pool.allocate("plane", 4096)
+    pool.release([("plane", kept)])
+    assert pool.acquire("plane", 4096) is kept
 
 
 def test_an_image_that_cannot_be_read_is_an_error_of_the_device(opencl):
     frame = opencl.render(random_splats(10, seed=8), CAMERA)
-    frame._images._rendered[0].leased["rgb_out"] = opencl.backend.pool.fresh("too small", 16)
+    frame._images._rendered[0].acquired["rgb_out"] = opencl.backend.pool.allocate("too small", 16)
     with pytest.raises(fs.DeviceError, match="failed while rendering rgb"):
         frame["rgb"]
 

@@ -82,7 +82,7 @@ def test_lenses_that_come_and_go_leave_no_rays_on_the_device(opencl):
     for k in range(10):
         machine.render(resident, fs.Camera.fisheye(40, 30, 2.0 + 0.1 * k)).wait()
     gc.collect()
-    assert len(machine.backend.ray_buffers._held) <= 5
+    assert len(machine.backend.ray_buffers._buffers) <= 5
 
 
 class Lost:

@@ -61,7 +61,7 @@ def test_a_frame_is_replayed_for_each_view(opencl):
 
 
 def test_counts_of_another_kind_of_frame_are_ignored(opencl):
-    """One that is rendered for the first time, into buffers that are there, leaves its tallies to whom comes
+    """One that is rendered for the first time, into buffers that are there, leaves its counters to whom comes
     next: an image that is launched again."""
     machine = as_on_a_gpu(opencl)
     resident = machine.upload(random_splats(300, seed=4))

@@ -82,7 +82,7 @@ def set_all(self, values):
     """Set every argument, whatever it was."""
     self._named = {}
     for command in self._commands:
-        command._marks = [object()] * len(command._marks)
+        command._bound = [object()] * len(command._bound)
     set_changed(self, values)
 
 
@@ -186,7 +186,7 @@ def test_a_failed_densification_keeps_the_checkpoint(renderer, dataset, tmp_path
     file, pool = tmp_path / "run.training.npz", renderer.backend.pool
     whole = Trainer(dataset, renderer, **settings)
     whole.run()
-    trainer, fresh, requested = Trainer(dataset, renderer, checkpoint=file, **settings), pool.fresh, []
+    trainer, fresh, requested = Trainer(dataset, renderer, checkpoint=file, **settings), pool.allocate, []
     for _ in range(15):
         trainer.step()
     trainer.save_checkpoint()
@@ -199,7 +199,7 @@ def test_a_failed_densification_keeps_the_checkpoint(renderer, dataset, tmp_path
         return fresh(name, size)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pool, "fresh", full)
+        patch.setattr(pool, "allocate", full)
         with pytest.raises(fs.DeviceError, match="no memory"):
             trainer.run()
     for after in (trainer.step, trainer.run, trainer.cloud, trainer.save_checkpoint):

@@ -62,7 +62,7 @@ def test_a_buffer_above_the_device_limit_is_an_error_with_a_remedy(renderer):
     backend = opencl(renderer)
     limit = renderer.device.largest_allocation_bytes
     with pytest.raises(fs.DeviceError, match=r"lists must be at most .* use fewer splats or a smaller frame"):
-        backend.pool.fresh("lists", limit + 1)
+        backend.pool.allocate("lists", limit + 1)
 
 
 def test_all_buffers_are_poisoned(renderer):

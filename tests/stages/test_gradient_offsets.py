@@ -32,5 +32,5 @@ def test_splats_have_an_offset_for_each_tile_that_lists_them(renderer):
             images = pipeline.forward(backend.upload(cloud), view)
             pipeline.backward(images, {"rgb": np.ones((side, side, 3), np.float32)})
             frame, words = images.frame, np.empty(1, np.uint32)
-            cl.enqueue_copy(frame.queue, words, frame.pool.known("reserved"))
+            cl.enqueue_copy(frame.queue, words, frame.pool.get("reserved"))
             assert words[0] == frame.count_pairs() > 32, (shape, len(cloud))

@@ -110,13 +110,13 @@ def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
         assert images.stats == expected.stats
         assert np.array_equal(images.read("rgb"), expected.read("rgb"))
     # in bands each time; else twice, then replayed
-    assert launched.count("tally_local") == (3 if budget else 2)
+    assert launched.count("count_local") == (3 if budget else 2)
     moved = replace(capture, camera=fs.Camera.look_at(641, 549, 1.0, (0.3, 0.0, 0.0), (0.0, 0.0, 3.0)))
     batch_images = pipeline.render(resident, prepare_batch(cloud, views_of([moved, capture]))[1])
     other = pipeline.render_view(backend.upload(cloud), prepare(cloud, moved)[1])
     for images, own in zip(batch_images.read("rgb"), (other, expected), strict=True):
         assert np.array_equal(images, own.read("rgb", 0))
-    assert launched.count("tally_local") > (3 if budget else 2)
+    assert launched.count("count_local") > (3 if budget else 2)
 
 
 def test_splats_culled_before_projection(backend, monkeypatch):

@@ -27,7 +27,7 @@ def test_large_buffers_are_the_devices_own(monkeypatch):
     requested = []
     monkeypatch.setattr(buffers, "large_pages", lambda address, size: requested.append((address, size)))
     pool = fs.Renderer("opencl:cpu").backend.pool
-    small, large = pool.fresh("small", 1 << 12), pool.fresh("large", (1 << 22) + 20)
+    small, large = pool.allocate("small", 1 << 12), pool.allocate("large", (1 << 22) + 20)
     for buffer in (small, large):
         assert not buffer.flags & cl.mem_flags.USE_HOST_PTR
     assert [size for _, size in requested] == [large.size]
@@ -48,7 +48,7 @@ def growth_in_large_pages(size):
     """Bytes in large pages that a new buffer of that size adds to the process."""
     backend = fs.Renderer("opencl:cpu").backend
     queue, before = cl.CommandQueue(backend.context), in_large_pages()
-    buffer = backend.pool.fresh("large", size)
+    buffer = backend.pool.allocate("large", size)
     cl.enqueue_fill_buffer(queue, buffer, np.zeros(1, np.uint32), 0, size).wait()
     return in_large_pages() - before
 

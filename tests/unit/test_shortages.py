@@ -70,7 +70,7 @@ pool = fs.Renderer("opencl:pocl").backend.pool
 held = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (held + 2**28, resource.getrlimit(resource.RLIMIT_AS)[1]))
 try:
-    buffers = [pool.fresh("a buffer", 2**26) for _ in range(9)]
+    buffers = [pool.allocate("a buffer", 2**26) for _ in range(9)]
 except fs.DeviceError as error:
     print(error)
 """

@@ -59,7 +59,7 @@ def test_cache_content_survives_a_failed_growth(stores, monkeypatch):
     resident = renderer.upload(store)
     renderer.render(resident, look())
     cache, pool, requested = resident.data._cache, renderer.backend.pool, []
-    fresh = pool.fresh
+    fresh = pool.allocate
 
     def full(name, size):
         requested.append(name)
@@ -78,7 +78,7 @@ def test_cache_content_survives_a_failed_growth(stores, monkeypatch):
     cl.enqueue_barrier(cache._queue, wait_for=[held])
     threading.Timer(0.2, held.set_status, [cl.command_execution_status.COMPLETE]).start()
     with monkeypatch.context() as patch:
-        patch.setattr(pool, "fresh", full)
+        patch.setattr(pool, "allocate", full)
         with pytest.raises(fs.DeviceError, match="no memory"):
             cache._grow(2 * cache._size)
     assert sum(buffer is not before[name] for name, buffer in cache._arrays.items()) == 1
@@ -196,13 +196,13 @@ def test_frames_and_cached_chunks_keep_the_budget(stores, monkeypatch):
 def test_smaller_frames_reuse_buffers():
     pool = fs.Renderer("opencl").backend.pool
     pool.clear()
-    pool.release_others("stores", 1 << 30, 100)
+    pool.trim("stores", 1 << 30, 100)
     for splats, kept in ((90, True), (100, True), (101, False)):
         pool.scratch("records", 1 << 20)
-        pool.release_others("stores", 0, splats)
+        pool.trim("stores", 0, splats)
         assert bool(pool.memory_bytes) == kept
     pool.scratch("records", 1 << 20)
-    pool.release_others("others", 0, 1)
+    pool.trim("others", 0, 1)
     assert not pool.memory_bytes
 
 

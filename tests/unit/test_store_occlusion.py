@@ -176,8 +176,8 @@ def test_missing_chunks_are_rendered_in_their_tiles(town, culling, monkeypatch, 
 def test_views_of_similar_size_reuse_memory(town, culling, monkeypatch):
     renderer, fresh = fs.Renderer("opencl"), []
     pool, resident = renderer.backend.pool, renderer.upload(town)
-    make, counts = pool.fresh, []
-    monkeypatch.setattr(pool, "fresh", lambda name, size: fresh.append(name) or make(name, size))
+    make, counts = pool.allocate, []
+    monkeypatch.setattr(pool, "allocate", lambda name, size: fresh.append(name) or make(name, size))
     for turn, along in ((0.0, 0.0), (0.02, 0.05), (0.06, 0.15), (0.06, 0.2)):
         before = len(fresh)
         frame = renderer.render(resident, view(turn, along))

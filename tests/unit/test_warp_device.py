@@ -399,4 +399,4 @@ def test_an_array_that_the_device_cannot_give_is_an_error_with_a_remedy(renderer
     with pytest.raises(
         fs.DeviceError, match=r"lists must fit the memory of \S+, got \d+ MiB; use fewer splats"
     ):
-        renderer.backend.pool.fresh("lists", size, wp.int32)
+        renderer.backend.pool.allocate("lists", size, wp.int32)

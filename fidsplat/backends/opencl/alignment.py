@@ -44,7 +44,7 @@ class OpenCLAlignment(AlignmentKernels):
             self._stages = []
             counted = self._scratch("textures", 4 * BINS * len(stages))
             cl.enqueue_fill_buffer(self._queue, counted, np.zeros(1, np.uint32), 0, 4 * BINS * len(stages))
-            source = complete = self._put("image", image), image.shape
+            source = complete = self._upload("image", image), image.shape
             for number, stage in reversed([*enumerate(stages)]):  # each level from the next finer one
                 given, source = self._prepared(number, stage, source, complete, counted)
                 self._stages.insert(0, given)
@@ -77,11 +77,11 @@ class OpenCLAlignment(AlignmentKernels):
         }
         if camera.lens is not None:
             raster = raster_of(camera.lens, width, height, camera.fx, camera.fy, camera.cx, camera.cy)
-            given["rays"] = self._put(f"rays {number}", raster.rays)
+            given["rays"] = self._upload(f"rays {number}", raster.rays)
         if stage.ignored is not None:
-            given["mask"] = self._put(f"mask {number}", stage.ignored.astype(np.uint8))
+            given["mask"] = self._upload(f"mask {number}", stage.ignored.astype(np.uint8))
         if given["radius"]:
-            given["taps"] = self._put(f"taps {number}", stage.taps)
+            given["taps"] = self._upload(f"taps {number}", stage.taps)
         made = finer
         if (width, height) != (full_width, full_height):
             made = self._scratch(f"image {number}", channels * size)
@@ -155,10 +155,10 @@ class OpenCLAlignment(AlignmentKernels):
     def _scratch(self, name: str, size: int) -> cl.Buffer:
         return self._workspace.pool.scratch(f"alignment: {name}", size)
 
-    def _put(self, name: str, array: np.ndarray) -> cl.Buffer:
+    def _upload(self, name: str, array: np.ndarray) -> cl.Buffer:
         """Copy an array to the device, a read-only array only once."""
         name, array = f"alignment: {name}", np.ascontiguousarray(array)
-        buffer, event = self._workspace.pool.put(self._queue, name, array)
+        buffer, event = self._workspace.pool.upload(self._queue, name, array)
         if event is not None:
             event.wait()
         return buffer

@@ -26,7 +26,7 @@ from fidsplat.backends.opencl.declare import (
     Layout,
     Member,
     Record,
-    Samples,
+    SampleBuffer,
     Scalars,
     output_argument,
 )
@@ -84,7 +84,15 @@ _WIDE = re.compile(r"wide(?<=\bwide)\b")
 _EFFECT_ARGUMENTS = {
     **{
         name: name
-        for name in ("project", "emit", "blend", "backdrop", "resolve", "project_backward", "project_step")
+        for name in (
+            "project",
+            "emit",
+            "blend",
+            "composite_background",
+            "resolve",
+            "project_backward",
+            "project_step",
+        )
     },
     **{"blend_checkpoints": "blend_backward", "blend_backward": "blend_backward", "find_unculled": "project"},
 }
@@ -92,22 +100,24 @@ _EFFECT_ARGUMENTS = {
 
 
 @dataclass(frozen=True)
-class Text:
+class ProgramText:
+    """OpenCL C of a program."""
+
     listing: str
-    """text with comments"""
+    """with comments"""
     compiled: str
-    """text without comments, with the same line numbers"""
+    """without comments, with the same line numbers"""
 
 
 @dataclass
-class Source:
+class KernelSource:
     """Flat kernel sources with their declarations for the host."""
 
-    programs: dict[str, Text]
+    programs: dict[str, ProgramText]
     records: dict[str, np.dtype]
     """structs of the texts, as NumPy types"""
     arguments: dict[str, tuple[Argument, ...]]
-    samples: tuple[Samples, ...]
+    sample_buffers: tuple[SampleBuffer, ...]
     """sample buffers of the effects"""
     scalars: Scalars
 
@@ -134,17 +144,18 @@ class Source:
         self.cloud_arrays: list[str] = []
         """names of the arrays of the cloud that the projection reads"""
         for kernel, arguments in self.arguments.items():
-            for one in arguments:
-                if one.source == "uniform":
-                    self.uniform_groups.setdefault(one.uniform[0], {})[one.uniform[1]] = one.name
-                elif one.source == "array":
-                    self.view_arrays.add(one.name)
-                elif one.source == "cloud" and kernel == "project":
-                    self.cloud_arrays.append(one.name)
+            for argument in arguments:
+                if argument.source == "uniform":
+                    group, index = argument.uniform
+                    self.uniform_groups.setdefault(group, {})[index] = argument.name
+                elif argument.source == "array":
+                    self.view_arrays.add(argument.name)
+                elif argument.source == "cloud" and kernel == "project":
+                    self.cloud_arrays.append(argument.name)
 
-    def takes(self, kernel: str, argument: str) -> bool:
+    def has_argument(self, kernel: str, argument: str) -> bool:
         """Whether a kernel has an argument of this name."""
-        return any(one.name == argument for one in self.arguments.get(kernel, ()))
+        return any(declared.name == argument for declared in self.arguments.get(kernel, ()))
 
 
 def layouts_of(features: FeatureSet) -> dict[str, Layout]:
@@ -153,19 +164,19 @@ def layouts_of(features: FeatureSet) -> dict[str, Layout]:
     for name in EXTENSIONS.keys() & {*chosen} - LAYOUTS.keys():
         LAYOUTS[name] = extension_layout(EXTENSIONS[name])
     parts: set[str] = set()
-    todo = chosen.copy()
-    while todo:
-        needed = list(LAYOUTS[todo.pop()].parts)
+    pending = chosen.copy()
+    while pending:
+        needed = list(LAYOUTS[pending.pop()].parts)
         for effect in chosen:
             for k, part in enumerate(needed):
-                needed[k] = dict(LAYOUTS[part].behind).get(effect, part)
-        todo += set(needed) - parts
+                needed[k] = dict(LAYOUTS[part].replaced_by).get(effect, part)
+        pending += set(needed) - parts
         parts.update(needed)
     names = (*features.effects, *sorted(parts), *features.outputs, *features.post_steps)
     return {name: LAYOUTS[name] for name in names}
 
 
-def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
+def assemble(features: FeatureSet, shape: DeviceShape) -> KernelSource:
     """Assemble the source of a feature set. Raises DeviceError if a file fills an unknown hook."""
     layouts = layouts_of(features)
     # blend and resolve are fused if a pixel has one sample and one pose, and no other pass adds to it
@@ -183,7 +194,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         files.append("part/resolve_fused.cl")
     if shape.lists == "tiled":
         files.append("list/tiled.cl")
-    # other cameras have no bounds by tile
+    # bounds of the depth in a tile exist for the pinhole only
     keys_by_tile = {"compose_pixel", "camera_pinhole"} <= layouts.keys() and shape.lists != "ordered"
     if keys_by_tile:
         layouts["tile_keys"] = LAYOUTS["tile_keys"]
@@ -196,9 +207,9 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         files += ["part/passes.cl", f"part/passes_{shape.schedule}.cl"]
         files.append("part/blocks_nearest.cl" if shape.schedule == "lanes" else "part/tile_nearest.cl")
     if "termination_depths" in layouts:  # after all passes through a list
-        way = "_pixel" if "compose_pixel" in layouts else ""
-        files += ["part/termination_depth_pixel.cl"] if way else []
-        files.append(f"part/termination_depth{way}_{shape.schedule}.cl")
+        order = "_pixel" if "compose_pixel" in layouts else ""
+        files += ["part/termination_depth_pixel.cl"] if order else []
+        files.append(f"part/termination_depth{order}_{shape.schedule}.cl")
     if "external_depth" in layouts:  # after all passes
         files.append("part/external_depth_end.cl")
     stages = {
@@ -231,11 +242,11 @@ def culls_before_projection(features: FeatureSet) -> bool:
     return bool(_frustum_parts(layouts_of(features)))
 
 
-def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
+def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> KernelSource:
     return _assemble_backward("gradients", _GRADIENTS, features, shape)
 
 
-def assemble_step(features: FeatureSet, shape: DeviceShape, camera: bool = False) -> Source:
+def assemble_step(features: FeatureSet, shape: DeviceShape, camera: bool = False) -> KernelSource:
     """Assemble a training step: the last stage of the backward pass, fused with Adam. camera: also sum the
     gradient with respect to the camera."""
     return _assemble_backward("step", _STEP, features, shape, ("step_camera",) if camera else ())
@@ -243,7 +254,7 @@ def assemble_step(features: FeatureSet, shape: DeviceShape, camera: bool = False
 
 def _assemble_backward(
     name: str, stages: Sequence[str], features: FeatureSet, shape: DeviceShape, parts: Sequence[str] = ()
-) -> Source:
+) -> KernelSource:
     layouts = layouts_of(features) | {part: LAYOUTS[part] for part in parts}
     # the backward pass needs the forward text of effects, but only the derivatives of outputs
     files = [layout.file for layout in layouts_of(replace(features, outputs=(), post_steps=())).values()]
@@ -264,8 +275,11 @@ def _dialect(shape: DeviceShape, scalars: Scalars, effects: Iterable[str] = ()) 
     effects."""
     if not shape.dialect or scalars.wide != "float":
         return []
-    own = {"arithmetic_approximate": "_exp", "blend_half": "_half"}
-    return [f"dialect/{shape.dialect}{suffix}.cl" for suffix in ("", *(own[n] for n in effects if n in own))]
+    suffixes = {"arithmetic_approximate": "_exp", "blend_half": "_half"}
+    return [
+        f"dialect/{shape.dialect}{suffix}.cl"
+        for suffix in ("", *(suffixes[n] for n in effects if n in suffixes))
+    ]
 
 
 def kernels_of(shape: DeviceShape) -> Mapping[str, tuple[Argument, ...]]:
@@ -275,7 +289,7 @@ def kernels_of(shape: DeviceShape) -> Mapping[str, tuple[Argument, ...]]:
 
 
 @cache
-def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> Source:
+def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> KernelSource:
     """Assemble the kernels of loss, regularisation and optimiser, for vectors of `lanes` floats."""
     files = ("loss_values", "loss" if lanes == 1 else "loss_strips", *_TRAINING)
     numbers = {"LANES": lanes, "FAST_FMA": int(fast_fma and lanes > 1), "SETUP_FP64": int(float64)}
@@ -285,7 +299,7 @@ def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> Source:
 
 
 @cache
-def assemble_alignment(items: int) -> Source:
+def assemble_alignment(items: int) -> KernelSource:
     """Assemble the kernels of direct image alignment, for work-groups of `items` work-items."""
     numbers: dict[str, int | str] = {"ITEMS": items, "LOWEST": alignment.LOWEST}
     for name in ("HUBER", "TUKEY", "MIN_NOISE", "MAX_NOISE"):
@@ -357,19 +371,19 @@ class Assembler:
         self._used: dict[str, list[str]] = {"struct": [], "arguments": [], "passed": []}
         """names of the structs and kernels of the texts"""
 
-    def source(self, programs: Mapping[str, Iterable[str]]) -> Source:
+    def source(self, programs: Mapping[str, Iterable[str]]) -> KernelSource:
         """Assemble programs from their stages, by the names of the programs."""
         declared = self._declared
         texts = {name: self._program(name, stages) for name, stages in programs.items()}
         records = {name: declared.structs[name].dtype(declared.scalars) for name in self._used["struct"]}
         arguments = {kernel: declared.arguments(kernel) for kernel in self._used["arguments"]}
-        return Source(texts, records, arguments, declared.samples, declared.scalars)
+        return KernelSource(texts, records, arguments, declared.sample_buffers, declared.scalars)
 
-    def _program(self, name: str, stages: Iterable[str]) -> Text:
+    def _program(self, name: str, stages: Iterable[str]) -> ProgramText:
         body = ""
         for stage in stages:
             file = f"{stage}.cl"
-            body += f"#line 1 {_shown(file)}\n{self._expand(file, 1, lines_of(file))}"
+            body += f"#line 1 {_line_file(file)}\n{self._expand(file, 1, lines_of(file))}"
         body = with_packed(with_constants(body, self._declared.constants), self._declared.packed)
         body = with_scalars(body, self._declared.scalars.wide)
         bare = _COMMENT.sub("", body)
@@ -377,7 +391,7 @@ class Assembler:
         for number, value in sorted(self._defines.items()):
             if number in bare:  # an unused number must not change the text
                 head += f"#define {number} {value}\n"
-        return Text(f"// the program `{name}`\n{head}{body}", f"\n{head}{bare}")
+        return ProgramText(f"// the program `{name}`\n{head}{body}", f"\n{head}{bare}")
 
     def _fill(self, hook: str, subject: str) -> Iterator[str]:
         if hook in self._used:
@@ -385,18 +399,18 @@ class Assembler:
             yield f'#line 1 "layout.py: {subject}"\n{self._declared.text(hook, subject)}'
         for file, by_hook in self._sections.items():
             for first, lines in by_hook.get(hook, ()):
-                yield f"#line {first} {_shown(file)}\n{self._expand(file, first, lines)}"
+                yield f"#line {first} {_line_file(file)}\n{self._expand(file, first, lines)}"
 
     def _expand(self, file: str, first: int, lines: tuple[str, ...]) -> str:
-        made = []
+        expanded = []
         for number, line in enumerate(lines, first):
             hook = _HOOK.fullmatch(line) if "//@@" in line else None
             if hook is None:
-                made.append(line)
+                expanded.append(line)
                 continue
             filled = "".join(self._fill(hook[1], hook[2] or ""))
-            made.append(f"{filled}#line {number + 1} {_shown(file)}" if filled else "")
-        return "\n".join(made) + "\n"
+            expanded.append(f"{filled}#line {number + 1} {_line_file(file)}" if filled else "")
+        return "\n".join(expanded) + "\n"
 
 
 class Declarations:
@@ -412,7 +426,7 @@ class Declarations:
     ) -> None:
         """fused: whether the blend kernel also resolves, with the arguments of both."""
         self.scalars = scalars
-        self.samples: tuple[Samples, ...] = ()
+        self.sample_buffers: tuple[SampleBuffer, ...] = ()
         self.constants: dict[str, str] = {}
         """fields of `Splat` that all splats share, and their values"""
         self.packed: dict[str, str] = {}
@@ -421,54 +435,55 @@ class Declarations:
         self._outputs, self._fused, self._kernels = outputs, fused, kernels
         view, splat, bounds, moments = VIEW, SPLAT, BOUNDS, MOMENTS
         for layout in self._layouts:
-            self.samples += layout.samples
+            self.sample_buffers += layout.sample_buffers
             self.constants |= dict(layout.constant)
             self.packed |= dict(layout.packed)
             view, splat = view.with_members(layout.view), splat.with_members(layout.splat)
             bounds, moments = bounds.with_members(layout.bounds), moments.with_members(layout.moments)
         # as many padding fields as in `Moments`
         alignment = moments.alignment // 4 * scalars.dtype("real").itemsize
-        fields = tuple(chain.from_iterable(one.names for one in moments.members))
+        fields = tuple(chain.from_iterable(member.names for member in moments.members))
         totals = Record("Totals", (Member("real", fields, "of all tiles"),), alignment)
         records = view, splat.without({**self.constants, **self.packed}), bounds, moments, totals
         self.structs = {record.name: record for record in records}
 
     def arguments(self, kernel: str) -> tuple[Argument, ...]:
         """A kernel's own arguments, then those of the effects in their order, each name once."""
-        found = {one.name: one for one in self._kernels[kernel]}
+        merged = {argument.name: argument for argument in self._kernels[kernel]}
         if field := _EFFECT_ARGUMENTS.get(kernel):
             for layout in self._layouts:
-                for one in getattr(layout, field):
-                    found[one.name] = one
+                for argument in getattr(layout, field):
+                    merged[argument.name] = argument
         if kernel in ("blend", "resolve"):
             access = "out" if kernel == "blend" else "in"
-            for one in self.samples:
-                found[one.name] = Argument(one.ctype, one.name, access, note=one.note)
+            for samples in self.sample_buffers:
+                merged[samples.name] = Argument(samples.ctype, samples.name, access, note=samples.note)
         if kernel == "resolve":
             for output in self._outputs:
-                found[f"{output.name}_out"] = output_argument(output)
+                merged[f"{output.name}_out"] = output_argument(output)
         if kernel == "blend" and self._fused:
-            for one in self.arguments("resolve"):
-                if one.name != "stride":
-                    found.setdefault(one.name, one)
-        return tuple(found.values())
+            for argument in self.arguments("resolve"):
+                if argument.name != "stride":
+                    merged.setdefault(argument.name, argument)
+        return tuple(merged.values())
 
     def text(self, hook: str, subject: str) -> str:
         """C for `//@@ struct NAME`, `//@@ arguments KERNEL` or `//@@ passed KERNEL`."""
         if hook == "struct":
             return self.structs[subject].text(self.scalars)
         text, arguments = "", self.arguments(subject)
-        for one in arguments:
-            comma = "," if one is not arguments[-1] else ""
+        for argument in arguments:
+            comma = "," if argument is not arguments[-1] else ""
             if hook == "passed":
-                text += f"        {one.name}{comma}\n"
+                text += f"        {argument.name}{comma}\n"
             else:
-                text += f"    {one.text}{comma}{f'  // {one.note}' if one.note else ''}\n"
+                note = f"  // {argument.note}" if argument.note else ""
+                text += f"    {argument.text}{comma}{note}\n"
         return text
 
 
 @cache
-def _shown(file: str) -> str:
+def _line_file(file: str) -> str:
     """The file name for `#line`: the path below kernels/, or the plain name of another file."""
     return f'"{Path(file).name}"' if Path(file).is_absolute() else f'"opencl/{file}"'
 
@@ -500,10 +515,10 @@ def with_packed(text: str, packed: Mapping[str, str]) -> str:
 def _refuse_unknown_hooks(files: list[str]) -> None:
     """Raise DeviceError if a file fills a hook that neither a stage nor an effect has."""
     stages = [stage.format(schedule) for stage in _FRAME for schedule in ("lanes", "group")]
-    everywhere = {f"{stage}.cl" for stage in chain(stages, *_LISTS.values())}
-    everywhere |= {layout.file for layout in LAYOUTS.values() if layout.file}
-    everywhere |= {f"part/{path.name}" for path in (kernels_folder() / "opencl/part").glob("*.cl")}
-    known = set(chain.from_iterable(map(_hooks, everywhere)))
+    hook_files = {f"{stage}.cl" for stage in chain(stages, *_LISTS.values())}
+    hook_files |= {layout.file for layout in LAYOUTS.values() if layout.file}
+    hook_files |= {f"part/{path.name}" for path in (kernels_folder() / "opencl/part").glob("*.cl")}
+    known = set(chain.from_iterable(map(_hooks, hook_files)))
     for file in files:
         if unknown := set(sections_of(file)) - known:
             raise DeviceError(

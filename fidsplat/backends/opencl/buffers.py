@@ -40,7 +40,7 @@ class BufferPool:
     def __init__(self, context: cl.Context, device: cl.Device) -> None:
         self._context = context
         self._device = device
-        self._is_host = bool(device.type & cl.device_type.CPU) and bool(device.host_unified_memory)
+        self._is_host_memory = bool(device.type & cl.device_type.CPU) and bool(device.host_unified_memory)
         """whether the device shares the host's memory"""
         self._buffers: dict[str, cl.Buffer] = {}
         self._arrays: dict[str, Array] = {}
@@ -56,22 +56,22 @@ class BufferPool:
         """Bytes of the scratch buffer of that name; 0 if there is none."""
         return self._buffers[name].size if name in self._buffers else 0
 
-    def known(self, name: str) -> cl.Buffer | None:
+    def get(self, name: str) -> cl.Buffer | None:
         """The scratch buffer of that name; None if there is none."""
         return self._buffers.get(name)
 
-    def lease(self, name: str, size: int, larger: bool = False) -> cl.Buffer:
-        """A buffer that belongs to the caller until `give_back`. larger: whether it may have more bytes."""
+    def acquire(self, name: str, size: int, larger: bool = False) -> cl.Buffer:
+        """A buffer that belongs to the caller until `release`. larger: whether it may have more bytes."""
         # remove the buffer before the check: the garbage collector may give back other buffers at any time
         spare = self._spare.get(name, [])
         while spare:
             buffer = spare.pop()
             if buffer.size == max(size, _MINIMUM) or (larger and buffer.size > size):
                 return buffer  # any other buffer belonged to frames of another size, and is released
-        return self.fresh(name, size)
+        return self.allocate(name, size)
 
-    def give_back(self, buffers: Iterable[tuple[str, cl.Buffer]]) -> None:
-        """Return leased buffers; one or two of each name are reused for frames of the same size."""
+    def release(self, buffers: Iterable[tuple[str, cl.Buffer]]) -> None:
+        """Return acquired buffers; one or two of each name are reused for frames of the same size."""
         for name, buffer in buffers:
             spare = self._spare.setdefault(name, [])
             if not spare or (len(spare) == 1 and spare[0].size == buffer.size):
@@ -86,9 +86,9 @@ class BufferPool:
                 size += buffer.size
         return size
 
-    def release_others(self, key: Hashable, size: int, splats: int = 0) -> None:
-        """Release all buffers before a frame if they belong to frames with another key and exceed `size`
-        bytes. Frames with the same key have buffers of equal size, or smaller buffers for fewer splats."""
+    def trim(self, key: Hashable, size: int, splats: int = 0) -> None:
+        """Release all buffers if the last frames had another key and the buffers exceed `size` bytes. Frames
+        with the same key have buffers of equal size, or smaller buffers for fewer splats."""
         if key == self._key and splats <= self._splats:
             return
         if self.memory_bytes > size:
@@ -108,7 +108,9 @@ class BufferPool:
         self._zeroed.clear()
         self.state = object()
 
-    def put(self, queue: cl.CommandQueue, name: str, array: np.ndarray) -> tuple[cl.Buffer, cl.Event | None]:
+    def upload(
+        self, queue: cl.CommandQueue, name: str, array: np.ndarray
+    ) -> tuple[cl.Buffer, cl.Event | None]:
         """Copy an array to a scratch buffer without waiting; returns the buffer and the event of the copy. A
         read-only array that the buffer already contains is not copied again."""
         content = self._contents.get(name)
@@ -129,16 +131,16 @@ class BufferPool:
             self._arrays.pop(name, None)
             self._buffers.pop(name, None)
             self.state = object()
-            buffer = self._buffers[name] = self.fresh(name, size)
+            buffer = self._buffers[name] = self.allocate(name, size)
         return buffer
 
     def array(self, queue: cl.CommandQueue, name: str, shape: tuple[int, ...]) -> Array:
         """A scratch buffer as a cached float32 array: creating one takes longer than a launch."""
         buffer = self.scratch(name, 4 * math.prod(shape))
-        known = self._arrays.get(name)
-        if known is None or known.base_data is not buffer or known.shape != shape or known.queue is not queue:
-            known = self._arrays[name] = Array(queue, shape, np.float32, data=buffer)
-        return known
+        array = self._arrays.get(name)
+        if array is None or array.base_data is not buffer or array.shape != shape or array.queue is not queue:
+            array = self._arrays[name] = Array(queue, shape, np.float32, data=buffer)
+        return array
 
     def zeroed(self, name: str, size: int, queue: cl.CommandQueue) -> cl.Buffer:
         """A zero-filled scratch buffer; the caller must leave it zeroed."""
@@ -148,7 +150,7 @@ class BufferPool:
             self._zeroed.add(name)
         return self._buffers[name]
 
-    def fresh(self, name: str, size: int) -> cl.Buffer:
+    def allocate(self, name: str, size: int) -> cl.Buffer:
         """A new buffer outside the pool. Raises DeviceError if the device cannot allocate it."""
         limit = self._device.max_mem_alloc_size
         if size > limit:
@@ -158,11 +160,11 @@ class BufferPool:
             )
         try:
             flags = cl.mem_flags.READ_WRITE
-            if self._is_host:
+            if self._is_host_memory:
                 # PoCL otherwise allocates the memory at the first use, and crashes if none is left
                 flags |= cl.mem_flags.ALLOC_HOST_PTR
             buffer = DeviceBuffer(self._context, flags, max(size, _MINIMUM))
-            if self._is_host and size >= _LARGE:
+            if self._is_host_memory and size >= _LARGE:
                 # without large pages, random accesses to records miss the TLB
                 self._request_large_pages(buffer)
             return buffer
@@ -186,46 +188,46 @@ class RayBuffers:
 
     def __init__(self, pool: BufferPool, queue: cl.CommandQueue) -> None:
         self._pool, self._queue = pool, queue
-        self._held: WeakKeyDictionary[RayRaster, dict[tuple[int, int], dict[str, cl.Buffer]]] = (
+        self._buffers: WeakKeyDictionary[RayRaster, dict[tuple[int, int], dict[str, cl.Buffer]]] = (
             WeakKeyDictionary()
         )
 
     def of(self, raster: RayRaster, rows: int, columns: int, slopes: bool = False) -> dict[str, cl.Buffer]:
         """Buffers by name, for a sample grid padded to rows x columns. slopes: also the derivatives of the
         rays with respect to the sample position, for box splats."""
-        sizes = self._held.setdefault(raster, {})
+        sizes = self._buffers.setdefault(raster, {})
         if (rows, columns) not in sizes:
             sizes[rows, columns] = {"rays": self._planar("rays", raster.rays, rows, columns)}
             if raster.lens.kind != "equirectangular":
-                maps = self._held.setdefault(raster.full_raster or raster, {}).setdefault((0, 0), {})
+                maps = self._buffers.setdefault(raster.full_raster or raster, {}).setdefault((0, 0), {})
                 if "ray_map" not in maps:
-                    maps["ray_map"] = self._put("ray_map", raster.bounds_pyramid[0])
+                    maps["ray_map"] = self._upload("ray_map", raster.bounds_pyramid[0])
                 sizes[rows, columns]["ray_map"] = maps["ray_map"]
         buffers = sizes[rows, columns]
         if slopes and "ray_slopes" not in buffers:
             flat = raster.ray_derivatives.reshape(raster.height, raster.width, 6)
             buffers["ray_slopes"] = self._planar("ray_slopes", flat, rows, columns)
-            buffers["ray_step"] = self._put("ray_step", np.array([raster.max_ray_derivative], np.float32))
+            buffers["ray_step"] = self._upload("ray_step", np.array([raster.max_ray_derivative], np.float32))
         return buffers
 
     def _planar(self, name: str, array: np.ndarray, rows: int, columns: int) -> cl.Buffer:
         """An image (rows, columns, channels) as a buffer (channels, rows, columns), padded with NaN."""
         channels = np.full((array.shape[2], rows, columns), np.nan, np.float32)
         channels[:, : array.shape[0], : array.shape[1]] = np.moveaxis(array, 2, 0)
-        return self._put(name, channels)
+        return self._upload(name, channels)
 
     @staticmethod
     def bytes_of(rasters: Collection[RayRaster], tile_height: int, columns: int, slopes: bool) -> int:
         """Bytes of the ray buffers of a frame, for sample grids padded to complete tiles."""
         rows = sum(-(-raster.height // tile_height) * tile_height for raster in rasters)
-        one = next(iter(rasters))
-        each = 36 if slopes else 12
-        return each * rows * columns + (
-            one.bounds_pyramid[0].nbytes if one.lens.kind != "equirectangular" else 0
+        first = next(iter(rasters))
+        ray_bytes = 36 if slopes else 12
+        return ray_bytes * rows * columns + (
+            first.bounds_pyramid[0].nbytes if first.lens.kind != "equirectangular" else 0
         )
 
-    def _put(self, name: str, array: np.ndarray) -> cl.Buffer:
-        buffer = self._pool.fresh(name, array.nbytes)
+    def _upload(self, name: str, array: np.ndarray) -> cl.Buffer:
+        buffer = self._pool.allocate(name, array.nbytes)
         cl.enqueue_copy(self._queue, buffer, array)
         return buffer
 

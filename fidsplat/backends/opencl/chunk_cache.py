@@ -225,7 +225,7 @@ class OpenCLChunkCache:
         if self._last is not None:
             self._last.wait()
         for name, width in self.widths.items():
-            buffer = self.workspace.pool.fresh(f"chunks of {name}", size * self._rows * width)
+            buffer = self.workspace.pool.allocate(f"chunks of {name}", size * self._rows * width)
             if self._size:
                 used = self._size * self._rows * width
                 # arrays grow one by one: if an allocation fails, the others are still complete
@@ -248,8 +248,8 @@ class GatheredChunks(Resident):
         super().__init__(int(self._ends[-1]))
         self.take_traits(cache.scene.scene)
         self.capacity = rounded_up(self.count, 4)  # so that the next view reuses the buffers
-        self._leased: list[tuple[str, cl.Buffer]] = []
-        weakref.finalize(self, workspace.pool.give_back, self._leased)
+        self._acquired: list[tuple[str, cl.Buffer]] = []
+        weakref.finalize(self, workspace.pool.release, self._acquired)
         self._copies: tuple[int, int, Copies | None] = (0, 0, None)
         """parameters of the last copy, with its splats [first, end)"""
         total, widest = self.capacity * sum(cache.widths.values()), self.capacity * max(cache.widths.values())
@@ -277,8 +277,8 @@ class GatheredChunks(Resident):
         if name not in self._buffers:
             # the buffer of the previous view is reused if large enough: allocating takes as long as filling
             label = f"the splats' {name}"
-            whole = self._workspace.pool.lease(label, self.capacity * width, larger=True)
-            self._leased.append((label, whole))
+            whole = self._workspace.pool.acquire(label, self.capacity * width, larger=True)
+            self._acquired.append((label, whole))
             self._fill(name, 0, self.count, whole)
             self._cache.wait()  # frames may be rendered on another queue
             self._buffers[name] = whole

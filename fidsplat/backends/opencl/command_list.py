@@ -17,12 +17,12 @@ _UNKNOWN = object()
 class Command:
     """One kernel launch: its own kernel object with bound arguments, and its size."""
 
-    __slots__ = ("_marks", "_types", "group", "kernel", "name", "size", "stage")
+    __slots__ = ("_bound", "_types", "group", "kernel", "name", "size", "stage")
 
     def __init__(self, kernel: cl.Kernel, name: str, types: Sequence[Callable[[Any], Any] | None]) -> None:
         """types: the NumPy type of each argument; None for a buffer."""
         self.kernel, self.name, self._types = kernel, name, types
-        self._marks: list[object] = [_UNKNOWN] * len(types)
+        self._bound: list[object] = [_UNKNOWN] * len(types)
         self.stage = ""
         self.size: tuple[int, ...] = ()
         self.group: tuple[int, ...] = ()
@@ -30,26 +30,26 @@ class Command:
     def bind(self, index: int, value: Any) -> None:
         """Set an argument unless it already has this value: comparing is faster than setting."""
         scalar = self._types[index]
-        mark: object = token_of(value) if scalar is None else value
-        bound = self._marks[index]
-        if mark is bound or (type(mark) is type(bound) and mark == bound):
+        identity: object = token_of(value) if scalar is None else value
+        bound = self._bound[index]
+        if identity is bound or (type(identity) is type(bound) and identity == bound):
             return
-        self._marks[index] = _UNKNOWN  # an interrupt between the next two lines leaves the argument unknown
+        self._bound[index] = _UNKNOWN  # an interrupt between the next two lines leaves the argument unknown
         if scalar is None:
             self.kernel.set_arg(index, value)
         else:  # faster than set_arg, which takes 20 times as long to find the type of a number
             self.kernel._set_arg_buf(index, scalar(value))  # pyright: ignore[reportAttributeAccessIssue]
-        self._marks[index] = mark
+        self._bound[index] = identity
 
 
 class _NamedArgument:
     """The positions of one argument in all commands, and its last value."""
 
-    __slots__ = ("mark", "places")
+    __slots__ = ("identity", "positions")
 
-    def __init__(self, places: list[tuple[Command, int]]) -> None:
-        self.places = places
-        self.mark: object = _UNKNOWN
+    def __init__(self, positions: list[tuple[Command, int]]) -> None:
+        self.positions = positions
+        self.identity: object = _UNKNOWN
 
 
 class CommandList:
@@ -65,7 +65,7 @@ class CommandList:
         self.program = program
         self._commands: list[Command] = []
         self._reusable: dict[str, list[Command]] = {}
-        self._used: dict[str, int] = {}
+        self._launch_counts: dict[str, int] = {}
         """number of launches of each kernel in this recording"""
         self._named: dict[str, _NamedArgument] = {}
         self.key: Any = None
@@ -82,7 +82,7 @@ class CommandList:
     def clear(self) -> None:
         """Remove all commands, so that other launches can be appended."""
         self.key = None
-        self._commands, self._used, self._named = [], {}, {}
+        self._commands, self._launch_counts, self._named = [], {}, {}
 
     def record(
         self,
@@ -93,16 +93,16 @@ class CommandList:
         stage: str = "",
     ) -> Command:
         """Append a launch. values: buffers and numbers in the order of the kernel's arguments."""
-        number = self._used.get(kernel, 0)
-        same = self._reusable.setdefault(kernel, [])
-        if number == len(same):
-            own = cl.Kernel(self.program.compiled[kernel], kernel)
-            same.append(Command(own, kernel, self.program.types[kernel]))
-        command = same[number]
+        number = self._launch_counts.get(kernel, 0)
+        commands = self._reusable.setdefault(kernel, [])
+        if number == len(commands):
+            kernel_object = cl.Kernel(self.program.compiled[kernel], kernel)
+            commands.append(Command(kernel_object, kernel, self.program.types[kernel]))
+        command = commands[number]
         command.stage, command.size, command.group = stage, size, group
         for index, value in enumerate(values):
             command.bind(index, value)
-        self._used[kernel] = number + 1
+        self._launch_counts[kernel] = number + 1
         self._commands.append(command)
         if self._named:
             self._named = {}
@@ -126,13 +126,15 @@ class CommandList:
             argument = self._named.get(name)
             if argument is None:
                 argument = self._named[name] = _NamedArgument(self._positions(name))
-            mark = token_of(value) if isinstance(value, cl.Buffer) else value
-            if mark is argument.mark or (type(mark) is type(argument.mark) and mark == argument.mark):
+            identity = token_of(value) if isinstance(value, cl.Buffer) else value
+            if identity is argument.identity or (
+                type(identity) is type(argument.identity) and identity == argument.identity
+            ):
                 continue
-            argument.mark = _UNKNOWN
-            for command, index in argument.places:
+            argument.identity = _UNKNOWN
+            for command, index in argument.positions:
                 command.bind(index, value)
-            argument.mark = mark
+            argument.identity = identity
 
     def submit(self, queue: cl.CommandQueue, first: int = 0, end: int | None = None) -> list[cl.Event]:
         """Enqueue the commands [first, end) in order; by default all."""

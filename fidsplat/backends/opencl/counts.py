@@ -10,8 +10,8 @@ import pyopencl as cl
 
 COUNTS = 4
 """words of the buffer `counts`, as in tile_lists.cl: big splats, pairs (two words), visible splats"""
-TALLIES = 8
-"""counters of the buffer `tallies`, as in prelude.cl"""
+COUNTERS = 8
+"""counters of the buffer `counters`, as in prelude.cl"""
 VISIBLE, PAIRS, BIG = 0, 2, 6
 """indices of the counters with totals: visible splats, pairs (two words), big splats"""
 
@@ -31,8 +31,8 @@ class Counts:
         return Counts(int(words[0]), int(words[1]) | int(words[2]) << 32, int(words[3]))
 
     @staticmethod
-    def of_tallies(words: np.ndarray) -> Counts:
-        """Counts of a frame from the buffer `tallies` (views, TALLIES); `big` of the first view only."""
+    def of_counters(words: np.ndarray) -> Counts:
+        """Counts of a frame from the buffer `counters` (views, COUNTERS); `big` of the first view only."""
         pairs = int(words[0, PAIRS]) | int(words[0, PAIRS + 1]) << 32
         return Counts(int(words[0, BIG]), pairs, int(words[:, VISIBLE].sum(dtype=np.int64)))
 

@@ -12,8 +12,8 @@ import numpy as np
 from fidsplat.effects import Output
 
 Access = Literal["", "in", "out"]
-Source = Literal["stage", "cloud", "uniform", "array"]
-_KINDS: dict[str, tuple[Access, Source]] = {
+ValueSource = Literal["stage", "cloud", "uniform", "array"]
+_KINDS: dict[str, tuple[Access, ValueSource]] = {
     **{"in": ("in", "stage"), "out": ("out", "stage")},
     **{"cloud": ("in", "cloud"), "array": ("in", "array")},
 }
@@ -40,8 +40,8 @@ class Member:
 def member(declaration: str, note: str = "") -> Member:
     """Parse a type and names, as in C but without commas: `real rotation[9]`, `wide r g b`."""
     ctype, *names = declaration.split()
-    found = [_NAME.fullmatch(name) for name in names]
-    return Member(ctype, tuple((match[1], int(match[2] or 1)) for match in found if match), note)
+    matches = [_NAME.fullmatch(name) for name in names]
+    return Member(ctype, tuple((match[1], int(match[2] or 1)) for match in matches if match), note)
 
 
 @dataclass(frozen=True)
@@ -77,18 +77,18 @@ class Record:
     def without(self, names: Collection[str]) -> Record:
         """The record without these fields, in the same order."""
         members = []
-        for one in self.members:
-            if fields := tuple([field for field in one.names if field[0] not in names]):
-                members.append(Member(one.ctype, fields, one.note))
+        for member in self.members:
+            if fields := tuple([field for field in member.names if field[0] not in names]):
+                members.append(Member(member.ctype, fields, member.note))
         return Record(self.name, tuple(members), self.alignment)
 
     def dtype(self, scalars: Scalars) -> np.dtype:
         """The C layout, by natural alignment."""
         fields = []
-        for one in self.members:
-            dtype = scalars.dtype(one.ctype)
+        for member in self.members:
+            dtype = scalars.dtype(member.ctype)
             fields += [
-                (name, dtype, (length,)) if length > 1 else (name, dtype) for name, length in one.names
+                (name, dtype, (length,)) if length > 1 else (name, dtype) for name, length in member.names
             ]
         plain = np.dtype(fields, align=True)
         size = plain.itemsize + -plain.itemsize % self.alignment
@@ -100,9 +100,9 @@ class Record:
         """The C struct, with a compile-time check of its size."""
         aligned = f" __attribute__((aligned({self.alignment})))" if self.alignment > 1 else ""
         size = self.dtype(scalars).itemsize
-        check = f"typedef char {self.name}_has_the_size_that_the_host_knows"
+        check = f"typedef char {self.name}_has_the_size_of_its_numpy_type"
         check += f"[(sizeof({self.name}) == {size}) ? 1 : -1];"
-        body = "".join([one.text for one in self.members])
+        body = "".join([member.text for member in self.members])
         return f"typedef struct{aligned} {{\n{body}}} {self.name};\n{check}\n"
 
 
@@ -112,7 +112,7 @@ class Argument:
     name: str
     access: Access
     """access to a buffer: `in` if the kernel only reads it, else `out`; empty for a number"""
-    source: Source = "stage"
+    source: ValueSource = "stage"
     """source of the value: the launch or frame, the cloud, or the view (`View.uniform`, `View.array`)"""
     uniform: tuple[str, int] = ("", 0)
     """group of uniforms, and index in it"""
@@ -127,24 +127,24 @@ class Argument:
         return f"global {const}{self.ctype} *restrict {self.name}"
 
 
-def takes(*declared: str | tuple[Argument, ...]) -> tuple[Argument, ...]:
+def args(*declared: str | tuple[Argument, ...]) -> tuple[Argument, ...]:
     """Parse declarations of kernel arguments; tuples of arguments are inserted unchanged.
 
     A declaration is a type, names, and a note after `//`: `int width height` declares two numbers. A word
     before the type declares buffers: `in` (only read), `out` (written), `cloud` (with a row for each splat),
     `array` (copied from the view): `in float raw  // 4 channels`.
     """
-    found: list[Argument] = []
-    for one in declared:
-        if not isinstance(one, str):
-            found += one
+    parsed: list[Argument] = []
+    for declaration in declared:
+        if not isinstance(declaration, str):
+            parsed += declaration
             continue
-        words, _, note = one.partition("//")
+        words, _, note = declaration.partition("//")
         kind, *rest = words.split()
         access, source = _KINDS.get(kind, ("", "stage"))
         ctype, *names = rest if kind in _KINDS else (kind, *rest)
-        found += (Argument(ctype, name, access, source, note=note.strip()) for name in names)
-    return tuple(found)
+        parsed += (Argument(ctype, name, access, source, note=note.strip()) for name in names)
+    return tuple(parsed)
 
 
 def uniforms(group: str, *declarations: str, note: str = "") -> tuple[Argument, ...]:
@@ -152,14 +152,14 @@ def uniforms(group: str, *declarations: str, note: str = "") -> tuple[Argument, 
     words = [declaration.split() for declaration in declarations]
     named = [(ctype, name) for ctype, *names in words for name in names]
     return tuple(
-        Argument(ctype, name, "", "uniform", (group, place), note)
-        for place, (ctype, name) in enumerate(named)
+        Argument(ctype, name, "", "uniform", (group, index), note)
+        for index, (ctype, name) in enumerate(named)
     )
 
 
 @dataclass(frozen=True)
-class Samples:
-    """A buffer of values per sample, written by the blend stage and read by the resolve stage."""
+class SampleBuffer:
+    """Values per sample, written by the blend stage and read by the resolve stage."""
 
     ctype: str
     name: str
@@ -187,9 +187,9 @@ class Layout:
     project: tuple[Argument, ...] = ()
     emit: tuple[Argument, ...] = ()
     blend: tuple[Argument, ...] = ()
-    backdrop: tuple[Argument, ...] = ()
+    composite_background: tuple[Argument, ...] = ()
     resolve: tuple[Argument, ...] = ()
-    samples: tuple[Samples, ...] = ()
+    sample_buffers: tuple[SampleBuffer, ...] = ()
     backward_file: str = ""
     """file of its derivatives below kernels/opencl/; empty: none"""
     moments: tuple[Member, ...] = ()
@@ -197,8 +197,8 @@ class Layout:
     blend_backward: tuple[Argument, ...] = ()
     project_backward: tuple[Argument, ...] = ()
     project_step: tuple[Argument, ...] = ()
-    behind: tuple[tuple[str, str], ...] = ()
-    """(camera or another slot, part): with that slot, the part replaces this layout"""
+    replaced_by: tuple[tuple[str, str], ...] = ()
+    """(effect, part): with that effect, the part replaces this layout"""
 
 
 def output_argument(output: Output) -> Argument:

@@ -13,7 +13,7 @@ from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.checked_cache import check_once
 from fidsplat.backends.interface import Backend, DeviceInfo, Rates
 from fidsplat.backends.opencl.alignment import OpenCLAlignment
-from fidsplat.backends.opencl.assemble import Source, assemble
+from fidsplat.backends.opencl.assemble import KernelSource, assemble
 from fidsplat.backends.opencl.chunk_cache import OpenCLChunkCache
 from fidsplat.backends.opencl.gradients import OpenCLGradients
 from fidsplat.backends.opencl.images import OpenCLImages
@@ -69,15 +69,15 @@ def open_device(selector: str = "") -> OpenCLBackend:
     matches; or a name from `devices` without `opencl:`, such as `pocl-2`. Raises DeviceError if no device can
     be used, and UnknownDeviceError if none matches.
     """
-    found = _named_devices()
-    if not found:
+    named = _named_devices()
+    if not named:
         raise DeviceError(_NO_PLATFORM)
     requested = selector.strip().lower()
-    numbered = found.get(f"opencl:{requested}") if requested[-1:].isdigit() else None
-    matching = [numbered] if numbered else _matching(found.values(), requested)
+    numbered = named.get(f"opencl:{requested}") if requested[-1:].isdigit() else None
+    matching = [numbered] if numbered else _matching(named.values(), requested)
     if not matching:
-        known = "; ".join(f"{name}: {device.name}" for name, device in found.items())
-        raise UnknownDeviceError(f"no OpenCL device matches {selector!r}; there are: {known}")
+        available = "; ".join(f"{name}: {device.name}" for name, device in named.items())
+        raise UnknownDeviceError(f"no OpenCL device matches {selector!r}; there are: {available}")
     usable = [device for device in matching if not _why_unusable(device)]
     if not usable:
         reasons = "; ".join(f"{device.name}: {_why_unusable(device)}" for device in matching)
@@ -131,9 +131,9 @@ class OpenCLBackend(Workspace, Backend):
     def pipeline(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLPipeline:
         if self._requested[0] is not self.shape:
             self._requested = self.shape, {}
-        known = self._requested[1].get((features, shape))
-        if known is not None:
-            return known
+        cached = self._requested[1].get((features, shape))
+        if cached is not None:
+            return cached
         if why := self.unsupported(features):
             raise DeviceError(why)
         key = self._key(features, shape)
@@ -184,7 +184,7 @@ class OpenCLBackend(Workspace, Backend):
             features = replace(features, setup_precision="float32")
         return features, shape or shape_for(features, self.shape)
 
-    def source(self, features: FeatureSet) -> Source:
+    def source(self, features: FeatureSet) -> KernelSource:
         """Kernel source of these features for this device."""
         return assemble(*self._key(features, None))
 
@@ -234,20 +234,20 @@ def _named_devices() -> dict[str, cl.Device]:
 
 
 def _name_of(device: cl.Device) -> str:
-    return next(name for name, known in _named_devices().items() if known == device)
+    return next(name for name, other in _named_devices().items() if other == device)
 
 
 def _matching(devices: Iterable[cl.Device], selector: str) -> list[cl.Device]:
     """Devices that match a selector. CPU names are not compared: `intel` would match PoCL on an Intel CPU."""
     devices = list(devices)
     if selector in ("cpu", "gpu"):
-        return [each for each in devices if each.type & getattr(cl.device_type, selector.upper())]
+        return [device for device in devices if device.type & getattr(cl.device_type, selector.upper())]
     if selector == "pocl":
-        return [each for each in devices if is_pocl(each)]
-    return [each for each in devices if selector in each.platform.name.lower()] or [
-        each
-        for each in devices
-        if not each.type & cl.device_type.CPU and selector in f"{each.name} {each.vendor}".lower()
+        return [device for device in devices if is_pocl(device)]
+    return [device for device in devices if selector in device.platform.name.lower()] or [
+        device
+        for device in devices
+        if not device.type & cl.device_type.CPU and selector in f"{device.name} {device.vendor}".lower()
     ]
 
 

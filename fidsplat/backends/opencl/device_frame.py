@@ -32,15 +32,15 @@ class FrameBuffers:
     view: cl.Buffer
     """records `View` (groups + 1, v)"""
     moving: cl.Buffer
-    """number of moving groups of splats, then their labels"""
+    """number of moving groups of splats, then the label of each group"""
     splats: cl.Buffer
     """records `Splat` (v, n)"""
     keys: cl.Buffer
     """sort keys by depth (v, n) uint32"""
     windows: cl.Buffer
     """tiles that a splat touches (v, n) uint2, or for many tiles its index in `big`"""
-    tallies: cl.Buffer
-    """counters, then the length of each tile's list (8 + t) uint32"""
+    counters: cl.Buffer
+    """totals of the frame, then the length of each tile's list (COUNTERS + t) uint32"""
     big: cl.Buffer
     """splats that touch more tiles than a window holds (big_capacity) uint32"""
     big_bounds: cl.Buffer
@@ -56,7 +56,7 @@ class FrameBuffers:
     lists: cl.Buffer
     """splats of each tile in depth order (capacity) uint32"""
     counts: cl.Buffer
-    """counts of pairs and splats, as `Counts` reads them"""
+    """totals that the host reads (`Counts`)"""
     raw: cl.Buffer
     """samples (4, s) float32: r, g, b, transmittance"""
     batch_indices: cl.Buffer
@@ -70,13 +70,13 @@ class Rendered:
     """Buffers and events of a submitted frame, without references to the cloud and scratch buffers."""
 
     queue: cl.CommandQueue
-    leased: dict[str, cl.Buffer]
+    acquired: dict[str, cl.Buffer]
     """output images and counts by name"""
     stats: Callable[[], dict[str, int]]
     events: list[cl.Event]
     """events of the launches"""
     stages: list[str] | None = None
-    """stages of the launches; None on a queue without profiling"""
+    """stage of each launch; None on a queue without profiling"""
     uploads: list[cl.Event] | None = None
     """keeps the cloud's arrays alive until the device has read them"""
 
@@ -109,7 +109,7 @@ class DeviceFrame:
         self.workspace, self.commands, self.shape = workspace, commands, shape
         self.resident, self.plan = resident, plan
         self.projected = resident.count
-        """number of splats of each view that have records; a capacity where others are culled before"""
+        """number of splats of each view that have records; with `culls_first` a capacity"""
         self.batch, self.views = views, len(views)
         self.view = view = views.view
         self.waits = replay_queue is None or shape.lists == "ordered"
@@ -137,17 +137,18 @@ class DeviceFrame:
         """numbers by the names of the kernel arguments"""
         self.numbers |= {"width": view.width, "height": view.height, "stride": self.stride}
         self.numbers["channel_stride"] = self.views * self.rows * self.stride
-        self.samples = RAW, *self.source.samples
+        self.sample_buffers = RAW, *self.source.sample_buffers
         """sample buffers, which the blend stage writes"""
         self.is_sub_frame = False
         """whether this is one pose of a frame with a shutter; the complete frame resolves its samples"""
         self.events: list[cl.Event] = []
         self.stages: list[str] = []
-        """stages of the launches"""
+        """stage of each launch"""
         self.arrays: dict[str, np.ndarray] = {}
-        """arrays copied to the device for this view"""
+        """host arrays copied to the device for this view"""
         self.uploads: list[cl.Event] = []
-        self.leased: dict[str, cl.Buffer] = {}
+        """events of copies to the device"""
+        self.acquired: dict[str, cl.Buffer] = {}
         self.counted_launches = 0
         """number of launches after which the counts are complete"""
         self.counted: cl.Event | None = None
@@ -188,14 +189,17 @@ class DeviceFrame:
         items: tuple[int, ...],
         group: tuple[int, ...],
         views: int = 1,
-        **given: Any,
+        **arguments: Any,
     ) -> cl.Event:
-        """Submit a kernel with at least `items` work-items per view. given: arguments by name."""
+        """Submit a kernel with at least `items` work-items per view. arguments: those that the
+        frame does not have, by name."""
         size = tuple([-(-count // side) * side for count, side in zip(items, group, strict=True)])
         if views > 1:
             size, group = (*size, views), (*group, 1)
-        arguments = self.source.arguments[kernel]
-        values = [given[one.name] if one.name in given else self.value(one) for one in arguments]
+        values = [
+            arguments[declared.name] if declared.name in arguments else self.value(declared)
+            for declared in self.source.arguments[kernel]
+        ]
         event = self.commands.launch(self.queue, kernel, size, group, values, stage)
         self.events.append(event)
         self.stages.append(stage)
@@ -214,21 +218,21 @@ class DeviceFrame:
         if argument.source == "uniform":  # only kernels of gradients
             group, index = argument.uniform
             return self.view.uniforms_of(group)[index]
-        return self.put(name, self.view.array(name))
+        return self.upload(name, self.view.array(name))
 
-    def take(self, name: str, size: int) -> cl.Buffer:
+    def scratch(self, name: str, size: int) -> cl.Buffer:
         """Bind a scratch buffer; the next frame overwrites it."""
         return self.bind(name, self.pool.scratch(name, size))
 
-    def lease(self, name: str, size: int) -> cl.Buffer:
+    def acquire(self, name: str, size: int) -> cl.Buffer:
         """Bind a buffer that belongs to the frame until its images are released."""
-        buffer = self.leased[name] = self.bind(name, self.pool.lease(name, size))
+        buffer = self.acquired[name] = self.bind(name, self.pool.acquire(name, size))
         return buffer
 
-    def put(self, name: str, array: np.ndarray) -> cl.Buffer:
+    def upload(self, name: str, array: np.ndarray) -> cl.Buffer:
         """Bind a scratch buffer with these contents; does not wait."""
         self.arrays[name] = array
-        buffer, event = self.pool.put(self.queue, name, array)
+        buffer, event = self.pool.upload(self.queue, name, array)
         if event is not None:
             self.uploads.append(event)
         return self.bind(name, buffer)
@@ -244,33 +248,33 @@ class DeviceFrame:
             cl.enqueue_copy(self.queue, array, self.named[name])
         return array
 
-    def lease_images(self, outputs: tuple[Output, ...]) -> None:
+    def acquire_images(self, outputs: tuple[Output, ...]) -> None:
         """Bind buffers for the output images of one view."""
         view = self.view
         pixels = (view.height // view.samples) * (view.width // view.samples)
         for output in outputs:
-            self.lease(f"{output.name}_out", 4 * pixels * output.channels)
-        self.put("batch_indices", self.batch.batch_indices)
+            self.acquire(f"{output.name}_out", 4 * pixels * output.channels)
+        self.upload("batch_indices", self.batch.batch_indices)
 
     def bind_images(self, images: dict[str, cl.Buffer]) -> None:
         """Bind the output images of the complete batch, of which these views fill a part."""
         self.named |= images
-        self.put("batch_indices", self.batch.batch_indices)
+        self.upload("batch_indices", self.batch.batch_indices)
 
-    def put_view(self, row: int, end: int) -> None:
+    def upload_view(self, row: int, end: int) -> None:
         """Copy the projection's uniforms to the device, for rows of samples [row, end)."""
         if self.view.raster is not None:
-            self.put_rays()
+            self.bind_rays()
         arrays = projection_arrays(self.batch, self.source, row, end)
         for name, array in arrays.items():
-            self.put(name, array)
+            self.upload(name, array)
 
     def rendered(self) -> Rendered:
         stages = None if self.queue is self.workspace.replay_queue else self.stages
-        return Rendered(self.queue, self.leased, self.stats, self.events, stages, self.uploads)
+        return Rendered(self.queue, self.acquired, self.stats, self.events, stages, self.uploads)
 
-    def put_rays(self) -> None:
+    def bind_rays(self) -> None:
         """Bind the ray buffers of a lens, and its map from directions to samples."""
         assert self.view.raster is not None
-        slopes = self.source.takes("blend", "ray_slopes")
+        slopes = self.source.has_argument("blend", "ray_slopes")
         self.named |= self.workspace.ray_buffers.of(self.view.raster, self.rows, self.stride, slopes)

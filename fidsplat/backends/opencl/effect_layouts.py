@@ -5,11 +5,11 @@ Buffers are (channels, rows, columns) of the padded sample grid, unless a note h
 
 from __future__ import annotations
 
-from fidsplat.backends.opencl.declare import Layout, Samples, member, takes, uniforms
+from fidsplat.backends.opencl.declare import Layout, SampleBuffer, args, member, uniforms
 from fidsplat.backends.opencl.layout import RAY_UNIFORMS
 from fidsplat.effects.extensions import Extension
 
-_RAYS = takes("in float rays  // 3 channels X, Y, Z; NaN outside the field of view")
+_RAYS = args("in float rays  // 3 channels X, Y, Z; NaN outside the field of view")
 _OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
 
 LAYOUTS: dict[str, Layout] = {
@@ -36,15 +36,15 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "color_rgb": Layout(
         "slot/color_rgb.cl",
-        project=takes("cloud float colors  // (n, 3)"),
+        project=args("cloud float colors  // (n, 3)"),
         backward_file="slot/color_rgb_backward.cl",
-        project_backward=takes("out float by_colors  // (n, 3)"),
+        project_backward=args("out float by_colors  // (n, 3)"),
     ),
     "color_sh": Layout(
         "slot/color_sh.cl",
-        project=takes("cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)"),
+        project=args("cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)"),
         backward_file="slot/color_sh_backward.cl",
-        project_backward=takes(
+        project_backward=args(
             "cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)", "out float by_sh  // the same shape"
         ),
     ),
@@ -80,7 +80,7 @@ LAYOUTS: dict[str, Layout] = {
         "slot/footprint_mixed.cl",
         parts=("box_edges",),
         splat=(member("int box"),),
-        project=takes("cloud int boxes  // (n) 1: box, 0: Gaussian"),
+        project=args("cloud int boxes  // (n) 1: box, 0: Gaussian"),
     ),
     "ellipsoid_exact": Layout(
         "slot/ellipsoid_exact.cl",
@@ -111,14 +111,14 @@ LAYOUTS: dict[str, Layout] = {
     "background_gradient": Layout(
         "slot/background_gradient.cl",
         parts=("world_ray",),
-        backdrop=uniforms(
+        composite_background=uniforms(
             "gradient", "float sky_r sky_g sky_b", "float ground_r ground_g ground_b", "float up_x up_y up_z"
         ),
     ),
     "background_panorama": Layout(
         "slot/background_panorama.cl",
         parts=("world_ray",),
-        backdrop=takes(
+        composite_background=args(
             uniforms("panorama_size", "int panorama_width panorama_height"),
             "array float panorama  // (panorama_height, panorama_width, 3)",
         ),
@@ -128,12 +128,12 @@ LAYOUTS: dict[str, Layout] = {
     "arithmetic_approximate": Layout("slot/arithmetic_fast.cl"),  # without a dialect
     "motion_groups": Layout(
         "slot/motion_groups.cl",
-        project=takes("cloud int labels  // (n)", "in int moving  // number of groups, then their labels"),
+        project=args("cloud int labels  // (n)", "in int moving  // number of groups, then their labels"),
     ),
     "external_depth": Layout(
         "slot/external_depth.cl",
         parts=("ray_depth",),
-        blend=takes(
+        blend=args(
             "array float external_depth external_rgb  // (h, w) infinite where there is none, (h, w, 3)",
             "array int external_label  // (h, w)",
         ),
@@ -147,20 +147,20 @@ LAYOUTS: dict[str, Layout] = {
         packed=(("r", "WORDS_LOW({}rg)"), ("g", "WORDS_HIGH({}rg)"), ("b", "WORDS_LOW({}b1)")),
     ),
     "termination_depths": Layout(
-        blend=takes(
+        blend=args(
             "in uint keys", "out uint termination_depths  // of each tile: the key at which it was finished"
         )
     ),
     # parts that several effects share
     "chord": Layout("part/chord.cl"),
-    "conic": Layout("part/conic.cl", behind=(("ellipsoids_only", "conic_facing"),)),
+    "conic": Layout("part/conic.cl", replaced_by=(("ellipsoids_only", "conic_facing"),)),
     "conic_facing": Layout("part/conic_facing.cl"),
     "perspective": Layout("part/perspective.cl"),
     "polygon": Layout("part/polygon.cl"),
     "ray_map": Layout(
         "part/ray_map.cl",
         view=(member("real map[6]", "low corner, cells per unit along x and y, cells a side, first row"),),
-        project=takes("in short4 ray_map"),
+        project=args("in short4 ray_map"),
     ),
     "rays": Layout(
         "part/rays.cl",
@@ -170,19 +170,19 @@ LAYOUTS: dict[str, Layout] = {
         ),
         project=_RAYS,
         blend=_RAYS,
-        backdrop=_RAYS,
+        composite_background=_RAYS,
     ),
     "thickness": Layout(
         "part/thickness.cl",
-        project=takes("cloud float thickness  // (n) [m]; 0: a disk"),
+        project=args("cloud float thickness  // (n) [m]; 0: a disk"),
         backward_file="part/thickness_backward.cl",
-        project_backward=takes(
+        project_backward=args(
             "cloud float thickness  // (n) [m]; 0: a disk", "out float by_thickness  // (n)"
         ),
-        project_step=takes("out float activated_thickness"),
+        project_step=args("out float activated_thickness"),
     ),
     "step_camera": Layout(
-        "train/step_camera.cl", project_step=takes("out real group_sums  // (work-groups, 10) by the camera")
+        "train/step_camera.cl", project_step=args("out real group_sums  // (work-groups, 10) by the camera")
     ),
     "box_cover": Layout("part/box_cover.cl"),
     "box_edges": Layout(
@@ -194,13 +194,13 @@ LAYOUTS: dict[str, Layout] = {
                 "1 / |grad| of the forms D + n_u, D - n_u, D + n_v, D - n_v",
             ),
         ),
-        behind=tuple((camera, "rays_box") for camera in _OWN_RAYS),
+        replaced_by=tuple((camera, "rays_box") for camera in _OWN_RAYS),
     ),
     "rays_box": Layout(
         "part/rays_box.cl",
         parts=("box_cover",),
-        project=takes("in float ray_step  // (1) maximum angle between the rays of neighbouring samples"),
-        blend=takes("in float ray_slopes  // 6 channels dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy"),
+        project=args("in float ray_step  // (1) maximum angle between the rays of neighbouring samples"),
+        blend=args("in float ray_slopes  // 6 channels dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy"),
     ),
     "ray_depth": Layout(
         "part/ray_depth.cl",
@@ -212,19 +212,19 @@ LAYOUTS: dict[str, Layout] = {
         "part/coplanar_layers.cl",
         parts=("ray_depth",),
         splat=(member("int group", "coplanar group, -1: none"),),
-        project=takes("cloud int coplanar_groups  // (n) index of the splat's group; -1: none"),
+        project=args("cloud int coplanar_groups  // (n) index of the splat's group; -1: none"),
     ),
-    "tile_keys": Layout("part/tile_keys.cl", emit=takes("in Splat splats")),
+    "tile_keys": Layout("part/tile_keys.cl", emit=args("in Splat splats")),
     "coverage": Layout("part/coverage.cl"),
     "ray": Layout(resolve=RAY_UNIFORMS),
-    "row_rotation": Layout("part/row_rotation.cl", resolve=takes("array float row_rotations  // (h, 3, 3)")),
+    "row_rotation": Layout("part/row_rotation.cl", resolve=args("array float row_rotations  // (h, 3, 3)")),
     # rays of fisheyes and panoramas have a length of 1
-    "ray_length": Layout("part/ray_length.cl", behind=(("camera_brown_conrady", "rays_length"),)),
+    "ray_length": Layout("part/ray_length.cl", replaced_by=(("camera_brown_conrady", "rays_length"),)),
     "rays_length": Layout("part/rays_length.cl"),
     "sample_length": Layout(
         "part/sample_length.cl",
         parts=("ray", "ray_length"),
-        behind=(("camera_brown_conrady", "rays_sample_length"),),
+        replaced_by=(("camera_brown_conrady", "rays_sample_length"),),
     ),
     "rays_sample_length": Layout("part/rays_sample_length.cl", parts=("rays_length",), resolve=_RAYS),
     "world_ray": Layout("part/world_ray.cl"),
@@ -232,32 +232,32 @@ LAYOUTS: dict[str, Layout] = {
     "alpha": Layout(
         "output/alpha.cl",
         backward_file="output/alpha_backward.cl",
-        blend_backward=takes("in float by_alpha  // (h, w)"),
+        blend_backward=args("in float by_alpha  // (h, w)"),
     ),
     "depth": Layout(
         "output/depth.cl",
         parts=("ray_depth", "coverage"),
-        samples=(Samples("float", "depth_raw", 2, "sum w z, sum w"),),
+        sample_buffers=(SampleBuffer("float", "depth_raw", 2, "sum w z, sum w"),),
         backward_file="output/depth_backward.cl",
-        blend_backward=takes("in float depth_raw  // 2 channels", "in float by_depth  // (h, w)"),
+        blend_backward=args("in float depth_raw  // 2 channels", "in float by_depth  // (h, w)"),
     ),
     "distortion": Layout(
         "output/distortion.cl",
         parts=("ray_depth",),
-        samples=(Samples("float", "distortion_raw", 4, "the first m, W, sum w m, sum w m^2"),),
+        sample_buffers=(SampleBuffer("float", "distortion_raw", 4, "the first m, W, sum w m, sum w m^2"),),
         backward_file="output/distortion_backward.cl",
-        blend_backward=takes("in float distortion_raw  // 4 channels", "in float by_distortion  // (h, w)"),
+        blend_backward=args("in float distortion_raw  // 4 channels", "in float by_distortion  // (h, w)"),
     ),
     "depth_median": Layout(
         "output/depth_median.cl",
         parts=("ray_depth", "coverage"),
-        samples=(Samples("float", "depth_median_raw"),),
+        sample_buffers=(SampleBuffer("float", "depth_median_raw"),),
     ),
     "depth_first": Layout(
         "output/depth_first.cl",
         parts=("ray_depth",),
         blend=uniforms("first_light", "float first_light"),
-        samples=(Samples("float", "depth_first_raw"),),
+        sample_buffers=(SampleBuffer("float", "depth_first_raw"),),
     ),
     "distance": Layout("output/distance.cl", parts=("depth", "sample_length")),
     "distance_median": Layout("output/distance_median.cl", parts=("depth_median", "sample_length")),
@@ -266,35 +266,35 @@ LAYOUTS: dict[str, Layout] = {
         "output/normal.cl",
         parts=("coverage",),
         splat=(member("wide nx ny nz"),),
-        samples=(Samples("float", "normal_raw", 3),),
+        sample_buffers=(SampleBuffer("float", "normal_raw", 3),),
         backward_file="output/normal_backward.cl",
         moments=(member("float nx ny nz"),),
-        blend_backward=takes("in float normal_raw  // 3 channels", "in float by_normal  // (h, w, 3)"),
+        blend_backward=args("in float normal_raw  // 3 channels", "in float by_normal  // (h, w, 3)"),
     ),
     "normal_world": Layout("output/normal_world.cl", parts=("normal", "row_rotation")),
     "label": Layout(
         "output/label.cl",
         parts=("coverage",),
         splat=(member("int label"),),
-        project=takes("cloud int labels  // (n)"),
-        samples=(Samples("float", "label_raw"), Samples("int", "label_id_raw")),
+        project=args("cloud int labels  // (n)"),
+        sample_buffers=(SampleBuffer("float", "label_raw"), SampleBuffer("int", "label_id_raw")),
     ),
     "splat_id": Layout(
         "output/splat_id.cl",
         parts=("coverage",),
         splat=(member("int splat_id"),),
-        project=takes("cloud int splat_ids  // (n)"),
-        samples=(Samples("float", "splat_id_raw"), Samples("int", "splat_id_index_raw")),
+        project=args("cloud int splat_ids  // (n)"),
+        sample_buffers=(SampleBuffer("float", "splat_id_raw"), SampleBuffer("int", "splat_id_index_raw")),
     ),
-    "overdraw": Layout("output/overdraw.cl", samples=(Samples("int", "overdraw_raw"),)),
-    "rounding": Layout("output/rounding.cl", samples=(Samples("float", "rounding_raw"),)),
-    "blended": Layout("output/blended.cl", samples=(Samples("int", "blended_raw"),)),
+    "overdraw": Layout("output/overdraw.cl", sample_buffers=(SampleBuffer("int", "overdraw_raw"),)),
+    "rounding": Layout("output/rounding.cl", sample_buffers=(SampleBuffer("float", "rounding_raw"),)),
+    "blended": Layout("output/blended.cl", sample_buffers=(SampleBuffer("int", "blended_raw"),)),
     # effects on the resolved rgb
     "fog": Layout(
         "output/fog.cl",
         parts=("ray_depth", "ray_length"),
-        blend=takes(uniforms("fog_density", "float fog_density"), RAY_UNIFORMS),
-        samples=(Samples("float", "fog_raw", averaged=True),),
+        blend=args(uniforms("fog_density", "float fog_density"), RAY_UNIFORMS),
+        sample_buffers=(SampleBuffer("float", "fog_raw", averaged=True),),
     ),
     "decode_srgb": Layout("post/decode_srgb.cl"),
     "veiling_glare": Layout(
@@ -303,7 +303,7 @@ LAYOUTS: dict[str, Layout] = {
     "exposure": Layout("post/exposure.cl", resolve=uniforms("exposure", "float exposure")),
     "vignetting": Layout(
         "post/vignetting.cl",
-        resolve=takes(
+        resolve=args(
             uniforms(
                 "vignette_center",
                 "float vignette_x vignette_y vignette_scale",
@@ -332,7 +332,7 @@ LAYOUTS: dict[str, Layout] = {
     "response_srgb": Layout("post/response_srgb.cl"),
     "response_table": Layout(
         "post/response_table.cl",
-        resolve=takes(
+        resolve=args(
             uniforms("response_count", "int response_count"), "array float response  // (response_count)"
         ),
     ),
@@ -346,6 +346,6 @@ def extension_layout(extension: Extension) -> Layout:
     return Layout(
         str(extension.opencl),
         parts=extension.parts,
-        samples=tuple(Samples("float", name) for name in extension.samples),
+        sample_buffers=tuple(SampleBuffer("float", name) for name in extension.samples),
         resolve=uniforms(extension.name, *(f"float {name}" for name in extension.uniforms)),
     )

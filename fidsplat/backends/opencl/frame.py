@@ -1,4 +1,4 @@
-"""The stages of a frame in order: plan, project, bin, sort, blend, resolve.
+"""The stages of a frame in order: project, bin, sort, blend, resolve.
 
 They are submitted to one in-order queue. A frame with more pairs than the memory budget allows is binned and
 blended in bands of tiles; a frame with a shutter is blended pose by pose and resolved once. Images are
@@ -14,7 +14,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.opencl import tiling
-from fidsplat.backends.opencl.counts import COUNTS, TALLIES, read_stats
+from fidsplat.backends.opencl.counts import COUNTERS, COUNTS, read_stats
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.tiling import TileBand
 from fidsplat.backends.view import SubFrame
@@ -22,14 +22,14 @@ from fidsplat.backends.view import SubFrame
 _GRID = (16, 4)
 """work-group of kernels over pixels or samples"""
 _UNLIMITED = 2**32 - 1
-_NEVER = np.full(1, 0xFFFFFFFF, np.uint32)
+_NO_DEPTH = np.full(1, 0xFFFFFFFF, np.uint32)
 """termination depth of tiles that are not rendered"""
 
 
 def render(frame: DeviceFrame) -> None:
     """Submit all stages of a frame whose images are bound."""
     if frame.view.sub_frames:
-        render_exposure(frame)
+        render_sub_frames(frame)
         return
     frame.discard_launches()
     allocate_samples(frame)
@@ -43,20 +43,20 @@ def render(frame: DeviceFrame) -> None:
 
 def allocate_samples(frame: DeviceFrame) -> None:
     """Bind the buffers that the blend stage writes."""
-    for one in frame.samples:
-        frame.take(one.name, 4 * frame.numbers["channel_stride"] * one.channels)
-    if frame.source.takes("blend", "termination_depths"):
-        ends = frame.lease("termination_depths", 4 * frame.tiles)
+    for samples in frame.sample_buffers:
+        frame.scratch(samples.name, 4 * frame.numbers["channel_stride"] * samples.channels)
+    if frame.source.has_argument("blend", "termination_depths"):
+        depths = frame.acquire("termination_depths", 4 * frame.tiles)
         if frame.view.band is not None:
-            cl.enqueue_fill_buffer(frame.queue, ends, _NEVER, 0, 4 * frame.tiles)
+            cl.enqueue_fill_buffer(frame.queue, depths, _NO_DEPTH, 0, 4 * frame.tiles)
 
 
 def render_sorted(frame: DeviceFrame) -> None:
     """Render on a CPU: wait for the number of pairs, then allocate the lists."""
     count, big = frame.resident.count, 0
-    frame.put_view(0, frame.rows)
+    frame.upload_view(0, frame.rows)
     while True:
-        tiling.allocate_tallies(frame, TALLIES * frame.views, big)
+        tiling.allocate_counters(frame, COUNTERS * frame.views, big)
         tiling.project(frame, 0, count)
         tiling.sort_by_depth(frame, count)
         counts = tiling.count_pairs(frame, count)
@@ -74,8 +74,8 @@ def render_sorted(frame: DeviceFrame) -> None:
 def render_tiled(frame: DeviceFrame) -> None:
     """Render on a GPU: submit all stages with the list capacity of previous frames, and again with larger
     lists if they exceeded it."""
-    frame.put_view(0, frame.rows)
-    frame.lease("counts", 4 * COUNTS)
+    frame.upload_view(0, frame.rows)
+    frame.acquire("counts", 4 * COUNTS)
     capacity = tiling.pair_capacity(frame.workspace)
     if frame.pair_limit:
         capacity = min(capacity, frame.pair_limit)
@@ -83,9 +83,9 @@ def render_tiled(frame: DeviceFrame) -> None:
     counted = tiling.start_lists(frame, capacity)
     frame.counted_launches = len(frame.events)
     if capacity:
-        every = TileBand(0, frame.tiles, capacity)
-        tiling.list_and_sort(frame, every, capacity, first_band=True)
-        blend(frame, every)
+        all_tiles = TileBand(0, frame.tiles, capacity)
+        tiling.list_and_sort(frame, all_tiles, capacity, first_band=True)
+        blend(frame, all_tiles)
         resolve(frame)
     if frame.waits:
         complete_tiled(frame, counted, capacity)
@@ -142,42 +142,44 @@ def render_in_chunks(frame: DeviceFrame) -> None:
 def blend(frame: DeviceFrame, band: TileBand) -> None:
     """Submit the blend kernel for a band of tiles; GPUs start with the longest lists."""
     group = frame.shape.blend_items
-    given: dict[str, Any] = {"band_first": band.first}
+    arguments: dict[str, Any] = {"band_first": band.first}
     if frame.shape.schedule == "group":
         ordered = frame.shape.lists != "ordered" and band.end - band.first == frame.tiles
-        given["tile_order"] = frame.named["tile_order"] if ordered else frame.buffers.starts
-        given["longest_first"] = ordered
-    frame.launch("blend", "blend", ((band.end - band.first) * group,), (group,), **given)
+        arguments["tile_order"] = frame.named["tile_order"] if ordered else frame.buffers.starts
+        arguments["longest_first"] = ordered
+    frame.launch("blend", "blend", ((band.end - band.first) * group,), (group,), **arguments)
 
 
 def resolve(frame: DeviceFrame) -> None:
     """Composite the background behind the splats and average samples to pixels, unless fused into `blend`."""
     arguments, view = frame.source.arguments, frame.view
-    if "backdrop" in arguments and not view.sub_frames:
-        _launch_grid(frame, "resolve", "backdrop", view.width, view.height)
+    if "composite_background" in arguments and not view.sub_frames:
+        _launch_grid(frame, "resolve", "composite_background", view.width, view.height)
     if "resolve" in arguments and not frame.is_sub_frame:
         _launch_grid(frame, "resolve", "resolve", view.width // view.samples, view.height // view.samples)
 
 
-def _launch_grid(frame: DeviceFrame, stage: str, kernel: str, width: int, height: int, **given: Any) -> None:
+def _launch_grid(
+    frame: DeviceFrame, stage: str, kernel: str, width: int, height: int, **arguments: Any
+) -> None:
     """Submit a kernel with a work-item for each pixel or sample of each view."""
-    frame.launch(stage, kernel, (width, height), _GRID, frame.views, width=width, height=height, **given)
+    frame.launch(stage, kernel, (width, height), _GRID, frame.views, width=width, height=height, **arguments)
 
 
-def render_exposure(frame: DeviceFrame) -> None:
+def render_sub_frames(frame: DeviceFrame) -> None:
     """Blend the sub-frames of a shutter one after another, and resolve their mean."""
-    for one in frame.samples:
-        size = 4 * frame.rows * frame.stride * one.channels
-        frame.bind(one.name, frame.pool.scratch(f"exposed {one.name}", size))
-    surroundings = {
-        one.name: frame.put(one.name, frame.view.array(one.name))
-        for one in frame.source.arguments.get("backdrop", ())
-        if one.source == "array"
+    for samples in frame.sample_buffers:
+        size = 4 * frame.rows * frame.stride * samples.channels
+        frame.bind(samples.name, frame.pool.scratch(f"accumulated {samples.name}", size))
+    background_arrays = {
+        argument.name: frame.upload(argument.name, frame.view.array(argument.name))
+        for argument in frame.source.arguments.get("composite_background", ())
+        if argument.source == "array"
     }
     stats = {"splats": frame.resident.count, "visible": 0, "pairs": 0}
     for sub_frame in frame.view.sub_frames:
         part = frame.sub_frame(sub_frame.view)
-        part.named |= surroundings
+        part.named |= background_arrays
         render(part)
         frame.events += part.events
         frame.stages += part.stages
@@ -185,9 +187,9 @@ def render_exposure(frame: DeviceFrame) -> None:
         for name, value in part.stats().items():
             stats[name] = max(stats[name], value)
         frame.uploads += part.uploads
-        frame.pool.give_back(part.leased.items())
-    if frame.source.takes("resolve", "rays"):
-        frame.put_rays()
+        frame.pool.release(part.acquired.items())
+    if frame.source.has_argument("resolve", "rays"):
+        frame.bind_rays()
     resolve(frame)
     frame.stats = partial(dict, stats)
 
@@ -195,14 +197,15 @@ def render_exposure(frame: DeviceFrame) -> None:
 def accumulate(frame: DeviceFrame, part: DeviceFrame, sub_frame: SubFrame) -> None:
     """Add the samples of a sub-frame to those of the frame."""
     size = sub_frame.view.width, sub_frame.view.height
-    given = {
-        **{"whole_stride": frame.stride, "whole_channel_stride": frame.rows * frame.stride},
+    strides = {
+        **{"frame_stride": frame.stride, "frame_channel_stride": frame.rows * frame.stride},
         **{"stride": part.stride, "channel_stride": part.rows * part.stride, "top": sub_frame.top},
     }
-    for one in frame.samples:
-        if not (one.averaged or sub_frame.middle):
+    for samples in frame.sample_buffers:
+        if not (samples.averaged or sub_frame.middle):
             continue
-        buffers = {"raw": part.named[one.name], "exposed": frame.named[one.name], "channels": one.channels}
-        weights = {"weight": sub_frame.weight, "first": sub_frame.first} if one.averaged else {}
-        kernel = "expose" if one.averaged else "expose_middle"
-        _launch_grid(frame, "expose", kernel, *size, **given, **buffers, **weights)
+        buffers = {"raw": part.named[samples.name], "accumulated": frame.named[samples.name]}
+        weights = {"weight": sub_frame.weight, "first": sub_frame.first} if samples.averaged else {}
+        kernel = "accumulate" if samples.averaged else "copy_middle"
+        arguments = {**strides, **buffers, **weights, "channels": samples.channels}
+        _launch_grid(frame, "accumulate", kernel, *size, **arguments)

@@ -110,21 +110,21 @@ class OpenCLGradients(GradientPipeline):
         """A copy of the frame that launches kernels of the program `gradients` and has their buffers."""
         frame = copy(forward)
         frame.commands, frame.source = self._tile_commands, self.source
-        frame.take("splat_slots", 4 * frame.resident.count)
-        frame.take("moments", self.source.records["Moments"].itemsize * frame.pairs)
-        frame.take("tile_sums", 3 * self.source.scalars.dtype("real").itemsize * frame.tiles)
+        frame.scratch("splat_slots", 4 * frame.resident.count)
+        frame.scratch("moments", self.source.records["Moments"].itemsize * frame.pairs)
+        frame.scratch("tile_sums", 3 * self.source.scalars.dtype("real").itemsize * frame.tiles)
         return frame
 
     def _submit_to_tiles(self, frame: DeviceFrame, gradients: Mapping[str, Any]) -> None:
         """Submit the kernels up to the sums over tiles; replays their command list if possible."""
         self._bind_gradients(frame, gradients)
-        reserved = frame.take("reserved", 8)
+        reserved = frame.scratch("reserved", 8)
         cl.enqueue_fill_buffer(frame.queue, reserved, _ZERO, 0, 8)
         ceiling = math.log(frame.view.ceiling)
         commands, key = self._tile_commands, self._key(frame)
         if key is not None and commands.key == key:
             given = {f"by_{name}": frame.named[f"by_{name}"] for name in self._by_outputs}
-            commands.set({**scalars_of(frame.view), "log_ceiling": ceiling, **frame.leased, **given})
+            commands.set({**scalars_of(frame.view), "log_ceiling": ceiling, **frame.acquired, **given})
             frame.events += commands.submit(frame.queue)
             frame.stages += commands.stages
             self._check_capacity(frame)
@@ -145,22 +145,22 @@ class OpenCLGradients(GradientPipeline):
         features, shape = self.features, self._pipeline.shape
         in_groups, tile = shape.schedule == "group", shape.tile_width * shape.tile_height
         chunks = frame.pairs // backward_chunk(features, shape) + frame.tiles
-        frame.take("checkpoints", (8 * tile if in_groups else 4 * (tile + shape.lanes)) * chunks)
+        frame.scratch("checkpoints", (8 * tile if in_groups else 4 * (tile + shape.lanes)) * chunks)
         if not in_groups:
             rows = -(-frame.view.height // shape.tile_height)
-            frame.take("big_rows", 4 * frame.numbers["big_capacity"] * rows)
+            frame.scratch("big_rows", 4 * frame.numbers["big_capacity"] * rows)
         if count := frame.resident.count:
             frame.launch("reserve", "reserve_slots", (count,), (_GROUP,), count=count)
         groups = chunks if in_groups else min(frame.tiles, frame.workspace.info.compute_units)
         if in_groups:
-            frame.take("reached", 4 * frame.tiles)
-            frame.take("chunk_tiles", 4 * chunks)
+            frame.scratch("reached", 4 * frame.tiles)
+            frame.scratch("chunk_tiles", 4 * chunks)
             size = frame.tiles * shape.blend_items
             frame.launch(
                 "blend backward", "blend_checkpoints", (size,), (shape.blend_items,), log_ceiling=log_ceiling
             )
         else:
-            frame.take("tapes", self._tape_bytes() * groups)
+            frame.scratch("tapes", self._tape_bytes() * groups)
         items = backward_items(features, shape)
         frame.launch("blend backward", "blend_backward", (groups * items,), (items,), log_ceiling=log_ceiling)
 
@@ -194,7 +194,7 @@ class OpenCLGradients(GradientPipeline):
             shape, given = gradient_shape(name, frame.view), gradients.get(name)
             if given is None:
                 size = 4 * math.prod(shape)
-                buffer = frame.take(f"by_{name}", size)
+                buffer = frame.scratch(f"by_{name}", size)
                 cl.enqueue_fill_buffer(frame.queue, buffer, _ZERO, 0, size)
                 continue
             check_shape(name, given.shape, frame.view)
@@ -206,7 +206,7 @@ class OpenCLGradients(GradientPipeline):
                     )
                 frame.bind(f"by_{name}", given.data)  # pyright: ignore[reportArgumentType]
             else:
-                frame.put(f"by_{name}", np.ascontiguousarray(given, np.float32))
+                frame.upload(f"by_{name}", np.ascontiguousarray(given, np.float32))
 
 
 class TileGradients:
@@ -271,7 +271,7 @@ class TileGradients:
         """Allocate the sums of work-groups for the camera, and return the number of work-groups."""
         groups = -(-frame.resident.count // _GROUP)
         real = self.pipeline.source.scalars.dtype("real").itemsize
-        frame.take("group_sums", _CAMERA * real * groups)
+        frame.scratch("group_sums", _CAMERA * real * groups)
         return groups
 
     def _add_up(self, frame: DeviceFrame, found: Mapping[str, Array], groups: int) -> None:

@@ -30,13 +30,13 @@ _KERNELS: WeakKeyDictionary[Workspace, tuple[cl.Kernel, int]] = WeakKeyDictionar
 """kernel of uint8.cl, compiled on first use, and values per work-item"""
 
 
-def lease_images(
+def acquire_images(
     workspace: Workspace, outputs: tuple[Output, ...], views: ViewBatch
 ) -> list[tuple[str, cl.Buffer]]:
     """Buffers for the output images of a batch, (views, h, w, channels) each; `Output.empty_value` in masked
     views. Raises DeviceError if they exceed the memory budget, or one the largest buffer of the device."""
     pixels = views.total * views.size[0] * views.size[1]
-    bytes_of = {one.name: 4 * pixels * one.channels for one in outputs}
+    bytes_of = {output.name: 4 * pixels * output.channels for output in outputs}
     largest = max(bytes_of, key=bytes_of.__getitem__)
     if bytes_of[largest] > workspace.largest_buffer:
         raise DeviceError(
@@ -44,15 +44,15 @@ def lease_images(
             f"largest buffer of the device, got {bytes_words(bytes_of[largest])}; render fewer views at once"
         )
     check_batch_memory(views.total, sum(bytes_of.values()), workspace.memory_budget)
-    leased = []
+    acquired = []
     for output in outputs:
         name = f"{output.name} of views"  # another pool name, as single frames must not reuse batch buffers
-        buffer = workspace.pool.lease(name, bytes_of[output.name])
-        leased.append((name, buffer))
+        buffer = workspace.pool.acquire(name, bytes_of[output.name])
+        acquired.append((name, buffer))
         if len(views) < views.total:
             empty = np.full(1, output.empty_value, output.dtype)
             cl.enqueue_fill_buffer(workspace.queue, buffer, empty, 0, bytes_of[output.name])
-    return leased
+    return acquired
 
 
 class OpenCLImages(Images):
@@ -64,10 +64,10 @@ class OpenCLImages(Images):
         views: ViewBatch | View,
         rendered: list[Rendered],
         splats: int,
-        leased: list[tuple[str, cl.Buffer]] | None = None,
+        acquired: list[tuple[str, cl.Buffer]] | None = None,
         replay: Replay | None = None,
     ) -> None:
-        """pipeline: an OpenCLPipeline. leased: image buffers of a batch; None for a single frame."""
+        """pipeline: an OpenCLPipeline. acquired: image buffers of a batch; None for a single frame."""
         self._workspace, self._splats, self._outputs = pipeline.workspace, splats, pipeline.outputs
         self._view = view = views if isinstance(views, View) else views.view
         if isinstance(views, ViewBatch):
@@ -75,14 +75,14 @@ class OpenCLImages(Images):
         self._size = view.height // view.samples, view.width // view.samples
         self._rendered, self._replay = rendered, replay
         self._tile = pipeline.shape.tile_height, pipeline.shape.tile_width
-        self._batch = None if leased is None else dict(zip(self._outputs, leased, strict=True))
+        self._batch = None if acquired is None else dict(zip(self._outputs, acquired, strict=True))
         self._timings: dict[str, float] = {}
         self._copied: list[Rendered] = []
         """frames from which tiles were copied; without their buffers"""
-        self._leased = [*(leased or ())]
-        for one in rendered:
-            self._leased += one.leased.items()
-        weakref.finalize(self, self._workspace.pool.give_back, self._leased)
+        self._acquired = [*(acquired or ())]
+        for part in rendered:
+            self._acquired += part.acquired.items()
+        weakref.finalize(self, self._workspace.pool.release, self._acquired)
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
         if index is not None:
@@ -103,7 +103,7 @@ class OpenCLImages(Images):
 
     def _copy(self, name: str, into: np.ndarray, offset: int) -> None:
         with self._workspace.failing(f"rendering {name}"):
-            buffer, after = self.buffer(name), self._done()
+            buffer, after = self.buffer(name), self._completion_events()
             # a separate queue: on the queue of the frames, the copy would wait for the next frame
             cl.enqueue_copy(self._workspace.read_queue, into, buffer, src_offset=offset, wait_for=after)
 
@@ -113,31 +113,31 @@ class OpenCLImages(Images):
         return self._size if channels == 1 else (*self._size, channels)
 
     def buffer(self, name: str) -> cl.Buffer:
-        return self.complete()[0].leased[f"{name}_out"] if self._batch is None else self._batch[name][1]
+        return self.complete()[0].acquired[f"{name}_out"] if self._batch is None else self._batch[name][1]
 
-    def _done(self) -> list[cl.Event]:
+    def _completion_events(self) -> list[cl.Event]:
         """Events after which the images are complete."""
         if not self._rendered:  # all views are masked out
             self._workspace.queue.finish()
-        for one in self.complete():
-            one.queue.flush()
-        return [one.events[-1] for one in self._rendered]
+        for part in self.complete():
+            part.queue.flush()
+        return [part.events[-1] for part in self._rendered]
 
     def read_uint8(self, name: str, index: int = 0) -> np.ndarray:
         workspace, shape, label = self._workspace, self._shape(name), "8 bits of an image"
         into, count = workspace.host_memory.empty(shape, np.uint8), math.prod(shape)
         with workspace.failing(f"rendering {name}"):
-            after = self._done()
+            after = self._completion_events()
             with workspace.lock:  # all images share the kernel object with its arguments
-                kernel, values = _kernel(workspace)
-                made = workspace.pool.lease(label, count)
+                kernel, values = _uint8_kernel(workspace)
+                converted = workspace.pool.acquire(label, count)
                 items = -(-count // (values * _UINT8_GROUP)) * _UINT8_GROUP
-                given = np.uint64(count), np.uint64(index * count), self.buffer(name), made
-                converted = kernel(workspace.read_queue, (items,), (_UINT8_GROUP,), *given, wait_for=after)
+                arguments = np.uint64(count), np.uint64(index * count), self.buffer(name), converted
+                event = kernel(workspace.read_queue, (items,), (_UINT8_GROUP,), *arguments, wait_for=after)
             try:
-                cl.enqueue_copy(workspace.read_queue, into, made, wait_for=[converted])
+                cl.enqueue_copy(workspace.read_queue, into, converted, wait_for=[event])
             finally:
-                workspace.pool.give_back([(label, made)])
+                workspace.pool.release([(label, converted)])
         return into
 
     def device_array(self, name: str, index: int | None = None) -> Any:
@@ -153,8 +153,8 @@ class OpenCLImages(Images):
 
     def wait(self) -> None:
         with self._workspace.failing("rendering"):
-            for one in self.complete():
-                one.queue.finish()
+            for part in self.complete():
+                part.queue.finish()
 
     @property
     def timings(self) -> Mapping[str, float]:
@@ -165,13 +165,13 @@ class OpenCLImages(Images):
                 with self._workspace.lock:
                     self._timings = self._timings or self._replay.timings()
                 return self._timings
-            return summed(one.timings() for one in (*rendered, *self._copied))
+            return summed(part.timings() for part in (*rendered, *self._copied))
 
     @property
     def stats(self) -> Mapping[str, int]:
         """Number of splats of the cloud, and of visible splats and pairs of all views."""
         with self._workspace.failing("rendering"):
-            stats = summed(one.stats() for one in self.complete())
+            stats = summed(part.stats() for part in self.complete())
             stats = {"splats": 0, "visible": 0, "pairs": 0} | stats | {"splats": self._splats}
             return summed([stats, *(copied.stats() for copied in self._copied)])
 
@@ -179,10 +179,10 @@ class OpenCLImages(Images):
         """The rendered parts; a replayed frame that exceeded its capacity is rendered again."""
         if self._replay is not None:
             with self._workspace.lock:
-                again = self._replay.overflow(self._rendered[0])
-                if again is not None:
-                    self._leased += again.leased.items()
-                    self._rendered = [again]
+                complete = self._replay.render_on_overflow(self._rendered[0])
+                if complete is not None:
+                    self._acquired += complete.acquired.items()
+                    self._rendered = [complete]
         return self._rendered
 
     def termination_depths(self) -> TerminationDepths:
@@ -191,14 +191,14 @@ class OpenCLImages(Images):
             (height, width), view = self._tile, self._view
             keys = np.empty((-(-view.height // height), -(-view.width // width)), np.uint32)
             (rendered,) = self.complete()
-            queue, buffer = self._workspace.read_queue, rendered.leased["termination_depths"]
-            cl.enqueue_copy(queue, keys, buffer, wait_for=self._done())
+            queue, buffer = self._workspace.read_queue, rendered.acquired["termination_depths"]
+            cl.enqueue_copy(queue, keys, buffer, wait_for=self._completion_events())
         return TerminationDepths.of_keys(keys, self._tile)
 
     def copy_tiles(self, other: OpenCLImages, tiles: np.ndarray) -> None:
         """Copy tiles of another frame of the same view. Raises DeviceError if the device has failed."""
         with self._workspace.failing("rendering"):
-            after, copied = [*self._done(), *other._done()], None
+            after, copied = [*self._completion_events(), *other._completion_events()], None
             for output in self._outputs.values():
                 width = 4 * output.channels  # bytes of a pixel
                 row_bytes = self._size[1] * width
@@ -214,18 +214,18 @@ class OpenCLImages(Images):
             if copied is not None:
                 copied.wait()  # the next frame may overwrite the buffers of `other`
             (rendered,) = other.complete()
-            self._copied.append(replace(rendered, leased={}, stats=partial(dict, rendered.stats())))
+            self._copied.append(replace(rendered, acquired={}, stats=partial(dict, rendered.stats())))
 
     def _rectangles(self, tiles: np.ndarray) -> Iterator[tuple[int, int, int, int]]:
         """Rectangles of pixels [top, bottom) x [left, right) that cover tiles (rows, columns) bool."""
         (rows, columns), (height, width) = self._size, (side // self._view.samples for side in self._tile)
-        for row, chosen in enumerate(tiles):
-            sides = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))
-            for first, end in sides.reshape(-1, 2).tolist():
+        for row, mask in enumerate(tiles):
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+            for first, end in edges.reshape(-1, 2).tolist():
                 yield row * height, min((row + 1) * height, rows), first * width, min(end * width, columns)
 
 
-def _kernel(workspace: Workspace) -> tuple[cl.Kernel, int]:
+def _uint8_kernel(workspace: Workspace) -> tuple[cl.Kernel, int]:
     if workspace not in _KERNELS:
         load_invoker()
         values = 16 if workspace.shape.schedule == "lanes" else 4

@@ -6,9 +6,9 @@ assemble.py prints them as C into kernels/opencl/, and the host binds arguments 
 
 from __future__ import annotations
 
-from fidsplat.backends.opencl.declare import Argument, Record, Samples, member, takes, uniforms
+from fidsplat.backends.opencl.declare import Argument, Record, SampleBuffer, args, member, uniforms
 
-RAW = Samples("float", "raw", 4, "r, g, b, transmittance", averaged=True)
+RAW = SampleBuffer("float", "raw", 4, "r, g, b, transmittance", averaged=True)
 """the sample buffer of every frame"""
 
 VIEW = Record(
@@ -68,23 +68,23 @@ MOMENTS = Record(
 )
 """Contribution of a tile to the gradient of a splat's record."""
 
-_SIZE = takes("int width height  // of the sample grid")
-_IMAGE_SIZE = takes("int width height  // of the image")
-_BIG = takes("uint big_capacity", "in Bounds big_bounds")
-_DIGIT = takes("uint count  // capacity in splats of a view", "in uint tallies", "uint first shift")
-_WALK = takes(
+_SIZE = args("int width height  // of the sample grid")
+_IMAGE_SIZE = args("int width height  // of the image")
+_BIG = args("uint big_capacity", "in Bounds big_bounds")
+_DIGIT = args("uint count  // capacity in splats of a view", "in uint counters", "uint first shift")
+_WALK = args(
     "uint count  // capacity in splats of a view",
-    "in uint order tallies",
+    "in uint order counters",
     "in uint2 windows",
     _BIG,
     _SIZE,
     "out uint table",
 )
-_EXPOSED = takes(
+_ACCUMULATED = args(
     _SIZE,
     "int stride  // samples per row of a sub-frame",
     "uint channel_stride  // samples per channel of a sub-frame",
-    *("int whole_stride", "uint whole_channel_stride", "int top channels"),
+    *("int frame_stride", "uint frame_channel_stride", "int top channels  // top: row of the frame"),
 )
 RAY_UNIFORMS = uniforms(
     "ray",
@@ -92,20 +92,20 @@ RAY_UNIFORMS = uniforms(
     note="of the sample grid; infinite where depths are distances",
 )
 
-_TILES = takes("in uint2 windows", "uint big_capacity", "in Bounds big_bounds", _IMAGE_SIZE)
-_RESERVED = takes(
+_TILES = args("in uint2 windows", "uint big_capacity", "in Bounds big_bounds", _IMAGE_SIZE)
+_RESERVED = args(
     *("uint count", "in uint keys", _TILES),
     "out uint splat_slots  // (n) first gradient buffer offset of each splat, which has one per tile",
     "out uint reserved  // number of offsets",
 )
 
-_BLENDED = takes(
+_BLENDED = args(
     "wide log_cut ceiling stop filter",
     *("float log_ceiling", "float background_r background_g background_b"),
     *("int stride  // of the padded image", "uint channel_stride", "in float by_rgb  // (h, w, 3)"),
 )
 
-_BLEND = takes(
+_BLEND = args(
     *("in Splat splats", "in uint lists starts"),
     "uint band_first  // the first tile of this launch; lists begin with its list",
     *(_SIZE, "wide log_cut ceiling stop filter"),
@@ -114,27 +114,27 @@ _BLEND = takes(
 )
 
 _EXPOSURE = "float gain_red gain_green gain_blue offset_red offset_green offset_blue"
-_LOSS_SIZE = takes(
+_LOSS_SIZE = args(
     "int width height  // values of a row: three of a pixel; rows",
     "int stride  // floats of an image's row",
     "uint image_stride  // floats of an image",
 )
-_MASK = takes("int masked", "in uchar mask  // (rows, pixels), where `masked`")
-_ALIGNED = takes(
+_MASK = args("int masked", "in uchar mask  // (rows, pixels), where `masked`")
+_ALIGNED = args(
     *("int width height channels", "uint least  // the lowest bin of textured pixels"),
     *(_EXPOSURE, "in uchar bins", "in float image rgb"),
 )
-_IMAGES = takes("out float images")
-_SURFACE = takes(
+_IMAGES = args("out float images")
+_SURFACE = args(
     _IMAGE_SIZE,
     "float inverse_x inverse_y middle_x middle_y  // 1 / focal lengths, and the principal point [px]",
 )
-_RENDERED_SH = takes("uint count rendered all", "int plain")
+_RENDERED_SH = args("uint count rendered all", "int plain")
 
 _ROTATION = "float " + " ".join(f"rotation_{row}{column}" for row in range(3) for column in range(3))
 
 KERNELS: dict[str, tuple[Argument, ...]] = {
-    "project": takes(
+    "project": args(
         "uint count",
         "in View view",
         "cloud float means  // (n, 3) [m], relative to the cloud's origin",
@@ -144,30 +144,30 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out Splat splats  // (views, n)",
         "out uint keys  // (views, n)",
         "out uint2 windows  // (views, n): corner and bits, or an index in `big` and 0",
-        "out uint tallies",
+        "out uint counters",
         "uint big_capacity",
         "out uint big  // splats that touch more than a window",
         "out Bounds big_bounds",
     ),
-    "pack_count": takes("uint count", "in uint keys", "out uint piece_counts"),
-    "pack_move": takes(
-        *("uint count", "in uint piece_offsets", "in Splat splats", "in uint keys", "in uint2 windows"),
+    "pack_count": args("uint count", "in uint keys", "out uint block_counts"),
+    "pack_move": args(
+        *("uint count", "in uint block_offsets", "in Splat splats", "in uint keys", "in uint2 windows"),
         *("out Splat splats_out", "out uint keys_out", "out uint2 windows_out"),
     ),
-    "scan_chunks": takes("uint bins", "out uint table totals"),
-    "scan_bins": takes("uint bins", "in uint totals", "out uint starts tallies", "uint slot"),
-    "sort_count": takes("in uint keys", _DIGIT, "out uint table"),
-    "sort_scatter": takes(
+    "scan_chunks": args("uint bins", "out uint table totals"),
+    "scan_bins": args("uint bins", "in uint totals", "out uint starts counters", "uint counter"),
+    "sort_count": args("in uint keys", _DIGIT, "out uint table"),
+    "sort_scatter": args(
         *("in uint keys indices", _DIGIT),
         *("out uint table", "in uint starts", "out uint keys_out indices_out"),
     ),
     "bin_count": _WALK,
-    "bin_emit": takes(*(_WALK, "in uint starts", "int band_first band_end", "out uint lists")),
-    "tile_starts": takes(
-        "uint tiles capacity", "in uint tallies", "out uint starts cursors counts tile_order"
+    "bin_emit": args(*(_WALK, "in uint starts", "int band_first band_end", "out uint lists")),
+    "tile_starts": args(
+        "uint tiles capacity", "in uint counters", "out uint starts cursors counts tile_order"
     ),
-    "tally_big": takes("uint count", _SIZE, _BIG, "in uint big", "out uint tallies"),
-    "emit": takes(
+    "count_big": args("uint count", _SIZE, _BIG, "in uint big", "out uint counters"),
+    "emit": args(
         *(
             "uint count splat_groups first_band",
             _SIZE,
@@ -177,23 +177,23 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("in uint2 windows", "in uint keys big", "in Bounds big_bounds", "in uint starts"),
         *("out uint counts cursors", "out uint2 pairs"),
     ),
-    "tally_local": takes("uint count", _SIZE, "in uint2 windows", "in uint keys", "out uint tallies"),
-    "emit_local": takes(
+    "count_local": args("uint count", _SIZE, "in uint2 windows", "in uint keys", "out uint counters"),
+    "emit_local": args(
         *("uint count first_band", _SIZE, "int band_first band_end", "uint capacity"),
         *("in uint2 windows", "in uint keys starts", "out uint counts cursors", "out uint2 pairs"),
     ),
-    "sort_tiles": takes(
-        "int band_first", "uint clear", "in uint starts", "out ulong pairs", "out uint lists tallies"
+    "sort_tiles": args(
+        "int band_first", "uint clear", "in uint starts", "out ulong pairs", "out uint lists counters"
     ),
     "blend": _BLEND,
-    "expose": takes(_EXPOSED, "float weight", "int first", "in float raw", "out float exposed"),
-    "expose_middle": takes(_EXPOSED, "in uint raw", "out uint exposed"),
-    "backdrop": takes(
+    "accumulate": args(_ACCUMULATED, "float weight", "int first", "in float raw", "out float accumulated"),
+    "copy_middle": args(_ACCUMULATED, "in uint raw", "out uint accumulated"),
+    "composite_background": args(
         *(_SIZE, "int stride", "uint channel_stride", RAY_UNIFORMS),
         uniforms("rotation", _ROTATION, note="world to camera"),
         "out float raw",
     ),
-    "resolve": takes(
+    "resolve": args(
         "int width height  // of the image",
         "int stride  // samples per row of raw",
         "uint channel_stride  // samples per channel of raw, of all views",
@@ -201,10 +201,10 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("float background_r background_g background_b", "in float raw"),
     ),
     # derivatives
-    "reserve_slots": takes(
+    "reserve_slots": args(
         *(_RESERVED, "out uint big_rows  // (rows of tiles, big splats): tiles above, less the first column")
     ),
-    "blend_backward": takes(
+    "blend_backward": args(
         *(
             "in Splat splats",
             "in uint lists starts",
@@ -220,7 +220,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float tapes  // a Tape for each work-item",
         "out uint reserved  // second word: number of claimed tiles",
     ),
-    "project_backward": takes(
+    "project_backward": args(
         *("uint count", "in View view", "cloud float means quats scales opacities"),
         *("in Splat splats", "in uint keys", _TILES, "in uint splat_slots", "in float moments"),
         "out float by_means  // (n, 3)",
@@ -230,7 +230,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float screen  // (n)",
         "out real group_sums  // (work-groups, 10) by the camera",
     ),
-    "project_step": takes(
+    "project_step": args(
         *("uint count", "in View view", "in Splat splats", "in uint keys", _TILES),
         *("in uint splat_slots", "in float moments"),
         "int counted move sparse  // sparse: update only splats that contribute",
@@ -247,26 +247,26 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float sh first_sh second_sh",
         "out float activated_quats activated_scales activated_opacities activated_sh",
     ),
-    "add_up": takes(
+    "add_up": args(
         *("uint tiles groups", "in real tile_sums group_sums  // (tiles, 3), (groups, 10)"),
         "out float background pose intrinsics",
     ),
     # direct image alignment
-    "align_shrink": takes(
+    "align_shrink": args(
         *("int width height channels full_width full_height", "float ratio_x ratio_y"),
         *("in float image", "out float made"),
     ),
-    "align_blur": takes(
+    "align_blur": args(
         "int width height channels vertical radius",
         "in float taps  // (radius + 1)",
         *("in float image", "out float made"),
     ),
-    "align_texture": takes(
+    "align_texture": args(
         *("int width height channels row", _MASK, "in float image", "out uchar bins"),
         "out uint counts  // (stages, BINS); row: the stage",
     ),
-    "align_errors": takes(_ALIGNED, "out uint counts  // (BINS)"),
-    "align_sums": takes(
+    "align_errors": args(_ALIGNED, "out uint counts  // (BINS)"),
+    "align_sums": args(
         _ALIGNED,
         "in uint counts",
         "int side huber moves axis lens  // moves: whether there is a moved render",
@@ -275,31 +275,31 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float made  // (work-groups, SUMS + 1)",
     ),
     # training
-    "loss_take": takes(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK, _IMAGES),
-    "loss_rows": takes(_LOSS_SIZE, _IMAGES),
-    "loss_columns": takes(_LOSS_SIZE, _IMAGES),
-    "loss_rows_backward": takes(_LOSS_SIZE, _IMAGES),
-    "loss_columns_backward": takes(
+    "loss_take": args(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK, _IMAGES),
+    "loss_rows": args(_LOSS_SIZE, _IMAGES),
+    "loss_columns": args(_LOSS_SIZE, _IMAGES),
+    "loss_rows_backward": args(_LOSS_SIZE, _IMAGES),
+    "loss_columns_backward": args(
         _LOSS_SIZE, "float l1_share ssim_share", _MASK, "in float images", "out float by_rgb"
     ),
-    "loss_sums": takes("uint image_stride", "in float images", "out float sums  // (work-groups, 3)"),
-    "loss_strips": takes(
+    "loss_sums": args("uint image_stride", "in float images", "out float sums  // (work-groups, 3)"),
+    "loss_strips": args(
         *(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK),
         *(_IMAGES, "out float sums  // (work-groups, 3)"),
     ),
-    "loss_strips_backward": takes(
+    "loss_strips_backward": args(
         *(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK),
         *("float l1_share ssim_share", "in float images", "out float by_rgb"),
     ),
-    "apply_exposure": takes("uint count  // pixels", _EXPOSURE, "in float rgb", "out float exposed"),
-    "exposure_backward": takes(
+    "apply_exposure": args("uint count  // pixels", _EXPOSURE, "in float rgb", "out float exposed"),
+    "exposure_backward": args(
         "uint count",
         _EXPOSURE,
         "in float rgb",
         "out float by_rgb",
         "out float exposure_sums  // (work-groups, 6)",
     ),
-    "surface_normals": takes(
+    "surface_normals": args(
         _SURFACE,
         _MASK,
         "float normal_share  // of each pixel",
@@ -307,15 +307,15 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float by_normal",
         "out float differences  // (rows, columns, 2, 3)",
     ),
-    "surface_depths": takes(_SURFACE, "in float differences", "out float by_depth"),
-    "activate": takes(
+    "surface_depths": args(_SURFACE, "in float differences", "out float by_depth"),
+    "activate": args(
         "uint count axes  // number of scales of a splat",
         "in float quats log_scales logits",
         "out float activated_quats activated_scales activated_thickness activated_opacities",
     ),
-    "activate_sh": takes(_RENDERED_SH, "in float sh", "out float activated_sh"),
-    "gather_rows": takes("uint count row copied", "in uint rows", "in float source", "out float gathered"),
-    "count_visible": takes(
+    "activate_sh": args(_RENDERED_SH, "in float sh", "out float activated_sh"),
+    "gather_rows": args("uint count row copied", "in uint rows", "in float source", "out float gathered"),
+    "count_visible": args(
         "uint count",
         _ROTATION,
         "float translation_x translation_y translation_z  // camera-space position of the means' zero [m]",
@@ -324,7 +324,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "in float means activated_scales activated_thickness",
         "out float visible_counts",
     ),
-    "add_position_noise": takes(
+    "add_position_noise": args(
         "uint count axes seed_low seed_high iteration purpose",
         "float size  // metres times 1 / m^2 of the steps",
         "float slope threshold  // of the opacity above which splats do not move",
@@ -336,17 +336,17 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
 
 GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_slots": _RESERVED,
-    "blend": takes(
+    "blend": args(
         "uint longest_first  // blend the tiles in the order of tile_order", "in uint tile_order", _BLEND
     ),
-    "blend_checkpoints": takes(
+    "blend_checkpoints": args(
         *("in Splat splats", "in uint lists starts", _IMAGE_SIZE, _BLENDED),
         "out float checkpoints  // per pixel and CHUNK splats: transmittance in front, light behind",
         "out uint reached  // (tiles) number of chunks before the transmittance stop",
         "out uint chunk_tiles  // tile of each chunk",
         "out real tile_sums  // (tiles, 3) by the background",
     ),
-    "blend_backward": takes(
+    "blend_backward": args(
         *("in Splat splats", "in uint lists starts", _TILES, "in uint splat_slots", _BLENDED),
         *("in float checkpoints", "in uint reached chunk_tiles"),
         "out float moments  // records Moments by gradient buffer offset",
@@ -355,10 +355,10 @@ GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
 """Kernels with other arguments in the group schedule, where a work-group shares a tile."""
 
 UNCULLED_KERNELS: dict[str, tuple[Argument, ...]] = {
-    "project": takes(KERNELS["project"], "in uint unculled  // splats that are projected"),
-    "find_unculled": takes(KERNELS["project"], "in uint unculled", "out uint unculled_bits unculled_counts"),
-    "list_unculled": takes(
-        "uint capacity", "in uint unculled_bits unculled_counts", "out uint unculled tallies"
+    "project": args(KERNELS["project"], "in uint unculled  // splats that are projected"),
+    "find_unculled": args(KERNELS["project"], "in uint unculled", "out uint unculled_bits unculled_counts"),
+    "list_unculled": args(
+        "uint capacity", "in uint unculled_bits unculled_counts", "out uint unculled counters"
     ),
 }
 """Kernels with frustum culling before projection."""

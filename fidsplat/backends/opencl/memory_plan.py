@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from fidsplat.backends.bands import even_parts
 from fidsplat.backends.batched_views import ViewBatch
-from fidsplat.backends.opencl.assemble import Source
+from fidsplat.backends.opencl.assemble import KernelSource
 from fidsplat.backends.opencl.buffers import RayBuffers
 from fidsplat.backends.opencl.layout import RAW
 from fidsplat.backends.opencl.resident import Resident
@@ -23,17 +23,17 @@ from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import DeviceError, bytes_words
 
-CHUNK = 1 << 20
-"""maximum splats of a chunk; a power of two, so that parts of every array start at aligned addresses"""
-_LARGE = 1 << 23
-"""maximum splats of a chunk if it needs little of the memory: larger chunks have fewer launches"""
-_MINIMUM = 1 << 10
-KEYS, WINDOWS, SORTED = 4, 8, 16
+DEFAULT_CHUNK = 1 << 20
+"""splats of a chunk; a power of two, so that the chunks of every array start at aligned addresses"""
+_MAX_CHUNK = 1 << 23
+"""maximum splats of a chunk that needs little of the memory: larger chunks have fewer launches"""
+_MIN_CHUNK = 1 << 10
+KEY_BYTES, WINDOW_BYTES, SORT_BYTES = 4, 8, 16
 """bytes per splat of sort keys, of tile windows, and of keys and indices during the sort"""
 MIN_BIG = 1 << 12
 """initial capacity for big splats"""
-SMALL = 1 << 14
-"""bytes for uniforms, counts and moving groups"""
+UNIFORM_BYTES = 1 << 14
+"""upper bound of the bytes of uniforms, counts and moving groups"""
 PART_BYTES = {"cpu": 1 << 28}
 """maximum bytes of a part of a batch without images, by kind of device; larger parts are not faster"""
 OTHER_PART_BYTES = 1 << 31
@@ -48,7 +48,7 @@ class MemoryPlan:
     """Division of a frame, or of a part of a batch, and the bytes of its buffers."""
 
     chunk: int
-    """splats that are projected at once; 0: all, without packing visible splats"""
+    """number of splats that are projected at once; 0: all, without packing the visible splats"""
     capacity: int
     """maximum visible splats of one band, if the cloud is projected in chunks"""
     total: int
@@ -64,15 +64,19 @@ class Part(NamedTuple):
 
 
 class MemoryPlanner:
-    def __init__(self, device: Workspace, source: Source, features: FeatureSet, shape: DeviceShape) -> None:
+    def __init__(
+        self, device: Workspace, source: KernelSource, features: FeatureSet, shape: DeviceShape
+    ) -> None:
         self._device, self._source, self._shape = device, source, shape
-        self._slopes = source.takes("blend", "ray_slopes")
-        self._by_camera = not _CAMERA_UNIFORMS.isdisjoint(source.uniform_groups)
+        self._has_ray_slopes = source.has_argument("blend", "ray_slopes")
+        self._has_camera_uniforms = not _CAMERA_UNIFORMS.isdisjoint(source.uniform_groups)
         self._channels = RAW.channels
-        for samples in source.samples:
+        for samples in source.sample_buffers:
             self._channels += samples.channels
-        resolved = source.takes("resolve", "rays")
-        self._separate = bool(source.view_arrays) or resolved or "backdrop" in source.arguments
+        resolve_rays = source.has_argument("resolve", "rays")
+        self._one_by_one = (
+            bool(source.view_arrays) or resolve_rays or "composite_background" in source.arguments
+        )
         """whether the views of a batch differ in more than the struct `View`"""
         self._image_channels = 0
         for output in features.images:
@@ -84,9 +88,9 @@ class MemoryPlanner:
     def frame(self, resident: Resident, view: View, reserved: int = 0) -> MemoryPlan:
         """Plan one view. reserved: bytes of other buffers. Raises DeviceError if it does not fit."""
         shape = self._shape
-        stays, upload = resident.bytes_for(self._source.cloud_arrays)
+        resident_bytes, upload_bytes = resident.bytes_for(self._source.cloud_arrays)
         samples, tables = self._samples_and_tables(view)
-        fixed = reserved + stays + SMALL + tables
+        fixed = reserved + resident_bytes + UNIFORM_BYTES + tables
         fixed += MIN_BIG * (4 + self._source.records["Bounds"].itemsize)
         # each sub-frame has its own samples
         fixed += 4 * samples * self._channels * (2 if view.sub_frames else 1)
@@ -94,34 +98,37 @@ class MemoryPlanner:
         for name in self._source.view_arrays:
             fixed += view.array(name).nbytes
         if view.raster is not None:
-            rasters = {view.raster, *(one.view.raster for one in view.sub_frames if one.view.raster)}
+            rasters = {
+                view.raster,
+                *(sub_frame.view.raster for sub_frame in view.sub_frames if sub_frame.view.raster),
+            }
             columns = -(-view.width // shape.tile_width) * shape.tile_width
-            fixed += RayBuffers.bytes_of(rasters, shape.tile_height, columns, self._slopes)
+            fixed += RayBuffers.bytes_of(rasters, shape.tile_height, columns, self._has_ray_slopes)
         record = self._source.records["Splat"].itemsize
         budget, largest = self._device.memory_budget, self._device.largest_buffer
-        return plan_of(resident.capacity, record, upload, fixed, shape.lists, budget, largest)
+        return plan_of(resident.capacity, record, upload_bytes, fixed, shape.lists, budget, largest)
 
     def parts(self, resident: Resident, views: ViewBatch) -> Iterator[Part]:
         """Divide a batch into parts that are rendered together."""
-        count, others = len(views), (views.total - 1) * self._image_bytes(views.view)
+        count, other_images = len(views), (views.total - 1) * self._image_bytes(views.view)
         if not count:
             return
-        plan = self.frame(resident, views.one(0), others)
+        plan = self.frame(resident, views.one(0), other_images)
         external = views.view.external_depth
-        together = views.stacked and not (resident.streamed or self._separate)
-        together = together and not (external and external.stacked)
-        if plan.chunk or not together or (views.numbers and self._by_camera):
+        batched = views.stacked and not (resident.streamed or self._one_by_one)
+        batched = batched and not (external and external.stacked)
+        if plan.chunk or not batched or (views.numbers and self._has_camera_uniforms):
             for k in range(count):
-                yield Part(k, k + 1, self.frame(resident, views.one(k), others))
+                yield Part(k, k + 1, self.frame(resident, views.one(k), other_images))
             return
         samples, tables = self._samples_and_tables(views.view)
-        splat = self._source.records["Splat"].itemsize + KEYS + WINDOWS
-        splat += SORTED if self._shape.lists == "ordered" else 0
-        each = resident.capacity * splat + tables + 4 * self._channels * samples
-        free = min(self._device.memory_budget - plan.total + each, self._device.largest_buffer)
-        most = min(free, PART_BYTES.get(self._device.info.kind, OTHER_PART_BYTES)) // each
-        for first, end in even_parts(count, max(1, min(most, _PART_SAMPLES // samples))):
-            yield Part(first, end, MemoryPlan(0, resident.count, plan.total + (end - first - 1) * each))
+        splat_bytes = self._source.records["Splat"].itemsize + KEY_BYTES + WINDOW_BYTES
+        splat_bytes += SORT_BYTES if self._shape.lists == "ordered" else 0
+        view_bytes = resident.capacity * splat_bytes + tables + 4 * self._channels * samples
+        free = min(self._device.memory_budget - plan.total + view_bytes, self._device.largest_buffer)
+        max_views = min(free, PART_BYTES.get(self._device.info.kind, OTHER_PART_BYTES)) // view_bytes
+        for first, end in even_parts(count, max(1, min(max_views, _PART_SAMPLES // samples))):
+            yield Part(first, end, MemoryPlan(0, resident.count, plan.total + (end - first - 1) * view_bytes))
 
     def _image_bytes(self, view: View) -> int:
         return 4 * self._image_channels * (view.width * view.height // view.samples**2)
@@ -143,30 +150,30 @@ def plan_of(
 
     Args:
         record_bytes: bytes of the struct `Splat`.
-        upload_bytes: bytes per splat that are copied for each frame; 0 if the cloud is resident.
-        fixed_bytes: bytes of sample buffers, outputs, tables, and of a resident cloud.
+        upload_bytes: bytes per splat that each frame copies to the device; 0 for a resident cloud.
+        fixed_bytes: bytes of sample buffers, outputs, tables, and the cloud if it is resident.
         lists: tile-binning strategy.
         budget: maximum total bytes.
         largest: maximum bytes of one buffer.
     """
-    direct = count * (record_bytes + KEYS + WINDOWS + (SORTED if lists == "ordered" else 0))
-    pairs = budget // 8
-    fits = not upload_bytes and fixed_bytes + direct + pairs <= budget
+    projected_bytes = record_bytes + KEY_BYTES + WINDOW_BYTES
+    splat_bytes = count * (projected_bytes + (SORT_BYTES if lists == "ordered" else 0))
+    pair_bytes = budget // 8
+    fits = not upload_bytes and fixed_bytes + splat_bytes + pair_bytes <= budget
     if fits and count * record_bytes <= largest:
-        return MemoryPlan(0, count, fixed_bytes + direct + pairs)
-    free = budget - fixed_bytes - pairs
-    each = record_bytes + KEYS + WINDOWS
-    chunk = CHUNK
-    while chunk < _LARGE and chunk * (each + upload_bytes) < free // 64:
+        return MemoryPlan(0, count, fixed_bytes + splat_bytes + pair_bytes)
+    free = budget - fixed_bytes - pair_bytes
+    chunk, chunked_bytes = DEFAULT_CHUNK, projected_bytes + upload_bytes
+    while chunk < _MAX_CHUNK and chunk * chunked_bytes < free // 64:
         chunk *= 2
-    while chunk > _MINIMUM and (chunk * (each + upload_bytes) > free // 8 or chunk > 2 * count):
+    while chunk > _MIN_CHUNK and (chunk * chunked_bytes > free // 8 or chunk > 2 * count):
         chunk //= 2
-    capacity = (free - chunk * (each + upload_bytes)) // (each + SORTED)
+    capacity = (free - chunk * chunked_bytes) // (projected_bytes + SORT_BYTES)
     capacity = min(capacity, largest // record_bytes, count)
-    if capacity < min(_MINIMUM, count):
+    if capacity < min(_MIN_CHUNK, count):
         raise DeviceError(
             f"memory_budget must exceed the {bytes_words(fixed_bytes)} of the frame and the cloud without "
             f"lists, got {bytes_words(budget)}; raise it, or render a smaller frame or fewer outputs"
         )
-    total = fixed_bytes + pairs + chunk * (each + upload_bytes) + capacity * (each + SORTED)
+    total = fixed_bytes + pair_bytes + chunk * chunked_bytes + capacity * (projected_bytes + SORT_BYTES)
     return MemoryPlan(chunk, capacity, total)

@@ -13,11 +13,11 @@ import pyopencl as cl
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import Pipeline
 from fidsplat.backends.opencl import tiling
-from fidsplat.backends.opencl.assemble import Source, culls_before_projection
+from fidsplat.backends.opencl.assemble import KernelSource, culls_before_projection
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.device_frame import DeviceFrame, Rendered
 from fidsplat.backends.opencl.frame import render
-from fidsplat.backends.opencl.images import OpenCLImages, lease_images
+from fidsplat.backends.opencl.images import OpenCLImages, acquire_images
 from fidsplat.backends.opencl.memory_plan import MemoryPlan, MemoryPlanner
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.recorded_frame import RecordedFrame, Replay
@@ -57,7 +57,7 @@ class OpenCLPipeline(Pipeline):
     def __init__(
         self,
         workspace: Workspace,
-        source: Source,
+        source: KernelSource,
         features: FeatureSet,
         shape: DeviceShape,
         other: Callable[[FeatureSet, DeviceShape], OpenCLPipeline],
@@ -109,18 +109,18 @@ class OpenCLPipeline(Pipeline):
         workspace, rendered = self.workspace, []
         with workspace.rendering():
             workspace.switch_to(workspace.queue)
-            leased = lease_images(workspace, self.features.images, views)
-            images = {f"{name}_out": buffer for name, (_, buffer) in zip(self.outputs, leased, strict=True)}
+            acquired = acquire_images(workspace, self.features.images, views)
+            images = {f"{name}_out": buffer for name, (_, buffer) in zip(self.outputs, acquired, strict=True)}
             for first, end, plan in self._planner.parts(resident, views):
                 part = views.part(first, end)
                 pipeline = self._for_part(resident, plan, part)
                 buffers = pipeline, "views", resident.capacity, plan
-                workspace.pool.release_others(buffers, workspace.memory_budget - plan.total)
+                workspace.pool.trim(buffers, workspace.memory_budget - plan.total)
                 frame = DeviceFrame(workspace, pipeline._commands, pipeline.shape, resident, part, plan)
                 frame.bind_images(images)
                 render(frame)
                 rendered.append(frame.rendered())
-            return OpenCLImages(self, views, rendered, resident.count, leased)
+            return OpenCLImages(self, views, rendered, resident.count, acquired)
 
     def fits(self, resident: Resident, view: View) -> bool:
         try:
@@ -162,7 +162,7 @@ class OpenCLPipeline(Pipeline):
                 return frame
             plan = self._planner.frame(resident, view)
             buffers = self._buffer_key(resident, view, plan)
-            workspace.pool.release_others(buffers, workspace.memory_budget - plan.total, resident.capacity)
+            workspace.pool.trim(buffers, workspace.memory_budget - plan.total, resident.capacity)
             if plan.chunk or not tiling.pair_capacity(workspace):
                 return self.render_complete(resident, view)
             resident.cached_frames.pop(key, None)  # after an interrupt the recording may be incomplete
@@ -182,9 +182,7 @@ class OpenCLPipeline(Pipeline):
     def _replay(self, resident: Resident, view: View, cached: CachedFrame) -> OpenCLImages | None:
         """Replay a cached frame for another view; None if its buffers are too small or were replaced."""
         workspace, recorded, waits = self.workspace, cached.recorded, self.shape.lists == "ordered"
-        workspace.pool.release_others(
-            cached.buffer_key, workspace.memory_budget - cached.plan.total, resident.capacity
-        )
+        workspace.pool.trim(cached.buffer_key, workspace.memory_budget - cached.plan.total, resident.capacity)
         if not waits and not tiling.pair_capacity(workspace):
             return None
         queue = workspace.switch_to(workspace.queue if waits else workspace.replay_queue)
@@ -222,26 +220,26 @@ class OpenCLPipeline(Pipeline):
             *(self.workspace, commands or self._commands, self.shape),
             *(resident, ViewBatch.single(view), plan, replay_queue, pair_limit),
         )
-        frame.lease_images(self.features.images)
+        frame.acquire_images(self.features.images)
         render(frame)
         return frame
 
     def _render_planned(self, resident: Resident, view: View, plan: MemoryPlan) -> DeviceFrame:
         # release the buffers of frames with other sizes; buffers of this size are part of the plan
         free = self.workspace.memory_budget - plan.total
-        self.workspace.pool.release_others(self._buffer_key(resident, view, plan), free, resident.capacity)
+        self.workspace.pool.trim(self._buffer_key(resident, view, plan), free, resident.capacity)
         return self._render_frame(resident, view, plan)
 
     def _buffer_key(self, resident: Resident, view: View, plan: MemoryPlan) -> tuple[Any, ...]:
         """Key of frames with equal buffer sizes."""
-        alike = resident.buffer_key if not plan.chunk else None
-        return self, view.width, view.height, alike or (resident.capacity, plan)
+        shared = resident.buffer_key if not plan.chunk else None
+        return self, view.width, view.height, shared or (resident.capacity, plan)
 
     def _cache(self, resident: Resident, key: tuple[Any, ...], frame: DeviceFrame) -> None:
         """Cache the plan of a frame; the next frame with this key is recorded."""
         cached, raster = resident.cached_frames, frame.view.raster
         if raster is not None:
-            rasters = {each.raster for each in cached.values()} - {None, raster}
+            rasters = {frame.raster for frame in cached.values()} - {None, raster}
             if len(rasters) >= _MAX_RASTERS:
                 cached.clear()
         if len(cached) >= _MAX_FRAMES:
@@ -270,8 +268,8 @@ class OpenCLPipeline(Pipeline):
 
     @cached_property
     def _unbatched(self) -> OpenCLPipeline:
-        """The pipeline that sets up splats one by one, for small clouds: compiling the vectorised set-up
-        would take longer than it saves."""
+        """The pipeline whose projection is not vectorised, for small clouds: compiling the vectorised
+        projection takes longer than it saves."""
         return self._other(self.features, replace(self.shape, batch=1))
 
     def _for_part(self, resident: Resident, plan: MemoryPlan, views: ViewBatch) -> OpenCLPipeline:

@@ -43,11 +43,11 @@ class _PoisonedPool(BufferPool):
     def scratch(self, name: str, size: int) -> cl.Buffer:
         return self._filled(super().scratch(name, size))
 
-    def lease(self, name: str, size: int) -> cl.Buffer:
-        return self._filled(super().lease(name, size))
+    def acquire(self, name: str, size: int) -> cl.Buffer:
+        return self._filled(super().acquire(name, size))
 
-    def fresh(self, name: str, size: int) -> cl.Buffer:
-        return self._filled(super().fresh(name, size))
+    def allocate(self, name: str, size: int) -> cl.Buffer:
+        return self._filled(super().allocate(name, size))
 
     def _filled(self, buffer: cl.Buffer) -> cl.Buffer:
         cl.enqueue_fill_buffer(self._queue, buffer, np.full(1, 0xFF, np.uint8), 0, buffer.size)
@@ -143,15 +143,15 @@ class OpenCLProbe(Probe):
         if pipeline.shape.lists != "ordered":
             kernel, place, size = "tile_starts", 1, (3 * items[0],)
             given |= {"tiles": len(lengths), "capacity": 2**32 - 1, "counts": sums}
-            tallies = buffer_of(workspace, np.concatenate([np.zeros(8, np.uint32), lengths]))
-            given |= {"tallies": tallies, "cursors": buffer_of(workspace, lengths)}
+            counters = buffer_of(workspace, np.concatenate([np.zeros(8, np.uint32), lengths]))
+            given |= {"counters": counters, "cursors": buffer_of(workspace, lengths)}
             given["tile_order"] = buffer_of(workspace, np.empty_like(lengths))
         else:
             kernel, place, size = "scan_bins", 4, items
             given |= {
                 "bins": len(lengths),
                 "totals": buffer_of(workspace, lengths),
-                "tallies": sums,
+                "counters": sums,
                 "slot": 4,
             }
         arguments = pipeline.source.arguments[kernel]

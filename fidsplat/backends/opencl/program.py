@@ -14,7 +14,7 @@ from typing import Any
 import pyopencl as cl
 
 from fidsplat.backends.caches import pocl_folder
-from fidsplat.backends.opencl.assemble import Source, assemble_check
+from fidsplat.backends.opencl.assemble import KernelSource, assemble_check
 from fidsplat.backends.opencl.pocl_workarounds import is_pocl, shared_program
 from fidsplat.backends.opencl.pocl_workarounds.target_patch import correct_target, needs_correction
 from fidsplat.backends.opencl.workspace import Workspace
@@ -77,18 +77,18 @@ def build(workspace: Workspace, text: str, *options: str) -> cl.Program:
 class Program:
     """The kernels of one source on one device."""
 
-    def __init__(self, workspace: Workspace, source: Source) -> None:
+    def __init__(self, workspace: Workspace, source: KernelSource) -> None:
         self.source, self.compiled = source, _compiled(workspace, source)
         """the program of each kernel"""
         self.types: dict[str, list[Callable[[Any], Any] | None]] = {}
         """NumPy type of each argument of a kernel; None for a buffer"""
         for kernel, arguments in source.arguments.items():
             self.types[kernel] = types = []
-            for one in arguments:
-                types.append(None if one.access else source.scalars.dtype(one.ctype).type)
+            for argument in arguments:
+                types.append(None if argument.access else source.scalars.dtype(argument.ctype).type)
 
 
-def _compiled(workspace: Workspace, source: Source) -> dict[str, cl.Program]:
+def _compiled(workspace: Workspace, source: KernelSource) -> dict[str, cl.Program]:
     """Compile a source; returns the program of each kernel.
 
     PoCL's cache may return a program without kernels if another process is writing the entry, or was killed
@@ -96,9 +96,9 @@ def _compiled(workspace: Workspace, source: Source) -> dict[str, cl.Program]:
     """
     load_invoker()
     for attempt in range(3):
-        again, compiled = [f"-DATTEMPT_{attempt}"] if attempt else [], {}
+        options, compiled = [f"-DATTEMPT_{attempt}"] if attempt else [], {}
         for text in source.programs.values():
-            program = build(workspace, text.compiled, *again)
+            program = build(workspace, text.compiled, *options)
             for kernel in program.all_kernels():
                 compiled[kernel.function_name] = program
         if source.arguments.keys() <= compiled.keys():

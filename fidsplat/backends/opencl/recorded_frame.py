@@ -15,7 +15,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewBatch
-from fidsplat.backends.opencl.counts import TALLIES, Capacity, Counts, enlarged, read_stats
+from fidsplat.backends.opencl.counts import COUNTERS, Capacity, Counts, enlarged, read_stats
 from fidsplat.backends.opencl.device_frame import DeviceFrame, Rendered
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.uniforms import numbers_of, projection_arrays
@@ -40,11 +40,11 @@ class RecordedFrame:
         """`BufferPool.state` of the bound scratch buffers"""
         self._waits = frame.waits
         """whether the host waits for the counts of each frame"""
-        self._rows, self._tallies = frame.rows, frame.pool.size("tallies")
+        self._rows, self._counter_bytes = frame.rows, frame.pool.size("counters")
         if frame.waits:
             pairs = min(frame.pool.size("lists") // 4, frame.workspace.pair_budget)
-            self.capacity, self._tallies = Capacity(self.capacity.big, pairs), 4 * TALLIES
-        self._counted = frame.counted_launches
+            self.capacity, self._counter_bytes = Capacity(self.capacity.big, pairs), 4 * COUNTERS
+        self._counted_launches = frame.counted_launches
         self._stages = self.commands.stages
         self._source = frame.source
         self._view, self._arrays = frame.view, frame.arrays
@@ -54,8 +54,8 @@ class RecordedFrame:
         """rendered views with their arrays and numbers"""
         self._bytes = 0
         self._uploads: deque[cl.Event] = deque(frame.uploads, maxlen=_UPLOADS)
-        self._leases = [(name, buffer.size) for name, buffer in frame.leased.items()]
-        self._scratch = [name for name in frame.named if name not in frame.leased]
+        self._acquired_sizes = [(name, buffer.size) for name, buffer in frame.acquired.items()]
+        self._scratch_names = [name for name in frame.named if name not in frame.acquired]
 
     def set_view(self, view: View, queue: cl.CommandQueue) -> bool:
         """Bind the uniforms of a view. Returns False if a scratch buffer was replaced."""
@@ -67,36 +67,36 @@ class RecordedFrame:
             self.commands.set(numbers)
             self._view, self._arrays = view, arrays
         for name, array in self._arrays.items():
-            _, event = pool.put(queue, name, array)
+            _, event = pool.upload(queue, name, array)
             if event is not None:  # other frames have overwritten the buffer
                 self._uploads.append(event)
         if not self._waits:
-            pool.zeroed("tallies", self._tallies, queue)  # other frames do not clear it
+            pool.zeroed("counters", self._counter_bytes, queue)  # other frames do not clear it
         return pool.state is self.state
 
     def submit(self, queue: cl.CommandQueue, splats: int) -> Rendered | None:
         """Render the bound view. None if the host waits for the counts and they exceed the capacity."""
         commands, pool = self.commands, self.workspace.pool
-        leased = {name: pool.lease(name, size) for name, size in self._leases}
-        commands.set(leased)
+        acquired = {name: pool.acquire(name, size) for name, size in self._acquired_sizes}
+        commands.set(acquired)
         if not self._waits:
             events = commands.submit(queue)
             queue.flush()
-            stats = partial(read_stats, self.workspace.read_queue, leased["counts"], events[-1], splats)
+            stats = partial(read_stats, self.workspace.read_queue, acquired["counts"], events[-1], splats)
             stages = None if queue is self.workspace.replay_queue else self._stages
-            return Rendered(queue, leased, stats, events, stages)
-        tallies = pool.scratch("tallies", self._tallies)
-        cl.enqueue_fill_buffer(queue, tallies, _ZERO, 0, self._tallies)
-        events = commands.submit(queue, 0, self._counted)
-        words = np.empty((1, TALLIES), np.uint32)
-        cl.enqueue_copy(queue, words, tallies)
-        counts = Counts.of_tallies(words)
+            return Rendered(queue, acquired, stats, events, stages)
+        counters = pool.scratch("counters", self._counter_bytes)
+        cl.enqueue_fill_buffer(queue, counters, _ZERO, 0, self._counter_bytes)
+        events = commands.submit(queue, 0, self._counted_launches)
+        words = np.empty((1, COUNTERS), np.uint32)
+        cl.enqueue_copy(queue, words, counters)
+        counts = Counts.of_counters(words)
         if not (self.capacity.holds(counts) or self._enlarge_lists(counts)):
-            pool.give_back(leased.items())
+            pool.release(acquired.items())
             return None
-        events += commands.submit(queue, self._counted)
+        events += commands.submit(queue, self._counted_launches)
         queue.flush()
-        return Rendered(queue, leased, partial(counts.stats, splats), events, self._stages)
+        return Rendered(queue, acquired, partial(counts.stats, splats), events, self._stages)
 
     def _enlarge_lists(self, counts: Counts) -> bool:
         """Bind larger lists if needed, where the host waits for the counts; returns whether they suffice."""
@@ -111,27 +111,27 @@ class RecordedFrame:
         """Replay the bound view, and bind its buffers to `frame` for the backward pass."""
         rendered = self.submit(frame.queue, frame.resident.count)
         assert rendered is not None  # on CPUs frames with derivatives are not replayed
-        frame.leased, events = rendered.leased, rendered.events
-        for name in self._scratch:
-            if (buffer := frame.pool.known(name)) is not None:
+        frame.acquired, events = rendered.acquired, rendered.events
+        for name in self._scratch_names:
+            if (buffer := frame.pool.get(name)) is not None:
                 frame.bind(name, buffer)
-        frame.named |= frame.leased
+        frame.named |= frame.acquired
         frame.numbers["big_capacity"], frame.pairs = self.capacity.big, self.capacity.pairs
         frame.events, frame.stages = events, self._stages.copy()
-        frame.counted, frame.stats = events[self._counted - 1], rendered.stats
+        frame.counted, frame.stats = events[self._counted_launches - 1], rendered.stats
 
     def _cache_view(self, view: View) -> tuple[View, dict[str, np.ndarray], dict[str, Any]]:
-        own = projection_arrays(ViewBatch.single(view), self._source, 0, self._rows)
+        arrays = projection_arrays(ViewBatch.single(view), self._source, 0, self._rows)
         for name in self._source.view_arrays:
-            own[name] = view.array(name)
+            arrays[name] = view.array(name)
         # count arrays that views share, such as a panorama, once
-        size = sum(array.nbytes for name, array in own.items() if array is not self._arrays.get(name))
+        size = sum(array.nbytes for name, array in arrays.items() if array is not self._arrays.get(name))
         if len(self._views) >= _VIEWS or self._bytes + size > _VIEWS_BYTES:
             self._views.clear()
             self._bytes = 0
         self._bytes += size
         # a reference to the view, so that no other view has its id
-        cached = view, self._arrays | own, numbers_of(view, self._source)
+        cached = view, self._arrays | arrays, numbers_of(view, self._source)
         self._views[id(view)] = cached
         return cached
 
@@ -148,27 +148,27 @@ class Replay:
     ) -> None:
         """render_again: function that renders the view with sufficient buffers."""
         self._recorded, self._view, self._render_again = recorded, view, render_again
-        self._number = recorded.workspace.frames
+        self._frame_number = recorded.workspace.frames
         self._resident: Resident | None = resident
-        self._timed = weakref.ref(resident)
+        self._weak_resident = weakref.ref(resident)
 
-    def overflow(self, rendered: Rendered) -> Rendered | None:
+    def render_on_overflow(self, rendered: Rendered) -> Rendered | None:
         """Render the frame again if its counts exceed the capacity; None if it is complete."""
         resident, workspace = self._resident, self._recorded.workspace
         if resident is None:
             return None
         queue, after = rendered.queue, None  # faster than waiting from another queue
-        if workspace.frames != self._number:  # later frames were submitted: do not wait for them
+        if workspace.frames != self._frame_number:  # later frames were submitted: do not wait for them
             queue.flush()
             queue, after = workspace.read_queue, rendered.events[-1:]
-        counts = Counts.read(queue, rendered.leased["counts"], after)
-        again = None if self._recorded.capacity.holds(counts) else self._render_again(resident, self._view)
+        counts = Counts.read(queue, rendered.acquired["counts"], after)
+        complete = None if self._recorded.capacity.holds(counts) else self._render_again(resident, self._view)
         self._resident = None  # release the cloud, which is no longer needed
-        return again
+        return complete
 
     def timings(self) -> dict[str, float]:
         """Milliseconds by stage, from another replay with profiling; empty if the cloud was released."""
-        resident, recorded, workspace = self._timed(), self._recorded, self._recorded.workspace
+        resident, recorded, workspace = self._weak_resident(), self._recorded, self._recorded.workspace
         if resident is None:
             return {}
         with workspace.rendering():
@@ -179,5 +179,5 @@ class Replay:
                 rendered = recorded.submit(queue, resident.count)
             rendered = rendered or self._render_again(resident, self._view)
             workspace.finish()
-            workspace.pool.give_back(rendered.leased.items())
+            workspace.pool.release(rendered.acquired.items())
         return rendered.timings()

@@ -74,13 +74,13 @@ class UploadedCloud(Resident):
         device = workspace.device
         self._shared = workspace.info.kind == "cpu" and bool(device.host_unified_memory)
         if self._shared:
-            weakref.finalize(self, _finish, os.getpid(), workspace.queue, workspace.replay_queue)
+            weakref.finalize(self, _wait_unless_forked, os.getpid(), workspace.queue, workspace.replay_queue)
             return
         self.streamed = total > workspace.memory_budget // 2 or widest > device.max_mem_alloc_size
         if not self.streamed:
             with workspace.failing("copying the cloud"):
                 for name in self._arrays.keys() - {"labels", "colors", "sh"}:
-                    self._whole(name)
+                    self._buffer(name)
                 workspace.queue.finish()
 
     def _bytes_of(self, names: Iterable[str]) -> int:
@@ -104,11 +104,11 @@ class UploadedCloud(Resident):
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
         if self.streamed:
-            piece = np.ascontiguousarray(self._array(name)[first:end])
-            buffer = self._workspace.pool.scratch(f"chunk of {name}", piece.nbytes)
-            cl.enqueue_copy(self._workspace.queue, buffer, piece)
+            chunk = np.ascontiguousarray(self._array(name)[first:end])
+            buffer = self._workspace.pool.scratch(f"chunk of {name}", chunk.nbytes)
+            cl.enqueue_copy(self._workspace.queue, buffer, chunk)
             return buffer
-        return self._region(self._whole(name), first, end, self._array(name).nbytes // max(self.count, 1))
+        return self._region(self._buffer(name), first, end, self._array(name).nbytes // max(self.count, 1))
 
     def _array(self, name: str) -> np.ndarray:
         """The array on the host; splat ids are created on first use."""
@@ -116,23 +116,23 @@ class UploadedCloud(Resident):
             self._arrays[name] = np.arange(self.count, dtype=np.int32)
         return self._arrays[name]
 
-    def _whole(self, name: str) -> cl.Buffer:
+    def _buffer(self, name: str) -> cl.Buffer:
         if name not in self._buffers:
             array = _aligned(np.ascontiguousarray(self._array(name)))
             flags = cl.mem_flags
             if array.size == 0:
-                buffer = self._workspace.pool.fresh(f"the cloud's {name}", 16)
+                buffer = self._workspace.pool.allocate(f"the cloud's {name}", 16)
             elif self._shared:
                 flags = flags.READ_ONLY | flags.USE_HOST_PTR
                 buffer = DeviceBuffer(self._workspace.context, flags, hostbuf=array)
             else:
-                buffer = self._workspace.pool.fresh(f"the cloud's {name}", array.nbytes)
+                buffer = self._workspace.pool.allocate(f"the cloud's {name}", array.nbytes)
                 cl.enqueue_copy(self._workspace.queue, buffer, array)
             self._buffers[name] = buffer
         return self._buffers[name]
 
 
-def _finish(process: int, *queues: cl.CommandQueue) -> None:
+def _wait_unless_forked(process: int, *queues: cl.CommandQueue) -> None:
     """Wait for kernels that may be reading the host's arrays, before these are released; not in a fork."""
     if process == os.getpid():
         for queue in queues:

@@ -37,7 +37,7 @@ def _copy_rate(workspace: Workspace, kernel: cl.Kernel) -> float:
     size = 2**29 if workspace.info.kind == "gpu" else 2**27
     share = min(workspace.info.largest_allocation_bytes, workspace.info.memory_bytes) // 8
     size = min(size, share) // (16 * _GROUP) * 16 * _GROUP
-    source, target = (workspace.pool.fresh("copied", size) for _ in range(2))
+    source, target = (workspace.pool.allocate("copied", size) for _ in range(2))
     cl.enqueue_fill_buffer(workspace.queue, source, np.zeros(1, np.float32), 0, size)
     items = size // 16
     best = _best(lambda: kernel(workspace.queue, (items,), (_GROUP,), source, target))
@@ -48,7 +48,7 @@ def _operation_rate(workspace: Workspace, kernel: cl.Kernel, a: float, b: float)
     # a GPU needs many work-items to hide its latencies; on a CPU a few groups per core are plenty
     groups = workspace.info.compute_units * (32 if workspace.info.kind == "gpu" else 4)
     items = groups * _GROUP
-    out = workspace.pool.fresh("sums", 4 * items * workspace.shape.lanes)
+    out = workspace.pool.allocate("sums", 4 * items * workspace.shape.lanes)
 
     def launch(rounds: int) -> cl.Event:
         return kernel(

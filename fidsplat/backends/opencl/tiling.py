@@ -17,9 +17,9 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.bands import split_by_cost
-from fidsplat.backends.opencl.counts import BIG, PAIRS, TALLIES, VISIBLE, Counts, enlarged
+from fidsplat.backends.opencl.counts import BIG, COUNTERS, PAIRS, VISIBLE, Counts, enlarged
 from fidsplat.backends.opencl.device_frame import DeviceFrame
-from fidsplat.backends.opencl.memory_plan import KEYS, MIN_BIG, WINDOWS
+from fidsplat.backends.opencl.memory_plan import KEY_BYTES, MIN_BIG, WINDOW_BYTES
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.util.errors import DeviceError
 
@@ -45,17 +45,17 @@ class TileBand(NamedTuple):
     pairs: int
 
 
-def allocate_tallies(frame: DeviceFrame, words: int, big: int = 0) -> None:
+def allocate_counters(frame: DeviceFrame, words: int, big: int = 0) -> None:
     """Allocate zeroed counters, and buffers for at least `big` splats that touch many tiles."""
     capacity = max(big * 5 // 4, frame.pool.size("big") // 4, MIN_BIG)
     frame.numbers["big_capacity"] = capacity
-    frame.take("big", 4 * capacity)
-    frame.take("big_bounds", frame.source.records["Bounds"].itemsize * capacity)
+    frame.scratch("big", 4 * capacity)
+    frame.scratch("big_bounds", frame.source.records["Bounds"].itemsize * capacity)
     if not frame.waits:  # the kernel sort_tiles clears them for the next replay
-        frame.bind("tallies", frame.pool.zeroed("tallies", 4 * words, frame.queue))
+        frame.bind("counters", frame.pool.zeroed("counters", 4 * words, frame.queue))
         return
-    tallies = frame.take("tallies", 4 * words)
-    cl.enqueue_fill_buffer(frame.queue, tallies, np.zeros(1, np.uint32), 0, 4 * words)
+    counters = frame.scratch("counters", 4 * words)
+    cl.enqueue_fill_buffer(frame.queue, counters, np.zeros(1, np.uint32), 0, 4 * words)
 
 
 def cull(frame: DeviceFrame, big: int) -> None:
@@ -63,11 +63,11 @@ def cull(frame: DeviceFrame, big: int) -> None:
     `frame.projected`."""
     count, pool = frame.resident.count, frame.pool
     groups, items = -(-count // _UNCULLED_SPLATS), (_ITEMS,)
-    frame.take("unculled", 4 * MIN_BIG)
+    frame.scratch("unculled", 4 * MIN_BIG)
     # before the first launch: a recorded launch must not bind buffers that are replaced later
-    _take_records(frame, min(pool.size("unculled") // 4, count))
-    frame.take("unculled_bits", _UNCULLED_SPLATS // 8 * groups)
-    frame.take("unculled_counts", 4 * groups)
+    _allocate_records(frame, min(pool.size("unculled") // 4, count))
+    frame.scratch("unculled_bits", _UNCULLED_SPLATS // 8 * groups)
+    frame.scratch("unculled_counts", 4 * groups)
     arrays = {name: frame.resident.part(name, 0, count) for name in frame.source.cloud_arrays}
     frame.launch("project", "find_unculled", (groups * _ITEMS,), items, frame.views, count=count, **arrays)
     while True:
@@ -75,11 +75,11 @@ def cull(frame: DeviceFrame, big: int) -> None:
         frame.launch("project", "list_unculled", (groups * _ITEMS,), items, capacity=frame.projected)
         if not frame.waits:
             break
-        found = int(frame.read("tallies", np.uint32, (TALLIES,))[VISIBLE])
-        if found <= frame.projected:
+        unculled = int(frame.read("counters", np.uint32, (COUNTERS,))[VISIBLE])
+        if unculled <= frame.projected:
             break
-        frame.take("unculled", 4 * min(found * 17 // 16, count))
-        allocate_tallies(frame, TALLIES + frame.tiles, big)
+        frame.scratch("unculled", 4 * min(unculled * 17 // 16, count))
+        allocate_counters(frame, COUNTERS + frame.tiles, big)
 
 
 def project(frame: DeviceFrame, first: int, end: int) -> None:
@@ -88,10 +88,10 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
     count, size = end - first, _splat_capacity(frame, end - first)
     if frame.shape.culls:
         size = frame.projected
-    windows = _take_records(frame, size)
+    windows = _allocate_records(frame, size)
     if frame.view.band is not None and size:
         # the kernel writes no window for splats outside the band, so windows are first set to empty
-        cl.enqueue_fill_buffer(frame.queue, windows, _NO_WINDOW, 0, WINDOWS * size)
+        cl.enqueue_fill_buffer(frame.queue, windows, _NO_WINDOW, 0, WINDOW_BYTES * size)
     if count:
         arrays = {name: frame.resident.part(name, first, end) for name in frame.source.cloud_arrays}
         batch = frame.shape.batch
@@ -100,11 +100,11 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
         frame.launch("project", "project", (items,), (group,), frame.views, count=count, **arrays)
 
 
-def _take_records(frame: DeviceFrame, size: int) -> cl.Buffer:
+def _allocate_records(frame: DeviceFrame, size: int) -> cl.Buffer:
     """Allocate records, keys and windows for `size` splats; returns the windows."""
-    frame.take("splats", size * frame.source.records["Splat"].itemsize)
-    frame.take("keys", KEYS * size)
-    return frame.take("windows", WINDOWS * size)
+    frame.scratch("splats", size * frame.source.records["Splat"].itemsize)
+    frame.scratch("keys", KEY_BYTES * size)
+    return frame.scratch("windows", WINDOW_BYTES * size)
 
 
 def _splat_capacity(frame: DeviceFrame, count: int) -> int:
@@ -119,12 +119,12 @@ def _splat_capacity(frame: DeviceFrame, count: int) -> int:
 def sort_by_depth(frame: DeviceFrame, count: int) -> None:
     """Radix sort of the visible splats by depth, ties by index."""
     views, chunks, bins = frame.views, frame.shape.chunks, 1 << frame.shape.radix_bits
-    table = frame.take("sort table", 4 * bins * chunks * views)
+    table = frame.scratch("sort table", 4 * bins * chunks * views)
     size = 4 * _splat_capacity(frame, count)
-    keys, order = frame.buffers.keys, frame.take("order 0", size)
+    keys, order = frame.buffers.keys, frame.scratch("order 0", size)
     for number, shift in enumerate(range(0, 32, frame.shape.radix_bits)):
-        keys_out = frame.take(f"sorted keys {number % 2}", size)
-        order_out = frame.take(f"order {(number + 1) % 2}", size)
+        keys_out = frame.scratch(f"sorted keys {number % 2}", size)
+        order_out = frame.scratch(f"order {(number + 1) % 2}", size)
         digit = {"keys": keys, "count": count, "first": number == 0, "shift": shift, "table": table}
         frame.launch("sort", "sort_count", (chunks,), (1,), views, **digit)
         starts = _prefix_sums(frame, "sort", table, bins, VISIBLE, views)
@@ -137,12 +137,12 @@ def sort_by_depth(frame: DeviceFrame, count: int) -> None:
 def count_pairs(frame: DeviceFrame, count: int) -> Counts:
     """Count the length of each tile's list; waits for the totals."""
     views = frame.views
-    table = frame.take("bin table", 4 * frame.tiles * frame.shape.chunks)
+    table = frame.scratch("bin table", 4 * frame.tiles * frame.shape.chunks)
     frame.launch("bin", "bin_count", (frame.shape.chunks,), (1,), views, table=table, count=count)
     # tiles of all views are numbered consecutively, view after view
     frame.buffers.starts = _prefix_sums(frame, "bin", table, frame.tiles // views, PAIRS, 1)
     frame.counted_launches = len(frame.events)
-    return Counts.of_tallies(frame.read("tallies", np.uint32, (views, TALLIES)))
+    return Counts.of_counters(frame.read("counters", np.uint32, (views, COUNTERS)))
 
 
 def sorted_bands(frame: DeviceFrame, first: int, end: int, pairs: int) -> Iterable[TileBand]:
@@ -161,23 +161,23 @@ def tile_pairs(frame: DeviceFrame) -> np.ndarray:
 def list_sorted(frame: DeviceFrame, band: TileBand, count: int) -> None:
     allocated, budget = frame.pool.size("lists") // 4, frame.workspace.pair_budget
     size = enlarged(band.pairs, budget) if 0 < allocated < band.pairs else band.pairs
-    frame.take("lists", 4 * size)
-    given = {"band_first": band.first, "band_end": band.end, "count": count}
+    frame.scratch("lists", 4 * size)
+    arguments = {"band_first": band.first, "band_end": band.end, "count": count}
     table = frame.named["bin table"]
-    frame.launch("bin", "bin_emit", (frame.shape.chunks,), (1,), frame.views, table=table, **given)
+    frame.launch("bin", "bin_emit", (frame.shape.chunks,), (1,), frame.views, table=table, **arguments)
 
 
 def _prefix_sums(
-    frame: DeviceFrame, stage: str, table: cl.Buffer, bins: int, slot: int, lists: int
+    frame: DeviceFrame, stage: str, table: cl.Buffer, bins: int, counter: int, lists: int
 ) -> cl.Buffer:
     """Prefix sums over tables of counts: the start of each bin (lists, bins of a list + 1). lists: 1 for a
-    single list of all views, or the number of views."""
+    single list of all views, or the number of views. counter: index of the sum in the buffer `counters`."""
     views, items = frame.views, frame.shape.scan_items
-    totals = frame.take(f"{stage} totals", 4 * bins * views)
-    each = bins * views // lists
-    starts = frame.take(f"{stage} starts", 4 * (each + 1) * lists)
+    totals = frame.scratch(f"{stage} totals", 4 * bins * views)
+    list_bins = bins * views // lists
+    starts = frame.scratch(f"{stage} starts", 4 * (list_bins + 1) * lists)
     frame.launch(stage, "scan_chunks", (bins,), (64,), views, table=table, bins=bins, totals=totals)
-    scan = {"bins": each, "totals": totals, "starts": starts, "slot": slot}
+    scan = {"bins": list_bins, "totals": totals, "starts": starts, "counter": counter}
     frame.launch(stage, "scan_bins", (items,), (items,), lists, **scan)
     return starts
 
@@ -185,8 +185,8 @@ def _prefix_sums(
 # on CPUs with a small memory budget: project in chunks, and store only the visible splats
 
 
-class Packed(NamedTuple):
-    """Splats of a band of rows, projected in chunks."""
+class PackedCounts(NamedTuple):
+    """Numbers of splats after the projection in chunks, for a band of rows."""
 
     count: int
     """number of stored splats; an estimate if it exceeds the capacity"""
@@ -194,26 +194,26 @@ class Packed(NamedTuple):
     """visible splats of the complete frame in the chunks projected so far"""
 
 
-def pack_visible(frame: DeviceFrame, top: int, end: int) -> Packed:
+def pack_visible(frame: DeviceFrame, top: int, end: int) -> PackedCounts:
     """Project in chunks, and pack the visible splats of tile rows [top, end)."""
     height, plan = frame.shape.tile_height, frame.plan
-    frame.put_view(top * height, end * height)
+    frame.upload_view(top * height, end * height)
     big = 0
     while True:
-        allocate_tallies(frame, TALLIES, big)
-        sizes = {"splats": frame.source.records["Splat"].itemsize, "keys": KEYS, "windows": WINDOWS}
-        packed = {name: frame.take(f"packed {name}", size * plan.capacity) for name, size in sizes.items()}
-        found, big = _pack_chunks(frame, packed)
+        allocate_counters(frame, COUNTERS, big)
+        sizes = {"splats": frame.source.records["Splat"].itemsize, "keys": KEY_BYTES, "windows": WINDOW_BYTES}
+        packed = {name: frame.scratch(f"packed {name}", size * plan.capacity) for name, size in sizes.items()}
+        counts, big = _pack_chunks(frame, packed)
         if big <= frame.numbers["big_capacity"]:
             break
         big *= 2
-    if found.count <= plan.capacity:
+    if counts.count <= plan.capacity:
         for name, buffer in packed.items():
             frame.bind(name, buffer)
-    return found
+    return counts
 
 
-def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[Packed, int]:
+def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[PackedCounts, int]:
     """Project and pack chunks until a capacity is exceeded. Returns the packed splats, and the number of big
     splats if it exceeded the capacity, else 0."""
     count, chunk, chunks = frame.resident.count, frame.plan.chunk, frame.shape.chunks
@@ -222,20 +222,20 @@ def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[Pack
     for start in range(0, count, chunk):
         stop = min(start + chunk, count)
         project(frame, start, stop)
-        frame.take("piece_counts", 8 * chunks)
+        frame.scratch("block_counts", 8 * chunks)
         frame.launch("project", "pack_count", (chunks,), (1,), count=stop - start)
-        counts = frame.read("piece_counts", np.uint32, (2, chunks)).astype(np.int64)
+        counts = frame.read("block_counts", np.uint32, (2, chunks)).astype(np.int64)
         visible += int(counts[1].sum())
-        places = np.concatenate([[0], np.cumsum(counts[0])]) + total
-        total = int(places[-1])
+        offsets = np.concatenate([[0], np.cumsum(counts[0])]) + total
+        total = int(offsets[-1])
         if total > frame.plan.capacity:
-            return Packed(-(-total * count // stop), visible), 0
-        big = int(frame.read("tallies", np.uint32, (TALLIES,))[BIG])
+            return PackedCounts(-(-total * count // stop), visible), 0
+        big = int(frame.read("counters", np.uint32, (COUNTERS,))[BIG])
         if big > frame.numbers["big_capacity"]:
-            return Packed(total, visible), big
-        frame.put("piece_offsets", places[:-1].astype(np.uint32))
+            return PackedCounts(total, visible), big
+        frame.upload("block_offsets", offsets[:-1].astype(np.uint32))
         frame.launch("project", "pack_move", (chunks,), (1,), count=stop - start, **out)
-    return Packed(total, visible), 0
+    return PackedCounts(total, visible), 0
 
 
 def split_rows(frame: DeviceFrame, top: int, end: int, count: int) -> list[tuple[int, int]]:
@@ -261,45 +261,50 @@ def pair_capacity(workspace: Workspace) -> int:
 
 def project_and_count(frame: DeviceFrame, big: int = 0) -> None:
     """Project the cloud and count the pairs of each tile, with buffers for at least `big` big splats."""
-    allocate_tallies(frame, TALLIES + frame.tiles, big)
+    allocate_counters(frame, COUNTERS + frame.tiles, big)
     if frame.shape.culls:
         cull(frame, big)
     project(frame, 0, frame.resident.count)
     count = frame.projected
-    frame.launch("bin", "tally_big", (_big_groups(frame) * _ITEMS,), (_ITEMS,), count=count)
+    frame.launch("bin", "count_big", (_big_groups(frame) * _ITEMS,), (_ITEMS,), count=count)
     if frame.shape.lists == "local":
-        launch_local(frame, "tally_local")
+        launch_local(frame, "count_local")
 
 
 def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
     """Compute the start of each tile's list; all lists are empty if there are more pairs than `capacity`."""
     items = frame.shape.scan_items
-    frame.take("starts", 4 * (frame.tiles + 1))
-    frame.take("cursors", 4 * frame.tiles)
-    frame.take("tile_order", 4 * frame.tiles)
+    frame.scratch("starts", 4 * (frame.tiles + 1))
+    frame.scratch("cursors", 4 * frame.tiles)
+    frame.scratch("tile_order", 4 * frame.tiles)
     groups = 1 + min(-(-frame.tiles // _START_TILES), _START_SHARES)
-    given = {"tiles": frame.tiles, "capacity": capacity}
-    return frame.launch("bin", "tile_starts", (groups * items,), (items,), **given)
+    arguments = {"tiles": frame.tiles, "capacity": capacity}
+    return frame.launch("bin", "tile_starts", (groups * items,), (items,), **arguments)
 
 
 def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band: bool) -> None:
-    frame.take("pairs", 8 * capacity)
-    frame.take("lists", 4 * capacity)
+    frame.scratch("pairs", 8 * capacity)
+    frame.scratch("lists", 4 * capacity)
     count, views, groups = frame.projected, frame.views, _big_groups(frame)
-    given = {"band_first": band.first, "band_end": band.end, "capacity": capacity, "first_band": first_band}
+    arguments = {
+        "band_first": band.first,
+        "band_end": band.end,
+        "capacity": capacity,
+        "first_band": first_band,
+    }
     if frame.shape.lists == "local":  # big splats, then all others
         frame.launch(
-            "bin", "emit", (groups * _ITEMS,), (_ITEMS,), views, count=count, splat_groups=0, **given
+            "bin", "emit", (groups * _ITEMS,), (_ITEMS,), views, count=count, splat_groups=0, **arguments
         )
-        launch_local(frame, "emit_local", **given)
+        launch_local(frame, "emit_local", **arguments)
     else:
         splat_groups = -(-count // _ITEMS)
         items = (splat_groups + -(-groups // views)) * _ITEMS
         frame.launch(
-            "bin", "emit", (items,), (_ITEMS,), views, count=count, splat_groups=splat_groups, **given
+            "bin", "emit", (items,), (_ITEMS,), views, count=count, splat_groups=splat_groups, **arguments
         )
-    given = {"band_first": band.first, "clear": not frame.waits}
-    frame.launch("sort", "sort_tiles", ((band.end - band.first) * _ITEMS,), (_ITEMS,), **given)
+    arguments = {"band_first": band.first, "clear": not frame.waits}
+    frame.launch("sort", "sort_tiles", ((band.end - band.first) * _ITEMS,), (_ITEMS,), **arguments)
 
 
 def unsorted_bands(frame: DeviceFrame, pairs: int) -> list[TileBand]:
@@ -308,16 +313,16 @@ def unsorted_bands(frame: DeviceFrame, pairs: int) -> list[TileBand]:
     if pairs <= budget:
         return [TileBand(0, frame.tiles, pairs)]
     frame.in_bands = True
-    tallies = frame.read("tallies", np.uint32, (TALLIES + frame.tiles,))
-    return [TileBand(*band) for band in split_by_cost(tallies[TALLIES:], budget)]
+    counters = frame.read("counters", np.uint32, (COUNTERS + frame.tiles,))
+    return [TileBand(*band) for band in split_by_cost(counters[COUNTERS:], budget)]
 
 
-def launch_local(frame: DeviceFrame, kernel: str, **given: Any) -> None:
+def launch_local(frame: DeviceFrame, kernel: str, **arguments: Any) -> None:
     """Submit a kernel of tile_lists_local.cl."""
     count, items = frame.resident.count, frame.shape.scan_items
     if count:
         groups = -(-count // _GROUP_SPLATS)
-        frame.launch("bin", kernel, (groups * items,), (items,), frame.views, count=count, **given)
+        frame.launch("bin", kernel, (groups * items,), (items,), frame.views, count=count, **arguments)
 
 
 def _big_groups(frame: DeviceFrame) -> int:

@@ -83,7 +83,7 @@ class LossReadback:
         self._workspace, self._groups = workspace, groups
         align = max(1, workspace.device.mem_base_addr_align // 8)
         size = -(-12 * groups // align) * align
-        self._buffer = workspace.pool.fresh("losses", SLOTS * size)
+        self._buffer = workspace.pool.allocate("losses", SLOTS * size)
         self._slots = [self._buffer.get_sub_region(k * size, 12 * groups) for k in range(SLOTS)]
         self._words = np.empty((SLOTS, size // 4), np.float32)
         self._next = 0
@@ -91,7 +91,7 @@ class LossReadback:
         """event of the last loss's sums; the queue is in order, so earlier losses are complete too"""
         self._unread: set[int] = set()
 
-    def take(self) -> tuple[int, cl.Buffer]:
+    def next_slot(self) -> tuple[int, cl.Buffer]:
         """The next slot and its buffer; slots are reused after `SLOTS` losses."""
         self._next = (self._next + 1) % SLOTS
         return self._next, self._slots[self._next]
@@ -152,23 +152,23 @@ class OpenCLTraining:
         for image, mask in views:
             weights = np.zeros(1, np.uint8) if mask is None else mask.astype(np.uint8)
             values = image.size if mask is None else max(1, 3 * int(weights.sum()))
-            buffers = self._put("an image", image), self._put("a mask", weights)
+            buffers = self._upload("an image", image), self._upload("a mask", weights)
             self._targets.append(_Target(*buffers, mask is not None, values))
 
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Set arrays of the state by their names; others are unchanged."""
         for name, array in arrays.items():
-            self._bound[name] = self._put(f"the splats' {name}", array)
+            self._bound[name] = self._upload(f"the splats' {name}", array)
             self._shapes[name] = array.shape
         self._splats_changed()
 
     def gather_rows(self, rows: np.ndarray, remaining: int) -> None:
         """Keep or duplicate splats: row i of the new state is row `rows[i]` of the old one, (m,) uint32.
         Moments are zero from row `remaining` on."""
-        self._bound["rows"], self._count = self._put("rows", rows), len(rows)
+        self._bound["rows"], self._count = self._upload("rows", rows), len(rows)
         for name, shape in self._shapes.items():
             made = len(rows), *shape[1:]
-            gathered = self._workspace.pool.fresh(f"the splats' {name}", 4 * math.prod(made))
+            gathered = self._workspace.pool.allocate(f"the splats' {name}", 4 * math.prod(made))
             moments = name.startswith(_MOMENTS)
             given = {"row": math.prod(shape[1:]), "copied": remaining if moments else len(rows)}
             self._launch(
@@ -219,7 +219,7 @@ class OpenCLTraining:
             sizes = shapes | ({} if shared else {"sh": 3 * rendered})
             for name, floats in sizes.items():
                 size = 4 * count * floats
-                self._bound[f"activated_{name}"] = self._workspace.pool.fresh(f"the splats' {name}", size)
+                self._bound[f"activated_{name}"] = self._workspace.pool.allocate(f"the splats' {name}", size)
             if "thickness" not in shapes:  # not used
                 self._bound["activated_thickness"] = self._bound["activated_scales"]
             self._bound |= {"rendered": rendered, "all": every, "plain": int(degree == 0)}
@@ -256,7 +256,7 @@ class OpenCLTraining:
         if (groups := math.prod(grid)) not in self._sums:
             self._sums[groups] = LossReadback(self._workspace, groups)
         sums = self._sums[groups]
-        slot, buffer = sums.take()
+        slot, buffer = sums.next_slot()
         gradient = self._array("by_rgb", (height, columns, 3))
         given = {
             **{"rgb": rgb, "target": target.image, "mask": target.mask, "masked": int(target.masked)},
@@ -435,9 +435,9 @@ class OpenCLTraining:
             commands.set(given)
             return commands.submit(self._queue)
 
-    def _put(self, what: str, array: np.ndarray) -> cl.Buffer:
+    def _upload(self, what: str, array: np.ndarray) -> cl.Buffer:
         array = np.ascontiguousarray(array)
-        buffer = self._workspace.pool.fresh(what, array.nbytes)
+        buffer = self._workspace.pool.allocate(what, array.nbytes)
         if array.nbytes:
             cl.enqueue_copy(self._queue, buffer, array)
         return buffer
@@ -457,7 +457,7 @@ class OpenCLTraining:
             return self._loss_images[1]
         size = 4 * (11 if self._lanes == 1 else 3) * self._stride(columns) * (height + 2 * _MARGIN_ROWS)
         self._loss_images = None  # release the old images first
-        buffer = self._workspace.pool.fresh("the loss's images", size)
+        buffer = self._workspace.pool.allocate("the loss's images", size)
         cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.float32), 0, size)
         self._loss_images = (height, columns), buffer
         return buffer

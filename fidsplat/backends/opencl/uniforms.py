@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch
-from fidsplat.backends.opencl.assemble import Source
+from fidsplat.backends.opencl.assemble import KernelSource
 from fidsplat.backends.view import View
 
 
@@ -21,7 +21,7 @@ def scalars_of(view: View) -> dict[str, float]:
     }
 
 
-def numbers_of(view: View, source: Source) -> dict[str, Any]:
+def numbers_of(view: View, source: KernelSource) -> dict[str, Any]:
     """All scalar kernel arguments of a view, by name."""
     numbers: dict[str, Any] = scalars_of(view)
     for group, names in source.uniform_groups.items():
@@ -31,9 +31,9 @@ def numbers_of(view: View, source: Source) -> dict[str, Any]:
     return numbers
 
 
-def projection_arrays(views: ViewBatch, source: Source, row: int, end: int) -> dict[str, np.ndarray]:
+def projection_arrays(views: ViewBatch, source: KernelSource, row: int, end: int) -> dict[str, np.ndarray]:
     """Array arguments of the projection by name, for rows of samples [row, end); read-only, so that
-    `BufferPool.put` copies each once."""
+    `BufferPool.upload` copies each once."""
     view = views.view
     if view.band is not None:
         row, end = max(row, view.band[0]), min(end, view.band[1])

@@ -68,7 +68,7 @@ class WarpImages(Images):
             if views > 1:  # single frames include images in their plan
                 check_batch_memory(views, self.nbytes, workspace.memory_budget)
             dtype = getattr(load(), output.dtype)
-            self.arrays[name] = workspace.pool.fresh(name, pixels * output.channels, dtype)
+            self.arrays[name] = workspace.pool.allocate(name, pixels * output.channels, dtype)
         self.rendered: list[Rendered] = []
 
     def blank(self) -> None:

@@ -182,7 +182,7 @@ class WarpPipeline(Pipeline):
         frame.resolve(into, launcher)
         rendered = Rendered(launcher, {"splats": resident.count, "visible": 0, "pairs": 0})
         # return the array to the pool for later frames
-        weakref.finalize(rendered, pool.give_back, "totals", counts)
+        weakref.finalize(rendered, pool.release, "totals", counts)
         stats = rendered.counts  # the closure references only the counts, so that the object can be released
 
         def complete() -> Rendered | None:

@@ -68,8 +68,8 @@ class PoisonedPool(ArrayPool):
     def scratch(self, name: str, size: int, dtype: Any) -> Any:
         return poison(super().scratch(name, size, dtype))
 
-    def fresh(self, name: str, size: int, dtype: Any) -> Any:
-        return poison(super().fresh(name, size, dtype))
+    def allocate(self, name: str, size: int, dtype: Any) -> Any:
+        return poison(super().allocate(name, size, dtype))
 
 
 def poison(array: Any) -> Any:

@@ -70,7 +70,7 @@ class Resident(ResidentData):
                     f"the number of sh coefficients per splat must be one of {known}, got {terms}"
                 )
         if "labels" not in arrays:
-            arrays["labels"] = pool.fresh("labels", count, load().int32)
+            arrays["labels"] = pool.allocate("labels", count, load().int32)
             arrays["labels"].zero_()
         for name, array in arrays.items():
             expected = count * max(terms, 1) if name == "colors" else count
@@ -118,7 +118,7 @@ def _uploaded(name: str, array: np.ndarray, pool: ArrayPool, dtype: Any = None) 
 
     dtype = dtype or _dtype(name)
     if array.size == 0:
-        return pool.fresh(name, 1, dtype)
+        return pool.allocate(name, 1, dtype)
     try:
         return wp.array(np.ascontiguousarray(array), dtype=dtype, device=pool.device).flatten()
     except (RuntimeError, MemoryError) as error:

@@ -168,7 +168,7 @@ def _arrays(raster: RayRaster, workspace: Workspace) -> dict[str, Any]:
 
 def _fresh(name: str, array: np.ndarray, dtype: Any, workspace: Workspace) -> Any:
     wp = load()
-    cached = workspace.pool.fresh(name, len(array), dtype)
+    cached = workspace.pool.allocate(name, len(array), dtype)
     wp.copy(cached, wp.array(array, dtype=dtype, device="cpu"))
     return cached
 

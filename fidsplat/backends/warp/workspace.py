@@ -44,7 +44,7 @@ class ArrayPool:
                 self.state = object()
                 for holder in list(self.holders):
                     holder.release_arrays()
-            array = self._arrays[name, dtype] = self.fresh(name, size, dtype)
+            array = self._arrays[name, dtype] = self.allocate(name, size, dtype)
         return array
 
     def exact(self, name: str, size: int, dtype: Any) -> Any:
@@ -78,7 +78,7 @@ class ArrayPool:
         return self._hosts[name]
 
     def lend(self, name: str, size: int, dtype: Any) -> Any:
-        """Lend a page-locked host array until `give_back`."""
+        """Lend a page-locked host array until `release`."""
         spare = self._spare.setdefault(name, [])
         return (
             spare.pop()
@@ -86,11 +86,11 @@ class ArrayPool:
             else load().empty(size, dtype=dtype, device="cpu", pinned=self.device.is_cuda)
         )
 
-    def give_back(self, name: str, array: Any) -> None:
+    def release(self, name: str, array: Any) -> None:
         """Return an array of `lend` to the pool."""
         self._spare[name].append(array)
 
-    def fresh(self, name: str, size: int, dtype: Any) -> Any:
+    def allocate(self, name: str, size: int, dtype: Any) -> Any:
         """A new array outside the pool. Raises DeviceError if the device has too little memory."""
         wp = load()
         try:

@@ -55,7 +55,7 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
     c = cross_ray(&s, RAY(0), RAY(1), RAY(2), half_r2
 //@@ ray_cross_arguments
     );
-//@ backdrop_ray
+//@ background_ray
     ray_x = rays[at];
     ray_y = rays[channel_stride + at];
     ray_z = rays[2 * (size_t)channel_stride + at];

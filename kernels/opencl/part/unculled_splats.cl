@@ -6,7 +6,7 @@
 #define UNCULLED_SPLATS (16 * UNCULLED_ITEMS)            // splats of a work-group
 #define UNCULLED_WORDS (UNCULLED_SPLATS / 32)
 //@ unculled
-    if (i >= tallies[TALLY_VISIBLE]) return;
+    if (i >= counters[COUNTER_VISIBLE]) return;
     i = unculled[i];
 //@ project_kernels
 // Index space of both kernels: work-groups of UNCULLED_ITEMS, one for UNCULLED_SPLATS splats.
@@ -34,7 +34,7 @@ kernel __attribute__((reqd_work_group_size(UNCULLED_ITEMS, 1, 1))) void find_unc
     if (item == 0) unculled_counts[get_group_id(0)] = total;
 }
 
-// Reads: unculled_bits, unculled_counts. Writes: unculled, at most `capacity` splats; tallies' number of visible splats. If more than
+// Reads: unculled_bits, unculled_counts. Writes: unculled, at most `capacity` splats; counters' number of visible splats. If more than
 // `capacity` splats pass, the counter of the first tile is set to 2^31, so that the frame is treated as overflowed.
 kernel __attribute__((reqd_work_group_size(UNCULLED_ITEMS, 1, 1))) void list_unculled(
 //@@ arguments list_unculled
@@ -60,7 +60,7 @@ kernel __attribute__((reqd_work_group_size(UNCULLED_ITEMS, 1, 1))) void list_unc
         if ((bits & bit) != 0 && place < capacity) unculled[place] = first + k;
     }
     if (item == 0 && group == get_num_groups(0) - 1) {
-        tallies[TALLY_VISIBLE] = total;
-        if (total > capacity) tallies[TALLIES] = 0x80000000u;
+        counters[COUNTER_VISIBLE] = total;
+        if (total > capacity) counters[COUNTERS] = 0x80000000u;
     }
 }

@@ -2,20 +2,20 @@
 // sample (part/rays.cl); others have (x, y, 1), or parallel rays for an infinite focal length.
 //@ kernels
 // Index space: one work-item per sample (x, y). Reads: raw's transmittances. Writes: raw's colours.
-kernel void backdrop(
-//@@ arguments backdrop
+kernel void composite_background(
+//@@ arguments composite_background
 ) {
     int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
     size_t at = (size_t)y * stride + x;
     float ray_x = ((float)x + 0.5f - ray_center_x) / ray_focal_x;
     float ray_y = ((float)y + 0.5f - ray_center_y) / ray_focal_y, ray_z = 1.0f;
-//@@ backdrop_ray
+//@@ background_ray
     float world_x = FMA(rotation_00, ray_x, FMA(rotation_10, ray_y, rotation_20 * ray_z));
     float world_y = FMA(rotation_01, ray_x, FMA(rotation_11, ray_y, rotation_21 * ray_z));
     float world_z = FMA(rotation_02, ray_x, FMA(rotation_12, ray_y, rotation_22 * ray_z));
     float behind[3];
-//@@ backdrop
+//@@ background
     float transmittance = raw[3 * (size_t)channel_stride + at];
     for (int channel = 0; channel < 3; channel++)
         raw[channel * (size_t)channel_stride + at] = FMA(transmittance, behind[channel], raw[channel * (size_t)channel_stride + at]);

@@ -6,7 +6,7 @@ static inline float panorama_at(global const float *restrict panorama, int width
     y = clamp(y, 0, height - 1);
     return panorama[((size_t)y * width + x) * 3 + channel];
 }
-//@ backdrop
+//@ background
     float longitude_share = FMA(atan2(world_x, world_z), 0.15915494309189535f, 0.5f);
     float latitude_share = FMA(atan2(world_y, sqrt(FMA(world_x, world_x, world_z * world_z))), 0.31830988618379067f, 0.5f);
     float panorama_x = FMA(longitude_share, (float)panorama_width, -0.5f);
