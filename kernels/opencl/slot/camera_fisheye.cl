@@ -13,47 +13,61 @@ static inline bool lens_image(global const View *view, real3_ p, real *image_x, 
     return angle <= view->lens_limit;
 }
 
+// Chart coordinates of eight points.
+static inline void chart_of(float8 x, float8 y, float8 z, float8 *chart_x, float8 *chart_y) {
+    float8 across = x * x + y * y, length = sqrt(across + z * z);
+    // 1 / (|r| + Z) = (|r| - Z) / (X^2 + Y^2), whichever does not cancel
+    float8 scale = select(length - z, (float8)(1.0f), z > 0) / select(across, length + z, z > 0);
+    *chart_x = x * scale;
+    *chart_y = y * scale;
+}
+
+static inline float lowest_of(float8 x, float8 y) {
+    float4 four = fmin(fmin(x.lo, x.hi), fmin(y.lo, y.hi));
+    return fmin(fmin(four.x, four.y), fmin(four.z, four.w));
+}
+
 // Box of the disk in the chart: the corners of a polygon around it, padded by the sagitta of the arcs between them. The complete
-// chart where an arc may be long or the disk may contain the pole of the chart, direction -z.
-static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real away, real *box) {
+// chart where an arc may be long or the disk may contain the pole of the chart, direction -z. Corners are vectors of float: CPUs
+// compute eight at once.
+static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real away, float *box) {
     real around = radius / POLYGON_INNER;
-    box[0] = box[2] = INFINITY;
-    box[1] = box[3] = -INFINITY;
     real3_ u = {a.x * around, a.y * around, a.z * around}, v = {b.x * around, b.y * around, b.z * around};
     // radius of the sphere around the polygon; squares are compared, so that no rounding is in the wrong direction
     real sphere = sqrt(fmax(dot3(u, u), dot3(v, v))) * REAL(1.000001);
-    real x0 = 0, y0 = 0, longest = 0;
     bool known = sphere < away && (p.z > 0 || p.x * p.x + p.y * p.y > sphere * sphere);
-    real cu = 1, cv = 0;
-    for (int k = 0; k <= POLYGON && known; k++) {
-        real3_ corner = {p.x + cu * u.x + cv * v.x, p.y + cu * u.y + cv * v.y, p.z + cu * u.z + cv * v.z};
-        real below = sqrt(dot3(corner, corner)) + corner.z;
-        real x1 = corner.x / below, y1 = corner.y / below;
-        if (k > 0) longest = fmax(longest, (x1 - x0) * (x1 - x0) + (y1 - y0) * (y1 - y0));
-        x0 = x1, y0 = y1;
-        next_corner(&cu, &cv);
-        box[0] = fmin(box[0], x1);
-        box[1] = fmax(box[1], x1);
-        box[2] = fmin(box[2], y1);
-        box[3] = fmax(box[3], y1);
-    }
-    known = known && longest < REAL(0.25);
-    // 1 - sqrt(1 - c^2 / 4) <= c^2 / 7.5 for c <= 1/2; and a margin for the rounding of the per-sample test
-    real pad = longest / REAL(7.5) + REAL(2e-4) * fmax(box[1] - box[0], box[3] - box[2]) + REAL(1e-6);
-    box[0] = known ? box[0] - pad : -INFINITY;
-    box[1] = known ? box[1] + pad : INFINITY;
-    box[2] = known ? box[2] - pad : -INFINITY;
-    box[3] = known ? box[3] + pad : INFINITY;
+    // half of the corners of a 16-gon; the others are opposite
+    const float8 cosine = {1, 0.92387953f, 0.70710678f, 0.38268343f, 0, -0.38268343f, -0.70710678f, -0.92387953f};
+    const float8 sine = {0, 0.38268343f, 0.70710678f, 0.92387953f, 1, 0.92387953f, 0.70710678f, 0.38268343f};
+    float8 dx = cosine * (float)u.x + sine * (float)v.x, dy = cosine * (float)u.y + sine * (float)v.y,
+           dz = cosine * (float)u.z + sine * (float)v.z, x0, y0, x1, y1;
+    float x = (float)p.x, y = (float)p.y, z = (float)p.z;
+    chart_of(x + dx, y + dy, z + dz, &x0, &y0);
+    chart_of(x - dx, y - dy, z - dz, &x1, &y1);
+    float low_x = lowest_of(x0, x1), high_x = -lowest_of(-x0, -x1), low_y = lowest_of(y0, y1), high_y = -lowest_of(-y0, -y1);
+    float8 x2 = (float8)(x0.s1, x0.s23, x0.s4567, x1.s0) - x0, y2 = (float8)(y0.s1, y0.s23, y0.s4567, y1.s0) - y0;
+    float8 x3 = (float8)(x1.s1, x1.s23, x1.s4567, x0.s0) - x1, y3 = (float8)(y1.s1, y1.s23, y1.s4567, y0.s0) - y1;
+    float longest = -lowest_of(-(x2 * x2 + y2 * y2), -(x3 * x3 + y3 * y3));
+    known = known && longest < 0.25f;
+    // 1 - sqrt(1 - c^2 / 4) <= c^2 / 7.5 for c <= 1/2; and a margin for rounding, here and in the per-sample test
+    float size = fmax(high_x - low_x, high_y - low_y), most = fmax(fmax(-low_x, high_x), fmax(-low_y, high_y));
+    float pad = longest / 7.5f + 2e-4f * size + 2e-6f * (1 + most);
+    box[0] = known ? low_x - pad : -INFINITY;
+    box[1] = known ? high_x + pad : INFINITY;
+    box[2] = known ? low_y - pad : -INFINITY;
+    box[3] = known ? high_y + pad : INFINITY;
 }
 //@ camera_depth
     pz = sqrt(dot3(p, p));
 //@ camera_reach
     reach = radius * sqrt(fmax(dot3(a, a), dot3(b, b)));
 //@ camera_bounds
-    real chart[4], center_x, center_y;
+    real center_x, center_y;
+    float chart[4];
     chart_box(a, b, p, radius, pz, chart);
     Bounds bounds = mapped_bounds(view->map, ray_map, chart[0], chart[1], chart[2], chart[3]);
-    if (!(pz >= near && lens_image(view, p, &center_x, &center_y))) center_x = center_y = NAN;   // no low-pass disc
+    // no low-pass disc; rays of a table have no image
+    if (view->lens_limit < 0 || !(pz >= near && lens_image(view, p, &center_x, &center_y))) center_x = center_y = NAN;
 //@ camera_derivative
         // radial and tangential derivatives, rotated into image axes
         real across = sqrt(p.x * p.x + p.y * p.y), angle = atan2(across, p.z), q = angle * angle;
