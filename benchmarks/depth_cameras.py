@@ -24,16 +24,25 @@ TILTS = (30, 50, 60, 70, 80)
 GREYS = (0.3, 0.1, 0.03)
 MIDDLE = 60
 """half edge of the measured square in pixels"""
-PUBLISHED: dict[str, Callable[[float], float]] = {
+
+
+def kinect_v1(z: float, tilt: float = 0.0) -> float:
+    """Khoshelham and Elberink 2012; for oblique walls, 10 to 60 degrees, Nguyen et al. 2012."""
+    angle = math.radians(tilt)
+    if not tilt:
+        return 1.425e-3 * z * z
+    oblique = 1e-4 / math.sqrt(z) * (angle / (math.pi / 2 - angle)) ** 2
+    return 1.2e-3 + 1.9e-3 * (z - 0.4) ** 2 + oblique if 10 <= tilt <= 60 else math.nan
+
+
+PUBLISHED: dict[str, Callable[..., float]] = {
     # 0.08 pixels of disparity (A. Grunnet-Jepsen, librealsense issue 3904)
-    "d435": lambda z: z * z * 0.08 / (424 * 0.05),
-    # Toelgyessy et al. 2021: 0.61 mm at 0.8 m, 0.89 mm at 1.5 m, 1.78 mm at 3 m
-    "azure-kinect": lambda z: float(
-        np.interp(z, (0.8, 1.5, 3.0), (0.61e-3, 0.89e-3, 1.78e-3), np.nan, np.nan)
-    ),
-    # Khoshelham and Elberink 2012
-    "kinect-v1": lambda z: 1.425e-3 * z * z,
+    "d435": lambda z, tilt=0: math.nan if tilt else z * z * 0.08 / (424 * 0.05),
+    # add_kinect_azure_noise of DLR-RM/BlenderProc, which cites Toelgyessy et al. 2021
+    "azure-kinect": lambda z, tilt=0: math.nan if tilt else 0.5e-3 + 1e-3 * (z - 0.5),
+    "kinect-v1": kinect_v1,
 }
+"""published standard deviation in metres by distance in metres and tilt in degrees"""
 
 
 def wall(z: float, grey: float = 0.9, tilt: float = 0.0) -> fs.Scene:
@@ -73,7 +82,7 @@ def main() -> None:
             plain = set(case) == {"z"}
             row = {"camera": name, "case": " ".join(f"{key} {value:g}" for key, value in case.items())}
             row |= {"measured": share, "rms_mm": rms * 1e3, "bias_mm": bias * 1e3 if plain else math.nan}
-            row["published_mm"] = PUBLISHED[name](case["z"]) * 1e3 if plain else math.nan
+            row["published_mm"] = math.nan if "grey" in case else PUBLISHED[name](**case) * 1e3
             rows.append(facts(renderer) | row)
     if keep(rows, arguments.json):
         return

@@ -69,8 +69,12 @@ def test_structured_light_follows_the_published_error_and_casts_a_shadow(rendere
     for z in (1.0, 2.0, 3.0):
         found = device.measure(renderer, fs.Scene([board(z)]), camera)[:, :90]
         assert (found - z)[found > 0].std() == pytest.approx(PUBLISHED["kinect-v1"](z), rel=0.2)
-    scene = fs.Scene([board(1.0, left=0.0), board(1.5)])
     calm = replace(device, noise=0.0, lateral=0.0, step=0.0)
+    for tilt in (30, 50, 60):
+        wall, middle = fs.Scene([board(1.5, tilt=math.radians(tilt))]), np.s_[:, 40:56]
+        found, true = (each.measure(renderer, wall, camera)[middle] for each in (device, calm))
+        assert (found - true).std() == pytest.approx(PUBLISHED["kinect-v1"](1.5, tilt), rel=0.2)
+    scene = fs.Scene([board(1.0, left=0.0), board(1.5)])
     row = calm.measure(renderer, scene, camera)[32]
     shadow = 580.0 * device.baseline * (1 / 1.0 - 1 / 1.5)
     holes = np.flatnonzero(row[:90] == 0)
@@ -136,6 +140,10 @@ def test_active_stereo_matches_its_pattern(renderer):
 def test_wrong_depth_cameras_are_refused(renderer):
     with pytest.raises(fs.InputError, match=r"unknown depth camera 'd453' .did you mean 'd435'"):
         depth_camera("d453")
+    with pytest.raises(fs.InputError, match=r"unknown depth camera \[\]; known"):
+        depth_camera([])
+    with pytest.raises(fs.InputError, match="renderer must be a Renderer, got 'opencl'; fs.Renderer"):
+        TimeOfFlight().measure("opencl", fs.Scene([board(1.0)]), pinhole(9.0))
     with pytest.raises(fs.InputError, match="max_disparity must be a multiple of 16"):
         ActiveStereo(max_disparity=50)
     with pytest.raises(fs.InputError, match="far must be a distance in metres above near"):
