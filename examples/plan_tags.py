@@ -19,6 +19,7 @@ from fidsplat.worlds.greenhouse import AISLE, Greenhouse
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("-o", "--out", default="plan", help="folder")
 parser.add_argument("--count", type=int, default=4, help="number of tags")
+parser.add_argument("--poses", type=int, default=150, help="number of evaluated poses")
 given = parser.parse_args()
 
 house = Greenhouse(rows=1, plants=4)
@@ -29,7 +30,8 @@ poses = [  # x right, y down, z forward, as of any camera; towards the row, at 0
     pinhole.with_pose(position=(x, -AISLE / 2, 0.5), target=(x + 0.6, 0.0, 0.3), up=(0, 0, 1)).camera_to_world
     for x in 0.3 * times
 ]
-plan = plan_tags(scene, fs.Trajectory(times, poses), PlanSettings(count=given.count, size=0.1), fs.Renderer())
+settings = PlanSettings(count=given.count, size=0.1, poses=given.poses)
+plan = plan_tags(scene, fs.Trajectory(times, poses), settings, fs.Renderer())
 facts = plan.facts()
 for tag in facts["tags"]:
     print(tag["spec"], np.round(tag["position"], 2), f"read at {tag['poses']} poses")

@@ -166,7 +166,7 @@ def plan_tags(
     if not visible:
         raise InputError(
             "the trajectory must have a flat surface of a tag's size in view below 70 degrees, got none; "
-            "give smaller tags, or poses of the camera (z forward, y down)"
+            + survey.remedy(poses)
         )
     seen, poses = [seen[k] for k in visible], poses[visible]
     conflicts = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2) < 2.2 * tag.radius
@@ -241,6 +241,23 @@ class Survey:
             apart = np.linalg.norm(poses[:, :3, 3] - one.pose[:3, 3], axis=1)
             poses = poses[apart > self.tag.radius + one.marker.radius]
         return poses
+
+    def remedy(self, poses: np.ndarray) -> str:
+        """What to change if none of the candidates (n, 4, 4) is readable."""
+        camera = self.cameras[0]
+        if len(poses):
+            between = poses[:, None, :3, 3] - self.path[None, :, :3, 3]
+            nearest = float(np.linalg.norm(between, axis=2).min())
+        else:
+            nearest = min((float(one[one > 0].min()) for one in self._depths if one.any()), default=0.0)
+        size, sides = self.tag.size, self.tag.bits.shape[1]
+        pixels = size * max(camera.fx, camera.fy) / (sides * nearest) if nearest else math.inf
+        if pixels < MODULE:
+            return (
+                f"{nearest:.3g} m away, a module of a tag has {pixels:.2g} pixels of the {MODULE:g} that are "
+                f"needed: give larger tags, --size {size * MODULE / pixels:.2g} or more"
+            )
+        return "give smaller tags, or poses of the camera (z forward, y down)"
 
     def sightings(self, tags: Sequence[PlacedMarker]) -> list[Sightings]:
         """Images in which each tag is readable."""

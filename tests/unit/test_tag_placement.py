@@ -1,7 +1,11 @@
 """Fisher information of tags against finite differences; selection against brute force; planned tags."""
 
 import itertools
+import json
 import math
+import runpy
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -332,14 +336,27 @@ def test_the_command_writes_a_scene_and_a_map(hall, few_candidates, tmp_path, ca
     assert "already exists" in fails(capsys, *words)[1]
 
 
+def test_the_example_plans_tags_in_an_aisle(few_candidates, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib", reason="the extra experiments is not installed")
+    example = Path(__file__).resolve().parents[2] / "examples" / "plan_tags.py"
+    given = ["--count", "2", "--poses", "9", "-o", str(tmp_path / "plan")]
+    monkeypatch.setattr(sys, "argv", [str(example), *given])
+    runpy.run_path(str(example), run_name="__main__")
+    facts = json.loads((tmp_path / "plan/plan.json").read_text())
+    assert len(facts["tags"]) == 2
+    assert facts["error_m"] < 0.5 * facts["error_without_m"]
+    assert f"{facts['error_m']:.4f} m with them" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["--count", "0"], "--count must be at least 1"),
+        (["--size", "0.01"], "give larger tags, --size 0."),
         (["--count", "31", "--family", "tag16h5"], "--count must be at most 30, the free ids of 16h5"),
         (["--size", "-1"], "--size must be above 0"),
         (["--target", "0"], "--target must be a positive length"),
-        (["--size", "9"], "the trajectory must have a flat surface of a tag"),
+        (["--size", "9"], "got none; give smaller tags"),
     ],
 )
 def test_impossible_plans_are_reported(hall, few_candidates, tmp_path, capsys, words, said):

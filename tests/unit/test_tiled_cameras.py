@@ -1,6 +1,10 @@
 """Cameras of all worlds of mujoco_warp and Newton, against rays of MuJoCo in C; Isaac Lab's interface."""
 
 import inspect
+import re
+import runpy
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -92,6 +96,18 @@ def test_mujoco_warps_geoms_are_composited_in_all_worlds(states, scene):
     square = mujoco.MjModel.from_xml_string(MODEL.replace('sensorsize="1 0.75"', 'sensorsize="1 1"'))
     with pytest.raises(fs.InputError, match="aspect ratio of its resolution 32 x 24, got 1 x 1 for 'eye'"):
         MujocoRig(square, scene, {1: "box"}, renderer=rig.renderer).render(worlds, meshes=True)
+
+
+def test_the_example_reads_the_tag_of_each_world(monkeypatch, capsys):
+    pytest.importorskip("mujoco_warp", reason="pip install 'fidsplat[tiled]'")
+    example = Path(__file__).resolve().parents[2] / "examples" / "tiled_cameras.py"
+    monkeypatch.setattr(sys, "argv", [str(example), "--worlds", "2"])
+    runpy.run_path(str(example), run_name="__main__")
+    said = capsys.readouterr().out
+    assert "rgb (2, 240, 320, 3)" in said
+    errors = re.findall(r"world (\d): apriltag:36h11:5, ([\d.]+) mm off", said)
+    assert [world for world, _ in errors] == ["0", "1"]
+    assert max(float(error) for _, error in errors) < 5
 
 
 def test_newtons_shapes_are_composited_in_all_worlds(states, scene):
