@@ -14,7 +14,16 @@ import numpy as np
 
 from fidsplat.cameras import Camera, RayTable
 from fidsplat.cameras.pinhole import MAX_SIZE
-from fidsplat.util.arguments import array_of, instance, invalid, items, number, python_scalars, whole_number
+from fidsplat.util.arguments import (
+    array_of,
+    instance,
+    invalid,
+    items,
+    number,
+    python_scalars,
+    real_array,
+    whole_number,
+)
 from fidsplat.util.directions import disk, perpendicular, unit
 from fidsplat.util.errors import InputError, unknown
 
@@ -39,7 +48,8 @@ class Spinning:
         for name, most in (("elevations", limit), ("azimuths", math.pi)):
             given = array_of(name, getattr(self, name), "numbers in radians", "fiu").astype(np.float64)
             if given.ndim != 1 or not (np.abs(given) <= most).all():
-                raise invalid(name, f"numbers up to {most:.4g} rad", getattr(self, name))
+                remedy = "np.radians converts degrees"
+                raise invalid(name, f"numbers up to {most:.4g} rad", getattr(self, name), remedy)
             object.__setattr__(self, name, tuple(given.tolist()))
         whole_number("columns", self.columns, 1, MAX_SIZE)
         if not 1 <= len(self.elevations) <= MAX_SIZE:
@@ -91,10 +101,10 @@ class Rosette:
 
     def __post_init__(self) -> None:
         number("half_angle", self.half_angle, "an angle above 0, at most 1.4 rad", 1e-6, 1.4)
-        rates = tuple(number("a rate", rate, "a finite number of rad/s") for rate in self.rates)
-        if len(rates) != 2:
-            raise invalid("rates", "two numbers in rad/s", self.rates)
-        object.__setattr__(self, "rates", rates)
+        rates = real_array("rates", self.rates, "two numbers in rad/s, one for each prism")
+        if rates.shape != (2,) or not np.isfinite(rates).all():
+            raise invalid("rates", "two numbers in rad/s, one for each prism", self.rates)
+        object.__setattr__(self, "rates", tuple(rates.tolist()))
         whole_number("points", self.points, 1, MAX_BEAMS)
 
     rings = 1
@@ -175,7 +185,7 @@ class Lidar:
         for name, low, high, requirement in (
             ("rate", 1e-3, 1e6, "scans per second, above 0"),
             ("near", 1e-3, 1e9, "metres, above 0"),
-            ("far", self.near, 1e9, "metres, above near"),
+            ("far", self.near, 1e9, "metres, from near to 1e9"),
             ("divergence", 1e-9, 0.5, "radians, above 0"),
             ("separation", 0.0, 1e9, "metres, at least 0"),
             ("opacity", 1e-3, 0.999, "a share from 0.001 to 0.999"),
@@ -197,6 +207,10 @@ class Lidar:
                 raise InputError(unknown("return of a lidar", kind, RETURNS))
         if not kinds or len(set(kinds)) < len(kinds):
             raise invalid("lidar returns", "one or more different kinds of return", self.returns)
+        if len(kinds) > 1 and self.rays == 1:
+            raise InputError(
+                "lidar rays must be at least 2 for several returns, got 1; give for example rays=4"
+            )
         object.__setattr__(self, "returns", kinds)
         instance("lidar reflectivity", self.reflectivity, dict, "a dict of numbers by label")
         for label, value in self.reflectivity.items():

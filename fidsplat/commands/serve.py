@@ -19,6 +19,7 @@ from fidsplat.commands.scenes import RenderInput, Size
 from fidsplat.logs.robot_log import SCENE
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util import interrupts
+from fidsplat.util.arguments import number
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
@@ -76,12 +77,12 @@ class Serve(RenderInput):
 
     def run(self) -> int:
         import fidsplat as fs
-        from fidsplat.cameras.trajectory import Trajectory, check_rate
+        from fidsplat.cameras.trajectory import Trajectory
         from fidsplat.formats import load_trajectory
         from fidsplat.scenes.up import scene_up
 
         self.check()
-        check_rate(self.rate)
+        number("--rate", self.rate, "a number of frames per second, 0.001 to 1000", 1e-3, 1e3)
         foxglove = self.foxglove or not self.ros2
         packages = ["rosbags", "mcap"] + ["foxglove"] * foxglove
         if self.ros2 and find_spec("rclpy") is None:
@@ -97,6 +98,11 @@ class Serve(RenderInput):
             path = load_trajectory(self.trajectory, self.file_rate).inverse()
         scene = self.load(size=self.size)
         outputs = self.outputs or scene.outputs
+        if self.compress and "rgb" not in outputs:
+            raise InputError(
+                f"--compress must have rgb among the outputs, got {','.join(outputs)}; leave out --compress, "
+                "or add rgb"
+            )
         with console(self.json).status("opening the device"):
             renderer = fs.Renderer(self.device or scene.device, self.memory_budget)
             resident = renderer.upload(scene)

@@ -153,7 +153,8 @@ def scan(
             left and z up; None: at the scene's camera at `start`.
         renderer: None: one for the scene's device.
         motion: `Motion(camera=...)` has the pose lidar_from_world at a time, instead of `pose`; `groups`
-            moves splats. None: the scene's groups move as its motion states.
+            moves splats. None: the sensor has one pose for all beams, also in a scene whose camera moves, and
+            the scene's groups move as its motion states.
         start: seconds, start of the scan; None: the time of the scene's shutter. label: whether the labels of
         the splats are requested. index: number of the scan, which selects its random noise.
 
@@ -209,7 +210,9 @@ def _resident(scene: Any, renderer: Renderer | None) -> tuple[Renderer, Any]:
     resident = isinstance(scene, ResidentCloud)
     if renderer is None and resident:
         raise InputError("renderer must be the renderer that uploaded the cloud, got None; pass renderer=")
-    renderer = renderer or Renderer(getattr(scene, "device", None))
+    if renderer is None:
+        renderer = Renderer(getattr(scene, "device", None))
+    instance("renderer", renderer, Renderer, remedy="fs.Renderer('opencl') opens a device")
     return renderer, scene if resident else renderer.upload(scene)
 
 

@@ -142,7 +142,7 @@ def test_wrong_depth_cameras_are_refused(renderer):
         depth_camera("d453")
     with pytest.raises(fs.InputError, match=r"unknown depth camera \[\]; known"):
         depth_camera([])
-    with pytest.raises(fs.InputError, match="renderer must be a Renderer, got 'opencl'; fs.Renderer"):
+    with pytest.raises(fs.InputError, match=r"renderer must be a Renderer, got 'opencl'; fs\.Renderer"):
         TimeOfFlight().measure("opencl", fs.Scene([board(1.0)]), pinhole(9.0))
     with pytest.raises(fs.InputError, match="max_disparity must be a multiple of 16"):
         ActiveStereo(max_disparity=50)

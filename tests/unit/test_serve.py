@@ -358,6 +358,15 @@ def test_a_port_in_use_and_wrong_options_are_one_line(tmp_path, capsys, monkeypa
     file.write_text(SCENE)
     assert main(["serve", str(file), "--lidar", "vlp"]) == 2
     assert "unknown lidar 'vlp'" in capsys.readouterr().err
+    for options, message in (
+        (["--rate", "0"], "--rate must be a number of frames per second, 0.001 to 1000, got 0.0"),
+        (
+            ["--compress", "--outputs", "depth"],
+            "--compress must have rgb among the outputs, got depth; leave",
+        ),
+    ):
+        assert main(["serve", str(file), *options]) == 2
+        assert message in capsys.readouterr().err
     monkeypatch.setenv("ROS_DOMAIN_ID", "233")
     assert main(["serve", str(file), "--ros2"]) == 2
     assert "ROS_DOMAIN_ID must be a number from 0 to 232, got '233'" in capsys.readouterr().err
