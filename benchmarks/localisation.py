@@ -1,6 +1,6 @@
 """Measure accuracy, time and covariance of `fs.localise` in the greenhouse, from random initial poses.
 
-    python benchmarks/localisation.py --repeats 100 [--distance 0.1 --degrees 5] [--noise 0.01] [--device D]
+    python benchmarks/localisation.py --repeats 100 [--distance 0.1 --degrees 5] [--noise 0.01] [--max-side 640]
 
 Photographs are rendered images with another exposure for each channel, noise and 8 bits. Prints median
 errors, the share of poses within 20 mm, processor and wall time, and the mean of the squared errors
@@ -15,6 +15,7 @@ from measuring import facts, keep, options, show
 
 import fidsplat as fs
 from fidsplat.cameras.pose_offset import offset_camera
+from fidsplat.localisation.direct_alignment import MAX_SIDE
 from fidsplat.vision.pose import pose_error
 from fidsplat.worlds.greenhouse import Greenhouse
 
@@ -29,6 +30,7 @@ def main() -> None:
     parser.add_argument("--degrees", type=float, default=5.0, help="angle from the truth to the start")
     parser.add_argument("--noise", type=float, default=0.01, help="standard deviation, display values")
     parser.add_argument("--change", type=float, default=0.0, help="change of the splats' colours, as a share")
+    parser.add_argument("--max-side", type=int, default=MAX_SIDE, help="pixels of the finest level")
     words = parser.parse_args()
     scene, renderer = Greenhouse(3, 6).scene, fs.Renderer(words.device)
     resident = renderer.upload(scene)
@@ -45,7 +47,9 @@ def main() -> None:
             renderer.render(photographed, camera, background=scene.background)["rgb"], random, words.noise
         )
         wall, cpu = time.perf_counter(), time.process_time()
-        found = fs.localise(image, scene, start, renderer=renderer, resident=resident)
+        found = fs.localise(
+            image, scene, start, max_side=words.max_side, renderer=renderer, resident=resident
+        )
         took = time.perf_counter() - wall, time.process_time() - cpu
         if number >= 0:
             rows.append(

@@ -44,6 +44,9 @@ class Localise:
     """FILE: candidates of the initial pose: COLMAP, transforms.json or a trajectory, e.g. of training"""
     out: str | None = None
     """FILE: also write the found poses: .tum, .kitti, .json (transforms.json) or a folder (COLMAP)"""
+    max_side: int = 320
+    """N: reduce larger photographs to this number of pixels along the larger side; more are more accurate and
+    take longer"""
     device: Device = None
     json: Json = False
 
@@ -84,6 +87,7 @@ class Localise:
                         scene,
                         None if start is None else camera.with_pose(camera_to_world=(start[:3], start[3:])),
                         candidates=[*previous, *candidates],
+                        max_side=self.max_side,
                         renderer=renderer,
                         resident=resident,
                     )

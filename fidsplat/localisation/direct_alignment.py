@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,9 @@ Render = Callable[[Camera], Any]
 
 MAX_PIXELS = 20_000
 """maximum number of pixels of a level; pixels with the largest gradients are used"""
+MAX_SIDE = 320
+"""maximum side in pixels of the finest level, by default: about 3 times the error of 640 pixels in half the
+time"""
 MIN_SIDE = 48
 """minimum side in pixels of the coarsest level"""
 MAX_LEVELS = 4
@@ -65,6 +68,8 @@ _SETTLED = 0.3
 _REPEATED, _REPEATED_PIXELS = 4.0, 0.01
 """size of a last step above which another step follows: in standard deviations, and in pixels for an image
 without noise"""
+_INCREASE = 1.01
+"""largest relative loss after a last step; the zero of the score is not exactly the minimum of the loss"""
 _LAST_STEPS = 6
 """maximum number of last steps"""
 _FULL_STEPS, _FULL_SETTLED = 12, 0.01
@@ -96,7 +101,7 @@ def stages_of(camera: Camera, mask: np.ndarray | None = None) -> list[tuple[Alig
     short, ignored = min(camera.width, camera.height), _ignored(mask, camera)
     shrinks = [2**k for k in range(MAX_LEVELS) if k == 0 or short >> k >= MIN_SIDE]
     coarsest = shrinks[-1]
-    finer = [(shrink, 0.7, 8 if shrink > 2 else 5) for shrink in reversed(shrinks[1:-1] or [1])]
+    finer = [(shrink, 0.7, 8 if shrink > 2 else 5) for shrink in reversed(shrinks[:-1] or [1])]
     found = []
     for shrink, blur, steps in [(coarsest, 2.0, 10), (coarsest, 1.0, 6), *finer, (1, 0.0, 0)]:
         width, height = camera.width // shrink, camera.height // shrink
@@ -117,6 +122,7 @@ def align(
     render: Render,
     kernels: AlignmentKernels,
     coarse: bool = False,
+    max_side: int = MAX_SIDE,
 ) -> Alignment:
     """Align a render of the scene with an image.
 
@@ -127,10 +133,15 @@ def align(
         render: renders the scene.
         kernels: sums over pixels.
         coarse: the stages of the coarsest level only, without a covariance.
+        max_side: maximum side in pixels of the finest level.
     """
-    stages = stages_of(start, mask)[: COARSE if coarse else None]
+    shrink = max(1.0, max(start.width, start.height) / max_side)
+    finest = start.resampled(max(1, round(start.width / shrink)), max(1, round(start.height / shrink)))
+    image = resized(image, finest.width, finest.height)
+    stages = stages_of(finest, mask)[: COARSE if coarse else None]
     with kernels.lock:
-        return _align(image, start, render, kernels, stages, coarse)
+        found = _align(image, finest, render, kernels, stages, coarse)
+    return replace(found, camera=start.with_pose(found.camera.world_to_camera))
 
 
 def _align(
@@ -237,7 +248,7 @@ def _last_steps(at: _State, stage: _Stage) -> tuple[Alignment, bool]:
         sums = stage.sums(frame, at, 0.0 if best is None else best[1].noise, blocks=True)
         if best is None:
             inverse = _inverse(sums, _bread(at, sums, stage, frame))
-        elif sums.cost_before > best[1].cost + 1e-6:
+        elif sums.cost_before > _INCREASE * best[1].cost:
             step, rejected = step / 4, True
             at = best[0].moved(best[1], step)
             continue
@@ -393,7 +404,7 @@ def _ignored(mask: np.ndarray | None, camera: Camera) -> np.ndarray | None:
         return None
     ignored = np.zeros((camera.height, camera.width), np.float32)
     if mask is not None:
-        ignored[~mask] = 1
+        ignored = resized(~mask, camera.width, camera.height)
     if camera.lens is not None:
         y, x = np.mgrid[: camera.height, : camera.width]
         rays = camera.rays(np.stack([x.ravel(), y.ravel()], axis=1) + 0.5)

@@ -13,7 +13,7 @@ from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.sensor import Sensor
 from fidsplat.images.files import pixels_of
-from fidsplat.localisation.direct_alignment import MIN_INLIERS, align
+from fidsplat.localisation.direct_alignment import MAX_SIDE, MIN_INLIERS, MIN_SIDE, align
 from fidsplat.localisation.initial_pose import most_similar, pose_of_markers
 from fidsplat.localisation.normal_equations import alignment_kernels
 from fidsplat.render.frame import Frame
@@ -23,7 +23,7 @@ from fidsplat.scenes import Scene
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.store.store import Store
-from fidsplat.util.arguments import instance, invalid
+from fidsplat.util.arguments import instance, invalid, whole_number
 from fidsplat.util.errors import InputError
 
 MAX_VALUE = 1e4
@@ -97,6 +97,7 @@ def localise(
     camera: Camera | None = None,
     candidates: Sequence[Camera] = (),
     mask: np.ndarray | None = None,
+    max_side: int = MAX_SIDE,
     renderer: Renderer | None = None,
     resident: ResidentCloud | None = None,
 ) -> Localisation:
@@ -119,6 +120,8 @@ def localise(
             scene's camera.
         candidates: cameras at possible poses, e.g. of the photographs of the scene.
         mask: (h, w) bool, False for ignored pixels, e.g. people.
+        max_side: larger images are reduced to this number of pixels along the larger side. More pixels are
+            more accurate and take longer.
         renderer: device; None: the default device.
         resident: the scene uploaded by `renderer`, to localise many images.
 
@@ -127,7 +130,7 @@ def localise(
             known marker in the image and no candidate.
         DeviceError: the device fails or lacks memory.
     """
-    pixels = _pixels(image)
+    pixels, max_side = _pixels(image), whole_number("max_side", max_side, MIN_SIDE, 32_767)
     kinds = Scene | SplatCloud | ResidentCloud | Store
     instance("scene", scene, kinds, "a Scene, a SplatCloud, a Store or a ResidentCloud")  # type: ignore[arg-type]
     renderer = Renderer() if renderer is None else instance("renderer", renderer, Renderer)
@@ -180,7 +183,7 @@ def localise(
         best = most_similar(pixels, camera, candidates, render_all, TRIED)
         tried = [align(pixels, mask, one, render, kernels, coarse=True) for one in best]
         starts = [min(tried, key=lambda one: one.noise).camera]
-    found = align(pixels, mask, starts[0], render, kernels)
+    found = align(pixels, mask, starts[0], render, kernels, max_side=max_side)
     return Localisation(found.camera, found.covariance, found.inliers, found.noise, source)
 
 

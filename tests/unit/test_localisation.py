@@ -135,6 +135,31 @@ def test_the_covariance_includes_errors_of_the_scene(renderer, room):
     assert np.mean(squares) < 100
 
 
+def test_a_large_image_is_reduced(renderer, room):
+    """The result is that of the image of the mean of 2 x 2 pixels; ignored pixels have no influence."""
+    scene, resident, _ = room
+    camera, start = scene.camera.resampled(128, 96), offset_camera(scene.camera, START)
+    image = np.array(renderer.render(resident, camera)["rgb"])
+    mask = np.ones((96, 128), bool)
+    mask[20:40, 60:90] = False
+    given = {"renderer": renderer, "resident": resident}
+    reduced, half = image.reshape(48, 2, 64, 2, 3).mean(axis=(1, 3)), mask[::2, ::2]
+    expected = fs.localise(reduced, scene, start, mask=half, **given)
+    found = fs.localise(
+        np.where(mask[..., None], image, 0.5),
+        scene,
+        camera.with_pose(start.world_to_camera),
+        mask=mask,
+        max_side=64,
+        **given,
+    )
+    assert (found.camera.width, found.camera.height) == (128, 96)
+    assert found.pose == pytest.approx(expected.pose, abs=1e-6)
+    assert found.covariance == pytest.approx(expected.covariance, rel=1e-3, abs=1e-12)
+    with pytest.raises(fs.InputError, match="max_side must be"):
+        fs.localise(image, scene, camera, max_side=8, renderer=renderer)
+
+
 @pytest.mark.parametrize("wrong", ["negated", "elsewhere", "outside the basin"])
 def test_a_wrong_pose_is_not_found(renderer, room, wrong):
     """Flat areas match at many poses, so residuals alone do not tell."""
