@@ -1,6 +1,6 @@
 """Measure accuracy, time and covariance of `fs.localise` in the greenhouse, from random initial poses.
 
-    python benchmarks/localisation.py --repeats 100 [--distance 0.1 --degrees 5] [--noise 0.01] [--max-side 640]
+    python benchmarks/localisation.py --repeats 100 [--distance 0.1 --degrees 5] [--noise 0.01] [--max-side N]
 
 Photographs are rendered images with another exposure for each channel, noise and 8 bits. Prints median
 errors, the share of poses within 20 mm, processor and wall time, and the mean of the squared errors
