@@ -15,9 +15,9 @@ from fidsplat.cameras import Camera
 from fidsplat.cameras.lenses import Orthographic
 from fidsplat.render.irradiance import LightField
 from fidsplat.render.reflection import Gloss, fit_harmonics, fresnel, gloss, lobe, view_directions
-from fidsplat.render.shadows import LightPoint, ReceiverPoints, light_points, visibility
+from fidsplat.render.shadows import LightPoint, ReceiverPoints, between, light_points, visibility
 from fidsplat.scenes import PlacedMarker, Scene
-from fidsplat.scenes.lights import GRIDS, Lighting, PointLight
+from fidsplat.scenes.lights import GRIDS, Light, Lighting, PointLight
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import rotation_of_coefficients
 from fidsplat.splats.rotations import quaternion_to_matrix
@@ -38,6 +38,8 @@ _DARK = 1e-6
 _CHUNK = 256
 _SAME = 0.03
 """maximum angle [rad] between normals of a bent marker for which reflections are computed once"""
+_REACH = 3.5
+"""standard deviations of a Gaussian beyond which it casts no shadow (opacity below 1 / 255)"""
 _WALL = 0.1
 """metres: a light is inside an object if splats are within this distance on all sides"""
 
@@ -76,17 +78,26 @@ class _Surroundings:
         return self.renderer.upload(self.scene)
 
     @cached_property
-    def black(self) -> tuple[Any, np.ndarray, np.ndarray]:
-        """Black splats on the device, for shadow maps, and their bounding box."""
+    def spheres(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centres (n, 3) and radii (n,) of spheres around the splats."""
         cloud = self.scene.cloud()
-        black = _rebuilt(cloud, colors=np.zeros((len(cloud), 3), np.float32))
-        low, high = cloud.bounds() if len(cloud) else (np.zeros(3), np.zeros(3))
-        return self.renderer.upload(black), low, high
+        thickness = 0 if cloud.thickness is None else cloud.thickness
+        radii = np.hypot(np.linalg.norm(cloud.scales, axis=1), thickness)
+        boxes = False if cloud.boxes is None else cloud.boxes
+        return cloud.world_means(), np.where(boxes, radii, _REACH * radii)
 
-    def extent(self, point: np.ndarray) -> float:
-        """Largest distance of a splat from a point, at most 1 km."""
-        _, low, high = self.black
-        return float(min(np.linalg.norm(np.maximum(high - point, point - low)) + 1e-3, 1e3))
+    def casters(self, light: Light, surface: ReceiverPoints) -> tuple[Any, float]:
+        """Black splats on the device that may cast shadows of a light on a surface, or None, and their
+        largest distance from the surface, at most 1 km."""
+        centres, radii = self.spheres
+        rows = np.arange(len(centres))
+        if self.scene.motion.is_still:
+            rows = rows[between(light, surface, centres, radii)]
+        if not len(rows):
+            return None, 0.0
+        far = np.linalg.norm(centres[rows] - surface.middle, axis=1) + radii[rows]
+        black = _rebuilt(self.scene.cloud(), rows, colors=np.zeros((len(rows), 3), np.float32))
+        return self.renderer.upload(black), float(min(far.max(), 1e3))
 
     def panoramas(self, points: np.ndarray, rows: int, near: float, **parts: Any) -> list[Any]:
         """Render panoramas with `alpha` at points (k, 3), in the axes of the world."""
@@ -216,9 +227,9 @@ def _measured(placed: PlacedMarker, light: Lighting, points: _Points, around: _S
         irradiance[rows] = field.irradiance(surface.normals[rows[0]], positions[rows])
     shown = []
     for number, one in enumerate(around.lights):
-        extent = around.extent(placed.pose[:3, 3])
-        for point in light_points(one, surface.points.mean(axis=0)):
-            seen = visibility(point, surface, around.black[0], around.scene.motion, extent, around.renderer)
+        casters, extent = around.casters(one, surface)
+        for point in light_points(one, surface.middle):
+            seen = visibility(point, surface, casters, around.scene.motion, extent, around.renderer)
             if seen.any():
                 around.arrived.add(number)
                 towards, power = point.arriving(surface.points)
@@ -285,28 +296,33 @@ def _split(
     Returns the splat (p,) of each part; its columns and rows [x0, x1) x [y0, y1) on the splat's grid, (p, 4)
     x0, y0, x1, y1; and the part (m,) of each point.
     """
-    owner, corners, part = [], [], np.empty(len(colors), np.int64)
-    for splat, (start, (width, height)) in enumerate(zip(points.starts, points.counts, strict=True)):
-        grid = colors[start : start + width * height].reshape(height, width, -1)
-        index = np.arange(start, start + width * height).reshape(height, width)
-        remaining = [(0, 0, int(width), int(height))]
-        while remaining:
-            x0, y0, x1, y1 = remaining.pop()
-            across, down = x1 - x0, y1 - y0
-            here = grid[y0:y1, x0:x1]
-            same = (here.max(axis=(0, 1)) - here.min(axis=(0, 1))).max() <= step
-            small = largest is None or max(across, down) <= largest
-            if (same and small) or across == down == 1:
-                part[index[y0:y1, x0:x1]] = len(owner)
-                owner.append(splat)
-                corners.append((x0, y0, x1, y1))
-            elif across >= down:
-                middle = x0 + across // 2
-                remaining += [(middle, y0, x1, y1), (x0, y0, middle, y1)]
-            else:
-                middle = y0 + down // 2
-                remaining += [(x0, middle, x1, y1), (x0, y0, x1, middle)]
-    return np.array(owner), np.array(corners), part
+    owner, part = np.arange(len(points.counts)), points.owner.copy()
+    corners = np.pad(points.counts, ((0, 0), (2, 0)))
+    row, column = np.divmod(np.arange(len(part)) - points.starts[part], points.counts[part, 0])
+    place = np.stack([column, row], 1)
+    rows = np.arange(len(part))  # points of the parts that may still be split
+    while True:
+        rows = rows[np.argsort(part[rows], kind="stable")]
+        parts, starts = np.unique(part[rows], return_index=True)
+        spread = np.maximum.reduceat(colors[rows], starts) - np.minimum.reduceat(colors[rows], starts)
+        size = corners[parts, 2:] - corners[parts, :2]
+        halved = spread.max(axis=1) > step
+        if largest is not None:
+            halved |= size.max(axis=1) > largest
+        halved &= size.max(axis=1) > 1
+        if not halved.any():
+            return owner, corners, part
+        parts, axis = parts[halved], (size[:, 1] > size[:, 0])[halved].astype(int)
+        middle = (corners[parts, axis] + corners[parts, axis + 2]) // 2
+        second = corners[parts]
+        corners[parts, axis + 2] = second[np.arange(len(parts)), axis] = middle
+        number = np.full(len(owner), -1)
+        number[parts] = np.arange(len(parts))
+        rows = rows[number[part[rows]] >= 0]
+        own = number[part[rows]]
+        beyond = place[rows, axis[own]] >= middle[own]
+        part[rows[beyond]] = len(owner) + own[beyond]
+        owner, corners = np.concatenate([owner, owner[parts]]), np.concatenate([corners, second])
 
 
 def _placed_parts(
@@ -332,16 +348,12 @@ def _from_camera(
         viewers = np.broadcast_to(-camera.world_to_camera[2, :3], surface.points.shape)
     else:
         viewers = unit(camera.position - surface.points)
-    found, black = np.zeros((len(viewers), 3)), not arriving.field.radiance.any()
-    for start in range(0, len(viewers), _CHUNK):
+    found = _highlights(surface.points, surface.normals, viewers[:, None], shiny, arriving.points)[:, 0]
+    for start in range(0, len(viewers) if arriving.field.radiance.any() else 0, _CHUNK):
         rows = slice(start, start + _CHUNK)
-        shown = [(point, one[rows]) for point, one in arriving.points]
-        normals = surface.normals[rows]
-        if not black:
-            directions, weights = lobe(viewers[rows, None], normals, shiny)
-            radiance = arriving.field.arriving(directions[:, 0], points.local[rows, :2])
-            found[rows] = np.einsum("nk,nkc->nc", weights[:, 0], radiance)
-        found[rows] += _highlights(surface.points[rows], normals, viewers[rows, None], shiny, shown)[:, 0]
+        directions, weights = lobe(viewers[rows, None], surface.normals[rows], shiny)
+        radiance = arriving.field.arriving(directions[:, 0], points.local[rows, :2])
+        found[rows] += np.einsum("nk,nkc->nc", weights[:, 0], radiance)
     cosine = np.einsum("mc,mc->m", viewers, surface.normals)
     return found, 1 - fresnel(cosine, shiny.reflectance)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -25,7 +27,10 @@ _WIDEST = np.tan(np.radians(80))
 """tangent of half the maximum field of view of a shadow map; there are no shadows beyond it"""
 
 
-class ReceiverPoints(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class ReceiverPoints:
+    """Points of a surface that receives shadows."""
+
     points: np.ndarray
     """(m, 3) in the world"""
     normals: np.ndarray
@@ -34,6 +39,19 @@ class ReceiverPoints(NamedTuple):
     """metres between neighbours"""
     clearance: float
     """metres in front of the marker within which splats cast no shadow"""
+
+    @cached_property
+    def middle(self) -> np.ndarray:
+        return (self.points.min(axis=0) + self.points.max(axis=0)) / 2
+
+    @cached_property
+    def radius(self) -> float:
+        """Largest distance of a point from the middle [m], at least the pitch."""
+        return max(float(np.linalg.norm(self.points - self.middle, axis=1).max()), self.pitch)
+
+    @cached_property
+    def is_flat(self) -> bool:
+        return bool(np.ptp(self.normals, axis=0).max() < 1e-9)
 
 
 class LightPoint(NamedTuple):
@@ -77,10 +95,35 @@ def light_points(light: Light, middle: np.ndarray) -> list[LightPoint]:
     return [LightPoint(light, *pair) for pair in zip(places, share, strict=True)]
 
 
+def between(light: Light, surface: ReceiverPoints, centres: np.ndarray, radii: np.ndarray) -> np.ndarray:
+    """Rows of the spheres that may be between a light and a surface: in front of the surface, and in a
+    capsule around both; for a sun in a cone."""
+    middle, normal = surface.middle, surface.normals.mean(axis=0)
+    reach = surface.radius + _MARGIN * surface.pitch
+    length, apart = float(np.linalg.norm(normal)), centres - middle
+    lowest = ((surface.points + surface.clearance * surface.normals - middle) @ normal).min() - surface.pitch
+    if isinstance(light, Sun):
+        towards = -unit(np.array(light.direction))
+        along = apart @ towards
+        across = np.linalg.norm(apart - along[:, None] * towards, axis=1)
+        widest = reach + np.tan(light.angle / 2) * np.maximum(along + radii, 0)
+        inside = (across - radii <= widest) & (along + radii >= -reach)
+        above = towards @ normal > np.sin(light.angle / 2) * length  # all rays rise from the surface
+        lowest = lowest if above else -np.inf
+    else:
+        assert isinstance(light, PointLight)
+        way = np.array(light.position) - middle
+        along = np.clip(apart @ way / max(way @ way, 1e-12), 0, 1)
+        across = np.linalg.norm(apart - along[:, None] * way, axis=1)
+        inside = across - radii <= max(reach, light.radius)
+        lowest = min(lowest, way @ normal - light.radius * length)
+    return np.flatnonzero(inside & (apart @ normal + radii * length >= lowest))
+
+
 def visibility(
     point: LightPoint,
     surface: ReceiverPoints,
-    black: ResidentCloud,
+    casters: ResidentCloud | None,
     motion: Motion,
     extent: float,
     renderer: Any,
@@ -89,27 +132,31 @@ def visibility(
     faces away.
 
     The marker is an opaque white surface in an external depth image, and other splats are black, so that the
-    image rendered from the light is the transmittance. black: the other splats in black, moved by `motion`.
-    extent: largest distance of a splat from the marker.
+    image rendered from the light is the transmittance. casters: the splats `between` both in black, moved by
+    `motion`; None: no splats. extent: largest distance of a splat from the marker.
     """
     towards, irradiance = point.arriving(surface.points)
     found = np.zeros(len(towards), np.float32)
-    lit = (np.einsum("mc,mc->m", towards, surface.normals) > 0) & (irradiance > 0).any(axis=1)
-    if lit.any():
-        points = surface.points[lit]
-        camera = _camera(point, points, surface.pitch, extent + surface.clearance)
-        depth = _depth_image(camera, points + surface.clearance * surface.normals[lit])
+    lit = (np.einsum("mc,mc->m", towards, surface.normals) > 0) & (irradiance @ np.ones(3) > 0)
+    if casters is None:
+        found[lit] = 1
+    elif lit.any():
+        points, normals = surface.points[lit], surface.normals[lit]
+        camera = _camera(point, surface, extent + surface.clearance)
+        shifted = points + surface.clearance * normals
+        if surface.is_flat:  # three points of its plane
+            shifted = shifted[0] + surface.pitch * np.pad(perpendicular(normals[0]), ((1, 0), (0, 0)))
+        depth = _depth_image(camera, shifted)
         image = ExternalDepth(np.ones((*depth.shape, 3), np.float32), depth)
-        seen = renderer.render(black, Capture(camera, motion=motion, external_depth=image))["rgb"][..., 0]
+        seen = renderer.render(casters, Capture(camera, motion=motion, external_depth=image))["rgb"][..., 0]
         found[lit] = _bilinear(np.asarray(seen), camera.project(points))
     return found
 
 
-def _camera(point: LightPoint, points: np.ndarray, pitch: float, extent: float) -> Camera:
+def _camera(point: LightPoint, surface: ReceiverPoints, extent: float) -> Camera:
     """Camera of a shadow map, at the light's point; for a sun, beyond all splats."""
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    reach = max(float(np.linalg.norm(points - middle, axis=1).max()), pitch)
-    inner = int(np.clip(np.ceil(2 * reach / pitch), 8, MAX_PIXELS))
+    middle, reach = surface.middle, surface.radius
+    inner = int(np.clip(np.ceil(2 * reach / surface.pitch), 8, MAX_PIXELS))
     side = inner + 2 * _MARGIN
     if isinstance(point.light, Sun):
         pose = look_at_matrix(

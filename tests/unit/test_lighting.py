@@ -150,6 +150,30 @@ def test_a_shadow_has_its_edge_at_the_computed_place(quaternion):
     assert bright[right < edge - 1.5 * finest].all()
 
 
+def test_splats_that_cannot_cast_shadows_are_left_out_without_a_change():
+    """With a motion, even of no distance, all splats are in the shadow maps."""
+    lights = (
+        replace(SUN, direction=(0.6, 0.2, 1), angle=0.3, samples=3),
+        fs.PointLight(position=(0.1, 0.2, -0.6), radius=0.1, samples=3),
+        fs.SpotLight(position=(-0.3, 0, -0.2), direction=(0.3, 0, 0.2)),
+    )
+    rng = np.random.default_rng(3)
+    disks, boxes = (
+        fs.SplatCloud(
+            rng.uniform(-0.8, 0.8, (150, 3)), rng.normal(size=(150, 4)), rng.uniform(0.005, 0.06, (150, 2)),
+            rng.uniform(0.2, 1, 150), colors=np.ones((150, 3)),
+        )
+        for _ in range(2)
+    )  # fmt: skip
+    scene = of_lights(*lights, clouds=[disks, boxes.with_boxes()])
+    bent = fs.marker("aruco:4x4_50:7", 0.16, shape="cylinder,radius=0.1,deviation=0.001")
+    scene = replace(scene, markers=[replace(scene.markers[0], marker=bent)])
+    every = replace(scene, cloud_motions={0: lambda time: np.eye(4)})
+    (found, _), (expected, _) = lit(scene), lit(every)
+    assert np.ptp(expected) > 0.1
+    assert np.allclose(found, expected, atol=1e-6)
+
+
 def test_a_large_light_has_a_penumbra_of_its_size():
     """A sun of the angular diameter 0.4 behind an edge at 0.2 m: 0.2 tan(0.2) on both sides."""
     wall = screen(0.5, 0, -0.2, 0.5, 1)
