@@ -328,11 +328,7 @@ def _returns(rays: dict[str, np.ndarray], lidar: Lidar) -> dict[str, np.ndarray]
     mean range by signal, their sum of intensities over n, and the label of the first."""
     count = lidar.rays
     if count == 1:
-        rest = len(lidar.returns) - 1
-        return {
-            name: np.pad(values.T, ((0, rest), (0, 0)), constant_values=-1 if name == "label" else 0)
-            for name, values in rays.items()
-        }
+        return {name: values.T.copy() for name, values in rays.items()}
     order = np.argsort(np.where(rays["range"] > 0, rays["range"], np.inf), axis=1, kind="stable")
     sorted_ = {name: np.take_along_axis(values, order, 1) for name, values in rays.items()}
     ranges, hit = sorted_["range"], sorted_["range"] > 0
