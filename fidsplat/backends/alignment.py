@@ -11,8 +11,8 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 
-BINS, SHIFT, LOWEST = 256, 19, 113 << 4
-"""histograms of positive float32 by their upper bits: 16 bins per octave from 2^-14 to 4"""
+BINS, SHIFT, FIRST_BIN = 256, 19, 113 << 4
+"""histograms of positive float32, 16 bins per octave from 2^-14 to 4: bin = (bits >> SHIFT) - FIRST_BIN"""
 
 
 class AlignmentStage(NamedTuple):
@@ -24,8 +24,8 @@ class AlignmentStage(NamedTuple):
     """(h, w) bool, True for ignored pixels of the level; None: none"""
     taps: np.ndarray
     """(r + 1,) float32: blur weights of the offsets 0 to r, the same on both sides; (1,) without blur"""
-    side: int
-    """side in pixels of the square blocks for which `AlignmentSums.scores` has separate sums"""
+    block_size: int
+    """side in pixels of the square blocks for which `AlignmentSums.block_rhs` has separate sums"""
 
 
 class AlignmentFit(NamedTuple):
@@ -50,7 +50,7 @@ class MovedFrame(NamedTuple):
     size: float
     """size of the motion [rad or m]"""
     axis: int
-    """index of the ray's component by which the second column of `AlignmentSums.right` is multiplied"""
+    """index of the ray's component by which the second column of `AlignmentSums.rhs` is multiplied"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,16 +64,16 @@ class AlignmentSums:
 
     matrix: np.ndarray
     """(c, 8, 8) outer product of a row with itself, weighted by the second derivative of the loss"""
-    right: np.ndarray
+    rhs: np.ndarray
     """(c, 8, 1) row times residual. With a MovedFrame (c, 8, 2): row times d, and row times -d times a
-    component of the ray, with d the derivative of the rendered value by the motion"""
-    square: np.ndarray
-    """(c,) squared residuals"""
-    scores: np.ndarray
+    component of the ray, where d is the derivative of the rendered value with respect to the motion"""
+    squared_residuals: np.ndarray
+    """(c,)"""
+    block_rhs: np.ndarray
     """(blocks, c, 8) row times residual in each block; empty unless requested"""
-    matrices: np.ndarray
+    block_matrices: np.ndarray
     """(blocks, c, 8, 8) `matrix` of each block; empty unless requested"""
-    moments: np.ndarray
+    block_moments: np.ndarray
     """(blocks, c, 6) unweighted sums of each block: image x with the exposure of the render, render y, x^2,
     y^2, x y, and 1; empty unless requested"""
     cost: float
@@ -107,24 +107,24 @@ class AlignmentKernels(ABC):
         """held from `load` to the last `sums` of an image"""
 
     @abstractmethod
-    def load(self, image: np.ndarray, stages: list[AlignmentStage], most: int) -> list[int]:
+    def load(self, image: np.ndarray, stages: list[AlignmentStage], max_pixels: int) -> list[int]:
         """Prepare an image (h, w, 1 or 3), float32 display values, for all stages; returns the number of
-        pixels of each. A stage uses the `most` pixels with the largest gradients."""
+        pixels of each. A stage uses about `max_pixels` pixels, those with the largest gradients."""
 
     @abstractmethod
     def sums(
         self, stage: int, frame: Any, fit: AlignmentFit, moved: MovedFrame | None = None, blocks: bool = False
     ) -> AlignmentSums:
-        """Sums of a stage for a Frame with rgb and depth. blocks: whether to return `scores`, `matrices`."""
+        """Sums of a stage for a Frame with rgb and depth. blocks: whether to return sums of each block."""
 
 
 def bins_of(values: np.ndarray) -> np.ndarray:
     """Histogram bins, 1 to 255, of positive values. Bin 0 is for unused pixels."""
     upper = np.ascontiguousarray(values, np.float32).view(np.uint32) >> SHIFT
-    return np.clip(upper.astype(np.int64) - LOWEST, 1, BINS - 1)
+    return np.clip(upper.astype(np.int64) - FIRST_BIN, 1, BINS - 1)
 
 
-def lowest_bin(counts: np.ndarray, most: int) -> int:
-    """Lowest bin to use, so that this and the higher bins contain about `most` values of a histogram."""
-    above = np.cumsum(counts[:0:-1])[::-1]
-    return 1 + int(np.flatnonzero(above >= min(most, above[0]))[-1])
+def lowest_bin(counts: np.ndarray, max_pixels: int) -> int:
+    """Lowest bin to use, so that it and the higher bins contain about `max_pixels` values of a histogram."""
+    at_least = np.cumsum(counts[:0:-1])[::-1]
+    return 1 + int(np.flatnonzero(at_least >= min(max_pixels, at_least[0]))[-1])

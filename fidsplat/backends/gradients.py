@@ -12,7 +12,7 @@ from fidsplat.backends.view import View
 from fidsplat.effects import IMAGES
 from fidsplat.util.errors import InputError
 
-NOT_THE_LAST = (
+NOT_LATEST_FRAME = (
     "backward must be called before the next frame of the device, got images of an earlier frame; "
     "render again"
 )
@@ -33,7 +33,7 @@ class DifferentiableImages:
         self._number = frame.workspace.frames
 
     @property
-    def last(self) -> bool:
+    def is_latest(self) -> bool:
         """Whether this is the device's latest frame, so that `backward` is possible."""
         return self.frame.workspace.frames == self._number
 

@@ -289,7 +289,7 @@ class GradientPipeline(ABC):
                 another shape.
         """
 
-    def backward_to_tiles(self, images: Any, gradients: Mapping[str, Any]) -> Any:
+    def backward_per_tile(self, images: Any, gradients: Mapping[str, Any]) -> Any:
         """Gradients in the form that `Backend.training().step` accepts; by default the same as `backward`."""
         return self.backward(images, gradients)
 

@@ -278,8 +278,8 @@ def _agreement(sums: AlignmentSums, noise: float) -> tuple[float, float]:
 
     noise: standard deviation of the noise of the image, in units of the render.
     """
-    count = np.maximum(sums.moments[:, :, 5], 1)
-    x, y, xx, yy, xy = np.moveaxis(sums.moments[:, :, :5] / count[:, :, None], 2, 0)
+    count = np.maximum(sums.block_moments[:, :, 5], 1)
+    x, y, xx, yy, xy = np.moveaxis(sums.block_moments[:, :, :5] / count[:, :, None], 2, 0)
     image, render = (xx - x * x).mean(axis=1) - noise**2, (yy - y * y).mean(axis=1)
     used = np.maximum(image, render) > max(MIN_CONTRAST, 2 * noise) ** 2
     used &= count[:, 0] >= MIN_PIXELS
@@ -312,17 +312,17 @@ def _bread(at: _State, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.nda
         motion = np.zeros(6)
         motion[axis] = size = turn if axis < 3 else turn / max(math.sqrt(sums.inverse_depth), 1e-3)
         other = stage.frame(offset_pose(at.pose, motion))
-        right = stage.sums(frame, at, sums.noise, moved=MovedFrame(other, size, axis % 3)).right
-        columns[:, :, axis] = right[:, :, 0]
+        rhs = stage.sums(frame, at, sums.noise, moved=MovedFrame(other, size, axis % 3)).rhs
+        columns[:, :, axis] = rhs[:, :, 0]
         if pinhole:
-            columns[:, :, axis // 3 * 3 + 2] += right[:, :, 1]
+            columns[:, :, axis // 3 * 3 + 2] += rhs[:, :, 1]
     return _assembled(columns)
 
 
 def _inverse(sums: AlignmentSums, bread: np.ndarray) -> np.ndarray | None:
     """The inverse of the derivative of the score; None if the pixels do not determine the pose, or if there
     are too few blocks of pixels for a covariance."""
-    if np.count_nonzero(sums.matrices.any(axis=(1, 2, 3))) <= len(bread):
+    if np.count_nonzero(sums.block_matrices.any(axis=(1, 2, 3))) <= len(bread):
         return None
     deviations = np.sqrt(np.maximum(np.diag(_assembled(sums.matrix)), 1e-15))
     scaled = bread / np.outer(deviations, deviations)
@@ -334,11 +334,11 @@ def _inverse(sums: AlignmentSums, bread: np.ndarray) -> np.ndarray | None:
 def _covariance(sums: AlignmentSums, inverse: np.ndarray) -> np.ndarray:
     """(6, 6) sandwich estimate from the scores of blocks, corrected for leverage by the delete-one-block
     jackknife (CR3, MacKinnon and White 1985)."""
-    count, size = len(sums.scores), len(inverse)
+    count, size = len(sums.block_rhs), len(inverse)
     matrices = np.zeros((count, size, size))
-    for channel in range(sums.scores.shape[1]):
+    for channel in range(sums.block_rhs.shape[1]):
         own = np.array(_parameters(channel))
-        matrices[:, own[:, None], own] += sums.matrices[:, channel]
+        matrices[:, own[:, None], own] += sums.block_matrices[:, channel]
     # more than 1: a single block may determine the pose, which makes the difference singular
     others = 1.000001 * np.eye(size) - inverse @ matrices
     errors = np.linalg.solve(others, (_scores(sums) @ inverse.T)[:, :, None])[:, :6, 0]
@@ -347,9 +347,9 @@ def _covariance(sums: AlignmentSums, inverse: np.ndarray) -> np.ndarray:
 
 def _scores(sums: AlignmentSums) -> np.ndarray:
     """Scores (blocks, 6 + 2 c)."""
-    scores = np.zeros((len(sums.scores), 6 + 2 * sums.scores.shape[1]))
-    for channel in range(sums.scores.shape[1]):
-        scores[:, _parameters(channel)] += sums.scores[:, channel]
+    scores = np.zeros((len(sums.block_rhs), 6 + 2 * sums.block_rhs.shape[1]))
+    for channel in range(sums.block_rhs.shape[1]):
+        scores[:, _parameters(channel)] += sums.block_rhs[:, channel]
     return scores
 
 
@@ -364,7 +364,7 @@ def _solved(sums: AlignmentSums, damping: float) -> np.ndarray:
 def _right(sums: AlignmentSums) -> np.ndarray:
     """The score (6 + 2 c,): right side of the normal equations."""
     right = np.zeros(6 + 2 * len(sums.matrix))
-    for channel, column in enumerate(sums.right[:, :, 0]):
+    for channel, column in enumerate(sums.rhs[:, :, 0]):
         right[_parameters(channel)] += column
     return right
 
@@ -389,10 +389,10 @@ def _exposure_of(sums: AlignmentSums) -> tuple[np.ndarray, np.ndarray]:
     """Changes (c,) of gains and offsets that equalise the means and standard deviations of the blurred
     images. A regression would underestimate the gain of misaligned images."""
     total = sums.matrix[:, 7, 7]
-    values, residuals = sums.matrix[:, 6, 7] / total, sums.right[:, 7, 0] / total
+    values, residuals = sums.matrix[:, 6, 7] / total, sums.rhs[:, 7, 0] / total
     variance = np.maximum(sums.matrix[:, 6, 6] / total - values**2, 1e-12)
-    mixed = sums.right[:, 6, 0] / total - values * residuals
-    image = variance + 2 * mixed + sums.square / total - residuals**2
+    mixed = sums.rhs[:, 6, 0] / total - values * residuals
+    image = variance + 2 * mixed + sums.squared_residuals / total - residuals**2
     gains = np.sqrt(np.maximum(image, 1e-12) / variance)
     return gains, values + residuals - gains * values
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from fidsplat.backends.alignment import (
     BINS,
+    FIRST_BIN,
     HUBER,
-    LOWEST,
     MAX_NOISE,
     MIN_NOISE,
     SHIFT,
@@ -38,9 +38,9 @@ def alignment_kernels(renderer: Renderer, resident: ResidentCloud) -> AlignmentK
 class HostAlignment(AlignmentKernels):
     """Sums on the host over the textured pixels of a stage."""
 
-    def load(self, image: np.ndarray, stages: list[AlignmentStage], most: int) -> list[int]:
+    def load(self, image: np.ndarray, stages: list[AlignmentStage], max_pixels: int) -> list[int]:
         """Prepare the image for its stages."""
-        self._targets = [_Target(image, stage, most) for stage in stages]
+        self._targets = [_Target(image, stage, max_pixels) for stage in stages]
         self._rendered: tuple[Any, ...] = ()
         return [len(target.rows) for target in self._targets]
 
@@ -71,24 +71,24 @@ class HostAlignment(AlignmentKernels):
         if moved is not None:
             change = (_at(target.blurred(moved.frame), target.rows) - values) / np.float32(moved.size)
             columns, column_weights = np.stack([change, -target.rays[moved.axis] * change]), matrix_weights
-        matrix, right, scores, matrices, moments = [], [], [], [], []
+        matrix, rhs, block_rhs, block_matrices, block_moments = [], [], [], [], []
         for channel, (gx, gy) in enumerate(zip(*slopes, strict=True)):
             row = np.stack([*-(gx * across + gy * down), values[channel], np.ones_like(gx)]).astype(float)
             weighted = row * column_weights
             matrix.append((row * matrix_weights) @ row.T)
-            right.append(weighted @ columns[:, channel].T)
+            rhs.append(weighted @ columns[:, channel].T)
             if blocks:
-                scores.append(target.by_block(weighted * columns[0, channel]))
-                matrices.append(target.by_block((row * matrix_weights)[:, None] * row))
+                block_rhs.append(target.by_block(weighted * columns[0, channel]))
+                block_matrices.append(target.by_block((row * matrix_weights)[:, None] * row))
                 x, y = (residuals + values)[channel].astype(float), values[channel].astype(float)
-                moments.append(target.by_block(np.stack([x, y, x * x, y * y, x * y, np.ones_like(x)])))
+                block_moments.append(target.by_block(np.stack([x, y, x * x, y * y, x * y, np.ones_like(x)])))
         return AlignmentSums(
             np.array(matrix),
-            np.array(right),
+            np.array(rhs),
             (residuals**2 * weights).sum(axis=1, dtype=float),
-            np.stack(scores, axis=1) if blocks else np.empty((0, len(values), 8)),
-            np.stack(matrices, axis=1) if blocks else np.empty((0, len(values), 8, 8)),
-            np.stack(moments, axis=1) if blocks else np.empty((0, len(values), 6)),
+            np.stack(block_rhs, axis=1) if blocks else np.empty((0, len(values), 8)),
+            np.stack(block_matrices, axis=1) if blocks else np.empty((0, len(values), 8, 8)),
+            np.stack(block_moments, axis=1) if blocks else np.empty((0, len(values), 6)),
             float(cost.mean()),
             float(_robust(error, fit.noise or noise, fit.huber)[2].mean()),
             float((inverse_depth**2).mean()),
@@ -107,7 +107,7 @@ class HostAlignment(AlignmentKernels):
 class _Target:
     """The image at one stage, at its textured pixels."""
 
-    def __init__(self, image: np.ndarray, stage: AlignmentStage, most: int) -> None:
+    def __init__(self, image: np.ndarray, stage: AlignmentStage, max_pixels: int) -> None:
         camera, self.taps = stage.camera, stage.taps
         width, height = camera.width, camera.height
         values = convolved(resized(image, width, height), stage.taps)
@@ -116,10 +116,12 @@ class _Target:
         bins[1:-1, 1:-1] = bins_of(np.sqrt((across * across + down * down).sum(axis=2)) / 2)
         if stage.ignored is not None:
             bins[stage.ignored] = 0
-        self.rows = rows = np.flatnonzero(bins >= lowest_bin(np.bincount(bins.ravel(), minlength=BINS), most))
+        self.rows = rows = np.flatnonzero(
+            bins >= lowest_bin(np.bincount(bins.ravel(), minlength=BINS), max_pixels)
+        )
         self.values, self.slopes = _at(values, rows), _slopes(values, rows)
         y, x = np.divmod(rows, width)
-        blocks = y // stage.side * width + x // stage.side
+        blocks = y // stage.block_size * width + x // stage.block_size
         self._order = np.argsort(blocks, kind="stable")
         self._starts = np.unique(blocks[self._order], return_index=True)[1]
         rays = camera.rays(np.stack([x, y], axis=1) + 0.5)
@@ -163,7 +165,7 @@ def _median(values: np.ndarray) -> float:
     counts = np.bincount(bins_of(values), minlength=BINS)
     before = np.cumsum(counts) - counts
     at = int(np.flatnonzero(before <= len(values) / 2)[-1])
-    low, high = (np.array([LOWEST + at, LOWEST + at + 1], np.uint32) << SHIFT).view(np.float32).tolist()
+    low, high = (np.array([FIRST_BIN + at, FIRST_BIN + at + 1], np.uint32) << SHIFT).view(np.float32).tolist()
     return low + (high - low) * (len(values) / 2 - before[at]) / max(int(counts[at]), 1)
 
 

@@ -90,9 +90,9 @@ class DeviceModel:
         """Gradients of the weighted normal loss with respect to `depth` and `normal`."""
         return self._kernels.normal_loss_gradients(images, view, camera, weight)
 
-    def backward_to_tiles(self, pipeline: Any, images: Images, gradients: Mapping[str, Any]) -> Any:
+    def backward_per_tile(self, pipeline: Any, images: Images, gradients: Mapping[str, Any]) -> Any:
         """The backward pass up to the gradients by tile, for `accumulate_statistics` and `step`."""
-        return pipeline.backward_to_tiles(images, gradients)
+        return pipeline.backward_per_tile(images, gradients)
 
     def accumulate_statistics(self, by_tiles: Any, camera: Camera, origin: np.ndarray) -> None:
         """Add screen gradients and visibility to the densification statistics."""
@@ -115,7 +115,7 @@ class DeviceModel:
         mcmc = settings.strategy == "mcmc"
         numbers = {
             **{"beta1": settings.beta1, "beta2": settings.beta2, "epsilon": settings.epsilon},
-            "root": math.sqrt(1 - settings.beta2**step),
+            "sqrt_correction2": math.sqrt(1 - settings.beta2**step),
             "sparse": float(settings.sparse_adam),
             "scale_penalty": settings.scale_penalty / (settings.axes * count) if mcmc else 0.0,
             "opacity_penalty": settings.opacity_penalty / count if mcmc else 0.0,

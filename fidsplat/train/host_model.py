@@ -83,7 +83,7 @@ class HostModel:
         _, by_depth, by_normal = normal_loss(depth, normal, weights, *lens)
         return {"depth": by_depth, "normal": by_normal}
 
-    def backward_to_tiles(
+    def backward_per_tile(
         self, pipeline: Any, images: Images, gradients: Mapping[str, Any]
     ) -> dict[str, Any]:
         """The gradients for `accumulate_statistics` and `step`."""

@@ -122,5 +122,5 @@ def _adam(
     second *= settings.beta2
     second += (1 - settings.beta2) * gradient * gradient
     size = rate / (1 - settings.beta1**step)
-    root = math.sqrt(1 - settings.beta2**step)
-    value -= size * first / (np.sqrt(second) / root + settings.epsilon)
+    sqrt_correction2 = math.sqrt(1 - settings.beta2**step)
+    value -= size * first / (np.sqrt(second) / sqrt_correction2 + settings.epsilon)

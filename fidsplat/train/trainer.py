@@ -459,7 +459,7 @@ class Trainer:
             view = self.dataset.views[number]
             mask = np.ones(view.image.shape[:2], np.float32) if view.mask is None else view.mask
             by_images["distortion"] = mask * np.float32(by_distortions / mask.size)
-        return loss, self._model.backward_to_tiles(pipeline, images, by_images)
+        return loss, self._model.backward_per_tile(pipeline, images, by_images)
 
     def _compile_next(self, iteration: int, plain: Capture, surface: Capture) -> None:
         """Compile in the background the kernels for the next SH degree or the next additional loss."""

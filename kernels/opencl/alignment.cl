@@ -1,16 +1,16 @@
 // Direct image alignment: residuals of an image against a render, and the sums of the normal equations of the camera pose. NumPy
 // version: fidsplat/localisation/normal_equations.py.
 // ITEMS   work-items of a group: 1 on CPUs
-// LOWEST  number of the first bin in the upper bits of a float
+// FIRST_BIN  number of the first bin in the upper bits of a float
 #pragma OPENCL FP_CONTRACT OFF
 #define ROW_ITEMS (ITEMS < 16 ? ITEMS : 16)
 #define BINS 256
-#define CHANNEL_ROWS 10   // rows of 8 sums of a channel: the matrix, the right side, and a second one or moments of image and render
+#define CHANNEL_ROWS 10   // rows of 8 sums of a channel: the matrix, the right-hand side, and a second one or moments of image and render
 #define SUMS (8 * (3 * CHANNEL_ROWS + 1))
 
 // Bin of a positive number: 16 bins per octave from 2^-14 on.
 static inline uint bin_of(float value) {
-    return (uint)clamp((int)(as_uint(value) >> 19) - LOWEST, 1, BINS - 1);
+    return (uint)clamp((int)(as_uint(value) >> 19) - FIRST_BIN, 1, BINS - 1);
 }
 
 // A channel of a pixel; of a grey image the mean of the rendered channels.
@@ -20,8 +20,8 @@ static inline float value_of(global const float *image, int i, int channel, int 
 }
 
 // Index space: (columns, rows) of the level. Reads: a larger image. Writes: means over the pixels of the level.
-kernel void align_shrink(
-//@@ arguments align_shrink
+kernel void align_downsample(
+//@@ arguments align_downsample
 ) {
     int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
@@ -34,7 +34,7 @@ kernel void align_shrink(
             share *= fmin(bottom, row + 1.0f) - fmax(top, (float)row);
             for (int c = 0; c < channels; c++) sum[c] += share * at[c];
         }
-    for (int c = 0; c < channels; c++) made[(y * (size_t)width + x) * channels + c] = sum[c] / (ratio_x * ratio_y);
+    for (int c = 0; c < channels; c++) result[(y * (size_t)width + x) * channels + c] = sum[c] / (ratio_x * ratio_y);
 }
 
 // Index space: (any number, rows). Reads: an image. Writes: its convolution along x or y with symmetric taps; the border is repeated.
@@ -43,7 +43,7 @@ kernel void align_blur(
 ) {
     int y = get_global_id(1), first = get_global_id(0), count = width * channels, step = get_global_size(0);
     global const float *own = image + y * (size_t)count;
-    global float *into = made + y * (size_t)count;
+    global float *into = result + y * (size_t)count;
     for (int i = first; i < count; i += step) into[i] = taps[0] * own[i];
     for (int k = 1; k <= radius; k++) {
         if (vertical) {
@@ -60,16 +60,16 @@ kernel void align_blur(
 }
 
 // Add a work-group's histogram to the histogram of all groups.
-static inline void add_bins(local uint *own, global uint *counts) {
+static inline void add_bins(local uint *group_counts, global uint *counts) {
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint k = get_local_id(0); k < BINS; k += ITEMS)
-        if (own[k]) atomic_add(&counts[k], own[k]);
+        if (group_counts[k]) atomic_add(&counts[k], group_counts[k]);
 }
 
 #if ITEMS == 1
-#define COUNT(own, bin) (own)[bin]++
+#define COUNT(counters, bin) (counters)[bin]++
 #else
-#define COUNT(own, bin) atomic_inc(&(own)[bin])
+#define COUNT(counters, bin) atomic_inc(&(counters)[bin])
 #endif
 
 // Index space: any number of work-groups of ITEMS, by rows. Reads: the image of a level. Writes: the bin of each pixel's gradient, 0
@@ -77,8 +77,8 @@ static inline void add_bins(local uint *own, global uint *counts) {
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_texture(
 //@@ arguments align_texture
 ) {
-    local uint own[BINS];
-    for (uint k = get_local_id(0); k < BINS; k += ITEMS) own[k] = 0;
+    local uint group_counts[BINS];
+    for (uint k = get_local_id(0); k < BINS; k += ITEMS) group_counts[k] = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int y = get_group_id(0); y < height; y += get_num_groups(0))
         for (int x = get_local_id(0); x < width; x += ITEMS) {
@@ -94,9 +94,9 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_texture(
                 bin = bin_of(sqrt(energy) / 2.0f);
             }
             bins[i] = (uchar)bin;
-            COUNT(own, bin);
+            COUNT(group_counts, bin);
         }
-    add_bins(own, counts + row * BINS);
+    add_bins(group_counts, counts + row * BINS);
 }
 
 // Residuals of a pixel: image, without gain and offset, minus render. Returns their root mean square.
@@ -117,17 +117,17 @@ static inline float residuals_of(
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_errors(
 //@@ arguments align_errors
 ) {
-    local uint own[BINS];
+    local uint group_counts[BINS];
     EXPOSURE;
-    for (uint k = get_local_id(0); k < BINS; k += ITEMS) own[k] = 0;
+    for (uint k = get_local_id(0); k < BINS; k += ITEMS) group_counts[k] = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int y = get_group_id(0); y < height; y += get_num_groups(0))
         for (int i = y * width + get_local_id(0); i < (y + 1) * width; i += ITEMS) {
             float residual[3];
-            if (bins[i] < least) continue;
-            COUNT(own, bin_of(residuals_of(i, channels, image, rgb, gain, offset, residual)));
+            if (bins[i] < min_bin) continue;
+            COUNT(group_counts, bin_of(residuals_of(i, channels, image, rgb, gain, offset, residual)));
         }
-    add_bins(own, counts);
+    add_bins(group_counts, counts);
 }
 
 // Median of a histogram, linear within its bin.
@@ -135,7 +135,7 @@ static inline float median_of(global const uint *counts) {
     uint total = 0, before = 0, k = 1;
     for (uint other = 1; other < BINS; other++) total += counts[other];
     while (k < BINS - 1 && 2 * (before + counts[k]) < total) before += counts[k++];
-    float low = as_float((LOWEST + k) << 19), high = as_float((LOWEST + k + 1) << 19);
+    float low = as_float((FIRST_BIN + k) << 19), high = as_float((FIRST_BIN + k + 1) << 19);
     return low + (high - low) * (0.5f * total - before) / fmax((float)counts[k], 1.0f);
 }
 
@@ -161,7 +161,7 @@ static inline float nearest(global const float *depth, int i, int width) {
     return largest;
 }
 
-// Index space: work-groups of ITEMS; group g has the blocks g, g + groups, ... of side x side pixels. Reads: image, render, depth,
+// Index space: work-groups of ITEMS; group g has the blocks g, g + groups, ... of block_size x block_size pixels. Reads: image, render, depth,
 // the rays of a lens, counts of `align_errors`, the render after a motion. Writes: the sums of each group, in a fixed order.
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
 //@@ arguments align_sums
@@ -179,32 +179,32 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
     // others: squares of three channels, number of pixels, two losses, squared inverse depths
     float8 totals[CHANNEL_ROWS * 3], others = 0.0f;
     for (int k = 0; k < CHANNEL_ROWS * 3; k++) totals[k] = 0.0f;
-    int across_blocks = (width + side - 1) / side, blocks = across_blocks * ((height + side - 1) / side);
+    int across_blocks = (width + block_size - 1) / block_size, blocks = across_blocks * ((height + block_size - 1) / block_size);
     for (int block = get_group_id(0); block < blocks; block += get_num_groups(0)) {
-        int left = block % across_blocks * side, top = block / across_blocks * side;
-        int right = min(left + side, width), bottom = min(top + side, height);
+        int left = block % across_blocks * block_size, top = block / across_blocks * block_size;
+        int right = min(left + block_size, width), bottom = min(top + block_size, height);
         for (int y = top + item / ROW_ITEMS; y < bottom; y += ITEMS / ROW_ITEMS)
             for (int x = left + item % ROW_ITEMS; x < right; x += ROW_ITEMS) {
                 int i = y * width + x;
-                if (bins[i] < least) continue;
+                if (bins[i] < min_bin) continue;
                 float residual[3], weight, curved, cost, before;
                 float error = residuals_of(i, channels, image, rgb, gain, offset, residual), inverse = nearest(depth, i, width);
                 robust(error, noise_before > 0.0f ? noise_before : noise, huber, channels, &weight, &curved, &before);
                 robust(error, noise, huber, channels, &weight, &curved, &cost);
                 float3 ray = {(x + 0.5f - center_x) / focal_x, (y + 0.5f - center_y) / focal_y, 1.0f};
-                float3 by_x = {1.0f / focal_x, 0.0f, 0.0f}, by_y = {0.0f, 1.0f / focal_y, 0.0f};
+                float3 ray_dx = {1.0f / focal_x, 0.0f, 0.0f}, ray_dy = {0.0f, 1.0f / focal_y, 0.0f};
                 if (lens) {
                     ray = vload3(i, rays);
-                    by_x = (vload3(i + 1, rays) - vload3(i - 1, rays)) / 2.0f;
-                    by_y = (vload3(i + width, rays) - vload3(i - width, rays)) / 2.0f;
+                    ray_dx = (vload3(i + 1, rays) - vload3(i - 1, rays)) / 2.0f;
+                    ray_dy = (vload3(i + width, rays) - vload3(i - width, rays)) / 2.0f;
                 }
                 // derivatives of pixel coordinates by the point: the dual basis of the rays' derivatives
-                float3 across = cross(by_y, ray), down = cross(ray, by_x);
-                across /= dot(by_x, across);
-                down /= dot(by_y, down);
+                float3 across = cross(ray_dy, ray), down = cross(ray, ray_dx);
+                across /= dot(ray_dx, across);
+                down /= dot(ray_dy, down);
                 float3 turn_x = cross(ray, across), turn_y = cross(ray, down);
                 float8 motion_x = (float8)(turn_x, across * inverse, 0.0f, 0.0f), motion_y = (float8)(turn_y, down * inverse, 0.0f, 0.0f);
-                float scale = axis == 0 ? -ray.x : axis == 1 ? -ray.y : -ray.z, of_column = moves ? curved : weight;
+                float scale = axis == 0 ? -ray.x : axis == 1 ? -ray.y : -ray.z, of_column = has_moved ? curved : weight;
                 float squares[3] = {0.0f, 0.0f, 0.0f};
                 for (int c = 0; c < channels; c++) {
                     float gx = (value_of(rgb, i + 1, c, channels) - value_of(rgb, i - 1, c, channels)) / 2.0f;
@@ -214,14 +214,14 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                         gy = (gy + (image[(i + width) * channels + c] - image[(i - width) * channels + c]) / 2.0f / gain[c]) / 2.0f;
                     }
                     float value = value_of(rgb, i, c, channels), column = residual[c];
-                    if (moves) column = (value_of(moved, i, c, channels) - value) / step;
+                    if (has_moved) column = (value_of(moved, i, c, channels) - value) / step;
                     float8 row = -(gx * motion_x + gy * motion_y), *total = totals + c * CHANNEL_ROWS;
                     row.s67 = (float2)(value, 1.0f);
                     float8 weighted = curved * row, entry = of_column * column * row;
                     for (int k = 0; k < 8; k++) total[k] += ((const float *)&weighted)[k] * row;
                     total[8] += entry;
                     float own = value + residual[c];
-                    total[9] += moves ? scale * entry : (float8)(own, value, own * own, value * value, own * value, 1.0f, 0.0f, 0.0f);
+                    total[9] += has_moved ? scale * entry : (float8)(own, value, own * own, value * value, own * value, 1.0f, 0.0f, 0.0f);
                     squares[c] = weight * residual[c] * residual[c];
                 }
                 others += (float8)(squares[0], squares[1], squares[2], 1.0f, cost, before, inverse * inverse, 0.0f);
@@ -235,7 +235,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
     for (int k = item; k < SUMS; k += ITEMS) {
         float sum = 0.0f;
         for (int other = 0; other < ITEMS; other++) sum += partial[other][k];
-        made[into + k] = sum;
+        result[into + k] = sum;
     }
-    if (item == 0) made[into + SUMS] = noise;
+    if (item == 0) result[into + SUMS] = noise;
 }

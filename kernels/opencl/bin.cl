@@ -1,25 +1,25 @@
 // Tile binning on CPUs: a stable counting sort of the depth-sorted splats, with the tiles as bins.
-// Index space of both kernels: one work-item per chunk of the depth-sorted splats of each view, which has `count` entries.
+// Index space of both kernels: one work-item per block of the depth-sorted splats of each view, which has `count` entries.
 
 // Windows are prefetched, since the depth order scatters them in memory.
 #define PREFETCH_DISTANCE 16
 
 typedef struct {
     int tiles_x, tiles_y, width, height;
-    uint from, to;           // this chunk
-    global uint *row;        // row of table[CHUNKS][tiles]
-} Chunk;
+    uint from, to;           // this block
+    global uint *row;        // row of table[SORT_BLOCKS][tiles]
+} SortBlock;
 
-static inline Chunk chunk_of(uint length, int width, int height, global uint *restrict table) {
-    Chunk c;
-    uint chunk = get_global_id(0), each = (length + CHUNKS - 1) / CHUNKS;
+static inline SortBlock sort_block_of(uint length, int width, int height, global uint *restrict table) {
+    SortBlock c;
+    uint block = get_global_id(0), block_size = (length + SORT_BLOCKS - 1) / SORT_BLOCKS;
     c.width = width;
     c.height = height;
     c.tiles_x = (width + TILE_W - 1) / TILE_W;
     c.tiles_y = (height + TILE_H - 1) / TILE_H;
-    c.from = min(chunk * each, length);
-    c.to = min(c.from + each, length);
-    c.row = table + ((size_t)get_global_id(1) * CHUNKS + chunk) * c.tiles_x * c.tiles_y;
+    c.from = min(block * block_size, length);
+    c.to = min(c.from + block_size, length);
+    c.row = table + ((size_t)get_global_id(1) * SORT_BLOCKS + block) * c.tiles_x * c.tiles_y;
     return c;
 }
 
@@ -31,18 +31,18 @@ typedef struct {             // state of bin_emit; lists of the tiles of the ban
 } Emission;
 
 // Counts a tile of a splat or, with an emission, writes the splat to the tile's list: one function for both, so they agree.
-static inline void bin_tile(int tile, uint index, const Chunk *c, const Emission *e) {
+static inline void bin_tile(int tile, uint index, const SortBlock *c, const Emission *e) {
     if (e) {
         if (tile < e->first || tile >= e->end) return;
         // differences modulo 2^32 are correct within the band, even if the frame has more pairs
-        uint place = e->starts[tile] - e->base + c->row[tile];
-        e->lists[place] = index;
+        uint position = e->starts[tile] - e->base + c->row[tile];
+        e->lists[position] = index;
     }
     c->row[tile]++;
 }
 
 static inline void bin_splats(global const uint *restrict order, global const uint2 *restrict windows,
-                              uint big_capacity, global const Bounds *restrict big_bounds, const Chunk *c,
+                              uint big_capacity, global const Bounds *restrict big_bounds, const SortBlock *c,
                               const Emission *e) {
     for (uint k = c->from; k < c->to; k++) {
         PREFETCH(windows + order[min(k + PREFETCH_DISTANCE, c->to - 1)]);
@@ -61,12 +61,12 @@ static inline void bin_splats(global const uint *restrict order, global const ui
     }
 }
 
-// Reads: order, counters' number of visible splats, windows, big_bounds. Writes: this chunk's row of table.
+// Reads: order, counters' number of visible splats, windows, big_bounds. Writes: this block's row of table.
 kernel void bin_count(
 //@@ arguments bin_count
 ) {
-    if (get_global_id(0) >= CHUNKS) return;
-    const Chunk c = chunk_of(counters[get_global_id(1) * COUNTERS + COUNTER_VISIBLE], width, height, table);
+    if (get_global_id(0) >= SORT_BLOCKS) return;
+    const SortBlock c = sort_block_of(counters[get_global_id(1) * COUNTERS + COUNTER_VISIBLE], width, height, table);
     order += get_global_id(1) * count;
     for (int tile = 0; tile < c.tiles_x * c.tiles_y; tile++) c.row[tile] = 0;
     bin_splats(order, windows, big_capacity, big_bounds, &c, 0);
@@ -76,8 +76,8 @@ kernel void bin_count(
 kernel void bin_emit(
 //@@ arguments bin_emit
 ) {
-    if (get_global_id(0) >= CHUNKS) return;
-    const Chunk c = chunk_of(counters[get_global_id(1) * COUNTERS + COUNTER_VISIBLE], width, height, table);
+    if (get_global_id(0) >= SORT_BLOCKS) return;
+    const SortBlock c = sort_block_of(counters[get_global_id(1) * COUNTERS + COUNTER_VISIBLE], width, height, table);
     order += get_global_id(1) * count;
     int before = (int)get_global_id(1) * c.tiles_x * c.tiles_y;    // tiles of preceding views
     const Emission e = {band_first - before, band_end - before, starts[band_first], starts + before, lists};

@@ -14,7 +14,7 @@ typedef union {
 //@@ compose_types
 typedef struct {
     vfloat t;               // transmittance in front of the next fragment
-//@@ light_state
+//@@ color_state
 //@@ state
 } Pixel;
 
@@ -24,7 +24,7 @@ typedef struct {            // uniforms of the blend stage
 
 static inline void pixel_start(Pixel *pixel) {
     pixel->t = 1.0f;
-//@@ light_start
+//@@ color_start
 //@@ start
 }
 
@@ -32,7 +32,7 @@ static inline void pixel_start(Pixel *pixel) {
 //@@ fragment_half_rho
 
 // Attributes of a fragment.
-static inline Attributes fragment_attributes(const Splat *s, Crossing c, vfloat inverse_d) {
+static inline Attributes fragment_attributes(const Splat *s, Intersection c, vfloat inverse_d) {
     Attributes attributes;
     attributes.r = s->r;
     attributes.g = s->g;
@@ -45,9 +45,9 @@ static inline Attributes fragment_attributes(const Splat *s, Crossing c, vfloat 
 static inline void composite(Pixel *pixel, const Attributes *attributes, vfloat opacity, vint mask, const BlendConstants *constants) {
     vint live = mask & VMASK(pixel->t > constants->stop);
 //@@ stop
-//@@ light_composite
+//@@ color_composite
 //@@ composite
-//@@ light_transmit
+//@@ color_transmit
 }
 
 // Pixels that are not terminated.
@@ -66,7 +66,7 @@ static inline vint pixel_unfinished(const Pixel *pixel, const BlendConstants *co
 
 //@@ compose_functions
 // Renders a fragment where `mask` is set: composites it, or inserts it into the k-buffer.
-static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint mask, vfloat screen,
+static inline void pixel_blend(Pixel *pixel, const Splat *s, Intersection c, vint mask, vfloat screen,
                                const BlendConstants *constants
 //@@ blend_parameters
 ) {
@@ -79,4 +79,4 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint ma
 //@@ compose
 }
 
-//@@ light_functions
+//@@ color_functions

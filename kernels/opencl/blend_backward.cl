@@ -80,7 +80,7 @@ typedef struct {
 
 //@@ fragment_functions
 // Position of the fragment on the splat's plane, from the row's forms and the low-pass distance.
-static inline Geometry geometry_of(const Splat *s, Crossing c, vfloat nu_x, vfloat nv_x, vfloat y, vfloat screen) {
+static inline Geometry geometry_of(const Splat *s, Intersection c, vfloat nu_x, vfloat nv_x, vfloat y, vfloat screen) {
     Geometry g;
     g.nu = FMA((vfloat)s->nuy, y, nu_x);
     g.nv = FMA((vfloat)s->nvy, y, nv_x);
@@ -93,40 +93,40 @@ static inline Geometry geometry_of(const Splat *s, Crossing c, vfloat nu_x, vflo
 
 // Gradient with respect to the fragment's weight: g c_k.
 static inline vfloat fragment_by_weight(const Splat *s, const PixelGradient *gradient, const Geometry *g) {
-    vfloat by_weight = FMA(gradient->r, (vfloat)s->r, FMA(gradient->g, (vfloat)s->g, gradient->b * s->b));
-//@@ by_weight
-    return by_weight;
+    vfloat grad_weight = FMA(gradient->r, (vfloat)s->r, FMA(gradient->g, (vfloat)s->g, gradient->b * s->b));
+//@@ grad_weight
+    return grad_weight;
 }
 
 // dL / d ln(opacity) of a fragment with this weight, unless the opacity ceiling applies.
-static inline vfloat backward_opacity(PixelGradient *gradient, vfloat by_weight, vfloat weight, vfloat opacity) {
-    vfloat gain = by_weight - gradient->behind;
+static inline vfloat backward_opacity(PixelGradient *gradient, vfloat grad_weight, vfloat weight, vfloat opacity) {
+    vfloat gain = grad_weight - gradient->behind;
     gradient->behind = FMA(opacity, gain, gradient->behind);
     return weight * gain;
 }
 
-// Adds the gradients of a fragment. by_log: with respect to ln(opacity); (x, y): position relative to the anchor.
-static inline void add_fragment(Sums *sums, const Splat *s, const PixelGradient *gradient, const Geometry *g, vfloat weight, vfloat by_log,
+// Adds the gradients of a fragment. grad_log: with respect to ln(opacity); (x, y): position relative to the anchor.
+static inline void add_fragment(Sums *sums, const Splat *s, const PixelGradient *gradient, const Geometry *g, vfloat weight, vfloat grad_log,
                                 vfloat screen, vfloat x, vfloat y, const BlendConstants *constants) {
     sums->r = FMA(weight, gradient->r, sums->r);
     sums->g = FMA(weight, gradient->g, sums->g);
     sums->b = FMA(weight, gradient->b, sums->b);
     vfloat half_rho = VSELECT(screen, g->half_rho, g->on_plane);
-    by_log = VSELECT((vfloat)0.0f, by_log, VMASK(s->log_opacity - half_rho <= constants->log_ceiling));
-    sums->log_opacity += by_log;
-    vfloat plane = 2.0f * VSELECT((vfloat)0.0f, by_log * g->inverse_d, g->on_plane);
-    vfloat by_nu = -plane * g->nu * g->inverse_d, by_nv = -plane * g->nv * g->inverse_d;
-    vfloat by_d = VSELECT((vfloat)0.0f, plane * g->half_rho, g->on_plane);
+    grad_log = VSELECT((vfloat)0.0f, grad_log, VMASK(s->log_opacity - half_rho <= constants->log_ceiling));
+    sums->log_opacity += grad_log;
+    vfloat plane = 2.0f * VSELECT((vfloat)0.0f, grad_log * g->inverse_d, g->on_plane);
+    vfloat grad_nu = -plane * g->nu * g->inverse_d, grad_nv = -plane * g->nv * g->inverse_d;
+    vfloat grad_d = VSELECT((vfloat)0.0f, plane * g->half_rho, g->on_plane);
 //@@ fragment_backward
-    sums->nu += by_nu;
-    sums->nu_x = FMA(by_nu, x, sums->nu_x);
-    sums->nu_y = FMA(by_nu, y, sums->nu_y);
-    sums->nv += by_nv;
-    sums->nv_x = FMA(by_nv, x, sums->nv_x);
-    sums->nv_y = FMA(by_nv, y, sums->nv_y);
-    sums->d += by_d;
-    sums->d_x = FMA(by_d, x, sums->d_x);
-    sums->d_y = FMA(by_d, y, sums->d_y);
+    sums->nu += grad_nu;
+    sums->nu_x = FMA(grad_nu, x, sums->nu_x);
+    sums->nu_y = FMA(grad_nu, y, sums->nu_y);
+    sums->nv += grad_nv;
+    sums->nv_x = FMA(grad_nv, x, sums->nv_x);
+    sums->nv_y = FMA(grad_nv, y, sums->nv_y);
+    sums->d += grad_d;
+    sums->d_x = FMA(grad_d, x, sums->d_x);
+    sums->d_y = FMA(grad_d, y, sums->d_y);
 }
 
 #if LANES == 16
@@ -157,33 +157,33 @@ static inline float lane_sum(vfloat x) { return (x.x + x.z) + (x.y + x.w); }
 #define lane_sum(x) (x)
 #endif
 
-// Values of Moments before the sum over lanes, or their sums.
+// Values of RecordGradient before the sum over lanes, or their sums.
 #if LANES == 16
 typedef struct {
     vfloat fields[(FIELDS + LANES - 1) / LANES * LANES];
 } Parts;
-#define MOMENT(field, parts) (m.fields[__builtin_offsetof(Moments, field) / sizeof(float)] = (parts))
+#define STORE_SUM(field, parts) (m.fields[__builtin_offsetof(RecordGradient, field) / sizeof(float)] = (parts))
 #else
-typedef Moments Parts;
-#define MOMENT(field, parts) (m.field = lane_sum(parts))
+typedef RecordGradient Parts;
+#define STORE_SUM(field, parts) (m.field = lane_sum(parts))
 #endif
 
-static inline Parts moments_of(const Sums *sums, const BlendConstants *constants) {
+static inline Parts record_gradient_of(const Sums *sums, const BlendConstants *constants) {
     Parts m = {0};          // zeroes the padding too
-    MOMENT(nu0, sums->nu);
-    MOMENT(nux, sums->nu_x);
-    MOMENT(nuy, sums->nu_y);
-    MOMENT(nv0, sums->nv);
-    MOMENT(nvx, sums->nv_x);
-    MOMENT(nvy, sums->nv_y);
-    MOMENT(d0, sums->d);
-    MOMENT(dx, sums->d_x);
-    MOMENT(dy, sums->d_y);
-    MOMENT(log_opacity, sums->log_opacity);
-    MOMENT(r, sums->r);
-    MOMENT(g, sums->g);
-    MOMENT(b, sums->b);
-//@@ moments
+    STORE_SUM(nu0, sums->nu);
+    STORE_SUM(nux, sums->nu_x);
+    STORE_SUM(nuy, sums->nu_y);
+    STORE_SUM(nv0, sums->nv);
+    STORE_SUM(nvx, sums->nv_x);
+    STORE_SUM(nvy, sums->nv_y);
+    STORE_SUM(d0, sums->d);
+    STORE_SUM(dx, sums->d_x);
+    STORE_SUM(dy, sums->d_y);
+    STORE_SUM(log_opacity, sums->log_opacity);
+    STORE_SUM(r, sums->r);
+    STORE_SUM(g, sums->g);
+    STORE_SUM(b, sums->b);
+//@@ record_gradients
     return m;
 }
 
@@ -195,7 +195,7 @@ static inline uint window_rank(uint2 window, int column, int row) {
 
 // Rank of a tile among those of a splat, row by row.
 #if LANES > 1
-// big_rows: from reserve_slots, row by row, for locality within a tile.
+// big_rows: from reserve_gradients, row by row, for locality within a tile.
 static inline uint tile_rank(uint2 window, uint big_capacity, global const uint *big_rows, int column, int row) {
     return window.y != 0 ? window_rank(window, column, row) : big_rows[row * (size_t)big_capacity + window.x] + column;
 }
@@ -231,10 +231,10 @@ static inline void put_rows(global uint *rows, uint stride, const Bounds *b, int
 // Reserves a gradient buffer offset for each tile of each visible splat. Offsets depend on the order in which work-groups run; the sums
 // of gradients do not.
 // Index space: one work-item per splat, in groups of RESERVE_ITEMS.
-// Reads: keys, windows, big_bounds. Writes: splat_slots, big_rows; adds to reserved.
+// Reads: keys, windows, big_bounds. Writes: gradient_offsets, big_rows; adds to reserved.
 #define RESERVE_ITEMS 64
-kernel __attribute__((reqd_work_group_size(RESERVE_ITEMS, 1, 1))) void reserve_slots(
-//@@ arguments reserve_slots
+kernel __attribute__((reqd_work_group_size(RESERVE_ITEMS, 1, 1))) void reserve_gradients(
+//@@ arguments reserve_gradients
 ) {
     local uint needed, first;
     uint i = get_global_id(0), offset = 0;
@@ -251,5 +251,5 @@ kernel __attribute__((reqd_work_group_size(RESERVE_ITEMS, 1, 1))) void reserve_s
     barrier(CLK_LOCAL_MEM_FENCE);
     if (get_local_id(0) == 0) first = atomic_add(reserved, needed);
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (i < count) splat_slots[i] = first + offset;
+    if (i < count) gradient_offsets[i] = first + offset;
 }

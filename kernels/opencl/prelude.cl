@@ -2,7 +2,7 @@
 // LANES          pixels that one work-item computes as a vector (1 on a GPU, 8 or 16 on a CPU)
 // TILE_W TILE_H  pixels of a tile; the lanes schedule requires TILE_W == LANES
 // BATCH          splats that a work-item of `project` sets up (1 on a GPU)
-// CHUNKS         contiguous blocks into which the stable counting sorts divide a list
+// SORT_BLOCKS         contiguous blocks into which the stable counting sorts divide a list
 //   RADIX_BITS     digit width of the depth sort
 // SCAN_ITEMS     work-items of the single work-group of a scan
 // SETUP_FP64     1: per-splat setup in double

@@ -61,8 +61,8 @@ typedef union {
 #define RETURN_CULLED return
 #if BATCH > 1
 // CPUs: set-up of splat i, written to column k of `batch`, in a loop that compilers vectorise. Only splats that cross the near plane
-// need a loop of their own: with `crossing` unset, their key becomes CROSSING.
-#define CROSSING 0xFFFFFFFDu
+// need a loop of their own: with `crosses_near` unset, their key becomes CROSSES_NEAR.
+#define CROSSES_NEAR 0xFFFFFFFDu
 #define KEY batch->keys[k]
 typedef struct {
     uint keys[BATCH], corners[BATCH], windows[BATCH], records[sizeof(Splat) / 4][BATCH], bounds[sizeof(Bounds) / 4][BATCH];
@@ -74,7 +74,7 @@ typedef union {
 
 INLINE void set_up(
 //@@ arguments project
-    , uint i, uint number, Batch *batch, uint k, bool crossing)
+    , uint i, uint view_index, Batch *batch, uint k, bool crosses_near)
 #else
 #define KEY keys[at]
 
@@ -84,11 +84,11 @@ kernel void project(
 #endif
 {
 #if BATCH == 1
-    uint i = get_global_id(0), number = get_global_id(1);
+    uint i = get_global_id(0), view_index = get_global_id(1);
     if (i >= count) return;
 #endif
-    uint at = number * count + i;
-    view += number;
+    uint at = view_index * count + i;
+    view += view_index;
     KEY = CULLED;
 //@@ unculled
 //@@ splat_view
@@ -118,8 +118,8 @@ kernel void project(
     real3_ a = rotate_to_camera(view, tangent_u), b = rotate_to_camera(view, tangent_v);
     real pz = p.z, near = view->near;
 //@@ camera_depth
-    real3_ facet = cross3(a, b);        // unit normal
-    real offset = dot3(facet, p);       // signed distance of the plane from the camera centre
+    real3_ unit_normal = cross3(a, b);
+    real offset = dot3(unit_normal, p);       // signed distance of the plane from the camera centre
 //@@ camera_offset
     // tested before fmax, which discards NaN
     if (!(scale_uv.x >= 0.0f && scale_uv.x < INFINITY && scale_uv.y >= 0.0f && scale_uv.y < INFINITY)) return;
@@ -208,11 +208,11 @@ static inline Bounds bounds_of(const Batch *batch, uint k) {
 #define bounds bounds_of(batch, k)
 INLINE void write_splat(
 //@@ arguments project
-    , uint i, uint number, const Batch *batch, uint k) {
-    uint at = number * count + i;
+    , uint i, uint view_index, const Batch *batch, uint k) {
+    uint at = view_index * count + i;
     keys[at] = batch->keys[k];
     if (batch->keys[k] >= OUT_OF_BAND) return;
-    view += number;
+    view += view_index;
 //@@ splat_view
     real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
     const uint (*word)[BATCH] = batch->records;
@@ -256,8 +256,8 @@ INLINE void write_splat(
 #define RETURN_CULLED return CULLED
 INLINE uint sphere_key(
 //@@ arguments project
-    , uint i, uint number) {
-    view += number;
+    , uint i, uint view_index) {
+    view += view_index;
 //@@ splat_view
     real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
     real3_ p = rotate_to_camera(view, mean);
@@ -272,15 +272,15 @@ INLINE uint sphere_key(
 kernel void project(
 //@@ arguments project
 ) {
-    uint number = get_global_id(1), first = get_global_id(0) * BATCH, visible[BATCH], length = 0;
+    uint view_index = get_global_id(1), first = get_global_id(0) * BATCH, visible[BATCH], length = 0;
     if (first >= count) return;
     Batch batch;
     VECTORISE for (uint k = 0; k < BATCH; k++)
         batch.keys[k] = sphere_key(
 //@@ passed project
-            , min(first + k, count - 1), number);
+            , min(first + k, count - 1), view_index);
     for (uint k = 0; k < min(count - first, (uint)BATCH); k++) {
-        keys[number * count + first + k] = batch.keys[k];
+        keys[view_index * count + first + k] = batch.keys[k];
         visible[length] = first + k;
         length += batch.keys[k] == 0;
     }
@@ -291,15 +291,15 @@ kernel void project(
     VECTORISE for (uint k = 0; k < padded; k++)
         set_up(
 //@@ passed project
-            , visible[k], number, &batch, k, false);
+            , visible[k], view_index, &batch, k, false);
     for (uint k = 0; k < length; k++) {
-        if (batch.keys[k] == CROSSING)
+        if (batch.keys[k] == CROSSES_NEAR)
             set_up(
 //@@ passed project
-                , visible[k], number, &batch, k, true);
+                , visible[k], view_index, &batch, k, true);
         write_splat(
 //@@ passed project
-            , visible[k], number, &batch, k);
+            , visible[k], view_index, &batch, k);
     }
 }
 #endif

@@ -5,9 +5,9 @@ kernel void resolve(
 ) {
     int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
-    uint number = get_global_id(2);
+    uint view_index = get_global_id(2);
     // behind the samples of the preceding views
-    size_t first = number * (channel_stride / get_global_size(2)) + (size_t)(y * SAMPLES) * stride + x * SAMPLES;
+    size_t first = view_index * (channel_stride / get_global_size(2)) + (size_t)(y * SAMPLES) * stride + x * SAMPLES;
 //@@ resolve_pixel
 }
 //@@ kernels

@@ -9,7 +9,7 @@
 //@@ footprint_here
 
 //@@ struct Totals
-typedef char totals_have_the_fields_of_moments[sizeof(Totals) / sizeof(real) == FIELDS ? 1 : -1];
+typedef char totals_have_the_fields_of_record_gradients[sizeof(Totals) / sizeof(real) == FIELDS ? 1 : -1];
 
 static inline real3_ add3(real3_ a, real3_ b) {
     real3_ c = {a.x + b.x, a.y + b.y, a.z + b.z};
@@ -39,7 +39,7 @@ typedef struct {            // gradients with respect to the parameters of one s
     float mean[3], quat[4], scale[2], opacity;
     float color[3], basis[SH_TERMS];    // by coefficient k of the colour: basis[k] times `color`
     float screen;
-    real by_camera[10];     // contribution to the gradient of the pose, of fx, fy, cx and cy
+    real grad_camera[10];     // contribution to the gradient of the pose, of fx, fy, cx and cy
 //@@ footprint_gradient
 } SplatGradient;
 
@@ -48,19 +48,19 @@ static inline SplatGradient splat_gradient(
     uint i, global const View *view, global const float *means, global const float *quats, global const float *scales,
     global const float *opacities, global const float *terms, uint row, global const Splat *splats, global const uint *keys,
     global const uint2 *windows, uint big_capacity, global const Bounds *big_bounds, int width, int height,
-    global const uint *splat_slots, global const float *moments
+    global const uint *gradient_offsets, global const float *record_gradients
 //@@ footprint_parameters
 ) {
-    SplatGradient own = {{0}};
-    if (keys[i] >= OUT_OF_BAND) return own;
+    SplatGradient splat_grad = {{0}};
+    if (keys[i] >= OUT_OF_BAND) return splat_grad;
     Totals total = {0};
-    global const float *slot = moments + (size_t)splat_slots[i] * FIELDS;
+    global const float *slot = record_gradients + (size_t)gradient_offsets[i] * FIELDS;
     uint tiles = tile_count(windows[i], big_capacity, big_bounds, width, height);
     for (uint tile = 0; tile < tiles; tile++, slot += FIELDS)
         for (uint field = 0; field < FIELDS; field++) ((real *)&total)[field] += slot[field];
-    real3_ by_ray = {0, 0, 0};       // by the vector from the camera to the centre, in world axes
+    real3_ grad_ray = {0, 0, 0};       // by the vector from the camera to the centre, in world axes
 //@@ color_backward
-    real by_log = total.log_opacity;
+    real grad_log = total.log_opacity;
     real w = quats[4 * i], x = quats[4 * i + 1], y = quats[4 * i + 2], z = quats[4 * i + 3];
     real s = REAL(2.0) / (w * w + x * x + y * y + z * z);
     real3_ tangent_u = {1 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)};
@@ -85,56 +85,56 @@ static inline SplatGradient splat_gradient(
     real scale = (offset < 0 ? -1 : 1) / steepest, n_scale = scale * REAL(0.70710678118654752440);
     real facing = fabs(offset) > (SETUP_FP64 ? REAL(1e-13) : REAL(1e-6)) * sqrt(dot3(p, p)) ? scale : 0;
 
-    real3_ by_k0 = {n_scale * total.nu0, n_scale * total.nv0, facing * total.d0};
-    real3_ by_kx = {n_scale * total.nux, n_scale * total.nvx, facing * total.dx};
-    real3_ by_ky = {n_scale * total.nuy, n_scale * total.nvy, facing * total.dy};
-    real3_ by_tu = add3(cross3(tv, by_k0), cross3(by_ky, tw));
-    real3_ by_tv = add3(cross3(by_k0, tu), cross3(tw, by_kx));
-    real3_ by_tw = add3(cross3(by_kx, tv), cross3(tu, by_ky));
+    real3_ grad_k0 = {n_scale * total.nu0, n_scale * total.nv0, facing * total.d0};
+    real3_ grad_kx = {n_scale * total.nux, n_scale * total.nvx, facing * total.dx};
+    real3_ grad_ky = {n_scale * total.nuy, n_scale * total.nvy, facing * total.dy};
+    real3_ grad_tu = add3(cross3(tv, grad_k0), cross3(grad_ky, tw));
+    real3_ grad_tv = add3(cross3(grad_k0, tu), cross3(tw, grad_kx));
+    real3_ grad_tw = add3(cross3(grad_kx, tv), cross3(tu, grad_ky));
 //@@ camera_backward
-    by_tw = add3(by_tw, add3(scaled(x_offset, by_tu), scaled(y_offset, by_tv)));
-    real3_ by_a = {view->focal_x * by_tu.x, view->focal_y * by_tv.x, by_tw.x};
-    real3_ by_b = {view->focal_x * by_tu.y, view->focal_y * by_tv.y, by_tw.y};
-    real3_ by_p = {view->focal_x * by_tu.z, view->focal_y * by_tv.z, by_tw.z};
-    own.by_camera[6] = dot3(by_tu, row_x);
-    own.by_camera[7] = dot3(by_tv, row_y);
-    own.by_camera[8] = dot3(by_tu, tw);
-    own.by_camera[9] = dot3(by_tv, tw);
+    grad_tw = add3(grad_tw, add3(scaled(x_offset, grad_tu), scaled(y_offset, grad_tv)));
+    real3_ grad_a = {view->focal_x * grad_tu.x, view->focal_y * grad_tv.x, grad_tw.x};
+    real3_ grad_b = {view->focal_x * grad_tu.y, view->focal_y * grad_tv.y, grad_tw.y};
+    real3_ grad_p = {view->focal_x * grad_tu.z, view->focal_y * grad_tv.z, grad_tw.z};
+    splat_grad.grad_camera[6] = dot3(grad_tu, row_x);
+    splat_grad.grad_camera[7] = dot3(grad_tv, row_y);
+    splat_grad.grad_camera[8] = dot3(grad_tu, tw);
+    splat_grad.grad_camera[9] = dot3(grad_tv, tw);
     // by the projected centre, in half images
-    real across_x = by_tu.z * view->width, across_y = by_tv.z * view->height;
-    own.screen = (float)(REAL(0.5) * pz * sqrt(across_x * across_x + across_y * across_y));
+    real across_x = grad_tu.z * view->width, across_y = grad_tv.z * view->height;
+    splat_grad.screen = (float)(REAL(0.5) * pz * sqrt(across_x * across_x + across_y * across_y));
 //@@ disk_backward
 //@@ ellipsoid_backward
-    real by_su = dot3(by_a, unit_a), by_sv = dot3(by_b, unit_b);
-    real3_ by_unit_a = scaled(su, by_a), by_unit_b = scaled(sv, by_b);
-//@@ facet_backward
+    real grad_su = dot3(grad_a, unit_a), grad_sv = dot3(grad_b, unit_b);
+    real3_ grad_unit_a = scaled(su, grad_a), grad_unit_b = scaled(sv, grad_b);
+//@@ unit_normal_backward
 //@@ footprint_backward
-    const real3_ by_motion[2] = {
-        add3(cross3(p, by_p), add3(cross3(unit_a, by_unit_a), cross3(unit_b, by_unit_b))),
-        add3(by_p, rotate_to_camera(view, by_ray)),
+    const real3_ grad_motion[2] = {
+        add3(cross3(p, grad_p), add3(cross3(unit_a, grad_unit_a), cross3(unit_b, grad_unit_b))),
+        add3(grad_p, rotate_to_camera(view, grad_ray)),
     };
     for (int k = 0; k < 2; k++) {
-        own.by_camera[3 * k] = by_motion[k].x;
-        own.by_camera[3 * k + 1] = by_motion[k].y;
-        own.by_camera[3 * k + 2] = by_motion[k].z;
+        splat_grad.grad_camera[3 * k] = grad_motion[k].x;
+        splat_grad.grad_camera[3 * k + 1] = grad_motion[k].y;
+        splat_grad.grad_camera[3 * k + 2] = grad_motion[k].z;
     }
-    real3_ by_mean = add3(rotate_to_world(view, by_p), by_ray);
-    real3_ by_u = rotate_to_world(view, by_unit_a);
-    real3_ by_v = rotate_to_world(view, by_unit_b);
+    real3_ grad_mean = add3(rotate_to_world(view, grad_p), grad_ray);
+    real3_ grad_u = rotate_to_world(view, grad_unit_a);
+    real3_ grad_v = rotate_to_world(view, grad_unit_b);
     // the tangents are 1 - s (y y + z z) etc. with s = 2 / |q|^2
-    real by_s = -by_u.x * (y * y + z * z) + by_u.y * (x * y + w * z) + by_u.z * (x * z - w * y)
-                + by_v.x * (x * y - w * z) - by_v.y * (x * x + z * z) + by_v.z * (y * z + w * x);
-    real inward = -s * by_s;
-    own.quat[0] = (float)(s * (by_u.y * z - by_u.z * y - by_v.x * z + by_v.z * x + inward * w));
-    own.quat[1] = (float)(s * (by_u.y * y + by_u.z * z + by_v.x * y - 2 * by_v.y * x + by_v.z * w + inward * x));
-    own.quat[2] = (float)(s * (-2 * by_u.x * y + by_u.y * x - by_u.z * w + by_v.x * x + by_v.z * z + inward * y));
-    own.quat[3] = (float)(s * (-2 * by_u.x * z + by_u.y * w + by_u.z * x - by_v.x * w - 2 * by_v.y * z + by_v.z * y
+    real grad_s = -grad_u.x * (y * y + z * z) + grad_u.y * (x * y + w * z) + grad_u.z * (x * z - w * y)
+                + grad_v.x * (x * y - w * z) - grad_v.y * (x * x + z * z) + grad_v.z * (y * z + w * x);
+    real inward = -s * grad_s;
+    splat_grad.quat[0] = (float)(s * (grad_u.y * z - grad_u.z * y - grad_v.x * z + grad_v.z * x + inward * w));
+    splat_grad.quat[1] = (float)(s * (grad_u.y * y + grad_u.z * z + grad_v.x * y - 2 * grad_v.y * x + grad_v.z * w + inward * x));
+    splat_grad.quat[2] = (float)(s * (-2 * grad_u.x * y + grad_u.y * x - grad_u.z * w + grad_v.x * x + grad_v.z * z + inward * y));
+    splat_grad.quat[3] = (float)(s * (-2 * grad_u.x * z + grad_u.y * w + grad_u.z * x - grad_v.x * w - 2 * grad_v.y * z + grad_v.z * y
                                        + inward * z));
-    own.mean[0] = (float)by_mean.x;
-    own.mean[1] = (float)by_mean.y;
-    own.mean[2] = (float)by_mean.z;
-    own.scale[0] = scales[2 * i] >= MIN_SCALE ? (float)by_su : 0.0f;
-    own.scale[1] = scales[2 * i + 1] >= MIN_SCALE ? (float)by_sv : 0.0f;
-    own.opacity = (float)(by_log / opacities[i]);
-    return own;
+    splat_grad.mean[0] = (float)grad_mean.x;
+    splat_grad.mean[1] = (float)grad_mean.y;
+    splat_grad.mean[2] = (float)grad_mean.z;
+    splat_grad.scale[0] = scales[2 * i] >= MIN_SCALE ? (float)grad_su : 0.0f;
+    splat_grad.scale[1] = scales[2 * i + 1] >= MIN_SCALE ? (float)grad_sv : 0.0f;
+    splat_grad.opacity = (float)(grad_log / opacities[i]);
+    return splat_grad;
 }

@@ -12,9 +12,9 @@ typedef struct {
     vfloat d;               // denominator
     vfloat q;               // n_u^2 + n_v^2
     vint inside;            // the intersection is within the cut-off radius R and beyond the near plane
-//@@ crossing
-//@@ footprint_crossing
-} Crossing;
+//@@ intersection
+//@@ footprint_intersection
+} Intersection;
 
 //@@ footprint
 #ifndef INVERSE_D
@@ -24,19 +24,19 @@ typedef struct {
 //@@ footprint_functions
 
 // Affine forms at heights y; `*_x` hold the terms that depend on the column only.
-static inline Crossing cross_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloat d_x, vfloat y, wide half_r2) {
-    Crossing c;
+static inline Intersection intersect_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloat d_x, vfloat y, wide half_r2) {
+    Intersection c;
     vfloat nu = FMA((vfloat)s->nuy, y, nu_x);
     vfloat nv = FMA((vfloat)s->nvy, y, nv_x);
     c.d = FMA((vfloat)s->dy, y, d_x);
     c.q = FMA(nu, nu, nv * nv);
     // product form: no division, and no special case for D = 0
     c.inside = VMASK(c.q <= half_r2 * (c.d * c.d)) & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
-//@@ footprint_cross
+//@@ footprint_intersect
     return c;
 }
 
-//@@ cross_functions
+//@@ intersect_functions
 // Opacity (the paper's alpha) of a fragment at half the squared distance, rho / 2.
 static inline vfloat fragment_opacity(const Splat *s, vfloat half_rho, wide ceiling) {
     return VMIN(EXP(s->log_opacity - half_rho), (vfloat)ceiling);

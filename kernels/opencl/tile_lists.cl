@@ -69,11 +69,11 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
         uint first = round + 4 * item;
         uint4 lengths = tile_lengths(counters, first, to);
         uint length[4] = {lengths.x, lengths.y, lengths.z, lengths.w};
-        uint place = (uint)(before + scan_group(partial, item, (ulong)lengths.x + lengths.y + lengths.z + lengths.w, &total));
+        uint position = (uint)(before + scan_group(partial, item, (ulong)lengths.x + lengths.y + lengths.z + lengths.w, &total));
         for (uint k = 0; k < 4 && first + k < to; k++) {
-            cursors[first + k] = place;
-            starts[first + k] = fits ? place : 0;
-            place += length[k];
+            cursors[first + k] = position;
+            starts[first + k] = fits ? position : 0;
+            position += length[k];
         }
         before += total;
     }
@@ -90,7 +90,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
 #define BIN_ITEMS 256
 
 // Rectangle of tiles that a big splat may overlap. Counting and listing both call this, so they agree, and `tile_count`
-// (moments.cl), which numbers the gradient buffer offsets, agrees with both.
+// (record_gradients.cl), which numbers the gradient buffer offsets, agrees with both.
 typedef struct { int top, left, columns, cells, tiles_x; } TileRect;
 
 static inline TileRect tile_rect(const Bounds *b, int width, int height) {
@@ -160,11 +160,11 @@ static inline void list_big_splat(const BigSplats *splats, uint k, const TileRec
     int before = (int)(splat / splats->count) * tiles_of(splats->width, splats->height);
     for (int cell = item; cell < rect->cells; cell += items) {
         int tile = rect_tile(rect, cell, b, splats->width, splats->height);
-        uint place = tile < 0 ? NO_OFFSET : next_offset(before + tile, band, cursors, false);
-        if (place >= band->capacity) continue;
+        uint position = tile < 0 ? NO_OFFSET : next_offset(before + tile, band, cursors, false);
+        if (position >= band->capacity) continue;
         uint key = splats->keys[splat];
 //@@ big_key
-        pairs[place] = (uint2)(splat, key);
+        pairs[position] = (uint2)(splat, key);
     }
 }
 
@@ -215,7 +215,7 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
     local ushort queue[BIN_ITEMS * WINDOW_TILES];     // (work-item of the splat, tile of its window)
     local uint corners[BIN_ITEMS], depths[BIN_ITEMS], deferred[TEAMS][TEAM_DEFERRED + 1];
     const Band band = {(width + TILE_W - 1) / TILE_W, band_first, band_end, starts[band_first], capacity};
-    uint item = get_local_id(0), number = get_group_id(1), big_count = min(counts[COUNT_BIG], big_capacity);
+    uint item = get_local_id(0), view_index = get_group_id(1), big_count = min(counts[COUNT_BIG], big_capacity);
     if (item == 0) queued = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     uint groups = get_num_groups(0) - splat_groups, i = get_global_id(0) - groups * BIN_ITEMS;
@@ -223,10 +223,10 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
         const BigSplats shared = {count, width, height, big, big_bounds, keys
 //@@ big_record_arguments
         };
-        list_big_splats(&shared, number * groups + get_group_id(0), groups * get_num_groups(1), big_count, &band, cursors,
+        list_big_splats(&shared, view_index * groups + get_group_id(0), groups * get_num_groups(1), big_count, &band, cursors,
                         pairs, deferred);
     } else {
-        uint splat = number * count + i;
+        uint splat = view_index * count + i;
         uint key = i < count ? keys[splat] : CULLED;
         uint2 window = key != CULLED ? windows[splat] : (uint2)(0);
         corners[item] = window.x;
@@ -236,24 +236,24 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     // evenly shared, since splats overlap few or many tiles; several at once, since each atomic has latency
-    int before = (int)number * tiles_of(width, height);
-    uint first_splat = number * count + i - item;
+    int before = (int)view_index * tiles_of(width, height);
+    uint first_splat = view_index * count + i - item;
     uint length = queued & QUEUED, visible = queued / ONE_VISIBLE;
     for (uint from = item; from < length; from += UNROLL * BIN_ITEMS) {
-        uint places[UNROLL], owners[UNROLL];
+        uint positions[UNROLL], owners[UNROLL];
         bool shared = false;
         for (uint n = 0; n < UNROLL; n++) {
             uint entry = from + n * BIN_ITEMS < length ? queue[from + n * BIN_ITEMS] : NO_ENTRY;
             owners[n] = entry / WINDOW_TILES;
-            places[n] = NO_OFFSET;
+            positions[n] = NO_OFFSET;
             if (entry != NO_ENTRY) {
                 int tile = before + window_tile((uint2)(corners[owners[n]], 1u << entry % WINDOW_TILES), band.tiles_x);
                 if (n == 0) shared = SHARES(tile);
-                places[n] = next_offset(tile, &band, cursors, shared);
+                positions[n] = next_offset(tile, &band, cursors, shared);
             }
         }
         for (uint n = 0; n < UNROLL; n++)
-            if (places[n] < band.capacity) pairs[places[n]] = (uint2)(first_splat + owners[n], depths[owners[n]]);
+            if (positions[n] < band.capacity) pairs[positions[n]] = (uint2)(first_splat + owners[n], depths[owners[n]]);
     }
     if (item == 0 && first_band && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
 }
@@ -351,14 +351,14 @@ static inline void bucket_starts(local uint *sums, local Buckets *buckets) {
 }
 
 // Sorts each bucket into `list`: within its bucket, a pair's place is the number of smaller keys. `starts` are the buckets' ends.
-#define BUCKETED(place) (indexed ? pairs[((local ushort *)items)[place]] : items[place])
+#define BUCKETED(position) (indexed ? pairs[((local ushort *)items)[position]] : items[position])
 static inline void sort_buckets(global const ulong *pairs, uint length, local ulong *items, local Buckets *buckets, float nearest,
                               float scale, bool indexed, global uint *restrict list) {
     for (uint k = get_local_id(0); k < length; k += SORT_ITEMS) {
         ulong pair = BUCKETED(k);
-        uint range = bucket_of(pair, nearest, scale), place = range > 0 ? buckets->starts[range - 1] : 0;
-        for (uint other = place, end = buckets->starts[range]; other < end; other++) place += BUCKETED(other) < pair;
-        list[place] = (uint)pair;
+        uint range = bucket_of(pair, nearest, scale), position = range > 0 ? buckets->starts[range - 1] : 0;
+        for (uint other = position, end = buckets->starts[range]; other < end; other++) position += BUCKETED(other) < pair;
+        list[position] = (uint)pair;
     }
 }
 
@@ -381,9 +381,9 @@ static inline bool bucket_sort(global const ulong *pairs, uint length, local ulo
     if (buckets->overfull) return false;
     for (uint k = item; k < length; k += SORT_ITEMS) {
         ulong pair = pairs[k];
-        uint place = atomic_inc(buckets->starts + bucket_of(pair, nearest, scale));      // starts of buckets become their ends
-        if (length > SORT_LOCAL) ((local ushort *)items)[place] = (ushort)k;
-        else items[place] = pair;
+        uint position = atomic_inc(buckets->starts + bucket_of(pair, nearest, scale));      // starts of buckets become their ends
+        if (length > SORT_LOCAL) ((local ushort *)items)[position] = (ushort)k;
+        else items[position] = pair;
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     if (length > SORT_LOCAL) sort_buckets(pairs, length, items, buckets, nearest, scale, true, list);

@@ -47,14 +47,14 @@ static inline Area area_of(const Share *share, int tiles, int tiles_x, global co
 static inline int area_index(const Area *area, uint2 window) {
     return window_tile((uint2)(window.x - area->corner, window.y), area->columns);
 }
-static inline int area_tile(const Area *area, int place, int tiles_x) {
-    return ((int)(area->corner >> 16) + place / area->columns) * tiles_x + (int)(area->corner & 0xFFFFu) + place % area->columns;
+static inline int area_tile(const Area *area, int position, int tiles_x) {
+    return ((int)(area->corner >> 16) + position / area->columns) * tiles_x + (int)(area->corner & 0xFFFFu) + position % area->columns;
 }
 
 // Number of pairs of each tile of the area. pair_counts: one word per tile.
 static inline void count_pairs(const Share *share, const Area *area, global const uint2 *restrict windows, global const uint *restrict keys,
                           local uint *pair_counts) {
-    for (int place = get_local_id(0); place < area->tiles; place += SCAN_ITEMS) pair_counts[place] = 0;
+    for (int position = get_local_id(0); position < area->tiles; position += SCAN_ITEMS) pair_counts[position] = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint splat = share->first + get_local_id(0); splat < share->end; splat += SCAN_ITEMS) {
         if (keys[splat] == CULLED) continue;
@@ -82,8 +82,8 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void count_local(
         return;
     }
     count_pairs(&share, &area, windows, keys, pair_counts);
-    for (int place = get_local_id(0); place < area.tiles; place += SCAN_ITEMS)
-        if (pair_counts[place] != 0) atomic_add(counters + area_tile(&area, place, tiles_x), pair_counts[place]);
+    for (int position = get_local_id(0); position < area.tiles; position += SCAN_ITEMS)
+        if (pair_counts[position] != 0) atomic_add(counters + area_tile(&area, position, tiles_x), pair_counts[position]);
 }
 
 // Index space: as count_local.
@@ -102,10 +102,10 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
     bool counted = area.tiles <= LOCAL_TILES;
     if (counted) {
         count_pairs(&share, &area, windows, keys, pair_counts);
-        for (int place = get_local_id(0); place < area.tiles; place += SCAN_ITEMS) {
-            if (pair_counts[place] == 0) continue;
-            int tile = before + area_tile(&area, place, tiles_x);
-            if (tile >= band.first && tile < band.end) pair_counts[place] = atomic_add(cursors + tile, pair_counts[place]);
+        for (int position = get_local_id(0); position < area.tiles; position += SCAN_ITEMS) {
+            if (pair_counts[position] == 0) continue;
+            int tile = before + area_tile(&area, position, tiles_x);
+            if (tile >= band.first && tile < band.end) pair_counts[position] = atomic_add(cursors + tile, pair_counts[position]);
         }
     }
     barrier(CLK_LOCAL_MEM_FENCE);
@@ -118,8 +118,8 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
             int tile = before + window_tile(window, tiles_x);
             if (tile < band.first || tile >= band.end) continue;
             // modulo 2^32, see next_offset
-            uint place = counted ? atomic_inc(pair_counts + area_index(&area, window)) - band.start : next_offset(tile, &band, cursors, false);
-            if (place < band.capacity) pairs[place] = (uint2)(splat, key);
+            uint position = counted ? atomic_inc(pair_counts + area_index(&area, window)) - band.start : next_offset(tile, &band, cursors, false);
+            if (position < band.capacity) pairs[position] = (uint2)(splat, key);
         }
     }
     if (visible_here != 0) atomic_add(&visible, visible_here);

@@ -5,15 +5,15 @@
 #define OF(name, count) JOINED(name, count)
 
 // Index space: one work-item per VALUES values. Reads: values (first + count), from `first` on. Writes:
-// made (count).
-kernel void to_uint8(ulong count, ulong first, global const float *values, global uchar *made) {
+// result (count).
+kernel void to_uint8(ulong count, ulong first, global const float *values, global uchar *result) {
     values += first;
     ulong at = get_global_id(0) * (ulong)VALUES;
     if (at + VALUES <= count) {
         OF(float, VALUES) v = OF(vload, VALUES)(0, values + at);
         v = rint(fmin(fmax(v, 0.0f), 1.0f) * 255.0f);
-        OF(vstore, VALUES)(OF(convert_uchar, VALUES)(v), 0, made + at);
+        OF(vstore, VALUES)(OF(convert_uchar, VALUES)(v), 0, result + at);
         return;
     }
-    for (; at < count; at++) made[at] = (uchar)rint(fmin(fmax(values[at], 0.0f), 1.0f) * 255.0f);
+    for (; at < count; at++) result[at] = (uchar)rint(fmin(fmax(values[at], 0.0f), 1.0f) * 255.0f);
 }

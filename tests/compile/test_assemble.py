@@ -174,7 +174,7 @@ TAKEN = {
         "pack_move": (8, 7, 0),
         "project": (14, 12, 0),
         "scan_bins": (5, 3, 16),
-        "scan_chunks": (3, 2, 0),
+        "scan_blocks": (3, 2, 0),
         "sort_count": (6, 3, 0),
         "sort_scatter": (10, 7, 0),
     },

@@ -108,7 +108,7 @@ def test_loss(renderer, views, works, weight, lanes):
 
 def test_the_loss_is_summed_piece_by_piece(renderer, views, works, monkeypatch):
     """As of large images, where a work-item adds up more than one value."""
-    monkeypatch.setattr(training, "_SUMS", 2)
+    monkeypatch.setattr(training, "_SUM_GROUPS", 2)
     work, _ = works(lanes=1)  # on CPUs it is summed strip by strip
     truth = views[0].image / 255.0
     image = (truth + np.random.default_rng(2).normal(0, 0.2, truth.shape)).astype(np.float32)
@@ -244,7 +244,7 @@ def taken_back(renderer, device, view, resident, lanes, outputs=("rgb",)):
     pipeline = renderer.backend.differentiate(features, shape)
     images = pipeline.forward(resident, seen)
     loss = random_loss(features, seen)
-    return device.backward_to_tiles(pipeline, images, {name: loss[name] for name in outputs})
+    return device.backward_per_tile(pipeline, images, {name: loss[name] for name in outputs})
 
 
 @pytest.mark.parametrize("sparse", [False, True])

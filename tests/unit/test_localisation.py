@@ -218,7 +218,7 @@ def test_sums_of_the_device_agree_with_numpy(renderer, room, lens):
     mask = np.ones((48, 64), bool)
     mask[10:20, 30:40] = False
     stages = [stage for stage, _ in stages_of(camera, mask)]
-    stages.append(stages[0]._replace(camera=camera.resampled(27, 19), ignored=None, side=5))
+    stages.append(stages[0]._replace(camera=camera.resampled(27, 19), ignored=None, block_size=5))
     moved = offset_camera(camera, np.array([0, 0, 0, 0, 1e-3, 0]))
     both = HostAlignment(), renderer.backend.alignment()
     noisy = image + np.random.default_rng(1).normal(0, 0.01, image.shape).astype(np.float32)

@@ -88,8 +88,8 @@ def test_cache_content_survives_a_failed_growth(stores, monkeypatch):
 def test_a_cache_smaller_than_a_view(stores, monkeypatch):
     renderer, store = fs.Renderer("opencl"), stores["disks"]
     # two chunks fit, and no frame is gathered at once
-    monkeypatch.setattr(chunk_cache, "_SHARE", renderer.backend.memory_budget // 10000)
-    monkeypatch.setattr(chunk_cache, "_GATHERED", renderer.backend.memory_budget // 10000)
+    monkeypatch.setattr(chunk_cache, "_CACHE_DIVISOR", renderer.backend.memory_budget // 10000)
+    monkeypatch.setattr(chunk_cache, "_CLOUD_DIVISOR", renderer.backend.memory_budget // 10000)
     resident, outputs = renderer.upload(store), ("rgb", "splat_id")
     for camera in (look(), look(turn=TURNED)):
         ours, whole = (renderer.render(each, camera, outputs) for each in (resident, store.cloud()))

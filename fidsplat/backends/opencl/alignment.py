@@ -39,25 +39,25 @@ class OpenCLAlignment(AlignmentKernels):
         self._commands = CommandList(self._program)
         self._stages: list[dict[str, Any]] = []
 
-    def load(self, image: np.ndarray, stages: list[AlignmentStage], most: int) -> list[int]:
+    def load(self, image: np.ndarray, stages: list[AlignmentStage], max_pixels: int) -> list[int]:
         with self._workspace.lock, self._workspace.failing("localising"):
             self._stages = []
-            counted = self._scratch("textures", 4 * BINS * len(stages))
-            cl.enqueue_fill_buffer(self._queue, counted, np.zeros(1, np.uint32), 0, 4 * BINS * len(stages))
-            source = complete = self._upload("image", image), image.shape
+            histograms = self._scratch("textures", 4 * BINS * len(stages))
+            cl.enqueue_fill_buffer(self._queue, histograms, np.zeros(1, np.uint32), 0, 4 * BINS * len(stages))
+            source = full = self._upload("image", image), image.shape
             for number, stage in reversed([*enumerate(stages)]):  # each level from the next finer one
-                given, source = self._prepared(number, stage, source, complete, counted)
-                self._stages.insert(0, given)
+                args, source = self._prepared(number, stage, source, full, histograms)
+                self._stages.insert(0, args)
             counts = np.empty((len(stages), BINS), np.uint32)
-            cl.enqueue_copy(self._queue, counts, counted)
-        found = []
-        for given, own in zip(self._stages, counts.astype(np.int64), strict=True):
-            given["least"] = least = lowest_bin(own, most)
-            found.append(int(own[least:].sum()))
-        return found
+            cl.enqueue_copy(self._queue, counts, histograms)
+        pixels = []
+        for args, histogram in zip(self._stages, counts.astype(np.int64), strict=True):
+            args["min_bin"] = min_bin = lowest_bin(histogram, max_pixels)
+            pixels.append(int(histogram[min_bin:].sum()))
+        return pixels
 
     def _prepared(
-        self, number: int, stage: AlignmentStage, source: _Image, full: _Image, counted: cl.Buffer
+        self, number: int, stage: AlignmentStage, source: _Image, full: _Image, histograms: cl.Buffer
     ) -> tuple[dict[str, Any], _Image]:
         """Arguments of a stage's kernels, and its image before the blur. source: the next finer image."""
         camera = stage.camera
@@ -65,61 +65,61 @@ class OpenCLAlignment(AlignmentKernels):
         if full_width % camera.width or full_height % camera.height:
             finer, (full_height, full_width, _) = full
         width, height, size = camera.width, camera.height, 4 * camera.width * camera.height
-        given = {
-            **{"width": width, "height": height, "channels": channels, "side": stage.side},
+        args = {
+            **{"width": width, "height": height, "channels": channels, "block_size": stage.block_size},
             **{"full_width": full_width, "full_height": full_height},
             **{"ratio_x": full_width / width, "ratio_y": full_height / height},
             **{"focal_x": camera.fx, "focal_y": camera.fy, "center_x": camera.cx, "center_y": camera.cy},
             **{"lens": int(camera.lens is not None), "rays": finer, "taps": finer, "mask": finer},
             **{"masked": int(stage.ignored is not None), "radius": len(stage.taps) - 1, "row": number},
             "bins": self._scratch(f"bins {number}", size // 4),
-            "counts": counted,
+            "counts": histograms,
         }
         if camera.lens is not None:
             raster = raster_of(camera.lens, width, height, camera.fx, camera.fy, camera.cx, camera.cy)
-            given["rays"] = self._upload(f"rays {number}", raster.rays)
+            args["rays"] = self._upload(f"rays {number}", raster.rays)
         if stage.ignored is not None:
-            given["mask"] = self._upload(f"mask {number}", stage.ignored.astype(np.uint8))
-        if given["radius"]:
-            given["taps"] = self._upload(f"taps {number}", stage.taps)
-        made = finer
+            args["mask"] = self._upload(f"mask {number}", stage.ignored.astype(np.uint8))
+        if args["radius"]:
+            args["taps"] = self._upload(f"taps {number}", stage.taps)
+        image = finer
         if (width, height) != (full_width, full_height):
-            made = self._scratch(f"image {number}", channels * size)
+            image = self._scratch(f"image {number}", channels * size)
             grid = -(-width // 64) * 64, height
-            self._launch("align_shrink", grid, (64, 1), {**given, "image": finer, "made": made})
-        given["image"] = self._blurred(made, given, f"image {number}", channels)
-        self._by_groups("align_texture", self._rows(height), given)
-        return given, (made, (height, width, channels))
+            self._launch("align_downsample", grid, (64, 1), {**args, "image": finer, "result": image})
+        args["image"] = self._blurred(image, args, f"image {number}", channels)
+        self._by_groups("align_texture", self._rows(height), args)
+        return args, (image, (height, width, channels))
 
     def sums(
         self, stage: int, frame: Any, fit: AlignmentFit, moved: MovedFrame | None = None, blocks: bool = False
     ) -> AlignmentSums:
-        given, channels = self._stages[stage], len(fit.gain)
-        height, width, side = given["height"], given["width"], given["side"]
-        count = -(-height // side) * -(-width // side)
+        args, channels = self._stages[stage], len(fit.gain)
+        height, width, block_size = args["height"], args["width"], args["block_size"]
+        count = -(-height // block_size) * -(-width // block_size)
         groups = count if blocks else min(count, _GROUPS[self._items])
         rgb, depth = (frame.images.buffer(name) for name in ("rgb", "depth"))
         other, step, axis = moved or (frame, 1.0, 0)
         moved_rgb = rgb if moved is None else other.images.buffer("rgb")
         with self._workspace.lock, self._workspace.failing("localising"):
-            values = self._blurred(rgb, given, "render", 3)
+            values = self._blurred(rgb, args, "render", 3)
             if moved is not None:
-                moved_rgb = self._blurred(moved_rgb, given, "moved render", 3)
+                moved_rgb = self._blurred(moved_rgb, args, "moved render", 3)
             counts = self._scratch("errors", 4 * BINS)
             cl.enqueue_fill_buffer(self._queue, counts, np.zeros(1, np.uint32), 0, 4 * BINS)
-            made = self._scratch("sums", 4 * groups * _SUMS)
+            sums = self._scratch("sums", 4 * groups * _SUMS)
             exposure = np.ones((2, 3))
             exposure[:, :channels] = fit.gain, fit.offset
             names = (f"{kind}_{name}" for kind in ("gain", "offset") for name in ("red", "green", "blue"))
-            given = given | dict(zip(names, exposure.ravel().tolist(), strict=True))
-            given |= {"rgb": values, "depth": depth, "counts": counts, "row": 0, "made": made}
-            given |= {"moved": moved_rgb, "moves": int(moved is not None), "step": step, "axis": axis}
-            given |= {"huber": int(fit.huber), "noise_before": fit.noise}
-            given["noise_factor"] = noise_factor(channels)
-            self._by_groups("align_errors", self._rows(height), given)
-            self._by_groups("align_sums", groups, given)
+            args = args | dict(zip(names, exposure.ravel().tolist(), strict=True))
+            args |= {"rgb": values, "depth": depth, "counts": counts, "row": 0, "result": sums}
+            args |= {"moved": moved_rgb, "has_moved": int(moved is not None), "step": step, "axis": axis}
+            args |= {"huber": int(fit.huber), "noise_before": fit.noise}
+            args["noise_factor"] = noise_factor(channels)
+            self._by_groups("align_errors", self._rows(height), args)
+            self._by_groups("align_sums", groups, args)
             packed = np.empty((groups, _SUMS), np.float32)
-            cl.enqueue_copy(self._queue, packed, made)
+            cl.enqueue_copy(self._queue, packed, sums)
         return _unpacked(packed, channels, blocks, moved is not None)
 
     @property
@@ -129,26 +129,26 @@ class OpenCLAlignment(AlignmentKernels):
     def _rows(self, height: int) -> int:
         return min(height, _GROUPS[self._items])
 
-    def _blurred(self, image: cl.Buffer, given: dict[str, Any], name: str, channels: int) -> cl.Buffer:
+    def _blurred(self, image: cl.Buffer, args: dict[str, Any], name: str, channels: int) -> cl.Buffer:
         """An image convolved with the taps of a stage; the image itself without blur."""
-        if not given["radius"]:
+        if not args["radius"]:
             return image
         for vertical in (0, 1):
-            size = 4 * channels * given["width"] * given["height"]
-            made = self._scratch(f"blurred {vertical} {name}", size)
-            own = {"image": image, "made": made, "vertical": vertical, "channels": channels}
-            across = 1 if self._items == 1 else 64
-            self._launch("align_blur", (across, given["height"]), (across, 1), given | own)
-            image = made
+            size = 4 * channels * args["width"] * args["height"]
+            result = self._scratch(f"blurred {vertical} {name}", size)
+            pass_arguments = {"image": image, "result": result, "vertical": vertical, "channels": channels}
+            width_items = 1 if self._items == 1 else 64
+            self._launch("align_blur", (width_items, args["height"]), (width_items, 1), args | pass_arguments)
+            image = result
         return image
 
-    def _by_groups(self, kernel: str, groups: int, given: dict[str, Any]) -> None:
-        self._launch(kernel, (groups * self._items,), (self._items,), given)
+    def _by_groups(self, kernel: str, groups: int, args: dict[str, Any]) -> None:
+        self._launch(kernel, (groups * self._items,), (self._items,), args)
 
     def _launch(
-        self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: dict[str, Any]
+        self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], args: dict[str, Any]
     ) -> None:
-        values = [given[one.name] for one in self._program.source.arguments[kernel]]
+        values = [args[argument.name] for argument in self._program.source.arguments[kernel]]
         self._commands.clear()
         self._commands.launch(self._queue, kernel, size, group, values)
 
@@ -165,14 +165,14 @@ class OpenCLAlignment(AlignmentKernels):
 
 
 def _unpacked(packed: np.ndarray, channels: int, blocks: bool, moved: bool) -> AlignmentSums:
-    """Unpack the sums of the work-groups: 8 matrix rows, a right side, and a second right side or moments,
+    """Unpack the sums of the work-groups: 8 matrix rows, the right-hand side, and a second one or moments,
     for each of 3 channels, then scalars."""
     rows = packed[:, :240].reshape(len(packed), 3, 10, 8)[:, :channels]
-    total, others = rows.sum(axis=0, dtype=float), packed[:, 240:248].sum(axis=0, dtype=float)
-    cost, before, inverse_depth = (others[4:7] / max(others[3], 1)).tolist()
-    own = rows[packed[:, 243] > 0 if blocks else slice(0)].astype(float)
+    total, scalars = rows.sum(axis=0, dtype=float), packed[:, 240:248].sum(axis=0, dtype=float)
+    cost, before, inverse_depth = (scalars[4:7] / max(scalars[3], 1)).tolist()
+    used = rows[packed[:, 243] > 0 if blocks else slice(0)].astype(float)
     return AlignmentSums(
-        *(total[:, :8], np.moveaxis(total[:, 8 : 9 + moved], 1, 2), others[:channels]),
-        *(own[:, :, 8], own[:, :, :8], own[:, :, 9, :6]),
+        *(total[:, :8], np.moveaxis(total[:, 8 : 9 + moved], 1, 2), scalars[:channels]),
+        *(used[:, :, 8], used[:, :, :8], used[:, :, 9, :6]),
         *(cost, before, inverse_depth, float(packed[0, 248])),
     )

@@ -35,7 +35,7 @@ from fidsplat.backends.opencl.layout import (
     BOUNDS,
     GROUP_KERNELS,
     KERNELS,
-    MOMENTS,
+    RECORD_GRADIENT,
     SPLAT,
     UNCULLED_KERNELS,
     VIEW,
@@ -66,11 +66,11 @@ _FRAME = (
 )
 """stages of the program `frame`; `{}` is the schedule; `pack` is used by the strategy `ordered` only"""
 _GRADIENTS = (
-    *("prelude", "math", "splat", "bounds", "moments", "blend_backward"),
+    *("prelude", "math", "splat", "bounds", "record_gradients", "blend_backward"),
     *("schedule/{}_cells", "schedule/{}_backward", "set_up_backward", "project_backward"),
 )
 _STEP = (
-    *("prelude", "math", "splat", "bounds", "moments", "set_up_backward"),
+    *("prelude", "math", "splat", "bounds", "record_gradients", "set_up_backward"),
     *("train/activation_functions", "train/adam", "project_step"),
 )
 _TRAINING = ("surface", "exposure", "activation_functions", "activate", "gather_rows", "position_noise")
@@ -301,7 +301,7 @@ def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> KernelSource
 @cache
 def assemble_alignment(items: int) -> KernelSource:
     """Assemble the kernels of direct image alignment, for work-groups of `items` work-items."""
-    numbers: dict[str, int | str] = {"ITEMS": items, "LOWEST": alignment.LOWEST}
+    numbers: dict[str, int | str] = {"ITEMS": items, "FIRST_BIN": alignment.FIRST_BIN}
     for name in ("HUBER", "TUKEY", "MIN_NOISE", "MAX_NOISE"):
         numbers[name] = f"{getattr(alignment, name)}f"
     declared = Declarations(Scalars("float", "float"))
@@ -342,7 +342,7 @@ def numbers_of(features: FeatureSet, shape: DeviceShape) -> dict[str, int]:
     """The build constants, by their names in the kernels."""
     numbers = {
         "BATCH": shape.batch,
-        "CHUNKS": shape.chunks,
+        "SORT_BLOCKS": shape.chunks,
         "FAST_FMA": int(shape.fast_fma),
         "LANES": shape.lanes,
         "RADIX_BITS": shape.radix_bits,
@@ -433,18 +433,19 @@ class Declarations:
         """packed fields of `Splat`, with the expressions that read them"""
         self._layouts = list((layouts or {}).values())
         self._outputs, self._fused, self._kernels = outputs, fused, kernels
-        view, splat, bounds, moments = VIEW, SPLAT, BOUNDS, MOMENTS
+        view, splat, bounds, record_gradient = VIEW, SPLAT, BOUNDS, RECORD_GRADIENT
         for layout in self._layouts:
             self.sample_buffers += layout.sample_buffers
             self.constants |= dict(layout.constant)
             self.packed |= dict(layout.packed)
             view, splat = view.with_members(layout.view), splat.with_members(layout.splat)
-            bounds, moments = bounds.with_members(layout.bounds), moments.with_members(layout.moments)
-        # as many padding fields as in `Moments`
-        alignment = moments.alignment // 4 * scalars.dtype("real").itemsize
-        fields = tuple(chain.from_iterable(member.names for member in moments.members))
+            bounds = bounds.with_members(layout.bounds)
+            record_gradient = record_gradient.with_members(layout.record_gradient)
+        # as many padding fields as in `RecordGradient`
+        alignment = record_gradient.alignment // 4 * scalars.dtype("real").itemsize
+        fields = tuple(chain.from_iterable(member.names for member in record_gradient.members))
         totals = Record("Totals", (Member("real", fields, "of all tiles"),), alignment)
-        records = view, splat.without({**self.constants, **self.packed}), bounds, moments, totals
+        records = view, splat.without({**self.constants, **self.packed}), bounds, record_gradient, totals
         self.structs = {record.name: record for record in records}
 
     def arguments(self, kernel: str) -> tuple[Argument, ...]:

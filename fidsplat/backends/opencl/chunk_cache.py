@@ -23,21 +23,21 @@ from fidsplat.backends.opencl.program import build
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.workspace import Workspace
 
-_SHARE = 4
-"""maximum fraction of the memory budget for the cache"""
-_GATHERED = 3
-"""maximum fraction of the memory budget for a gathered cloud that is not streamed"""
-_FIRST_SLOTS = 16
-_LAUNCH = 1 << 15
+_CACHE_DIVISOR = 4
+"""the cache has at most the memory budget divided by this"""
+_CLOUD_DIVISOR = 3
+"""a gathered cloud that is not streamed has at most the memory budget divided by this"""
+_INITIAL_SLOTS = 16
+_MAX_LAUNCH = 1 << 15
 """maximum number of chunks of a launch: the smallest limit of any device for the second dimension"""
-_NOWHERE = 0xFFFFFFFF
+_NO_POSE = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
 class Copies:
     """Parameters of the kernels that copy rows of cached chunks."""
 
-    pieces: cl.Buffer
+    parameters: cl.Buffer
     """parameters in the layout of `gather_chunks.cl`"""
     poses: cl.Buffer | None
     count: int
@@ -55,7 +55,8 @@ class OpenCLChunkCache:
         self.workspace, self.scene, self._rows = workspace, scene, max(scene.largest_chunk, 1)
         self.applies_poses = workspace.info.float64
         """whether the device applies `Chunk.pose`; else it must be None"""
-        self.widths: dict[str, int] = {}
+        self.row_bytes: dict[str, int] = {}
+        """bytes per splat by the name of the array"""
         self._arrays: dict[str, cl.Buffer] = {}
         self._size = 0
         self._free: list[int] = []
@@ -68,8 +69,8 @@ class OpenCLChunkCache:
         self._lock = threading.RLock()
         self._queue = cl.CommandQueue(workspace.context)
         """queue of transfers that run while a frame is rendered"""
-        self._last: cl.Event | None = None
-        """event of the last copy out of slots"""
+        self._last_copy: cl.Event | None = None
+        """event of the last copy out of the cache"""
         program = build(
             workspace, kernel_text("store/gather_chunks.cl"), f"-DINSTANCED={int(self.applies_poses)}"
         )
@@ -77,16 +78,16 @@ class OpenCLChunkCache:
 
     @property
     def memory_bytes(self) -> int:
-        return self._size * self._rows * sum(self.widths.values())
+        return self._size * self._rows * sum(self.row_bytes.values())
 
     def gather(self, chunks: Sequence[Chunk], first_id: int = 0) -> GatheredChunks:
         """Concatenate chunks into one cloud; an array is copied when a frame first reads it. first_id:
         `splat_id` of the first splat."""
         with self._lock:
             self._rendered = {chunk.key for chunk in chunks}
-            if not self.widths:
+            if not self.row_bytes:
                 for name, array in chunks[0].load().items():
-                    self.widths[name] = array.dtype.itemsize * int(np.prod(array.shape[1:], dtype=np.int64))
+                    self.row_bytes[name] = array.itemsize * int(np.prod(array.shape[1:], dtype=np.int64))
         return GatheredChunks(self, chunks, first_id)
 
     def prefetch(self, chunks: Sequence[Chunk]) -> None:
@@ -94,7 +95,7 @@ class OpenCLChunkCache:
         requested = {chunk.key for chunk in chunks}  # pinned: requested chunks must not evict each other
         for chunk in chunks:
             with self._lock:
-                if chunk.key in self._slots or not self.widths:
+                if chunk.key in self._slots or not self.row_bytes:
                     continue
             arrays = chunk.load()
             with self._lock:
@@ -103,47 +104,47 @@ class OpenCLChunkCache:
                     return
 
     def copy(
-        self, name: str, chunks: Sequence[Chunk], spans: np.ndarray, target: cl.Buffer, known: Copies | None
+        self, name: str, chunks: Sequence[Chunk], spans: np.ndarray, target: cl.Buffer, cached: Copies | None
     ) -> Copies | None:
         """Copy rows of chunks into an array. spans: (k, 3) first row of each chunk, its destination, number
-        of rows. known: result of this method for the same rows of another array."""
+        of rows. cached: result of this method for the same rows of another array."""
         with self._lock, self.workspace.failing("copying splats"):
-            if known is not None and known.evictions == self._evictions:
-                self._launch(name, known, target)
-                return known
-            rounds = list(self._rounds(chunks))
+            if cached is not None and cached.evictions == self._evictions:
+                self._launch(name, cached, target)
+                return cached
+            ranges = list(self._ranges(chunks))
             copies = None
-            for first, end in rounds:
+            for first, end in ranges:
                 copies = self._copies(chunks[first:end], spans[first:end])
                 self._launch(name, copies, target)
-            return copies if len(rounds) == 1 else None
+            return copies if len(ranges) == 1 else None
 
     def wait(self) -> None:
         with self._lock, self.workspace.failing("copying splats"):
-            if self._last is not None:
-                self._last.wait()
+            if self._last_copy is not None:
+                self._last_copy.wait()
 
-    def _rounds(self, chunks: Sequence[Chunk]) -> Iterator[tuple[int, int]]:
+    def _ranges(self, chunks: Sequence[Chunk]) -> Iterator[tuple[int, int]]:
         """Split chunks into ranges that fit the slots at once."""
-        most, first, keys = self._max_slots, 0, set()
-        for number, chunk in enumerate(chunks):
+        max_keys, first, keys = self._max_slots, 0, set()
+        for index, chunk in enumerate(chunks):
             keys.add(chunk.key)
-            if len(keys) > most or number - first == _LAUNCH:
-                yield first, number
-                first, keys = number, {chunk.key}
+            if len(keys) > max_keys or index - first == _MAX_LAUNCH:
+                yield first, index
+                first, keys = index, {chunk.key}
         yield first, len(chunks)
 
     def _copies(self, chunks: Sequence[Chunk], spans: np.ndarray) -> Copies:
         """Load chunks into slots, and return the parameters of their copies."""
-        slots = self._cached(chunks)
-        table = np.full((len(chunks), 4), _NOWHERE, np.uint32)
-        begins = np.array([chunk.first for chunk in chunks])
-        table[:, 0] = np.array(slots) * self._rows + begins + spans[:, 0]
+        slots = self._load_missing(chunks)
+        table = np.full((len(chunks), 4), _NO_POSE, np.uint32)
+        first_rows = np.array([chunk.first for chunk in chunks])
+        table[:, 0] = np.array(slots) * self._rows + first_rows + spans[:, 0]
         table[:, 1:3] = spans[:, 1:]
-        poses = [(number, chunk.pose) for number, chunk in enumerate(chunks) if chunk.pose is not None]
-        table[[number for number, _ in poses], 3] = np.arange(len(poses))
+        poses = [(index, chunk.pose) for index, chunk in enumerate(chunks) if chunk.pose is not None]
+        table[[index for index, _ in poses], 3] = np.arange(len(poses))
         return Copies(
-            pieces=self._constant(table),
+            parameters=self._constant(table),
             poses=self._constant(np.stack([pose for _, pose in poses])) if poses else None,
             count=len(chunks),
             rows=int(table[:, 2].max(initial=0)),
@@ -155,18 +156,18 @@ class OpenCLChunkCache:
         return cl.Buffer(self.workspace.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=array)
 
     def _launch(self, name: str, copies: Copies, target: cl.Buffer) -> None:
-        words = self.widths[name] // 4
-        moves = copies.poses is not None and name in ("means", "quats")
-        items = copies.rows * (1 if moves else words)
+        words = self.row_bytes[name] // 4
+        posed = copies.poses is not None and name in ("means", "quats")
+        items = copies.rows * (1 if posed else words)
         if not items:
             return
-        kernel = self._kernels["gather_placed" if moves else "gather"]
-        poses = (copies.poses,) if moves else ()
-        kernel.set_args(self._arrays[name], copies.pieces, np.uint32(words), *poses, target)
+        kernel = self._kernels["gather_posed" if posed else "gather"]
+        poses = (copies.poses,) if posed else ()
+        kernel.set_args(self._arrays[name], copies.parameters, np.uint32(words), *poses, target)
         size = -(-items // 64) * 64, copies.count
-        self._last = cl.enqueue_nd_range_kernel(self.workspace.queue, kernel, size, (64, 1))
+        self._last_copy = cl.enqueue_nd_range_kernel(self.workspace.queue, kernel, size, (64, 1))
 
-    def _cached(self, chunks: Sequence[Chunk]) -> list[int]:
+    def _load_missing(self, chunks: Sequence[Chunk]) -> list[int]:
         """Load chunks that are not cached, and return the slots of all."""
         keys = {chunk.key for chunk in chunks}
         for chunk in chunks:
@@ -182,10 +183,10 @@ class OpenCLChunkCache:
         if slot is None:
             return False
         try:
-            for name, width in self.widths.items():
+            for name, row_bytes in self.row_bytes.items():
                 if arrays[name].size:
-                    array, place = np.ascontiguousarray(arrays[name]), slot * self._rows * width
-                    cl.enqueue_copy(self._queue, self._arrays[name], array, dst_offset=place)
+                    array, offset = np.ascontiguousarray(arrays[name]), slot * self._rows * row_bytes
+                    cl.enqueue_copy(self._queue, self._arrays[name], array, dst_offset=offset)
         except BaseException:
             self._free.append(slot)
             raise
@@ -194,14 +195,14 @@ class OpenCLChunkCache:
 
     def _slot(self, pinned: Collection[Hashable]) -> int | None:
         if not self._free and self._size < self._max_slots:
-            self._grow(min(self._max_slots, max(_FIRST_SLOTS, 2 * self._size)))
+            self._grow(min(self._max_slots, max(_INITIAL_SLOTS, 2 * self._size)))
         if self._free:
             return self._free.pop()
         oldest = next((key for key in self._slots if key not in pinned), None)
         if oldest is None:
             return None
-        if self._last is not None:
-            self._last.wait()  # a kernel may be reading it
+        if self._last_copy is not None:
+            self._last_copy.wait()  # a kernel may be reading it
         self._evictions += 1
         return self._slots.pop(oldest)
 
@@ -213,21 +214,21 @@ class OpenCLChunkCache:
     @property
     def _slot_bytes(self) -> int:
         """Bytes of a slot. The widest array counts twice, as it exists twice while the cache grows."""
-        return self._rows * (sum(self.widths.values()) + max(self.widths.values()))
+        return self._rows * (sum(self.row_bytes.values()) + max(self.row_bytes.values()))
 
     @property
     def _max_slots(self) -> int:
-        share = self.workspace.memory_budget // _SHARE // self._slot_bytes
-        widest = self.workspace.device.max_mem_alloc_size // (self._rows * max(self.widths.values()))
-        return max(1, self._size, min(share, widest, self.scene.distinct(self.applies_poses)))
+        fitting = self.workspace.memory_budget // _CACHE_DIVISOR // self._slot_bytes
+        allocatable = self.workspace.device.max_mem_alloc_size // (self._rows * max(self.row_bytes.values()))
+        return max(1, self._size, min(fitting, allocatable, self.scene.distinct(self.applies_poses)))
 
     def _grow(self, size: int) -> None:
-        if self._last is not None:
-            self._last.wait()
-        for name, width in self.widths.items():
-            buffer = self.workspace.pool.allocate(f"chunks of {name}", size * self._rows * width)
+        if self._last_copy is not None:
+            self._last_copy.wait()
+        for name, row_bytes in self.row_bytes.items():
+            buffer = self.workspace.pool.allocate(f"chunks of {name}", size * self._rows * row_bytes)
             if self._size:
-                used = self._size * self._rows * width
+                used = self._size * self._rows * row_bytes
                 # arrays grow one by one: if an allocation fails, the others are still complete
                 cl.enqueue_copy(self._queue, buffer, self._arrays[name], byte_count=used).wait()
             self._arrays[name] = buffer
@@ -252,40 +253,41 @@ class GatheredChunks(Resident):
         weakref.finalize(self, workspace.pool.release, self._acquired)
         self._copies: tuple[int, int, Copies | None] = (0, 0, None)
         """parameters of the last copy, with its splats [first, end)"""
-        total, widest = self.capacity * sum(cache.widths.values()), self.capacity * max(cache.widths.values())
+        row_bytes = cache.row_bytes.values()
+        total, widest = self.capacity * sum(row_bytes), self.capacity * max(row_bytes)
         self.streamed = (
-            total > workspace.memory_budget // _GATHERED or widest > workspace.device.max_mem_alloc_size
+            total > workspace.memory_budget // _CLOUD_DIVISOR or widest > workspace.device.max_mem_alloc_size
         )
 
     def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
         """Bytes of these arrays and of the full cache on the device, and bytes per splat copied for each
         frame."""
-        read, stays = {*names, *self._buffers}, self._cache.reserved_bytes
-        each = sum(self._width(name) for name in read)
-        return (stays, each) if self.streamed else (stays + self.capacity * each, 0)
+        splat_bytes = sum(self._row_bytes(name) for name in {*names, *self._buffers})
+        cache_bytes = self._cache.reserved_bytes
+        return (cache_bytes, splat_bytes) if self.streamed else (cache_bytes + self.capacity * splat_bytes, 0)
 
     @property
     def memory_bytes(self) -> int:
         return self._cache.memory_bytes + super().memory_bytes
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
-        width = self._width(name)
+        row_bytes = self._row_bytes(name)
         if self.streamed:
-            buffer = self._workspace.pool.scratch(f"chunk of {name}", (end - first) * width)
+            buffer = self._workspace.pool.scratch(f"chunk of {name}", (end - first) * row_bytes)
             self._fill(name, first, end, buffer)
             return buffer
         if name not in self._buffers:
             # the buffer of the previous view is reused if large enough: allocating takes as long as filling
             label = f"the splats' {name}"
-            whole = self._workspace.pool.acquire(label, self.capacity * width, larger=True)
-            self._acquired.append((label, whole))
-            self._fill(name, 0, self.count, whole)
+            buffer = self._workspace.pool.acquire(label, self.capacity * row_bytes, larger=True)
+            self._acquired.append((label, buffer))
+            self._fill(name, 0, self.count, buffer)
             self._cache.wait()  # frames may be rendered on another queue
-            self._buffers[name] = whole
-        return self._region(self._buffers[name], first, end, width)
+            self._buffers[name] = buffer
+        return self._region(self._buffers[name], first, end, row_bytes)
 
-    def _width(self, name: str) -> int:
-        return 4 if name == "splat_ids" else self._cache.widths[name]
+    def _row_bytes(self, name: str) -> int:
+        return 4 if name == "splat_ids" else self._cache.row_bytes[name]
 
     def _fill(self, name: str, first: int, end: int, target: cl.Buffer) -> None:
         if first == end:
@@ -294,13 +296,16 @@ class GatheredChunks(Resident):
             ids = self._first_id + np.arange(first, end, dtype=np.int32)
             cl.enqueue_copy(self._workspace.queue, target, ids)
             return
-        lowest = int(np.searchsorted(self._ends, first, side="right"))
-        highest = int(np.searchsorted(self._ends, end, side="left")) + 1
-        ends = self._ends[lowest:highest]
-        starts = ends - [chunk.count for chunk in self._chunks[lowest:highest]]
-        begin, stop = np.maximum(starts, first), np.minimum(ends, end)
-        spans = np.stack([begin - starts, begin - first, stop - begin], axis=1)
-        begun, stopped, known = self._copies
-        known = known if (begun, stopped) == (first, end) else None
-        copies = self._cache.copy(name, self._chunks[lowest:highest], spans, target, known)
+        overlapping = slice(
+            int(np.searchsorted(self._ends, first, side="right")),
+            int(np.searchsorted(self._ends, end, side="left")) + 1,
+        )
+        chunks, ends = self._chunks[overlapping], self._ends[overlapping]
+        starts = ends - [chunk.count for chunk in chunks]
+        from_splat, to_splat = np.maximum(starts, first), np.minimum(ends, end)
+        spans = np.stack([from_splat - starts, from_splat - first, to_splat - from_splat], axis=1)
+        *cached_range, cached = self._copies
+        copies = self._cache.copy(
+            name, chunks, spans, target, cached if cached_range == [first, end] else None
+        )
         self._copies = first, end, copies

@@ -192,8 +192,8 @@ class Layout:
     sample_buffers: tuple[SampleBuffer, ...] = ()
     backward_file: str = ""
     """file of its derivatives below kernels/opencl/; empty: none"""
-    moments: tuple[Member, ...] = ()
-    """fields of `Moments` (layout.py)"""
+    record_gradient: tuple[Member, ...] = ()
+    """fields of `RecordGradient` (layout.py)"""
     blend_backward: tuple[Argument, ...] = ()
     project_backward: tuple[Argument, ...] = ()
     project_step: tuple[Argument, ...] = ()

@@ -38,14 +38,14 @@ LAYOUTS: dict[str, Layout] = {
         "slot/color_rgb.cl",
         project=args("cloud float colors  // (n, 3)"),
         backward_file="slot/color_rgb_backward.cl",
-        project_backward=args("out float by_colors  // (n, 3)"),
+        project_backward=args("out float grad_colors  // (n, 3)"),
     ),
     "color_sh": Layout(
         "slot/color_sh.cl",
         project=args("cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)"),
         backward_file="slot/color_sh_backward.cl",
         project_backward=args(
-            "cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)", "out float by_sh  // the same shape"
+            "cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)", "out float grad_sh  // the same shape"
         ),
     ),
     "lowpass_none": Layout("slot/lowpass_none.cl", backward_file="slot/lowpass_none_backward.cl"),
@@ -62,7 +62,7 @@ LAYOUTS: dict[str, Layout] = {
             member("float px py pr", "the filter's support: centre and radius [samples]; radius < 0: none"),
         ),
         backward_file="slot/lowpass_screen_backward.cl",
-        moments=(member("float disc_x disc_y", "by the position of the low-pass disc"),),
+        record_gradient=(member("float disc_x disc_y", "by the position of the low-pass disc"),),
     ),
     "stop_inclusive": Layout(),
     "stop_exclusive": Layout("slot/stop_exclusive.cl", backward_file="slot/stop_exclusive_backward.cl"),
@@ -87,7 +87,7 @@ LAYOUTS: dict[str, Layout] = {
         parts=("thickness",),
         splat=(member("wide bulge", "2 / m^2 of a 3D Gaussian, 0 of a disk"),),
         backward_file="slot/ellipsoid_exact_backward.cl",
-        moments=(member("float bulge"),),
+        record_gradient=(member("float bulge"),),
     ),
     "ellipsoid_ewa": Layout(
         "slot/ellipsoid_ewa.cl",
@@ -177,12 +177,12 @@ LAYOUTS: dict[str, Layout] = {
         project=args("cloud float thickness  // (n) [m]; 0: a disk"),
         backward_file="part/thickness_backward.cl",
         project_backward=args(
-            "cloud float thickness  // (n) [m]; 0: a disk", "out float by_thickness  // (n)"
+            "cloud float thickness  // (n) [m]; 0: a disk", "out float grad_thickness  // (n)"
         ),
         project_step=args("out float activated_thickness"),
     ),
     "step_camera": Layout(
-        "train/step_camera.cl", project_step=args("out real group_sums  // (work-groups, 10) by the camera")
+        "train/step_camera.cl", project_step=args("out real camera_sums  // (work-groups, 10) by the camera")
     ),
     "box_cover": Layout("part/box_cover.cl"),
     "box_edges": Layout(
@@ -206,7 +206,7 @@ LAYOUTS: dict[str, Layout] = {
         "part/ray_depth.cl",
         splat=(member("wide z_numerator", "depth = z_numerator / D"), member("wide z_center z_reach")),
         backward_file="part/ray_depth_backward.cl",
-        moments=(member("float z_numerator z_center"),),
+        record_gradient=(member("float z_numerator z_center"),),
     ),
     "coplanar_layers": Layout(
         "part/coplanar_layers.cl",
@@ -232,21 +232,21 @@ LAYOUTS: dict[str, Layout] = {
     "alpha": Layout(
         "output/alpha.cl",
         backward_file="output/alpha_backward.cl",
-        blend_backward=args("in float by_alpha  // (h, w)"),
+        blend_backward=args("in float grad_alpha  // (h, w)"),
     ),
     "depth": Layout(
         "output/depth.cl",
         parts=("ray_depth", "coverage"),
         sample_buffers=(SampleBuffer("float", "depth_raw", 2, "sum w z, sum w"),),
         backward_file="output/depth_backward.cl",
-        blend_backward=args("in float depth_raw  // 2 channels", "in float by_depth  // (h, w)"),
+        blend_backward=args("in float depth_raw  // 2 channels", "in float grad_depth  // (h, w)"),
     ),
     "distortion": Layout(
         "output/distortion.cl",
         parts=("ray_depth",),
         sample_buffers=(SampleBuffer("float", "distortion_raw", 4, "the first m, W, sum w m, sum w m^2"),),
         backward_file="output/distortion_backward.cl",
-        blend_backward=args("in float distortion_raw  // 4 channels", "in float by_distortion  // (h, w)"),
+        blend_backward=args("in float distortion_raw  // 4 channels", "in float grad_distortion  // (h, w)"),
     ),
     "depth_median": Layout(
         "output/depth_median.cl",
@@ -268,8 +268,8 @@ LAYOUTS: dict[str, Layout] = {
         splat=(member("wide nx ny nz"),),
         sample_buffers=(SampleBuffer("float", "normal_raw", 3),),
         backward_file="output/normal_backward.cl",
-        moments=(member("float nx ny nz"),),
-        blend_backward=args("in float normal_raw  // 3 channels", "in float by_normal  // (h, w, 3)"),
+        record_gradient=(member("float nx ny nz"),),
+        blend_backward=args("in float normal_raw  // 3 channels", "in float grad_normal  // (h, w, 3)"),
     ),
     "normal_world": Layout("output/normal_world.cl", parts=("normal", "row_rotation")),
     "label": Layout(

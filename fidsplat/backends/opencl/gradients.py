@@ -13,7 +13,7 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from fidsplat.backends.gradients import (
-    NOT_THE_LAST,
+    NOT_LATEST_FRAME,
     CapacityExceeded,
     DifferentiableImages,
     check_shape,
@@ -40,8 +40,8 @@ from fidsplat.util.errors import InputError
 
 _GROUP = 64  # work-group size: RESERVE_ITEMS, POSE_ITEMS, SUM_ITEMS and STEP_ITEMS of the kernels
 _SUMS = {"background": 3, "pose": 6, "intrinsics": 4}
-"""gradients that are sums over tiles or splats, and their numbers"""
-_CAMERA = 10
+"""gradients that are sums over tiles or splats, and their number of components"""
+_CAMERA = 10  # pose and intrinsics
 _DOING = "taking derivatives"
 _F32 = np.dtype(np.float32)
 _ZERO = np.zeros(1, np.uint32)  # also zeroes floats
@@ -70,17 +70,19 @@ class OpenCLGradients(GradientPipeline):
         self.source = assemble_gradients(pipeline.features, pipeline.shape)
         self.program = Program(pipeline.workspace, self.source)
         arguments = self.source.arguments
-        self._by_outputs = [
+        self._output_gradients = [
             name
             for name in GRADIENT_OUTPUTS
-            if any(one.name == f"by_{name}" for one in arguments["blend_backward"])
+            if any(argument.name == f"grad_{name}" for argument in arguments["blend_backward"])
         ]
-        self.cloud_arrays = [one.name for one in arguments["project_backward"] if one.source == "cloud"]
+        self.cloud_arrays = [
+            argument.name for argument in arguments["project_backward"] if argument.source == "cloud"
+        ]
         self._pair_limit = 0
         """list capacity of frames for whose counts the host does not wait"""
         self._tile_commands, self.sum_commands = CommandList(self.program), CommandList(self.program)
         self.step_commands: dict[bool, CommandList] = {}
-        """command lists of a step by whether it sums the gradient of the camera"""
+        """command lists of `TileGradients.step` by `with_camera`"""
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
         """Render one frame. waits: whether to wait for its counts, which a GPU needs only for the first
@@ -95,27 +97,27 @@ class OpenCLGradients(GradientPipeline):
 
     def backward(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
         with images.frame.workspace.lock:
-            return self.backward_to_tiles(images, gradients).gradients()
+            return self.backward_per_tile(images, gradients).gradients()
 
-    def backward_to_tiles(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> TileGradients:
+    def backward_per_tile(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> TileGradients:
         check_gradients(self.features, gradients)
-        if not images.last:
-            raise InputError(NOT_THE_LAST)
+        if not images.is_latest:
+            raise InputError(NOT_LATEST_FRAME)
         with images.frame.workspace.lock, images.frame.workspace.failing(_DOING):
             frame = self._backward_frame(images.frame)
-            self._submit_to_tiles(frame, gradients)
+            self._submit_blend_backward(frame, gradients)
             return TileGradients(self, images, frame)
 
     def _backward_frame(self, forward: DeviceFrame) -> DeviceFrame:
         """A copy of the frame that launches kernels of the program `gradients` and has their buffers."""
         frame = copy(forward)
         frame.commands, frame.source = self._tile_commands, self.source
-        frame.scratch("splat_slots", 4 * frame.resident.count)
-        frame.scratch("moments", self.source.records["Moments"].itemsize * frame.pairs)
-        frame.scratch("tile_sums", 3 * self.source.scalars.dtype("real").itemsize * frame.tiles)
+        frame.scratch("gradient_offsets", 4 * frame.resident.count)
+        frame.scratch("record_gradients", self.source.records["RecordGradient"].itemsize * frame.pairs)
+        frame.scratch("background_sums", 3 * self.source.scalars.dtype("real").itemsize * frame.tiles)
         return frame
 
-    def _submit_to_tiles(self, frame: DeviceFrame, gradients: Mapping[str, Any]) -> None:
+    def _submit_blend_backward(self, frame: DeviceFrame, gradients: Mapping[str, Any]) -> None:
         """Submit the kernels up to the sums over tiles; replays their command list if possible."""
         self._bind_gradients(frame, gradients)
         reserved = frame.scratch("reserved", 8)
@@ -123,14 +125,14 @@ class OpenCLGradients(GradientPipeline):
         ceiling = math.log(frame.view.ceiling)
         commands, key = self._tile_commands, self._key(frame)
         if key is not None and commands.key == key:
-            given = {f"by_{name}": frame.named[f"by_{name}"] for name in self._by_outputs}
-            commands.set({**scalars_of(frame.view), "log_ceiling": ceiling, **frame.acquired, **given})
+            values = {f"grad_{name}": frame.named[f"grad_{name}"] for name in self._output_gradients}
+            commands.set({**scalars_of(frame.view), "log_ceiling": ceiling, **frame.acquired, **values})
             frame.events += commands.submit(frame.queue)
             frame.stages += commands.stages
             self._check_capacity(frame)
             return
         commands.clear()
-        self._record_to_tiles(frame, ceiling)
+        self._record_blend_backward(frame, ceiling)
         self._check_capacity(frame)
         commands.key = self._key(frame)
 
@@ -141,7 +143,7 @@ class OpenCLGradients(GradientPipeline):
         count, size = frame.resident.count, (frame.view.width, frame.view.height)
         return frame.pool.state, count, frame.capacity, size
 
-    def _record_to_tiles(self, frame: DeviceFrame, log_ceiling: float) -> None:
+    def _record_blend_backward(self, frame: DeviceFrame, log_ceiling: float) -> None:
         features, shape = self.features, self._pipeline.shape
         in_groups, tile = shape.schedule == "group", shape.tile_width * shape.tile_height
         chunks = frame.pairs // backward_chunk(features, shape) + frame.tiles
@@ -150,10 +152,10 @@ class OpenCLGradients(GradientPipeline):
             rows = -(-frame.view.height // shape.tile_height)
             frame.scratch("big_rows", 4 * frame.numbers["big_capacity"] * rows)
         if count := frame.resident.count:
-            frame.launch("reserve", "reserve_slots", (count,), (_GROUP,), count=count)
+            frame.launch("reserve", "reserve_gradients", (count,), (_GROUP,), count=count)
         groups = chunks if in_groups else min(frame.tiles, frame.workspace.info.compute_units)
         if in_groups:
-            frame.scratch("reached", 4 * frame.tiles)
+            frame.scratch("reached_chunks", 4 * frame.tiles)
             frame.scratch("chunk_tiles", 4 * chunks)
             size = frame.tiles * shape.blend_items
             frame.launch(
@@ -173,11 +175,11 @@ class OpenCLGradients(GradientPipeline):
         words = 2 * 8 * chunk + 1
         return 8 * chunk * shape.tile_width * shape.tile_height + -(-4 * words // vector) * vector
 
-    def compile_step(self, by_camera: bool = False) -> None:
+    def compile_step(self, with_camera: bool = False) -> None:
         """Compile the kernel of `step`, which gradients do not need."""
-        if by_camera not in self.step_commands:
-            source = assemble_step(self.features, self._pipeline.shape, by_camera)
-            self.step_commands[by_camera] = CommandList(Program(self._pipeline.workspace, source))
+        if with_camera not in self.step_commands:
+            source = assemble_step(self.features, self._pipeline.shape, with_camera)
+            self.step_commands[with_camera] = CommandList(Program(self._pipeline.workspace, source))
 
     def _check_capacity(self, frame: DeviceFrame) -> None:
         """Raise CapacityExceeded if the lists were too small."""
@@ -190,23 +192,23 @@ class OpenCLGradients(GradientPipeline):
 
     def _bind_gradients(self, frame: DeviceFrame, gradients: Mapping[str, Any]) -> None:
         """Bind the gradients with respect to the outputs as kernel arguments."""
-        for name in self._by_outputs:
-            shape, given = gradient_shape(name, frame.view), gradients.get(name)
-            if given is None:
+        for name in self._output_gradients:
+            shape, gradient = gradient_shape(name, frame.view), gradients.get(name)
+            if gradient is None:
                 size = 4 * math.prod(shape)
-                buffer = frame.scratch(f"by_{name}", size)
+                buffer = frame.scratch(f"grad_{name}", size)
                 cl.enqueue_fill_buffer(frame.queue, buffer, _ZERO, 0, size)
                 continue
-            check_shape(name, given.shape, frame.view)
-            if isinstance(given, Array):
-                if given.dtype != _F32 or not given.flags.c_contiguous or given.offset:
+            check_shape(name, gradient.shape, frame.view)
+            if isinstance(gradient, Array):
+                if gradient.dtype != _F32 or not gradient.flags.c_contiguous or gradient.offset:
                     raise InputError(
                         f"the gradient of {name} must be a complete, contiguous float32 array, got "
-                        f"{given.dtype} at offset {given.offset}; copy it first"
+                        f"{gradient.dtype} at offset {gradient.offset}; copy it first"
                     )
-                frame.bind(f"by_{name}", given.data)  # pyright: ignore[reportArgumentType]
+                frame.bind(f"grad_{name}", gradient.data)  # pyright: ignore[reportArgumentType]
             else:
-                frame.upload(f"by_{name}", np.ascontiguousarray(given, np.float32))
+                frame.upload(f"grad_{name}", np.ascontiguousarray(gradient, np.float32))
 
 
 class TileGradients:
@@ -218,12 +220,12 @@ class TileGradients:
     def gradients(self) -> dict[str, Any]:
         """The result of `OpenCLGradients.backward`, from the sums over tiles."""
         pipeline = self.pipeline
-        with self._last():
+        with self._latest_frame():
             frame = copy(self._frame)
             frame.commands = pipeline.sum_commands
             frame.commands.clear()
             count, groups = frame.resident.count, self._allocate_camera_sums(frame)
-            found = self._allocate_results(frame)
+            results = self._allocate_results(frame)
             if count:
                 arrays: dict[str, Any] = {
                     name: frame.resident.part(name, 0, count) for name in pipeline.cloud_arrays
@@ -231,23 +233,27 @@ class TileGradients:
                 frame.launch(
                     "project backward", "project_backward", (count,), (_GROUP,), count=count, **arrays
                 )
-            self._add_up(frame, found, groups)
-            return found
+            self._sum_gradients(frame, results, groups)
+            return results
 
-    def step(self, given: Mapping[str, Any], by_camera: bool = False) -> Callable[[], np.ndarray] | None:
+    def step(
+        self, arguments: Mapping[str, Any], with_camera: bool = False
+    ) -> Callable[[], np.ndarray] | None:
         """Submit an optimiser step (kernels/opencl/project_step.cl), compiled by
         `OpenCLGradients.compile_step`.
 
-        given: arguments that are not the frame's. by_camera: whether to return a function that waits for the
-        gradient (10,) with respect to the camera: pose and intrinsics.
+        arguments: those that the frame does not have. with_camera: whether to return a function that waits
+        for the gradient (10,) with respect to the camera: pose and intrinsics.
         """
-        with self._last():
-            frame, commands = self._frame, self.pipeline.step_commands[by_camera]
-            given = {**given, "count": (count := frame.resident.count)}
-            groups = self._allocate_camera_sums(frame) if by_camera else 0
-            arguments = commands.program.source.arguments["project_step"]
+        with self._latest_frame():
+            frame, commands = self._frame, self.pipeline.step_commands[with_camera]
+            arguments = {**arguments, "count": (count := frame.resident.count)}
+            groups = self._allocate_camera_sums(frame) if with_camera else 0
             values = {
-                one.name: given[one.name] if one.name in given else frame.value(one) for one in arguments
+                declared.name: arguments[declared.name]
+                if declared.name in arguments
+                else frame.value(declared)
+                for declared in commands.program.source.arguments["project_step"]
             }
             if commands.key != count:
                 commands.clear()
@@ -257,13 +263,13 @@ class TileGradients:
             commands.set(values)
             frame.events += commands.submit(frame.queue)
             frame.stages.append("project backward")
-            return self._camera_readback(frame, groups) if by_camera else None
+            return self._camera_readback(frame, groups) if with_camera else None
 
     @contextmanager
-    def _last(self) -> Iterator[None]:
+    def _latest_frame(self) -> Iterator[None]:
         """A context that uses the device. Raises InputError after a later frame of the device."""
-        if not self._images.last:
-            raise InputError(NOT_THE_LAST)
+        if not self._images.is_latest:
+            raise InputError(NOT_LATEST_FRAME)
         with self._frame.workspace.lock, self._frame.workspace.failing(_DOING):
             yield
 
@@ -271,14 +277,16 @@ class TileGradients:
         """Allocate the sums of work-groups for the camera, and return the number of work-groups."""
         groups = -(-frame.resident.count // _GROUP)
         real = self.pipeline.source.scalars.dtype("real").itemsize
-        frame.scratch("group_sums", _CAMERA * real * groups)
+        frame.scratch("camera_sums", _CAMERA * real * groups)
         return groups
 
-    def _add_up(self, frame: DeviceFrame, found: Mapping[str, Array], groups: int) -> None:
+    def _sum_gradients(self, frame: DeviceFrame, results: Mapping[str, Array], groups: int) -> None:
         """Sum the gradients of the background over tiles, and those of the camera over work-groups."""
-        given: dict[str, Any] = {name: found[name].data for name in _SUMS}
-        given |= {"tiles": frame.tiles, "groups": groups}
-        frame.launch("project backward", "add_up", (sum(_SUMS.values()) * _GROUP,), (_GROUP,), **given)
+        arguments: dict[str, Any] = {name: results[name].data for name in _SUMS}
+        arguments |= {"tiles": frame.tiles, "groups": groups}
+        frame.launch(
+            "project backward", "sum_gradients", (sum(_SUMS.values()) * _GROUP,), (_GROUP,), **arguments
+        )
 
     def _camera_readback(self, frame: DeviceFrame, groups: int) -> Callable[[], np.ndarray]:
         """Sum the gradient of the camera over work-groups; returns a function that waits for it."""
@@ -286,18 +294,18 @@ class TileGradients:
         frame.commands = self.pipeline.sum_commands
         frame.commands.clear()
         arrays = {name: frame.pool.array(frame.queue, name, (k,)) for name, k in _SUMS.items()}
-        self._add_up(frame, arrays, groups)
-        found = np.empty(_CAMERA, np.float32)
-        copied = [
+        self._sum_gradients(frame, arrays, groups)
+        gradient = np.empty(_CAMERA, np.float32)
+        copy_events = [
             cl.enqueue_copy(frame.queue, part, arrays[name].data, is_blocking=False)  # pyright: ignore
-            for name, part in (("pose", found[:6]), ("intrinsics", found[6:]))
+            for name, part in (("pose", gradient[:6]), ("intrinsics", gradient[6:]))
         ]
         frame.queue.flush()
 
         def read() -> np.ndarray:
             with frame.workspace.lock, frame.workspace.failing(_DOING):
-                cl.wait_for_events(copied)
-            return found
+                cl.wait_for_events(copy_events)
+            return gradient
 
         return read
 
@@ -315,9 +323,9 @@ class TileGradients:
             shapes["colors"] = (count, 3)
         if "thickness" in self.pipeline.cloud_arrays:
             shapes["thickness"] = (count,)
-        found = {}
+        results = {}
         for name, shape in shapes.items():
-            argument = name if name == "screen" else f"by_{name}"
-            found[name] = frame.pool.array(frame.queue, argument, shape)
-            frame.named[argument] = found[name].data  # pyright: ignore[reportArgumentType]
-        return found
+            argument = name if name == "screen" else f"grad_{name}"
+            results[name] = frame.pool.array(frame.queue, argument, shape)
+            frame.named[argument] = results[name].data  # pyright: ignore[reportArgumentType]
+        return results

@@ -55,8 +55,8 @@ BOUNDS = Record(
     ),
 )
 
-MOMENTS = Record(
-    "Moments",
+RECORD_GRADIENT = Record(
+    "RecordGradient",
     (
         member("float nu0 nux nuy", "gradients by n_u times 1, x, y, summed over a tile"),
         member("float nv0 nvx nvy"),
@@ -95,14 +95,14 @@ RAY_UNIFORMS = uniforms(
 _TILES = args("in uint2 windows", "uint big_capacity", "in Bounds big_bounds", _IMAGE_SIZE)
 _RESERVED = args(
     *("uint count", "in uint keys", _TILES),
-    "out uint splat_slots  // (n) first gradient buffer offset of each splat, which has one per tile",
+    "out uint gradient_offsets  // (n) first gradient buffer offset of each splat, which has one per tile",
     "out uint reserved  // number of offsets",
 )
 
 _BLENDED = args(
     "wide log_cut ceiling stop filter",
     *("float log_ceiling", "float background_r background_g background_b"),
-    *("int stride  // of the padded image", "uint channel_stride", "in float by_rgb  // (h, w, 3)"),
+    *("int stride  // of the padded image", "uint channel_stride", "in float grad_rgb  // (h, w, 3)"),
 )
 
 _BLEND = args(
@@ -121,7 +121,7 @@ _LOSS_SIZE = args(
 )
 _MASK = args("int masked", "in uchar mask  // (rows, pixels), where `masked`")
 _ALIGNED = args(
-    *("int width height channels", "uint least  // the lowest bin of textured pixels"),
+    *("int width height channels", "uint min_bin  // the lowest bin of textured pixels"),
     *(_EXPOSURE, "in uchar bins", "in float image rgb"),
 )
 _IMAGES = args("out float images")
@@ -129,7 +129,7 @@ _SURFACE = args(
     _IMAGE_SIZE,
     "float inverse_x inverse_y middle_x middle_y  // 1 / focal lengths, and the principal point [px]",
 )
-_RENDERED_SH = args("uint count rendered all", "int plain")
+_RENDERED_SH = args("uint count rendered_terms stored_terms", "int as_rgb")
 
 _ROTATION = "float " + " ".join(f"rotation_{row}{column}" for row in range(3) for column in range(3))
 
@@ -154,7 +154,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("uint count", "in uint block_offsets", "in Splat splats", "in uint keys", "in uint2 windows"),
         *("out Splat splats_out", "out uint keys_out", "out uint2 windows_out"),
     ),
-    "scan_chunks": args("uint bins", "out uint table totals"),
+    "scan_blocks": args("uint bins", "out uint table totals"),
     "scan_bins": args("uint bins", "in uint totals", "out uint starts counters", "uint counter"),
     "sort_count": args("in uint keys", _DIGIT, "out uint table"),
     "sort_scatter": args(
@@ -201,7 +201,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("float background_r background_g background_b", "in float raw"),
     ),
     # derivatives
-    "reserve_slots": args(
+    "reserve_gradients": args(
         *(_RESERVED, "out uint big_rows  // (rows of tiles, big splats): tiles above, less the first column")
     ),
     "blend_backward": args(
@@ -211,33 +211,33 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
             "in uint2 windows",
             "uint big_capacity",
             _IMAGE_SIZE,
-            "in uint splat_slots big_rows",
+            "in uint gradient_offsets big_rows",
         ),
         _BLENDED,
         "out float checkpoints  // transmittance of each tile in front of every CHUNK splats",
-        "out float moments  // records Moments by gradient buffer offset",
-        "out real tile_sums  // (tiles, 3) by the background",
+        "out float record_gradients  // records RecordGradient by gradient buffer offset",
+        "out real background_sums  // (tiles, 3) by the background",
         "out float tapes  // a Tape for each work-item",
         "out uint reserved  // second word: number of claimed tiles",
     ),
     "project_backward": args(
         *("uint count", "in View view", "cloud float means quats scales opacities"),
-        *("in Splat splats", "in uint keys", _TILES, "in uint splat_slots", "in float moments"),
-        "out float by_means  // (n, 3)",
-        "out float by_quats  // (n, 4)",
-        "out float by_scales  // (n, 2)",
-        "out float by_opacities  // (n)",
+        *("in Splat splats", "in uint keys", _TILES, "in uint gradient_offsets", "in float record_gradients"),
+        "out float grad_means  // (n, 3)",
+        "out float grad_quats  // (n, 4)",
+        "out float grad_scales  // (n, 2)",
+        "out float grad_opacities  // (n)",
         "out float screen  // (n)",
-        "out real group_sums  // (work-groups, 10) by the camera",
+        "out real camera_sums  // (work-groups, 10) by the camera",
     ),
     "project_step": args(
         *("uint count", "in View view", "in Splat splats", "in uint keys", _TILES),
-        *("in uint splat_slots", "in float moments"),
-        "int counted move sparse  // sparse: update only splats that contribute",
-        "uint all  // SH coefficients of a splat",
-        "float beta1 beta2 rest1 rest2 root epsilon",
-        "float size_means size_scales size_quats size_logits  // step sizes",
-        "float size_sh size_rest  // of degree 0 and above",
+        *("in uint gradient_offsets", "in float record_gradients"),
+        "int add_statistics update sparse  // sparse: update only splats that contribute",
+        "uint stored_terms  // SH coefficients of a splat",
+        "float beta1 beta2 one_minus_beta1 one_minus_beta2 sqrt_correction2 epsilon",
+        "float lr_means lr_scales lr_quats lr_logits  // learning rates",
+        "float lr_sh lr_rest  // of degree 0 and above",
         "float scale_penalty opacity_penalty",
         "out float gradient_sums",
         "out float means first_means second_means",
@@ -247,19 +247,19 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float sh first_sh second_sh",
         "out float activated_quats activated_scales activated_opacities activated_sh",
     ),
-    "add_up": args(
-        *("uint tiles groups", "in real tile_sums group_sums  // (tiles, 3), (groups, 10)"),
+    "sum_gradients": args(
+        *("uint tiles groups", "in real background_sums camera_sums  // (tiles, 3), (groups, 10)"),
         "out float background pose intrinsics",
     ),
     # direct image alignment
-    "align_shrink": args(
+    "align_downsample": args(
         *("int width height channels full_width full_height", "float ratio_x ratio_y"),
-        *("in float image", "out float made"),
+        *("in float image", "out float result"),
     ),
     "align_blur": args(
         "int width height channels vertical radius",
         "in float taps  // (radius + 1)",
-        *("in float image", "out float made"),
+        *("in float image", "out float result"),
     ),
     "align_texture": args(
         *("int width height channels row", _MASK, "in float image", "out uchar bins"),
@@ -269,18 +269,18 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "align_sums": args(
         _ALIGNED,
         "in uint counts",
-        "int side huber moves axis lens  // moves: whether there is a moved render",
+        "int block_size huber has_moved axis lens  // has_moved: whether there is a moved render",
         "float focal_x focal_y center_x center_y noise_factor noise_before step",
         "in float depth rays moved",
-        "out float made  // (work-groups, SUMS + 1)",
+        "out float result  // (work-groups, SUMS + 1)",
     ),
     # training
-    "loss_take": args(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK, _IMAGES),
+    "loss_load": args(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK, _IMAGES),
     "loss_rows": args(_LOSS_SIZE, _IMAGES),
     "loss_columns": args(_LOSS_SIZE, _IMAGES),
     "loss_rows_backward": args(_LOSS_SIZE, _IMAGES),
     "loss_columns_backward": args(
-        _LOSS_SIZE, "float l1_share ssim_share", _MASK, "in float images", "out float by_rgb"
+        _LOSS_SIZE, "float l1_share ssim_share", _MASK, "in float images", "out float grad_rgb"
     ),
     "loss_sums": args("uint image_stride", "in float images", "out float sums  // (work-groups, 3)"),
     "loss_strips": args(
@@ -289,14 +289,14 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "loss_strips_backward": args(
         *(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK),
-        *("float l1_share ssim_share", "in float images", "out float by_rgb"),
+        *("float l1_share ssim_share", "in float images", "out float grad_rgb"),
     ),
     "apply_exposure": args("uint count  // pixels", _EXPOSURE, "in float rgb", "out float exposed"),
     "exposure_backward": args(
         "uint count",
         _EXPOSURE,
         "in float rgb",
-        "out float by_rgb",
+        "out float grad_rgb",
         "out float exposure_sums  // (work-groups, 6)",
     ),
     "surface_normals": args(
@@ -304,10 +304,10 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         _MASK,
         "float normal_share  // of each pixel",
         "in float depth normal alpha",
-        "out float by_normal",
+        "out float grad_normal",
         "out float differences  // (rows, columns, 2, 3)",
     ),
-    "surface_depths": args(_SURFACE, "in float differences", "out float by_depth"),
+    "surface_depths": args(_SURFACE, "in float differences", "out float grad_depth"),
     "activate": args(
         "uint count axes  // number of scales of a splat",
         "in float quats log_scales logits",
@@ -335,21 +335,21 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
 """The arguments of each kernel, before those of effects and outputs."""
 
 GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
-    "reserve_slots": _RESERVED,
+    "reserve_gradients": _RESERVED,
     "blend": args(
         "uint longest_first  // blend the tiles in the order of tile_order", "in uint tile_order", _BLEND
     ),
     "blend_checkpoints": args(
         *("in Splat splats", "in uint lists starts", _IMAGE_SIZE, _BLENDED),
         "out float checkpoints  // per pixel and CHUNK splats: transmittance in front, light behind",
-        "out uint reached  // (tiles) number of chunks before the transmittance stop",
+        "out uint reached_chunks  // (tiles) number of chunks before the transmittance stop",
         "out uint chunk_tiles  // tile of each chunk",
-        "out real tile_sums  // (tiles, 3) by the background",
+        "out real background_sums  // (tiles, 3) by the background",
     ),
     "blend_backward": args(
-        *("in Splat splats", "in uint lists starts", _TILES, "in uint splat_slots", _BLENDED),
-        *("in float checkpoints", "in uint reached chunk_tiles"),
-        "out float moments  // records Moments by gradient buffer offset",
+        *("in Splat splats", "in uint lists starts", _TILES, "in uint gradient_offsets", _BLENDED),
+        *("in float checkpoints", "in uint reached_chunks chunk_tiles"),
+        "out float record_gradients  // records RecordGradient by gradient buffer offset",
     ),
 }
 """Kernels with other arguments in the group schedule, where a work-group shares a tile."""

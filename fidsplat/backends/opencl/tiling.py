@@ -176,7 +176,7 @@ def _prefix_sums(
     totals = frame.scratch(f"{stage} totals", 4 * bins * views)
     list_bins = bins * views // lists
     starts = frame.scratch(f"{stage} starts", 4 * (list_bins + 1) * lists)
-    frame.launch(stage, "scan_chunks", (bins,), (64,), views, table=table, bins=bins, totals=totals)
+    frame.launch(stage, "scan_blocks", (bins,), (64,), views, table=table, bins=bins, totals=totals)
     scan = {"bins": list_bins, "totals": totals, "starts": starts, "counter": counter}
     frame.launch(stage, "scan_bins", (items,), (items,), lists, **scan)
     return starts

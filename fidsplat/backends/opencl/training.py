@@ -24,19 +24,20 @@ _MARGIN, _MARGIN_ROWS = 16, 5
 """zero margin around an image: in floats of a row, and in rows"""
 _PANEL, _STRIP = 128, 64
 """values of a row and number of rows per work-item on CPUs (kernels/opencl/train/loss_strips.cl)"""
-_SUMS, _SUMMED = 512, 128
+_SUM_GROUPS, _SUM_ITEMS = 512, 128
 """work-groups of the loss sums, and their work-items (SUM_ITEMS of kernels/opencl/train/loss.cl)"""
 _EXPOSURE_GROUPS = 64
 """work-groups of the sums for the gradient of the exposure"""
-_EACH_ROWS = 4
-"""rows per work-item of the vertical passes (EACH_ROWS of kernels/opencl/train/loss.cl)"""
+_ROWS_PER_ITEM = 4
+"""rows per work-item of the vertical passes (ROWS_PER_ITEM of kernels/opencl/train/loss.cl)"""
 _MOMENTS = ("first_", "second_")
 """name prefixes of Adam's moments"""
 SLOTS = 16
 """maximum number of unread losses"""
 _STEP_NUMBERS = (
-    *("beta1", "beta2", "rest1", "rest2", "root", "epsilon", "scale_penalty", "opacity_penalty"),
-    *(f"size_{name}" for name in ("means", "scales", "quats", "logits", "sh", "rest")),
+    *("beta1", "beta2", "one_minus_beta1", "one_minus_beta2", "sqrt_correction2", "epsilon"),
+    *("scale_penalty", "opacity_penalty"),
+    *(f"lr_{name}" for name in ("means", "scales", "quats", "logits", "sh", "rest")),
 )
 """numeric arguments of a step of Adam (kernels/opencl/project_step.cl)"""
 
@@ -140,7 +141,7 @@ class OpenCLTraining:
         """SH degree of the last rendered cloud, and the cloud"""
         self._targets: list[_Target] = []
         self._loss_images: tuple[tuple[int, int], cl.Buffer] | None = None
-        self._sums: dict[int, LossReadback] = {}
+        self._readbacks: dict[int, LossReadback] = {}
         self._version = object()
         """a new object whenever the buffers of the splats change"""
         self._replayed: dict[str, CommandList] = {}
@@ -167,22 +168,21 @@ class OpenCLTraining:
         Moments are zero from row `remaining` on."""
         self._bound["rows"], self._count = self._upload("rows", rows), len(rows)
         for name, shape in self._shapes.items():
-            made = len(rows), *shape[1:]
-            gathered = self._workspace.pool.allocate(f"the splats' {name}", 4 * math.prod(made))
+            new_shape = len(rows), *shape[1:]
+            gathered = self._workspace.pool.allocate(f"the splats' {name}", 4 * math.prod(new_shape))
             moments = name.startswith(_MOMENTS)
-            given = {"row": math.prod(shape[1:]), "copied": remaining if moments else len(rows)}
-            self._launch(
-                "gather_rows", math.prod(made), given | {"source": self._bound[name], "gathered": gathered}
-            )
-            self._bound[name], self._shapes[name] = gathered, made
+            args = {"row": math.prod(shape[1:]), "copied": remaining if moments else len(rows)}
+            args |= {"source": self._bound[name], "gathered": gathered}
+            self._launch("gather_rows", math.prod(new_shape), args)
+            self._bound[name], self._shapes[name] = gathered, new_shape
         self._splats_changed()
 
     def write(self, arrays: Mapping[str, np.ndarray], first: int) -> None:
         """Overwrite arrays of the state from row `first` to their end."""
         for name, array in arrays.items():
-            above = first * 4 * math.prod(self._shapes[name][1:])
+            array, offset = np.ascontiguousarray(array), first * 4 * math.prod(self._shapes[name][1:])
             if array.nbytes:
-                cl.enqueue_copy(self._queue, self._bound[name], np.ascontiguousarray(array), dst_offset=above)
+                cl.enqueue_copy(self._queue, self._bound[name], array, dst_offset=offset)
 
     def clear(self, names: Sequence[str]) -> None:
         """Fill arrays of the state with zeros."""
@@ -202,17 +202,17 @@ class OpenCLTraining:
 
     def read(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Copy arrays of the state to the host; all by default."""
-        found = {}
+        arrays = {}
         for name in self._shapes if names is None else names:
-            found[name] = np.empty(self._shapes[name], np.float32)
-            cl.enqueue_copy(self._queue, found[name], self._bound[name])
-        return found
+            arrays[name] = np.empty(self._shapes[name], np.float32)
+            cl.enqueue_copy(self._queue, arrays[name], self._bound[name])
+        return arrays
 
     def resident(self, degree: int, origin: np.ndarray) -> ResidentArrays:
         """The splats in training as a cloud, with SH up to `degree`; it shares and changes with the state."""
         if self._resident is None or self._resident[0] != degree:
-            count, rendered, every = self._count, (degree + 1) ** 2, self._shapes["sh"][1]
-            shared = degree > 0 and rendered == every  # the coefficients are rendered as they are
+            count, rendered, stored = self._count, (degree + 1) ** 2, self._shapes["sh"][1]
+            shared = degree > 0 and rendered == stored  # the coefficients are rendered as they are
             shapes = {"quats": 4, "scales": 2, "opacities": 1} | (
                 {"thickness": 1} if self._bound["axes"] == 3 else {}
             )
@@ -222,7 +222,7 @@ class OpenCLTraining:
                 self._bound[f"activated_{name}"] = self._workspace.pool.allocate(f"the splats' {name}", size)
             if "thickness" not in shapes:  # not used
                 self._bound["activated_thickness"] = self._bound["activated_scales"]
-            self._bound |= {"rendered": rendered, "all": every, "plain": int(degree == 0)}
+            self._bound |= {"rendered_terms": rendered, "stored_terms": stored, "as_rgb": int(degree == 0)}
             self._launch("activate", count)
             if shared:
                 self._bound["activated_sh"] = self._bound["sh"]
@@ -245,72 +245,74 @@ class OpenCLTraining:
         gradient of the loss (h, w, 3), a device array that is valid until the next call.
         """
         rgb, (height, columns, _) = images.device_buffer("rgb")
-        rendered, shown = rgb, _exposure_arguments(exposure)
-        if shown:
+        rendered, exposure_arguments = rgb, _exposure_arguments(exposure)
+        if exposure_arguments:
             rgb = self._scratch("exposed", 12 * height * columns)
-            given = shown | {"count": height * columns, "rgb": rendered, "exposed": rgb}
-            self._launch("apply_exposure", height * columns, given)
-        target, size, strided = self._targets[view], 3 * height * columns, self._lanes > 1
-        number, stride = target.values, self._stride(columns)
-        grid = (-(-3 * columns // _PANEL), -(-height // _STRIP)) if strided else (_SUMS,)
-        if (groups := math.prod(grid)) not in self._sums:
-            self._sums[groups] = LossReadback(self._workspace, groups)
-        sums = self._sums[groups]
-        slot, buffer = sums.next_slot()
-        gradient = self._array("by_rgb", (height, columns, 3))
-        given = {
+            args = exposure_arguments | {"count": height * columns, "rgb": rendered, "exposed": rgb}
+            self._launch("apply_exposure", height * columns, args)
+        target, size, in_strips = self._targets[view], 3 * height * columns, self._lanes > 1
+        value_count, stride = target.values, self._stride(columns)
+        grid = (-(-3 * columns // _PANEL), -(-height // _STRIP)) if in_strips else (_SUM_GROUPS,)
+        if (groups := math.prod(grid)) not in self._readbacks:
+            self._readbacks[groups] = LossReadback(self._workspace, groups)
+        readback = self._readbacks[groups]
+        slot, buffer = readback.next_slot()
+        gradient = self._array("grad_rgb", (height, columns, 3))
+        args = {
             **{"rgb": rgb, "target": target.image, "mask": target.mask, "masked": int(target.masked)},
-            **{"l1_share": (1 - dssim_weight) / number, "sums": buffer, "by_rgb": gradient.data},
+            **{"l1_share": (1 - dssim_weight) / value_count, "sums": buffer, "grad_rgb": gradient.data},
         }
 
-        def launches() -> list[Launch]:
-            every = given | {
+        def loss_launches() -> list[Launch]:
+            values = args | {
                 "ssim_share": dssim_weight / size,
                 **{"width": 3 * columns, "height": height, "stride": stride},
                 **{"images": self._allocate_images(height, columns)},
                 "image_stride": stride * (height + 2 * _MARGIN_ROWS),
             }
-            if strided:
+            if in_strips:
                 kernels = "loss_strips", "loss_strips_backward"
-                return [self._one(kernel, grid, (1, 1), every) for kernel in kernels]
-            made = [self._items("loss_take", 3 * columns, every, height)]
+                return [self._launch_of(kernel, grid, (1, 1), values) for kernel in kernels]
+            launches = [self._row_launch("loss_load", 3 * columns, values, height)]
             for kernel in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
-                each = _EACH_ROWS if "columns" in kernel else 1
-                made.append(self._items(kernel, 3 * columns, every, -(-height // each)))
-            return [*made, self._one("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), every)]
+                rows = -(-height // _ROWS_PER_ITEM) if "columns" in kernel else height
+                launches.append(self._row_launch(kernel, 3 * columns, values, rows))
+            items = (_SUM_GROUPS * _SUM_ITEMS,)
+            return [*launches, self._launch_of("loss_sums", items, (_SUM_ITEMS,), values)]
 
-        events = self._replay("loss", (height, columns, dssim_weight), given, launches)
-        sums.submitted(slot, events[0 if strided else -1])
+        events = self._replay("loss", (height, columns, dssim_weight), args, loss_launches)
+        readback.submitted(slot, events[0 if in_strips else -1])
 
-        by_exposure: Callable[[], np.ndarray] | None = None
-        if shown:
-            given = shown | {"count": height * columns, "rgb": rendered, "by_rgb": gradient.data}
-            by_exposure = self._exposure_readback(given)
+        exposure_gradient: Callable[[], np.ndarray] | None = None
+        if exposure_arguments:
+            args = exposure_arguments | {"rgb": rendered, "grad_rgb": gradient.data}
+            args["count"] = height * columns
+            exposure_gradient = self._exposure_readback(args)
 
         def value() -> tuple[Any, ...]:
             self._queue.flush()
             with self._workspace.failing("training"):
-                absolute, squared, ssim = sums.read(slot)
-                more = () if by_exposure is None else (by_exposure(),)
-            loss = (1 - dssim_weight) * absolute / number + dssim_weight * (1 - ssim / size)
-            return float(loss), float(squared / number), *more
+                absolute, squared, ssim = readback.read(slot)
+                more = () if exposure_gradient is None else (exposure_gradient(),)
+            loss = (1 - dssim_weight) * absolute / value_count + dssim_weight * (1 - ssim / size)
+            return float(loss), float(squared / value_count), *more
 
         return value, gradient
 
-    def _exposure_readback(self, given: Mapping[str, Any]) -> Callable[[], np.ndarray]:
+    def _exposure_readback(self, args: Mapping[str, Any]) -> Callable[[], np.ndarray]:
         """Continue the gradient through the exposure; returns a function that waits for the exposure's
         gradient."""
         groups = _EXPOSURE_GROUPS
-        sums, found = self._scratch("exposure sums", 24 * groups), np.empty((groups, 6), np.float32)
-        launch = self._one(
-            "exposure_backward", (groups * _GROUP,), (_GROUP,), {**given, "exposure_sums": sums}
+        sums, group_sums = self._scratch("exposure sums", 24 * groups), np.empty((groups, 6), np.float32)
+        launch = self._launch_of(
+            "exposure_backward", (groups * _GROUP,), (_GROUP,), {**args, "exposure_sums": sums}
         )
         self._enqueue(launch)
-        copied = cl.enqueue_copy(self._queue, found, sums, is_blocking=False)
+        copied = cl.enqueue_copy(self._queue, group_sums, sums, is_blocking=False)
 
         def read() -> np.ndarray:
             copied.wait()
-            return found.sum(axis=0, dtype=np.float64).reshape(2, 3)
+            return group_sums.sum(axis=0, dtype=np.float64).reshape(2, 3)
 
         return read
 
@@ -320,99 +322,101 @@ class OpenCLTraining:
         depth, target = images.device_array("depth"), self._targets[view]
         height, width = depth.shape
         shapes = {"depth": (height, width), "normal": (height, width, 3)}
-        found = {name: self._array(f"by {name}", shape) for name, shape in shapes.items()}
-        given = {
+        results = {name: self._array(f"grad {name}", shape) for name, shape in shapes.items()}
+        args = {
             **{"width": width, "height": height, "mask": target.mask, "masked": int(target.masked)},
             **{"inverse_x": 1 / camera.fx, "inverse_y": 1 / camera.fy},
             **{"middle_x": camera.cx, "middle_y": camera.cy},
             **{name: images.device_array(name).data for name in ("depth", "normal", "alpha")},
-            **{f"by_{name}": array.data for name, array in found.items()},
+            **{f"grad_{name}": array.data for name, array in results.items()},
             "normal_share": weight / (width * height),
             "differences": self._scratch("differences", 24 * width * height),
         }
         for kernel in ("surface_normals", "surface_depths"):
-            self._enqueue(self._items(kernel, width, given, height))
-        return found
+            self._enqueue(self._row_launch(kernel, width, args, height))
+        return results
 
-    def accumulate_statistics(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
-        """Add a frame's screen gradients to the statistics. taken: result of `backward_to_tiles`."""
-        self._step(taken, dict.fromkeys(_STEP_NUMBERS, 0.0) | {"move": 0, "sparse": 0}, camera, origin)
+    def accumulate_statistics(self, gradients: Any, camera: Camera, origin: np.ndarray) -> None:
+        """Add a frame's screen gradients to the statistics. gradients: result of `backward_per_tile`."""
+        self._step(gradients, dict.fromkeys(_STEP_NUMBERS, 0.0) | {"update": 0, "sparse": 0}, camera, origin)
 
     def step(
         self,
-        taken: Any,
+        gradients: Any,
         sizes: Mapping[str, float],
         numbers: Mapping[str, float],
         camera: Camera | None,
         origin: np.ndarray,
-        by_camera: bool = False,
+        with_camera: bool = False,
     ) -> Callable[[], np.ndarray] | None:
         """Apply a step of Adam.
 
         Args:
-            taken: the result of `GradientPipeline.backward_to_tiles`.
+            gradients: the result of `GradientPipeline.backward_per_tile`.
             sizes: learning rates of `means`, `scales`, `quats`, `logits`, `sh` (degree 0) and `rest` (higher
                 degrees).
-            numbers: `beta1`, `beta2`, `epsilon`, `root` (square root of 1 - beta2^step); `scale_penalty` and
-                `opacity_penalty`, added to the gradients; `sparse`: 1 to update only splats that contribute
-                to the frame.
+            numbers: `beta1`, `beta2`, `epsilon`, `sqrt_correction2` (square root of 1 - beta2^step);
+                `scale_penalty` and `opacity_penalty`, added to the gradients; `sparse`: 1 to update only
+                splats that contribute to the frame.
             camera: if given, statistics are accumulated first.
-            by_camera: whether to return a function that waits for the gradient (10,) of pose and intrinsics.
+            with_camera: whether to return a function that waits for the gradient (10,) with respect to pose
+                and intrinsics.
         """
-        given = {f"size_{name}": size for name, size in sizes.items()} | dict(numbers)
-        given |= {"rest1": 1 - numbers["beta1"], "rest2": 1 - numbers["beta2"]}
+        args = {f"lr_{name}": size for name, size in sizes.items()} | dict(numbers)
+        args |= {"one_minus_beta1": 1 - numbers["beta1"], "one_minus_beta2": 1 - numbers["beta2"]}
         return self._step(
-            taken, given | {"move": 1, "sparse": int(numbers["sparse"])}, camera, origin, by_camera
+            gradients, args | {"update": 1, "sparse": int(numbers["sparse"])}, camera, origin, with_camera
         )
 
     def _step(
         self,
-        taken: Any,
-        given: Mapping[str, Any],
+        gradients: Any,
+        args: Mapping[str, Any],
         camera: Camera | None,
         origin: np.ndarray,
-        by_camera: bool = False,
+        with_camera: bool = False,
     ) -> Callable[[], np.ndarray] | None:
         # compiling takes seconds: it is first, so that an interrupt leaves the statistics unchanged
-        taken.pipeline.compile_step(by_camera)
+        gradients.pipeline.compile_step(with_camera)
         if camera is not None:
             self._count_visible(camera, origin)
-        return taken.step({**self._bound, **given, "counted": int(camera is not None)}, by_camera)
+        return gradients.step({**self._bound, **args, "add_statistics": int(camera is not None)}, with_camera)
 
     def _count_visible(self, camera: Camera, origin: np.ndarray) -> None:
         if (cached := self._cameras.get(camera)) is None or cached[0] is not origin:
             cached = self._cameras[camera] = origin, _camera_arguments(camera, origin)
-        given = cached[1]
-        self._replay("count", (), given, lambda: [self._items("count_visible", self._count, given)])
+        args = cached[1]
+        self._replay("count", (), args, lambda: [self._row_launch("count_visible", self._count, args)])
 
     def add_noise(self, size: float, slope: float, threshold: float, words: Sequence[int]) -> None:
         """Add MCMC noise to the means: random steps in the plane of each disk with `size` times its variance,
         reduced by a sigmoid of this `slope` for opacities above `threshold`. words: seed (low, high),
         iteration, purpose."""
         names = ("seed_low", "seed_high", "iteration", "purpose")
-        given = {"size": size, "slope": slope, "threshold": threshold, **dict(zip(names, words, strict=True))}
-        self._launch("add_position_noise", self._count, given)
+        args = {"size": size, "slope": slope, "threshold": threshold, **dict(zip(names, words, strict=True))}
+        self._launch("add_position_noise", self._count, args)
 
     @property
     def _queue(self) -> cl.CommandQueue:
         """The queue of differentiable frames, ordered after all work on other queues."""
         return self._workspace.switch_to(self._workspace.queue)
 
-    def _launch(self, kernel: str, items: int, given: Mapping[str, Any] | None = None) -> None:
-        self._enqueue(self._items(kernel, items, given or {}))
+    def _launch(self, kernel: str, items: int, args: Mapping[str, Any] | None = None) -> None:
+        self._enqueue(self._row_launch(kernel, items, args or {}))
 
-    def _items(self, kernel: str, items: int, given: Mapping[str, Any], rows: int = 0) -> Launch:
-        """A launch with at least `items` work-items, or that many for each of some rows."""
+    def _row_launch(self, kernel: str, items: int, args: Mapping[str, Any], rows: int = 0) -> Launch:
+        """A launch with at least `items` work-items, for each of `rows` rows if given."""
         width = max(_GROUP, -(-items // _GROUP) * _GROUP)
-        return self._one(
-            kernel, (width, rows) if rows else (width,), (_GROUP, 1) if rows else (_GROUP,), given
+        return self._launch_of(
+            kernel, (width, rows) if rows else (width,), (_GROUP, 1) if rows else (_GROUP,), args
         )
 
-    def _one(
-        self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: Mapping[str, Any]
+    def _launch_of(
+        self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], args: Mapping[str, Any]
     ) -> Launch:
-        every = {**self._bound, "count": self._count, **given}
-        return kernel, size, group, [every[one.name] for one in self._program.source.arguments[kernel]]
+        values = {**self._bound, "count": self._count, **args}
+        names = (argument.name for argument in self._program.source.arguments[kernel])
+        return kernel, size, group, [values[name] for name in names]
 
     def _enqueue(self, launch: Launch) -> None:
         with self._workspace.failing("training"):
@@ -420,9 +424,9 @@ class OpenCLTraining:
             self._commands.launch(self._queue, *launch)
 
     def _replay(
-        self, name: str, key: tuple[Any, ...], given: Mapping[str, Any], launches: Callable[[], list[Launch]]
+        self, name: str, key: tuple[Any, ...], args: Mapping[str, Any], launches: Callable[[], list[Launch]]
     ) -> list[cl.Event]:
-        """Replay a command list of a training step with the arguments `given`. launches: returns the
+        """Replay a command list of a training step with the arguments `args`. launches: returns the
         launches; called to record again if the key, the splats or the buffers have changed."""
         commands = self._replayed.setdefault(name, CommandList(self._program))
         key = (*key, self._version, self._workspace.pool.state)
@@ -432,7 +436,7 @@ class OpenCLTraining:
                 for launch in launches():
                     commands.record(*launch)
                 commands.key = key
-            commands.set(given)
+            commands.set(args)
             return commands.submit(self._queue)
 
     def _upload(self, what: str, array: np.ndarray) -> cl.Buffer:
@@ -476,8 +480,8 @@ def _exposure_arguments(exposure: np.ndarray | None) -> dict[str, float]:
 def _camera_arguments(camera: Camera, origin: np.ndarray) -> dict[str, float]:
     rotation = camera.world_to_camera[:3, :3]
     names = [f"rotation_{i}{j}" for i in range(3) for j in range(3)]
-    given = dict(zip(names, rotation.ravel().tolist(), strict=True))
+    args = dict(zip(names, rotation.ravel().tolist(), strict=True))
     translation = rotation @ (origin - camera.position)
-    given |= dict(zip(("translation_x", "translation_y", "translation_z"), translation.tolist(), strict=True))
-    given |= {"focal_x": camera.fx, "focal_y": camera.fy, "center_x": camera.cx, "center_y": camera.cy}
-    return given | {"near": camera.near, "width": camera.width, "height": camera.height}
+    args |= dict(zip(("translation_x", "translation_y", "translation_z"), translation.tolist(), strict=True))
+    args |= {"focal_x": camera.fx, "focal_y": camera.fy, "center_x": camera.cx, "center_y": camera.cy}
+    return args | {"near": camera.near, "width": camera.width, "height": camera.height}

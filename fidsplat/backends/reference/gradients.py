@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.gradients import NOT_THE_LAST, check_shape, gradient_shape
+from fidsplat.backends.gradients import NOT_LATEST_FRAME, check_shape, gradient_shape
 from fidsplat.backends.interface import GradientPipeline, Images, Pipeline
 from fidsplat.backends.reference.gradients_blend import Blend, Decisions, Samples, decide
 from fidsplat.backends.reference.gradients_scene import Parameters, Placed, place, place_backward
@@ -33,7 +33,7 @@ class ReferenceGradients(GradientPipeline):
     def backward(self, images: Any, gradients: Mapping[str, Any]) -> dict[str, np.ndarray]:
         check_gradients(self._features, gradients)
         if self._last is None or self._last[0] is not images:
-            raise InputError(NOT_THE_LAST)
+            raise InputError(NOT_LATEST_FRAME)
         frame = self._last[1]
         return frame.backward({name: np.asarray(array, np.float64) for name, array in gradients.items()})
 

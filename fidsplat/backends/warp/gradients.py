@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.gradients import NOT_THE_LAST, DifferentiableImages, check_shape, gradient_shape
+from fidsplat.backends.gradients import NOT_LATEST_FRAME, DifferentiableImages, check_shape, gradient_shape
 from fidsplat.backends.interface import GradientPipeline
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.command_list import Launcher
@@ -57,8 +57,8 @@ class WarpGradients(GradientPipeline):
     def backward(self, images: WarpDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
         frame = images.frame
         check_gradients(frame.program.features, gradients)
-        if not images.last:
-            raise InputError(NOT_THE_LAST)
+        if not images.is_latest:
+            raise InputError(NOT_LATEST_FRAME)
         with frame.workspace.working("in the backward pass"):
             return _Backward(frame, self._kernels, gradients).results()
 

@@ -63,11 +63,11 @@ static inline bool ptx_shares(uint value) {
 #define SHARES(value) ptx_shares(value)
 
 static inline uint ptx_increment(global uint *counters, uint index) {
-    uint active, same = ptx_same(index, &active), before, place = 0;
+    uint active, same = ptx_same(index, &active), before, position = 0;
     asm("mov.u32 %0, %%lanemask_lt;" : "=r"(before));
     before &= same;
-    if (before == 0) place = atomic_add(counters + index, popcount(same));
-    asm volatile("shfl.sync.idx.b32 %0, %0, %1, 31, %2;" : "+r"(place) : "r"(31 - clz(same & -same)), "r"(same));
-    return place + popcount(before);
+    if (before == 0) position = atomic_add(counters + index, popcount(same));
+    asm volatile("shfl.sync.idx.b32 %0, %0, %1, 31, %2;" : "+r"(position) : "r"(31 - clz(same & -same)), "r"(same));
+    return position + popcount(before);
 }
 #define INCREMENT(counters, index, shared) ((shared) ? ptx_increment(counters, index) : atomic_inc((counters) + (index)))

@@ -2,7 +2,7 @@
 // not depend on the order of the additions.
 //@ list
     int tiles_x = (width + TILE_W - 1) / TILE_W;
-    counters += number * (uint)(tiles_x * ((height + TILE_H - 1) / TILE_H));
+    counters += view_index * (uint)(tiles_x * ((height + TILE_H - 1) / TILE_H));
     bool shared = window != 0 && SHARES(window_tile((uint2)(corner, window), tiles_x));
     for (uint mask = window; mask != 0; mask &= mask - 1)
         INCREMENT(counters + COUNTERS, window_tile((uint2)(corner, mask), tiles_x), shared);

@@ -5,9 +5,9 @@
         vfloat depth_sum = BLOCK_LOAD(depth_raw + at, stride), weight_sum = BLOCK_LOAD(depth_raw + channel_stride + at, stride);
         vint has_depth = VMASK(weight_sum > 0.0f);
         weight_sum = VSELECT((vfloat)1.0f, weight_sum, has_depth);
-        gradient->depth = VSELECT((vfloat)0.0f, pixels_of(by_depth, 1, 0, x, y, width, height) / weight_sum, has_depth);
+        gradient->depth = VSELECT((vfloat)0.0f, pixels_of(grad_depth, 1, 0, x, y, width, height) / weight_sum, has_depth);
         gradient->depth_weight = -gradient->depth * (depth_sum / weight_sum);
-//@ by_weight
-    by_weight += FMA(gradient->depth, g->z, gradient->depth_weight);
+//@ grad_weight
+    grad_weight += FMA(gradient->depth, g->z, gradient->depth_weight);
 //@ fragment_backward
-    by_d += add_depth(sums, s, g, weight * gradient->depth, screen, x, y, &by_nu, &by_nv);
+    grad_d += add_depth(sums, s, g, weight * gradient->depth, screen, x, y, &grad_nu, &grad_nv);

@@ -8,28 +8,28 @@
         vint has_normal = VMASK(normal_length > 0.0f);
         vfloat normal_scale = VSELECT((vfloat)0.0f, 1.0f / normal_length, has_normal);
         nx *= normal_scale; ny *= normal_scale; nz *= normal_scale;
-        vfloat by_nx = pixels_of(by_normal, 3, 0, x, y, width, height), by_ny = pixels_of(by_normal, 3, 1, x, y, width, height);
-        vfloat by_nz = pixels_of(by_normal, 3, 2, x, y, width, height), along = by_nx * nx + by_ny * ny + by_nz * nz;
-        gradient->normal_x = (by_nx - along * nx) * normal_scale;
-        gradient->normal_y = (by_ny - along * ny) * normal_scale;
-        gradient->normal_z = (by_nz - along * nz) * normal_scale;
-//@ by_weight
-    by_weight = FMA(gradient->normal_x, (vfloat)s->nx, by_weight);
-    by_weight = FMA(gradient->normal_y, (vfloat)s->ny, by_weight);
-    by_weight = FMA(gradient->normal_z, (vfloat)s->nz, by_weight);
+        vfloat grad_nx = pixels_of(grad_normal, 3, 0, x, y, width, height), grad_ny = pixels_of(grad_normal, 3, 1, x, y, width, height);
+        vfloat grad_nz = pixels_of(grad_normal, 3, 2, x, y, width, height), along = grad_nx * nx + grad_ny * ny + grad_nz * nz;
+        gradient->normal_x = (grad_nx - along * nx) * normal_scale;
+        gradient->normal_y = (grad_ny - along * ny) * normal_scale;
+        gradient->normal_z = (grad_nz - along * nz) * normal_scale;
+//@ grad_weight
+    grad_weight = FMA(gradient->normal_x, (vfloat)s->nx, grad_weight);
+    grad_weight = FMA(gradient->normal_y, (vfloat)s->ny, grad_weight);
+    grad_weight = FMA(gradient->normal_z, (vfloat)s->nz, grad_weight);
 //@ sums
     vfloat nx, ny, nz;
 //@ fragment_backward
     sums->nx = FMA(weight, gradient->normal_x, sums->nx);
     sums->ny = FMA(weight, gradient->normal_y, sums->ny);
     sums->nz = FMA(weight, gradient->normal_z, sums->nz);
-//@ moments
-    MOMENT(nx, sums->nx);
-    MOMENT(ny, sums->ny);
-    MOMENT(nz, sums->nz);
-//@ facet_backward
+//@ record_gradients
+    STORE_SUM(nx, sums->nx);
+    STORE_SUM(ny, sums->ny);
+    STORE_SUM(nz, sums->nz);
+//@ unit_normal_backward
         real towards = offset > 0 ? -1 : 1;
-        real3_ by_facet = {towards * total.nx, towards * total.ny, towards * total.nz};
+        real3_ grad_unit_normal = {towards * total.nx, towards * total.ny, towards * total.nz};
 //@@ ellipsoid_normal_backward
-        by_unit_a = add3(by_unit_a, cross3(unit_b, by_facet));
-        by_unit_b = add3(by_unit_b, cross3(by_facet, unit_a));
+        grad_unit_a = add3(grad_unit_a, cross3(unit_b, grad_unit_normal));
+        grad_unit_b = add3(grad_unit_b, cross3(grad_unit_normal, unit_a));

@@ -21,7 +21,7 @@ static inline vfloat opacity_rounding(const Splat *s, vfloat h) {
     return UNIT * (16.0f + 2.0f * fabs((vfloat)s->log_opacity) + 32.0f * fmin(h, (vfloat)100.0f));
 }
 
-static inline void add_rounding(Pixel *pixel, const Splat *s, Crossing c, vfloat x, vfloat y, vint mask, vfloat screen,
+static inline void add_rounding(Pixel *pixel, const Splat *s, Intersection c, vfloat x, vfloat y, vint mask, vfloat screen,
                                 const BlendConstants *constants) {
     vfloat across = fabs(x), down = fabs(y);
     vfloat off = FORM_ROUNDING * (FORM_TERMS(s->nu0, s->nux, s->nuy) + FORM_TERMS(s->nv0, s->nvx, s->nvy));

@@ -1,11 +1,11 @@
 // Colours and transmittance of a pixel in the type of fragments.
-//@ light_state
+//@ color_state
     vfloat r, g, b;
-//@ light_start
+//@ color_start
     pixel->r = 0.0f;
     pixel->g = 0.0f;
     pixel->b = 0.0f;
-//@ light_composite
+//@ color_composite
 #if LANES == 1
     vfloat weight = pixel->t * VSELECT((vfloat)0.0f, opacity, live);
 #else
@@ -14,13 +14,13 @@
     pixel->r = FMA(weight, attributes->r, pixel->r);
     pixel->g = FMA(weight, attributes->g, pixel->g);
     pixel->b = FMA(weight, attributes->b, pixel->b);
-//@ light_transmit
+//@ color_transmit
 #if LANES == 1
     pixel->t = pixel->t - weight;
 #else       // sequential in the order of fragments; `live` is computed in parallel
     pixel->t = VSELECT(pixel->t, pixel->t - full_weight, live);
 #endif
-//@ light_functions
+//@ color_functions
 // Stores LANES pixels at index `at` of each channel of `raw`; a channel has `channel_stride` samples.
 #define PIXEL_STORE_BASE(pixel, raw, channel_stride, at) \
     BLOCK_STORE((pixel)->r, raw + (at), stride); \

@@ -7,7 +7,7 @@
 // shared edge differ by a factor only, so their ramps add up to 1, and the coverages of a partition of a rectangle into boxes
 // with parallel sides add up to that of the rectangle: at corners and T-junctions, under perspective, through lenses and below
 // the size of a sample. Coverage is the exact area where edges are parallel to the rows of samples.
-//@ footprint_crossing
+//@ footprint_intersection
     vfloat cover;           // covered share of the sample
 //@ footprint_functions
 #define SQRT_2 WIDE(1.41421356237309504880)   // the numerators have the factor sqrt(1/2)

@@ -5,7 +5,7 @@ static inline vfloat slab_coverage(vfloat d, vfloat n, wide edge_0, wide edge_1)
     vfloat below = clamp(FMA(FMA((vfloat)-SQRT_2, n, d), (vfloat)edge_1, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
     return fmax(above + below - 1.0f, (vfloat)0.0f);
 }
-//@ footprint_cross
+//@ footprint_intersect
     if (IS_BOX(s)) {
         c.cover = slab_coverage(c.d, nu, s->edge_u0, s->edge_u1) * slab_coverage(c.d, nv, s->edge_v0, s->edge_v1);
         c.inside = VMASK(c.cover > 0.0f) & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);

@@ -46,7 +46,7 @@ typedef struct {
 } Layer;
 
 typedef struct {
-    Layer open;                 // layer that still accumulates fragments
+    Layer current;                 // layer that still accumulates fragments
     AttributeFields next;       // nearest layer of this pass; its depth is infinite if there is none
     vfloat next_z, next_opacity;
     vint next_group;
@@ -77,10 +77,10 @@ static inline Layer no_layer(void) {
         }
 //@ chunk_of_layers_sorted
         if (pixels[0].layers) {
-            if (splats[lists[places[0]]].group >= 0) until = 0;
+            if (splats[lists[positions[0]]].group >= 0) until = 0;
             else if (!until) until = blocks_until(pixels, &constants, layer_depths);
             if (!until) {
-                for (; splats[lists[places[length - 1]]].group < 0; length--) read--;
+                for (; splats[lists[positions[length - 1]]].group < 0; length--) read--;
                 rest_nearest = INFINITY;        // not deferred
             }
         }
@@ -143,24 +143,24 @@ static inline void layer_add(Layer *layer, const Splat *s, const Attributes *att
 //@@ layer_accumulate
 }
 
-// Completes the open layer: keeps it where it is the nearest one of this pass. It is nearer by slightly more than the rounding of
+// Completes the current layer: keeps it where it is the nearest one of this pass. It is nearer by slightly more than the rounding of
 // depths, so that it is in front of ungrouped splats in the same plane.
 static inline void layer_close(Layers *layers) {
-    if (layers->open.group < 0) return;
-    const AttributeFields own = {layers->open.mean};
+    if (layers->current.group < 0) return;
+    const AttributeFields own = {layers->current.mean};
     const vfloat z = FMA(fabs(own.attributes.z), (vfloat)-0x1p-16f, own.attributes.z);
-    vint nearest = VMASK(layers->open.optical_depth > 0.0f) & VMASK(z < layers->next_z);
-    nearest &= VMASK(z > layers->from) | (VMASK(z == layers->from) & VMASK(layers->open.group > layers->from_group));
+    vint nearest = VMASK(layers->current.optical_depth > 0.0f) & VMASK(z < layers->next_z);
+    nearest &= VMASK(z > layers->from) | (VMASK(z == layers->from) & VMASK(layers->current.group > layers->from_group));
     layers->next_z = VSELECT(layers->next_z, z, nearest);
-    layers->next_opacity = VSELECT(layers->next_opacity, layers->open.opacity, nearest);
-    layers->next_group = VSELECT(layers->next_group, (vint)layers->open.group, nearest);
+    layers->next_opacity = VSELECT(layers->next_opacity, layers->current.opacity, nearest);
+    layers->next_group = VSELECT(layers->next_group, (vint)layers->current.group, nearest);
 #if LANES == 1
     if (nearest) layers->next = own;
 #else
     for (uint field = 0; field < sizeof(Attributes) / sizeof(vfloat); field++)
         layers->next.fields[field] = VSELECT(layers->next.fields[field], own.fields[field], nearest);
 #endif
-    layers->open = no_layer();
+    layers->current = no_layer();
 }
 
 // Completes the layers: the depth behind which no fragment belongs to this pass.
@@ -182,12 +182,12 @@ static inline const float *blocks_until(Pixel *pixels, const BlendConstants *con
 //@ layers
     if (pixel->layers) {
         Layers *layers = pixel->layers;
-        if (s->group != layers->open.group) {
+        if (s->group != layers->current.group) {
             layer_close(layers);
-            layers->open.group = s->group;
+            layers->current.group = s->group;
         }
         if (s->group >= 0) {
-            layer_add(&layers->open, s, &attributes, opacity, mask);
+            layer_add(&layers->current, s, &attributes, opacity, mask);
             return;
         }
         mask &= VMASK(attributes.z >= layers->from) & VMASK(attributes.z < layers->next_z);

@@ -54,7 +54,7 @@ static inline bool precedes(global const Splat *splats, uint splat, uint other) 
 static inline void k_buffer_composite(Pixel *pixel, wide z, wide opacity, uint splat, global const Splat *splats,
                                      const BlendConstants *constants) {
     const Splat s = splats[splat];
-    const Crossing nowhere = {1.0f};
+    const Intersection nowhere = {1.0f};
     Attributes attributes = fragment_attributes(&s, nowhere, 1.0f);
     attributes.z = z;
     composite(pixel, &attributes, opacity, VMASK(true), constants);
@@ -142,13 +142,13 @@ static inline void k_buffer_push(Pixel *pixel, wide nearest, wide z, wide opacit
         k_buffer_enqueue(pixel, first_z, first_opacity, first_splat, splats);
 }
 
-// Inserts a fragment of a splat, none of whose fragments is nearer than `nearest`. place: index that gives its position in the list.
-static inline void k_buffer_insert(Pixel *pixel, wide nearest, wide z, wide opacity, const Attributes *attributes, uint splat, uint place,
+// Inserts a fragment of a splat, none of whose fragments is nearer than `nearest`. position: index that gives its position in the list.
+static inline void k_buffer_insert(Pixel *pixel, wide nearest, wide z, wide opacity, const Attributes *attributes, uint splat, uint position,
                                 int mask, global const Splat *splats, const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
     if (k_buffer->bounded) {
-        if (z > k_buffer->until || (z == k_buffer->until && !precedes(splats, place, k_buffer->until_splat))) return;
-        if (z < k_buffer->from || (z == k_buffer->from && precedes(splats, place, k_buffer->from_splat))) return;
+        if (z > k_buffer->until || (z == k_buffer->until && !precedes(splats, position, k_buffer->until_splat))) return;
+        if (z < k_buffer->from || (z == k_buffer->from && precedes(splats, position, k_buffer->from_splat))) return;
     }
     k_buffer_push(pixel, nearest, z, opacity, splat, splats, constants);
 }
@@ -173,4 +173,4 @@ static inline void k_buffer_insert(Pixel *pixel, wide nearest, wide z, wide opac
         if (ready) k_buffer->from = -INFINITY;
 //@ blend_arguments
                                 , splats, lists[batch + which], lists[batch + which]
-                                , staged[k + 1 < listed ? places[cell][k + 1] : length - 1].splat.nearest
+                                , staged[k + 1 < listed ? cell_splats[cell][k + 1] : length - 1].splat.nearest

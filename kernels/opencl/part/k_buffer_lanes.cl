@@ -21,7 +21,7 @@
 #define NO_FRAGMENT (-INFINITY)            // depth of an empty lane of `farthest`
 typedef struct {                    // one fragment per lane
     vfloat z, opacity;
-    vint place;                     // position of its splat in the list
+    vint position;                     // position of its splat in the list
     AttributeFields data;
 } Entry;
 typedef struct {                    // not in registers
@@ -29,8 +29,8 @@ typedef struct {                    // not in registers
     uchar order[K_BUFFER_SIZE];           // indices of entries: `count` used ones, nearest first, then the free ones
     int count;
     int bounded;                    // fragments outside of [from, until) are skipped
-    vfloat from, until;             // depths; at depth `from` only positions from `from_place` on, at depth `until` only positions before
-    vint from_place, until_place;
+    vfloat from, until;             // depths; at depth `from` only positions from `from_position` on, at depth `until` only positions before
+    vint from_position, until_position;
 } Queue;
 typedef struct {
     Entry farthest;
@@ -47,7 +47,7 @@ static inline void queue_start(Queue *queue) {
     queue->count = queue->bounded = 0;
     queue->from = -INFINITY;
     queue->until = INFINITY;
-    queue->from_place = queue->until_place = 0;
+    queue->from_position = queue->until_position = 0;
 }
 
 // Bits of a depth as an integer of the same order; its own inverse.
@@ -91,19 +91,19 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
     int deferred_count = 0;
     bool ordered = false;       // all further splats are deferred
     for (uint read = starts[tile] - base, end = starts[tile + 1] - base; (read < end || deferred_count > 0) && alive;) {
-        uint places[CHUNK], listed[CHUNK], length = 0;      // positions in the list, and splat indices
+        uint positions[CHUNK], listed[CHUNK], length = 0;      // positions in the list, and splat indices
         // read a chunk, unless a full chunk of deferred splats is in front of all unread splats
         const bool reads = read < end && deferred_count <= DEFERRED_CAPACITY - CHUNK
                            && (deferred_count < CHUNK
                                || deferred[deferred_count - CHUNK] >= (ulong)rounded_key(splats[lists[read]].nearest) << 32);
         if (reads)
-            for (; length < CHUNK && read < end; length++) places[length] = read++;
+            for (; length < CHUNK && read < end; length++) positions[length] = read++;
         else
-            for (; length < CHUNK && deferred_count > 0; length++) places[length] = (uint)deferred[--deferred_count];
+            for (; length < CHUNK && deferred_count > 0; length++) positions[length] = (uint)deferred[--deferred_count];
         wide rest_nearest = read < end ? splats[lists[read]].nearest : INFINITY;
         if (!reads && deferred_count > 0) rest_nearest = fmin(rest_nearest, key_depth((uint)(deferred[deferred_count - 1] >> 32)));
 //@@ chunk_of_layers_sorted
-        for (uint which = 0; which < length; which++) listed[which] = lists[places[which]];
+        for (uint which = 0; which < length; which++) listed[which] = lists[positions[which]];
         // touched[splat]: bit mask of the blocks that it overlaps. keys[splat][block]: its minimum depth in the block, whose low bits
         // are replaced by the splat's index in the chunk.
         int touched[CHUNK] __attribute__((aligned(64))), keys[CHUNK][BLOCKS] __attribute__((aligned(64)));
@@ -130,7 +130,7 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
                 if (blocks == 0) continue;
                 const uint min_depth = min_key(keys[which], blocks);
                 far += min_depth >= rounded_key(rest_nearest);
-                batch[taken++] = (ulong)min_depth << 32 | places[which];
+                batch[taken++] = (ulong)min_depth << 32 | positions[which];
             }
             if (ordered || far > DEFER_THRESHOLD) {
                 ordered = true;
@@ -151,9 +151,9 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
             VSTORE((vint)0x7FFFFFFF, unsorted + count);
             for (int first = 0; first < count; first += LANES) {
                 const vint some = VLOAD(unsorted + first);
-                vint places = 0;
-                for (int other = 0; other < count; other++) places -= VMASK(some > unsorted[other]);
-                for (int lane = 0; lane < min(count - first, LANES); lane++) sorted[((int *)&places)[lane]] = unsorted[first + lane];
+                vint ranks = 0;
+                for (int other = 0; other < count; other++) ranks -= VMASK(some > unsorted[other]);
+                for (int lane = 0; lane < min(count - first, LANES); lane++) sorted[((int *)&ranks)[lane]] = unsorted[first + lane];
             }
             sorted[count] = 0x7F800000;         // infinity
             wide nearest[CHUNK + LANES];        // nearest[k]: lower bound of the depths of all fragments after splat k
@@ -214,9 +214,9 @@ static inline void swap_lanes(vfloat *one, vfloat *other, vint mask) {
 static inline void swap_entries(Entry *one, Entry *other, vint mask) {
     swap_lanes(&one->z, &other->z, mask);
     swap_lanes(&one->opacity, &other->opacity, mask);
-    vint place = one->place;
-    one->place = VSELECT(place, other->place, mask);
-    other->place = VSELECT(other->place, place, mask);
+    vint position = one->position;
+    one->position = VSELECT(position, other->position, mask);
+    other->position = VSELECT(other->position, position, mask);
 #pragma unroll
     for (uint field = 0; field < sizeof(Attributes) / sizeof(vfloat); field++)
         swap_lanes(&one->data.fields[field], &other->data.fields[field], mask);
@@ -224,7 +224,7 @@ static inline void swap_entries(Entry *one, Entry *other, vint mask) {
 
 // Lanes where one fragment precedes the other: by depth, then by position in the list.
 static inline vint entry_before(const Entry *one, const Entry *other) {
-    return VMASK(one->z < other->z) | (VMASK(one->z == other->z) & VMASK(one->place < other->place));
+    return VMASK(one->z < other->z) | (VMASK(one->z == other->z) & VMASK(one->position < other->position));
 }
 
 // Enqueues the fragments pushed out of `farthest`. If the queue is full, each lane evicts its farthest fragment and sets `until`: the
@@ -244,21 +244,21 @@ static inline void k_buffer_enqueue(KBuffer *k_buffer, Entry *own) {
     }
     vint dropped = VMASK(own->z < EMPTY_Z);
     queue->until = VSELECT(queue->until, k_buffer->farthest.z, dropped);
-    queue->until_place = VSELECT(queue->until_place, k_buffer->farthest.place, dropped);
+    queue->until_position = VSELECT(queue->until_position, k_buffer->farthest.position, dropped);
     queue->bounded = 1;
     swap_entries(own, &k_buffer->farthest, dropped);
 }
 
-// Inserts a fragment of the splat at `place` in the list; no later fragment is nearer than `nearest`.
+// Inserts a fragment of the splat at `position` in the list; no later fragment is nearer than `nearest`.
 static inline void k_buffer_insert(Pixel *pixel, vfloat nearest, vfloat z, vfloat opacity, const Attributes *attributes,
-                                   uint splat, uint place, vint mask, global const Splat *splats,
+                                   uint splat, uint position, vint mask, global const Splat *splats,
                                    const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
-    vint here = (vint)(int)place;
+    vint here = (vint)(int)position;
     Queue *queue = k_buffer->queue;
     if (queue->bounded) {
-        mask &= VMASK(z < queue->until) | (VMASK(z == queue->until) & VMASK(here < queue->until_place));
-        mask &= VMASK(z > queue->from) | (VMASK(z == queue->from) & VMASK(here >= queue->from_place));
+        mask &= VMASK(z < queue->until) | (VMASK(z == queue->until) & VMASK(here < queue->until_position));
+        mask &= VMASK(z > queue->from) | (VMASK(z == queue->from) & VMASK(here >= queue->from_position));
         if (!VANY(mask)) return;
     }
     Entry own = {VSELECT((vfloat)NO_FRAGMENT, z, mask), opacity, here};
@@ -279,7 +279,7 @@ static inline void k_buffer_insert(Pixel *pixel, vfloat nearest, vfloat z, vfloa
     farthest->z = NO_FRAGMENT;
     Queue *queue = pixel->k_buffer.queue;
     queue->from = queue->until;
-    queue->from_place = queue->until_place;
+    queue->from_position = queue->until_position;
     queue->until = INFINITY;
     repeats = VMASK(queue->from < INFINITY);
 //@ layer_passed
@@ -296,4 +296,4 @@ static inline void k_buffer_insert(Pixel *pixel, vfloat nearest, vfloat z, vfloa
                 continue;
             }
 //@ blend_arguments
-                        , splats, listed[which], places[which], next_nearest
+                        , splats, listed[which], positions[which], next_nearest

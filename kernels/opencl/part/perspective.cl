@@ -19,8 +19,8 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
         real3_ cv = image_row(view->focal_y, view->center_y - center_y, row_y, tw);
         bounds = ellipse_bounds(cu, cv, tw, center_x, center_y, radius * radius);
 #if BATCH > 1
-    } else if (!crossing) {
-        KEY = CROSSING;
+    } else if (!crosses_near) {
+        KEY = CROSSES_NEAR;
         return;
 #endif
     } else {

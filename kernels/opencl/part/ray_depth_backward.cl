@@ -15,25 +15,25 @@
     vfloat z_numerator, z_center;
 //@ fragment_functions
 // Adds the gradient with respect to a fragment's depth at (x, y) from the anchor; returns the gradient with respect to D.
-static inline vfloat add_depth(Sums *sums, const Splat *s, const Geometry *g, vfloat by_z, vfloat screen, vfloat x, vfloat y,
-                               vfloat *by_nu, vfloat *by_nv) {
-    vfloat by_numerator = VSELECT((vfloat)0.0f, by_z * g->inverse_d, g->hit), by_d = -by_numerator * g->z;
-    vfloat by_center = VSELECT(by_z, (vfloat)0.0f, g->hit), by_q = 0.0f;     // by_q n_u, by_q n_v: gradients with respect to n_u, n_v
+static inline vfloat add_depth(Sums *sums, const Splat *s, const Geometry *g, vfloat grad_z, vfloat screen, vfloat x, vfloat y,
+                               vfloat *grad_nu, vfloat *grad_nv) {
+    vfloat grad_numerator = VSELECT((vfloat)0.0f, grad_z * g->inverse_d, g->hit), grad_d = -grad_numerator * g->z;
+    vfloat grad_center = VSELECT(grad_z, (vfloat)0.0f, g->hit), grad_q = 0.0f;     // grad_q n_u, grad_q n_v: gradients with respect to n_u, n_v
 //@@ disc_add_depth
 //@@ footprint_add_depth
-    sums->z_numerator += by_numerator;
-    sums->z_center += by_center;
-    return by_d;
+    sums->z_numerator += grad_numerator;
+    sums->z_center += grad_center;
+    return grad_d;
 }
 
-//@ moments
-    MOMENT(z_numerator, sums->z_numerator);
-    MOMENT(z_center, sums->z_center);
+//@ record_gradients
+    STORE_SUM(z_numerator, sums->z_numerator);
+    STORE_SUM(z_center, sums->z_center);
 //@ camera_backward
         // z_numerator is the signed determinant of M
-        real by_volume = facing * total.z_numerator;
-        by_tu = add3(by_tu, scaled(by_volume, kx));
-        by_tv = add3(by_tv, scaled(by_volume, ky));
-        by_tw = add3(by_tw, scaled(by_volume, k0));
+        real grad_volume = facing * total.z_numerator;
+        grad_tu = add3(grad_tu, scaled(grad_volume, kx));
+        grad_tv = add3(grad_tv, scaled(grad_volume, ky));
+        grad_tw = add3(grad_tw, scaled(grad_volume, k0));
 //@ disk_backward
-        by_p.z += total.z_center;
+        grad_p.z += total.z_center;

@@ -3,8 +3,8 @@
 // dY/dy, dZ/dy.
 //@ footprint_functions
 // Ramp of a form over one sample: 1 half a sample inside of the edge, 0 half a sample outside.
-static inline vfloat edge_ramp(vfloat form, vfloat by_x, vfloat by_y) {
-    vfloat steep = sqrt(fmax(FMA(by_x, by_x, by_y * by_y), (vfloat)1e-36f));
+static inline vfloat edge_ramp(vfloat form, vfloat form_dx, vfloat form_dy) {
+    vfloat steep = sqrt(fmax(FMA(form_dx, form_dx, form_dy * form_dy), (vfloat)1e-36f));
     return clamp(form / steep + 0.5f, (vfloat)0.0f, (vfloat)1.0f);
 }
 
@@ -18,9 +18,9 @@ static inline vfloat slab_coverage(vfloat d, vfloat n, vfloat d_x, vfloat d_y, v
 static inline vfloat along_ray(wide x, wide y, wide z, vfloat to_x, vfloat to_y, vfloat to_z) {
     return FMA((vfloat)z, to_z, FMA((vfloat)y, to_y, (vfloat)x * to_x));
 }
-//@ ray_cross_parameters
+//@ ray_intersect_parameters
     , vfloat xx, vfloat yx, vfloat zx, vfloat xy, vfloat yy, vfloat zy   // derivatives of the ray with respect to x and y
-//@ ray_cross
+//@ ray_intersect
     if (IS_BOX(s)) {
         vfloat d_x = along_ray(s->dx, s->dy, s->dz, xx, yx, zx), d_y = along_ray(s->dx, s->dy, s->dz, xy, yy, zy);
         vfloat u_x = along_ray(s->nux, s->nuy, s->nuz, xx, yx, zx), u_y = along_ray(s->nux, s->nuy, s->nuz, xy, yy, zy);
@@ -28,15 +28,15 @@ static inline vfloat along_ray(wide x, wide y, wide z, vfloat to_x, vfloat to_y,
         c.cover = slab_coverage(d, nu, d_x, d_y, u_x, u_y) * slab_coverage(d, nv, d_x, d_y, v_x, v_y);
         c.inside = VMASK(c.cover > 0.0f) & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
     }
-//@ ray_cross_arguments
+//@ ray_intersect_arguments
                               , SLOPE(0), SLOPE(1), SLOPE(2), SLOPE(3), SLOPE(4), SLOPE(5)
 //@ lanes_start
 #define SLOPE(k) BLOCK_LOAD(ray_slopes + (k) * ray_plane + (y0 + TOP(block)) * ray_stride + x0 + LEFT(block), ray_stride)
 //@ group_start
-    float own_slopes[6][ROWS];
+    float pixel_slopes[6][ROWS];
     for (int row = 0; row < ROWS; row++)
-        for (int k = 0; k < 6; k++) own_slopes[k][row] = ray_slopes[k * ray_plane + (py + row) * ray_stride + px];
-#define SLOPE(k) own_slopes[k][row]
+        for (int k = 0; k < 6; k++) pixel_slopes[k][row] = ray_slopes[k * ray_plane + (py + row) * ray_stride + px];
+#define SLOPE(k) pixel_slopes[k][row]
 //@ footprint_spread
     // A partly covered sample is at |u| <= 1 + |grad F| / 2 D for the forms F = D -+ n_u, likewise for v. With
     // |grad F| <= |F| ray_step (|F| of its three factors) and D >= su sv |offset| / |P|, the point P on the plane is at most

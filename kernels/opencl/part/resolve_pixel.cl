@@ -1,4 +1,4 @@
-// Resolve of a pixel (x, y) of view `number`: the mean of its samples, which start at `first`, over the background.
+// Resolve of a pixel (x, y) of view `view_index`: the mean of its samples, which start at `first`, over the background.
 //@ resolve_pixel
     float r = 0, g = 0, b = 0, t = 0;
 //@@ resolve_start
@@ -13,7 +13,7 @@
         }
     const float mean = 1.0f / (SAMPLES * SAMPLES);
     t *= mean;
-    size_t out = ((size_t)batch_indices[number] * height + y) * width + x;
+    size_t out = ((size_t)batch_indices[view_index] * height + y) * width + x;
     rgb_out[3 * out] = FMA(t, background_r, r * mean);
     rgb_out[3 * out + 1] = FMA(t, background_g, g * mean);
     rgb_out[3 * out + 2] = FMA(t, background_b, b * mean);

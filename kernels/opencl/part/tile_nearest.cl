@@ -1,5 +1,5 @@
 // Minimum depth of a splat's fragments in a tile, for GPUs.
-//@ cross_functions
+//@ intersect_functions
 #define BLOCKS_SLACK 1e-6f              // above the rounding error, relative to the terms of the affine forms
 static inline float tile_nearest(const Splat splat, int left, int top) {
     const Splat *s = &splat;

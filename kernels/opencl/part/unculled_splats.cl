@@ -56,8 +56,8 @@ kernel __attribute__((reqd_work_group_size(UNCULLED_ITEMS, 1, 1))) void list_unc
     uint start = sums[UNCULLED_ITEMS - 1], total = start + ends[UNCULLED_WORDS - 1];
     for (uint k = item; k < UNCULLED_SPLATS; k += UNCULLED_ITEMS) {
         uint bits = unculled_bits[(first + k) / 32], bit = 1u << k % 32;
-        uint place = start + ends[k / 32] - popcount(bits & ~(bit - 1));
-        if ((bits & bit) != 0 && place < capacity) unculled[place] = first + k;
+        uint position = start + ends[k / 32] - popcount(bits & ~(bit - 1));
+        if ((bits & bit) != 0 && position < capacity) unculled[position] = first + k;
     }
     if (item == 0 && group == get_num_groups(0) - 1) {
         counters[COUNTER_VISIBLE] = total;

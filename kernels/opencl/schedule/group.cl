@@ -17,17 +17,17 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     local Staged staged[STAGED];
     local uint cells[CELLS_Y * CELLS_STRIDE / 4];           // [row of cells][splat]: a byte of bits, one per cell that the splat overlaps
     local uint touched[CELLS_X * CELLS_Y][ITEMS];           // [cell][work-item]: bits of the splats in the work-item's share
-    local uchar places[CELLS_X * CELLS_Y][CELLS_STRIDE];    // [cell]: staged splats that overlap it, in order
+    local uchar cell_splats[CELLS_X * CELLS_Y][CELLS_STRIDE];    // [cell]: staged splats that overlap it, in order
     local int alive;
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
     uint tile = longest_first ? tile_order[get_group_id(0)] : band_first + get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
-    uint number = tile / (uint)(tiles_x * tiles_y), here = tile - number * (uint)(tiles_x * tiles_y);
+    uint view_index = tile / (uint)(tiles_x * tiles_y), here = tile - view_index * (uint)(tiles_x * tiles_y);
     int x0 = (int)(here % (uint)tiles_x) * TILE_W, y0 = (int)(here / (uint)tiles_x) * TILE_H;
-    uint block = item / 32, part = item % 32 / ITEMS, own = item % ITEMS;
+    uint block = item / 32, part = item % 32 / ITEMS, cell_item = item % ITEMS;
     uint cell_x = block % CELL_W * BLOCK_X + part % BLOCK_X, cell_y = block / CELL_W * CELL_W + part / BLOCK_X;
     uint cell = cell_y * CELLS_X + cell_x;
-    int px = x0 + (int)(cell_x * CELL_W + own % CELL_W), py = y0 + (int)(cell_y * CELL_H + own / CELL_W * ROWS);
+    int px = x0 + (int)(cell_x * CELL_W + cell_item % CELL_W), py = y0 + (int)(cell_y * CELL_H + cell_item / CELL_W * ROWS);
 
     Pixel pixels[ROWS];
     for (int row = 0; row < ROWS; row++) pixel_start(&pixels[row]);
@@ -58,7 +58,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         // uniform: all work-items read the same vote, taken before this batch is blended
 //@@ voted
         if (!alive) break;
-        uint listed = list_cell(cells, cell_x, cell_y, own, length, touched[cell], places[cell]);
+        uint listed = list_cell(cells, cell_x, cell_y, cell_item, length, touched[cell], cell_splats[cell]);
         // skipped if all pixels of the work-item are terminated
         bool unfinished = false;
         for (int row = 0; row < ROWS; row++)
@@ -67,7 +67,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
                 ;
         if (!unfinished) listed = 0;
         for (uint k = 0; k < listed; k++) {
-            uint which = places[cell][k];
+            uint which = cell_splats[cell][k];
             Staged copy;
             for (int part = 0; part < VECTORS; part++) copy.words[part] = staged[which].words[part];
             const Splat s = copy.splat;
@@ -76,8 +76,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
             wide nu_x = FMA(s.nux, x, s.nu0), nv_x = FMA(s.nvx, x, s.nv0), d_x = FMA(s.dx, x, s.d0);
             for (int row = 0; row < ROWS; row++) {
                 wide y = (wide)(py + row - s.ay);
-                Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
-//@@ cross
+                Intersection c = intersect_row(&s, nu_x, nv_x, d_x, y, half_r2);
+//@@ intersect
                 wide screen;
                 int mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
 //@@ mask
@@ -90,7 +90,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     }
 //@@ pass_end
 
-    size_t stride = (size_t)tiles_x * TILE_W, top = (size_t)number * tiles_y * TILE_H;
+    size_t stride = (size_t)tiles_x * TILE_W, top = (size_t)view_index * tiles_y * TILE_H;
     for (int row = 0; row < ROWS; row++) {
         size_t at = (top + py + row) * stride + px;
         Pixel *pixel = &pixels[row];

@@ -14,36 +14,36 @@ static inline Splat copy_of(local const Staged *staged) {
     return copy.splat;
 }
 
-static inline Crossing cross_at(const Splat *s, int px, int py, const BlendConstants *constants, wide *x, wide *y,
+static inline Intersection intersect_at(const Splat *s, int px, int py, const BlendConstants *constants, wide *x, wide *y,
                                 wide *nu_x, wide *nv_x, wide *half_r2) {
     *x = (wide)(px - s->ax);
     *y = (wide)(py - s->ay);
     *nu_x = FMA(s->nux, *x, s->nu0);
     *nv_x = FMA(s->nvx, *x, s->nv0);
     *half_r2 = s->log_opacity - constants->log_cut;
-    return cross_row(s, *nu_x, *nv_x, FMA(s->dx, *x, s->d0), *y, *half_r2);
+    return intersect_row(s, *nu_x, *nv_x, FMA(s->dx, *x, s->d0), *y, *half_r2);
 }
 
 typedef struct {            // a splat at a pixel, before transmittance is known
-    wide opacity, by_weight;
+    wide opacity, grad_weight;
     int mask;
 } FragmentTerms;
 
 static inline FragmentTerms fragment_terms(const Splat *s, int px, int py, const PixelGradient *gradient, const BlendConstants *constants) {
     wide x, y, nu_x, nv_x, half_r2, screen;
-    Crossing c = cross_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
+    Intersection c = intersect_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     FragmentTerms terms;
     terms.mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
     terms.opacity = fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->ceiling);
     const Geometry g = geometry_of(s, c, nu_x, nv_x, y, screen);
-    terms.by_weight = fragment_by_weight(s, gradient, &g);
+    terms.grad_weight = fragment_by_weight(s, gradient, &g);
     return terms;
 }
 
 // Attenuates a pixel by the splat; returns the opacity there.
 static inline wide forward_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants) {
     wide x, y, nu_x, nv_x, half_r2, screen;
-    Crossing c = cross_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
+    Intersection c = intersect_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     int mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
     if (!VANY(mask)) return 0.0f;
     return attenuate(pixel, fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->ceiling), mask, constants);
@@ -51,48 +51,48 @@ static inline wide forward_fragment(const Splat *s, int px, int py, Pixel *pixel
 
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
 // Reads:  splats, lists, starts[tiles + 1], and the gradients of the images.
-// Writes: checkpoints of all pixels and reached chunks; reached, chunk_tiles; tile_sums.
+// Writes: checkpoints of all pixels ; reached_chunks, chunk_tiles; background_sums.
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints(
 //@@ arguments blend_checkpoints
 ) {
     local Staged staged[STAGED];
     local uint cells[CELLS_Y * CELLS_STRIDE / 4];           // [row of cells][splat]: a byte of bits, one per cell that the splat overlaps
     local uint touched[CELLS_X * CELLS_Y][ITEMS];           // [cell][work-item]: bits of the splats in the work-item's share
-    local uchar places[CELLS_X * CELLS_Y][STAGED];          // [cell]: staged splats that overlap it, in order
+    local uchar cell_splats[CELLS_X * CELLS_Y][STAGED];          // [cell]: staged splats that overlap it, in order
     local float parts[3 * PARTS];
     local int alive;
     local uint max_reached;
     const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};
-    uint number = get_group_id(0), item = get_local_id(0);
+    uint tile_index = get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W;
-    int x0 = (int)(number % (uint)tiles_x) * TILE_W, y0 = (int)(number / (uint)tiles_x) * TILE_H;
-    uint block = item / 32, part = item % 32 / ITEMS, own = item % ITEMS;
+    int x0 = (int)(tile_index % (uint)tiles_x) * TILE_W, y0 = (int)(tile_index / (uint)tiles_x) * TILE_H;
+    uint block = item / 32, part = item % 32 / ITEMS, cell_item = item % ITEMS;
     uint cell_x = block % CELL_W * BLOCK_X + part % BLOCK_X, cell_y = block / CELL_W * CELL_W + part / BLOCK_X;
     uint cell = cell_y * CELLS_X + cell_x;
-    int column = (int)(cell_x * CELL_W + own % CELL_W), top = (int)(cell_y * CELL_H + own / CELL_W * ROWS);
+    int column = (int)(cell_x * CELL_W + cell_item % CELL_W), top = (int)(cell_y * CELL_H + cell_item / CELL_W * ROWS);
     int px = x0 + column, py = y0 + top;
-    uint start = starts[number], end = starts[number + 1], first_chunk = start / CHUNK + number;
-    for (uint k = first_chunk + item; k <= end / CHUNK + number; k += GROUP) chunk_tiles[k] = number;
+    uint start = starts[tile_index], end = starts[tile_index + 1], first_chunk = start / CHUNK + tile_index;
+    for (uint k = first_chunk + item; k <= end / CHUNK + tile_index; k += GROUP) chunk_tiles[k] = tile_index;
 
     PixelGradient gradients[ROWS];
     Pixel pixels[ROWS];
-    vfloat transmittances[ROWS], by_weights[ROWS];
+    vfloat transmittances[ROWS], grad_weights[ROWS];
     for (int row = 0; row < ROWS; row++) {
         PixelGradient *gradient = &gradients[row];
         int x = px, y = py + row;
         size_t at = y * (size_t)stride + x;
-        gradient->r = pixels_of(by_rgb, 3, 0, x, y, width, height);
-        gradient->g = pixels_of(by_rgb, 3, 1, x, y, width, height);
-        gradient->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
+        gradient->r = pixels_of(grad_rgb, 3, 0, x, y, width, height);
+        gradient->g = pixels_of(grad_rgb, 3, 1, x, y, width, height);
+        gradient->b = pixels_of(grad_rgb, 3, 2, x, y, width, height);
         gradient->behind = FMA(gradient->r, (vfloat)background_r, FMA(gradient->g, (vfloat)background_g, gradient->b * background_b));
 //@@ pixel_gradient_start
         // pixels outside of the image have no transmittance
         pixel_start(&pixels[row], x < width && y < height ? 1.0f : 0.0f);
         transmittances[row] = pixels[row].t;
-        by_weights[row] = 0.0f;
+        grad_weights[row] = 0.0f;
     }
     global float2 *checkpoint = (global float2 *)checkpoints + (size_t)first_chunk * PIXELS + top * TILE_W + column;
-    uint chunk = 0, reached_chunks = 0;        // current chunk; number of chunks that transmittance reaches at this work-item's pixels
+    uint chunk = 0, last_reached = 0;        // current chunk; number of chunks that transmittance reaches at this work-item's pixels
     if (item == 0) max_reached = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
 
@@ -111,7 +111,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
         find_cells(staged, length, x0, y0, &constants, cells, touched);
         barrier(CLK_LOCAL_MEM_FENCE);
         if (!alive) break;
-        uint listed = list_cell(cells, cell_x, cell_y, own, length, touched[cell], places[cell]);
+        uint listed = list_cell(cells, cell_x, cell_y, cell_item, length, touched[cell], cell_splats[cell]);
         if (!unfinished) listed = 0;
         uint beyond = (batch - start + length + CHUNK - 1) / CHUNK;      // number of chunks up to the end of the batch
         for (uint k = 0; k <= listed; k += UNROLL) {
@@ -119,7 +119,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
             uint which[UNROLL];
             FragmentTerms terms[UNROLL][ROWS];
             for (int next = 0; next < UNROLL; next++) {
-                which[next] = k + next < listed ? places[cell][k + next] : 0;
+                which[next] = k + next < listed ? cell_splats[cell][k + next] : 0;
                 const Splat s = copy_of(&staged[which[next]]);
                 for (int row = 0; row < ROWS; row++) terms[next][row] = fragment_terms(&s, px, py + row, &gradients[row], &constants);
             }
@@ -127,32 +127,32 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
                 // completed chunks
                 for (uint to = k + next < listed ? (batch - start + which[next]) / CHUNK : beyond; chunk < to; chunk++)
                     for (int row = 0; row < ROWS; row++) {
-                        checkpoint[(size_t)chunk * PIXELS + row * TILE_W] = (float2)(transmittances[row], by_weights[row]);
-                        if (transmittances[row] > stop) reached_chunks = chunk + 1;
+                        checkpoint[(size_t)chunk * PIXELS + row * TILE_W] = (float2)(transmittances[row], grad_weights[row]);
+                        if (transmittances[row] > stop) last_reached = chunk + 1;
                         transmittances[row] = pixel_transmittance(&pixels[row]);
-                        by_weights[row] = 0.0f;
+                        grad_weights[row] = 0.0f;
                     }
                 if (k + next >= listed) break;
                 for (int row = 0; row < ROWS; row++) {
                     wide transmittance = pixels[row].t;
                     wide composited = attenuate(&pixels[row], terms[next][row].opacity, terms[next][row].mask, &constants);
-                    by_weights[row] = FMA(transmittance * composited, terms[next][row].by_weight, by_weights[row]);
+                    grad_weights[row] = FMA(transmittance * composited, terms[next][row].grad_weight, grad_weights[row]);
                 }
             }
         }
     }
-    atomic_max(&max_reached, reached_chunks);
+    atomic_max(&max_reached, last_reached);
     barrier(CLK_LOCAL_MEM_FENCE);
     // gradient with respect to the transmittance behind each chunk; for terminated pixels, that of the background
     for (int row = 0; row < ROWS; row++) {
-        vfloat behind = gradients[row].behind, shown_behind = pixels[row].t * behind;
+        vfloat behind = gradients[row].behind, transmitted_behind = pixels[row].t * behind;
         for (int last = (int)max_reached - 1; last >= 0; last -= PREFETCH_CHUNKS) {
             float2 loaded[PREFETCH_CHUNKS];
             for (int k = 0; k < PREFETCH_CHUNKS; k++) loaded[k] = checkpoint[(size_t)max(last - k, 0) * PIXELS + row * TILE_W];
             for (int k = 0; k < min(PREFETCH_CHUNKS, last + 1); k++) {
                 checkpoint[(size_t)(last - k) * PIXELS + row * TILE_W].y = behind;
-                shown_behind += loaded[k].y;
-                behind = loaded[k].x > stop ? shown_behind / loaded[k].x : gradients[row].behind;
+                transmitted_behind += loaded[k].y;
+                behind = loaded[k].x > stop ? transmitted_behind / loaded[k].x : gradients[row].behind;
             }
         }
     }
@@ -166,11 +166,11 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
     parts[PARTS + item] = behind_g;
     parts[2 * PARTS + item] = behind_b;
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item == 0) reached[number] = max_reached;
+    if (item == 0) reached_chunks[tile_index] = max_reached;
     if (item < 3) {
         real sum = 0;
         for (uint other = 0; other < GROUP; other++) sum += parts[item * PARTS + other];
-        tile_sums[3 * number + item] = sum;
+        background_sums[3 * tile_index + item] = sum;
     }
 }
 
@@ -178,9 +178,9 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
 #undef PARTS
 #define GROUP BACK_ITEMS
 #define PARTS (GROUP + 1)
-#define EACH (PIXELS / GROUP)                // pixels per work-item
+#define PIXELS_PER_ITEM (PIXELS / GROUP)                // pixels per work-item
 #define PATCH_W 8                            // of the 32 work-items of a warp
-#define PATCH_H (4 * EACH)
+#define PATCH_H (4 * PIXELS_PER_ITEM)
 #define PATCHES_X (TILE_W / PATCH_W)
 #define PATCHES (PIXELS / (PATCH_W * PATCH_H))
 #define SHARE_OF_SPLAT (GROUP / CHUNK)       // work-items that sum a splat's fragments
@@ -188,8 +188,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
 #define SCRATCH (2 * CHUNK * STRIDE > PARTS * FIELDS ? 2 * CHUNK * STRIDE : PARTS * FIELDS)
 
 // Index space: work-groups of GROUP, one per chunk of a tile's list.
-// Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, splat_slots, checkpoints, reached, chunk_tiles, and the gradients
-// of the images. Writes: moments of each splat of each tile.
+// Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, gradient_offsets, checkpoints, reached_chunks, chunk_tiles, and the gradients
+// of the images. Writes: record_gradients of each splat of each tile.
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
 //@@ arguments blend_backward
 ) {
@@ -197,16 +197,16 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     local float scratch[SCRATCH];
     local float2 *fragments = (local float2 *)scratch;      // [splat][pixel]: transmittance, opacity; then weight, gradient of ln(opacity)
     local PixelGradient shared[PIXELS];
-    local uint slots[CHUNK], within[PATCHES];               // bits: splats whose bounds overlap a patch
+    local uint offsets[CHUNK], within[PATCHES];               // bits: splats whose bounds overlap a patch
     const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};
     uint id = get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H, tiles = tiles_x * tiles_y;
     if (id >= starts[tiles] / CHUNK + tiles) return;
-    uint number = chunk_tiles[id], start = starts[number], end = starts[number + 1];
-    uint chunk = id - (start / CHUNK + number), first = start + chunk * CHUNK;
+    uint tile_index = chunk_tiles[id], start = starts[tile_index], end = starts[tile_index + 1];
+    uint chunk = id - (start / CHUNK + tile_index), first = start + chunk * CHUNK;
     if (first >= end) return;
     uint count = min(end - first, (uint)CHUNK);
-    int tile_column = (int)(number % (uint)tiles_x), tile_row = (int)(number / (uint)tiles_x);
+    int tile_column = (int)(tile_index % (uint)tiles_x), tile_row = (int)(tile_index / (uint)tiles_x);
     int x0 = tile_column * TILE_W, y0 = tile_row * TILE_H;
 
     for (uint word = item; word < count * VECTORS; word += GROUP) {
@@ -215,13 +215,13 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     }
     for (uint which = GROUP - 1 - item; which < count; which += GROUP) {
         uint index = lists[first + which];
-        slots[which] = splat_slots[index] + tile_rank(windows[index], big_bounds, tile_column, tile_row, width, height);
+        offsets[which] = gradient_offsets[index] + tile_rank(windows[index], big_bounds, tile_column, tile_row, width, height);
     }
     if (item < PATCHES) within[item] = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (chunk >= reached[number]) {          // no transmittance left
+    if (chunk >= reached_chunks[tile_index]) {          // no transmittance left
         for (uint cell = item; cell < count * FIELDS; cell += GROUP)
-            moments[(size_t)slots[cell / FIELDS] * FIELDS + cell % FIELDS] = 0.0f;
+            record_gradients[(size_t)offsets[cell / FIELDS] * FIELDS + cell % FIELDS] = 0.0f;
         return;
     }
     for (uint cell = item; cell < PATCHES * count; cell += GROUP) {
@@ -233,21 +233,21 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     uint patch = item / 32, in_patch = item % 32;
     int column = (int)(patch % PATCHES_X * PATCH_W + in_patch % PATCH_W), px = x0 + column;
     int top = (int)(patch / PATCHES_X * PATCH_H + in_patch / PATCH_W);
-    PixelGradient gradients[EACH];
-    Pixel pixels[EACH];
-    for (int each = 0; each < EACH; each++) {
-        PixelGradient *gradient = &gradients[each];
-        int x = px, y = y0 + top + 4 * each;
-        size_t at = y * (size_t)stride + x, mine = (top + 4 * each) * TILE_W + column;
-        gradient->r = pixels_of(by_rgb, 3, 0, x, y, width, height);
-        gradient->g = pixels_of(by_rgb, 3, 1, x, y, width, height);
-        gradient->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
+    PixelGradient gradients[PIXELS_PER_ITEM];
+    Pixel pixels[PIXELS_PER_ITEM];
+    for (int k = 0; k < PIXELS_PER_ITEM; k++) {
+        PixelGradient *gradient = &gradients[k];
+        int x = px, y = y0 + top + 4 * k;
+        size_t at = y * (size_t)stride + x, mine = (top + 4 * k) * TILE_W + column;
+        gradient->r = pixels_of(grad_rgb, 3, 0, x, y, width, height);
+        gradient->g = pixels_of(grad_rgb, 3, 1, x, y, width, height);
+        gradient->b = pixels_of(grad_rgb, 3, 2, x, y, width, height);
         gradient->behind = FMA(gradient->r, (vfloat)background_r, FMA(gradient->g, (vfloat)background_g, gradient->b * background_b));
 //@@ pixel_gradient_start
         float2 checkpoint = ((global const float2 *)checkpoints)[(size_t)id * PIXELS + mine];
         gradient->behind = checkpoint.y;
         shared[mine] = *gradient;
-        pixel_start(&pixels[each], checkpoint.x);
+        pixel_start(&pixels[k], checkpoint.x);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
 
@@ -255,30 +255,30 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     for (uint bits = mine; bits != 0; bits &= bits - 1) {
         uint which = 31 - clz((int)(bits & -bits));
         const Splat s = copy_of(&staged[which]);
-        for (int each = 0; each < EACH; each++) {
-            int y = y0 + top + 4 * each;
+        for (int k = 0; k < PIXELS_PER_ITEM; k++) {
+            int y = y0 + top + 4 * k;
             wide transmittance = 0.0f, opacity = 0.0f;
-            if (pixels[each].t > stop && px >= s.x0 && px < s.x1 && y >= s.y0 && y < s.y1) {
-                transmittance = pixels[each].t;
-                opacity = forward_fragment(&s, px, y, &pixels[each], &constants);
+            if (pixels[k].t > stop && px >= s.x0 && px < s.x1 && y >= s.y0 && y < s.y1) {
+                transmittance = pixels[k].t;
+                opacity = forward_fragment(&s, px, y, &pixels[k], &constants);
             }
-            fragments[which * STRIDE + (top + 4 * each) * TILE_W + column] = (float2)(transmittance, opacity);
+            fragments[which * STRIDE + (top + 4 * k) * TILE_W + column] = (float2)(transmittance, opacity);
         }
     }
     // each work-item reads only what it wrote, but without a barrier NVIDIA's compiler (driver 580) moved the read before the write
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint bits = mine, which; bits != 0; bits ^= 1u << which) {
         which = 31 - clz((int)bits);
-        for (int each = 0; each < EACH; each++) {
-            local float2 *at = &fragments[which * STRIDE + (top + 4 * each) * TILE_W + column];
+        for (int k = 0; k < PIXELS_PER_ITEM; k++) {
+            local float2 *at = &fragments[which * STRIDE + (top + 4 * k) * TILE_W + column];
             float2 here = *at;
             if (here.y > 0.0f) {
                 const Splat s = staged[which].splat;
                 wide weight = here.x * here.y, x, y, nu_x, nv_x, half_r2, screen;
-                Crossing c = cross_at(&s, px, y0 + top + 4 * each, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
+                Intersection c = intersect_at(&s, px, y0 + top + 4 * k, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
                 fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
                 const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
-                *at = (float2)(weight, backward_opacity(&gradients[each], fragment_by_weight(&s, &gradients[each], &g), weight, here.y));
+                *at = (float2)(weight, backward_opacity(&gradients[k], fragment_by_weight(&s, &gradients[k], &g), weight, here.y));
             } else
                 (*at).x = 0.0f;
         }
@@ -298,14 +298,14 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             float2 here = fragments[which * STRIDE + at];
             if (here.x == 0.0f) continue;
             wide x, y, nu_x, nv_x, half_r2, screen;
-            Crossing c = cross_at(&s, x0 + column, y0 + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
+            Intersection c = intersect_at(&s, x0 + column, y0 + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
             fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
             const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
             const PixelGradient gradient = shared[at];
             add_fragment(&sums, &s, &gradient, &g, here.x, here.y, screen, x, y, &constants);
         }
     }
-    const Moments m = moments_of(&sums, &constants);
+    const RecordGradient m = record_gradient_of(&sums, &constants);
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint field = 0; field < FIELDS; field++) scratch[field * PARTS + item] = ((const float *)&m)[field];
     barrier(CLK_LOCAL_MEM_FENCE);
@@ -313,6 +313,6 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
         uint field = cell % FIELDS, splat = cell / FIELDS;
         float sum = 0;
         for (uint other = 0; other < SHARE_OF_SPLAT; other++) sum += scratch[field * PARTS + splat * SHARE_OF_SPLAT + other];
-        moments[(size_t)slots[splat] * FIELDS + field] = sum;
+        record_gradients[(size_t)offsets[splat] * FIELDS + field] = sum;
     }
 }

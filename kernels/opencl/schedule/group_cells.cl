@@ -79,30 +79,30 @@ static inline void find_cells(local const Staged *staged, uint length, int left,
 #endif
 }
 
-// Lists the staged splats that overlap a cell, in order. Called by the complete group; `own` is the index of the work-item in its
-// cell. touched, places: of this cell. Returns the number of splats.
-static inline uint list_cell(local const uint *cells, uint cell_x, uint cell_y, uint own, uint length, local uint *touched,
-                             local uchar *places) {
+// Lists the staged splats that overlap a cell, in order. Called by the complete group; `cell_item` is the index of the work-item in its
+// cell. touched, cell_splats: of this cell. Returns the number of splats.
+static inline uint list_cell(local const uint *cells, uint cell_x, uint cell_y, uint cell_item, uint length, local uint *touched,
+                             local uchar *cell_splats) {
     uint listed = 0, before = 0;
 #ifdef CELLS_BY_WARP
-    uint bits = touched[own];
+    uint bits = touched[cell_item];
 #else
     uint bits = 0;
     // the lowest byte of a word is its first on all devices
     for (uint k = 0; k < SHARE / 4; k++) {
-        uint four = cells[cell_y * (CELLS_STRIDE / 4) + own * (SHARE / 4) + k] >> cell_x & 0x01010101u;
+        uint four = cells[cell_y * (CELLS_STRIDE / 4) + cell_item * (SHARE / 4) + k] >> cell_x & 0x01010101u;
         bits |= (four * 0x01020408u >> 24 & 15u) << (4 * k);
     }
-    uint first = own * SHARE, rest = max(length, first) - first;
+    uint first = cell_item * SHARE, rest = max(length, first) - first;
     if (rest < SHARE) bits &= (1u << rest) - 1u;     // stale bytes of an earlier batch
-    touched[own] = bits;
+    touched[cell_item] = bits;
     barrier(CLK_LOCAL_MEM_FENCE);
 #endif
     for (uint other = 0; other < ITEMS; other++) {
-        if (other == own) before = listed;
+        if (other == cell_item) before = listed;
         listed += popcount(touched[other]);
     }
-    for (; bits != 0; bits &= bits - 1) places[before++] = (uchar)(own * SHARE + 31 - clz(bits & -bits));
+    for (; bits != 0; bits &= bits - 1) cell_splats[before++] = (uchar)(cell_item * SHARE + 31 - clz(bits & -bits));
 #ifdef CELLS_BY_WARP
     WARP_BARRIER();
 #else

@@ -12,14 +12,14 @@ kernel void blend(
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
     uint tile = band_first + get_global_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
-    const uint each = (uint)(tiles_x * tiles_y), number = tile / each, across = (uint)tiles_x;
-    uint here = tile - number * each, column = here % across, row = here / across;
-    if (band_first % each == 0 && get_global_size(0) % each == 0) {
+    const uint view_tiles = (uint)(tiles_x * tiles_y), view_index = tile / view_tiles, across = (uint)tiles_x;
+    uint here = tile - view_index * view_tiles, column = here % across, row = here / across;
+    if (band_first % view_tiles == 0 && get_global_size(0) % view_tiles == 0) {
         // complete views: bands of rows column by column, since neighbours share splats in the cache
         uint first = here / (ROWS_TOGETHER * across) * ROWS_TOGETHER, rows = min((uint)ROWS_TOGETHER, (uint)tiles_y - first);
         column = (here - first * across) / rows;
         row = first + (here - first * across) % rows;
-        tile = number * each + row * across + column;
+        tile = view_index * view_tiles + row * across + column;
     }
     int x0 = (int)column * TILE_W, y0 = (int)row * TILE_H;
 
@@ -41,8 +41,8 @@ kernel void blend(
             vfloat nu_x = FMA((vfloat)s.nux, x, (vfloat)s.nu0);
             vfloat nv_x = FMA((vfloat)s.nvx, x, (vfloat)s.nv0);
             vfloat d_x = FMA((vfloat)s.dx, x, (vfloat)s.d0);
-            Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
-//@@ cross
+            Intersection c = intersect_row(&s, nu_x, nv_x, d_x, y, half_r2);
+//@@ intersect
             vfloat screen;
             vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
 //@@ mask
@@ -57,7 +57,7 @@ kernel void blend(
 //@@ tile_loop_end
 //@@ pass_end
 
-    size_t stride = (size_t)tiles_x * TILE_W, top = (size_t)number * tiles_y * TILE_H;
+    size_t stride = (size_t)tiles_x * TILE_W, top = (size_t)view_index * tiles_y * TILE_H;
     for (int block = 0; block < BLOCKS; block++) {
         size_t at = (top + y0 + TOP(block)) * stride + x0 + LEFT(block);
         Pixel *pixel = &pixels[empty ? 0 : block];

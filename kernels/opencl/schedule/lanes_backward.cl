@@ -1,8 +1,8 @@
 // Backward pass of blending for CPUs. Each work-item takes the next unprocessed tile until none is left, so that one tape per
 // work-item is enough.
 // Index space: one work-item (and work-group) per core.
-// Reads:  splats, lists, starts[tiles + 1], windows, big_rows, splat_slots, and the gradients of the images.
-// Writes: moments of each splat of the tile; tile_sums. Consumes: checkpoints, tapes; reserved[1], the number of tiles taken.
+// Reads:  splats, lists, starts[tiles + 1], windows, big_rows, gradient_offsets, and the gradients of the images.
+// Writes: record_gradients of each splat of the tile; background_sums. Consumes: checkpoints, tapes; reserved[1], the number of tiles taken.
 // Splats are scattered in memory, so the next ones are prefetched.
 #define PREFETCH_SPLATS 8
 
@@ -14,7 +14,7 @@
 typedef struct {            // fragments in the order of compositing, block by block
     vfloat transmittance[TAPE_FRAGMENTS], opacity[TAPE_FRAGMENTS];
     uint blocks[TAPE_SPLATS];      // per splat, as bits: blocks with fragments
-    uint slots[TAPE_SPLATS];
+    uint offsets[TAPE_SPLATS];
     uint length;            // number of blocks
 } Tape;
 
@@ -31,28 +31,28 @@ typedef struct {            // pixels of a tile's first block, relative to a spl
 typedef struct {            // a splat in a block: pixel positions relative to its anchor, and its forms
     vfloat x, y, nu_x, nv_x, screen;
     vint mask;
-    Crossing crossing;
+    Intersection intersection;
 } Block;
 
 static inline BlockOrigin block_origin(const Splat *s, const Tile *tile) {
-    const BlockOrigin place = {(float)(tile->x0 - s->ax) + BLOCK_X, (float)(tile->y0 - s->ay) + BLOCK_Y};
-    return place;
+    const BlockOrigin origin = {(float)(tile->x0 - s->ax) + BLOCK_X, (float)(tile->y0 - s->ay) + BLOCK_Y};
+    return origin;
 }
 
-static inline Block block_of(const Splat *s, const Tile *tile, const BlockOrigin *place, int block) {
+static inline Block block_of(const Splat *s, const Tile *tile, const BlockOrigin *origin, int block) {
     Block b;
     wide half_r2 = s->log_opacity - tile->constants->log_cut;
-    b.x = place->x + tile->left[block];
-    b.y = place->y + tile->top[block];
+    b.x = origin->x + tile->left[block];
+    b.y = origin->y + tile->top[block];
     b.nu_x = FMA((vfloat)s->nux, b.x, (vfloat)s->nu0);
     b.nv_x = FMA((vfloat)s->nvx, b.x, (vfloat)s->nv0);
-    b.crossing = cross_row(s, b.nu_x, b.nv_x, FMA((vfloat)s->dx, b.x, (vfloat)s->d0), b.y, half_r2);
-    b.mask = fragment_mask(s, b.crossing, b.x, b.y, half_r2, tile->constants->filter, &b.screen);
+    b.intersection = intersect_row(s, b.nu_x, b.nv_x, FMA((vfloat)s->dx, b.x, (vfloat)s->d0), b.y, half_r2);
+    b.mask = fragment_mask(s, b.intersection, b.x, b.y, half_r2, tile->constants->filter, &b.screen);
     return b;
 }
 
 // Attenuates the live blocks by the splat and records its fragments on the tape. Returns the blocks that are still live.
-static inline uint forward_splat(const Splat *s, const Tile *tile, Pixel *pixels, uint alive, global Tape *tape, uint place) {
+static inline uint forward_splat(const Splat *s, const Tile *tile, Pixel *pixels, uint alive, global Tape *tape, uint tape_index) {
     const BlendConstants *constants = tile->constants;
     uint touched = alive & touched_blocks(s, tile->x0, tile->y0, s->log_opacity - constants->log_cut, constants->filter), contributing = 0;
     uint length = tape->length;
@@ -61,7 +61,7 @@ static inline uint forward_splat(const Splat *s, const Tile *tile, Pixel *pixels
         int block = 31 - clz((int)(touched & -touched));
         const Block b = block_of(s, tile, &at, block);
         if (UNLIKELY(!VANY(b.mask))) continue;
-        vfloat half_rho = fragment_half_rho(s, b.crossing, INVERSE_D(b.crossing), b.screen);
+        vfloat half_rho = fragment_half_rho(s, b.intersection, INVERSE_D(b.intersection), b.screen);
         vfloat opacity = fragment_opacity(s, half_rho, constants->ceiling);
         tape->transmittance[length] = pixels[block].t;
         tape->opacity[length++] = attenuate(&pixels[block], opacity, b.mask, constants);
@@ -69,42 +69,42 @@ static inline uint forward_splat(const Splat *s, const Tile *tile, Pixel *pixels
         if (UNLIKELY(!VANY(VMASK(pixel_transmittance(&pixels[block]) > constants->stop)))) alive &= ~(1u << block);
     }
     tape->length = length;
-    tape->blocks[place] = contributing;
+    tape->blocks[tape_index] = contributing;
     return alive;
 }
 
 // Backward pass of a splat's fragments, which are the last on the tape; removes them.
-static inline void backward_splat(const Splat *s, const Tile *tile, global Tape *tape, uint place, PixelGradient *gradients,
-                                  global float *slot) {
+static inline void backward_splat(const Splat *s, const Tile *tile, global Tape *tape, uint tape_index, PixelGradient *gradients,
+                                  global float *out) {
     const BlendConstants *constants = tile->constants;
     Sums sums = {0};
-    uint blocks = tape->blocks[place], at = tape->length -= popcount(blocks);
+    uint blocks = tape->blocks[tape_index], at = tape->length -= popcount(blocks);
     const BlockOrigin corner = block_origin(s, tile);
     for (; blocks != 0; blocks &= blocks - 1, at++) {
         int block = 31 - clz((int)(blocks & -blocks));
         const Block b = block_of(s, tile, &corner, block);
-        const Geometry g = geometry_of(s, b.crossing, b.nu_x, b.nv_x, b.y, b.screen);
+        const Geometry g = geometry_of(s, b.intersection, b.nu_x, b.nv_x, b.y, b.screen);
         vfloat opacity = tape->opacity[at], weight = tape->transmittance[at] * opacity;
-        vfloat by_log = backward_opacity(&gradients[block], fragment_by_weight(s, &gradients[block], &g), weight, opacity);
-        add_fragment(&sums, s, &gradients[block], &g, weight, by_log, b.screen, b.x, b.y, constants);
+        vfloat grad_log = backward_opacity(&gradients[block], fragment_by_weight(s, &gradients[block], &g), weight, opacity);
+        add_fragment(&sums, s, &gradients[block], &g, weight, grad_log, b.screen, b.x, b.y, constants);
     }
-    const Parts m = moments_of(&sums, constants);
+    const Parts m = record_gradient_of(&sums, constants);
 #if LANES == 16
     uint field = 0;
-    for (; field + LANES <= FIELDS; field += LANES) VSTORE(lane_sums(m.fields + field), slot + field);
+    for (; field + LANES <= FIELDS; field += LANES) VSTORE(lane_sums(m.fields + field), out + field);
     if (field < FIELDS) {
         float last[LANES];
         VSTORE(lane_sums(m.fields + field), last);
-        for (uint k = 0; field + k < FIELDS; k++) slot[field + k] = last[k];
+        for (uint k = 0; field + k < FIELDS; k++) out[field + k] = last[k];
     }
 #else
-    *(global Moments *)slot = m;
+    *(global RecordGradient *)out = m;
 #endif
 }
 
-static inline void store_zero_moments(global float *moments, uint slot) {
-    const Moments nothing = {0};
-    ((global Moments *)moments)[slot] = nothing;
+static inline void store_zero_gradient(global float *record_gradients, uint offset) {
+    const RecordGradient nothing = {0};
+    ((global RecordGradient *)record_gradients)[offset] = nothing;
 }
 
 // Prefetches all data of the splat at `next` in the list.
@@ -112,7 +112,7 @@ static inline void store_zero_moments(global float *moments, uint slot) {
     PREFETCH(splats + lists[next]);                                             \
     PREFETCH((global const char *)(splats + lists[next]) + 64);                 \
     PREFETCH(windows + lists[next]);                                            \
-    PREFETCH(splat_slots + lists[next])
+    PREFETCH(gradient_offsets + lists[next])
 
 kernel void blend_backward(
 //@@ arguments blend_backward
@@ -126,11 +126,11 @@ kernel void blend_backward(
         tile.left[block] = (float)LEFT(block);
         tile.top[block] = (float)TOP(block);
     }
-    for (uint number; (number = atomic_inc(reserved + 1)) < (uint)(tiles_x * tiles_y);) {
-        int column = (int)(number % (uint)tiles_x), tile_row = (int)(number / (uint)tiles_x);
+    for (uint tile_index; (tile_index = atomic_inc(reserved + 1)) < (uint)(tiles_x * tiles_y);) {
+        int column = (int)(tile_index % (uint)tiles_x), tile_row = (int)(tile_index / (uint)tiles_x);
         tile.x0 = column * TILE_W;
         tile.y0 = tile_row * TILE_H;
-        uint start = starts[number], end = starts[number + 1];
+        uint start = starts[tile_index], end = starts[tile_index + 1];
 
         // gradients of the tile's pixels; 0 outside of the image
         PixelGradient gradients[BLOCKS];
@@ -138,9 +138,9 @@ kernel void blend_backward(
             PixelGradient *gradient = &gradients[block];
             int x = tile.x0 + LEFT(block), y = tile.y0 + TOP(block);
             size_t at = y * (size_t)stride + x;
-            gradient->r = pixels_of(by_rgb, 3, 0, x, y, width, height);
-            gradient->g = pixels_of(by_rgb, 3, 1, x, y, width, height);
-            gradient->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
+            gradient->r = pixels_of(grad_rgb, 3, 0, x, y, width, height);
+            gradient->g = pixels_of(grad_rgb, 3, 1, x, y, width, height);
+            gradient->b = pixels_of(grad_rgb, 3, 2, x, y, width, height);
             gradient->behind = FMA(gradient->r, (vfloat)background_r, FMA(gradient->g, (vfloat)background_g, gradient->b * background_b));
 //@@ pixel_gradient_start
         }
@@ -150,7 +150,7 @@ kernel void blend_backward(
         for (int block = 0; block < BLOCKS; block++) pixel_start(&pixels[block], (vfloat)1.0f);
         const uint in_image = blocks_within(0, min(width - tile.x0, TILE_W), 0, min(height - tile.y0, TILE_H));
         uint alive = in_image, position = start, first = start, chunk = 0;
-        global float *own = checkpoints + (size_t)(start / CHUNK + number) * CHECKPOINT_FLOATS;
+        global float *own = checkpoints + (size_t)(start / CHUNK + tile_index) * CHECKPOINT_FLOATS;
         tape->length = 0;
         for (; position < end && alive; position++) {
             if (position == start || tape->length + BLOCKS > TAPE_FRAGMENTS || position - first == TAPE_SPLATS) {
@@ -162,10 +162,10 @@ kernel void blend_backward(
                 ((global uint *)own)[(size_t)chunk * CHECKPOINT_FLOATS + TILE_W * TILE_H] = first;
             }
             PREFETCH_SPLAT(min(position + PREFETCH_SPLATS, end - 1));
-            uint index = lists[position], place = position - first;
-            tape->slots[place] = splat_slots[index] + tile_rank(windows[index], big_capacity, big_rows, column, tile_row);
+            uint index = lists[position], tape_index = position - first;
+            tape->offsets[tape_index] = gradient_offsets[index] + tile_rank(windows[index], big_capacity, big_rows, column, tile_row);
             const Splat s = splats[index];
-            alive = forward_splat(&s, &tile, pixels, alive, tape, place);
+            alive = forward_splat(&s, &tile, pixels, alive, tape, tape_index);
         }
         vfloat behind_r = 0.0f, behind_g = 0.0f, behind_b = 0.0f;
         for (int block = 0; block < BLOCKS; block++) {
@@ -173,16 +173,16 @@ kernel void blend_backward(
             behind_g = FMA(pixels[block].t, gradients[block].g, behind_g);
             behind_b = FMA(pixels[block].t, gradients[block].b, behind_b);
         }
-        tile_sums[3 * number] = lane_sum(behind_r);
-        tile_sums[3 * number + 1] = lane_sum(behind_g);
-        tile_sums[3 * number + 2] = lane_sum(behind_b);
+        background_sums[3 * tile_index] = lane_sum(behind_r);
+        background_sums[3 * tile_index + 1] = lane_sum(behind_g);
+        background_sums[3 * tile_index + 2] = lane_sum(behind_b);
 
         // splats behind the last one processed do not contribute
         for (uint k = position; k < end; k++) {
             PREFETCH(windows + lists[min(k + PREFETCH_SPLATS, end - 1)]);
-            PREFETCH(splat_slots + lists[min(k + PREFETCH_SPLATS, end - 1)]);
-            uint slot = splat_slots[lists[k]] + tile_rank(windows[lists[k]], big_capacity, big_rows, column, tile_row);
-            store_zero_moments(moments, slot);
+            PREFETCH(gradient_offsets + lists[min(k + PREFETCH_SPLATS, end - 1)]);
+            uint offset = gradient_offsets[lists[k]] + tile_rank(windows[lists[k]], big_capacity, big_rows, column, tile_row);
+            store_zero_gradient(record_gradients, offset);
         }
         for (bool revisits = false; position > start; revisits = true) {
             if (revisits) {
@@ -197,22 +197,22 @@ kernel void blend_backward(
                 for (uint k = first; k < position; k++) {
                     PREFETCH_SPLAT(min(k + PREFETCH_SPLATS, end - 1));
                     uint index = lists[k];
-                    tape->slots[k - first] = splat_slots[index] + tile_rank(windows[index], big_capacity, big_rows, column, tile_row);
+                    tape->offsets[k - first] = gradient_offsets[index] + tile_rank(windows[index], big_capacity, big_rows, column, tile_row);
                     const Splat s = splats[index];
                     alive = forward_splat(&s, &tile, pixels, alive, tape, k - first);
                 }
             }
             for (; position > first; position--) {
-                uint place = position - 1 - first, next = max(position - 1, first + PREFETCH_SPLATS) - PREFETCH_SPLATS;
+                uint tape_index = position - 1 - first, next = max(position - 1, first + PREFETCH_SPLATS) - PREFETCH_SPLATS;
                 PREFETCH(splats + lists[next]);
                 PREFETCH((global const char *)(splats + lists[next]) + 64);
-                PREFETCH(moments + (size_t)tape->slots[next - first] * FIELDS);
-                if (tape->blocks[place] == 0) {
-                    store_zero_moments(moments, tape->slots[place]);
+                PREFETCH(record_gradients + (size_t)tape->offsets[next - first] * FIELDS);
+                if (tape->blocks[tape_index] == 0) {
+                    store_zero_gradient(record_gradients, tape->offsets[tape_index]);
                     continue;
                 }
                 const Splat s = splats[lists[position - 1]];
-                backward_splat(&s, &tile, tape, place, gradients, moments + (size_t)tape->slots[place] * FIELDS);
+                backward_splat(&s, &tile, tape, tape_index, gradients, record_gradients + (size_t)tape->offsets[tape_index] * FIELDS);
             }
         }
     }

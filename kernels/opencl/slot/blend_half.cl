@@ -80,20 +80,20 @@ static inline float within_half(float color) { return clamp(color, -65504.0f, 65
         attributes.rg = HALF_PAIR(attributes.r, attributes.g);
         attributes.b1 = HALF_PAIR(attributes.b, -1.0f);
 #endif
-//@ light_state
+//@ color_state
     half_pair rg, bt;           // (r, g) and (b, t)
-//@ light_start
+//@ color_start
     pixel->rg = HALF_PAIR((vfloat)0.0f, (vfloat)0.0f);
     pixel->bt = HALF_PAIR((vfloat)0.0f, (vfloat)1.0f);
-//@ light_composite
+//@ color_composite
     vfloat visible = VSELECT((vfloat)0.0f, opacity, live);
     half_pair weights = HALF_BY_HIGH(HALF_PAIR(visible, visible), pixel->bt);
     vfloat weight = HALF_LOW(weights);
     pixel->rg = HALF_FMA(weights, COLOR_RG(attributes), pixel->rg);
     pixel->bt = HALF_FMA(weights, COLOR_B1(attributes), pixel->bt);
-//@ light_transmit
+//@ color_transmit
     pixel->t = HALF_HIGH(pixel->bt);
-//@ light_functions
+//@ color_functions
 // Stores LANES pixels at index `at` of each channel of `raw`; a channel has `channel_stride` samples.
 #define PIXEL_STORE_BASE(pixel, raw, channel_stride, at) \
     BLOCK_STORE(HALF_LOW((pixel)->rg), raw + (at), stride); \

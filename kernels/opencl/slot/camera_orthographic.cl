@@ -1,6 +1,6 @@
 // Orthographic camera, parallel rays along z: x = fx X + cx, so the last row of the projection is (0, 0, 1). D is constant, and depth
 // times D is another affine form of the pixel.
-//@ crossing
+//@ intersection
     vfloat z;               // depth times D, at the ray-plane intersection
 //@ camera
 static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ z_row) {
@@ -9,7 +9,7 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
     return row;
 }
 //@ camera_offset
-    offset = facet.z;       // the visible side: the camera is infinitely far away
+    offset = unit_normal.z;       // the visible side: the camera is infinitely far away
 //@ camera_bounds
     real3_ row_x = {a.x, b.x, p.x}, row_y = {a.y, b.y, p.y}, tw = {0, 0, 1};
     real3_ tu = image_row(view->focal_x, view->center_x, row_x, tw);
@@ -32,7 +32,7 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
     record.zy = (wide)((a.z * ky.x + b.z * ky.y) * facing);
     record.d_near = INFINITY;
     record.z_near = (wide)near;
-//@ cross
+//@ intersect
     c.z = FMA((vfloat)s.zy, (vfloat)y, FMA((vfloat)s.zx, x, (vfloat)s.z0));
     c.inside &= VMASK(c.z >= s.z_near * c.d);
 //@ camera_attribute_depth

@@ -3,9 +3,9 @@
 #define SH_TERMS 1
 #define PLAIN 1
 #define CLOUD_TERMS 0
-#define BY_TERMS by_colors
+#define BY_TERMS grad_colors
 //@ color_backward
-    own.basis[0] = 1;
-    own.color[0] = (float)total.r;
-    own.color[1] = (float)total.g;
-    own.color[2] = (float)total.b;
+    splat_grad.basis[0] = 1;
+    splat_grad.color[0] = (float)total.r;
+    splat_grad.color[1] = (float)total.g;
+    splat_grad.color[2] = (float)total.b;

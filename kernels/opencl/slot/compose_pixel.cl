@@ -23,6 +23,6 @@
 //@ start
     k_buffer_start(&pixel->k_buffer);
 //@ blend_parameters
-                               , global const Splat *splats, uint splat, uint place, vfloat next_nearest
+                               , global const Splat *splats, uint splat, uint position, vfloat next_nearest
 //@ compose
-    k_buffer_insert(pixel, next_nearest, attributes.z, opacity, &attributes, splat, place, mask, splats, constants);
+    k_buffer_insert(pixel, next_nearest, attributes.z, opacity, &attributes, splat, position, mask, splats, constants);

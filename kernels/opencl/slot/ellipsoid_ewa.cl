@@ -22,14 +22,14 @@ static inline Projected widened(real3_ across, real3_ down, real spread) {
     if (THICK_HERE) {
         if (!(pz >= near)) return;           // early test of the near plane
         real sw = THICKNESS_HERE;
-        real3_ c = {facet.x * sw, facet.y * sw, facet.z * sw}, across, down;    // projected axes [samples]
+        real3_ c = {unit_normal.x * sw, unit_normal.y * sw, unit_normal.z * sw}, across, down;    // projected axes [samples]
         real per_x, per_y;                                           // samples per metre at the centre
 //@@ camera_image
         const Projected wide_image = widened(across, down, REAL(0.3) / view->filter);
 //@@ ewa_opacity
         a.x = wide_image.l11 / per_x; a.y = wide_image.l21 / per_y; a.z = 0;
         b.x = 0; b.y = wide_image.l22 / per_y; b.z = 0;
-        facet.x = facet.y = 0; facet.z = 1;
+        unit_normal.x = unit_normal.y = 0; unit_normal.z = 1;
         offset = pz;
 //@@ camera_offset
         su = a.x;
@@ -51,7 +51,7 @@ static inline Projected widened(real3_ across, real3_ down, real spread) {
             outward.x += along * axes[k].x; outward.y += along * axes[k].y; outward.z += along * axes[k].z;
         }
         real length = sqrt(dot3(outward, outward));
-        facet.x = outward.x / length; facet.y = outward.y / length; facet.z = outward.z / length;
+        unit_normal.x = outward.x / length; unit_normal.y = outward.y / length; unit_normal.z = outward.z / length;
     }
 //@ camera_derivative
         if (THICK_HERE) filtered = false;   // EWA has its own low-pass

@@ -1,4 +1,4 @@
 // Backward pass of the opacity compensation.
 //@ ewa_opacity_backward
-        by_determinant2 = REAL(0.5) * by_log / wide_image.determinant2;
-        by_grown -= REAL(0.5) * by_log / wide_image.grown;
+        grad_determinant2 = REAL(0.5) * grad_log / wide_image.determinant2;
+        grad_grown -= REAL(0.5) * grad_log / wide_image.grown;

@@ -15,34 +15,34 @@
 //@ ellipsoid_backward
     if (THICK_HERE) {
         const real l11 = wide_image.l11;
-        real by_l11 = by_a.x / per_x, by_l21 = by_a.y / per_y, by_l22 = by_b.y / per_y;
-        real by_per_x = -by_l11 * a.x, by_per_y = -(by_l21 * a.y + by_l22 * b.y);
-        real by_grown = REAL(0.5) * by_l22 * wide_image.l22 / wide_image.grown, by_determinant2 = 0;
+        real grad_l11 = grad_a.x / per_x, grad_l21 = grad_a.y / per_y, grad_l22 = grad_b.y / per_y;
+        real grad_per_x = -grad_l11 * a.x, grad_per_y = -(grad_l21 * a.y + grad_l22 * b.y);
+        real grad_grown = REAL(0.5) * grad_l22 * wide_image.l22 / wide_image.grown, grad_determinant2 = 0;
 //@@ ewa_opacity_backward
-        by_determinant2 += by_grown;
-        real by_xx = REAL(0.5) * (by_l11 - (by_l21 * wide_image.l21 + by_l22 * wide_image.l22) / l11) / l11 + spread * by_grown;
-        real by_xy = by_l21 / l11, by_yy = spread * by_grown;
-        real3_ by_crossed = scaled(2 * by_determinant2, wide_image.crossed);
-        real3_ by_across = add3(cross3(down, by_crossed), add3(scaled(2 * by_xx, across), scaled(by_xy, down)));
-        real3_ by_down = add3(cross3(by_crossed, across), add3(scaled(2 * by_yy, down), scaled(by_xy, across)));
-        by_per_x += dot3(by_across, across) / per_x;
-        by_per_y += dot3(by_down, down) / per_y;
-        by_across = scaled(per_x, by_across);
-        by_down = scaled(per_y, by_down);
-        by_a.x = by_across.x; by_a.y = by_down.x; by_a.z = -slope_x * by_across.x - slope_y * by_down.x;
-        by_b.x = by_across.y; by_b.y = by_down.y; by_b.z = -slope_x * by_across.y - slope_y * by_down.y;
-        by_c.x = by_across.z; by_c.y = by_down.z; by_c.z = -slope_x * by_across.z - slope_y * by_down.z;
+        grad_determinant2 += grad_grown;
+        real grad_xx = REAL(0.5) * (grad_l11 - (grad_l21 * wide_image.l21 + grad_l22 * wide_image.l22) / l11) / l11 + spread * grad_grown;
+        real grad_xy = grad_l21 / l11, grad_yy = spread * grad_grown;
+        real3_ grad_crossed = scaled(2 * grad_determinant2, wide_image.crossed);
+        real3_ grad_across = add3(cross3(down, grad_crossed), add3(scaled(2 * grad_xx, across), scaled(grad_xy, down)));
+        real3_ grad_down = add3(cross3(grad_crossed, across), add3(scaled(2 * grad_yy, down), scaled(grad_xy, across)));
+        grad_per_x += dot3(grad_across, across) / per_x;
+        grad_per_y += dot3(grad_down, down) / per_y;
+        grad_across = scaled(per_x, grad_across);
+        grad_down = scaled(per_y, grad_down);
+        grad_a.x = grad_across.x; grad_a.y = grad_down.x; grad_a.z = -slope_x * grad_across.x - slope_y * grad_down.x;
+        grad_b.x = grad_across.y; grad_b.y = grad_down.y; grad_b.z = -slope_x * grad_across.y - slope_y * grad_down.y;
+        grad_c.x = grad_across.z; grad_c.y = grad_down.z; grad_c.z = -slope_x * grad_across.z - slope_y * grad_down.z;
         // slopes at their limits are constant
-        real by_slope_x = slope_x == p.x * ahead ? -dot3(by_across, depths) : 0;
-        real by_slope_y = slope_y == p.y * ahead ? -dot3(by_down, depths) : 0;
-        by_p.x += by_slope_x * ahead;
-        by_p.y += by_slope_y * ahead;
-        by_p.z -= (by_slope_x * slope_x + by_slope_y * slope_y + by_per_x * per_x + by_per_y * per_y) * ahead;
+        real grad_slope_x = slope_x == p.x * ahead ? -dot3(grad_across, depths) : 0;
+        real grad_slope_y = slope_y == p.y * ahead ? -dot3(grad_down, depths) : 0;
+        grad_p.x += grad_slope_x * ahead;
+        grad_p.y += grad_slope_y * ahead;
+        grad_p.z -= (grad_slope_x * slope_x + grad_slope_y * slope_y + grad_per_x * per_x + grad_per_y * per_y) * ahead;
         // The image depends on fx x + cx z and fy y + cy z of the axes and the centre; limits of slopes are constant in pixels.
         const real3_ xs = {su * unit_a.x, sv * unit_b.x, c.x}, ys = {su * unit_a.y, sv * unit_b.y, c.y};
-        const real3_ by_xs = {by_a.x, by_b.x, by_c.x}, by_ys = {by_a.y, by_b.y, by_c.y};
-        own.by_camera[6] = (dot3(by_xs, xs) + by_p.x * p.x) / view->focal_x;
-        own.by_camera[7] = (dot3(by_ys, ys) + by_p.y * p.y) / view->focal_y;
-        own.by_camera[8] = (dot3(by_xs, depths) + by_p.x * pz) / view->focal_x;
-        own.by_camera[9] = (dot3(by_ys, depths) + by_p.y * pz) / view->focal_y;
+        const real3_ grad_xs = {grad_a.x, grad_b.x, grad_c.x}, grad_ys = {grad_a.y, grad_b.y, grad_c.y};
+        splat_grad.grad_camera[6] = (dot3(grad_xs, xs) + grad_p.x * p.x) / view->focal_x;
+        splat_grad.grad_camera[7] = (dot3(grad_ys, ys) + grad_p.y * p.y) / view->focal_y;
+        splat_grad.grad_camera[8] = (dot3(grad_xs, depths) + grad_p.x * pz) / view->focal_x;
+        splat_grad.grad_camera[9] = (dot3(grad_ys, depths) + grad_p.y * pz) / view->focal_y;
     }

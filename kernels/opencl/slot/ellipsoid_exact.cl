@@ -8,7 +8,7 @@
 //@ functions
 // From scaled axes a, b, c of lengths `lengths`: tangents, unit normal and area |a x b| of the disk for the ray `towards`. Returns
 // 1 / m, or infinity if there is no such disk.
-static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths, real3_ *a, real3_ *b, real3_ *facet, real *area) {
+static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths, real3_ *a, real3_ *b, real3_ *unit_normal, real *area) {
     real3_ axes[3] = {*a, *b, c};
     // starting with the longest axis, which avoids cancellation
     int i0 = lengths[0] >= lengths[1] && lengths[0] >= lengths[2] ? 0 : lengths[1] >= lengths[2] ? 1 : 2;
@@ -30,8 +30,8 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
     real u0 = g0 * w0 / s0, u1 = g1 * w1 / s1, u2 = g2 * w2 / s2;
     real3_ n = {e0.x * u0 + e1.x * u1 + e2.x * u2, e0.y * u0 + e1.y * u1 + e2.y * u2, e0.z * u0 + e1.z * u1 + e2.z * u2};
     real length = sqrt(dot3(n, n));
-    facet->x = n.x / length; facet->y = n.y / length; facet->z = n.z / length;
-    *area = s0 * fmax(s1, s2) * m / dot3(*facet, towards);
+    unit_normal->x = n.x / length; unit_normal->y = n.y / length; unit_normal->z = n.z / length;
+    *area = s0 * fmax(s1, s2) * m / dot3(*unit_normal, towards);
     return min_length / m;
 }
 //@ lowpass_make
@@ -42,17 +42,17 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
         bool parallel = false;
 //@@ camera_ellipsoid
         const real lengths[3] = {su, sv, THICKNESS_HERE};
-        real3_ c = {facet.x * lengths[2], facet.y * lengths[2], facet.z * lengths[2]};
-        real area, inverse_m = conjugate_disk(towards, c, lengths, &a, &b, &facet, &area);
+        real3_ c = {unit_normal.x * lengths[2], unit_normal.y * lengths[2], unit_normal.z * lengths[2]};
+        real area, inverse_m = conjugate_disk(towards, c, lengths, &a, &b, &unit_normal, &area);
         if (!(inverse_m < INFINITY)) return;            // the camera is at the centre
         third.x = towards.x * inverse_m; third.y = towards.y * inverse_m; third.z = towards.z * inverse_m;
         if (!parallel) inverse_m2 = inverse_m * inverse_m;
-        offset = dot3(facet, towards);
+        offset = dot3(unit_normal, towards);
         su = area;                                      // only the product su * sv is used, and scaled by the low-pass
         sv = 1;
     }
 //@ footprint_reach
-    const real own_radius = radius;                     // without the cone's widening, which is for bounds
+    const real cutoff_radius = radius;                     // without the cone's widening, which is for bounds
     if (THICK_HERE) {
         reach = radius * sqrt(a.z * a.z + b.z * b.z + third.z * third.z);
 //@@ camera_ellipsoid_reach
@@ -64,11 +64,11 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
 //@@ camera_ellipsoid_box
     }
 //@ footprint_bounds
-    radius = own_radius;
+    radius = cutoff_radius;
 //@ footprint_disc
         // the disk's test does not account for fragments of the ellipsoid that `near` removes
         if (THICK_HERE && pz >= near && pz - reach < near) record.disc_x = (wide)(center_x - anchor_x);
-//@ footprint_cross
+//@ footprint_intersect
     if (s->bulge > 0.0f) {
         vfloat squared = FMA((vfloat)s->bulge, c.q, c.d * c.d);      // D^2 (1 + rho_disk / m^2)
         c.inside = VMASK(c.q <= half_r2 * squared) & VMASK(c.d > 0.0f) & VMASK(squared <= s->d_near * c.d);

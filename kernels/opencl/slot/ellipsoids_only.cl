@@ -3,7 +3,7 @@
 //@ footprint
 #define INVERSE_D(c) 1.0f
 #define HALF_RHO(c, inverse_d) ((c).q)
-//@ footprint_cross
+//@ footprint_intersect
     c.d = 1.0f;
     c.q = FMA(nu_x, nu_x, nv * nv);
     c.inside = VMASK(c.q <= half_r2);

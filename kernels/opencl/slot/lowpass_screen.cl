@@ -39,7 +39,7 @@
             vfloat disc_y = fmax(fabs(y - s->disc_y) - half_y - BLOCKS_PAD, (vfloat)0.0f);
             outside &= VMASK(FMA(disc_x, disc_x, disc_y * disc_y) * filter > half_r2);
         }
-//@ cross_functions
+//@ intersect_functions
 #define HAS_DISC(s) ((s)->disc_x < 1e17f)       // disc_x is huge without a low-pass disc, NaN where the lens has no image of the centre
 //@ fragment_mask
 // Vectors of pixels skip splats without a disc; for single pixels the test costs as much as it saves.
@@ -49,7 +49,7 @@
 #define SKIPS_DISC(s) false
 #endif
 
-static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, vfloat y, wide half_r2, wide filter,
+static inline vint fragment_mask(const Splat *s, Intersection c, vfloat x, vfloat y, wide half_r2, wide filter,
                                  vfloat *screen) {
     *screen = 0.0f;
     if (SKIPS_DISC(s)) return c.inside;
@@ -59,11 +59,11 @@ static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, vfloat y,
     return c.inside | VMASK(*screen <= half_r2);
 }
 //@ fragment_half_rho
-static inline vfloat fragment_half_rho(const Splat *s, Crossing c, vfloat inverse_d, vfloat screen) {
+static inline vfloat fragment_half_rho(const Splat *s, Intersection c, vfloat inverse_d, vfloat screen) {
     vfloat half_rho = HALF_RHO(c, inverse_d);
     return SKIPS_DISC(s) ? half_rho : VSELECT(screen, VMIN(half_rho, screen), c.inside);
 }
-//@ disc_crossing
+//@ disc_intersection
     vfloat screen;              // rho / 2 of the low-pass disc
 //@ disc_mask
             c.screen = screen;

@@ -1,37 +1,37 @@
-// Gathers resident chunks of stores into the arrays of the rendered cloud, in scene order, and transforms chunks of placed
+// Gathers resident chunks of stores into the arrays of the rendered cloud, in scene order, and transforms chunks of posed
 // stores. INSTANCED: the device has float64 for the transform.
 #pragma OPENCL FP_CONTRACT OFF
 #if INSTANCED
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 #endif
 
-// Index space: (words of the largest piece, pieces). Reads: pieces (source row, target row, rows, pose or NOT_PLACED), source.
+// Index space: (words of the largest copy, copies). Reads: copies (source row, target row, rows, pose or NO_POSE), source.
 // Writes: target. words: per row.
-kernel void gather(global const uint *source, global const uint4 *pieces, uint words, global uint *target) {
-    uint4 piece = pieces[get_global_id(1)];
+kernel void gather(global const uint *source, global const uint4 *copies, uint words, global uint *target) {
+    uint4 copy = copies[get_global_id(1)];
     ulong word = get_global_id(0);
-    if (word >= (ulong)piece.z * words) return;
-    target[(ulong)piece.y * words + word] = source[(ulong)piece.x * words + word];
+    if (word >= (ulong)copy.z * words) return;
+    target[(ulong)copy.y * words + word] = source[(ulong)copy.x * words + word];
 }
 
 #if INSTANCED
-#define NOT_PLACED 0xffffffffu
+#define NO_POSE 0xffffffffu
 
 // A row of means (width 3) or quaternions (width 4). Bit-identical to `moved` (fidsplat/store/subset.py): sums have the same
 // order. Words of a pose: rotation by rows, translation of the origin of the means, quaternion.
-// Index space: (rows of the largest piece, pieces).
-kernel void gather_placed(
-    global const float *source, global const uint4 *pieces, uint width, global const double *poses, global float *target) {
-    uint4 piece = pieces[get_global_id(1)];
+// Index space: (rows of the largest copy, copies).
+kernel void gather_posed(
+    global const float *source, global const uint4 *copies, uint width, global const double *poses, global float *target) {
+    uint4 copy = copies[get_global_id(1)];
     uint row = get_global_id(0);
-    if (row >= piece.z) return;
-    global const float *from = source + (ulong)width * (piece.x + row);
-    global float *to = target + (ulong)width * (piece.y + row);
-    if (piece.w == NOT_PLACED) {
+    if (row >= copy.z) return;
+    global const float *from = source + (ulong)width * (copy.x + row);
+    global float *to = target + (ulong)width * (copy.y + row);
+    if (copy.w == NO_POSE) {
         for (uint i = 0; i < width; i++) to[i] = from[i];
         return;
     }
-    global const double *pose = poses + 16 * (ulong)piece.w;
+    global const double *pose = poses + 16 * (ulong)copy.w;
     if (width == 3) {
         double x = from[0], y = from[1], z = from[2];
         for (int i = 0; i < 3; i++)

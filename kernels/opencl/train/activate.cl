@@ -12,15 +12,15 @@ kernel void activate(
     activated_opacities[i] = sigmoid(logits[i]);
 }
 
-// Index space: one work-item per splat and rendered coefficient of a channel. Reads: sh, of `all` coefficients. Writes: the first
-// `rendered` of them, packed; at degree 0, if `plain`, the RGB colours.
+// Index space: one work-item per splat and rendered coefficient of a channel. Reads: sh, of `stored_terms` coefficients. Writes: the first
+// `rendered_terms` of them, packed; at degree 0, if `as_rgb`, the RGB colours.
 kernel void activate_sh(
 //@@ arguments activate_sh
 ) {
     uint k = get_global_id(0);
-    if (k >= count * 3 * rendered) return;
-    float value = sh[k / (3 * rendered) * 3 * all + k % (3 * rendered)];
-    activated_sh[k] = plain ? plain_color(value) : value;
+    if (k >= count * 3 * rendered_terms) return;
+    float value = sh[k / (3 * rendered_terms) * 3 * stored_terms + k % (3 * rendered_terms)];
+    activated_sh[k] = as_rgb ? plain_color(value) : value;
 }
 
 // Index space: one work-item per splat. Reads: means, scales. Updates: the number of frames in whose frustum the splat was, by a

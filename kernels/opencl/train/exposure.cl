@@ -11,7 +11,7 @@ kernel void apply_exposure(
     vstore3(gain * vload3(i, rgb) + offset, i, exposed);
 }
 
-// Index space: any number of work-groups of EXPOSURE_ITEMS, each with a contiguous range of pixels. Reads: the render. Updates: by_rgb, from
+// Index space: any number of work-groups of EXPOSURE_ITEMS, each with a contiguous range of pixels. Reads: the render. Updates: grad_rgb, from
 // the gradient with respect to the exposed render to the gradient with respect to the render. Writes: sums per work-group of the gradients with
 // respect to the gains' logarithms and the offsets, in a fixed order (deterministic).
 kernel __attribute__((reqd_work_group_size(EXPOSURE_ITEMS, 1, 1))) void exposure_backward(
@@ -24,11 +24,11 @@ kernel __attribute__((reqd_work_group_size(EXPOSURE_ITEMS, 1, 1))) void exposure
     real sums[6] = {0};
     for (uint i = first + item; i < end; i += EXPOSURE_ITEMS)
         for (uint c = 0; c < 3; c++) {
-            float slope = by_rgb[3 * (size_t)i + c];
+            float slope = grad_rgb[3 * (size_t)i + c];
             if (slope == 0.0f) continue;       // outside of the mask the render may not be finite
             sums[c] += slope * gain[c] * rgb[3 * (size_t)i + c];
             sums[3 + c] += slope;
-            by_rgb[3 * (size_t)i + c] = slope * gain[c];
+            grad_rgb[3 * (size_t)i + c] = slope * gain[c];
         }
     for (uint k = 0; k < 6; k++) partial[k][item] = sums[k];
     barrier(CLK_LOCAL_MEM_FENCE);

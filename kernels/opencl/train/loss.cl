@@ -1,7 +1,7 @@
 // Training loss for GPUs (loss_values.cl): each kernel is a pass over all pixels. A work-item computes LANES values of a row.
 
 // Rows per work-item in the passes over columns; the rows share their reads.
-#define EACH_ROWS 4
+#define ROWS_PER_ITEM 4
 
 // Declares a work-item's position in an image, `rows` rows of LANES values; returns outside of the image.
 #define LOCATE(rows) \
@@ -11,8 +11,8 @@
 
 // Index space: one work-item per value of the image. Reads: the render, the target, the mask. Writes: images 0 and 1 of `images`.
 // Where the mask is 0 the render is replaced by the target.
-kernel void loss_take(
-//@@ arguments loss_take
+kernel void loss_load(
+//@@ arguments loss_load
 ) {
     int column = get_global_id(0), row = get_global_id(1);
     if (column >= width || row >= height) return;
@@ -45,37 +45,37 @@ kernel void loss_rows(
     VSTORE(INSIDE(ab), images + 6 * image_stride + at);
 }
 
-// Column-wise means of `count` images from `from` on, for EACH_ROWS rows. Rows below the last margin, which are in the
+// Column-wise means of `count` images from `from` on, for ROWS_PER_ITEM rows. Rows below the last margin, which are in the
 // next image of the buffer, only affect results outside of the image.
 static inline void columns_of(global const float *from, int count, int stride, uint image_stride, vfloat means[][5]) {
-    for (int each = 0; each < EACH_ROWS; each++)
-        for (int image = 0; image < count; image++) means[each][image] = 0;
+    for (int row_offset = 0; row_offset < ROWS_PER_ITEM; row_offset++)
+        for (int image = 0; image < count; image++) means[row_offset][image] = 0;
 #pragma unroll
-    for (int k = -RADIUS; k < RADIUS + EACH_ROWS; k++)
+    for (int k = -RADIUS; k < RADIUS + ROWS_PER_ITEM; k++)
 #pragma unroll
         for (int image = 0; image < count; image++) {
             vfloat value = VLOAD(from + image * (size_t)image_stride + k * stride);
 #pragma unroll
-            for (int each = 0; each < EACH_ROWS; each++)
-                if (k - each >= -RADIUS && k - each <= RADIUS) means[each][image] += WINDOW[k - each + RADIUS] * value;
+            for (int row_offset = 0; row_offset < ROWS_PER_ITEM; row_offset++)
+                if (k - row_offset >= -RADIUS && k - row_offset <= RADIUS) means[row_offset][image] += WINDOW[k - row_offset + RADIUS] * value;
         }
 }
 
-// Index space: (LANES values, EACH_ROWS rows). Reads: images 2 to 6. Writes: images 7 to 9, the gradients of the SSIM with respect to the means of
+// Index space: (LANES values, ROWS_PER_ITEM rows). Reads: images 2 to 6. Writes: images 7 to 9, the gradients of the SSIM with respect to the means of
 // a, a a and a b; image 10, the SSIM.
 kernel void loss_columns(
 //@@ arguments loss_columns
 ) {
-    LOCATE(EACH_ROWS);
-    vfloat column_means[EACH_ROWS][5];
+    LOCATE(ROWS_PER_ITEM);
+    vfloat column_means[ROWS_PER_ITEM][5];
     columns_of(images + 2 * image_stride + at, 5, stride, image_stride, column_means);
-    for (int each = 0; each < EACH_ROWS && row + each < height; each++, at += stride) {
-        vfloat a = column_means[each][0], b = column_means[each][1], aa = column_means[each][2];
-        vfloat bb = column_means[each][3], ab = column_means[each][4];
+    for (int row_offset = 0; row_offset < ROWS_PER_ITEM && row + row_offset < height; row_offset++, at += stride) {
+        vfloat a = column_means[row_offset][0], b = column_means[row_offset][1], aa = column_means[row_offset][2];
+        vfloat bb = column_means[row_offset][3], ab = column_means[row_offset][4];
         const Ssim here = ssim_of(a, b, aa, bb, ab);
-        VSTORE(INSIDE(here.by_mean), images + 7 * image_stride + at);
-        VSTORE(INSIDE(here.by_variance), images + 8 * image_stride + at);
-        VSTORE(INSIDE(here.by_shared), images + 9 * image_stride + at);
+        VSTORE(INSIDE(here.grad_mean), images + 7 * image_stride + at);
+        VSTORE(INSIDE(here.grad_variance), images + 8 * image_stride + at);
+        VSTORE(INSIDE(here.grad_shared), images + 9 * image_stride + at);
         VSTORE(INSIDE(here.ssim), images + 10 * image_stride + at);
     }
 }
@@ -85,35 +85,35 @@ kernel void loss_rows_backward(
 //@@ arguments loss_rows_backward
 ) {
     LOCATE(1);
-    vfloat by_mean = 0, by_variance = 0, by_shared = 0;
+    vfloat grad_mean = 0, grad_variance = 0, grad_shared = 0;
     for (int k = -RADIUS; k <= RADIUS; k++) {
         global const float *from = images + 7 * image_stride + at + 3 * k;
         vfloat w = WINDOW[k + RADIUS];
-        by_mean += w * VLOAD(from);
-        by_variance += w * VLOAD(from + image_stride);
-        by_shared += w * VLOAD(from + 2 * image_stride);
+        grad_mean += w * VLOAD(from);
+        grad_variance += w * VLOAD(from + image_stride);
+        grad_shared += w * VLOAD(from + 2 * image_stride);
     }
-    VSTORE(INSIDE(by_mean), images + 2 * image_stride + at);
-    VSTORE(INSIDE(by_variance), images + 3 * image_stride + at);
-    VSTORE(INSIDE(by_shared), images + 4 * image_stride + at);
+    VSTORE(INSIDE(grad_mean), images + 2 * image_stride + at);
+    VSTORE(INSIDE(grad_variance), images + 3 * image_stride + at);
+    VSTORE(INSIDE(grad_shared), images + 4 * image_stride + at);
 }
 
-// Index space: (LANES values, EACH_ROWS rows). Reads: images 0 to 4. Writes: the gradient of the loss, in the shape of the image.
+// Index space: (LANES values, ROWS_PER_ITEM rows). Reads: images 0 to 4. Writes: the gradient of the loss, in the shape of the image.
 kernel void loss_columns_backward(
 //@@ arguments loss_columns_backward
 ) {
-    LOCATE(EACH_ROWS);
-    vfloat column_means[EACH_ROWS][5];
+    LOCATE(ROWS_PER_ITEM);
+    vfloat column_means[ROWS_PER_ITEM][5];
     columns_of(images + 2 * image_stride + at, 3, stride, image_stride, column_means);
-    for (int each = 0; each < EACH_ROWS && row < height; each++, row++, at += stride) {
-        vfloat by_mean = column_means[each][0], by_variance = column_means[each][1], by_shared = column_means[each][2];
+    for (int row_offset = 0; row_offset < ROWS_PER_ITEM && row < height; row_offset++, row++, at += stride) {
+        vfloat grad_mean = column_means[row_offset][0], grad_variance = column_means[row_offset][1], grad_shared = column_means[row_offset][2];
         vfloat a = VLOAD(images + at), b = VLOAD(images + image_stride + at);
-        vfloat slope = sign(a - b) * l1_share - (by_mean + 2.0f * a * by_variance + b * by_shared) * ssim_share;
+        vfloat slope = sign(a - b) * l1_share - (grad_mean + 2.0f * a * grad_variance + b * grad_shared) * ssim_share;
         float values[LANES];
         VSTORE(slope, values);
         for (int k = 0; k < LANES && column + k < width; k++) {
             bool counts = !masked || mask[(size_t)row * (width / 3) + (column + k) / 3];
-            by_rgb[(size_t)row * width + column + k] = counts ? values[k] : 0.0f;
+            grad_rgb[(size_t)row * width + column + k] = counts ? values[k] : 0.0f;
         }
     }
 }

@@ -94,9 +94,9 @@ kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips(
                 mean_ab = FMA(w, row_means[4], mean_ab);
             }
             const Ssim terms = ssim_of(mean_a, mean_b, mean_aa, mean_bb, mean_ab);
-            VSTORE(INSIDE(terms.by_mean), images + to);
-            VSTORE(INSIDE(terms.by_variance), images + image_stride + to);
-            VSTORE(INSIDE(terms.by_shared), images + 2 * image_stride + to);
+            VSTORE(INSIDE(terms.grad_mean), images + to);
+            VSTORE(INSIDE(terms.grad_variance), images + image_stride + to);
+            VSTORE(INSIDE(terms.grad_shared), images + 2 * image_stride + to);
             ssim_sum += INSIDE(terms.ssim);
         }
         ssim += sum_of(ssim_sum);
@@ -116,16 +116,16 @@ kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips_backward(
     for (int row = first - RADIUS; row < end + RADIUS; row++) {
         global const float *from = images + (size_t)(row + MARGIN_ROWS) * stride + MARGIN + left;
         for (int vector = 0; vector < VECTORS && left + vector * LANES < width; vector++, from += LANES) {
-            vfloat by_mean = 0, by_variance = 0, by_shared = 0;
+            vfloat grad_mean = 0, grad_variance = 0, grad_shared = 0;
 #pragma unroll
             for (int k = -RADIUS; k <= RADIUS; k++) {
                 vfloat w = WINDOW[k + RADIUS];
-                by_mean = FMA(w, VLOAD(from + 3 * k), by_mean);
-                by_variance = FMA(w, VLOAD(from + image_stride + 3 * k), by_variance);
-                by_shared = FMA(w, VLOAD(from + 2 * image_stride + 3 * k), by_shared);
+                grad_mean = FMA(w, VLOAD(from + 3 * k), grad_mean);
+                grad_variance = FMA(w, VLOAD(from + image_stride + 3 * k), grad_variance);
+                grad_shared = FMA(w, VLOAD(from + 2 * image_stride + 3 * k), grad_shared);
             }
             vfloat *here = means[(row + TAPS) % TAPS] + 3 * vector;
-            here[0] = by_mean, here[1] = by_variance, here[2] = by_shared;
+            here[0] = grad_mean, here[1] = grad_variance, here[2] = grad_shared;
         }
         int y = row - RADIUS;
         if (y < first) continue;
@@ -135,26 +135,26 @@ kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips_backward(
         size_t at = (size_t)y * width;
         load_row(a, b, left, width, rgb + at, target + at, masked, mask + at / 3);
         for (int vector = 0, column = left; vector < VECTORS && column < width; vector++, column += LANES) {
-            vfloat by_mean = 0, by_variance = 0, by_shared = 0;
+            vfloat grad_mean = 0, grad_variance = 0, grad_shared = 0;
 #pragma unroll
             for (int k = 0; k < TAPS; k++) {
                 const vfloat *terms = rows[k] + 3 * vector;
                 vfloat w = WINDOW[k];
-                by_mean = FMA(w, terms[0], by_mean);
-                by_variance = FMA(w, terms[1], by_variance);
-                by_shared = FMA(w, terms[2], by_shared);
+                grad_mean = FMA(w, terms[0], grad_mean);
+                grad_variance = FMA(w, terms[1], grad_variance);
+                grad_shared = FMA(w, terms[2], grad_shared);
             }
             vfloat x = VLOAD(a + MARGIN + vector * LANES), target_value = VLOAD(b + MARGIN + vector * LANES);
-            vfloat slope = sign(x - target_value) * l1_share - (by_mean + 2.0f * x * by_variance + target_value * by_shared) * ssim_share;
+            vfloat slope = sign(x - target_value) * l1_share - (grad_mean + 2.0f * x * grad_variance + target_value * grad_shared) * ssim_share;
             if (!masked && column + LANES <= width) {
-                VSTORE(slope, by_rgb + at + column);
+                VSTORE(slope, grad_rgb + at + column);
                 continue;
             }
             float values[LANES];
             VSTORE(slope, values);
             for (int k = 0; k < LANES && column + k < width; k++) {
                 bool counts = !masked || mask[(at + column + k) / 3];
-                by_rgb[at + column + k] = counts ? values[k] : 0.0f;
+                grad_rgb[at + column + k] = counts ? values[k] : 0.0f;
             }
         }
     }

@@ -20,7 +20,7 @@ constant float WINDOW[2 * RADIUS + 1] = {
 
 // SSIM of a window's means, and its gradients with respect to the means of a, a a and a b.
 typedef struct {
-    vfloat ssim, by_mean, by_variance, by_shared;
+    vfloat ssim, grad_mean, grad_variance, grad_shared;
 } Ssim;
 
 static inline Ssim ssim_of(vfloat a, vfloat b, vfloat aa, vfloat bb, vfloat ab) {
@@ -28,9 +28,9 @@ static inline Ssim ssim_of(vfloat a, vfloat b, vfloat aa, vfloat bb, vfloat ab) 
     vfloat means = a * a + b * b + C1, variances = (aa - a * a) + (bb - b * b) + C2;
     vfloat top = 2.0f * a * b + C1, shared = 2.0f * (ab - a * b) + C2;
     result.ssim = top * shared / (means * variances);
-    result.by_shared = 2.0f * top / (means * variances);
-    result.by_variance = -result.ssim / variances;
-    vfloat by_mean = 2.0f * (b * shared - a * result.ssim * variances) / (means * variances);
-    result.by_mean = by_mean - (2.0f * a * result.by_variance + b * result.by_shared);
+    result.grad_shared = 2.0f * top / (means * variances);
+    result.grad_variance = -result.ssim / variances;
+    vfloat grad_mean = 2.0f * (b * shared - a * result.ssim * variances) / (means * variances);
+    result.grad_mean = grad_mean - (2.0f * a * result.grad_variance + b * result.grad_shared);
     return result;
 }

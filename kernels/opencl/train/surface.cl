@@ -21,7 +21,7 @@ kernel void surface_normals(
     if (x >= width || y >= height) return;
     size_t at = y * (size_t)width + x;
     bool counts = !masked || mask[at];
-    float3 by_n = 0.0f, by_down = 0.0f, by_across = 0.0f;
+    float3 grad_n = 0.0f, grad_down = 0.0f, grad_across = 0.0f;
     if (counts && x > 0 && y > 0 && x + 1 < width && y + 1 < height && HAS_DEPTH(x, y) && HAS_DEPTH(x - 1, y) && HAS_DEPTH(x + 1, y)
         && HAS_DEPTH(x, y - 1) && HAS_DEPTH(x, y + 1)) {
         float3 down = POINT(x, y + 1) - POINT(x, y - 1), across = POINT(x + 1, y) - POINT(x - 1, y);
@@ -30,15 +30,15 @@ kernel void surface_normals(
         if (size > 0.0f) {
             float3 unit_n = crossed / size, own = vload3(at, normal);
             float share = normal_share * alpha[at];
-            by_n = -share * unit_n;
-            float3 by_crossed = (-share / size) * (own - dot(unit_n, own) * unit_n);
-            by_down = cross(across, by_crossed);
-            by_across = cross(by_crossed, down);
+            grad_n = -share * unit_n;
+            float3 grad_crossed = (-share / size) * (own - dot(unit_n, own) * unit_n);
+            grad_down = cross(across, grad_crossed);
+            grad_across = cross(grad_crossed, down);
         }
     }
-    vstore3(by_n, at, by_normal);
-    vstore3(by_down, 2 * at, differences);
-    vstore3(by_across, 2 * at + 1, differences);
+    vstore3(grad_n, at, grad_normal);
+    vstore3(grad_down, 2 * at, differences);
+    vstore3(grad_across, 2 * at + 1, differences);
 }
 
 // Index space: (columns, rows). Reads: differences. Writes: the gradients with respect to depths.
@@ -53,5 +53,5 @@ kernel void surface_depths(
     if (y + 1 < height) by -= vload3(2 * (at + width), differences);
     if (x > 0) by += vload3(2 * (at - 1) + 1, differences);
     if (x + 1 < width) by -= vload3(2 * (at + 1) + 1, differences);
-    by_depth[at] = (x + 0.5f - middle_x) * inverse_x * by.x + (y + 0.5f - middle_y) * inverse_y * by.y + by.z;
+    grad_depth[at] = (x + 0.5f - middle_x) * inverse_x * by.x + (y + 0.5f - middle_y) * inverse_y * by.y + by.z;
 }

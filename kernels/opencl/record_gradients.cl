@@ -1,7 +1,7 @@
-// Gradients of a splat's record, summed over the pixels of one tile (`Moments`), and the number of tiles of a splat.
+// Gradients of a splat's record, summed over the pixels of one tile (`RecordGradient`), and the number of tiles of a splat.
 
-//@@ struct Moments
-#define FIELDS (sizeof(Moments) / sizeof(float))
+//@@ struct RecordGradient
+#define FIELDS (sizeof(RecordGradient) / sizeof(float))
 
 // Number of tiles of a splat.
 static inline uint tile_count(uint2 window, uint big_capacity, global const Bounds *big_bounds, int width, int height) {
