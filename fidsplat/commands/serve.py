@@ -16,7 +16,6 @@ from fidsplat.cameras.screw import exponential
 from fidsplat.commands.options import Json, require_packages
 from fidsplat.commands.output import console, report
 from fidsplat.commands.scenes import RenderInput, Size
-from fidsplat.logs.robot_log import SCENE
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import number
@@ -191,6 +190,8 @@ class _Driver:
 
     def base_at(self, time: float) -> np.ndarray:
         """Pose of base_link in the world (4, 4) at a time; times must not decrease."""
+        from fidsplat.logs.reader import SCENE
+
         self._place(self._base @ exponential(self._twist * max(0.0, min(time, self._until) - self._time)))
         self._time = time
         for stamped in self._log.received("/pose", "geometry_msgs/msg/PoseStamped"):

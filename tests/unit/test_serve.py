@@ -372,6 +372,14 @@ def test_a_port_in_use_and_wrong_options_are_one_line(tmp_path, capsys, monkeypa
     assert "ROS_DOMAIN_ID must be a number from 0 to 232, got '233'" in capsys.readouterr().err
 
 
+def test_an_installation_without_extras_names_live():
+    missing = ["rosbags", "mcap", "lz4", "zstandard", "foxglove", "cyclonedds"]
+    code = f"import sys; sys.modules |= dict.fromkeys({missing}); from fidsplat.cli import main; exit(main())"
+    done = subprocess.run([sys.executable, "-c", code, "serve", "no.toml"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.strip().endswith("fidsplat serve; pip install 'fidsplat[live]'")
+
+
 @pytest.mark.parametrize(("package", "options"), [("foxglove", []), ("cyclonedds", ["--ros2"])])
 def test_a_missing_package_names_its_extra(tmp_path, capsys, monkeypatch, package, options):
     monkeypatch.setattr("fidsplat.commands.options.find_spec", lambda name: None if name == package else name)
