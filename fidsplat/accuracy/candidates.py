@@ -15,7 +15,7 @@ from fidsplat.capture.quality import Quality
 
 FILE = Path(__file__).with_name("candidates.json")
 MARGIN = 1.5
-"""factor of a promised error over the largest measured error, which other scenes may exceed slightly"""
+"""ratio of a promised error to the largest measured error, which other scenes may exceed slightly"""
 
 DEFAULTS: dict[str, Any] = {
     "alpha_cutoff": 1.0 / 255.0,
@@ -60,7 +60,7 @@ class Candidate:
 
 @cache
 def load(kind: str) -> tuple[Candidate, ...]:
-    """The candidates for a kind of device (cpu, gpu), the fastest first.
+    """Candidates for a kind of device (cpu, gpu), the fastest first.
 
     A kind without measurements uses the candidates of CPUs: errors in float32 are similar, and costs have
     the same order.

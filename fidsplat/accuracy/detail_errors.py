@@ -54,34 +54,34 @@ def measure_detail(
             f"{store.path} must have levels of detail, got none; build it again with levels, from more splats"
         )
     measured, levels, views = [], range(1, store.levels + 1), settings.views
-    for number, one in enumerate(settings.lowpass):
-        worst: dict[int, list[float | None]] = {level: [None] * len(SIZES) for level in levels}
-        for done, camera in enumerate(cameras_around(store, views, settings.seed)):
-            level = levels[done % len(levels)]
+    for number, lowpass in enumerate(settings.lowpass):
+        max_errors: dict[int, list[float | None]] = {level: [None] * len(SIZES) for level in levels}
+        for view, camera in enumerate(cameras_around(store, views, settings.seed)):
+            level = levels[view % len(levels)]
             # a larger cut-off would omit more of the small splats than of the merged splats
-            capture = Capture(camera, quality=Quality(lowpass=one, alpha_cutoff=REFERENCE_CUTOFF))
-            found = errors_of(store, renderer, capture, SIZES, level)
-            worst[level] = [_larger(*pair) for pair in zip(worst[level], found, strict=True)]
-            progress("measuring levels of detail", (number + (done + 1) / views) / len(settings.lowpass))
-        about = -(-views // len(levels)), renderer.device.title, date.today().isoformat()
+            capture = Capture(camera, quality=Quality(lowpass=lowpass, alpha_cutoff=REFERENCE_CUTOFF))
+            errors = errors_of(store, renderer, capture, SIZES, level)
+            max_errors[level] = [_larger(*pair) for pair in zip(max_errors[level], errors, strict=True)]
+            progress("measuring levels of detail", (number + (view + 1) / views) / len(settings.lowpass))
+        provenance = -(-views // len(levels)), renderer.device.title, date.today().isoformat()
         measured += [
-            DetailErrors(one, level, SIZES, tuple(errors), *about) for level, errors in worst.items()
+            DetailErrors(lowpass, level, SIZES, tuple(errors), *provenance)
+            for level, errors in max_errors.items()
         ]
     save_detail_errors(store.path, store.identity, measured)
     store.detail_errors = load_detail_errors(store.path, store.identity)
     return measured
 
 
-def _larger(one: float | None, other: float | None) -> float | None:
-    return max((error for error in (one, other) if error is not None), default=None)
+def _larger(a: float | None, b: float | None) -> float | None:
+    return max((error for error in (a, b) if error is not None), default=None)
 
 
 def errors_of(
     store: Store, renderer: Renderer, capture: Capture, sizes: Sequence[float], level: int
 ) -> list[float | None]:
-    """Largest difference of rgb from the exact frame for each size of cells: smaller cells are merged.
-
-    None for a size that merges the same cells as the next smaller size, or that changes no pixel.
+    """Largest difference of rgb from the exact frame for each size; cells of a smaller projected size are
+    merged. None for a size that merges the same cells as the next smaller size, or that changes no pixel.
 
     Args:
         sizes: ascending, in samples.
@@ -89,25 +89,25 @@ def errors_of(
     """
     splats = ChunkedSplats([store])
     features, view = prepare(splats, capture)
-    complete = before = select(splats, [view], features)
+    complete = previous = select(splats, [view], features)
     exact = None
-    worst: list[float | None] = [None] * len(sizes)
+    max_errors: list[float | None] = [None] * len(sizes)
     for number, size in enumerate(sizes):
-        limits = tuple(size if 0 < at <= level else 0.0 for at in range(store.levels + 1))
-        selection = select(splats, [view], features, (limits,))
-        if selection == before:
+        level_sizes = tuple(size if 0 < k <= level else 0.0 for k in range(store.levels + 1))
+        selection = select(splats, [view], features, (level_sizes,))
+        if selection == previous:
             continue
         if exact is None:
             exact = renderer.render(splats.load(complete), capture)["rgb"].astype(np.float64)
         merged = renderer.render(splats.load(selection), capture)["rgb"]
         # no change of a pixel gives None, not an error of 0
-        worst[number], before = float(np.abs(merged - exact).max()) or None, selection
-    return worst
+        max_errors[number], previous = float(np.abs(merged - exact).max()) or None, selection
+    return max_errors
 
 
 def cameras_around(store: Store, count: int, seed: int = 0) -> Iterator[Camera]:
-    """Cameras that look at random chunks. The distance is drawn such that cells of the camera's level have a
-    size within `SIZES` in the image; the levels are used in turn."""
+    """Cameras that look at random chunks, for one level after another, at random distances where cells of
+    the level have a projected size within `SIZES`."""
     generator = np.random.default_rng(seed)
     nodes = store.nodes
     chunks = nodes[nodes["level"] == 0]
@@ -119,10 +119,10 @@ def cameras_around(store: Store, count: int, seed: int = 0) -> Iterator[Camera]:
         chunk = chunks[generator.integers(len(chunks))]
         target = (chunk["low"] + chunk["high"]).astype(np.float64) / 2 + store.origin
         # stratified sampling of the logarithm of the size
-        share = (number // len(edges) + generator.random()) / rounds
-        size = SIZES[0] * (SIZES[-1] / SIZES[0]) ** share
-        away = edges[number % len(edges)] * focal / size
-        towards = generator.normal(size=3)
-        position = target + away * towards / np.linalg.norm(towards)
-        near = min(0.01, away / 100)
+        fraction = (number // len(edges) + generator.random()) / rounds
+        size = SIZES[0] * (SIZES[-1] / SIZES[0]) ** fraction
+        distance = edges[number % len(edges)] * focal / size
+        direction = generator.normal(size=3)
+        position = target + distance * direction / np.linalg.norm(direction)
+        near = min(0.01, distance / 100)
         yield Camera.look_at(WIDTH, HEIGHT, FOV_X, position, target, up=(0.0, -1.0, 1e-3), near=near)

@@ -55,20 +55,20 @@ def errors(image: ArrayLike, reference: ArrayLike) -> Errors:
     Raises:
         InputError: the shapes differ, the images are empty, or a value is not finite.
     """
-    found, expected = np.asarray(image, np.float64), np.asarray(reference, np.float64)
-    if found.shape != expected.shape:
-        raise InputError(f"image must have the shape {expected.shape} of the reference, got {found.shape}")
-    if found.size == 0:
-        raise InputError(f"image must not be empty, got shape {found.shape}")
-    for name, values in (("image", found), ("reference", expected)):
-        bad = values.size - int(np.isfinite(values).sum())
-        if bad:
-            raise InputError(f"{name} must be finite, got {bad} of {values.size} values NaN or infinite")
-    off = np.abs(found - expected)
-    mean_square = float(np.mean(off**2))
+    computed, expected = np.asarray(image, np.float64), np.asarray(reference, np.float64)
+    if computed.shape != expected.shape:
+        raise InputError(f"image must have the shape {expected.shape} of the reference, got {computed.shape}")
+    if computed.size == 0:
+        raise InputError(f"image must not be empty, got shape {computed.shape}")
+    for name, values in (("image", computed), ("reference", expected)):
+        invalid = values.size - int(np.isfinite(values).sum())
+        if invalid:
+            raise InputError(f"{name} must be finite, got {invalid} of {values.size} values NaN or infinite")
+    difference = np.abs(computed - expected)
+    mean_square = float(np.mean(difference**2))
     return Errors(
-        maximum=float(off.max()),
-        p999=float(np.quantile(off, 0.999)),
+        maximum=float(difference.max()),
+        p999=float(np.quantile(difference, 0.999)),
         rmse=mean_square**0.5,
         psnr=float(-10 * np.log10(mean_square)) if mean_square > 0 else float("inf"),
     )
@@ -80,11 +80,11 @@ def full_precision(capture: Capture, renderer: Renderer) -> Capture:
     Low-pass, samples, order and first_hit are unchanged. The device blends in float64 if it supports that
     (`supports_float64`).
     """
-    best = ideal_quality(capture.quality, REFERENCE_CUTOFF)
-    best = best.with_(arithmetic="precise", blend_precision="float32")
+    quality = ideal_quality(capture.quality, REFERENCE_CUTOFF)
+    quality = quality.with_(arithmetic="precise", blend_precision="float32")
     if not renderer.device.always_float64 and supports_float64(renderer, capture):
-        best = best.with_(blend_precision="float64")
-    return capture.with_(quality=best)
+        quality = quality.with_(blend_precision="float64")
+    return capture.with_(quality=quality)
 
 
 def supports_float64(renderer: Renderer, capture: Capture) -> bool:

@@ -26,8 +26,8 @@ from fidsplat.util.errors import DeviceError, InputError
 from fidsplat.util.files import from_json, read_text, user_cache, write_json
 from fidsplat.util.provenance import code_hash, digest_of
 
-LAYERS = 100
-"""default maximum number of faint fragments at a pixel"""
+FAINT_FRAGMENTS = 100
+"""default maximum number of fragments below the cut-off at a pixel"""
 DETAIL_ERRORS = (1 / 255, 4 / 255, 16 / 255, 0.5)
 """errors of levels of detail that are tried if only the time is bounded"""
 
@@ -39,7 +39,7 @@ def quality_within(
     scene: Scene | SplatCloud | Store | None = None,
     capture: Capture | Camera | None = None,
     device: str | Renderer | None = None,
-    layers: int = LAYERS,
+    faint_fragments: int = FAINT_FRAGMENTS,
     colors: float = 1.0,
 ) -> Quality:
     """Choose the fastest quality within an error, or the most accurate quality within a frame time.
@@ -49,9 +49,9 @@ def quality_within(
     the capture's quality.
 
     Without a scene, the error is promised for a class of scenes: at each pixel, the opacities of the
-    fragments below the cut-off sum to at most `layers` times the cut-off (true for at most `layers` splats),
-    and colours and background have a range of at most `colors`. The errors of cut-off and stop are bounded
-    for this class; the error of float32 rounding was measured over random scenes (docs/accuracy.md).
+    fragments below the cut-off sum to at most `faint_fragments` times the cut-off (true for at most as many
+    splats), and colours and background have a range of at most `colors`. The errors of cut-off and stop are
+    bounded for this class; the error of float32 rounding was measured over random scenes (docs/accuracy.md).
 
     With a scene and a camera, the error is measured in that scene on this device, and the choice is cached in
     the user's cache folder.
@@ -65,14 +65,14 @@ def quality_within(
             errors are tried.
         capture: capture or camera of the measurement; default: the scene's own.
         device: name of a device, or a Renderer; default: the device of `Renderer()`.
-        layers, colors: class of scenes, without a scene.
+        faint_fragments, colors: class of scenes, without a scene.
 
     Raises:
         InputError: a bound is missing, invalid, or not possible; the message names the smallest possible
             value.
         DeviceError: the device cannot be used or fails.
     """
-    return choose(error, ms, scene, capture, device, layers=layers, colors=colors).quality
+    return choose(error, ms, scene, capture, device, faint_fragments=faint_fragments, colors=colors).quality
 
 
 def choose(
@@ -82,7 +82,7 @@ def choose(
     capture: Capture | Camera | None = None,
     device: str | Renderer | None = None,
     report: Callable[[str], None] = lambda message: None,
-    layers: int = LAYERS,
+    faint_fragments: int = FAINT_FRAGMENTS,
     colors: float = 1.0,
 ) -> Choice:
     """Choose a quality as `quality_within` does; returns it with its error and time.
@@ -94,19 +94,22 @@ def choose(
         raise InputError(f"scene must be a SplatCloud, a Scene or a Store, got a {type(scene).__name__}")
     if isinstance(scene, Store):
         scene = Scene(stores=(scene,))
-    own = scene.capture if isinstance(scene, Scene) else Capture()
-    requested = capture if isinstance(capture, Capture) else own.with_(camera=capture)
-    requested = replace(requested, camera=requested.camera or own.camera, outputs=("rgb",), sensor=Sensor())
-    for name, given in (("scene", scene), ("camera", requested.camera)):
-        if given is None and (ms is not None or scene is not None or requested.camera is not None):
+    default = scene.capture if isinstance(scene, Scene) else Capture()
+    requested = capture if isinstance(capture, Capture) else default.with_(camera=capture)
+    camera = requested.camera or default.camera
+    requested = replace(requested, camera=camera, outputs=("rgb",), sensor=Sensor())
+    for name, value in (("scene", scene), ("camera", camera)):
+        if value is None and (ms is not None or scene is not None or camera is not None):
             what = "ms" if ms is not None else "an error that is measured"
             raise InputError(f"{name} must be given with {what}, got none; give scene=... and capture=...")
     renderer = device if isinstance(device, Renderer) else Renderer(device or default_device())
-    front = candidates.load(renderer.device.kind)
+    pareto_front = candidates.load(renderer.device.kind)
     if scene is None:
         assert error is not None
-        scenes = SceneClass(whole_number("layers", layers, 1, 2**31 - 1), _color_range(colors))
-        return _promised(error, scenes, front, requested.quality, renderer)
+        scenes = SceneClass(
+            whole_number("faint_fragments", faint_fragments, 1, 2**31 - 1), _color_range(colors)
+        )
+        return _promised(error, scenes, pareto_front, requested.quality, renderer)
     splats = scene.splats if isinstance(scene, Scene) else scene
     bases, content = [requested.quality], splats
     if isinstance(splats, ChunkedSplats):
@@ -126,7 +129,7 @@ def choose(
 
     def search_with(base: Quality) -> Choice:
         measurement.base = base  # all bases have the same reference image
-        return _search(CandidateSearch(measurement, front), error, ms)
+        return _search(CandidateSearch(measurement, pareto_front), error, ms)
 
     choice = _best_of(dict.fromkeys(bases), search_with, first=error is not None)
     _save(key, choice)
@@ -146,16 +149,16 @@ def check_bounds(error: float | None, ms: float | None) -> None:
 
 
 def _color_range(value: Any) -> float:
-    if not 0 < (found := as_float(value)) < math.inf:
+    if not 0 < (number := as_float(value)) < math.inf:
         raise InputError(f"colors must be a positive range, got {value!r}; give the largest colour, e.g. 1.0")
-    return found
+    return number
 
 
 @dataclass(frozen=True)
 class SceneClass:
     """Class of scenes for which an error is promised without a measurement."""
 
-    layers: int
+    faint_fragments: int
     """maximum sum of the opacities of a pixel's fragments below the cut-off, divided by the cut-off"""
     colors: float
     """maximum range of the colours of splats and background"""
@@ -167,19 +170,20 @@ class SceneClass:
         at most the remaining transmittance.
         """
         quality = candidate.quality(base)
-        omitted = self.layers * quality.alpha_cutoff + quality.transmittance_stop
+        omitted = self.faint_fragments * quality.alpha_cutoff + quality.transmittance_stop
         return self.colors * (omitted + MARGIN * candidate.error_max)
 
     def __str__(self) -> str:
-        return f"for colours of a range of {self.colors:g} and at most {self.layers} faint layers at a pixel"
+        count = self.faint_fragments
+        return f"for colours of a range of {self.colors:g} and at most {count} faint fragments at a pixel"
 
 
 def _promised(
-    error: float, scenes: SceneClass, front: tuple[Candidate, ...], base: Quality, renderer: Renderer
+    error: float, scenes: SceneClass, pareto_front: tuple[Candidate, ...], base: Quality, renderer: Renderer
 ) -> Choice:
     """The fastest candidate whose promised error is within the bound."""
     name = renderer.device.name
-    for candidate in front:
+    for candidate in pareto_front:
         # the rounding error of float16 grows with the number of fragments
         unbounded = candidate.settings.get("blend_precision") == "float16"
         if unbounded or scenes.promised_error(candidate, base) > error:
@@ -189,15 +193,15 @@ def _promised(
             promised = scenes.promised_error(supported, base)
             quality, settings = supported.quality(base), supported.settings
             return Choice(quality, promised, None, None, "promised", name, settings, remark=str(scenes))
-    finest = sorted(front, key=lambda candidate: scenes.promised_error(candidate, base))
-    best = next(
+    by_error = sorted(pareto_front, key=lambda candidate: scenes.promised_error(candidate, base))
+    lowest = next(
         scenes.promised_error(candidate, base)
-        for candidate in finest
+        for candidate in by_error
         if _supported(candidate, base, renderer)
     )
     raise InputError(
-        f"error must be at least {best:.2g} to be promised {scenes} on {name}, got {error:g}; allow a "
-        "larger error, set fewer layers, or give scene=... and capture=... to measure the error"
+        f"error must be at least {lowest:.2g} to be promised {scenes} on {name}, got {error:g}; allow a "
+        "larger error, lower faint_fragments, or give scene=... and capture=... to measure the error"
     )
 
 
@@ -217,13 +221,13 @@ def _search(search: CandidateSearch, error: float | None, ms: float | None) -> C
     if error is None:
         assert ms is not None
         return search.most_accurate_in(ms)
-    found = search.fastest_within(error)
-    if ms is not None and p90_ms(found) > ms:
+    choice = search.fastest_within(error)
+    if ms is not None and p90_ms(choice) > ms:
         raise InputError(
-            f"ms must be at least {p90_ms(found):.3g} on {search.device} for an error of {error:g}, got "
+            f"ms must be at least {p90_ms(choice):.3g} on {search.device} for an error of {error:g}, got "
             f"{ms:g}; {_best_in(search, ms)}"
         )
-    return found
+    return choice
 
 
 def _best_in(search: CandidateSearch, ms: float) -> str:

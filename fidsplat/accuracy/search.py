@@ -25,12 +25,12 @@ REPEATS = 9
 MIN_REPEATS = 3
 MAX_SECONDS = 10.0
 """time limit of one comparison of qualities, which still times at least `MIN_REPEATS` frames of each"""
-GROUP = 4
-"""candidates that are timed together before one is chosen"""
-TOO_SLOW = 1.5
-"""multiple of the allowed time; a candidate whose first frame takes longer is not timed further"""
-START = 0.5
-"""share of the allowed time; candidates with a shorter expected time are tried last"""
+GROUP_SIZE = 4
+"""number of candidates that are timed together before one is chosen"""
+MAX_FIRST_FRAME = 1.5
+"""multiple of the allowed time; candidates whose first frame takes longer are not timed"""
+START_FRACTION = 0.5
+"""fraction of the allowed time; candidates that are expected to be faster are tried last"""
 SCENE_VARIATION = 4.0
 """factor by which a candidate's error in this scene may be below the error that other scenes predict"""
 
@@ -101,47 +101,47 @@ class SceneMeasurement:
         return frame_timer(self.renderer, self._resident, self._capture, quality=quality)
 
 
-Measured = tuple[Candidate, float]
+MeasuredCandidate = tuple[Candidate, float]
 """a candidate that the device supports, and its error in the scene"""
 
 
 class CandidateSearch:
-    """Search among candidates, sorted by cost, with a scene in which they are measured."""
+    """Search among candidates, sorted by cost, by measuring them in a scene."""
 
     def __init__(self, measurement: SceneMeasurement, candidates: tuple[Candidate, ...]) -> None:
         self.measurement, self._candidates = measurement, candidates
         self.device = measurement.renderer.device.name
 
     def fastest_within(self, error: float) -> Choice:
-        """The fastest of the first `GROUP` candidates within the error.
+        """The fastest of the first `GROUP_SIZE` candidates within the error.
 
         Raises:
             InputError: no candidate is within the error; the message names the lowest possible error.
         """
-        hits: list[Measured] = []
-        missed: Measured | None = None
+        within: list[MeasuredCandidate] = []
+        last_exceeding: MeasuredCandidate | None = None
         for candidate in self._candidates:
-            # skip candidates that exceed the error even in easy scenes, and candidates that are hardly more
-            # accurate than the last measured candidate that exceeded it
+            # skip candidates that exceed the error even in easy scenes, or that are hardly more accurate than
+            # the last candidate that exceeded it
             if candidate.error_easy > SCENE_VARIATION * error:
                 continue
-            if missed and not _much_more_accurate(candidate, *missed):
+            if last_exceeding and not _much_more_accurate(candidate, *last_exceeding):
                 continue
             for supported, measured in self._measured([candidate]):
                 if measured <= error:
-                    hits.append((supported, measured))
+                    within.append((supported, measured))
                 else:
-                    missed = candidate, error / measured
-            if len(hits) == GROUP:
+                    last_exceeding = candidate, error / measured
+            if len(within) == GROUP_SIZE:
                 break
-        finest: list[Measured] = []
-        if not hits:  # the finest candidates may have been skipped
-            best = sorted(self._candidates, key=lambda candidate: candidate.error_median)[:GROUP]
-            finest = list(self._measured(best))
-            hits = [(supported, measured) for supported, measured in finest if measured <= error]
-        if hits:
-            return min(self._timed(hits), key=lambda choice: choice.ms or 0.0)
-        lowest = min(measured for _, measured in finest)
+        most_accurate: list[MeasuredCandidate] = []
+        if not within:  # the finest candidates may have been skipped
+            best = sorted(self._candidates, key=lambda candidate: candidate.error_median)[:GROUP_SIZE]
+            most_accurate = list(self._measured(best))
+            within = [(supported, measured) for supported, measured in most_accurate if measured <= error]
+        if within:
+            return min(self._timed(within), key=lambda choice: choice.ms or 0.0)
+        lowest = min(measured for _, measured in most_accurate)
         raise InputError(
             f"error must be at least {lowest:.2g} for this scene on {self.device}, got {error:g}; allow "
             f"{lowest * 1.1:.2g} or more"
@@ -154,21 +154,21 @@ class CandidateSearch:
         Raises:
             InputError: no candidate is fast enough; the message names the time of the fastest.
         """
-        tried: list[tuple[Measured, Choice]] = []
-        start = self._start(ms)
+        timed: list[tuple[MeasuredCandidate, Choice]] = []
+        start = self._first_index(ms)
         for group in (self._candidates[start:], self._candidates[:start]):
-            likely = self._likely(group, ms)
-            for first in range(0, len(likely), GROUP):
-                pairs = likely[first : first + GROUP]
-                tried += zip(pairs, self._timed(pairs), strict=True)
-                in_time = [choice for _, choice in tried if p90_ms(choice) <= ms]
+            fast = self._fast_candidates(group, ms)
+            for first in range(0, len(fast), GROUP_SIZE):
+                measured_candidates = fast[first : first + GROUP_SIZE]
+                timed += zip(measured_candidates, self._timed(measured_candidates), strict=True)
+                in_time = [choice for _, choice in timed if p90_ms(choice) <= ms]
                 if in_time:
                     return min(in_time, key=lambda choice: choice.error)
         # time the fastest candidates again, since other programs may have delayed their frames
-        fastest = [pair for pair, _ in sorted(tried, key=lambda pair: p90_ms(pair[1]))]
+        fastest = [pair for pair, _ in sorted(timed, key=lambda pair: p90_ms(pair[1]))]
         if not fastest:
-            fastest = list(itertools.islice(self._measured(self._candidates), GROUP))
-        best = min(self._timed(fastest[:GROUP]), key=p90_ms)
+            fastest = list(itertools.islice(self._measured(self._candidates), GROUP_SIZE))
+        best = min(self._timed(fastest[:GROUP_SIZE]), key=p90_ms)
         if p90_ms(best) <= ms:
             return best
         raise InputError(
@@ -176,30 +176,30 @@ class CandidateSearch:
             f"fastest quality has an error of {best.error:.2g}"
         )
 
-    def _start(self, ms: float) -> int:
-        """Index of the first candidate whose expected time is at least `START` times the allowed time."""
-        usual = min(self._candidates, key=lambda candidate: abs(math.log(candidate.cost))).portable
-        (times,) = self.measurement.times([self._quality(usual)], MIN_REPEATS)
-        costs = [candidate.cost * times.median / usual.cost for candidate in self._candidates]
-        start = next((k for k, cost in enumerate(costs) if cost >= START * ms), len(costs))
-        return max(0, min(start, len(costs) - 2 * GROUP))
+    def _first_index(self, ms: float) -> int:
+        """Index of the first candidate expected to take at least `START_FRACTION` of the allowed time."""
+        typical = min(self._candidates, key=lambda candidate: abs(math.log(candidate.cost))).portable
+        (times,) = self.measurement.times([self._quality(typical)], MIN_REPEATS)
+        costs = [candidate.cost * times.median / typical.cost for candidate in self._candidates]
+        first = next((k for k, cost in enumerate(costs) if cost >= START_FRACTION * ms), len(costs))
+        return max(0, min(first, len(costs) - 2 * GROUP_SIZE))
 
-    def _likely(self, group: Iterable[Candidate], ms: float) -> list[Measured]:
-        """Candidates whose first frame takes at most `TOO_SLOW` times the allowed time, sorted by error."""
-        likely, slow = [], 0
+    def _fast_candidates(self, group: Iterable[Candidate], ms: float) -> list[MeasuredCandidate]:
+        """Candidates with a first frame within `MAX_FIRST_FRAME` times the allowed time, sorted by error."""
+        fast, slow_count = [], 0
         for candidate, measured in self._measured(group):
-            if self.measurement.time(self._quality(candidate)) <= TOO_SLOW * ms:
-                likely.append((candidate, measured))
+            if self.measurement.time(self._quality(candidate)) <= MAX_FIRST_FRAME * ms:
+                fast.append((candidate, measured))
             else:
-                slow += 1
-            if slow == GROUP:
+                slow_count += 1
+            if slow_count == GROUP_SIZE:
                 break
-        return sorted(likely, key=lambda pair: pair[1])
+        return sorted(fast, key=lambda pair: pair[1])
 
     def _quality(self, candidate: Candidate) -> Quality:
         return candidate.quality(self.measurement.base)
 
-    def _measured(self, candidates: Iterable[Candidate]) -> Iterator[Measured]:
+    def _measured(self, candidates: Iterable[Candidate]) -> Iterator[MeasuredCandidate]:
         """Candidates with their errors; settings that the device lacks are removed."""
         for candidate in candidates:
             try:
@@ -211,13 +211,13 @@ class CandidateSearch:
                 measured = self.measurement.error(self._quality(candidate))
             yield candidate, measured
 
-    def _timed(self, pairs: list[Measured]) -> list[Choice]:
+    def _timed(self, pairs: list[MeasuredCandidate]) -> list[Choice]:
         """Choices of candidates, with their frame times."""
         qualities = [self._quality(candidate) for candidate, _ in pairs]
-        every = zip(pairs, qualities, self.measurement.times(qualities), strict=True)
+        rows = zip(pairs, qualities, self.measurement.times(qualities), strict=True)
         return [
             Choice(quality, error, times.median, times.p90, "measured", self.device, candidate.settings)
-            for (candidate, error), quality, times in every
+            for (candidate, error), quality, times in rows
         ]
 
 
@@ -227,12 +227,12 @@ def p90_ms(choice: Choice) -> float:
     return choice.ms_p90
 
 
-def _much_more_accurate(candidate: Candidate, missed: Candidate, factor: float) -> bool:
-    """Whether the error of a candidate is probably at most `factor` times the error of `missed`.
+def _much_more_accurate(candidate: Candidate, exceeding: Candidate, factor: float) -> bool:
+    """Whether the error of a candidate is probably at most `factor` times the error of `exceeding`.
 
     The median over the measured scenes depends on the cut-off, the maximum on the stop; a candidate that is
     better in one of them is tried.
     """
-    enough = SCENE_VARIATION * factor
-    by_median = candidate.error_median <= enough * missed.error_median
-    return by_median or candidate.error_max <= enough * missed.error_max
+    ratio = SCENE_VARIATION * factor
+    by_median = candidate.error_median <= ratio * exceeding.error_median
+    return by_median or candidate.error_max <= ratio * exceeding.error_max

@@ -12,10 +12,10 @@ import numpy as np
 from fidsplat.cameras.lenses import BrownConrady, Fisheye, Lens
 from fidsplat.util.errors import InputError, unknown
 
-PIXEL = 0.5
-"""added to pixel coordinates of ROS and OpenCV, where the centre of the first pixel is 0, not 0.5"""
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""rotation between OpenGL's camera axes (y up, z backwards) and OpenCV's"""
+PIXEL_OFFSET = 0.5
+"""added to pixel coordinates of ROS, OpenCV and BOP, where the centre of the first pixel is 0, not 0.5"""
+OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+"""OpenGL's camera axes (y up, z backwards) in OpenCV's, and vice versa"""
 LINK_FROM_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 """REP-103's body axes (x forward, y left, z up) from OpenCV's camera axes"""
 _COLMAP: dict[str, tuple[type[BrownConrady | Fisheye], tuple[str, ...]]] = {
@@ -51,6 +51,11 @@ _ROS: dict[str, tuple[type[BrownConrady | Fisheye], tuple[str, ...]]] = {
 """supported values of `distortion_model`: lens and its coefficients in order"""
 
 
+def opencv_matrix(camera: Any) -> np.ndarray:
+    """Intrinsic matrix (3, 3) for the pixel coordinates of ROS, OpenCV and BOP."""
+    return camera.matrix - [[0, 0, PIXEL_OFFSET], [0, 0, PIXEL_OFFSET], [0, 0, 0]]
+
+
 class PinholeArguments(NamedTuple):
     """Arguments of `Camera.pinhole`."""
 
@@ -71,8 +76,8 @@ def colmap_arguments(camera: Any, pose: Any) -> PinholeArguments:
         if hasattr(camera, "params"):
             model = getattr(camera.model, "name", camera.model)
             camera = (model, camera.width, camera.height, camera.params)
-        model, width, height, given = camera
-        parameters = [float(number) for number in given]
+        model, width, height, parameter_values = camera
+        parameters = [float(number) for number in parameter_values]
     except (AttributeError, TypeError, ValueError):
         raise InputError(
             "camera must be a pycolmap.Camera, or (model, width, height, parameters), "
@@ -87,15 +92,15 @@ def colmap_arguments(camera: Any, pose: Any) -> PinholeArguments:
             f"the camera model must be one of {', '.join(_COLMAP)}, got {model}; undistort the images, "
             "e.g. by colmap image_undistorter"
         )
-    kind, names = _COLMAP[model]
-    own = 3 if "SIMPLE" in model or model.startswith("RADIAL") else 4  # f, cx, cy or fx, fy, cx, cy
-    if len(parameters) != own + len(names):
+    lens_class, names = _COLMAP[model]
+    intrinsics = 3 if "SIMPLE" in model or model.startswith("RADIAL") else 4  # f, cx, cy or fx, fy, cx, cy
+    if len(parameters) != intrinsics + len(names):
         raise InputError(
-            f"the parameters of COLMAP's model {model} must be {'f' if own == 3 else 'fx, fy'}, cx, cy"
+            f"the parameters of COLMAP's model {model} must be {'f' if intrinsics == 3 else 'fx, fy'}, cx, cy"
             f"{''.join(f', {name}' for name in names)}, got {len(parameters)} numbers"
         )
-    lens = kind(**dict(zip(names, parameters[own:], strict=True)))
-    fx, fy, cx, cy = parameters[:own] if own == 4 else (parameters[0], *parameters[:3])
+    lens = lens_class(**dict(zip(names, parameters[intrinsics:], strict=True)))
+    fx, fy, cx, cy = parameters[:intrinsics] if intrinsics == 4 else (parameters[0], *parameters[:3])
     return PinholeArguments(width, height, fx, fy, cx, cy, pose, lens)
 
 
@@ -103,7 +108,7 @@ def nerfstudio_arguments(transforms: Any, frame: Any) -> PinholeArguments:
     """Arguments of `Camera.pinhole` for a frame of transforms.json, by its index or file_path."""
     try:
         frames = list(transforms["frames"])
-        paths = [one.get("file_path") for one in frames]
+        paths = [entry.get("file_path") for entry in frames]
     except (TypeError, KeyError, IndexError, AttributeError):
         raise InputError(
             "transforms must be the content of a transforms.json, with a list of frames, got "
@@ -114,44 +119,44 @@ def nerfstudio_arguments(transforms: Any, frame: Any) -> PinholeArguments:
         raise InputError(
             f"frame must be a number from 0 to {len(frames) - 1} or a file_path of transforms, got {frame!r}"
         )
-    given = {**transforms, **frames[number]}
+    values = {**transforms, **frames[number]}
     try:
-        matrix = np.array(given["transform_matrix"], np.float64)
+        matrix = np.array(values["transform_matrix"], np.float64)
         if matrix.shape == (3, 4):
             matrix = np.vstack([matrix, (0, 0, 0, 1)])
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
             raise ValueError
     except (KeyError, TypeError, ValueError, OverflowError):
         raise InputError(
-            f"transform_matrix must be 4 x 4 finite numbers, got {given.get('transform_matrix')!r}"
+            f"transform_matrix must be 4 x 4 finite numbers, got {values.get('transform_matrix')!r}"
         ) from None
     try:
-        width, height = int(given["w"]), int(given["h"])
+        width, height = int(values["w"]), int(values["h"])
     except (KeyError, TypeError, ValueError, OverflowError):
         raise InputError(
-            f"w and h must be the size of the images in pixels, got {given.get('w')!r} and {given.get('h')!r}"
+            f"w and h must be the size of the images [px], got {values.get('w')!r} and {values.get('h')!r}"
         ) from None
     try:
-        fx = _focal_length(given, "x", width)
-        fy = _focal_length(given, "y", height) if given.keys() & {"fl_y", "camera_angle_y"} else fx
-        cx, cy = float(given.get("cx", width / 2)), float(given.get("cy", height / 2))
+        fx = _focal_length(values, "x", width)
+        fy = _focal_length(values, "y", height) if values.keys() & {"fl_y", "camera_angle_y"} else fx
+        cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
     except InputError:  # a ValueError too
         raise
     except (KeyError, TypeError, ValueError, OverflowError):
         raise InputError(
             "fl_x, or camera_angle_x, must be a finite number, got "
-            f"{given.get('fl_x')!r} and {given.get('camera_angle_x')!r}"
+            f"{values.get('fl_x')!r} and {values.get('camera_angle_x')!r}"
         ) from None
-    pose = matrix @ OPENGL
+    pose = matrix @ OPENGL_AXES
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3], world_to_camera[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
-    return PinholeArguments(width, height, fx, fy, cx, cy, world_to_camera, _nerfstudio_lens(given))
+    return PinholeArguments(width, height, fx, fy, cx, cy, world_to_camera, _nerfstudio_lens(values))
 
 
-def _focal_length(given: Mapping[str, Any], axis: str, pixels: int) -> float:
-    if f"fl_{axis}" in given:
-        return float(given[f"fl_{axis}"])
-    angle = float(given[f"camera_angle_{axis}"])
+def _focal_length(values: Mapping[str, Any], axis: str, pixels: int) -> float:
+    if f"fl_{axis}" in values:
+        return float(values[f"fl_{axis}"])
+    angle = float(values[f"camera_angle_{axis}"])
     if not 0 < angle < math.pi:
         raise InputError(f"camera_angle_{axis} must be between 0 and pi radians, got {angle:g}")
     return pixels / 2 / math.tan(angle / 2)
@@ -195,20 +200,21 @@ def ros_arguments(info: Any, world_to_camera: Any, rectified: bool) -> PinholeAr
         )
     lens = None if rectified else kind(**dict(zip(names, coefficients, strict=False)))
     (fx, _, cx), (_, fy, cy) = matrix[0, :3], matrix[1, :3]
-    return PinholeArguments(width, height, fx, fy, cx + PIXEL, cy + PIXEL, world_to_camera, lens)
+    cx, cy = cx + PIXEL_OFFSET, cy + PIXEL_OFFSET
+    return PinholeArguments(width, height, fx, fy, cx, cy, world_to_camera, lens)
 
 
-def _nerfstudio_lens(given: Mapping[str, Any]) -> Lens:
-    model = given.get("camera_model", "OPENCV_FISHEYE" if given.get("is_fisheye") else "PINHOLE")
+def _nerfstudio_lens(values: Mapping[str, Any]) -> Lens:
+    model = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "PINHOLE")
     if not isinstance(model, str) or model not in _NERFSTUDIO:
         raise InputError(
             f"camera_model must be one of {', '.join(_NERFSTUDIO)}, got {model!r}; undistort the images first"
         )
-    values = {name: given[name] for name in COEFFICIENTS if given.get(name)}
-    if others := values.keys() - _NERFSTUDIO[model]:
+    coefficients = {name: values[name] for name in COEFFICIENTS if values.get(name)}
+    if others := coefficients.keys() - _NERFSTUDIO[model]:
         name = min(others)
         raise InputError(
             f"coefficients of the camera_model {model} must be {', '.join(_NERFSTUDIO[model])}, got {name} = "
-            f"{values[name]!r}; undistort the images first"
+            f"{coefficients[name]!r}; undistort the images first"
         )
-    return (Fisheye if model == "OPENCV_FISHEYE" else BrownConrady)(**values)
+    return (Fisheye if model == "OPENCV_FISHEYE" else BrownConrady)(**coefficients)

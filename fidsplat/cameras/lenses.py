@@ -21,9 +21,10 @@ FISHEYE_LIMIT = math.radians(100)
 """largest angle in radians between a fisheye's rays and its axis: a field of view of 200 degrees"""
 MAX_COEFFICIENT = 1e12
 """largest magnitude of a lens coefficient: more than any invertible lens has; products stay finite"""
-_STEPS = 4096  # entries of the table of initial values of Newton's method
-_ITERATIONS = 12
-_LOWEST = math.cos(math.radians(1))  # the stereographic projection maps -z to infinity
+_TABLE_SIZE = 4096  # entries of the table of initial values of Newton's method
+_MAX_ITERATIONS = 12  # of Newton's method
+# minimum angle between a ray and -z, which the stereographic projection maps to infinity
+_MIN_ANGLE_COSINE = math.cos(math.radians(1))
 _NEGLIGIBLE = 1e-200  # smaller leading coefficients are dropped: roots would overflow
 
 
@@ -48,7 +49,7 @@ class BrownConrady:
 
     kind: ClassVar[str] = "brown_conrady"
     along_ray: ClassVar[bool] = False
-    """whether depths are distances along the ray; else they are along z"""
+    """whether depths are distances along the ray; otherwise they are along z"""
 
     def __post_init__(self) -> None:
         _check(self)
@@ -76,23 +77,24 @@ class BrownConrady:
         return not any(getattr(self, field.name) for field in fields(self))
 
     @cached_property
-    def fold(self) -> float:
-        """tan of the angle from the axis at which the radial polynomial folds back; inf if it never does."""
-        above = np.polynomial.Polynomial([1, self.k1, self.k2, self.k3])
-        below = np.polynomial.Polynomial([1, self.k4, self.k5, self.k6])
+    def max_tangent(self) -> float:
+        """Tangent of the angle from the axis at which the radial polynomial stops increasing; inf if it never
+        does."""
+        numerator = np.polynomial.Polynomial([1, self.k1, self.k2, self.k3])
+        denominator = np.polynomial.Polynomial([1, self.k4, self.k5, self.k6])
         q = np.polynomial.Polynomial([0, 2])
-        slope = (above + q * above.deriv()) * below - q * above * below.deriv()
-        return math.sqrt(min(_first_root(slope), _first_root(below)))
+        slope = (numerator + q * numerator.deriv()) * denominator - q * numerator * denominator.deriv()
+        return math.sqrt(min(_first_root(slope), _first_root(denominator)))
 
     def _distorted(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
         """Image coordinates and their derivatives by x and y: a, b, a_x, a_y, b_x, b_y."""
         q = x * x + y * y
-        above = 1 + q * (self.k1 + q * (self.k2 + q * self.k3))
-        below = 1 + q * (self.k4 + q * (self.k5 + q * self.k6))
-        slope_above = self.k1 + q * (2 * self.k2 + q * 3 * self.k3)
-        slope_below = self.k4 + q * (2 * self.k5 + q * 3 * self.k6)
-        radial = above / below
-        slope = 2 * (slope_above - radial * slope_below) / below  # d radial / d x is this times x
+        numerator = 1 + q * (self.k1 + q * (self.k2 + q * self.k3))
+        denominator = 1 + q * (self.k4 + q * (self.k5 + q * self.k6))
+        numerator_slope = self.k1 + q * (2 * self.k2 + q * 3 * self.k3)
+        denominator_slope = self.k4 + q * (2 * self.k5 + q * 3 * self.k6)
+        radial = numerator / denominator
+        slope = 2 * (numerator_slope - radial * denominator_slope) / denominator  # d radial / dx = slope x
         a = x * radial + 2 * self.p1 * x * y + self.p2 * (q + 2 * x * x) + q * (self.s1 + q * self.s2)
         b = y * radial + self.p1 * (q + 2 * y * y) + 2 * self.p2 * x * y + q * (self.s3 + q * self.s4)
         prism_a, prism_b = 2 * (self.s1 + 2 * q * self.s2), 2 * (self.s3 + 2 * q * self.s4)
@@ -103,12 +105,14 @@ class BrownConrady:
         return a, b, a_x, a_y, b_x, b_y
 
     def image(self, points: np.ndarray) -> np.ndarray:
-        """Image coordinates (n, 2) of points (n, 3); NaN behind the camera and beyond the fold."""
+        """Image coordinates (n, 2) of points (n, 3); NaN behind the camera and beyond `max_tangent`."""
         points = _rows("points", points, 3)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
             a, b = self._distorted(x, y)[:2]
-            visible = (points[:, 2] > 0) & (np.hypot(x, y) < self.fold) & np.isfinite(a) & np.isfinite(b)
+            visible = (
+                (points[:, 2] > 0) & (np.hypot(x, y) < self.max_tangent) & np.isfinite(a) & np.isfinite(b)
+            )
         return np.where(visible[:, None], np.stack([a, b], 1), np.nan)
 
     def derivative(self, points: np.ndarray) -> np.ndarray:
@@ -126,40 +130,42 @@ class BrownConrady:
         image = _rows("image", image, 2)
         a, b = image.T
         distance = np.hypot(a, b)
-        x, y = _scaled(a, b, distance, self._undistorted(distance))
+        x, y = _with_length(a, b, distance, self._undistorted(distance))
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            for _ in range(_ITERATIONS):
-                here_a, here_b, a_x, a_y, b_x, b_y = self._distorted(x, y)
-                off_a, off_b = here_a - a, here_b - b
-                area = a_x * b_y - a_y * b_x
-                x, y = x - (b_y * off_a - a_y * off_b) / area, y - (a_x * off_b - b_x * off_a) / area
-                if not np.nanmax(np.abs(off_a) + np.abs(off_b), initial=0.0) > 1e-13:
+            for _ in range(_MAX_ITERATIONS):
+                image_a, image_b, a_x, a_y, b_x, b_y = self._distorted(x, y)
+                error_a, error_b = image_a - a, image_b - b
+                determinant = a_x * b_y - a_y * b_x
+                step_x = (b_y * error_a - a_y * error_b) / determinant
+                step_y = (a_x * error_b - b_x * error_a) / determinant
+                x, y = x - step_x, y - step_y
+                if not np.nanmax(np.abs(error_a) + np.abs(error_b), initial=0.0) > 1e-13:
                     break
-            here_a, here_b, a_x, a_y, b_x, b_y = self._distorted(x, y)
-            visible = (np.abs(here_a - a) + np.abs(here_b - b) < 1e-9 * (1 + distance)) & (
+            image_a, image_b, a_x, a_y, b_x, b_y = self._distorted(x, y)
+            visible = (np.abs(image_a - a) + np.abs(image_b - b) < 1e-9 * (1 + distance)) & (
                 a_x * b_y > a_y * b_x
             )
-            visible &= np.hypot(x, y) < self.fold
+            visible &= np.hypot(x, y) < self.max_tangent
         return np.where(visible[:, None], np.stack([x, y, np.ones_like(x)], 1), np.nan)
 
     def _undistorted(self, distance: np.ndarray) -> np.ndarray:
-        """tan of the angles whose images have these distances from the centre, by the radial terms alone."""
+        """Tangents of the angles with these distances from the image centre, by the radial terms alone."""
         symmetric = BrownConrady(self.k1, self.k2, self.k3, self.k4, self.k5, self.k6)
 
         def radial(tangent: np.ndarray) -> np.ndarray:
             return symmetric._distorted(tangent, np.zeros(1))[0]
 
-        furthest = float(np.max(distance, initial=0.0))
-        top = min(1.0, self.fold)
-        while top < self.fold and top < 1e4 and radial(np.array([top]))[0] < furthest:
-            top = min(2 * top, self.fold)
-        tangents = np.linspace(0, top * (1 - 1e-9), _STEPS)
+        max_distance = float(np.max(distance, initial=0.0))
+        limit = min(1.0, self.max_tangent)
+        while limit < self.max_tangent and limit < 1e4 and radial(np.array([limit]))[0] < max_distance:
+            limit = min(2 * limit, self.max_tangent)
+        tangents = np.linspace(0, limit * (1 - 1e-9), _TABLE_SIZE)
         return np.interp(distance, radial(tangents), tangents)
 
     @property
     def uniforms(self) -> tuple[float, ...]:
-        """Uniforms of the kernels: k1 to k6, p1, p2, s1 to s4, and the square of the fold."""
-        return (*(getattr(self, field.name) for field in fields(self)), min(self.fold**2, 1e30))
+        """Uniforms of the kernels: k1 to k6, p1, p2, s1 to s4, and the square of `max_tangent`."""
+        return (*(getattr(self, field.name) for field in fields(self)), min(self.max_tangent**2, 1e30))
 
 
 @dataclass(frozen=True)
@@ -182,18 +188,18 @@ class Fisheye:
         _check(self)
 
     @cached_property
-    def limit(self) -> float:
+    def max_angle(self) -> float:
         """Largest visible angle from the axis, radians."""
         slope = np.polynomial.Polynomial([1, 3 * self.k1, 5 * self.k2, 7 * self.k3, 9 * self.k4])
         return min(math.sqrt(_first_root(slope)), FISHEYE_LIMIT)
 
-    def distance(self, angle):
+    def image_radius(self, angle):
         """Distance from the image centre of a ray at an angle in radians from the axis."""
         q = angle * angle
         return angle * (1 + q * (self.k1 + q * (self.k2 + q * (self.k3 + q * self.k4))))
 
     def _slope(self, angle):
-        """Derivative of the distance with respect to the angle."""
+        """Derivative of the image radius with respect to the angle."""
         q = angle * angle
         return 1 + q * (3 * self.k1 + q * (5 * self.k2 + q * (7 * self.k3 + q * 9 * self.k4)))
 
@@ -201,14 +207,14 @@ class Fisheye:
         """Jacobian of the image coordinates with respect to X, Y, Z, (n, 2, 3), at visible points (n, 3)."""
         points = _rows("points", points, 3)
         x, y, z = points.T
-        across = np.hypot(x, y)
-        angle = np.arctan2(across, z)
+        radius = np.hypot(x, y)
+        angle = np.arctan2(radius, z)
         with np.errstate(divide="ignore", invalid="ignore"):
-            cos, sin = np.where(across > 0, x / across, 1.0), np.where(across > 0, y / across, 0.0)
-            outward = self._slope(angle) / (across**2 + z**2)
-            around = np.where(across > 0, self.distance(angle) / across, 1 / z)
-        by_radius = outward * np.stack([z * cos, z * sin, -across])
-        by_theta = around * np.stack([-sin, cos, 0 * z])
+            cos, sin = np.where(radius > 0, x / radius, 1.0), np.where(radius > 0, y / radius, 0.0)
+            per_angle = self._slope(angle) / (radius**2 + z**2)
+            per_azimuth = np.where(radius > 0, self.image_radius(angle) / radius, 1 / z)
+        by_radius = per_angle * np.stack([z * cos, z * sin, -radius])
+        by_theta = per_azimuth * np.stack([-sin, cos, 0 * z])
         return np.moveaxis(
             np.stack([cos * by_radius - sin * by_theta, sin * by_radius + cos * by_theta]), 2, 0
         )
@@ -216,10 +222,10 @@ class Fisheye:
     def image(self, points: np.ndarray) -> np.ndarray:
         """Image coordinates (n, 2) of points (n, 3); NaN outside the field of view."""
         points = _rows("points", points, 3)
-        across = np.hypot(points[:, 0], points[:, 1])
-        angle = np.arctan2(across, points[:, 2])
-        visible = np.asarray(angle <= self.limit) & np.asarray((across > 0) | (points[:, 2] > 0))
-        a, b = _scaled(points[:, 0], points[:, 1], across, self.distance(angle))
+        radius = np.hypot(points[:, 0], points[:, 1])
+        angle = np.arctan2(radius, points[:, 2])
+        visible = np.asarray(angle <= self.max_angle) & np.asarray((radius > 0) | (points[:, 2] > 0))
+        a, b = _with_length(points[:, 0], points[:, 1], radius, self.image_radius(angle))
         return np.where(visible[:, None], np.stack([a, b], 1), np.nan)
 
     def rays(self, image: np.ndarray) -> np.ndarray:
@@ -227,24 +233,24 @@ class Fisheye:
         image = _rows("image", image, 2)
         a, b = image.T
         distance = np.hypot(a, b)
-        angles = np.linspace(0, self.limit, _STEPS)
-        angle = np.interp(distance, self.distance(angles), angles)
-        for _ in range(_ITERATIONS):
+        angles = np.linspace(0, self.max_angle, _TABLE_SIZE)
+        angle = np.interp(distance, self.image_radius(angles), angles)
+        for _ in range(_MAX_ITERATIONS):
             slope = self._slope(angle)
-            off = self.distance(angle) - distance
+            error = self.image_radius(angle) - distance
             with np.errstate(divide="ignore", invalid="ignore"):
-                step = np.where(slope > 1e-12, off / slope, 0.0)
-            angle = np.clip(angle - step, 0.0, self.limit)
+                step = np.where(slope > 1e-12, error / slope, 0.0)
+            angle = np.clip(angle - step, 0.0, self.max_angle)
             if not np.abs(step).max(initial=0.0) > 1e-14:
                 break
-        x, y = _scaled(a, b, distance, np.sin(angle))
-        visible = distance <= self.distance(self.limit)
+        x, y = _with_length(a, b, distance, np.sin(angle))
+        visible = distance <= self.image_radius(self.max_angle)
         return np.where(visible[:, None], np.stack([x, y, np.cos(angle)], 1), np.nan)
 
     @property
     def uniforms(self) -> tuple[float, ...]:
-        """Uniforms of the kernels: k1 to k4 and the limit."""
-        return (self.k1, self.k2, self.k3, self.k4, self.limit)
+        """Uniforms of the kernels: k1 to k4 and `max_angle`."""
+        return (self.k1, self.k2, self.k3, self.k4, self.max_angle)
 
 
 @dataclass(frozen=True)
@@ -268,13 +274,13 @@ class Equirectangular:
         where the longitude jumps, it is the Jacobian of a point 1e-6 rad away towards z."""
         points = _rows("points", points, 3)
         x, y, z = points.T
-        far = np.linalg.norm(points, axis=1)
-        polar = np.hypot(x, z) < 1e-6 * far
-        x, z = np.where(polar, 0.0, x), np.where(polar, 1e-6 * far, z)
-        flat = np.hypot(x, z)
+        distance = np.linalg.norm(points, axis=1)
+        polar = np.hypot(x, z) < 1e-6 * distance
+        x, z = np.where(polar, 0.0, x), np.where(polar, 1e-6 * distance, z)
+        horizontal = np.hypot(x, z)
         with np.errstate(divide="ignore", invalid="ignore"):
-            longitude = np.stack([z, 0 * y, -x]) / flat**2
-            latitude = np.stack([-x * y / flat, flat, -z * y / flat]) / far**2
+            longitude = np.stack([z, 0 * y, -x]) / horizontal**2
+            latitude = np.stack([-x * y / horizontal, horizontal, -z * y / horizontal]) / distance**2
         return np.moveaxis(np.stack([longitude, latitude]), 2, 0)
 
     def rays(self, image: np.ndarray) -> np.ndarray:
@@ -328,14 +334,14 @@ class RayTable:
     """uniforms of a fisheye with an empty field of view, so that no splat's centre has an image"""
 
     def __post_init__(self) -> None:
-        given = real_array("directions", self.directions)
-        if given.ndim != 3 or given.shape[2] != 3:
-            raise InputError(f"directions must have the shape (h, w, 3), got {given.shape}")
+        directions = real_array("directions", self.directions)
+        if directions.ndim != 3 or directions.shape[2] != 3:
+            raise InputError(f"directions must have the shape (h, w, 3), got {directions.shape}")
         with np.errstate(divide="ignore", invalid="ignore"):
-            rays = given / np.linalg.norm(given, axis=2, keepdims=True)
+            rays = directions / np.linalg.norm(directions, axis=2, keepdims=True)
         if not np.isfinite(rays).any():
             raise InputError("directions must have a ray, got none with finite numbers and a length above 0")
-        if (rays[..., 2] < -_LOWEST).any():
+        if (rays[..., 2] < -_MIN_ANGLE_COSINE).any():
             raise InputError(
                 "directions must be at least 1 degree from -z, got a ray that is closer; turn the camera's "
                 "axes"
@@ -351,8 +357,8 @@ class RayTable:
     def derivative(self, points: np.ndarray) -> np.ndarray:
         """Jacobian (n, 2, 3) of coordinates across the beam, in beam widths, at points (n, 3)."""
         points = _rows("points", points, 3)
-        far = np.linalg.norm(points, axis=1, keepdims=True)
-        return perpendicular(points / far) / (self.divergence * far[:, :, None])
+        distance = np.linalg.norm(points, axis=1, keepdims=True)
+        return perpendicular(points / distance) / (self.divergence * distance[:, :, None])
 
     def rays(self, image: np.ndarray) -> np.ndarray:
         """Unit directions (n, 3) of the pixels of image coordinates (n, 2); NaN outside the table."""
@@ -387,8 +393,8 @@ def _rows(name: str, value: np.ndarray, width: int) -> np.ndarray:
 def _check(lens) -> None:
     for field in fields(lens):
         requirement = f"a finite number, in size at most {MAX_COEFFICIENT:g}"
-        given = getattr(lens, field.name), requirement, -MAX_COEFFICIENT, MAX_COEFFICIENT
-        object.__setattr__(lens, field.name, number(f"lens coefficient {field.name}", *given))
+        bounds = getattr(lens, field.name), requirement, -MAX_COEFFICIENT, MAX_COEFFICIENT
+        object.__setattr__(lens, field.name, number(f"lens coefficient {field.name}", *bounds))
 
 
 def _first_root(polynomial: np.polynomial.Polynomial) -> float:
@@ -401,7 +407,7 @@ def _first_root(polynomial: np.polynomial.Polynomial) -> float:
     return float(real.min()) if len(real) else math.inf
 
 
-def _scaled(a: np.ndarray, b: np.ndarray, length: np.ndarray, target: np.ndarray):
-    """Vectors (a, b) of a length, scaled to a target length; 0 stays 0."""
+def _with_length(a: np.ndarray, b: np.ndarray, length: np.ndarray, target: np.ndarray):
+    """Vectors (a, b) of these lengths, scaled to target lengths; 0 stays 0."""
     factor = target / np.where(length > 0, length, 1.0)
     return a * factor, b * factor

@@ -37,8 +37,8 @@ class Shutter:
     readout: float = 0.0
     """seconds between the exposures of the first and the last row (rolling shutter)"""
     rows_per_band: int = 8
-    """rows that share the poses of the band's middle row. An object that moves v pixels during the readout of
-    h rows is displaced by at most v (rows_per_band - 1) / (2 h) pixels; 1 is exact and slow"""
+    """rows of a band, which share the poses of its middle row. The error for an object that moves v pixels
+    during the readout of h rows is at most v (rows_per_band - 1) / (2 h) pixels; 1 is exact and slow"""
 
     def __post_init__(self) -> None:
         python_scalars(self)
@@ -48,9 +48,9 @@ class Shutter:
                 raise InputError(f"shutter {name} must be a finite number of seconds, got {value!r}")
             if name != "time" and value < 0:
                 raise InputError(f"shutter {name} must be 0 or more seconds, got {value!r}")
-        for name, most in (("sub_poses", MAX_SUB_POSES), ("rows_per_band", math.inf)):
+        for name, maximum in (("sub_poses", MAX_SUB_POSES), ("rows_per_band", math.inf)):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= maximum:
                 limit = f"1 to {MAX_SUB_POSES}" if name == "sub_poses" else "1 or more"
                 raise InputError(f"shutter {name} must be a whole number, {limit}, got {value!r}")
 
@@ -107,10 +107,10 @@ class Motion:
     def camera_at(self, time: float) -> np.ndarray | None:
         """world_to_camera (4, 4) at a time; None for a static camera."""
         time = number("the time of a motion", time)
-        return None if self.camera is None else _checked(self.camera(time), "the camera", time)
+        return None if self.camera is None else _rigid_pose(self.camera(time), "the camera", time)
 
     def sampled(self, times: Iterable[float]) -> Motion:
-        """Copy restricted to the poses at these times, which can be pickled even if poses are functions."""
+        """A copy with the poses at these times only, which can be pickled even if poses are functions."""
         try:
             moments = [number("a time", time, "a finite number of seconds") for time in times]
         except TypeError:
@@ -120,7 +120,7 @@ class Motion:
         return Motion(camera, groups)
 
     def moved(self, camera: Camera, time: float) -> Camera:
-        """The camera at the pose of a time."""
+        """The camera at its pose at a time."""
         instance("the camera of a motion", camera, Camera)
         pose = self.camera_at(time)
         return camera if pose is None else camera.with_pose(pose)
@@ -129,25 +129,25 @@ class Motion:
         """Label and motion (4, 4) of each group at a time."""
         time = number("the time of a motion", time)
         return [
-            (label, _checked(pose(time), f"the splats of label {label}", time))
+            (label, _rigid_pose(pose(time), f"the splats of label {label}", time))
             for label, pose in sorted(self.groups.items())
         ]
 
 
 @dataclass(frozen=True, eq=False)
 class _PoseTable:
-    """Poses at given times, callable as a function of the time."""
+    """Poses at sampled times, as a function of the time."""
 
     poses: dict[float, np.ndarray]
 
     def __call__(self, time: float) -> np.ndarray:
         if time not in self.poses:
-            given = ", ".join(f"{one:g}" for one in self.poses)
-            raise InputError(f"time must be a sampled time of this motion ({given} s), got {time:g} s")
+            sampled = ", ".join(f"{t:g}" for t in self.poses)
+            raise InputError(f"time must be a sampled time of this motion ({sampled} s), got {time:g} s")
         return self.poses[time]
 
 
-def _checked(matrix, what: str, time: float) -> np.ndarray:
+def _rigid_pose(matrix, what: str, time: float) -> np.ndarray:
     """Validated rigid pose (4, 4) float64."""
     matrix = pose_matrix(matrix, f"the pose of {what} at {time:g} s")
     check_similarity(matrix, f"the pose of {what} at {time:g} s", rigid=True)

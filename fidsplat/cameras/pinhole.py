@@ -60,11 +60,11 @@ class Camera(PickledByFields, Summarised):
     """lens model; None: a pinhole, also for a lens whose coefficients are all 0"""
 
     def __post_init__(self) -> None:
-        put = object.__setattr__
+        set_field = object.__setattr__
         for name in ("width", "height"):
-            put(self, name, _size(name, getattr(self, name)))
+            set_field(self, name, _size(name, getattr(self, name)))
         for name in ("fx", "fy", "cx", "cy", "near", "far"):
-            put(self, name, _number(name, getattr(self, name)))
+            set_field(self, name, _number(name, getattr(self, name)))
         if not (0 < self.near < math.inf):
             raise InputError(f"camera near must be above 0 and finite, got {self.near!r}")
         smallest, largest = FOCAL_LENGTHS
@@ -85,16 +85,16 @@ class Camera(PickledByFields, Summarised):
 
     def _set_pose(self, world_to_camera: Any, position: Any) -> None:
         """Set and validate the pose of a new camera."""
-        given = pose_matrix(world_to_camera, "camera world_to_camera")
-        check_similarity(given, "camera world_to_camera", rigid=True)
-        matrix = np.array(given, dtype=np.float64)
-        rotation, moved = matrix[:3, :3], matrix[:3, 3]
+        pose = pose_matrix(world_to_camera, "camera world_to_camera")
+        check_similarity(pose, "camera world_to_camera", rigid=True)
+        matrix = np.array(pose, dtype=np.float64)
+        rotation, translation = matrix[:3, :3], matrix[:3, 3]
         if position is None:
             # the inverse, not the transpose: a rotation from a float32 file is orthonormal to 1e-7 only
-            position = np.linalg.solve(rotation, -moved) + 0.0
+            position = np.linalg.solve(rotation, -translation) + 0.0
         else:
             position = _vector("position", position)
-            if np.abs(rotation @ position + moved).max() > 1e-6 * (1 + np.abs(position).max()):
+            if np.abs(rotation @ position + translation).max() > 1e-6 * (1 + np.abs(position).max()):
                 raise InputError(
                     "camera position must be the centre of projection of world_to_camera, got "
                     f"{tuple(position.tolist())}; omit it, or use camera.with_pose(world_to_camera)"
@@ -120,10 +120,10 @@ class Camera(PickledByFields, Summarised):
             y, x = np.mgrid[0.5 : self.height : self.height / 24, 0.5 : self.width : self.width / 32]
             covered = np.isfinite(self.rays(np.stack([x.ravel(), y.ravel()], 1))[:, 0]).mean()
             if covered < 0.5 and isinstance(lens, BrownConrady):
-                values = [(each.name, getattr(lens, each.name)) for each in fields(lens)]
-                given = ", ".join(f"{name} = {value:g}" for name, value in values if value)
+                values = [(coefficient.name, getattr(lens, coefficient.name)) for coefficient in fields(lens)]
+                listed = ", ".join(f"{name} = {value:g}" for name, value in values if value)
                 raise InputError(
-                    f"camera distortion must be invertible in half of the image, got {given}, which is not "
+                    f"camera distortion must be invertible in half of the image, got {listed}, which is not "
                     f"invertible in {100 * (1 - covered):.0f} % of it; check the coefficients and the focal "
                     f"length ({self.fx:g} pixels)"
                 )
@@ -160,27 +160,27 @@ class Camera(PickledByFields, Summarised):
             raise InputError(f"a fisheye must have 4 coefficients, k1 to k4, got {len(factors)}")
         lens, width, height = Fisheye(*factors), _size("width", width), _size("height", height)
         f = fisheye_focal_length(width, fov_x, lens)
-        place = width / 2, height / 2, world_to_camera, near, far
-        return Camera.pinhole(width, height, f, f, *place, lens=lens)
+        rest = width / 2, height / 2, world_to_camera, near, far
+        return Camera.pinhole(width, height, f, f, *rest, lens=lens)
 
     @staticmethod
     def equirectangular(width, height, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
         """A panorama of the sphere: z in the centre, -z at the left and right edges, -y at the top."""
         width, height = _size("width", width), _size("height", height)
         fx, fy = width / (2 * math.pi), height / math.pi
-        place = width / 2, height / 2, world_to_camera, near, far
-        return Camera.pinhole(width, height, fx, fy, *place, lens=Equirectangular())
+        rest = width / 2, height / 2, world_to_camera, near, far
+        return Camera.pinhole(width, height, fx, fy, *rest, lens=Equirectangular())
 
     @staticmethod
     def orthographic(width, height, metres_wide, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
         """An orthographic camera with square pixels whose image is ``metres_wide`` metres wide."""
         width, height = _size("width", width), _size("height", height)
-        across = _number("metres_wide", metres_wide)
-        if not 0 < across < math.inf:
+        metres = _number("metres_wide", metres_wide)
+        if not 0 < metres < math.inf:
             raise InputError(f"camera metres_wide must be above 0 and finite, got {metres_wide!r}")
-        f = width / across
-        place = width / 2, height / 2, world_to_camera, near, far
-        return Camera.pinhole(width, height, f, f, *place, lens=Orthographic())
+        f = width / metres
+        rest = width / 2, height / 2, world_to_camera, near, far
+        return Camera.pinhole(width, height, f, f, *rest, lens=Orthographic())
 
     @staticmethod
     def look_at(
@@ -378,12 +378,12 @@ def fisheye_focal_length(width: int, fov_x: float, lens: Fisheye) -> float:
     """Focal length in pixels of a fisheye with a width in pixels and a horizontal field of view in
     radians."""
     angle = _number("fov_x", fov_x)
-    if not 1e-9 < angle <= 2 * lens.limit + 1e-12:
+    if not 1e-9 < angle <= 2 * lens.max_angle + 1e-12:
         raise InputError(
-            f"camera fov_x of this fisheye must be between 0 and {math.degrees(2 * lens.limit):.4g} "
+            f"camera fov_x of this fisheye must be between 0 and {math.degrees(2 * lens.max_angle):.4g} "
             f"degrees, got {math.degrees(angle):.6g}"
         )
-    return width / 2 / float(lens.distance(angle / 2))
+    return width / 2 / float(lens.image_radius(angle / 2))
 
 
 def focal_length(width: int, fov_x: float) -> float:
@@ -410,10 +410,10 @@ def look_at_matrix(position, target, up=(0.0, -1.0, 0.0)) -> np.ndarray:
         raise InputError("camera up must not be zero, got (0, 0, 0)")
     right = np.cross(forward, upward / length)
     if np.linalg.norm(right) < 1e-9:
-        other = " ".join(f"{x:g}" for x in np.eye(3)[np.abs(forward).argmin()])
+        direction = " ".join(f"{x:g}" for x in np.eye(3)[np.abs(forward).argmin()])
         raise InputError(
             f"camera up must not be parallel to the optical axis, got {tuple(upward.tolist())}; give another "
-            f"direction, such as {other}, or move position or look_at"
+            f"direction, such as {direction}, or move position or look_at"
         )
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])

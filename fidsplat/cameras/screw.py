@@ -7,14 +7,14 @@ import numpy as np
 from fidsplat.splats.rotations import matrix_to_quaternion
 
 
-def interpolate(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
-    """Interpolate along the screw motion from one rigid pose (4, 4) to another; share: 0 to 1."""
-    return start @ exponential(twist(start, end) * share)
+def interpolate(start: np.ndarray, end: np.ndarray, fraction: float) -> np.ndarray:
+    """Interpolate along the screw motion from one rigid pose (4, 4) to another. fraction: 0 to 1."""
+    return start @ exponential(twist(start, end) * fraction)
 
 
 def twist(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """The twist (6,) of the screw motion from one rigid pose (4, 4) to another in time 1: axis times angle,
-    and velocity, in the axes of `start` (logarithm of SE(3))."""
+    """Logarithm of SE(3): the twist (6,) from one rigid pose (4, 4) to another in time 1: rotation vector
+    [rad], then velocity, in the axes of `start`."""
     rotation = start[:3, :3].T @ end[:3, :3]
     translation = start[:3, :3].T @ (end[:3, 3] - start[:3, 3])
     axis = _rotation_vector(rotation)
@@ -23,7 +23,7 @@ def twist(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def exponential(motion: np.ndarray) -> np.ndarray:
-    """The rigid motion (4, 4) along a twist (6,) in time 1 (exponential of SE(3))."""
+    """Exponential of SE(3): the rigid motion (4, 4) of a twist (6,) in time 1."""
     pose = np.eye(4)
     pose[:3, :3] = rotation_matrix(motion[:3])
     pose[:3, 3] = _left_jacobian(motion[:3]) @ motion[3:]
@@ -38,20 +38,20 @@ def _skew(axis: np.ndarray) -> np.ndarray:
 def _rotation_vector(rotation: np.ndarray) -> np.ndarray:
     """Axis times angle (0 to pi) of a rotation matrix."""
     w, *xyz = matrix_to_quaternion(rotation)
-    length = np.linalg.norm(xyz)
-    return np.array(xyz) * (2 * math.atan2(length, w) / length if length > 0 else 2.0)
+    sine = np.linalg.norm(xyz)
+    return np.array(xyz) * (2 * math.atan2(sine, w) / sine if sine > 0 else 2.0)
 
 
 def rotation_matrix(axis: np.ndarray) -> np.ndarray:
     """Rotation matrix (3, 3) of a rotation vector (3,), axis times angle in radians (Rodrigues)."""
     angle, skew = float(np.linalg.norm(axis)), _skew(axis)
-    half = np.sinc(angle / 2 / math.pi)
-    return np.eye(3) + np.sinc(angle / math.pi) * skew + half * half / 2 * skew @ skew
+    half_sinc = np.sinc(angle / 2 / math.pi)
+    return np.eye(3) + np.sinc(angle / math.pi) * skew + half_sinc * half_sinc / 2 * skew @ skew
 
 
 def _left_jacobian(axis: np.ndarray) -> np.ndarray:
     """Left Jacobian (3, 3) of SO(3) at a rotation vector v: integral of exp(s [v]x) over s from 0 to 1."""
     angle, skew = float(np.linalg.norm(axis)), _skew(axis)
-    half = np.sinc(angle / 2 / math.pi)
-    third = 1 / 6 - angle**2 / 120 if angle < 1e-3 else (1 - np.sinc(angle / math.pi)) / angle**2
-    return np.eye(3) + half * half / 2 * skew + third * skew @ skew
+    half_sinc = np.sinc(angle / 2 / math.pi)
+    cubic = 1 / 6 - angle**2 / 120 if angle < 1e-3 else (1 - np.sinc(angle / math.pi)) / angle**2
+    return np.eye(3) + half_sinc * half_sinc / 2 * skew + cubic * skew @ skew

@@ -15,7 +15,7 @@ from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion, po
 from fidsplat.util.arguments import PickledByFields, as_float, flag, invalid, number, real_array
 from fidsplat.util.errors import InputError
 
-UNIT = 1e-3
+MAX_LENGTH_ERROR = 1e-3
 """largest deviation of a quaternion's length from 1, for quaternions that files round"""
 MAX_SAMPLES = 10_000_000
 """maximum number of sampled poses"""
@@ -44,7 +44,7 @@ class Trajectory(PickledByFields):
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
             raise InputError(
                 "the times of a trajectory must be one or more finite, increasing numbers of seconds, got "
-                f"{_shown(self.times, times)}"
+                f"{_offending_times(self.times, times)}"
             )
         count = len(self.poses) if isinstance(self.poses, Sequence) or np.ndim(self.poses) else 0
         if count != len(times):
@@ -54,10 +54,10 @@ class Trajectory(PickledByFields):
         if isinstance(first, Sequence | np.ndarray) and len(first) == 7:
             poses = np.array([_of_vector(k, vector) for k, vector in enumerate(self.poses)])
         else:
-            given = [pose_matrix(pose, f"pose {k} of a trajectory") for k, pose in enumerate(self.poses)]
-            for k, pose in enumerate(given):
+            matrices = [pose_matrix(pose, f"pose {k} of a trajectory") for k, pose in enumerate(self.poses)]
+            for k, pose in enumerate(matrices):
                 check_similarity(pose, f"pose {k} of a trajectory", rigid=True)
-            poses = np.array(given, np.float64)
+            poses = np.array(matrices, np.float64)
         times.flags.writeable = poses.flags.writeable = False
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "poses", poses)
@@ -78,13 +78,13 @@ class Trajectory(PickledByFields):
         if after == 0 or after == len(times):
             return self.poses[min(after, len(times) - 1)]
         start, end, duration = self.poses[after - 1], self.poses[after], times[after] - times[after - 1]
-        share = float((time - times[after - 1]) / duration)
+        fraction = float((time - times[after - 1]) / duration)
         if not self.smooth:
-            return interpolate(start, end, share)
+            return interpolate(start, end, fraction)
         curve = [start, start @ exponential(self._velocities[after - 1] * (duration / 3))]
         curve += [end @ exponential(self._velocities[after] * (-duration / 3)), end]
         while len(curve) > 1:  # de Casteljau's algorithm with screw motions instead of lines
-            curve = [interpolate(a, b, share) for a, b in itertools.pairwise(curve)]
+            curve = [interpolate(a, b, fraction) for a, b in itertools.pairwise(curve)]
         return curve[0]
 
     @cached_property
@@ -93,14 +93,14 @@ class Trajectory(PickledByFields):
         durations = np.diff(self.times)[:, None]
         if not len(durations):
             return np.zeros((1, 6))
-        along = np.array([twist(*pair) for pair in itertools.pairwise(self.poses)]) / durations
+        velocities = np.array([twist(*pair) for pair in itertools.pairwise(self.poses)]) / durations
         before, after = durations[:-1], durations[1:]
-        inner = (along[:-1] * after + along[1:] * before) / (before + after)
+        inner = (velocities[:-1] * after + velocities[1:] * before) / (before + after)
         # limits rotations: a third of an interval's velocity must rotate by less than a quarter rotation,
         # otherwise a fast rotation in a short interval makes the long neighbour's curve ambiguous
         rotations = np.linalg.norm(inner[:, :3], axis=1, keepdims=True) * np.maximum(before, after) / 3
         inner *= np.minimum(1.0, math.pi / 2 / np.maximum(rotations, 1e-300))
-        return np.concatenate([along[:1], inner, along[-1:]])
+        return np.concatenate([velocities[:1], inner, velocities[-1:]])
 
     @property
     def vectors(self) -> np.ndarray:
@@ -109,10 +109,10 @@ class Trajectory(PickledByFields):
 
     def inverse(self) -> Trajectory:
         """Trajectory of the inverse poses: world to camera from camera to world, and vice versa."""
-        turned = self.poses[:, :3, :3].transpose(0, 2, 1)
+        rotations = self.poses[:, :3, :3].transpose(0, 2, 1)
         poses = np.zeros_like(self.poses)
-        poses[:, :3, :3], poses[:, 3, 3] = turned, 1.0
-        poses[:, :3, 3] = -(turned @ self.poses[:, :3, 3:])[:, :, 0]
+        poses[:, :3, :3], poses[:, 3, 3] = rotations, 1.0
+        poses[:, :3, 3] = -(rotations @ self.poses[:, :3, 3:])[:, :, 0]
         return Trajectory(self.times, poses, self.smooth)
 
     def sampled(self, rate: float) -> Trajectory:
@@ -145,7 +145,7 @@ def _of_vector(k: int, vector) -> np.ndarray:
             f"{numbers.tolist()}"
         )
     length = float(np.linalg.norm(numbers[3:]))
-    if abs(length - 1) > UNIT:
+    if abs(length - 1) > MAX_LENGTH_ERROR:
         raise InputError(
             f"the quaternion w, x, y, z of pose {k} of a trajectory must have length 1, got {length:g} for "
             f"{numbers[3:].tolist()}"
@@ -153,9 +153,9 @@ def _of_vector(k: int, vector) -> np.ndarray:
     return rigid_matrix(numbers[:3], numbers[3:])
 
 
-def _shown(given, times: np.ndarray) -> str:
+def _offending_times(original, times: np.ndarray) -> str:
     """The times for an error message: the first pair that does not increase, or all times."""
     if times.ndim == 1 and len(times) > 1 and np.isfinite(times).all():
         k = int(np.argmax(np.diff(times) <= 0))
         return f"{times[k]:.15g} and then {times[k + 1]:.15g} (number {k + 1}, counted from 0)"
-    return repr(given)
+    return repr(original)

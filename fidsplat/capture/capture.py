@@ -14,11 +14,11 @@ from fidsplat.capture.sensor import Sensor
 from fidsplat.util.arguments import PickledByFields
 from fidsplat.util.errors import InputError, unknown
 
-_KINDS = {
+_CLASSES = {
     **{"motion": Motion, "shutter": Shutter, "sensor": Sensor, "fog": Fog},
     **{"external_depth": ExternalDepth},
 }
-# shared by captures: making them takes longer than the rest of a capture
+# shared by captures: constructing them takes longer than the rest of a capture
 _QUALITY, _MOTION, _SHUTTER, _SENSOR = Quality(), Motion(), Shutter(), Sensor()
 _DEFAULTS = {"motion": _MOTION, "shutter": _SHUTTER, "sensor": _SENSOR}
 
@@ -50,18 +50,18 @@ class Capture(PickledByFields):
     """external depth image of the camera's size from another renderer: an opaque surface among the splats"""
 
     def __post_init__(self) -> None:
-        put = object.__setattr__
+        set_field = object.__setattr__
         if self.camera is not None and not isinstance(self.camera, Camera):
             raise InputError(f"camera must be a Camera, e.g. fs.Camera.look_at(...), got {self.camera!r}")
-        put(self, "outputs", output_names(self.outputs))
-        put(self, "quality", Quality.of(self.quality))
-        put(self, "background", background_of(self.background))
-        for name, kind in _KINDS.items():
+        set_field(self, "outputs", output_names(self.outputs))
+        set_field(self, "quality", Quality.of(self.quality))
+        set_field(self, "background", background_of(self.background))
+        for name, kind in _CLASSES.items():
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
                 raise InputError(f"{name} must be a {kind.__name__}, got {value!r}")
             if value is None and name in _DEFAULTS:
-                put(self, name, _DEFAULTS[name])
+                set_field(self, name, _DEFAULTS[name])
 
     @cached_property
     def has_fog(self) -> bool:
@@ -70,7 +70,7 @@ class Capture(PickledByFields):
 
     @cached_property
     def rendered_background(self) -> Background:
-        """Background behind all splats: the colour of the fog, or the background if there is no fog."""
+        """The fog's colour, or the background if there is no fog."""
         return self.fog.color if self.fog is not None and self.has_fog else self.background
 
     @cached_property
@@ -82,7 +82,7 @@ class Capture(PickledByFields):
         return len(self.shutter.bands(rows)) > 1 or len(self.shutter.times(0.0)) > 1
 
     def picklable(self) -> Capture:
-        """A copy that can be pickled: motion functions are replaced by poses at the shutter's times."""
+        """A copy that can be pickled: poses at the shutter's times replace motion functions."""
         if self.motion.is_still or self.camera is None:
             return self
         shutter = self.shutter
@@ -93,13 +93,11 @@ class Capture(PickledByFields):
     def with_(self, **changes: Any) -> Capture:
         """A copy with some fields changed; None leaves a field unchanged. Raises InputError for an unknown
         field or a value of the wrong type."""
-        given = {}
-        for name, value in changes.items():
+        for name in changes:
             if name not in self.__dataclass_fields__:
                 raise InputError(unknown("field of a capture", name, self.__dataclass_fields__))
-            if value is not None:
-                given[name] = value
-        return replace(self, **given) if given else self
+        changes = {name: value for name, value in changes.items() if value is not None}
+        return replace(self, **changes) if changes else self
 
 
 class CaptureFields(TypedDict, total=False):

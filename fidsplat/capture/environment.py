@@ -75,21 +75,21 @@ class Panorama(PickledByFields):
     """path of the image file"""
 
     def __post_init__(self) -> None:
-        given = array_of("background: a panorama", self.image, "(h, w, 3) numbers", "fiu")
-        if given.ndim != 3 or given.shape[2] != 3:
-            raise InputError(f"background: a panorama must be (h, w, 3) numbers, got {given.shape}")
-        if not 2 <= min(given.shape[:2]) <= max(given.shape[:2]) <= MAX_PANORAMA:
-            height, width = given.shape[:2]
+        pixels = array_of("background: a panorama", self.image, "(h, w, 3) numbers", "fiu")
+        if pixels.ndim != 3 or pixels.shape[2] != 3:
+            raise InputError(f"background: a panorama must be (h, w, 3) numbers, got {pixels.shape}")
+        if not 2 <= min(pixels.shape[:2]) <= max(pixels.shape[:2]) <= MAX_PANORAMA:
+            height, width = pixels.shape[:2]
             raise InputError(
                 f"background: a panorama must have 2 to {MAX_PANORAMA} pixels a side, got {width} x {height}"
             )
-        whole = np.iinfo(given.dtype).max if given.dtype in (np.uint8, np.uint16) else 1
+        white = np.iinfo(pixels.dtype).max if pixels.dtype in (np.uint8, np.uint16) else 1
         with np.errstate(over="ignore"):  # an overflow of float32 is rejected below
-            image = np.array(given, np.float32, order="C") / np.float32(whole)
-        if wrong := np.count_nonzero(~np.isfinite(image)):
+            image = np.array(pixels, np.float32, order="C") / np.float32(white)
+        if invalid_count := np.count_nonzero(~np.isfinite(image)):
             which = f"the panorama {self.file}" if self.file else "the panorama"
             raise InputError(
-                f"background: {which} must be finite, got {wrong:,} values that are NaN or infinite; "
+                f"background: {which} must be finite, got {invalid_count:,} values that are NaN or infinite; "
                 "replace them"
             )
         image.flags.writeable = False
@@ -130,9 +130,9 @@ class ExternalDepth(PickledByFields):
                 f"rgb and depth of external_depth must have shapes (h, w, 3) and (h, w), got {rgb.shape} and "
                 f"{depth.shape}"
             )
-        whole = 255 if rgb.dtype == np.uint8 else 1
-        if wrong := np.count_nonzero(~np.isfinite(rgb)):
-            raise InputError(f"external_depth must have finite colours, got {wrong:,} other numbers")
+        white = 255 if rgb.dtype == np.uint8 else 1
+        if invalid_count := np.count_nonzero(~np.isfinite(rgb)):
+            raise InputError(f"external_depth must have finite colours, got {invalid_count:,} other numbers")
         if (depth < 0).any():
             raise InputError(
                 f"external_depth must have depths of at least 0, got {np.nanmin(depth):g}; 0 means no surface"
@@ -142,13 +142,13 @@ class ExternalDepth(PickledByFields):
                 f"label of external_depth must be integers {depth.shape}, or one for all, got {label.dtype} "
                 f"{label.shape}"
             )
-        here = np.isfinite(depth) & (depth > 0)
-        made = {
-            "rgb": np.array(rgb, np.float32, order="C") / np.float32(whole),
-            "depth": np.where(here, depth, np.inf).astype(np.float32),
+        has_surface = np.isfinite(depth) & (depth > 0)
+        arrays = {
+            "rgb": np.array(rgb, np.float32, order="C") / np.float32(white),
+            "depth": np.where(has_surface, depth, np.inf).astype(np.float32),
             "label": np.ascontiguousarray(np.broadcast_to(label, depth.shape), np.int32),
         }
-        for name, array in made.items():
+        for name, array in arrays.items():
             array = array.copy() if array is getattr(self, name) else array
             array.flags.writeable = False
             object.__setattr__(self, name, array)

@@ -45,12 +45,12 @@ class Spinning:
 
     def __post_init__(self) -> None:
         limit = math.radians(88)
-        for name, most in (("elevations", limit), ("azimuths", math.pi)):
-            given = array_of(name, getattr(self, name), "numbers in radians", "fiu").astype(np.float64)
-            if given.ndim != 1 or not (np.abs(given) <= most).all():
+        for name, maximum in (("elevations", limit), ("azimuths", math.pi)):
+            angles = array_of(name, getattr(self, name), "numbers in radians", "fiu").astype(np.float64)
+            if angles.ndim != 1 or not (np.abs(angles) <= maximum).all():
                 remedy = "np.radians converts degrees"
-                raise invalid(name, f"numbers up to {most:.4g} rad", getattr(self, name), remedy)
-            object.__setattr__(self, name, tuple(given.tolist()))
+                raise invalid(name, f"numbers up to {maximum:.4g} rad", getattr(self, name), remedy)
+            object.__setattr__(self, name, tuple(angles.tolist()))
         whole_number("columns", self.columns, 1, MAX_SIZE)
         if not 1 <= len(self.elevations) <= MAX_SIZE:
             raise invalid("elevations", f"1 to {MAX_SIZE} numbers", self.elevations)
@@ -72,11 +72,11 @@ class Spinning:
 
     def directions(self, start: float, duration: float) -> np.ndarray:
         """(columns x rings, 3) unit directions in the order of firing, the same for every scan."""
-        turn = math.pi - 2 * math.pi * (np.arange(self.columns) + 0.5) / self.columns
-        azimuth = turn[:, None] + (np.array(self.azimuths) if self.azimuths else 0.0)
+        firing_azimuth = math.pi - 2 * math.pi * (np.arange(self.columns) + 0.5) / self.columns
+        azimuth = firing_azimuth[:, None] + (np.array(self.azimuths) if self.azimuths else 0.0)
         elevation = np.broadcast_to(self.elevations, (self.columns, self.rings))
-        flat = np.cos(elevation)
-        rays = (flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation))
+        cosine = np.cos(elevation)
+        rays = (cosine * np.cos(azimuth), cosine * np.sin(azimuth), np.sin(elevation))
         return np.stack(rays, 2).reshape(-1, 3)
 
     def fractions(self) -> np.ndarray:
@@ -120,9 +120,9 @@ class Rosette:
         first, second = (rate * time for rate in self.rates)
         left = self.half_angle / 2 * (np.cos(first) + np.cos(second))
         up = self.half_angle / 2 * (np.sin(first) + np.sin(second))
-        away = np.hypot(left, up)
-        aside = np.sinc(away / np.pi)
-        return np.stack([np.cos(away), aside * left, aside * up], 1)
+        angle = np.hypot(left, up)
+        sinc = np.sinc(angle / np.pi)
+        return np.stack([np.cos(angle), sinc * left, sinc * up], 1)
 
     def fractions(self) -> np.ndarray:
         """(points,) time of each beam as a fraction of the scan."""
@@ -162,7 +162,7 @@ class Lidar:
     noise: float = 0.0
     """standard deviation of ranges in metres"""
     noise_growth: float = 0.0
-    """standard deviation per metre of range, in addition to `noise`"""
+    """increase of the standard deviation per metre of range"""
     detection_range: float = math.inf
     """metres at which a surface of 10 % reflectivity, facing the sensor, is detected with a probability of
     90 %. The signal is proportional to reflectivity, cosine of incidence and inverse square of the range"""
@@ -172,8 +172,8 @@ class Lidar:
     """label -> reflectivity of its splats, 0 or more; by default the luminance of a splat's colour in linear
     light"""
     bands: int = 32
-    """number of poses per scan if anything moves, at most the number of columns; a beam and its pose are up
-    to duration / (2 bands) apart in time"""
+    """number of poses per scan if anything moves, at most the number of columns; a beam is rendered at a pose
+    up to duration / (2 bands) earlier or later"""
     seed: int = 0
     """seed of noise and detection, 0 to 2^32 - 1"""
     source: str = ""
@@ -227,14 +227,14 @@ class Lidar:
     @staticmethod
     def preset(name: str, **changes: Any) -> Lidar:
         """A sensor by name: vlp-16, os1-64 or livox-mid-40. changes: values of other fields."""
-        known = presets()
-        if not isinstance(name, str) or name.lower() not in known:
-            raise InputError(unknown("lidar", name, known))
+        all_presets = presets()
+        if not isinstance(name, str) or name.lower() not in all_presets:
+            raise InputError(unknown("lidar", name, all_presets))
         for change in changes:
             if change not in Lidar.__dataclass_fields__:
                 raise InputError(unknown("field of a lidar", change, Lidar.__dataclass_fields__))
-        found = known[name.lower()]
-        return replace(found, **changes) if changes else found
+        preset = all_presets[name.lower()]
+        return replace(preset, **changes) if changes else preset
 
     @property
     def duration(self) -> float:
@@ -269,7 +269,7 @@ def _rays(lidar: Lidar, start: float, moving: bool) -> tuple[Camera, np.ndarray,
     """Camera, pixels and directions of a scan, as returned by the methods of `Lidar`."""
     pattern, n = lidar.pattern, lidar.rays
     beams = pattern.directions(start, lidar.duration)
-    rays = _spread(beams, lidar.divergence, n)
+    rays = _divergent_rays(beams, lidar.divergence, n)
     if isinstance(pattern, Spinning):
         order = np.arange(len(rays)).reshape(pattern.columns, pattern.rings * n)
     else:
@@ -296,14 +296,14 @@ def _grid(rays: np.ndarray, begin: int, end: int, rows: int, width: int) -> np.n
     """Indices (rows, width) of rays [begin, end), sorted into columns by horizontal direction and into rows
     by vertical direction; -1 in unused cells."""
     grid = np.full((width, rows), -1)
-    across = begin + np.argsort(rays[begin:end, 1], kind="stable")
+    columns = begin + np.argsort(rays[begin:end, 1], kind="stable")
     for column in range(width):
-        part = across[column * rows : (column + 1) * rows]
-        grid[column, : len(part)] = part[np.argsort(rays[part, 2], kind="stable")]
+        in_column = columns[column * rows : (column + 1) * rows]
+        grid[column, : len(in_column)] = in_column[np.argsort(rays[in_column, 2], kind="stable")]
     return grid.T
 
 
-def _spread(beams: np.ndarray, divergence: float, count: int) -> np.ndarray:
+def _divergent_rays(beams: np.ndarray, divergence: float, count: int) -> np.ndarray:
     """(n x count, 3) directions of the rays of beams (n, 3), evenly distributed over the beam's disk by
     Vogel's spiral; the first ray is at its centre."""
     if count == 1:
@@ -314,16 +314,16 @@ def _spread(beams: np.ndarray, divergence: float, count: int) -> np.ndarray:
 @cache
 def presets() -> dict[str, Lidar]:
     """Presets of lidars.json by name."""
-    found = json.loads(Path(__file__).with_name("lidars.json").read_text("utf-8"))
-    return {name: _of_preset(values) for name, values in found.items()}
+    values_by_name = json.loads(Path(__file__).with_name("lidars.json").read_text("utf-8"))
+    return {name: _parsed_preset(values) for name, values in values_by_name.items()}
 
 
-def _of_preset(values: dict[str, Any]) -> Lidar:
+def _parsed_preset(values: dict[str, Any]) -> Lidar:
     values = dict(values)
     if "half_angle_deg" in values:
         rates = [rate * 2 * math.pi / 60 for rate in values.pop("rates_rpm")]
-        half, points = math.radians(values.pop("half_angle_deg")), values.pop("points")
-        pattern: Pattern = Rosette(half, (rates[0], rates[1]), points)
+        half_angle, points = math.radians(values.pop("half_angle_deg")), values.pop("points")
+        pattern: Pattern = Rosette(half_angle, (rates[0], rates[1]), points)
     else:
         degrees = values.pop("elevations_deg")
         if isinstance(degrees, dict):

@@ -20,15 +20,15 @@ BLEND_PRECISIONS = ("float32", "float16", "float64")
 MAX_SAMPLES = 8
 MIXTURES = ("exact", "fitted", "paper", "facets")
 BY_FORMULA = LADDER, NESTED = 121, 562
+"""numbers of Gaussians of the two templates that fidsplat/markers/mixture.py computes"""
 TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41, *BY_FORMULA)
-"""supported numbers of Gaussians per rectangle: templates of fidsplat/markers/templates.json, and the last
-two, which fidsplat/markers/mixture.py computes"""
+"""supported numbers of Gaussians per rectangle; the others are in fidsplat/markers/templates.json"""
 MAX_LEVELS, MAX_DENSITY = 8, 100
 
 
-def _one_of(what: str, value: Any, known: tuple) -> None:
-    if not isinstance(value, (str, int, type(None))) or isinstance(value, bool) or value not in known:
-        raise invalid(what, f"one of {', '.join(map(str, known))}", value)
+def _one_of(what: str, value: Any, choices: tuple) -> None:
+    if not isinstance(value, (str, int, type(None))) or isinstance(value, bool) or value not in choices:
+        raise invalid(what, f"one of {', '.join(map(str, choices))}", value)
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class MarkerQuality:
     2^-L of the half width."""
 
     density: int = 3
-    """Copies of all levels but the last in `paper`, 1 to 100: more copies are more opaque and slower."""
+    """Copies of each level of `paper` except the last, 1 to 100: more copies are more opaque and slower."""
 
     growth: float | None = None
-    """Modules, 0 to 1, by which a rectangle extends into neighbours of the same colour (a long rectangle more
-    along its axis). It closes gaps and rounds corners. None: 0.4 for fitted, 0 for paper."""
+    """Modules, 0 to 1, by which a rectangle extends into neighbours of the same colour, more along its longer
+    axis. It closes gaps and rounds corners. None: 0.4 for fitted, 0 for paper."""
 
     template: int = 25
     """Gaussians per rectangle with an aspect ratio up to 6 in `fitted`, and in splat files of `exact`: 1, 5,
@@ -77,8 +77,8 @@ class MarkerQuality:
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality settings of a frame. The output `error` bounds their error in one frame (docs/accuracy.md);
-    they have no bound for all scenes.
+    """Quality settings of a frame. They do not bound the error in every scene; the output `error` bounds it
+    in one frame (docs/accuracy.md).
 
     Raises:
         InputError: a value is out of range.
@@ -87,7 +87,7 @@ class Quality:
     alpha_cutoff: float = 1e-5
     """Minimum alpha of a fragment, in (0, 1), default 1e-5. It determines the radius R of each splat in
     standard deviations, R^2 = 2 ln(opacity / cutoff). Lower values make splats larger and slower; higher
-    values remove their faint rims: at 1/255, the value of other renderers, images are off by 0.018 where
+    values remove their faint rims: with 1/255, as in other renderers, images have errors of 0.018 where
     splats overlap, and 100 splats of alpha 0.0039 lose 32 % opacity (docs/accuracy.md)."""
 
     transmittance_stop: float = 1e-4
@@ -160,24 +160,24 @@ class Quality:
     def __post_init__(self) -> None:
         python_scalars(self)
 
-        def within(name: str, low: float, high: float, low_open: bool, high_open: bool) -> None:
+        def within(name: str, low: float, high: float, excludes_low: bool, excludes_high: bool) -> None:
             value = getattr(self, name)
-            found = as_float(value)
-            ok = (
-                math.isfinite(found)
-                and (found > low if low_open else found >= low)
-                and (found < high if high_open else found <= high)
+            number = as_float(value)
+            valid = (
+                math.isfinite(number)
+                and (number > low if excludes_low else number >= low)
+                and (number < high if excludes_high else number <= high)
             )
-            if not ok:
-                left, right = "(" if low_open else "[", ")" if high_open else "]"
-                raise InputError(f"quality: {name} must be in {left}{low:g}, {high:g}{right}, got {value!r}")
+            if not valid:
+                interval = f"{'[('[excludes_low]}{low:g}, {high:g}{'])'[excludes_high]}"
+                raise InputError(f"quality: {name} must be in {interval}, got {value!r}")
 
         within("alpha_cutoff", 0.0, 1.0, True, True)
         within("transmittance_stop", 0.0, 1.0, False, True)
         within("opacity_ceiling", 0.0, 1.0, True, False)
         within("first_hit", 0.0, 1.0, True, True)
         within("detail_error", 0.0, 1.0, False, True)
-        for name, known in (
+        for name, choices in (
             ("stop_rule", STOP_RULES),
             ("lowpass", LOWPASS),
             ("ellipsoid", ELLIPSOID),
@@ -186,7 +186,7 @@ class Quality:
             ("arithmetic", ARITHMETIC),
             ("blend_precision", BLEND_PRECISIONS),
         ):
-            _one_of(f"quality: {name}", getattr(self, name), known)
+            _one_of(f"quality: {name}", getattr(self, name), choices)
         instance("quality: marker", self.marker, MarkerQuality, "an fs.MarkerQuality")
         if self.blend_precision == "float64" and self.setup_precision != "float64":
             raise InputError(
@@ -223,7 +223,7 @@ class Quality:
         if not isinstance(quality, str):
             raise InputError(f"quality must be an fs.Quality or text, got {quality!r}")
         first, *rest = (part.strip() for part in quality.split(","))
-        chosen = PRESETS["standard"] if "=" in first else cls.named(first)
+        base = PRESETS["standard"] if "=" in first else cls.named(first)
         changes: dict[str, Any] = {}
         for part in [first, *rest] if "=" in first else rest:
             name, equals, value = (piece.strip() for piece in part.partition("="))
@@ -232,11 +232,11 @@ class Quality:
                     f"quality must be settings as key=value, e.g. alpha_cutoff=1e-3, got {part!r}"
                 )
             if name.startswith("marker."):
-                own = name.removeprefix("marker.")
-                changes.setdefault("marker", {})[own] = _read(MarkerQuality, own, value)
+                setting = name.removeprefix("marker.")
+                changes.setdefault("marker", {})[setting] = _read(MarkerQuality, setting, value)
             else:
                 changes[name] = _read(cls, name, value)
-        return chosen.with_(**changes)
+        return base.with_(**changes)
 
     def with_(self, **changes) -> Quality:
         """A copy with some settings changed. marker: a `MarkerQuality`, or a dict of changed settings."""
@@ -256,10 +256,10 @@ def setting_types(kind: type[Quality] | type[MarkerQuality]) -> dict[str, str]:
 
 
 def _check_known(kind: type[Quality] | type[MarkerQuality], name: str) -> None:
-    known = [setting.name for setting in fields(kind)]
-    if name not in known:
+    names = [setting.name for setting in fields(kind)]
+    if name not in names:
         whose = "marker quality" if kind is MarkerQuality else "quality"
-        raise InputError(unknown(f"setting of {whose}", name, known))
+        raise InputError(unknown(f"setting of {whose}", name, names))
 
 
 def _read(kind: type[Quality] | type[MarkerQuality], name: str, text: str) -> Any:

@@ -15,13 +15,13 @@ from fidsplat.util.response import to_light
 
 RESPONSES = ("linear", "srgb")
 BITS = (8, 16)
-GAMMAS = 0.01, 100.0
+GAMMA_RANGE = 0.01, 100.0
 """range of gammas"""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """weights of linear RGB in luminance (Rec. 709)"""
-MOST_BALANCE = 8.0
+MAX_WHITE_BALANCE = 8.0
 """largest factor of a measured white balance"""
-LARGEST = 1e15
+MAX_VALUE = 1e15
 """largest factor and curve value: results stay within float32"""
 
 
@@ -75,7 +75,7 @@ class Sensor:
         python_scalars(self)
         if not as_float(self.full_well) >= 1:
             raise invalid("sensor: full_well", "a number of electrons, 1 or more", self.full_well)
-        for name, highest in (("exposure", LARGEST), ("gain", LARGEST), ("read_noise", self.full_well)):
+        for name, highest in (("exposure", MAX_VALUE), ("gain", MAX_VALUE), ("read_noise", self.full_well)):
             number(f"sensor: {name}", getattr(self, name), f"a number from 0 to {highest:g}", 0, highest)
         if self.read_noise > 0 and math.isinf(self.full_well):
             raise InputError(f"sensor: full_well must be given with read_noise, got {self.read_noise!r} only")
@@ -108,23 +108,23 @@ class Sensor:
                 requirement = f"{', '.join(RESPONSES)}, a gamma above 0, or a table"
                 raise invalid("sensor: response", requirement, self.response)
         elif not math.isnan(as_float(self.response)):
-            number("sensor: a gamma", self.response, "from {:g} to {:g}".format(*GAMMAS), *GAMMAS)
+            number("sensor: a gamma", self.response, "from {:g} to {:g}".format(*GAMMA_RANGE), *GAMMA_RANGE)
         else:
             object.__setattr__(self, "response", _numbers("response", self.response, 2, 65536))
 
     @cached_property
     def extra(self) -> dict[str, tuple[float, ...]]:
         """Numbers of `extra_steps` by name."""
-        found = {}
+        steps = {}
         for text in self.extra_steps:
             name, colon, numbers = text.partition(":")
-            found[name] = _numbers("extra_steps", map(float, numbers.split(",") if colon else ()), 0, 64)
-        return found
+            steps[name] = _numbers("extra_steps", map(float, numbers.split(",") if colon else ()), 0, 64)
+        return steps
 
     @cached_property
     def steps(self) -> tuple[str, ...]:
         """Names of the active steps, in order of application."""
-        found = [
+        steps = [
             ("decode_srgb", self.decode == "srgb"),
             ("veiling_glare", self.veiling_glare > 0),
             ("exposure", self.exposure != 1 or self.auto_exposure > 0),
@@ -135,16 +135,16 @@ class Sensor:
             ("white_balance", self.white_balance != (1.0, 1.0, 1.0)),
         ]
         if not isinstance(self.response, (str, tuple)):
-            found.append(("response_gamma", self.response != 1))
+            steps.append(("response_gamma", self.response != 1))
         elif self.response == "srgb":
-            found.append(("response_srgb", True))
+            steps.append(("response_srgb", True))
         elif isinstance(self.response, tuple):
             # a table that is the identity only clamps, as every output does
             line = np.linspace(0, 1, len(self.response))
-            found.append(("response_table", not np.array_equal(self.response, line)))
-        found += [(name, True) for name in self.extra]
-        found.append(("quantise", self.bits is not None))
-        return tuple(name for name, active in found if active)
+            steps.append(("response_table", not np.array_equal(self.response, line)))
+        steps += [(name, True) for name in self.extra]
+        steps.append(("quantise", self.bits is not None))
+        return tuple(name for name, active in steps if active)
 
     @property
     def needs_metering(self) -> bool:
@@ -161,12 +161,12 @@ class Sensor:
         glare = self.glare_light or tuple(mean.tolist())
         # scattering changes the mean only if glare_light is given
         mean = (1 - self.veiling_glare) * mean + self.veiling_glare * np.array(glare)
-        luminance = max(float(mean @ LUMINANCE), 1 / LARGEST)
+        luminance = max(float(mean @ LUMINANCE), 1 / MAX_VALUE)
         exposure = self.exposure * (self.auto_exposure / luminance if self.auto_exposure > 0 else 1.0)
-        balance = self.white_balance
-        if balance == "grey":
-            balance = tuple((luminance / np.maximum(mean, luminance / MOST_BALANCE)).tolist())
-        changes = {"exposure": exposure, "auto_exposure": 0.0, "white_balance": balance}
+        white_balance = self.white_balance
+        if white_balance == "grey":
+            white_balance = tuple((luminance / np.maximum(mean, luminance / MAX_WHITE_BALANCE)).tolist())
+        changes = {"exposure": exposure, "auto_exposure": 0.0, "white_balance": white_balance}
         return replace(self, glare_light=glare if self.veiling_glare > 0 else (), **changes)
 
     def uniforms_of(self, name: str) -> tuple[Any, ...]:
@@ -192,7 +192,7 @@ class Sensor:
             case _:
                 return (getattr(self, name),)
 
-    def changes(self) -> dict[str, Any]:
+    def non_default(self) -> dict[str, Any]:
         """Values that differ from the default sensor, by name."""
         default = Sensor()
         pairs = ((f.name, getattr(self, f.name)) for f in fields(self))
@@ -207,8 +207,8 @@ def _numbers(name: str, values: Any, lowest: int, highest: int) -> tuple[float, 
     if (
         numbers is None
         or not lowest <= len(numbers) <= highest
-        or not all(abs(value) <= LARGEST for value in numbers)
+        or not all(abs(value) <= MAX_VALUE for value in numbers)
     ):
         counts = highest if lowest == highest else f"{lowest} to {highest}"
-        raise invalid(f"sensor: {name}", f"{counts} finite numbers up to {LARGEST:g}", values)
+        raise invalid(f"sensor: {name}", f"{counts} finite numbers up to {MAX_VALUE:g}", values)
     return numbers

@@ -31,7 +31,7 @@ class Views:
     def __post_init__(self) -> None:
         counts = {"captures": len(self.captures)} if len(self.captures) != 1 else {}
         counts |= {} if self.poses is None else {"poses": len(self.poses)}
-        counts |= {f"groups[{label}]": len(each) for label, each in (self.groups or {}).items()}
+        counts |= {f"groups[{label}]": len(poses) for label, poses in (self.groups or {}).items()}
         for external in (capture.external_depth for capture in self.captures):
             if external and external.stacked:
                 counts["external_depth"] = len(external.depth)
@@ -82,7 +82,7 @@ class Views:
         if self.poses is not None and camera is not None:
             camera = camera.with_pose(camera_to_world=self.poses[number])
         if self.groups:
-            moved = {label: _constant(each[number]) for label, each in self.groups.items()}
+            moved = {label: _constant(poses[number]) for label, poses in self.groups.items()}
             motion = Motion(motion.camera, {**motion.groups, **moved})
         unchanged = camera is base.camera and motion is base.motion
         return base if unchanged else base.with_(camera=camera, motion=motion)
@@ -91,31 +91,31 @@ class Views:
         """Raise InputError if captures differ in size or outputs."""
         first = self.captures[0]
         for number, capture in enumerate(self.captures[1:], 1):
-            for what, one, other in (
+            for what, expected, value in (
                 ("size", _size(first.camera), _size(capture.camera)),
                 ("outputs", first.outputs, capture.outputs),
             ):
-                if one != other:
+                if expected != value:
                     raise InputError(
-                        f"the views of a batch must have the same {what}, got {one} for view 0 and {other} "
-                        f"for view {number}; render them in separate batches"
+                        f"the views of a batch must have the same {what}, got {expected} for view 0 and "
+                        f"{value} for view {number}; render them in separate batches"
                     )
 
 
 def views_of(captures: Iterable[Capture], poses: Any = None, groups: Any = None, mask: Any = None) -> Views:
-    """Validated views of the arguments of `Renderer.render_batch`."""
+    """Validated views, from the arguments of `Renderer.render_batch`."""
     if groups is not None and not isinstance(groups, Mapping):
         raise InputError(f"groups must be {{label: poses (views, 7)}}, got {groups!r}")
     for label in groups or ():
         if isinstance(label, bool) or not isinstance(label, (int, np.integer)):
             raise InputError(f"keys of groups must be integer labels, got {label!r}")
-    given = {int(label): pose_matrices(f"groups[{label}]", each) for label, each in (groups or {}).items()}
+    moved = {int(label): pose_matrices(f"groups[{label}]", array) for label, array in (groups or {}).items()}
     if mask is not None:
         mask = array_of("mask", mask, "(views,) bools", "b")
         if mask.ndim != 1:
             raise InputError(f"mask must be (views,) bools, got the shape {mask.shape}")
     matrices = None if poses is None else pose_matrices("poses", poses)
-    views = Views(tuple(captures), matrices, given or None, mask)
+    views = Views(tuple(captures), matrices, moved or None, mask)
     views.check_sizes()
     return views
 
@@ -123,29 +123,29 @@ def views_of(captures: Iterable[Capture], poses: Any = None, groups: Any = None,
 def pose_matrices(name: str, poses: Any) -> np.ndarray:
     """Rigid matrices (v, 4, 4) float64 of poses (v, 7): x y z in metres, and a quaternion w x y z of any
     non-zero length."""
-    given = real_array(name, poses, "(views, 7) numbers: x y z, quaternion w x y z")
-    if given.ndim != 2 or given.shape[1] != 7:
+    vectors = real_array(name, poses, "(views, 7) numbers: x y z, quaternion w x y z")
+    if vectors.ndim != 2 or vectors.shape[1] != 7:
         raise InputError(
-            f"{name} must have the shape (views, 7), x y z and a quaternion w x y z, got {given.shape}"
+            f"{name} must have the shape (views, 7), x y z and a quaternion w x y z, got {vectors.shape}"
         )
     with np.errstate(over="ignore"):  # an overflow becomes infinite and is rejected
-        lengths = np.linalg.norm(given[:, 3:], axis=1)
-        wrong = ~((np.abs(given[:, :3]) <= LARGEST).all(1) & (lengths > 0) & (lengths < np.inf))
-    if wrong.any():
-        view = int(np.argmax(wrong))
+        lengths = np.linalg.norm(vectors[:, 3:], axis=1)
+        invalid_rows = ~((np.abs(vectors[:, :3]) <= LARGEST).all(1) & (lengths > 0) & (lengths < np.inf))
+    if invalid_rows.any():
+        view = int(np.argmax(invalid_rows))
         raise InputError(
             f"{name}[{view}] must be x y z, at most {LARGEST:g} metres, and a finite quaternion w x y z that "
-            f"is not all 0, got {given[view].tolist()}"
+            f"is not all 0, got {vectors[view].tolist()}"
         )
-    matrices = np.zeros((len(given), 4, 4))
-    matrices[:, :3, :3] = quaternion_to_matrix(given[:, 3:])
-    matrices[:, :3, 3] = given[:, :3]
+    matrices = np.zeros((len(vectors), 4, 4))
+    matrices[:, :3, :3] = quaternion_to_matrix(vectors[:, 3:])
+    matrices[:, :3, 3] = vectors[:, :3]
     matrices[:, 3, 3] = 1
     return matrices
 
 
 def _constant(pose: np.ndarray):
-    """Motion function with a constant pose."""
+    """A motion that always has this pose."""
     return lambda time: pose
 
 

@@ -46,7 +46,7 @@ class Info:
 
 
 def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
-    from fidsplat.splats.statistics import SHARES
+    from fidsplat.splats.statistics import PERCENTILES
 
     rows = [
         ("splats", f"{facts['splats']:,} ({facts['kind']}), SH degree {facts['sh_degree']}"),
@@ -57,7 +57,7 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
         return rows
 
     scales, opacities = (" / ".join(f"{v:.3g}" for v in facts[key]) for key in ("scales", "opacities"))
-    shares = " / ".join(map(str, SHARES))
+    shares = " / ".join(map(str, PERCENTILES))
     low, high = facts["middle_bounds"]
     place = f"position = {point(facts['marker_position'])}, quaternion = {point(facts['marker_quaternion'])}"
     place += ": a tenth of the scene, in front of its middle"

@@ -22,16 +22,16 @@ class Output:
     summary: str = ""
     """line for `fidsplat render --help`"""
     display: str = "color"
-    """representation in image files and previews, one of `DISPLAYS`; the array is stored too, except for
+    """how image files and previews represent it, one of `DISPLAYS`; files contain the array too, except for
     color and normal"""
     tolerance: float = 0.0
-    """largest allowed error of a device in addition to the reference's certificate of a pixel
+    """largest error of a device that tests allow, in addition to the reference's error bound of a pixel
     (`NAME_certificate`)"""
     relative: bool = False
     """whether the tolerance is relative to the value"""
     discontinuous: bool = False
-    """whether the value jumps where a decision changes: pixels that the reference marks by `NAME_may_flip`
-    are not compared; other pixels may differ by the tolerance or by the reference's `NAME_bound`"""
+    """whether rounding can change the value by a jump, e.g. by another order of fragments: pixels that the
+    reference marks by `NAME_may_flip` are not compared; others may differ by the tolerance or `NAME_bound`"""
     empty_value: int = 0
     """value of a pixel without splats"""
     public: bool = True
@@ -62,10 +62,10 @@ def _image(
 _COLOR: dict[str, Any] = {"tolerance": 2e-5}
 _NORMAL: dict[str, Any] = {"channels": 3, "display": "normal", "tolerance": 2e-5}
 _DEPTH: dict[str, Any] = {"display": "depth", "tolerance": 1e-4, "relative": True}
-_DEPTH_OF_ONE: dict[str, Any] = _DEPTH | {"discontinuous": True}
+_FRAGMENT_DEPTH: dict[str, Any] = _DEPTH | {"discontinuous": True}
 _ID: dict[str, Any] = {"dtype": "int32", "display": "label", "discontinuous": True, "empty_value": -1}
 
-_PLAIN = (
+_WITHOUT_OUTPUT = (
     *("camera_pinhole", "camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
     *("camera_orthographic", "color_rgb", "color_sh", "lowpass_none", "lowpass_pixel", "lowpass_screen"),
     *("stop_inclusive", "stop_exclusive", "compose_ordered", "compose_pixel", "compose_coplanar"),
@@ -86,11 +86,11 @@ _PLAIN = (
 _IMAGES = (
     _image("alpha", "coverage, 1 - transmittance", **_COLOR),
     _image("depth", "expected depth along z [m]; 0 where alpha is below 1/255", **_DEPTH),
-    _image("depth_median", "depth [m] at which transmittance falls to 1/2", **_DEPTH_OF_ONE),
-    _image("depth_first", "depth [m] at which opacity reaches the quality's first_hit", **_DEPTH_OF_ONE),
+    _image("depth_median", "depth [m] at which transmittance falls to 1/2", **_FRAGMENT_DEPTH),
+    _image("depth_first", "depth [m] at which opacity reaches the quality's first_hit", **_FRAGMENT_DEPTH),
     _image("distance", "expected distance along the ray [m]", needs="depth", **_DEPTH),
-    _image("distance_median", "distance [m] of depth_median", needs="depth_median", **_DEPTH_OF_ONE),
-    _image("distance_first", "distance [m] of depth_first", needs="depth_first", **_DEPTH_OF_ONE),
+    _image("distance_median", "distance [m] of depth_median", needs="depth_median", **_FRAGMENT_DEPTH),
+    _image("distance_first", "distance [m] of depth_first", needs="depth_first", **_FRAGMENT_DEPTH),
     _image("normal", "unit normal towards the camera, in camera axes", **_NORMAL),
     _image("normal_world", "unit normal towards the camera, in world axes", needs="normal", **_NORMAL),
     _image("label", "label of the splat with the largest weight, or -1", **_ID),
@@ -101,7 +101,7 @@ _IMAGES = (
     _image("rounding", public=False),
 )
 
-CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in (*map(Effect, _PLAIN), *_IMAGES)}
+CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in (*map(Effect, _WITHOUT_OUTPUT), *_IMAGES)}
 
 RGB = Output("rgb", 3, "float32", "colour in display space, not clamped above 1", **_COLOR)
 IMAGES: dict[str, Output] = {
@@ -116,7 +116,7 @@ DERIVED_OUTPUTS = {
         "error", 1, "float32", "certified upper bound of the error of rgb (docs/accuracy.md)", "count"
     ),
 }
-"""outputs that are computed from two renderings (fidsplat/render/certified_error.py)"""
+"""outputs that the host computes from two rendered images (fidsplat/render/certified_error.py)"""
 
 
 def declared_output(name: str) -> Output:

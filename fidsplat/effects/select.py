@@ -15,7 +15,7 @@ from fidsplat.effects.extensions import EXTENSIONS, load_extensions
 from fidsplat.splats.traits import CloudTraits
 from fidsplat.util.errors import InputError, unknown
 
-_KINDS = {Gradient: "gradient", Panorama: "panorama"}
+_BACKGROUND_KINDS = {Gradient: "gradient", Panorama: "panorama"}
 
 
 @dataclass(frozen=True)
@@ -24,15 +24,15 @@ class FeatureSet:
     from view to view (intrinsics, poses, thresholds, background) are uniforms instead."""
 
     effects: tuple[str, ...]
-    """One effect per kind in fixed order: camera, color, ellipsoids (optional), lowpass, stop, external depth
-    (optional), compose, footprint, background, arithmetic; then optional ones."""
+    """One effect of each kind in a fixed order: camera, color, ellipsoid (optional), lowpass, stop, external
+    depth (optional), compose, footprint, background, arithmetic; then optional effects."""
     outputs: tuple[str, ...]
     """Sorted names of the outputs other than rgb."""
     sh_degree: int
     samples: int
     setup_precision: str
     post_steps: tuple[str, ...] = ()
-    """Steps on rgb after blending, in order: fog, then sensor steps."""
+    """Steps that change rgb after blending, in order: fog, then sensor steps."""
 
     @cached_property
     def names(self) -> frozenset[str]:
@@ -54,7 +54,7 @@ class FeatureSet:
 
 
 def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
-    """Select the effects that a capture of a cloud requires; without a camera, those of a pinhole.
+    """Select the effects that a capture of a cloud requires, for a pinhole if the capture has no camera.
     Raises InputError for an unknown output or incompatible effects."""
     _load_extensions_of(capture)
     for name in capture.outputs:
@@ -83,8 +83,8 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
             "use blend_precision='float32'"
         )
     flat = cloud.footprint == "gaussian" and not ellipsoid
-    in_spheres = lens is None and flat and lowpass != "pixel"
-    # spherical harmonics of degree 0 do not depend on the view: RGB colours (`SplatCloud.plain_colors`)
+    bounded_by_spheres = lens is None and flat and lowpass != "pixel"
+    # harmonics of degree 0 do not depend on the view and are rendered as colours (`SplatCloud.plain_colors`)
     sh_degree = max(cloud.sh_degree, 0)
     return FeatureSet(
         effects=(
@@ -94,16 +94,16 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
             *(("ellipsoids_only",) if ewa_only else ()),
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
-            # before the compositing effect, whose fragments it occludes
+            # the surface is composited among the fragments of the next effect
             *(("external_depth",) if capture.external_depth is not None else ()),
-            _composing(cloud, quality.order, one_depth_each=ewa_only and not double),
+            _compositing(cloud, quality.order, equal_depths=ewa_only and not double),
             f"footprint_{cloud.footprint}",
-            f"background_{_KINDS.get(type(background), 'constant')}",
+            f"background_{_BACKGROUND_KINDS.get(type(background), 'constant')}",
             # float64 blending requires precise functions; half precision suffices with approximate ones
             f"arithmetic_{'precise' if double else 'approximate' if half else quality.arithmetic}",
             *(("motion_groups",) if capture.motion.groups else ()),
             *(("shutter_exposure",) if capture.has_sub_frames else ()),
-            *(("shutter_rows",) if capture.has_sub_frames and in_spheres else ()),
+            *(("shutter_rows",) if capture.has_sub_frames and bounded_by_spheres else ()),
             *(("blend_double",) if double else ("blend_half",) if half else ()),
         ),
         outputs=tuple(sorted({*capture.outputs} - {"rgb", *DERIVED_OUTPUTS})),
@@ -135,14 +135,14 @@ def with_termination_depths(features: FeatureSet) -> FeatureSet:
     return replace(features, effects=(*features.effects, "termination_depths"))
 
 
-def _composing(cloud: CloudTraits, order: str, one_depth_each: bool) -> str:
+def _compositing(cloud: CloudTraits, order: str, equal_depths: bool) -> str:
     """Select the compositing effect: by centre depth or by fragment depth, with or without layers of coplanar
-    groups. If all fragments of a splat have the depth of its centre, both orders are equal, and the effect
-    without a k-buffer suffices."""
+    groups. equal_depths: whether all fragments of a splat have the depth of its centre; both orders are equal
+    then, and the effect without a k-buffer suffices."""
     if cloud.has_coplanar_groups:
         orders = {"centre": "compose_ordered", "auto": "compose_coplanar", "pixel": "compose_coplanar_pixel"}
         return orders[order]
-    return "compose_pixel" if order == "pixel" and not one_depth_each else "compose_ordered"
+    return "compose_pixel" if order == "pixel" and not equal_depths else "compose_ordered"
 
 
 def _ellipsoid(cloud: CloudTraits, quality: Quality, lens: Lens | None) -> str:

@@ -45,7 +45,7 @@ def load_ply(path: str | os.PathLike[str], progress: Progress | None = None) -> 
     if dropped:
         warnings.warn(drop_report(dropped, rows.count, rows.path), stacklevel=2)
     groups = arrays.pop("coplanar_groups", None)
-    cloud = SplatCloud.of_checked(**arrays, origin=origin, dropped=dropped)
+    cloud = SplatCloud.from_validated(**arrays, origin=origin, dropped=dropped)
     return cloud if groups is None else cloud.with_coplanar_groups(groups)
 
 

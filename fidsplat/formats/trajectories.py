@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye, Lens, Trajectory
-from fidsplat.cameras.foreign import COEFFICIENTS, OPENGL
+from fidsplat.cameras.foreign import COEFFICIENTS, OPENGL_AXES
 from fidsplat.cameras.trajectory import check_rate
 from fidsplat.formats.colmap import has_colmap, image_poses, load_colmap, save_colmap
 from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
@@ -157,7 +157,7 @@ def lens_table(lens: Lens | None) -> dict[str, Any] | None:
 
 def _transforms_json(trajectory: Trajectory, camera: Camera, names: Sequence[str]) -> dict[str, Any]:
     frames = [
-        {"file_path": name, "time": time, "transform_matrix": (pose @ OPENGL + 0.0).tolist()}
+        {"file_path": name, "time": time, "transform_matrix": (pose @ OPENGL_AXES + 0.0).tolist()}
         for name, time, pose in zip(
             names, np.asarray(trajectory.times).tolist(), trajectory.poses, strict=True
         )
@@ -256,7 +256,7 @@ def _transforms(file: Path, text: str) -> tuple[list[float] | None, list[np.ndar
             matrix = np.vstack([matrix, (0, 0, 0, 1)])
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
             raise InputError(f"{where} must be 4 x 4 finite numbers, got {matrix.tolist()}")
-        poses.append(_rigid(where, matrix) @ OPENGL)
+        poses.append(_rigid(where, matrix) @ OPENGL_AXES)
     if any(time is None for time, _ in pairs):
         return None, poses
     return _numbers(f"{file}, the times of its frames", [time for time, _ in pairs]), poses

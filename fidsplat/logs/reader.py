@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.cameras.foreign import PIXEL
+from fidsplat.cameras.foreign import PIXEL_OFFSET
 from fidsplat.images.files import decode_rgb
 from fidsplat.logs.bags import log_messages
 from fidsplat.logs.writers import typestore
@@ -120,7 +120,7 @@ def detections_of(message: Any) -> list[Detection]:
     """Tags of an AprilTagDetectionArray, as `RobotLog.detections` writes them."""
     found = []
     for one in message.detections:
-        corners = np.array([(corner.x, corner.y) for corner in one.corners]) + PIXEL
+        corners = np.array([(corner.x, corner.y) for corner in one.corners]) + PIXEL_OFFSET
         found.append(Detection("apriltag", one.family, one.id, None, corners))
     return found
 

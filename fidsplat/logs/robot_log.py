@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye
-from fidsplat.cameras.foreign import LINK_FROM_OPTICAL, PIXEL
+from fidsplat.cameras.foreign import LINK_FROM_OPTICAL, PIXEL_OFFSET, opencv_matrix
 from fidsplat.effects import IMAGES
 from fidsplat.images.files import encode_image, pixels_of, to_uint8
 from fidsplat.logs.reader import SCENE
@@ -130,7 +130,7 @@ class RobotLog:
             InputError: a lens without a ROS model.
         """
         model, factors = _distortion(instance("camera", camera, Camera))
-        k = camera.matrix - [[0, 0, PIXEL], [0, 0, PIXEL], [0, 0, 0]]
+        k = opencv_matrix(camera)
         roi = self._of("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
         message = self._of("sensor_msgs/msg/CameraInfo")(
             self._header(time, self._frame(name)), camera.height, camera.width, model,
@@ -261,8 +261,8 @@ class RobotLog:
         point, tag = (self._of(f"apriltag_msgs/msg/{name}") for name in ("Point", "AprilTagDetection"))
         tags = []
         for code in items("found", found, Detection, "a list of Detection"):
-            corners = [point(float(x), float(y)) for x, y in np.asarray(code.corners) - PIXEL]
-            middle = point(*(np.asarray(code.corners).mean(0) - PIXEL).tolist())
+            corners = [point(float(x), float(y)) for x, y in np.asarray(code.corners) - PIXEL_OFFSET]
+            middle = point(*(np.asarray(code.corners).mean(0) - PIXEL_OFFSET).tolist())
             family, number = (code.payload or "", -1) if code.id is None else (code.family or "", code.id)
             tags.append(tag(family, number, 0, 0.0, 0.0, middle, corners, np.zeros(9)))
         message = self._of("apriltag_msgs/msg/AprilTagDetectionArray")(

@@ -149,7 +149,7 @@ def bend(
     scales = cloud.scales if cloud.boxes is None else (cloud.scales + gap).astype(np.float32)
     rows, groups, copies = _groups(cloud, surface, half, overlap)
     means = at.points[rows] + np.where(copies, gap, 0.0)[:, None] * at.normals[rows]
-    bent = SplatCloud.of_checked(
+    bent = SplatCloud.from_validated(
         means.astype(np.float32),
         quats[rows],
         scales[rows],

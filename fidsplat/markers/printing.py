@@ -160,7 +160,7 @@ def _cloud(
     for array in arrays:
         array.flags.writeable = False  # without a copy by SplatCloud
     # one sheet of paper: the order of its splats does not matter
-    cloud = SplatCloud.of_checked(
+    cloud = SplatCloud.from_validated(
         means, quats, scales, opacities, colors=colors, origin=np.zeros(3), dropped={}
     )
     return cloud.with_coplanar_groups(0)

@@ -8,25 +8,29 @@ from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.capture.environment import DeviceExternalDepth, ExternalDepth
 from fidsplat.render.renderer import Renderer
 
-MESH = -2
-"""label of surface 0 of a simulator; surface i has MESH - i"""
+MESH_LABEL = -2
+"""label of surface 0 of a simulator; surface i has MESH_LABEL - i"""
 MESH_OFFSET = 2e-3
 """metres by which surfaces of simulators are offset away from the camera"""
 
 
 def device_surface(
-    renderer: Renderer, packed: Any, depths: Any, ids: Any, size: tuple[int, int], red: int
+    renderer: Renderer, packed: Any, depths: Any, ids: Any, size: tuple[int, int], red_bit: int
 ) -> ExternalDepth:
-    """External depth images of all views from wp.arrays (views, pixels): colours packed in uint32 with red at
-    the bit `red`, depths along z, and int32 ids of surfaces, negative for none. They stay on the renderer's
-    device."""
+    """External depth images of all views, which stay on the renderer's device.
+
+    Args:
+        packed, depths, ids: wp.arrays (views, pixels): colours in uint32, with red from the bit `red_bit`;
+            depths along z [m]; int32 ids of surfaces, negative where there is none.
+        size: height and width of the images.
+    """
     wp, device = load(), packed.device
-    made = [wp.empty(packed.shape, dtype=dtype, device=device) for dtype in (wp.vec3, wp.float32, wp.int32)]
-    given = [packed, depths, ids, red, MESH, MESH_OFFSET]
+    images = [wp.empty(packed.shape, dtype=dtype, device=device) for dtype in (wp.vec3, wp.float32, wp.int32)]
+    arguments = [packed, depths, ids, red_bit, MESH_LABEL, MESH_OFFSET]
     with quiet():
         kernel = kernels("surfaces").unpack_surfaces
-        wp.launch(kernel, packed.shape, given, made, device=device, record_tape=False)
-    shaped = [each.reshape((len(packed), *size)) for each in made]
+        wp.launch(kernel, packed.shape, arguments, images, device=device, record_tape=False)
+    images = [image.reshape((len(packed), *size)) for image in images]
     if device == getattr(renderer.backend, "device", None):
-        return DeviceExternalDepth(*shaped)
-    return ExternalDepth(*(each.numpy() for each in shaped))
+        return DeviceExternalDepth(*images)
+    return ExternalDepth(*(image.numpy() for image in images))

@@ -67,9 +67,9 @@ class DifferentiableFrame(Frame):
         instance("gradients", gradients, Mapping, "arrays by the name of their output")
         if not self._images.shares_arrays:
             gradients = {name: host_array(f"the gradient of {name}", by) for name, by in gradients.items()}
-        given = {name: _numeric_array(name, value) for name, value in gradients.items()}
+        arrays = {name: _numeric_array(name, value) for name, value in gradients.items()}
         with self._lock:
-            results = self._pipeline.backward(self._forward, given)
+            results = self._pipeline.backward(self._forward, arrays)
             return results if on_device else {name: on_host(array) for name, array in results.items()}
 
 

@@ -31,9 +31,10 @@ from fidsplat.util.files import atomic_write, from_json, path_of, read_text, wri
 from fidsplat.util.provenance import digest_of
 
 RECORD = "flight.json"
-SHEET = "contact-sheet.png"
+CONTACT_SHEET = "contact-sheet.png"
 POSES = "trajectory.tum"
 _COLUMNS, _ROWS = 4, 3
+"""frames per row and column of the contact sheet"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,13 +117,13 @@ class FlightFolder:
         self.folder, self.flight, self.device = path_of(folder), flight, device
         self._source = None if source is None else os.path.relpath(source, self.folder)
         self.key = flight.key(device)
-        before = self._read_record()
-        if before is not None and before.get("key") != self.key and not overwrite:
+        previous = self._read_record()
+        if previous is not None and previous.get("key") != self.key and not overwrite:
             raise InputError(
                 f"{self.folder} must be empty or contain this flight, got another flight of "
-                f"{before.get('frames', 'some')} frames; give another folder, or --overwrite to replace it"
+                f"{previous.get('frames', 'some')} frames; give another folder, or --overwrite to replace it"
             )
-        if before is None and not overwrite and len(self.remaining()) < len(flight):
+        if previous is None and not overwrite and len(self.remaining()) < len(flight):
             raise InputError(
                 f"{self.folder} must be empty or contain this flight, got frames without {RECORD}; give "
                 "another folder, or --overwrite to replace them"
@@ -176,7 +177,7 @@ class FlightFolder:
         chosen = sorted({round(k) for k in np.linspace(0, len(files) - 1, min(len(files), _COLUMNS * _ROWS))})
         cells = [(f"{float(self.flight.path.times[k]):.2f} s", read_image(files[k])) for k in chosen]
         rows = [cells[start : start + _COLUMNS] for start in range(0, len(cells), _COLUMNS)]
-        return write_png(self.folder / SHEET, contact_sheet(rows, width=320))
+        return write_png(self.folder / CONTACT_SHEET, contact_sheet(rows, width=320))
 
     def write_video(self, path: str | Path, rate: float) -> Iterator[int]:
         """Write the frames as a video; yields the number of each after it is encoded."""
@@ -194,10 +195,10 @@ class FlightFolder:
         if not file.exists():
             return None
         try:
-            found = from_json(read_text(file))
+            record = from_json(read_text(file))
         except ValueError:
-            found = {}
-        return found if isinstance(found, dict) else {}
+            record = {}
+        return record if isinstance(record, dict) else {}
 
     def _record(self) -> dict[str, Any]:
         path = self.flight.path
@@ -228,14 +229,14 @@ def scene_of_frame(scene: Scene, image: Path) -> Scene:
     path, number = load_trajectory(folder / POSES), int(image.stem)
     if number >= len(path):
         return scene
-    return _at(scene, path, float(path.times[number]))
+    return _moved_to(scene, path, float(path.times[number]))
 
 
 def scene_at(scene: Scene, pose: np.ndarray, time: float) -> Scene:
     """The scene with its camera at a pose (4, 4), camera to world, at a time [s]."""
-    return _at(scene, Trajectory([time], pose[None]), time)
+    return _moved_to(scene, Trajectory([time], pose[None]), time)
 
 
-def _at(scene: Scene, path: Trajectory, time: float) -> Scene:
+def _moved_to(scene: Scene, path: Trajectory, time: float) -> Scene:
     shutter = Shutter() if scene.shutter is None else scene.shutter
     return replace(scene, camera_motion=path.inverse(), shutter=replace(shutter, time=time))

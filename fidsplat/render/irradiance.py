@@ -1,4 +1,4 @@
-"""Irradiance from panoramas that are rendered at points of a marker."""
+"""Light field of a marker: radiance from panoramas at its points, and the irradiance that they cause."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 Neighbour = tuple[tuple[np.ndarray, np.ndarray], np.ndarray]
+"""index (row, column) and weight of a cell, for bilinear interpolation"""
 
 
 def panorama_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
@@ -16,22 +17,21 @@ def panorama_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
     longitude = (np.arange(columns) + 0.5) / columns * 2 * np.pi - np.pi
     edges = np.arange(rows + 1) / rows * np.pi - np.pi / 2
     latitude = (edges[1:] + edges[:-1]) / 2
-    around, down = np.meshgrid(longitude, latitude)
-    flat = np.cos(down)
-    directions = np.stack([flat * np.sin(around), np.sin(down), flat * np.cos(around)], -1)
+    longitudes, latitudes = np.meshgrid(longitude, latitude)
+    cosine = np.cos(latitudes)
+    directions = np.stack([cosine * np.sin(longitudes), np.sin(latitudes), cosine * np.cos(longitudes)], -1)
     angles = np.repeat(np.diff(np.sin(edges)) * 2 * np.pi / columns, columns)
     return directions.reshape(-1, 3), angles
 
 
 def cosine_weights(normal: np.ndarray, directions: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Weights (d,) of radiance in the irradiance of a surface; their sum is pi."""
+    """Weights (d,) with which the radiance from directions (d, 3) sums to irradiance; their sum is pi."""
     weights = np.maximum(directions @ normal, 0) * angles
     return weights * (np.pi / weights.sum())
 
 
 def neighbours(x: np.ndarray, y: np.ndarray) -> Iterator[Neighbour]:
-    """Indices (row, column) and weights of the four cells around each position, for bilinear
-    interpolation."""
+    """The four cells around each position."""
     left, top = np.floor(x).astype(int), np.floor(y).astype(int)
     for dy in (0, 1):
         for dx in (0, 1):
@@ -39,13 +39,13 @@ def neighbours(x: np.ndarray, y: np.ndarray) -> Iterator[Neighbour]:
 
 
 class LightField:
-    """Radiance from all directions, measured on a grid over a marker and interpolated between."""
+    """Radiance from all directions, measured on a grid over a marker and interpolated between its points."""
 
     def __init__(self, directions: np.ndarray, angles: np.ndarray) -> None:
         self.directions, self.angles = directions, angles
         self.low, self.high = np.zeros(2), np.ones(2)
         self.radiance = np.zeros((1, 1, len(angles), 3))
-        """(rows, columns, d, 3)"""
+        """(rows, columns, d, 3) radiance from each direction at each grid point"""
 
     @staticmethod
     def uniform(radiance: tuple[float, float, float]) -> LightField:
@@ -65,46 +65,46 @@ class LightField:
     ) -> LightField:
         """Refine the grid until the error of interpolated irradiance is at most `step` times its maximum.
 
-        levels: numbers of panoramas along a side; the last is used unchecked. positions: (m, 2) on
-        the marker. radiance_at: function of positions (k, 2) that returns (k, d, 3). normal: (3,) for the
-        compared irradiance.
+        levels: numbers of panoramas along a side; the error of the last is not checked. positions: (m, 2) on
+        the marker. radiance_at: function of positions (k, 2) that returns radiance (k, d, 3). normal: (3,)
+        surface normal of the compared irradiance.
         """
         field = LightField(*panorama_directions(rows))
         field.low, field.high = positions.min(axis=0), positions.max(axis=0)
         weights = cosine_weights(normal, field.directions, field.angles)
-        known: dict[tuple[float, float], np.ndarray] = {}
+        measured: dict[tuple[float, float], np.ndarray] = {}
         for level in levels:
-            sides = np.linspace(0, 1, level) if level > 1 else [0.5]
-            shares = [(x, y) for y in sides for x in sides]
-            new = [share for share in shares if share not in known]
-            new_places = field.low + np.array(new) * (field.high - field.low)
-            known |= dict(zip(new, radiance_at(new_places), strict=True))
-            field.radiance = np.stack([known[share] for share in shares]).reshape(level, level, -1, 3)
+            coordinates = np.linspace(0, 1, level) if level > 1 else [0.5]
+            points = [(x, y) for y in coordinates for x in coordinates]
+            new_points = [point for point in points if point not in measured]
+            new_positions = field.low + np.array(new_points) * (field.high - field.low)
+            measured |= dict(zip(new_points, radiance_at(new_positions), strict=True))
+            field.radiance = np.stack([measured[point] for point in points]).reshape(level, level, -1, 3)
             if level == levels[-1]:
                 break
-            found = np.einsum("d,yxdc->yxc", weights, field.radiance)
-            halved = found[::2, ::2]
+            irradiance = np.einsum("d,yxdc->yxc", weights, field.radiance)
+            coarse = irradiance[::2, ::2]
             error = max(
-                _difference(found[::2, 1::2], (halved[:, 1:] + halved[:, :-1]) / 2),
-                _difference(found[1::2, ::2], (halved[1:] + halved[:-1]) / 2),
+                _difference(irradiance[::2, 1::2], (coarse[:, 1:] + coarse[:, :-1]) / 2),
+                _difference(irradiance[1::2, ::2], (coarse[1:] + coarse[:-1]) / 2),
             )
             # the error of the coarser grid, at least twice the error of this grid
-            if error <= 2 * step * found.max():
+            if error <= 2 * step * irradiance.max():
                 break
         return field
 
-    def _between(self, positions: np.ndarray) -> Iterator[Neighbour]:
-        """Grid indices (y, x) and weights of the four measurements around each position (m, 2)."""
+    def _grid_neighbours(self, positions: np.ndarray) -> Iterator[Neighbour]:
+        """The four grid points around each position (m, 2)."""
         size = np.array(self.radiance.shape[1::-1]) - 1
         span = np.where(self.high > self.low, self.high - self.low, 1)
-        for (y, x), share in neighbours(*(np.clip((positions - self.low) / span, 0, 1) * size).T):
-            yield (np.minimum(y, size[1]), np.minimum(x, size[0])), share
+        for (y, x), weight in neighbours(*(np.clip((positions - self.low) / span, 0, 1) * size).T):
+            yield (np.minimum(y, size[1]), np.minimum(x, size[0])), weight
 
     def interpolated(self, values: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """Values (rows, columns, ...) of the grid at positions (m, 2)."""
+        """Interpolate values (rows, columns, ...) of the grid at positions (m, 2)."""
         return sum(  # type: ignore[return-value]
-            values[index] * share.reshape(-1, *[1] * (values.ndim - 2))
-            for index, share in self._between(positions)
+            values[index] * weight.reshape(-1, *[1] * (values.ndim - 2))
+            for index, weight in self._grid_neighbours(positions)
         )
 
     @property
@@ -113,29 +113,29 @@ class LightField:
         rows = round(np.sqrt(len(self.angles) / 2))
         return self.radiance.reshape(*self.radiance.shape[:2], rows, 2 * rows, 3)
 
-    def _pixels(self, directions: np.ndarray) -> Iterator[Neighbour]:
-        """Indices (y, x) and weights of the four pixels of a panorama around each direction (..., 3)."""
+    def _pixel_neighbours(self, directions: np.ndarray) -> Iterator[Neighbour]:
+        """The four pixels of a panorama around each direction (..., 3)."""
         rows, columns = self._images.shape[2:4]
         x, y, z = np.moveaxis(directions, -1, 0)
         u = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * columns - 0.5
         v = (np.arcsin(np.clip(y, -1, 1)) / np.pi + 0.5) * rows - 0.5
-        for (row, column), share in neighbours(u, v):
-            yield (np.clip(row, 0, rows - 1), column % columns), share
+        for (row, column), weight in neighbours(u, v):
+            yield (np.clip(row, 0, rows - 1), column % columns), weight
 
-    def arriving(self, directions: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    def incoming_radiance(self, directions: np.ndarray, positions: np.ndarray) -> np.ndarray:
         """Radiance (m, k, 3) from directions (m, k, 3) at positions (m, 2), interpolated in both."""
-        found = np.zeros(directions.shape)
-        for pixel, share in self._pixels(directions):
-            for (row, column), near in self._between(positions):
-                here = self._images[row[:, None], column[:, None], *pixel]
-                found += here * (share * near[:, None])[..., None]
-        return found
+        radiance = np.zeros(directions.shape)
+        for pixel, weight in self._pixel_neighbours(directions):
+            for (row, column), grid_weight in self._grid_neighbours(positions):
+                values = self._images[row[:, None], column[:, None], *pixel]
+                radiance += values * (weight * grid_weight[:, None])[..., None]
+        return radiance
 
     def reflected(self, directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Weighted sums (rows, columns, v, 3) of the radiance from directions (v, k, 3)."""
         return sum(  # type: ignore[return-value]
-            np.einsum("vk,yxvkc->yxvc", weights * share, self._images[:, :, *pixel])
-            for pixel, share in self._pixels(directions)
+            np.einsum("vk,yxvkc->yxvc", weights * weight, self._images[:, :, *pixel])
+            for pixel, weight in self._pixel_neighbours(directions)
         )
 
     def irradiance(self, normal: np.ndarray, positions: np.ndarray) -> np.ndarray:
@@ -144,5 +144,5 @@ class LightField:
         return self.interpolated(np.einsum("d,yxdc->yxc", weights, self.radiance), positions)
 
 
-def _difference(one: np.ndarray, other: np.ndarray) -> float:
-    return float(np.abs(one - other).max(initial=0.0))
+def _difference(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.abs(a - b).max(initial=0.0))

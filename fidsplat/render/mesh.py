@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 
 import numpy as np
 
@@ -19,12 +18,13 @@ from fidsplat.util.arguments import items, number
 from fidsplat.util.errors import InputError
 from fidsplat.util.progress import Progress, no_progress
 
-VIEWS, SIDE, FOV = 64, 512, math.radians(50.0)
-"""views around a scene: their number, pixels per side and field of view"""
+VIEWS, IMAGE_SIDE, FOV = 64, 512, math.radians(50.0)
+"""views around a scene: their number, pixels per side and field of view [rad]"""
 RESOLUTION = 200
 """voxels along the longest side of a scene"""
 _TINY = 1e-300
-MOST_VOXELS = 1 << 20
+"""minimum length of a voxel [m]"""
+MAX_VOXELS = 1 << 20
 """maximum number of voxels per side"""
 
 
@@ -54,9 +54,9 @@ def scene_mesh(
     voxel = (
         size / RESOLUTION if voxel is None else number("voxel", voxel, "a positive length in metres", _TINY)
     )
-    if size / voxel > MOST_VOXELS / 2:
+    if size / voxel > MAX_VOXELS / 2:
         raise InputError(
-            f"voxel must be at least {2 * size / MOST_VOXELS:.2g} m for this scene, got {voxel:g}"
+            f"voxel must be at least {2 * size / MAX_VOXELS:.2g} m for this scene, got {voxel:g}"
         )
     views = list(
         views_around(scene, low, high)
@@ -69,10 +69,11 @@ def scene_mesh(
         )
     renderer = Renderer(scene.device) if renderer is None else renderer
     report: Callable[[str, float], object] = progress or no_progress
-    still = median_depth_capture(scene.capture, "rgb", "normal")
+    capture = median_depth_capture(scene.capture, "rgb", "normal")
     field = DistanceField(voxel, (low + high) / 2)
     images = []
-    frames = renderer.render_views(renderer.upload(scene), [replace(still, camera=one) for one in views])
+    captures = [capture.with_(camera=camera) for camera in views]
+    frames = renderer.render_views(renderer.upload(scene), captures)
     for k, frame in enumerate(frames):
         depth = frame["depth_first"]
         field.allocate(depth, views[k])
@@ -87,29 +88,31 @@ def scene_mesh(
 def _cosine(normal: np.ndarray, camera: Camera) -> np.ndarray:
     """Cosine (h, w) float32 of the angle between the rays and the normals (h, w, 3), at least 0.1."""
     pixels = camera.pixel_centres.reshape(-1, 2)
-    ends = camera.unproject(pixels, np.ones(len(pixels))) - camera.unproject(pixels, np.zeros(len(pixels)))
-    rays = (ends @ camera.world_to_camera[:3, :3].T).reshape(normal.shape)
+    origins, points = (camera.unproject(pixels, np.full(len(pixels), depth)) for depth in (0.0, 1.0))
+    rays = ((points - origins) @ camera.world_to_camera[:3, :3].T).reshape(normal.shape)
     cosine = -(normal * rays).sum(2) / np.linalg.norm(rays, axis=2)
     return np.nan_to_num(np.maximum(cosine, 0.1), nan=0.1).astype(np.float32)
 
 
 def views_around(scene: Scene, low: np.ndarray, high: np.ndarray) -> list[Camera]:
     """Cameras on a sphere around a box, spaced by the golden angle, without cameras below level ground."""
-    guess = guess_up(scene.cloud())
-    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-    away = radius / math.sin(FOV / 2)
+    up_axis = guess_up(scene.cloud())
+    center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    distance = radius / math.sin(FOV / 2)
     k = np.arange(VIEWS)
     z = 1 - (2 * k + 1) / VIEWS
-    angle, across = math.pi * (1 + 5**0.5) * k, np.sqrt(1 - z * z)
-    directions = np.stack([across * np.cos(angle), across * np.sin(angle), z], 1)
-    found = []
+    angle, horizontal = math.pi * (1 + 5**0.5) * k, np.sqrt(1 - z * z)
+    directions = np.stack([horizontal * np.cos(angle), horizontal * np.sin(angle), z], 1)
+    cameras = []
     for direction in directions:
-        if guess.ground and direction @ guess.direction < 0.1:
+        if up_axis.ground and direction @ up_axis.direction < 0.1:
             continue
-        up = guess.direction if abs(direction @ guess.direction) < 0.99 else np.roll(guess.direction, 1)
-        near = max(away - 1.5 * radius, 1e-3 * radius)
-        found.append(Camera.look_at(SIDE, SIDE, FOV, middle + away * direction, middle, up, near=near))
-    return found
+        up = up_axis.direction if abs(direction @ up_axis.direction) < 0.99 else np.roll(up_axis.direction, 1)
+        near = max(distance - 1.5 * radius, 1e-3 * radius)
+        cameras.append(
+            Camera.look_at(IMAGE_SIDE, IMAGE_SIDE, FOV, center + distance * direction, center, up, near=near)
+        )
+    return cameras
 
 
 def _bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -118,5 +121,5 @@ def _bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     if not len(cloud):
         raise InputError("the scene of a mesh must have at least one splat, got none")
     low, high = np.percentile(cloud.means.astype(np.float64), (0.5, 99.5), axis=0) + cloud.origin
-    reach = np.percentile(cloud.scales, 90)
-    return low - reach, high + reach
+    margin = np.percentile(cloud.scales, 90)
+    return low - margin, high + margin

@@ -63,8 +63,8 @@ class SeveralDevices:
                 "devices must be of one model, so that their frames are bit-identical, got "
                 f"{', '.join(sorted(titles))}; name devices of one model"
             )
-        self._shares = np.linspace(0.0, 1.0, len(names) + 1)
-        """borders of the bands as fractions of the frame's height, 0 and 1 included"""
+        self._borders = np.linspace(0.0, 1.0, len(names) + 1)
+        """borders between the bands, from 0 to 1, as fractions of the frame's height"""
         self._pool = ThreadPoolExecutor(len(names), "fidsplat-device")
 
     def __repr__(self) -> str:
@@ -94,11 +94,11 @@ class SeveralDevices:
         bands = self._bands(camera.height)
 
         def render_band(number: int) -> tuple[Frame, float]:
-            begun = time.perf_counter()
+            start = time.perf_counter()
             frame = self.renderers[number].render_band(
                 bands[number], resident[number], capture, names, quality
             )
-            return frame.wait(), time.perf_counter() - begun
+            return frame.wait(), time.perf_counter() - start
 
         rendered = list(self._pool.map(render_band, range(len(bands))))
         self._balance([end - first for first, end in bands], [seconds for _, seconds in rendered])
@@ -122,10 +122,10 @@ class SeveralDevices:
         except TypeError:
             raise invalid("captures", "a list of Capture or Camera", captures) from None
         workers = [
-            _Worker(partial(renderer.render_views, one, outputs=names, quality=quality))
-            for renderer, one in zip(self.renderers, resident, strict=True)
+            _Worker(partial(renderer.render_views, cloud, outputs=names, quality=quality))
+            for renderer, cloud in zip(self.renderers, resident, strict=True)
         ]
-        waiting: deque[_Worker] = deque()
+        pending: deque[_Worker] = deque()
         failure: Exception | None = None
         try:
             for worker in cycle(workers):
@@ -136,13 +136,13 @@ class SeveralDevices:
                 except Exception as error:
                     failure = error
                     break
-                waiting.append(worker)
-                if len(waiting) > _IN_FLIGHT * len(workers):
-                    yield waiting.popleft().result()
+                pending.append(worker)
+                if len(pending) > _IN_FLIGHT * len(workers):
+                    yield pending.popleft().result()
             for worker in workers:
                 worker.end()
-            while waiting:
-                yield waiting.popleft().result()
+            while pending:
+                yield pending.popleft().result()
         finally:
             for worker in workers:
                 worker.stop()
@@ -153,32 +153,32 @@ class SeveralDevices:
         self, scene: Scene | SplatCloud | Store | Sequence[ResidentCloud]
     ) -> Sequence[ResidentCloud]:
         if isinstance(scene, Sequence):
-            given = items("scene", scene, ResidentCloud, "a scene, or the result of `upload`")
+            resident = items("scene", scene, ResidentCloud, "a scene, or the result of `upload`")
         else:
-            given = self.upload(scene)
-        if len(given) != len(self.renderers):
+            resident = self.upload(scene)
+        if len(resident) != len(self.renderers):
             raise InputError(
-                f"scene must be uploaded to all {len(self.renderers)} devices, got {len(given)}; give the "
+                f"scene must be uploaded to all {len(self.renderers)} devices, got {len(resident)}; give the "
                 "result of `upload`"
             )
-        return given
+        return resident
 
     def _bands(self, height: int) -> list[tuple[int, int]]:
         """Rows [first, end) of each device, at least one row each; small frames use fewer devices."""
         devices = min(len(self.renderers), height)
-        shares = self._shares if devices == len(self.renderers) else np.linspace(0, 1, devices + 1)
-        borders = np.round(shares * height).astype(int)
+        fractions = self._borders if devices == len(self.renderers) else np.linspace(0, 1, devices + 1)
+        rows = np.round(fractions * height).astype(int)
         for number in range(1, devices):
-            borders[number] = min(max(borders[number], borders[number - 1] + 1), height - devices + number)
-        return list(pairwise(borders.tolist()))
+            rows[number] = min(max(rows[number], rows[number - 1] + 1), height - devices + number)
+        return list(pairwise(rows.tolist()))
 
     def _balance(self, rows: list[int], seconds: list[float]) -> None:
-        """Move the borders of the bands to equalise their times, as if all rows took the same time."""
+        """Move the borders of the bands to equalise their times; the rows of a band count alike."""
         if len(rows) < len(self.renderers) or max(seconds) <= _MAX_IMBALANCE * np.mean(seconds):
             return
-        spent = np.concatenate([[0.0], np.cumsum(seconds)])
-        ends = np.concatenate([[0.0], np.cumsum(rows)]) / sum(rows)
-        self._shares = np.interp(np.linspace(0.0, spent[-1], len(spent)), spent, ends)
+        elapsed = np.concatenate([[0.0], np.cumsum(seconds)])
+        borders = np.concatenate([[0.0], np.cumsum(rows)]) / sum(rows)
+        self._borders = np.interp(np.linspace(0.0, elapsed[-1], len(elapsed)), elapsed, borders)
 
 
 class _Worker:
@@ -187,7 +187,7 @@ class _Worker:
     _END = object()
 
     def __init__(self, render: Callable[[Iterator[Any]], Iterator[Frame]]) -> None:
-        """render: `Renderer.render_views` with a scene bound."""
+        """render: `Renderer.render_views` of a scene, as a function of the captures."""
         self._captures: SimpleQueue[Any] = SimpleQueue()
         self._frames: SimpleQueue[Frame | BaseException] = SimpleQueue()
         self._stopped = False
@@ -199,7 +199,7 @@ class _Worker:
         self._captures.put(capture)
 
     def end(self) -> None:
-        """Mark the end of the captures."""
+        """Queue the end of the captures."""
         self._captures.put(self._END)
 
     def result(self) -> Frame:
@@ -248,12 +248,12 @@ class _BandImages(Images):
     @property
     def timings(self) -> dict[str, float]:
         """Milliseconds of each stage on the slowest device."""
-        each = [frame.timings for frame in self.frames]
-        return {stage: max(one.get(stage, 0.0) for one in each) for stage in each[0]}
+        timings = [frame.timings for frame in self.frames]
+        return {stage: max(ms.get(stage, 0.0) for ms in timings) for stage in timings[0]}
 
     @property
     def stats(self) -> dict[str, Any]:
         """splats: maximum over the devices; visible, pairs: sums over the bands."""
-        each = [frame.stats for frame in self.frames]
-        most = max(one["splats"] for one in each)
-        return {"splats": most} | {name: sum(one[name] for one in each) for name in ("visible", "pairs")}
+        stats = [frame.stats for frame in self.frames]
+        sums = {name: sum(counts[name] for counts in stats) for name in ("visible", "pairs")}
+        return {"splats": max(counts["splats"] for counts in stats)} | sums

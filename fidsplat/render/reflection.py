@@ -1,7 +1,5 @@
-"""Reflection of light by a surface: Lambert's law, and gloss by the microfacet model GGX.
-
-GGX with Smith's height-correlated masking (Walter et al. 2007, Heitz 2014) and Fresnel's factor of a
-dielectric.
+"""Glossy reflection: the microfacet model GGX with Smith's height-correlated masking (Walter et al. 2007,
+Heitz 2014) and the Fresnel factor of a dielectric.
 """
 
 from __future__ import annotations
@@ -13,15 +11,18 @@ import numpy as np
 from fidsplat.splats.harmonics import C0, MAX_DEGREE, sh_basis
 from fidsplat.util.directions import perpendicular, sphere
 
-_DIRECTIONS = 256
-_GRAZING = 0.05
+_VIEW_DIRECTIONS = 256
+"""number of directions to which harmonics are fitted"""
+_MIN_VIEW_COSINE = 0.05
 """minimum cosine between normal and fitted directions: markers are not legible beyond 87 degrees"""
-_LOBE = 64
-_BELOW = 1e-6
+_LOBE_SAMPLES = 64
+"""samples of a reflection"""
+_MIN_COSINE = 1e-6
+"""cosine to the normal below which a direction is behind the surface"""
 
 
-class Gloss(NamedTuple):
-    """A glossy surface."""
+class GlossyBrdf(NamedTuple):
+    """Specular BRDF of a rough dielectric."""
 
     roughness: float
     reflectance: float
@@ -36,77 +37,77 @@ class Gloss(NamedTuple):
 def fresnel(cosine: np.ndarray, reflectance: float) -> np.ndarray:
     """Fresnel factor of unpolarised light on a dielectric. reflectance: at normal incidence."""
     root = min(np.sqrt(reflectance), 1 - 1e-9)
-    index, cosine = (1 + root) / (1 - root), np.clip(cosine, 0, 1)
-    inner = np.sqrt(index**2 - 1 + cosine**2)
-    mirrored, along = inner - cosine, np.maximum(inner + cosine, 1e-12)
-    across = 1 + cosine * mirrored
-    return 0.5 * (mirrored / along) ** 2 * (1 + ((cosine * along - 1) / across) ** 2)
+    index, c = (1 + root) / (1 - root), np.clip(cosine, 0, 1)
+    g = np.sqrt(index**2 - 1 + c**2)  # the symbols c and g of Cook and Torrance
+    difference, total = g - c, np.maximum(g + c, 1e-12)
+    return 0.5 * (difference / total) ** 2 * (1 + ((c * total - 1) / (1 + c * difference)) ** 2)
 
 
-def gloss(
-    cosine: np.ndarray, to_viewer: np.ndarray, to_light: np.ndarray, normal: np.ndarray, surface: Gloss
+def glossy_reflection(
+    cosine: np.ndarray, to_viewer: np.ndarray, to_light: np.ndarray, normal: np.ndarray, brdf: GlossyBrdf
 ) -> np.ndarray:
     """Reflected radiance (n, v) towards viewers (n, v, 3) per irradiance of a surface that faces the light:
     the BRDF times the cosine of the light. cosine: (n, v) of viewer and normal (n, 3); to_light: (n, 3)."""
-    square = surface.alpha**2
+    square = brdf.alpha**2
     light = np.einsum("nc,nc->n", to_light, normal)[:, None]
-    above = (cosine > _BELOW) & (light > _BELOW)
-    view, light = np.maximum(cosine, _BELOW), np.maximum(light, _BELOW)
-    along = np.einsum("nvc,nc->nv", to_viewer, to_light)
-    length = np.sqrt(np.maximum(2 + 2 * along, 1e-12))
+    above = (cosine > _MIN_COSINE) & (light > _MIN_COSINE)
+    view, light = np.maximum(cosine, _MIN_COSINE), np.maximum(light, _MIN_COSINE)
+    cosine_between = np.einsum("nvc,nc->nv", to_viewer, to_light)
+    length = np.sqrt(np.maximum(2 + 2 * cosine_between, 1e-12))
     half = (view + light) / length
     distribution = square / (np.pi * (half**2 * (square - 1) + 1) ** 2)
-    masking = 0.5 / (light * _slope(view, square) + view * _slope(light, square))
+    masking = 0.5 / (light * _smith_root(view, square) + view * _smith_root(light, square))
     # the cosine is between viewer and half vector
-    factor = fresnel((1 + along) / length, surface.reflectance)
+    factor = fresnel((1 + cosine_between) / length, brdf.reflectance)
     return np.where(above, distribution * masking * factor * light, 0.0)
 
 
-def lobe(to_viewer: np.ndarray, normal: np.ndarray, surface: Gloss) -> tuple[np.ndarray, np.ndarray]:
+def sample_lobe(to_viewer: np.ndarray, normal: np.ndarray, brdf: GlossyBrdf) -> tuple[np.ndarray, np.ndarray]:
     """Importance samples of the reflection: directions (n, v, k, 3) towards incoming light, and weights (n,
     v, k). The sum of weights times radiance is the radiance towards viewers (n, v, 3). Visible normals are
     sampled (Heitz 2018)."""
-    square, i = surface.alpha**2, np.arange(_LOBE)
-    radius, angle = np.sqrt((i + 0.5) / _LOBE), 2 * np.pi * _van_der_corput(_LOBE)
+    square, i = brdf.alpha**2, np.arange(_LOBE_SAMPLES)
+    radius, phi = np.sqrt((i + 0.5) / _LOBE_SAMPLES), 2 * np.pi * _van_der_corput(_LOBE_SAMPLES)
     axes = np.concatenate([perpendicular(normal), normal[:, None]], 1)
     local = np.einsum("nvd,ncd->nvc", to_viewer, axes)
-    stretched = local * (surface.alpha, surface.alpha, 1.0)
+    stretched = local * (brdf.alpha, brdf.alpha, 1.0)
     stretched = (stretched / np.linalg.norm(stretched, axis=-1, keepdims=True))[..., None, :]
-    first = np.cross((0.0, 0.0, 1.0), stretched)
-    across = np.linalg.norm(first, axis=-1, keepdims=True)
-    first = np.where(across > 1e-9, first / np.maximum(across, 1e-9), (1.0, 0.0, 0.0))
-    second = np.cross(stretched, first)
-    one, share = radius * np.cos(angle), (1 + stretched[..., 2]) / 2
-    two = (1 - share) * np.sqrt(1 - one**2) + share * (radius * np.sin(angle))
-    three = np.sqrt(np.maximum(1 - one**2 - two**2, 0))
-    half = one[:, None] * first + two[..., None] * second + three[..., None] * stretched
-    half *= (surface.alpha, surface.alpha, 1.0)
+    tangent = np.cross((0.0, 0.0, 1.0), stretched)
+    length = np.linalg.norm(tangent, axis=-1, keepdims=True)
+    tangent = np.where(length > 1e-9, tangent / np.maximum(length, 1e-9), (1.0, 0.0, 0.0))
+    bitangent = np.cross(stretched, tangent)
+    t1, s = radius * np.cos(phi), (1 + stretched[..., 2]) / 2
+    t2 = (1 - s) * np.sqrt(1 - t1**2) + s * (radius * np.sin(phi))
+    t3 = np.sqrt(np.maximum(1 - t1**2 - t2**2, 0))
+    half = t1[:, None] * tangent + t2[..., None] * bitangent + t3[..., None] * stretched
+    half *= (brdf.alpha, brdf.alpha, 1.0)
     half[..., 2] = np.maximum(half[..., 2], 1e-9)
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
     local = local[..., None, :]
     cosine = np.sum(local * half, axis=-1, keepdims=True)
-    found = 2 * cosine * half - local
-    light, view = found[..., 2], np.maximum(local[..., 2], _BELOW)
-    above = light > _BELOW
-    masking = light * (view + _slope(view, square))
-    masking = masking / (light * _slope(view, square) + view * _slope(light, square))
-    weights = np.where(above, fresnel(cosine[..., 0], surface.reflectance) * masking / _LOBE, 0.0)
-    return np.einsum("nvkc,ncd->nvkd", found, axes), weights
+    reflected = 2 * cosine * half - local
+    light, view = reflected[..., 2], np.maximum(local[..., 2], _MIN_COSINE)
+    above = light > _MIN_COSINE
+    masking = light * (view + _smith_root(view, square))
+    masking = masking / (light * _smith_root(view, square) + view * _smith_root(light, square))
+    weights = np.where(above, fresnel(cosine[..., 0], brdf.reflectance) * masking / _LOBE_SAMPLES, 0.0)
+    return np.einsum("nvkc,ncd->nvkd", reflected, axes), weights
 
 
-def _slope(cosine: np.ndarray, square: float) -> np.ndarray:
+def _smith_root(cosine: np.ndarray, square: float) -> np.ndarray:
+    """Square root in Smith's masking function. square: GGX width squared."""
     return np.sqrt(cosine**2 * (1 - square) + square)
 
 
 def _van_der_corput(count: int) -> np.ndarray:
-    """First numbers (count,) of the van der Corput sequence in base 2."""
+    """First `count` numbers of the van der Corput sequence in base 2."""
     bits = np.arange(count)[:, None] >> np.arange(16) & 1
     return bits @ 0.5 ** np.arange(1, 17)
 
 
 def view_directions(normal: np.ndarray) -> np.ndarray:
     """Unit directions (v, 3) from a surface to viewers, evenly over the hemisphere of its normal (3,)."""
-    return sphere(_DIRECTIONS, _GRAZING) @ np.stack([*perpendicular(normal), normal])
+    return sphere(_VIEW_DIRECTIONS, _MIN_VIEW_COSINE) @ np.stack([*perpendicular(normal), normal])
 
 
 def fit_harmonics(to_viewer: np.ndarray, colors: np.ndarray) -> np.ndarray:

@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from fidsplat.scenes import Scene
     from fidsplat.splats.cloud import SplatCloud
 
-_REFERENCE = 0.1  # reflectivity for which `Lidar.detection_range` is stated
-_ODDS = 9  # odds of a detection at that range: a probability of 90 %
-# the odds grow with the fourth power of the signal: a third of the signal has a probability of 10 %
-_CUTOFF = 1e-3  # minimum alpha of a fragment; fainter fragments hardly move the surface at `Lidar.opacity`
+_REFLECTIVITY = 0.1  # reflectivity for which `Lidar.detection_range` is stated
+_ODDS_AT_RANGE = 9  # odds of a detection at that range: a probability of 90 %
+# the odds are proportional to signal^4: a third of the signal is detected with a probability of 10 %
+_ALPHA_CUTOFF = 1e-3  # minimum alpha of a fragment; fainter ones hardly move the surface at `Lidar.opacity`
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ class Scan:
         return self.lidar.directions(self.start)
 
     @cached_property
-    def band(self) -> np.ndarray:
+    def pose_index(self) -> np.ndarray:
         """(beams,) index of the pose of each beam."""
         moving = len(self.poses) > 1
         pixels = self.lidar.camera(self.start, moving).width * self.lidar.rows_per_band(moving)
@@ -83,7 +83,7 @@ class Scan:
     @cached_property
     def world_points(self) -> np.ndarray:
         """(r, beams, 3) float64 metres in the world; NaN without a return."""
-        poses = self.poses[self.band]
+        poses = self.poses[self.pose_index]
         return np.einsum("bij,rbj->rbi", poses[:, :3, :3], self.points) + poses[:, :3, 3]
 
     def image(self, name: str = "range") -> np.ndarray:
@@ -117,10 +117,10 @@ class Scan:
         columns["echo"] = echo.astype(np.uint8)
         if self.label is not None:
             columns["label"] = self.label[echo, beam]
-        made = np.empty(len(beam), [(name, values.dtype) for name, values in columns.items()])
+        result = np.empty(len(beam), [(name, values.dtype) for name, values in columns.items()])
         for name, values in columns.items():
-            made[name] = values
-        return made
+            result[name] = values
+        return result
 
     def save(self, path: str | os.PathLike[str], frame: str = "lidar") -> None:
         """Write `cloud` as .pcd, .ply or .npy. Raises InputError for another ending."""
@@ -155,13 +155,14 @@ def scan(
         motion: `Motion(camera=...)` has the pose lidar_from_world at a time, instead of `pose`; `groups`
             moves splats. None: the sensor has one pose for all beams, also in a scene whose camera moves, and
             the scene's groups move as its motion states.
-        start: seconds, start of the scan; None: the time of the scene's shutter. label: whether the labels of
-        the splats are requested. index: number of the scan, which selects its random noise.
+        start: seconds, start of the scan; None: the time of the scene's shutter.
+        label: whether the scan has labels of splats.
+        index: number of the scan, which selects its random noise.
 
     Raises:
         InputError: no pose, or a pose that is not rigid; as `Renderer.render`.
     """
-    renderer, resident = _resident(scene, renderer)
+    renderer, resident = _renderer_and_cloud(scene, renderer)
     request = ScanRequest.of(lidar, scene, label, motion, start)
     capture = request.capture(pose)
     assert capture.camera is not None
@@ -189,21 +190,21 @@ def scan_batch(
     Raises:
         InputError: as `scan`.
     """
-    renderer, resident = _resident(scene, renderer)
+    renderer, resident = _renderer_and_cloud(scene, renderer)
     matrices = pose_matrices("poses", poses)
     request = ScanRequest.of(lidar, scene, label, Motion(), start)
     batch = renderer.render_batch(resident, request.capture(np.eye(4)), poses=poses)
     images = dict(batch)
 
     def decoded(view: int) -> Scan:
-        own = {name: each[view] for name, each in images.items()}
-        return request.decoded(own, matrices[view : view + 1], view)
+        view_images = {name: image[view] for name, image in images.items()}
+        return request.decoded(view_images, matrices[view : view + 1], view)
 
-    with ThreadPoolExecutor() as pool:  # NumPy computes without the lock of Python
+    with ThreadPoolExecutor() as pool:  # NumPy computes without Python's global lock
         return list(pool.map(decoded, range(len(matrices))))
 
 
-def _resident(scene: Any, renderer: Renderer | None) -> tuple[Renderer, Any]:
+def _renderer_and_cloud(scene: Any, renderer: Renderer | None) -> tuple[Renderer, Any]:
     from fidsplat.render.renderer import Renderer
     from fidsplat.render.resident import ResidentCloud
 
@@ -222,7 +223,7 @@ class ScanRequest:
 
     lidar: Lidar
     base: Capture
-    """the scene's"""
+    """capture of the scene"""
     motion: Motion
     start: float
     label: bool
@@ -256,7 +257,7 @@ class ScanRequest:
             self.base.quality,
             samples=1,
             lowpass="none",
-            alpha_cutoff=max(self.base.quality.alpha_cutoff, _CUTOFF),
+            alpha_cutoff=max(self.base.quality.alpha_cutoff, _ALPHA_CUTOFF),
             first_hit=lidar.opacity,
             transmittance_stop=(1 - lidar.opacity) * (1 - 1e-6),  # behind the surface; below its rounding
         )
@@ -281,29 +282,29 @@ class ScanRequest:
         """Convert rendered images to a scan. poses: (bands, 4, 4) world_from_lidar."""
         lidar, pixels = self.lidar, self.lidar.pixels(self.start, self.moving)
 
-        def of_rays(image: np.ndarray) -> np.ndarray:
-            flat = image.reshape(-1, *image.shape[2:])
+        def by_ray(image: np.ndarray) -> np.ndarray:
+            pixel_values = image.reshape(-1, *image.shape[2:])
             # the rays of a spinning lidar are all pixels, in order
-            return flat if isinstance(lidar.pattern, Spinning) else flat[pixels.reshape(-1)]
+            return pixel_values if isinstance(lidar.pattern, Spinning) else pixel_values[pixels.reshape(-1)]
 
-        images = {name: of_rays(image) for name, image in images.items()}
+        images = {name: by_ray(image) for name, image in images.items()}
         lens = lidar.camera(self.start, self.moving).lens
         assert isinstance(lens, RayTable)
-        intensity = _intensity(images, of_rays(lens.directions), lidar.reflectivity)
+        intensity = _intensity(images, by_ray(lens.directions), lidar.reflectivity)
         rays = {"range": images["distance_first"], "intensity": intensity}
         if "label" in images:
             rays["label"] = images["label"]
-        found = _returns({name: values.reshape(pixels.shape) for name, values in rays.items()}, lidar)
-        _measure(found, lidar, np.random.default_rng((lidar.seed, number_of_scan)))
-        label = found["label"].astype(np.int32) if self.label else None
-        ranges, intensity = (found[name].astype(np.float32, copy=False) for name in ("range", "intensity"))
+        returns = _returns({name: values.reshape(pixels.shape) for name, values in rays.items()}, lidar)
+        _simulate_detection(returns, lidar, np.random.default_rng((lidar.seed, number_of_scan)))
+        label = returns["label"].astype(np.int32) if self.label else None
+        ranges, intensity = (returns[name].astype(np.float32, copy=False) for name in ("range", "intensity"))
         return Scan(lidar, self.start, ranges, intensity, label, poses)
 
 
 def _intensity(
     images: Mapping[str, np.ndarray], directions: np.ndarray, reflectivity: Mapping[int, float]
 ) -> np.ndarray:
-    """Reflectivity times cosine of incidence (rays,) float32 of images of rays."""
+    """Reflectivity times cosine of incidence, (rays,) float32, from rendered outputs (rays, ...)."""
     color = images["rgb"] / np.maximum(images["alpha"], 1e-6)[:, None]
     light = to_light(np.minimum(color, 1), "srgb", np.float32) @ LUMINANCE.astype(np.float32)
     for label, value in reflectivity.items():
@@ -324,63 +325,67 @@ def _pose_of(pose: Any, camera: Camera | None) -> np.ndarray:
 
 
 def _returns(rays: dict[str, np.ndarray], lidar: Lidar) -> dict[str, np.ndarray]:
-    """Returns (r, beams) of the rays of beams, (beams, n): neighbours in range are one return, with their
-    mean range by signal, their sum of intensities over n, and the label of the first."""
+    """Returns (r, beams) of beams of n rays, (beams, n). Rays within `separation` of each other form one
+    return: its range is their mean weighted by signal, its intensity their sum / n, its label that of the
+    nearest ray."""
     count = lidar.rays
     if count == 1:
         return {name: values.T.copy() for name, values in rays.items()}
     order = np.argsort(np.where(rays["range"] > 0, rays["range"], np.inf), axis=1, kind="stable")
-    sorted_ = {name: np.take_along_axis(values, order, 1) for name, values in rays.items()}
-    ranges, hit = sorted_["range"], sorted_["range"] > 0
-    starts = np.diff(np.where(hit, ranges, 0.0), axis=1, prepend=-np.inf) > lidar.separation
-    group = np.clip(np.cumsum(starts & hit, axis=1) - 1, 0, count - 1)
+    by_range = {name: np.take_along_axis(values, order, 1) for name, values in rays.items()}
+    ranges, hits = by_range["range"], by_range["range"] > 0
+    starts = np.diff(np.where(hits, ranges, 0.0), axis=1, prepend=-np.inf) > lidar.separation
+    group = np.clip(np.cumsum(starts & hits, axis=1) - 1, 0, count - 1)
     # 1e-9: a group of black surfaces has a range too
-    signal = np.where(hit, (sorted_["intensity"] + 1e-9) / np.where(hit, ranges, 1.0) ** 2, 0.0)
+    signal = np.where(hits, (by_range["intensity"] + 1e-9) / np.where(hits, ranges, 1.0) ** 2, 0.0)
     beams = np.arange(len(ranges))[:, None]
 
-    def gathered(values: np.ndarray) -> np.ndarray:
+    def sum_by_group(values: np.ndarray) -> np.ndarray:
         total = np.zeros(ranges.shape)
-        np.add.at(total, (beams, group), np.where(hit, values, 0.0))
+        np.add.at(total, (beams, group), np.where(hits, values, 0.0))
         return total
 
-    power = gathered(signal)
+    power = sum_by_group(signal)
     with np.errstate(divide="ignore", invalid="ignore"):
-        mean = np.where(power > 0, gathered(signal * ranges) / power, 0.0)
-    light = gathered(sorted_["intensity"]) / count
+        mean = np.where(power > 0, sum_by_group(signal * ranges) / power, 0.0)
+    light = sum_by_group(by_range["intensity"]) / count
     groups = (power > 0).sum(1)
-    picks = []
+    chosen = []
     for kind in lidar.returns:
-        pick = {"first": 0 * groups, "last": groups - 1, "strongest": power.argmax(1)}[kind]
-        repeated = np.logical_or.reduce([pick == earlier for earlier in picks]) if picks else groups < 0
-        picks.append(np.where((groups > 0) & ~repeated, pick, -1))
-    picked = np.stack(picks)
-    known, at = picked >= 0, np.clip(picked, 0, count - 1)
-    rows = np.arange(len(ranges))
-    found = {
-        name: np.where(known, each[rows, at], 0.0) for name, each in (("range", mean), ("intensity", light))
+        index = {"first": 0 * groups, "last": groups - 1, "strongest": power.argmax(1)}[kind]
+        repeated = np.logical_or.reduce([index == other for other in chosen]) if chosen else groups < 0
+        chosen.append(np.where((groups > 0) & ~repeated, index, -1))
+    indices = np.stack(chosen)
+    exists, at = indices >= 0, np.clip(indices, 0, count - 1)
+    beam = np.arange(len(ranges))
+    returns = {
+        name: np.where(exists, values[beam, at], 0.0)
+        for name, values in (("range", mean), ("intensity", light))
     }
-    if "label" in sorted_:
-        first = np.argmax(group[None] == at[..., None], axis=2)
-        found["label"] = np.where(known, sorted_["label"][rows, first], -1)
-    return found
+    if "label" in by_range:
+        first_ray = np.argmax(group[None] == at[..., None], axis=2)
+        returns["label"] = np.where(exists, by_range["label"][beam, first_ray], -1)
+    return returns
 
 
-def _measure(found: dict[str, np.ndarray], lidar: Lidar, random: np.random.Generator) -> None:
-    """Apply detection, drop-outs, noise and the limits of range, in place."""
-    ranges = found["range"]
-    kept = (ranges >= lidar.near) & (ranges <= lidar.far)
+def _simulate_detection(returns: dict[str, np.ndarray], lidar: Lidar, random: np.random.Generator) -> None:
+    """Apply the probability of detection, drop-outs, noise and the range limits to returns, in place."""
+    ranges = returns["range"]
+    detected = (ranges >= lidar.near) & (ranges <= lidar.far)
     if math.isfinite(lidar.detection_range):
         # signal relative to the signal at the detection range
         signal = (
-            found["intensity"] / _REFERENCE * (lidar.detection_range / np.maximum(ranges, lidar.near)) ** 2
+            returns["intensity"]
+            / _REFLECTIVITY
+            * (lidar.detection_range / np.maximum(ranges, lidar.near)) ** 2
         )
-        odds = _ODDS * np.square(np.square(signal))
-        kept &= random.random(ranges.shape, np.float32) * (1 + odds) < odds
+        odds = _ODDS_AT_RANGE * np.square(np.square(signal))
+        detected &= random.random(ranges.shape, np.float32) * (1 + odds) < odds
     if lidar.dropouts:
-        kept &= random.random(ranges.shape, np.float32) >= lidar.dropouts
+        detected &= random.random(ranges.shape, np.float32) >= lidar.dropouts
     if lidar.noise or lidar.noise_growth:
         noise = random.standard_normal(ranges.shape, np.float32)
         ranges += noise * (lidar.noise + lidar.noise_growth * ranges)
-        kept &= (ranges >= lidar.near) & (ranges <= lidar.far)
-    for name, values in found.items():
-        values[~kept] = -1 if name == "label" else 0
+        detected &= (ranges >= lidar.near) & (ranges <= lidar.far)
+    for name, values in returns.items():
+        values[~detected] = -1 if name == "label" else 0

@@ -1,4 +1,4 @@
-"""Shadow maps: transmittance of the splats between points of a light and a marker."""
+"""Shadow maps: transmittance of the splats between the points of a light and a marker."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from fidsplat.render.resident import ResidentCloud
 
 MAX_PIXELS = 512
-"""pixels of a shadow map along a side"""
+"""maximum pixels of a shadow map along a side"""
 _MARGIN = 4
 """width [pixels] of the border around the marker"""
-_WIDEST = np.tan(np.radians(80))
+_MAX_TANGENT = np.tan(np.radians(80))
 """tangent of half the maximum field of view of a shadow map; there are no shadows beyond it"""
 
 
 @dataclass(frozen=True, eq=False)
 class ReceiverPoints:
-    """Points of a surface that receives shadows."""
+    """Points of a surface that receives light."""
 
     points: np.ndarray
     """(m, 3) in the world"""
@@ -60,64 +60,68 @@ class LightPoint(NamedTuple):
     light: Light
     position: np.ndarray
     """(3,) position; for a sun the direction of its light"""
-    share: float
+    power_fraction: float
+    """fraction of the light's power"""
 
-    def arriving(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def irradiance(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Unit directions (m, 3) to the light, and unshadowed irradiance (m, 3) of facing surfaces."""
-        power = self.share * self.light.power
+        power = self.power_fraction * self.light.power
         if isinstance(self.light, Sun):
             return np.broadcast_to(-self.position, points.shape), np.broadcast_to(power, points.shape)
-        towards = self.position - points
-        distance = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
-        towards, irradiance = towards / distance, power / distance**2
+        to_light = self.position - points
+        distance = np.maximum(np.linalg.norm(to_light, axis=1, keepdims=True), 1e-9)
+        to_light, irradiance = to_light / distance, power / distance**2
         if isinstance(self.light, SpotLight):
             low, high = np.cos(self.light.outer), np.cos(self.light.inner)
-            cosine = -towards @ unit(np.array(self.light.direction))
+            cosine = -to_light @ unit(np.array(self.light.direction))
             irradiance = irradiance * np.clip((cosine - low) / (high - low), 0, 1)[:, None] ** 2
-        return towards, irradiance
+        return to_light, irradiance
 
 
 def light_points(light: Light, middle: np.ndarray) -> list[LightPoint]:
-    """Sample points of a light, seen as a disk from the position `middle` (3,)."""
+    """Sample points of a light on the disk that faces the position `middle` (3,)."""
     size = light.angle if isinstance(light, Sun) else getattr(light, "radius", 0.0)
     count = light.samples if size > 0 else 1
-    share, places = np.full(count, 1 / count), disk(count) * (count > 1)
+    fractions, points = np.full(count, 1 / count), disk(count) * (count > 1)
     if isinstance(light, Sun):
         axis = unit(np.array(light.direction))
-        across = np.sin(size / 2) * (places @ perpendicular(axis))
-        cosine = np.sqrt(1 - (across**2).sum(axis=1))
-        places = cosine[:, None] * axis + across
-        share = share / cosine  # a surface that faces the sun receives its intensity
+        offset = np.sin(size / 2) * (points @ perpendicular(axis))
+        cosine = np.sqrt(1 - (offset**2).sum(axis=1))
+        points = cosine[:, None] * axis + offset
+        fractions = fractions / cosine  # a surface that faces the sun receives its intensity
     else:
         assert isinstance(light, PointLight)
         center = np.array(light.position)
-        places = center + size * (places @ perpendicular(unit(center - middle)))
-    return [LightPoint(light, *pair) for pair in zip(places, share, strict=True)]
+        points = center + size * (points @ perpendicular(unit(center - middle)))
+    return [LightPoint(light, *pair) for pair in zip(points, fractions, strict=True)]
 
 
-def between(light: Light, surface: ReceiverPoints, centres: np.ndarray, radii: np.ndarray) -> np.ndarray:
-    """Rows of the spheres that may be between a light and a surface: in front of the surface, and in a
-    capsule around both; for a sun in a cone."""
+def shadow_casters(
+    light: Light, surface: ReceiverPoints, centres: np.ndarray, radii: np.ndarray
+) -> np.ndarray:
+    """Rows of the spheres, centres (n, 3) and radii (n,), that may cast shadows on a surface: in front
+    of the surface, and in a capsule around both; for a sun in a cone."""
     middle, normal = surface.middle, surface.normals.mean(axis=0)
-    reach = surface.radius + _MARGIN * surface.pitch
-    length, apart = float(np.linalg.norm(normal)), centres - middle
-    lowest = ((surface.points + surface.clearance * surface.normals - middle) @ normal).min() - surface.pitch
+    radius = surface.radius + _MARGIN * surface.pitch
+    length, offsets = float(np.linalg.norm(normal)), centres - middle
+    receivers = surface.points + surface.clearance * surface.normals
+    min_height = ((receivers - middle) @ normal).min() - surface.pitch
     if isinstance(light, Sun):
-        towards = -unit(np.array(light.direction))
-        along = apart @ towards
-        across = np.linalg.norm(apart - along[:, None] * towards, axis=1)
-        widest = reach + np.tan(light.angle / 2) * np.maximum(along + radii, 0)
-        inside = (across - radii <= widest) & (along + radii >= -reach)
-        above = towards @ normal > np.sin(light.angle / 2) * length  # all rays rise from the surface
-        lowest = lowest if above else -np.inf
+        to_light = -unit(np.array(light.direction))
+        along = offsets @ to_light
+        distance_from_axis = np.linalg.norm(offsets - along[:, None] * to_light, axis=1)
+        max_distance = radius + np.tan(light.angle / 2) * np.maximum(along + radii, 0)
+        inside = (distance_from_axis - radii <= max_distance) & (along + radii >= -radius)
+        above = to_light @ normal > np.sin(light.angle / 2) * length  # all rays rise from the surface
+        min_height = min_height if above else -np.inf
     else:
         assert isinstance(light, PointLight)
-        way = np.array(light.position) - middle
-        along = np.clip(apart @ way / max(way @ way, 1e-12), 0, 1)
-        across = np.linalg.norm(apart - along[:, None] * way, axis=1)
-        inside = across - radii <= max(reach, light.radius)
-        lowest = min(lowest, way @ normal - light.radius * length)
-    return np.flatnonzero(inside & (apart @ normal + radii * length >= lowest))
+        to_light = np.array(light.position) - middle
+        along = np.clip(offsets @ to_light / max(to_light @ to_light, 1e-12), 0, 1)
+        distance_from_axis = np.linalg.norm(offsets - along[:, None] * to_light, axis=1)
+        inside = distance_from_axis - radii <= max(radius, light.radius)
+        min_height = min(min_height, to_light @ normal - light.radius * length)
+    return np.flatnonzero(inside & (offsets @ normal + radii * length >= min_height))
 
 
 def visibility(
@@ -132,42 +136,43 @@ def visibility(
     faces away.
 
     The marker is an opaque white surface in an external depth image, and other splats are black, so that the
-    image rendered from the light is the transmittance. casters: the splats `between` both in black, moved by
+    image rendered from the light is the transmittance. casters: the splats between both in black, moved by
     `motion`; None: no splats. extent: largest distance of a splat from the marker.
     """
-    towards, irradiance = point.arriving(surface.points)
-    found = np.zeros(len(towards), np.float32)
-    lit = (np.einsum("mc,mc->m", towards, surface.normals) > 0) & (irradiance @ np.ones(3) > 0)
+    to_light, irradiance = point.irradiance(surface.points)
+    visible = np.zeros(len(to_light), np.float32)
+    facing = (np.einsum("mc,mc->m", to_light, surface.normals) > 0) & (irradiance @ np.ones(3) > 0)
     if casters is None:
-        found[lit] = 1
-    elif lit.any():
-        points, normals = surface.points[lit], surface.normals[lit]
+        visible[facing] = 1
+    elif facing.any():
+        points, normals = surface.points[facing], surface.normals[facing]
         camera = _camera(point, surface, extent + surface.clearance)
-        shifted = points + surface.clearance * normals
+        surface_points = points + surface.clearance * normals
         if surface.is_flat:  # three points of its plane
-            shifted = shifted[0] + surface.pitch * np.pad(perpendicular(normals[0]), ((1, 0), (0, 0)))
-        depth = _depth_image(camera, shifted)
+            offsets = surface.pitch * np.pad(perpendicular(normals[0]), ((1, 0), (0, 0)))
+            surface_points = surface_points[0] + offsets
+        depth = _depth_image(camera, surface_points)
         image = ExternalDepth(np.ones((*depth.shape, 3), np.float32), depth)
-        seen = renderer.render(casters, Capture(camera, motion=motion, external_depth=image))["rgb"][..., 0]
-        found[lit] = _bilinear(np.asarray(seen), camera.project(points))
-    return found
+        frame = renderer.render(casters, Capture(camera, motion=motion, external_depth=image))
+        visible[facing] = _bilinear(np.asarray(frame["rgb"][..., 0]), camera.project(points))
+    return visible
 
 
 def _camera(point: LightPoint, surface: ReceiverPoints, extent: float) -> Camera:
     """Camera of a shadow map, at the light's point; for a sun, beyond all splats."""
-    middle, reach = surface.middle, surface.radius
-    inner = int(np.clip(np.ceil(2 * reach / surface.pitch), 8, MAX_PIXELS))
+    middle, radius = surface.middle, surface.radius
+    inner = int(np.clip(np.ceil(2 * radius / surface.pitch), 8, MAX_PIXELS))
     side = inner + 2 * _MARGIN
     if isinstance(point.light, Sun):
         pose = look_at_matrix(
-            middle - (extent + 2 * reach) * point.position, middle, perpendicular(point.position)[0]
+            middle - (extent + 2 * radius) * point.position, middle, perpendicular(point.position)[0]
         )
-        return Camera.orthographic(side, side, 2 * reach * side / inner, pose, near=1e-6)
-    away = float(np.linalg.norm(middle - point.position))
-    tangent = min(reach / np.sqrt(max(away**2 - reach**2, 1e-12)), _WIDEST)
+        return Camera.orthographic(side, side, 2 * radius * side / inner, pose, near=1e-6)
+    distance = float(np.linalg.norm(middle - point.position))
+    tangent = min(radius / np.sqrt(max(distance**2 - radius**2, 1e-12)), _MAX_TANGENT)
     focal = inner / (2 * tangent)
     pose = look_at_matrix(point.position, middle, perpendicular(unit(middle - point.position))[0])
-    return Camera.pinhole(side, side, focal, focal, side / 2, side / 2, pose, near=min(1e-3, away / 10))
+    return Camera.pinhole(side, side, focal, focal, side / 2, side / 2, pose, near=min(1e-3, distance / 10))
 
 
 def _depth_image(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -181,11 +186,11 @@ def _depth_image(camera: Camera, points: np.ndarray) -> np.ndarray:
     plane = np.linalg.lstsq(_affine(pixels), value, rcond=None)[0]
     height, width = camera.height, camera.width
     image = (_affine(camera.pixel_centres.reshape(-1, 2)) @ plane).reshape(height, width)
-    off = value - _affine(pixels) @ plane
-    if len(off) and np.abs(off).max() > 1e-6 * np.abs(value).max():  # a curved surface
+    residual = value - _affine(pixels) @ plane
+    if len(residual) and np.abs(residual).max() > 1e-6 * np.abs(value).max():  # a curved surface
         column, row = np.clip(pixels.astype(int), 0, (width - 1, height - 1)).T
         total, count = np.zeros((height, width)), np.zeros((height, width))
-        np.add.at(total, (row, column), off)
+        np.add.at(total, (row, column), residual)
         np.add.at(count, (row, column), 1)
         for dy in (-1, 0, 1):  # also in the neighbours of the points' pixels
             for dx in (-1, 0, 1):
@@ -208,4 +213,4 @@ def _bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)  # NaN is outside
     x, y = np.clip(np.where(inside.reshape(-1, 1), pixels, 0) - 0.5, 0, (width - 1, height - 1)).T
     padded = np.pad(image, ((0, 1), (0, 1)))
-    return np.where(inside, sum(share * padded[cell] for cell, share in neighbours(x, y)), 1.0)
+    return np.where(inside, sum(weight * padded[cell] for cell, weight in neighbours(x, y)), 1.0)

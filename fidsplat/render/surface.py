@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from fidsplat.render.resident import ResidentCloud
     from fidsplat.scenes import Scene
 
-SAMPLES = 32
-"""samples per side of the rendered patch"""
-SHARE, LEAST = 0.02, 8.0
-"""default radius of the patch: fraction of the image width, and minimum in pixels"""
-MEDIAN = 0.5
-"""opacity in front of the median depth; more transparent pixels are empty"""
-_RAY = 0.1
-"""field of view [rad] of the camera that renders a ray"""
+PATCH_SIZE = 32
+"""pixels per side of the rendered patch"""
+RADIUS_FRACTION, MIN_RADIUS = 0.02, 8.0
+"""default radius of the fitted patch: fraction of the image width, and minimum in pixels"""
+MEDIAN_OPACITY = 0.5
+"""accumulated opacity at the median depth; pixels of a lower opacity have no surface"""
+_RAY_FOV = 0.1
+"""field of view [rad] of the camera around a ray"""
 
 
 def surface_at(
@@ -59,27 +59,27 @@ def surface_at(
     capture = scene.capture
     if camera is None and scene.camera is not None:
         camera = capture.motion.moved(scene.camera, capture.shutter.time)
-    camera, pixel = _viewpoint(camera, pixel, ray)
+    camera, pixel = _camera_and_pixel(camera, pixel, ray)
     if radius is not None:
         radius = number("radius", radius, "a positive length in metres", 1e-9)
     if renderer is None:
         from fidsplat.render.renderer import Renderer  # imported here, as most callers pass a renderer
 
         renderer = Renderer(scene.device)
-    uploaded = renderer.upload(scene) if resident is None else resident
-    still = median_depth_capture(capture)
+    resident_scene = renderer.upload(scene) if resident is None else resident
+    capture_of_depth = median_depth_capture(capture)
 
     def depth_of(patch: Camera) -> np.ndarray:
-        return renderer.render(uploaded, still.with_(camera=patch))["depth_first"]
+        return renderer.render(resident_scene, capture_of_depth.with_(camera=patch))["depth_first"]
 
     pixels = default_radius(camera)
     if radius is not None:
-        metres = _radius(camera, pixel, pixels, _middle_depth(depth_of(_patch(camera, pixel, pixels))))
+        metres = _metres_of(camera, pixel, pixels, _median_of(depth_of(_patch(camera, pixel, pixels))))
         pixels = min(pixels * radius / metres, 2.0 * camera.width)
     patch = _patch(camera, pixel, pixels)
     depth = depth_of(patch)
-    metres = _radius(camera, pixel, pixels, _middle_depth(depth))
-    return _fitted(depth, patch, (SAMPLES / 2, SAMPLES / 2), SAMPLES / 2, metres)
+    metres = _metres_of(camera, pixel, pixels, _median_of(depth))
+    return _fit_patch(depth, patch, (PATCH_SIZE / 2, PATCH_SIZE / 2), PATCH_SIZE / 2, metres)
 
 
 def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = None) -> Surface:
@@ -94,13 +94,13 @@ def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = 
     Raises:
         InputError: no plane in at least half of the patch; a pixel outside the image.
     """
-    camera, pixel = _viewpoint(camera, pixel, None)
+    camera, pixel = _camera_and_pixel(camera, pixel, None)
     pixels = default_radius(camera) if radius is None else radius
     x, y = (int(v) for v in pixel)
-    reach, step = int(np.ceil(pixels)), max(1, int(pixels) // (SAMPLES // 4))
-    left, top = max(x - reach, 0), max(y - reach, 0)
-    patch = depth[top : y + reach + 1 : step, left : x + reach + 1 : step]
-    metres = _radius(camera, pixel, pixels, _middle_depth(patch))
+    half_side, step = int(np.ceil(pixels)), max(1, int(pixels) // (PATCH_SIZE // 4))
+    left, top = max(x - half_side, 0), max(y - half_side, 0)
+    patch = depth[top : y + half_side + 1 : step, left : x + half_side + 1 : step]
+    metres = _metres_of(camera, pixel, pixels, _median_of(patch))
     window = replace(  # centres of the pixels in every step-th row and column
         camera,
         width=patch.shape[1],
@@ -110,38 +110,39 @@ def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = 
         cx=(camera.cx - left - 0.5) / step + 0.5,
         cy=(camera.cy - top - 0.5) / step + 0.5,
     )
-    at = ((pixel[0] - left - 0.5) / step + 0.5, (pixel[1] - top - 0.5) / step + 0.5)
-    return _fitted(patch, window, at, pixels / step, metres)
+    patch_pixel = ((pixel[0] - left - 0.5) / step + 0.5, (pixel[1] - top - 0.5) / step + 0.5)
+    return _fit_patch(patch, window, patch_pixel, pixels / step, metres)
 
 
 def median_depth_capture(capture: Capture, *outputs: str) -> Capture:
-    """Capture of the median depth `depth_first` and other outputs at the time of the shutter, without effects
-    of sensor and air."""
-    quality = replace(capture.quality, samples=1, first_hit=MEDIAN)
+    """The capture of the median depth, output as `depth_first`, and of other outputs: at the shutter's time,
+    without sensor, fog and external depth image."""
+    quality = replace(capture.quality, samples=1, first_hit=MEDIAN_OPACITY)
     motion, shutter = Motion(None, capture.motion.groups), Shutter(time=capture.shutter.time)
-    still = capture.with_(outputs=("depth_first", *outputs), quality=quality, motion=motion, shutter=shutter)
-    return replace(still, sensor=Sensor(), background=(0.0, 0.0, 0.0), fog=None, external_depth=None)
+    outputs = ("depth_first", *outputs)
+    base = capture.with_(outputs=outputs, quality=quality, motion=motion, shutter=shutter)
+    return replace(base, sensor=Sensor(), background=(0.0, 0.0, 0.0), fog=None, external_depth=None)
 
 
 def default_radius(camera: Camera) -> float:
     """Radius of the patch in pixels."""
-    return max(SHARE * camera.width, LEAST)
+    return max(RADIUS_FRACTION * camera.width, MIN_RADIUS)
 
 
-def _viewpoint(camera: Camera | None, pixel, ray) -> tuple[Camera, tuple[float, float]]:
+def _camera_and_pixel(camera: Camera | None, pixel, ray) -> tuple[Camera, tuple[float, float]]:
     if (pixel is None) == (ray is None):
         given = "neither" if pixel is None else "both"
         raise InputError(f"exactly one of pixel and ray must be given, got {given}; leave one out")
     if ray is not None:
-        return _ray_camera(ray), (SAMPLES / 2, SAMPLES / 2)
+        return _ray_camera(ray), (PATCH_SIZE / 2, PATCH_SIZE / 2)
     if camera is None:
         raise InputError("camera must be given for a scene without a camera, got None; pass camera=")
-    at = real_array("pixel", pixel, "two numbers")
-    if at.shape != (2,) or not (0 <= at[0] <= camera.width and 0 <= at[1] <= camera.height):
+    point = real_array("pixel", pixel, "two numbers")
+    if point.shape != (2,) or not (0 <= point[0] <= camera.width and 0 <= point[1] <= camera.height):
         raise InputError(
             f"pixel must be (x, y) in the image, 0 to {camera.width} and 0 to {camera.height}, got {pixel!r}"
         )
-    return camera, (float(at[0]), float(at[1]))
+    return camera, (float(point[0]), float(point[1]))
 
 
 def _ray_camera(ray) -> Camera:
@@ -152,40 +153,40 @@ def _ray_camera(ray) -> Camera:
     if origin.shape != (3,) or direction.shape != (3,) or not direction.any():
         raise InputError(f"ray must be an origin (3,) and a direction (3,), not 0, got {ray!r}")
     up = np.eye(3)[np.argmin(np.abs(direction))]
-    along = direction / np.linalg.norm(direction)
-    return Camera.look_at(SAMPLES, SAMPLES, _RAY, origin, origin + along, up, near=1e-3)
+    unit_direction = direction / np.linalg.norm(direction)
+    return Camera.look_at(PATCH_SIZE, PATCH_SIZE, _RAY_FOV, origin, origin + unit_direction, up, near=1e-3)
 
 
 def _patch(camera: Camera, pixel: tuple[float, float], radius: float) -> Camera:
-    """A camera that shows a square around a pixel, of half side `radius`, in `SAMPLES` samples."""
-    zoom = SAMPLES / (2 * radius)
+    """Camera of the square around a pixel with half sides of `radius` pixels."""
+    zoom = PATCH_SIZE / (2 * radius)
     cx = (camera.cx - pixel[0] + radius) * zoom
     cy = (camera.cy - pixel[1] + radius) * zoom
     return replace(
-        camera, width=SAMPLES, height=SAMPLES, fx=camera.fx * zoom, fy=camera.fy * zoom, cx=cx, cy=cy
+        camera, width=PATCH_SIZE, height=PATCH_SIZE, fx=camera.fx * zoom, fy=camera.fy * zoom, cx=cx, cy=cy
     )
 
 
-def _middle_depth(depth: np.ndarray) -> float:
-    filled = depth[depth > 0]
-    if not len(filled):
+def _median_of(depth: np.ndarray) -> float:
+    depths = depth[depth > 0]
+    if not len(depths):
         raise InputError("the surface must have splats at this pixel, got none; give another pixel")
-    return float(np.median(filled))
+    return float(np.median(depths))
 
 
-def _radius(camera: Camera, pixel: tuple[float, float], pixels: float, depth: float) -> float:
+def _metres_of(camera: Camera, pixel: tuple[float, float], pixels: float, depth: float) -> float:
     """Convert a radius in pixels at a depth to metres."""
-    sides = np.array([pixel, (pixel[0] + pixels, pixel[1]), (pixel[0] - pixels, pixel[1])])
-    middle, *others = camera.unproject(sides, np.full(3, depth))
-    return float(np.nanmax(np.linalg.norm(others - middle, axis=1)))
+    pixels_at = np.array([pixel, (pixel[0] + pixels, pixel[1]), (pixel[0] - pixels, pixel[1])])
+    center, *others = camera.unproject(pixels_at, np.full(3, depth))
+    return float(np.nanmax(np.linalg.norm(others - center, axis=1)))
 
 
-def _fitted(
+def _fit_patch(
     depth: np.ndarray, camera: Camera, pixel: tuple[float, float], pixels: float, metres: float
 ) -> Surface:
     centres = camera.pixel_centres
-    within = ((centres - pixel) ** 2).sum(2) <= max(pixels, 1.0) ** 2
-    depths = depth[within].astype(np.float64)
-    points = camera.unproject(centres[within], np.where(depths > 0, depths, np.nan))
-    origin, ahead = camera.unproject(np.array([pixel, pixel]), np.array([0.0, 1.0]))
-    return fit_surface(points, origin, ahead - origin, metres)
+    mask = ((centres - pixel) ** 2).sum(2) <= max(pixels, 1.0) ** 2
+    depths = depth[mask].astype(np.float64)
+    points = camera.unproject(centres[mask], np.where(depths > 0, depths, np.nan))
+    origin, further = camera.unproject(np.array([pixel, pixel]), np.array([0.0, 1.0]))
+    return fit_surface(points, origin, further - origin, metres)

@@ -63,7 +63,7 @@ def environment_tables(scene: SceneParts, folder: Path) -> dict[str, dict]:
     if scene.fog is not None:
         tables["fog"] = {"density": float(scene.fog.density), "color": list(scene.fog.color)}
     if scene.sensor is not None:
-        changes = scene.sensor.changes()
+        changes = scene.sensor.non_default()
         tables["sensor"] = {
             name: list(value) if isinstance(value, tuple) else value for name, value in changes.items()
         }

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from fidsplat.capture.sensor import GAMMAS
+from fidsplat.capture.sensor import GAMMA_RANGE
 from fidsplat.scenes.table import Table, names_of
 from fidsplat.util.arguments import (
     LARGEST,
@@ -93,8 +93,8 @@ class Lighting:
         if self.ambient is not None:
             object.__setattr__(self, "ambient", _radiance("light: ambient", self.ambient))
         if self.response not in ("srgb", "linear") or isinstance(self.response, bool):
-            requirement = '"srgb", "linear" or a gamma from {:g} to {:g}'.format(*GAMMAS)
-            number("light: response", self.response, requirement, *GAMMAS)
+            requirement = '"srgb", "linear" or a gamma from {:g} to {:g}'.format(*GAMMA_RANGE)
+            number("light: response", self.response, requirement, *GAMMA_RANGE)
 
     def displayed(self, radiance: np.ndarray) -> np.ndarray:
         """Colours of reflected radiance."""

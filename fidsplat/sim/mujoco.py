@@ -10,7 +10,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera, Orthographic
 from fidsplat.capture.environment import ExternalDepth
-from fidsplat.render.device_surface import MESH, MESH_OFFSET, device_surface
+from fidsplat.render.device_surface import MESH_LABEL, MESH_OFFSET, device_surface
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.sim.poses import OPENGL
@@ -51,7 +51,7 @@ class MujocoRig(SimulatorRig):
     The state that `render` reads is an MjData, a list of MjData, one for each environment, or mujoco_warp's
     Data; after `mj_forward` or `mj_step`, which compute the poses of bodies and cameras. Its `meshes` may be
     geom groups, by default 0, 1 and 2, rendered by MuJoCo (with OpenGL, for pinhole cameras) or mujoco_warp.
-    Geom i has the label `MESH` - i.
+    Geom i has the label `MESH_LABEL` - i.
 
     Raises:
         InputError: as `Rig`; a body or camera that the model does not have, a camera without a name.
@@ -147,7 +147,7 @@ class MujocoRig(SimulatorRig):
                 size = each.camera.height, each.camera.width
                 own = slice(first, first := first + size[0] * size[1])
                 arrays = context.rgb_data[:, own], context.depth_data[:, own], ids[:, own]
-                found[name] = device_surface(self.renderer, *arrays, size, red=16)
+                found[name] = device_surface(self.renderer, *arrays, size, red_bit=16)
         return found
 
     def _meshes(self, data: Sequence[Any], groups: list[int]) -> dict[str, list[ExternalDepth]]:
@@ -194,7 +194,9 @@ def _mesh_image(renderer: Any, data: Any, camera: int, option: Any) -> ExternalD
     objects = renderer.render()[..., 0]
     renderer.disable_segmentation_rendering()
     return ExternalDepth(
-        rgb, np.where(objects >= 0, depth + np.float32(MESH_OFFSET), 0.0), np.minimum(MESH - objects, MESH)
+        rgb,
+        np.where(objects >= 0, depth + np.float32(MESH_OFFSET), 0.0),
+        np.minimum(MESH_LABEL - objects, MESH_LABEL),
     )
 
 

@@ -102,6 +102,6 @@ class NewtonRig(SimulatorRig):
             colors, depths, ids = (array.reshape((len(places), -1)) for array in images.values())
             ids = ids.view(wp.int32)
             found[name] = device_surface(
-                self.renderer, colors, depths, ids, (camera.height, camera.width), red=0
+                self.renderer, colors, depths, ids, (camera.height, camera.width), red_bit=0
             )
         return found

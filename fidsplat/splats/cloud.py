@@ -93,9 +93,9 @@ class SplatCloud(PickledByFields, Summarised):
         Arrays are copied unless they are float32 and read-only, including their base. Raises InputError,
         naming the array, for a wrong shape or type.
         """
-        given = real_numbers("means", means)
-        n = given.shape[0] if given.ndim else -1
-        check_shape("means", given, (n, 3))
+        given_means = real_numbers("means", means)
+        n = given_means.shape[0] if given_means.ndim else -1
+        check_shape("means", given_means, (n, 3))
         arrays = {"quats": real_numbers("quats", quats), "scales": real_numbers("scales", scales)}
         arrays["opacities"] = real_numbers("opacities", opacities)
         thick = arrays["scales"].shape == (n, 3)
@@ -117,20 +117,20 @@ class SplatCloud(PickledByFields, Summarised):
             check_shape(name, array, shapes[name])
         new_labels = whole_numbers(labels, n)
 
-        single = {name: as_float32(array) for name, array in {"means": given, **arrays}.items()}
-        keep, dropped = find_defects(single)
-        if keep is not None:
-            single = {name: array[keep] for name, array in single.items()}
-            given = single["means"] if given.dtype == F32 else given[keep]
-            new_labels = new_labels[keep]
+        float32 = {name: as_float32(array) for name, array in {"means": given_means, **arrays}.items()}
+        valid, dropped = find_defects(float32)
+        if valid is not None:
+            float32 = {name: array[valid] for name, array in float32.items()}
+            given_means = float32["means"] if given_means.dtype == F32 else given_means[valid]
+            new_labels = new_labels[valid]
             warnings.warn(drop_report(dropped, n, source), stacklevel=2)
         if thick:
-            single["thickness"] = as_float32(single["scales"][:, 2])
-            single["scales"] = as_float32(single["scales"][:, :2])
-        self._finish(given, single, new_labels, origin, dropped)
+            float32["thickness"] = as_float32(float32["scales"][:, 2])
+            float32["scales"] = as_float32(float32["scales"][:, :2])
+        self._finish(given_means, float32, new_labels, origin, dropped)
 
     @classmethod
-    def of_checked(
+    def from_validated(
         cls,
         means,
         quats,
@@ -147,25 +147,25 @@ class SplatCloud(PickledByFields, Summarised):
         """A cloud of validated arrays, without a copy: means float32 or float64, quats of any length above 0,
         and either sh or colors. dropped: counts of a reader."""
         cloud = object.__new__(cls)
-        single = {"quats": quats, "scales": scales, "opacities": opacities, "colors": colors, "sh": sh}
-        single["means"] = means if means.dtype == F32 else as_float32(means)
+        float32 = {"quats": quats, "scales": scales, "opacities": opacities, "colors": colors, "sh": sh}
+        float32["means"] = means if means.dtype == F32 else as_float32(means)
         if thickness is not None:
-            single["thickness"] = thickness
+            float32["thickness"] = thickness
         cloud._finish(
-            means, single, whole_numbers(None, len(means)) if labels is None else labels, origin, dropped
+            means, float32, whole_numbers(None, len(means)) if labels is None else labels, origin, dropped
         )
         return cloud
 
-    def _finish(self, given, single: dict[str, np.ndarray], labels, origin, dropped: dict[str, int]) -> None:
-        """Freeze validated splats. given: the means in their original type."""
-        single["quats"] = unit_quaternions(single["quats"])
-        if "thickness" in single and not single["thickness"].any():
-            del single["thickness"]
+    def _finish(self, means, float32: dict[str, np.ndarray], labels, origin, dropped: dict[str, int]) -> None:
+        """Freeze validated splats, arrays by name. means: in the type of the caller."""
+        float32["quats"] = unit_quaternions(float32["quats"])
+        if "thickness" in float32 and not float32["thickness"].any():
+            del float32["thickness"]
         if origin is not None:
             new_origin = check_origin(origin)
         else:  # chosen without the dropped splats
-            single["means"], new_origin = choose_origin(given, single["means"], single["scales"])
-        self._set(**dict.fromkeys(OPTIONAL) | single, labels=labels, origin=new_origin, dropped=dropped)
+            float32["means"], new_origin = choose_origin(means, float32["means"], float32["scales"])
+        self._set(**dict.fromkeys(OPTIONAL) | float32, labels=labels, origin=new_origin, dropped=dropped)
 
     def _set(self, **values) -> None:
         for name, value in values.items():
@@ -243,8 +243,8 @@ class SplatCloud(PickledByFields, Summarised):
         corners. Raises InputError for an empty cloud."""
         if not len(self):
             raise InputError("the cloud must have at least one splat to have bounds, got none")
-        reach = self.half_extents(3.0)
-        return (self.means - reach).min(axis=0) + self.origin, (self.means + reach).max(axis=0) + self.origin
+        half = self.half_extents(3.0)
+        return (self.means - half).min(axis=0) + self.origin, (self.means + half).max(axis=0) + self.origin
 
     def half_extents(self, sigmas: float) -> np.ndarray:
         """Half extents (n, 3) float64 [m] along the world axes: Gaussians to `sigmas`, boxes to corners."""
@@ -267,9 +267,9 @@ class SplatCloud(PickledByFields, Summarised):
         if self.thickness is None:
             return self
         quats, scales, rows = self.quats.copy(), self.scales.copy(), self.thickness > 0
-        three = np.column_stack([scales[rows], self.thickness[rows]])
-        turned, sorted_scales = with_thinnest_last(quats[rows], three)
-        quats[rows], scales[rows] = turned, sorted_scales[:, :2]
+        all_scales = np.column_stack([scales[rows], self.thickness[rows]])
+        rotated, sorted_scales = with_thinnest_last(quats[rows], all_scales)
+        quats[rows], scales[rows] = rotated, sorted_scales[:, :2]
         return self._replaced(quats=unit_quaternions(quats), scales=scales, thickness=None)
 
     def with_labels(self, labels) -> "SplatCloud":

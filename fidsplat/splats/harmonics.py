@@ -57,25 +57,25 @@ def sh_basis(degree: int, dirs: np.ndarray) -> np.ndarray:
     return np.stack(columns, axis=1)
 
 
-def colors_of_degree(given: Mapping[str, np.ndarray], sh_degree: int) -> dict[str, np.ndarray]:
+def colors_of_degree(arrays: Mapping[str, np.ndarray], sh_degree: int) -> dict[str, np.ndarray]:
     """`colors` or `sh` converted to an SH degree, with 0 for missing bands; degree -1: plain colours.
 
-    given: arrays of a cloud: `means`, and `colors` or `sh`; for degree -1, `sh` must have degree 0.
+    arrays: of a cloud: `means`, and `colors` or `sh`; for degree -1, `sh` must have degree 0.
     """
     if sh_degree < 0:
-        if "colors" in given:
-            return {"colors": given["colors"]}
-        return {"colors": np.maximum(np.float32(C0) * given["sh"][:, 0] + np.float32(0.5), np.float32(0))}
+        if "colors" in arrays:
+            return {"colors": arrays["colors"]}
+        return {"colors": np.maximum(np.float32(C0) * arrays["sh"][:, 0] + np.float32(0.5), np.float32(0))}
     terms = (sh_degree + 1) ** 2
-    if "sh" in given and given["sh"].shape[1] == terms:
-        return {"sh": given["sh"]}
-    sh = np.zeros((len(given["means"]), terms, 3), np.float32)
-    if "sh" in given:
-        common = min(terms, given["sh"].shape[1])
-        sh[:, :common] = given["sh"][:, :common]
+    if "sh" in arrays and arrays["sh"].shape[1] == terms:
+        return {"sh": arrays["sh"]}
+    sh = np.zeros((len(arrays["means"]), terms, 3), np.float32)
+    if "sh" in arrays:
+        common = min(terms, arrays["sh"].shape[1])
+        sh[:, :common] = arrays["sh"][:, :common]
     else:
         with np.errstate(over="ignore"):  # colours of a damaged store
-            sh[:, 0] = (given["colors"].astype(np.float64) - 0.5) / C0
+            sh[:, 0] = (arrays["colors"].astype(np.float64) - 0.5) / C0
     return {"sh": sh}
 
 
@@ -91,8 +91,8 @@ def color_range(colors: np.ndarray | None, sh: np.ndarray | None) -> tuple[float
         return float(values.min(initial=0.0)), float(values.max(initial=0.0))
     highest = np.full((len(sh), 3), 0.5)
     for band in range(int(np.sqrt(sh.shape[1]))):
-        own = sh[:, band**2 : (band + 1) ** 2]
-        squares = np.einsum("nkc,nkc->nc", own, own, dtype=np.float64)
+        coefficients = sh[:, band**2 : (band + 1) ** 2]
+        squares = np.einsum("nkc,nkc->nc", coefficients, coefficients, dtype=np.float64)
         highest += np.sqrt((2 * band + 1) / (4 * np.pi) * squares)
     return 0.0, float(highest[np.isfinite(highest)].max(initial=0.0))
 

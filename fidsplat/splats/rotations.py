@@ -93,12 +93,12 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
     if not scale > 0 or not np.isfinite(scale):
         raise InputError(f"{name} must be a rotation with a positive scale, got scale {scale:g}")
     rotation = linear / scale
-    off = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if off > 1e-6:
-        rounded = "; give more digits" if off < 0.01 else ""
+    deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if deviation > 1e-6:
+        rounded = "; give more digits" if deviation < 0.01 else ""
         raise InputError(
             f"{name} must be a rotation with one uniform scale, got columns that are skew or of unequal "
-            f"length, by {off:.1g} where 1e-06 is allowed{rounded}"
+            f"length, by {deviation:.1g} where 1e-06 is allowed{rounded}"
         )
     (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
     if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:  # the determinant

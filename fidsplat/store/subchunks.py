@@ -26,7 +26,7 @@ class Subchunks:
     """(k, 3) float64 metres: minimum corners of boxes around the centres"""
     high: np.ndarray
     """(k, 3) float64 metres: maximum corners"""
-    reach: np.ndarray
+    max_sigma: np.ndarray
     """(k,) metres: largest standard deviation"""
     pinned: np.ndarray
     """(k,) bool: part of every frame"""
@@ -37,7 +37,7 @@ class Subchunks:
 
     def boxes(self, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
         """Minimum and maximum corners (k, 3) of boxes around splats to `sigmas` standard deviations."""
-        around = sigmas * self.reach[:, None]
+        around = sigmas * self.max_sigma[:, None]
         return self.low - around, self.high + around
 
 
@@ -57,16 +57,16 @@ class SubchunkTable:
         store = self._store
         instances, own = np.divmod(numbers, max(len(store.nodes), 1))
         each = [self._boxes(node) for node in own.tolist()]
-        counts = np.array([len(reach) for _, _, reach in each], np.int64)
+        counts = np.array([len(max_sigma) for _, _, max_sigma in each], np.int64)
         nodes, instance = np.repeat(numbers, counts), np.repeat(instances, counts)
         low, high = (np.concatenate([np.empty((0, 3)), *(one[corner] for one in each)]) for corner in (0, 1))
-        reach = np.concatenate([np.empty(0), *(one[2] for one in each)])
+        max_sigma = np.concatenate([np.empty(0), *(one[2] for one in each)])
         if store.poses is not None:
             low, high = store.instance_boxes(low, high, instance)
         first = ROWS * (np.arange(len(nodes)) - np.repeat(np.cumsum(counts) - counts, counts))
         rows = np.minimum(store.counts(nodes) - first, ROWS)
         return Subchunks(
-            nodes, first, rows, low + self._offset, high + self._offset, reach, self._pinned[nodes]
+            nodes, first, rows, low + self._offset, high + self._offset, max_sigma, self._pinned[nodes]
         )
 
     def _boxes(self, node: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -81,36 +81,33 @@ class Band:
         return self.with_nodes(nodes).without_occluded_subchunks(termination)
 
     def without_occluded_subchunks(self, termination: TerminationDepths) -> Band:
-        """The same rows, rendered from the subchunks that can contribute."""
-        every = self.scene.subchunks(self.nodes)
-        masked = tuple((each, self._can_contribute(each, termination)) for each in every)
+        """The same rows, rendered from the subchunks that can contribute only."""
+        parts = self.scene.subchunks(self.nodes)
+        masked = tuple((part, self._can_contribute(part, termination)) for part in parts)
         return self._with_cache(replace(self, subchunks=masked))
 
     def missing_subchunks(self, termination: TerminationDepths, missing: NodeMasks) -> list[Subchunks]:
         """Subchunks that can contribute but were not rendered, of the band's nodes and of missing nodes."""
-        own = [
-            each.only(self._can_contribute(each, termination) & ~used) for each, used in self.subchunks or ()
-        ]
-        others = (
-            each.only(self._can_contribute(each, termination)) for each in self.scene.subchunks(missing)
-        )
-        return [each for each in (*own, *others) if len(each.nodes)]
+        candidates = [(part, ~rendered) for part, rendered in self.subchunks or ()]
+        candidates += [(part, np.array(True)) for part in self.scene.subchunks(missing)]
+        parts = [part.only(self._can_contribute(part, termination) & mask) for part, mask in candidates]
+        return [part for part in parts if len(part.nodes)]
 
     def contributing_tiles(
         self, subchunks: Sequence[Subchunks], termination: TerminationDepths
     ) -> np.ndarray:
         """(rows, columns) bool: tiles to which subchunks can contribute."""
         tiles = np.zeros(termination.depths.shape, bool)
-        for each in subchunks:
-            tiles |= contributing_tiles(self.view, self.features, each.boxes, each.reach, termination)
+        for part in subchunks:
+            tiles |= contributing_tiles(self.view, self.features, part.boxes, part.max_sigma, termination)
         return tiles
 
     def _can_contribute(self, subchunks: Subchunks, termination: TerminationDepths) -> np.ndarray:
         """(k,) bool: subchunks that are pinned, or in the frustum and not occluded."""
         if not len(subchunks.nodes):
             return np.zeros(0, bool)
-        visible = in_frustum(self.view, self.features, subchunks.boxes, subchunks.reach)
-        visible &= ~occluded(self.view, self.features, subchunks.boxes, subchunks.reach, termination)
+        visible = in_frustum(self.view, self.features, subchunks.boxes, subchunks.max_sigma)
+        visible &= ~occluded(self.view, self.features, subchunks.boxes, subchunks.max_sigma, termination)
         return visible | subchunks.pinned
 
     @cached_property
@@ -134,9 +131,10 @@ class Band:
     @property
     def missing(self) -> NodeMasks:
         """Visible nodes from which the band is not rendered."""
-        return tuple(each & ~own for each, own in zip(self.visible, self.nodes, strict=True))
+        return tuple(mask & ~rendered for mask, rendered in zip(self.visible, self.nodes, strict=True))
 
     def occluded(self, termination: TerminationDepths) -> NodeMasks:
+        """Nodes of the scene that are occluded in this band."""
         return occluded_nodes(self.scene, self.view, self.features, termination)
 
     @cached_property
@@ -144,16 +142,20 @@ class Band:
         """Chunks, or rows of chunks, from which the band is rendered."""
         if self.subchunks is None:
             return Selection.of(self.nodes)
-        return Selection.of_subchunks([each.only(used) for each, used in self.subchunks])
+        return Selection.of_subchunks([part.only(rendered) for part, rendered in self.subchunks])
 
     @cached_property
     def count(self) -> int:
+        """Number of splats from which the band is rendered."""
         if self.subchunks is None:
             return self.count_of(self.nodes) + len(self.scene.in_memory)
-        return sum(int(each.rows[used].sum()) for each, used in self.subchunks) + len(self.scene.in_memory)
+        counts = (int(part.rows[rendered].sum()) for part, rendered in self.subchunks)
+        return sum(counts) + len(self.scene.in_memory)
 
     def count_of(self, nodes: NodeMasks) -> int:
-        return sum(int(n[own].sum()) for n, own in zip(self.scene.node_counts, nodes, strict=True))
+        """Number of splats of nodes."""
+        masked = zip(self.scene.node_counts, nodes, strict=True)
+        return sum(int(counts[mask].sum()) for counts, mask in masked)
 
     @property
     def halves(self) -> list[Band]:
@@ -170,26 +172,26 @@ class BandSplitter:
     """Splits views into bands that fit on the device, starting with the bands of the previous view."""
 
     def __init__(self) -> None:
-        self._cuts: dict[tuple[int, int], list[int]] = {}
+        self._borders: dict[tuple[int, int], list[int]] = {}
         """first rows of the bands of the previous view, and the end, by the view's rows"""
         self._capacity = 0
         """largest number of splats of a band that fits"""
 
     def split(self, full: Band, fits: Callable[[Band], bool]) -> Iterator[Band]:
-        """Bands from the top that fit or cannot be split; `fits` is called immediately before each."""
-        waiting = [full.with_rows(*rows) for rows in pairwise(self._cuts.get(full.rows, full.rows))]
+        """Bands from the top, which fit or cannot be split; `fits` is called immediately before each."""
+        remaining = [full.with_rows(*rows) for rows in pairwise(self._borders.get(full.rows, full.rows))]
         bands: list[Band] = []
-        while waiting:
-            band = waiting.pop(0)
-            fitting = fits(band)
-            if not fitting and (halves := band.halves):
+        while remaining:
+            band = remaining.pop(0)
+            band_fits = fits(band)
+            if not band_fits and (halves := band.halves):
                 self._capacity = min(self._capacity, band.count // 2)
-                waiting[:0] = halves
+                remaining[:0] = halves
                 continue
-            if fitting:
+            if band_fits:
                 self._capacity = max(self._capacity, band.count)
             bands.append(band)
             yield band
         counts = np.array([band.count for band in bands])
         firsts = [bands[first].rows[0] for first, _, _ in split_by_cost(counts, self._capacity)]
-        self._cuts = {full.rows: [*firsts, bands[-1].rows[1]]}
+        self._borders = {full.rows: [*firsts, bands[-1].rows[1]]}

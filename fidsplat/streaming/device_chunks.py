@@ -1,4 +1,4 @@
-"""Chunks of a scene in the form that a device's chunk cache loads."""
+"""Chunks of a scene for the chunk cache of a device."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fidsplat.store.store import Store
 
 
 class DeviceChunks:
-    """Chunks of a scene by selection, each with the function that loads its arrays."""
+    """Chunks of a scene, each with the function that loads its arrays."""
 
     def __init__(self, scene: ChunkedSplats) -> None:
         self.scene = scene
@@ -30,10 +30,10 @@ class DeviceChunks:
         chunks = []
         for number, (store, nodes) in enumerate(zip(self.scene.stores, selection.nodes, strict=True)):
             posed = applies_poses and self._can_pose(store)
-            known = self._chunks.setdefault((number, posed), {})
+            cached = self._chunks.setdefault((number, posed), {})
             for index, node in enumerate(nodes):
-                if (chunk := known.get(node)) is None:
-                    chunk = known[node] = self._chunk_of(number, node, posed)
+                if (chunk := cached.get(node)) is None:
+                    chunk = cached[node] = self._chunk_of(number, node, posed)
                 if selection.rows is not None:
                     first, count = selection.rows[number][index]
                     chunk = replace(chunk, first=first, count=count)
@@ -46,11 +46,11 @@ class DeviceChunks:
 
     def distinct(self, applies_poses: bool) -> int:
         """Number of different chunk keys. applies_poses: whether the device applies poses of instances."""
-        each = (
+        keys = (
             len(store.nodes) * (1 if applies_poses and self._can_pose(store) else store.instances)
             for store in self.scene.stores
         )
-        return sum(each) + -(-len(self.scene.in_memory) // self.largest_chunk)
+        return sum(keys) + -(-len(self.scene.in_memory) // self.largest_chunk)
 
     @cached_property
     def _group_ids(self) -> np.ndarray:
@@ -67,10 +67,10 @@ class DeviceChunks:
 
     def _chunk_of(self, number: int, node: int, posed: bool) -> Chunk:
         store = self.scene.stores[number]
-        instance, own = divmod(node, len(store.nodes))
-        key = (number, own if posed else node)
+        instance, node_of_store = divmod(node, len(store.nodes))
+        key = (number, node_of_store if posed else node)
         pose = store.pose_rows[instance] if posed else None
-        return Chunk(key, int(store.nodes["count"][own]), partial(self._arrays, key, posed), pose)
+        return Chunk(key, int(store.nodes["count"][node_of_store]), partial(self._arrays, key, posed), pose)
 
     def _arrays(self, key: tuple[int, int], posed: bool) -> dict[str, np.ndarray]:
         return self._on_device(self.scene.unplaced_chunk(*key) if posed else self.scene.chunk(*key))
@@ -83,10 +83,10 @@ class DeviceChunks:
         """Arrays with consecutive indices of coplanar groups, and flags as int32."""
         result = dict(arrays)
         if "coplanar_groups" in result:
-            ids, known = result["coplanar_groups"], self._group_ids
-            dense = np.searchsorted(known, ids).astype(np.int32)
+            ids, group_ids = result["coplanar_groups"], self._group_ids
+            dense = np.searchsorted(group_ids, ids).astype(np.int32)
             # in a damaged store, chunks without coplanar groups may have ids
-            result["coplanar_groups"] = np.where(np.isin(ids, known), dense, np.int32(-1))
+            result["coplanar_groups"] = np.where(np.isin(ids, group_ids), dense, np.int32(-1))
         if "boxes" in result:
             result["boxes"] = result["boxes"].astype(np.int32)
         return result

@@ -1,4 +1,4 @@
-"""Frustum culling of boxes of splats, and their size on the image.
+"""Frustum culling of boxes of splats, and bounds of their projected size.
 
 The test is conservative for every camera model, low-pass and shutter: a culled box contains no splat that
 contributes to the frame. It applies the criteria of `project.cl` to all splats that a box can contain.
@@ -24,54 +24,54 @@ Boxes = Callable[[float], tuple[np.ndarray, np.ndarray]]
 of boxes around the splats to that extent"""
 
 PADDING = 1.01
-"""factor by which the extent of splats is enlarged, for rounding errors"""
-_ACROSS, _ALONG = 0.5, 1 / 8
+"""factor that enlarges the extent of splats, for rounding errors"""
+_FILTER_ACROSS, _FILTER_ALONG = 0.5, 1 / 8
 """standard deviations of the filter of the low-pass `pixel`: across the ray in samples, and along it as a
 share of the depth (kernels/opencl/slot/lowpass_pixel.cl)"""
 _ROUNDING = 1e-5
 """relative error of a coordinate that projection in float32 computes"""
 
 
-def in_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
-    """Mask (n,) of boxes with splats that may contribute to the frame, at any pose of the shutter and of
-    moving groups.
+def in_frustum(view: View, features: FeatureSet, boxes: Boxes, max_sigma: np.ndarray) -> np.ndarray:
+    """Frustum culling: mask (n,) of the boxes whose splats may contribute to the frame, at any pose of the
+    shutter and of moving groups.
 
-    reach: (n,) largest standard deviation of each box's splats [m].
+    max_sigma: (n,) largest standard deviation of each box's splats [m].
     """
     if view.sub_frames:
-        visible = np.zeros(len(reach), bool)
+        visible = np.zeros(len(max_sigma), bool)
         for sub_frame in view.sub_frames:
-            visible |= in_frustum(sub_frame.view, features, boxes, reach)
+            visible |= in_frustum(sub_frame.view, features, boxes, max_sigma)
         return visible
-    visible = _in_pose_frustum(view, features, boxes, reach)
-    for _, own in view.groups:
-        visible |= _in_pose_frustum(own, features, boxes, reach)
+    visible = _in_frustum_of_pose(view, features, boxes, max_sigma)
+    for _, group_view in view.groups:
+        visible |= _in_frustum_of_pose(group_view, features, boxes, max_sigma)
     return visible
 
 
 @dataclass(frozen=True)
 class Extent:
-    """Bound on the extent of splats around their centres p, in the camera's frame.
+    """Bounds on the extent of splats around their centres p, in the camera's frame.
 
     The low-pass `pixel` adds an ellipse in the disk's plane to a disk of R standard deviations: by the
     derivative at p, its points e are at most R s samples to the side and R k z in depth, with z the depth
-    of p, s = `_ACROSS` and k = `_ALONG`. A side of the image is a plane through the camera's centre, at a
-    distance of n . p / z samples from p; a displacement e scales this distance by 1 + e_z / z and adds the
-    samples to the side. Covariances add: a point p beyond a side, d = -n . p, reaches over the side only if
-    d^2 <= R^2 (E^2 + (k d)^2 + (s z)^2), with E the disk's standard deviation along n. A disk and a margin
-    enlarged by 1 / sqrt(1 - (R k)^2) that are beyond the side do not. The bound on depths is the sum:
-    z - R k z, less the disk's own extent. The low-pass does not change splats whose centre is in front of
-    the near plane.
+    of p, s = `_FILTER_ACROSS` and k = `_FILTER_ALONG`. A side of the image is a plane through the camera's
+    centre, at a distance of n . p / z samples from p; a displacement e scales this distance by 1 + e_z / z
+    and adds the samples to the side. Covariances add: a point p beyond a side, d = -n . p, reaches over the
+    side only if d^2 <= R^2 (E^2 + (k d)^2 + (s z)^2), with E the disk's standard deviation along n. A disk
+    and a margin enlarged by 1 / sqrt(1 - (R k)^2) that are beyond the side do not. The bound on depths is the
+    sum: z - R k z, less the disk's own extent. The low-pass does not change splats whose centre is in front
+    of the near plane.
     """
 
     radius: float
     """extent of disks to the sides, in standard deviations"""
     margin: float
     """margin around their projection [samples]"""
-    depths: float
-    """extent of disks in depth, in standard deviations"""
-    nearer: float = 1.0
-    """factor on the depth of the nearest point"""
+    depth_radius: float
+    """extent of disks along z, in standard deviations"""
+    depth_factor: float = 1.0
+    """factor by which the low-pass `pixel` reduces the depth of the nearest point"""
 
     @staticmethod
     def of(view: View, features: FeatureSet, minimum: float = 0.0) -> Extent | None:
@@ -81,26 +81,26 @@ class Extent:
         cut-offs below about 1e-13.
         """
         radius = max(cutoff_radius(view), minimum)
-        # margin for the low-pass disc, or for the low-pass of EWA
+        # margin for the low-pass filter `screen`, or for that of EWA
         plain = Extent(radius, radius * view.samples + 2.0, radius)
-        if not _widened(features):
+        if not _has_pixel_lowpass(features):
             return plain
         # bounding spheres of disks bound depths along the ray; they include the sideways extent
-        aside = _ACROSS * _max_ray_rotation(view) if view.along_ray else 0.0
-        nearer = 1.0 - radius * math.hypot(_ALONG, aside)
+        max_angle = _FILTER_ACROSS * _max_ray_rotation(view) if view.along_ray else 0.0
+        nearer = 1.0 - radius * math.hypot(_FILTER_ALONG, max_angle)
         if nearer <= 0 or view.parallel or isinstance(view.lens, BrownConrady):
             return None
-        larger = 1.0 / math.sqrt(1.0 - (radius * _ALONG) ** 2)
-        margin = max(plain.margin, larger * radius * _ACROSS + 2.0)
-        return Extent(larger * radius, margin, radius / nearer, nearer)
+        enlarged = 1.0 / math.sqrt(1.0 - (radius * _FILTER_ALONG) ** 2)
+        margin = max(plain.margin, enlarged * radius * _FILTER_ACROSS + 2.0)
+        return Extent(enlarged * radius, margin, radius / nearer, nearer)
 
     def nearest(self, view: View, boxes: CameraBoxes) -> np.ndarray:
-        """Lower bounds (n,) on depths [m]. boxes: boxes to `depths` standard deviations."""
+        """Lower bounds (n,) on depths [m]. boxes: boxes to `depth_radius` standard deviations."""
         nearest = boxes.nearest(view)
-        return np.minimum(self.nearer * nearest, nearest)
+        return np.minimum(self.depth_factor * nearest, nearest)
 
 
-def _widened(features: FeatureSet) -> bool:
+def _has_pixel_lowpass(features: FeatureSet) -> bool:
     return "lowpass_pixel" in features.names
 
 
@@ -109,19 +109,19 @@ def cutoff_radius(view: View) -> float:
     return PADDING * math.sqrt(2.0 * (math.log(MAX_OPACITY) - view.log_cut))
 
 
-def ewa_extent(view: View, features: FeatureSet, radius: float, reach: np.ndarray) -> np.ndarray | None:
-    """Extent (n,) of EWA footprints around projected centres, in samples times depth [m]; None without EWA.
+def ewa_extent(view: View, features: FeatureSet, radius: float, max_sigma: np.ndarray) -> np.ndarray | None:
+    """Radius (n,) of EWA footprints around projected centres, in samples times depth [m]; None without EWA.
 
     EWA projects by the derivative at the centre, so that a footprint can be larger than the projected splat.
-    radius: extent in standard deviations. reach: (n,) largest standard deviations [m].
+    radius: extent in standard deviations. max_sigma: (n,) largest standard deviations [m].
     """
     if not {"ellipsoid_ewa", "ellipsoid_ewa_antialiased"} & features.names:
         return None
     slope = 1.0 if view.parallel else math.hypot(1.0, max(map(abs, view.slopes)))
-    return max(view.focal_x, view.focal_y) * slope * radius * reach
+    return max(view.focal_x, view.focal_y) * slope * radius * max_sigma
 
 
-def _in_pose_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
+def _in_frustum_of_pose(view: View, features: FeatureSet, boxes: Boxes, max_sigma: np.ndarray) -> np.ndarray:
     extent = Extent.of(view, features)
     if extent is None:
         # the low-pass filter does not change splats whose centre is behind the near plane
@@ -131,31 +131,32 @@ def _in_pose_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.n
     centers = CameraBoxes(view, *boxes(0.0))
     disks = CameraBoxes(view, *boxes(radius))
     visible = disks.furthest(view) >= view.near * (1 - _ROUNDING)
-    deep = disks if extent.depths == radius else CameraBoxes(view, *boxes(extent.depths))
-    visible &= extent.nearest(view, deep) <= view.far * (1 + _ROUNDING)
+    deep_boxes = disks if extent.depth_radius == radius else CameraBoxes(view, *boxes(extent.depth_radius))
+    visible &= extent.nearest(view, deep_boxes) <= view.far * (1 + _ROUNDING)
     if view.raster is None:
-        wide = ewa_extent(view, features, radius, reach)
+        ewa_radius = ewa_extent(view, features, radius, max_sigma)
         for normal, offset in _pinhole_sides(view, margin):
-            inside = disks.beyond(normal) + offset >= 0
-            if wide is not None:
-                inside |= centers.beyond(normal) + offset + wide >= 0
+            inside = disks.support(normal) + offset >= 0
+            if ewa_radius is not None:
+                inside |= centers.support(normal) + offset + ewa_radius >= 0
             visible &= inside
         return visible
     lens = view.raster.lens
     if isinstance(lens, Equirectangular | RayTable):
         return visible
-    step = view.raster.max_ray_derivative * margin
+    slack = view.raster.max_ray_derivative * margin
     if isinstance(lens, Fisheye):
-        if _widened(features):
-            step = _max_ray_rotation(view) * max(margin, extent.depths * _ACROSS + 2.0)
-            return visible & centers.within(_max_ray_angle(view.raster), step, extent.depths * reach)
-        return visible & disks.within(_max_ray_angle(view.raster) + step)
+        if _has_pixel_lowpass(features):
+            slack = _max_ray_rotation(view) * max(margin, extent.depth_radius * _FILTER_ACROSS + 2.0)
+            displacement = extent.depth_radius * max_sigma
+            return visible & centers.within_angle(_max_ray_angle(view.raster), slack, displacement)
+        return visible & disks.within_angle(_max_ray_angle(view.raster) + slack)
     low, high = _slopes(view.raster)
     for axis in (0, 1):
-        for sign, side in ((1.0, low[axis] - step), (-1.0, high[axis] + step)):
+        for sign, edge_slope in ((1.0, low[axis] - slack), (-1.0, high[axis] + slack)):
             normal = np.zeros(3)
-            normal[axis], normal[2] = sign, -sign * side
-            visible &= disks.beyond(normal) >= 0
+            normal[axis], normal[2] = sign, -sign * edge_slope
+            visible &= disks.support(normal) >= 0
     return visible
 
 
@@ -171,43 +172,45 @@ class CameraBoxes:
         self.rounding = _ROUNDING * (np.abs(middle).sum(1) + half.sum(1) + np.abs(view.translation).sum())
         self._half = half
 
-    def beyond(self, normal: np.ndarray) -> np.ndarray:
-        """Largest dot product (n,) of a box's points with a vector (3,) in the camera's frame."""
-        reach = self._half @ np.abs(self._view.rotation.T @ normal)
-        return self.middle @ normal + reach + self.rounding * np.abs(normal).sum()
+    def support(self, normal: np.ndarray) -> np.ndarray:
+        """Support function of each box (n,): the largest dot product of its points with a vector (3,)."""
+        extent = self._half @ np.abs(self._view.rotation.T @ normal)
+        return self.middle @ normal + extent + self.rounding * np.abs(normal).sum()
 
     def nearest(self, view: View) -> np.ndarray:
         """Lowest depth (n,) of each box [m], by the view's definition of depth."""
         if view.along_ray:
             return np.maximum(np.linalg.norm(self.middle, axis=1) - self._radius, 0.0)
-        return -self.beyond(np.array([0.0, 0.0, -1.0]))
+        return -self.support(np.array([0.0, 0.0, -1.0]))
 
     def furthest(self, view: View) -> np.ndarray:
         """Highest depth (n,) of each box [m]."""
         if view.along_ray:
             return np.linalg.norm(self.middle, axis=1) + self._radius
-        return self.beyond(np.array([0.0, 0.0, 1.0]))
+        return self.support(np.array([0.0, 0.0, 1.0]))
 
-    def off_axis(self) -> np.ndarray:
-        """Lowest distance (n,) of each box from the vertical axis [m], near which panoramas are stretched."""
+    def distance_from_vertical_axis(self) -> np.ndarray:
+        """Distance (n,) of each box from the vertical axis [m], near which panoramas are stretched."""
         return np.maximum(np.hypot(self.middle[:, 0], self.middle[:, 2]) - self._radius, 0.0)
 
     @property
     def _radius(self) -> np.ndarray:
         return np.linalg.norm(self._half, axis=1) + self.rounding
 
-    def within(self, angle: float, step: float = 0.0, further: np.ndarray | None = None) -> np.ndarray:
-        """Mask (n,) of boxes that may have points within an angle [rad] of the optical axis, after a
-        displacement by a share `step` of their distance to the camera and by `further` (n,) metres."""
+    def within_angle(
+        self, angle: float, slope: float = 0.0, displacement: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Mask (n,) of boxes that may have points within an angle [rad] of the optical axis, if points are
+        displaced by `slope` times their distance to the camera, and by `displacement` (n,) metres."""
         distance = np.linalg.norm(self.middle, axis=1)
         with np.errstate(over="ignore"):  # infinite for a box around the camera
-            around = np.arcsin(np.minimum(self._radius / np.maximum(distance, 1e-300), 1.0))
-        off = np.arctan2(np.hypot(self.middle[:, 0], self.middle[:, 1]), self.middle[:, 2])
-        if further is not None:
+            angular_radius = np.arcsin(np.minimum(self._radius / np.maximum(distance, 1e-300), 1.0))
+        off_axis = np.arctan2(np.hypot(self.middle[:, 0], self.middle[:, 1]), self.middle[:, 2])
+        if displacement is not None:
             with np.errstate(over="ignore"):
-                aside = step + further / np.maximum(distance - self._radius, 1e-300)
-            around = np.where(aside < 1, around + np.arcsin(np.minimum(aside, 1.0)), np.inf)
-        return (distance <= self._radius) | (off - around <= angle)
+                shift = slope + displacement / np.maximum(distance - self._radius, 1e-300)
+            angular_radius = np.where(shift < 1, angular_radius + np.arcsin(np.minimum(shift, 1.0)), np.inf)
+        return (distance <= self._radius) | (off_axis - angular_radius <= angle)
 
 
 def _pinhole_sides(view: View, margin: float) -> list[tuple[np.ndarray, float]]:
@@ -216,14 +219,14 @@ def _pinhole_sides(view: View, margin: float) -> list[tuple[np.ndarray, float]]:
     rows = (0, view.height) if view.band is None else view.band
     grid = ((0, view.focal_x, view.center_x, (0, view.width)), (1, view.focal_y, view.center_y, rows))
     for axis, focal, center, (first, end) in grid:
-        for sign, side in ((1.0, first - margin), (-1.0, end + margin)):
+        for sign, border in ((1.0, first - margin), (-1.0, end + margin)):
             # sign (focal x / z + center - side) >= 0, times z for perspective
             normal = np.zeros(3)
             normal[axis] = sign * focal
             if view.parallel:
-                sides.append((normal, sign * (center - side)))
+                sides.append((normal, sign * (center - border)))
                 continue
-            normal[2] = sign * (center - side)
+            normal[2] = sign * (center - border)
             sides.append((normal, 0.0))
     return sides
 
@@ -233,11 +236,11 @@ def _max_ray_rotation(view: View) -> float:
     lens = view.lens
     if not isinstance(lens, Fisheye):
         return 1.0 / min(view.focal_x, view.focal_y)
-    angles = np.linspace(1e-6, lens.limit, 4096)
-    slopes = lens.distance(angles + 1e-6) - lens.distance(angles - 1e-6)
-    slope = min(float(slopes.min()) / 2e-6, float((lens.distance(angles) / np.sin(angles)).min()))
+    angles = np.linspace(1e-6, lens.max_angle, 4096)
+    slopes = lens.image_radius(angles + 1e-6) - lens.image_radius(angles - 1e-6)
+    min_slope = min(float(slopes.min()) / 2e-6, float((lens.image_radius(angles) / np.sin(angles)).min()))
     # 5 % margin, as angles are sampled
-    return math.inf if slope < 0.05 else 1.05 / (slope * min(view.focal_x, view.focal_y))
+    return math.inf if min_slope < 0.05 else 1.05 / (min_slope * min(view.focal_x, view.focal_y))
 
 
 @lru_cache(maxsize=8)
@@ -262,18 +265,18 @@ def projected_sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
         return np.max(
             [projected_sizes(sub_frame.view, boxes, edges) for sub_frame in view.sub_frames], axis=0
         )
-    largest = np.zeros(len(edges))
-    for one in (view, *(own for _, own in view.groups)):
-        focal = max(one.focal_x, one.focal_y)
-        if isinstance(one.lens, RayTable):
-            focal = 1 / one.lens.divergence  # samples per radian
-        if one.parallel:
-            largest = np.maximum(largest, edges * focal)
+    max_sizes = np.zeros(len(edges))
+    for pose_view in (view, *(group_view for _, group_view in view.groups)):
+        focal = max(pose_view.focal_x, pose_view.focal_y)
+        if isinstance(pose_view.lens, RayTable):
+            focal = 1 / pose_view.lens.divergence  # samples per radian
+        if pose_view.parallel:
+            max_sizes = np.maximum(max_sizes, edges * focal)
             continue
-        centers = CameraBoxes(one, *boxes(0.0))
-        panorama = one.raster is not None and isinstance(one.raster.lens, Equirectangular)
-        nearest = centers.off_axis() if panorama else centers.nearest(one)
+        centers = CameraBoxes(pose_view, *boxes(0.0))
+        panorama = pose_view.raster is not None and isinstance(pose_view.raster.lens, Equirectangular)
+        nearest = centers.distance_from_vertical_axis() if panorama else centers.nearest(pose_view)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             size = np.where(nearest > 0, edges * focal / np.maximum(nearest, 1e-300), np.inf)
-        largest = np.maximum(largest, np.where(edges > 0, size, 0.0))
-    return largest
+        max_sizes = np.maximum(max_sizes, np.where(edges > 0, size, 0.0))
+    return max_sizes

@@ -40,10 +40,10 @@ def _visible_nodes(
         return np.zeros(0, bool)
     nodes, instances = store.nodes, store.instances
     level = np.tile(nodes["level"], instances)
-    reach = np.tile(nodes["reach"].astype(np.float64), instances)
+    max_sigma = np.tile(nodes["reach"].astype(np.float64), instances)
     visible = np.zeros(len(level), bool)
     for view in views:
-        visible |= in_frustum(view, features, boxes, reach)
+        visible |= in_frustum(view, features, boxes, max_sigma)
     pinned = scene.pinned[number]
     if not cell_sizes.any():
         return (visible | pinned) & (level == 0)
@@ -54,7 +54,7 @@ def _visible_nodes(
     for view in views:
         refined |= projected_sizes(view, boxes, edges) > cell_sizes[level]
     reached = parents < 0
-    for above in range(int(level.max()), 0, -1):
-        children = np.flatnonzero((level == above - 1) & (parents >= 0))
+    for parent_level in range(int(level.max()), 0, -1):
+        children = np.flatnonzero((level == parent_level - 1) & (parents >= 0))
         reached[children] = (reached & refined & visible)[parents[children]]
     return ((reached & visible) | pinned) & (~refined | (level == 0))

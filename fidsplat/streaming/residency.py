@@ -75,7 +75,7 @@ class Residency:
         full = Band.of(self.scene, view, features, self.scene.cell_sizes(quality))
 
         def fits(band: Band, first_id: int = 0) -> bool:
-            data = self._data(band.selection, first_id)
+            data = self._loaded(band.selection, first_id)
             return pipeline.fits(data, band.view)
 
         def scene_indices_of(bands: Sequence[Band]) -> Callable[[], np.ndarray]:
@@ -90,7 +90,7 @@ class Residency:
             culling_pipeline = backend.pipeline(with_termination_depths(features))
 
             def render_band(band: Band, first_id: int) -> tuple[Images, TerminationDepths]:
-                images = culling_pipeline.render_view(self._data(band.selection, first_id), band.view)
+                images = culling_pipeline.render_view(self._loaded(band.selection, first_id), band.view)
                 return images, backend.termination_depths(images)
 
             rendered = self._occlusion.render(full, fits, render_band, backend.copy_tiles)
@@ -99,7 +99,7 @@ class Residency:
                 yield BandData(full.rows, full.view, None, scene_indices_of(bands), images)
                 return
         for band in self._splitter.split(full, fits):
-            yield BandData(band.rows, band.view, self._data(band.selection), scene_indices_of([band]))
+            yield BandData(band.rows, band.view, self._loaded(band.selection), scene_indices_of([band]))
 
     def gather(
         self, views: Sequence[View], features: FeatureSet, qualities: Iterable[Quality]
@@ -110,9 +110,9 @@ class Residency:
         """
         selection = select(self.scene, views, features, self.scene.cell_sizes(*qualities))
         self.node_count = len(selection)
-        return self._data(selection), partial(self.scene.ids, selection)
+        return self._loaded(selection), partial(self.scene.ids, selection)
 
-    def _data(self, selection: Selection, first_id: int = 0) -> ResidentData:
+    def _loaded(self, selection: Selection, first_id: int = 0) -> ResidentData:
         if self._current is None or self._current[:2] != (selection, first_id):
             self._current = None  # released before the upload, as both may not fit on the device
             if self._cache is None:

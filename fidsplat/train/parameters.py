@@ -108,7 +108,7 @@ class Splats:
         values, coefficients = self.values, slice((degree + 1) ** 2)
         means, sh = values["means"][:], values["sh"][:, coefficients]
         scales = self.scales
-        return SplatCloud.of_checked(
+        return SplatCloud.from_validated(
             means if shared else means.copy(),
             values["quats"].copy(),  # SplatCloud normalises them in place
             np.ascontiguousarray(scales[:, :2]),

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.cameras.foreign import OPENGL
+from fidsplat.cameras.foreign import OPENGL_AXES
 from fidsplat.formats.ply import save_ply
 from fidsplat.formats.sog import save_sog
 from fidsplat.scenes.scene import Scene
@@ -95,7 +95,7 @@ def _in_script(text: str) -> str:
 def _view(means: np.ndarray, camera: Camera) -> dict[str, Any]:
     """Pose, field of view and clipping of a camera, in PlayCanvas' axes."""
     world_to_camera = np.asarray(camera.world_to_camera, np.float64)
-    pose = _GLTF_AXES @ np.linalg.inv(world_to_camera) @ OPENGL
+    pose = _GLTF_AXES @ np.linalg.inv(world_to_camera) @ OPENGL_AXES
     depths = means @ world_to_camera[2, :3] + world_to_camera[2, 3]
     front = depths[depths > 0]
     middle = float(np.median(front)) if len(front) else 1.0

@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import Camera
+from fidsplat.cameras.foreign import opencv_matrix
 from fidsplat.images.files import write_png
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, read_text, writable_folder, write_json
 from fidsplat.vision.truth import Box, MarkerTruth, Truth
 from fidsplat.vision.visible import POINTS, outline
 
-PIXEL = 0.5
-"""offset to the pixel coordinates of BOP, whose first pixel centre is at 0"""
 DEPTH_SCALE = 0.1
 """millimetres of a depth step; 16 bits have a range of 6.5 m"""
 
@@ -73,7 +72,7 @@ class BopScene:
                 self._folder / "depth" / f"{name}.png", np.where(steps < 65536, steps, 0).astype(np.uint16)
             )
         self._cameras[str(number)] = {
-            "cam_K": (camera.matrix - [[0, 0, PIXEL], [0, 0, PIXEL], [0, 0, 0]]).ravel().tolist(),
+            "cam_K": opencv_matrix(camera).ravel().tolist(),
             "cam_R_w2c": camera.world_to_camera[:3, :3].ravel().tolist(),
             "cam_t_w2c": (1000 * camera.world_to_camera[:3, 3]).tolist(),
             "depth_scale": DEPTH_SCALE,

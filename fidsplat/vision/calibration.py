@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye
+from fidsplat.cameras.foreign import PIXEL_OFFSET
 from fidsplat.images.tag_dictionaries import families, parse_family
 from fidsplat.markers import Marker, parse_spec
 from fidsplat.markers.boards import BoardSpec
@@ -23,8 +24,6 @@ ESTIMATED: dict[type, tuple[str, ...]] = {
     Fisheye: ("k1", "k2", "k3", "k4"),
 }
 """estimated coefficients of each lens, in OpenCV's order"""
-PIXEL = 0.5
-"""offset to OpenCV's pixel coordinates, whose first pixel centre is at 0"""
 GRID = 24
 """points of an image along each edge at which projections are compared"""
 
@@ -67,7 +66,7 @@ def calibrate(views: Sequence[BoardView], start: Camera) -> Camera:
     if start.lens is not None and type(start.lens) not in ESTIMATED:
         raise invalid("the lens of a calibration", "none, brown_conrady or fisheye", start.lens.kind)
     points = [np.pad(view.points, ((0, 0), (0, 1))).astype(np.float32)[:, None] for view in views]
-    corners = [(view.corners - PIXEL).astype(np.float32)[:, None] for view in views]
+    corners = [(view.corners - PIXEL_OFFSET).astype(np.float32)[:, None] for view in views]
     size = (start.width, start.height)
     try:
         if isinstance(start.lens, Fisheye):
@@ -91,7 +90,7 @@ def calibrate(views: Sequence[BoardView], start: Camera) -> Camera:
     if start.lens is not None:
         kind: Any = type(start.lens)
         lens = kind(**dict(zip(ESTIMATED[kind], np.ravel(values).tolist(), strict=False)))
-    fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + PIXEL, matrix[1, 2] + PIXEL
+    fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + PIXEL_OFFSET, matrix[1, 2] + PIXEL_OFFSET
     return Camera.pinhole(*size, *map(float, (fx, fy, cx, cy)), lens=lens)
 
 

@@ -85,14 +85,14 @@ def test_parallel_rays():
 
 def test_beyond_the_fold_nothing_is_visible():
     lens = BrownConrady(k1=-0.35)
-    assert lens.fold == pytest.approx(math.sqrt(1 / (3 * 0.35)))
+    assert lens.max_tangent == pytest.approx(math.sqrt(1 / (3 * 0.35)))
     camera = fs.Camera.pinhole(80, 60, 52.0, 52.0, 40.0, 30.0, lens=lens)
-    radius = 52 * lens.fold * (1 - 0.35 * lens.fold**2)
+    radius = 52 * lens.max_tangent * (1 - 0.35 * lens.max_tangent**2)
     assert not np.isnan(camera.rays([[40 + radius - 1e-3, 30]])).any()
     assert np.isnan(camera.rays([[40 + radius + 1e-3, 30]])).all()
     # the polynomial comes back to the image there; the lens does not
     assert np.isnan(camera.project([[1.5, 0, 1]])).all()
-    assert BrownConrady(k1=0.2, k4=-0.1).fold == pytest.approx(math.sqrt(10), rel=0.5)
+    assert BrownConrady(k1=0.2, k4=-0.1).max_tangent == pytest.approx(math.sqrt(10), rel=0.5)
 
 
 def test_opencv_fills_its_rational_model_up_with_zeros():
@@ -180,7 +180,7 @@ LENSES = [
 @pytest.mark.parametrize("name", ["k1", "k2", "k3", "k4"])
 def test_a_fisheye_sees_as_far_as_distances_grow(name):
     lens, angles = Fisheye(**{name: -0.2}), np.linspace(0, math.radians(100), 100_001)
-    assert lens.limit == pytest.approx(angles[lens.distance(angles).argmax()], abs=2e-5)
+    assert lens.max_angle == pytest.approx(angles[lens.image_radius(angles).argmax()], abs=2e-5)
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.kind)

@@ -157,7 +157,7 @@ def test_a_moving_rosette_has_fewer_poses_than_beams(device):
     assert hit.mean() > 0.9
     assert len(found.poses) == 10
     np.testing.assert_allclose(found.world_points[0][hit][:, 0], 5.0, atol=1e-4)
-    late = np.abs(found.poses[found.band][:, 0, 3] - 3 * (0.2 + found.time))
+    late = np.abs(found.poses[found.pose_index][:, 0, 3] - 3 * (0.2 + found.time))
     assert late.max() <= 3 * 0.1 / (2 * 10) + 1e-9
 
 

@@ -10,11 +10,11 @@ import pytest
 import fidsplat as fs
 from fidsplat.render.irradiance import LightField, cosine_weights, panorama_directions
 from fidsplat.render.reflection import (
-    Gloss,
+    GlossyBrdf,
     fit_harmonics,
     fresnel,
-    gloss,
-    lobe,
+    glossy_reflection,
+    sample_lobe,
     view_directions,
 )
 from fidsplat.scenes import PlacedMarker
@@ -247,18 +247,18 @@ def test_gaussians_and_rotated_boxes_are_lit():
 
 @pytest.mark.parametrize("roughness", [0.3, 0.6, 1.0])
 def test_reflections_by_sampling_equal_the_integral(roughness):
-    surface, rows = Gloss(roughness, 0.04), 128
+    surface, rows = GlossyBrdf(roughness, 0.04), 128
     field = LightField(*panorama_directions(rows))
     toward = np.array([0.5, 0.0, math.sqrt(0.75)])
     light = 0.1 + 1.0 * (field.directions @ toward > math.cos(math.radians(25)))
     field.radiance = np.repeat(light[:, None], 3, 1)[None, None]
     views = view_directions(UP)[::16]
-    directions, weights = lobe(views[None], UP[None], surface)
-    arriving = field.arriving(directions[0], np.zeros((len(views), 2)))[..., 0]
-    sampled = (arriving * weights[0]).sum(-1)
+    directions, weights = sample_lobe(views[None], UP[None], surface)
+    incoming = field.incoming_radiance(directions[0], np.zeros((len(views), 2)))[..., 0]
+    sampled = (incoming * weights[0]).sum(-1)
     count = len(field.directions)
     for view, found in zip(views, sampled, strict=True):
-        reflected = gloss(
+        reflected = glossy_reflection(
             np.full((count, 1), view @ UP),
             np.broadcast_to(view, (count, 1, 3)),
             field.directions,
@@ -278,7 +278,7 @@ def test_fresnel_by_polarisation():
     assert (fresnel(np.array([0.0, 0.3]), 0.0) == 0).all()
     assert fresnel(np.array([0.0, 0.5]), 1.0) == pytest.approx(1)
     views = np.array([[0, 0, 1.0], [math.sin(1.2), 0, math.cos(1.2)]])
-    _, weights = lobe(views[None], UP[None], Gloss(0.1, 0.04))
+    _, weights = sample_lobe(views[None], UP[None], GlossyBrdf(0.1, 0.04))
     assert np.allclose(weights[0].sum(-1), expected, rtol=0.03)
 
 
@@ -321,7 +321,7 @@ def test_the_error_of_harmonics_of_degree_3():
     views = view_directions(UP)
     errors = []
     for roughness in (0.25, 0.5):
-        weights = lobe(views[None], UP[None], Gloss(roughness, 0.04))
+        weights = sample_lobe(views[None], UP[None], GlossyBrdf(roughness, 0.04))
         light = field.reflected(weights[0][0], weights[1][0])[0, 0] + 0.05
         colors = to_colors(light, "srgb")
         fitted = 0.5 + np.einsum("vk,kc->vc", sh_basis(3, -views), fit_harmonics(views, colors[None])[0])

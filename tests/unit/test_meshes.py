@@ -38,7 +38,7 @@ def ball():
     )
     with pytest.MonkeyPatch.context() as small:
         small.setattr(mesh, "VIEWS", 24)
-        small.setattr(mesh, "SIDE", 112)
+        small.setattr(mesh, "IMAGE_SIDE", 112)
         return scene_mesh(fs.Scene([cloud]), voxel=VOXEL, renderer=fs.Renderer("opencl"))
 
 

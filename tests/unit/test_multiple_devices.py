@@ -28,7 +28,7 @@ def test_bands_of_several_devices_are_bit_identical(store, two):
     for scene in (store, cloud, fs.Scene([cloud], look())):
         given = two.upload(scene)
         for share in (0.5, 0.2, 0.97):
-            two._shares = np.array([0.0, share, 1.0])
+            two._borders = np.array([0.0, share, 1.0])
             ours = two.render(given, look(turn=TURNED), outputs)
             whole = alone.render(cloud, look(turn=TURNED), outputs)
             assert np.array_equal(ours.capture.camera.world_to_camera, look(turn=TURNED).world_to_camera)
@@ -60,7 +60,7 @@ def test_bands_of_effects_that_depend_on_the_row(two, capture):
     whole = fs.Renderer("opencl").render(cloud, capture)["rgb"]
     given = two.upload(cloud)
     for share in (0.3, 0.6):
-        two._shares = np.array([0.0, share, 1.0])
+        two._borders = np.array([0.0, share, 1.0])
         assert np.array_equal(two.render(given, capture)["rgb"], whole), share
     assert len(np.unique(whole.reshape(-1, 3), axis=0)) > 100
 
@@ -79,7 +79,7 @@ def test_splats_outside_a_band_are_not_big():
 
 def test_a_device_caches_the_visible_chunks_of_its_band(store, two):
     given = two.upload(store)
-    two._shares = np.array([0.0, 0.5, 1.0])
+    two._borders = np.array([0.0, 0.5, 1.0])
     two.render(given, look()).wait()
     one = fs.Renderer("opencl")
     alone = one.upload(store)
@@ -100,15 +100,15 @@ def test_views_are_distributed_and_returned_in_order(store, two):
 
 
 def test_bands_adapt_to_the_speed_of_devices(two):
-    two._shares = np.array([0.0, 0.5, 1.0])
+    two._borders = np.array([0.0, 0.5, 1.0])
     two._balance([50, 50], [3.0, 1.0])
-    assert two._shares == pytest.approx([0, 1 / 3, 1])
+    assert two._borders == pytest.approx([0, 1 / 3, 1])
     two._balance([33, 67], [1.0, 1.05])
-    assert two._shares == pytest.approx([0, 1 / 3, 1])
+    assert two._borders == pytest.approx([0, 1 / 3, 1])
     assert two._bands(3) == [(0, 1), (1, 3)]
-    two._shares = np.array([0.0, 0.001, 1.0])
+    two._borders = np.array([0.0, 0.001, 1.0])
     assert two._bands(4) == [(0, 1), (1, 4)]
-    two._shares = np.array([0.0, 0.999, 1.0])
+    two._borders = np.array([0.0, 0.999, 1.0])
     assert two._bands(4) == [(0, 3), (3, 4)]
     assert two._bands(1) == [(0, 1)]
 

@@ -89,22 +89,22 @@ def layers(count, opacity, color=1.0):
 )
 def test_the_promise_names_its_class_of_scenes(renderer, error, count, colors):
     """The hardest scene of the class: the maximum number of layers just below the cut-off."""
-    quality = fs.quality_within(error, device=renderer, layers=count, colors=colors)
+    quality = fs.quality_within(error, device=renderer, faint_fragments=count, colors=colors)
     haze = layers(count, 0.99 * quality.alpha_cutoff, colors)
     light = fs.SplatCloud.concatenate([layers(30, 0.5, 0.0), layers(1, 1.0, colors).transformed(AWAY)])
     for cloud in (haze, light):
         frame = renderer.render(cloud, SMALL, quality=quality)
         assert errors(frame["rgb"], ideal(cloud, SMALL, quality)).maximum <= error
-    choice = choose(error, device=renderer, layers=count, colors=colors)
-    assert f"range of {colors:g} and at most {count} faint layers" in choice.summary
+    choice = choose(error, device=renderer, faint_fragments=count, colors=colors)
+    assert f"range of {colors:g} and at most {count} faint fragments" in choice.summary
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ({"layers": 10**9}, "at most 1000000000 faint layers"),
+        ({"faint_fragments": 10**9}, "at most 1000000000 faint fragments"),
         ({"colors": 1e9}, r"range of 1e\+09"),
-        ({"layers": 0}, "layers must be .* got 0"),
+        ({"faint_fragments": 0}, "faint_fragments must be .* got 0"),
         ({"colors": 0}, "got 0"),
     ],
 )

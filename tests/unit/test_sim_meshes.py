@@ -14,7 +14,7 @@ pytest.importorskip("mujoco", reason="pip install 'fidsplat[sim]'")
 SETUP = """
 import mujoco, numpy as np, fidsplat as fs
 from fidsplat.scenes import PlacedMarker
-from fidsplat.sim.mujoco import MESH, MESH_OFFSET, MujocoRig
+from fidsplat.sim.mujoco import MESH_LABEL, MESH_OFFSET, MujocoRig
 model = mujoco.MjModel.from_xml_string('''<mujoco>
   <visual><global offwidth="100" offheight="60"/></visual>
   <asset><texture type="skybox" builtin="gradient" rgb1="1 0 0" rgb2="1 0 0" width="64" height="64"/></asset>
@@ -45,7 +45,7 @@ MESHES = (
     + """
 images = rig.render(data, meshes=range(6)).of("eye").frame(0)
 label, depth, rgb = images["label"], images["depth"], images["rgb"]
-assert set(np.unique(label)) == {-1, 1, MESH, MESH - 1}, np.unique(label)
+assert set(np.unique(label)) == {-1, 1, MESH_LABEL, MESH_LABEL - 1}, np.unique(label)
 assert (model.vis.global_.offwidth, model.vis.global_.offheight) == (100, 60)  # the model is as before
 
 # MuJoCo's own image: the same pixels are geoms, with its colours and depths; its red sky is nowhere
@@ -59,7 +59,7 @@ metres = own.render()
 own.enable_segmentation_rendering()
 geoms = own.render()[..., 0]
 mesh = label < -1
-np.testing.assert_array_equal(label[mesh], MESH - geoms[mesh])
+np.testing.assert_array_equal(label[mesh], MESH_LABEL - geoms[mesh])
 near_tag = np.lib.stride_tricks.sliding_window_view(np.pad(label == 1, 1), (3, 3)).any((2, 3))
 mesh &= ~near_tag  # whose edges cover parts of pixels
 assert mesh.sum() > 1000
@@ -71,17 +71,17 @@ np.testing.assert_allclose(rgb[label == -1], np.broadcast_to((0.2, 0.3, 0.6), (n
 assert (geoms[label == 1] == 0).all()
 assert np.ptp(depth[label == 1]) < 1e-5 and abs(depth[label == 1].mean() - 1.4) < 1e-5
 ball = geoms == 1
-assert ball.sum() > 100 and (label[ball] == MESH - 1).all()
+assert ball.sum() > 100 and (label[ball] == MESH_LABEL - 1).all()
 
 # geom groups: MuJoCo shows 0, 1 and 2 by default; environments are rendered one by one
 other = mujoco.MjData(model)
 other.qpos[0] = 0.05
 mujoco.mj_forward(model, other)
 labels = rig.render([data, other], meshes=True)["label"]
-assert set(np.unique(labels)) == {-1, 1, MESH}
+assert set(np.unique(labels)) == {-1, 1, MESH_LABEL}
 labels = rig.render([data, other], meshes=3)["label"][:, 0]
-assert set(np.unique(labels)) == {-1, 1, MESH - 1}
-rows = [np.flatnonzero((one == MESH - 1).any(1)).mean() for one in labels]
+assert set(np.unique(labels)) == {-1, 1, MESH_LABEL - 1}
+rows = [np.flatnonzero((one == MESH_LABEL - 1).any(1)).mean() for one in labels]
 assert rows[1] < rows[0] - 5  # the ball has moved up
 
 both = MujocoRig(model, scene, {1: "box"}, renderer=fs.Renderer("reference"))

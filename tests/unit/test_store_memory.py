@@ -161,7 +161,7 @@ def test_a_memory_budget_makes_bands(stores):
     resident = limited.upload(store)
     ours = limited.render(resident, camera)
     assert np.array_equal(ours["rgb"], plain.render(store.cloud(), camera)["rgb"])
-    assert len(resident.data._splitter._cuts[0, 90]) > 2
+    assert len(resident.data._splitter._borders[0, 90]) > 2
 
 
 @pytest.mark.sweep
@@ -222,4 +222,4 @@ def test_bands_that_fit_together_are_merged():
     assert len(list(made.split(whole, lambda band: True))) == 8
     made._capacity = 33
     list(made.split(whole, lambda band: True))
-    assert made._cuts == {(0, 64): [0, 32, 64]}
+    assert made._borders == {(0, 64): [0, 32, 64]}

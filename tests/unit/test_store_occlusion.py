@@ -272,7 +272,7 @@ def test_splats_are_within_the_bounds_of_their_box(name):
 
     shown = np.flatnonzero(trace["keys"] < 0xFFFFFFFE)
     keys = TerminationDepths.of_keys(trace["keys"], (1, 1)).depths
-    least = occlusion_test.minimum_keys(view, features, boxes)
+    least = occlusion_test.min_sort_keys(view, features, boxes)
     assert (least[shown] <= keys[shown]).all()
     # one tile for each sample: only tiles that the splat touches do not terminate
     records, rectangles = trace["records"], np.full((len(cloud), 4), -1)

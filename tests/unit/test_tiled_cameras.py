@@ -83,7 +83,7 @@ def check(images, states, geom_of):
 
 def test_mujoco_warps_geoms_are_composited_in_all_worlds(states, scene):
     warp = pytest.importorskip("mujoco_warp", reason="pip install 'fidsplat[tiled]'")
-    from fidsplat.sim.mujoco import MESH, MujocoRig
+    from fidsplat.sim.mujoco import MESH_LABEL, MujocoRig
 
     model, single = states
     there, worlds = warp.put_model(model), warp.put_data(model, single[0], nworld=len(single))
@@ -91,7 +91,7 @@ def test_mujoco_warps_geoms_are_composited_in_all_worlds(states, scene):
     warp.kinematics(there, worlds)
     warp.camlight(there, worlds)
     rig = MujocoRig(model, scene, {1: "box"}, renderer=fs.Renderer("reference"), outputs=OUTPUTS)
-    check(rig.render(worlds, meshes=True), states, lambda label: MESH - label)
+    check(rig.render(worlds, meshes=True), states, lambda label: MESH_LABEL - label)
     assert set(np.unique(rig.render(worlds, meshes=3)["label"])) == {-1, 1}
     square = mujoco.MjModel.from_xml_string(MODEL.replace('sensorsize="1 0.75"', 'sensorsize="1 1"'))
     with pytest.raises(fs.InputError, match="aspect ratio of its resolution 32 x 24, got 1 x 1 for 'eye'"):
