@@ -1,4 +1,5 @@
-"""`pytest --certificates=FILE`: what the reference leaves open, over all images that a run compares.
+"""`pytest --certificates=FILE`: counts of pixels that the reference does not determine, over all images
+that a run compares.
 
 A certificate says what float32 may change in a pixel's colour (fidsplat/backends/reference/error_bounds.py):
 where it is large, a test sees little there. A plugin of pytest, which conftest.py names.
@@ -62,8 +63,8 @@ def pytest_terminal_summary(terminalreporter, config):
 
 
 def table(file):
-    """Markdown, of what each process has written: by folder, and the files with most above the second
-    threshold."""
+    """Markdown table of the counts of all processes: by folder, and the files with the most pixels above
+    the second threshold."""
     files, folders = (defaultdict(lambda: np.zeros(2 + len(THRESHOLDS), int)) for _ in range(2))
     for line in file.read_text("utf-8").splitlines():
         for name, counts in json.loads(line).items():

@@ -20,7 +20,7 @@ from fidsplat.selftest.agreement import compare
 SIZE = (37, 22)
 
 
-def turning(time: float) -> np.ndarray:
+def rotating(time: float) -> np.ndarray:
     """A camera that turns and moves on."""
     pose, angle = np.eye(4), 0.5 * time
     pose[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
@@ -35,7 +35,7 @@ def sliding(time: float) -> np.ndarray:
     return pose
 
 
-def with_thick(cloud: fs.SplatCloud) -> fs.SplatCloud:
+def with_ellipsoids(cloud: fs.SplatCloud) -> fs.SplatCloud:
     """The cloud with as many 3D Gaussians among its splats."""
     flat = random_splats(len(cloud), 22, depth=(0.8, 4.0), scale=(0.05, 0.5), across=1.2)
     scales = np.column_stack([flat.scales, flat.scales[::-1, 0]])
@@ -79,10 +79,10 @@ _FIXED = {
     "boxes and Gaussians": Switch(
         "footprint", cloud=lambda cloud: cloud.with_boxes(np.arange(len(cloud)) // 4 % 2 == 0)
     ),
-    "ellipsoids": Switch("ellipsoids", cloud=with_thick),
-    "exact ellipsoids": Switch("ellipsoids", cloud=with_thick, quality={"ellipsoid": "exact"}),
+    "ellipsoids": Switch("ellipsoids", cloud=with_ellipsoids),
+    "exact ellipsoids": Switch("ellipsoids", cloud=with_ellipsoids, quality={"ellipsoid": "exact"}),
     "antialiased ellipsoids": Switch(
-        "ellipsoids", cloud=with_thick, quality={"ellipsoid": "ewa_antialiased"}
+        "ellipsoids", cloud=with_ellipsoids, quality={"ellipsoid": "ewa_antialiased"}
     ),
     "low-pass none": Switch("lowpass", quality={"lowpass": "none"}),
     "low-pass pixel": Switch("lowpass", quality={"lowpass": "pixel"}),
@@ -120,13 +120,13 @@ COARSE = ("set-up",)
 LENSES = [name for name, switch in SWITCHES.items() if switch.kind == "lens"]
 
 
-def goes(names: Iterable[str]) -> bool:
+def is_compatible(names: Iterable[str]) -> bool:
     """Whether no two of them are of one kind."""
     kinds = [SWITCHES[name].kind for name in names]
     return len(kinds) == len(set(kinds))
 
 
-def everything(lens: str | None) -> tuple[str, ...]:
+def all_effects(lens: str | None) -> tuple[str, ...]:
     """All effects behind that lens (None: a pinhole); of those that exclude each other one, another for each
     lens. None is coarse, so that images are compared closely."""
     kinds: dict[str, list[str]] = {}
@@ -144,13 +144,13 @@ def _cloud(degree: int | None) -> fs.SplatCloud:
 
 @dataclass(frozen=True)
 class Combination:
-    """What a set of switches asks for."""
+    """Features that a set of switches requests."""
 
     cloud: fs.SplatCloud
     capture: fs.Capture
 
     def features(self, *more: str) -> FeatureSet:
-        """What it calls for, and more outputs."""
+        """The requested features, and more outputs."""
         return select(self.cloud, self.capture.with_(outputs=(*self.capture.outputs, *more)))
 
 
@@ -171,7 +171,7 @@ def combination(names: Iterable[str]) -> Combination:
         ("rgb", *(switch.output for switch in chosen if switch.output)),
         fs.Quality().with_(**merged["quality"]),
         requested.get("background", (0.1, 0.2, 0.3)),
-        fs.Motion(turning if merged["shutter"] else None, requested.get("groups", {})),
+        fs.Motion(rotating if merged["shutter"] else None, requested.get("groups", {})),
         fs.Shutter(**merged["shutter"]),
         fs.Sensor(**merged["sensor"]),
         requested.get("fog"),
@@ -179,7 +179,7 @@ def combination(names: Iterable[str]) -> Combination:
     return Combination(cloud, capture)
 
 
-def assert_drawn(renderer: fs.Renderer, names: Iterable[str]) -> None:
+def assert_renders(renderer: fs.Renderer, names: Iterable[str]) -> None:
     """It builds, it renders, and all its images are the reference's within tolerance and certificate."""
     requested = combination(names)
     frame = renderer.render(requested.cloud, requested.capture)

@@ -6,7 +6,8 @@ from fidsplat.cli import main
 
 
 def fails(capsys, *words) -> tuple[int, str]:
-    """Run and return exit status and the one line on stderr; nothing stands on stdout."""
+    """Run a command that fails; returns the exit status and the one line on stderr, and checks that
+    stdout is empty."""
     status = main([str(word) for word in words])
     out, err = capsys.readouterr()
     assert out == ""

@@ -1,11 +1,11 @@
-"""What a kernel takes of an NVIDIA GPU, from its machine code alone: no GPU is needed."""
+"""Resources of a kernel on an NVIDIA GPU, from its machine code; no GPU is needed."""
 
 import struct
 
 _REGISTERS, _FRAME = 0x2F, 0x11
 
 
-def taken(cubin: bytes) -> dict[str, int]:
+def resources_of(cubin: bytes) -> dict[str, int]:
     """`registers`, and bytes of `stack`, of the largest function of a cubin: an ELF file whose sections
     `.nv.info` hold (form, attribute, size, symbol, value) of each.
     """

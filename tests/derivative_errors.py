@@ -34,7 +34,7 @@ _ORIGIN = (40.0, -25.0, 7.0)
 
 
 class Difference(NamedTuple):
-    """Of one parameter's whole array."""
+    """For the complete array of one parameter."""
 
     parameter: str
     norm: float
@@ -43,7 +43,7 @@ class Difference(NamedTuple):
     """one less the cosine of both"""
 
 
-def random_picture(
+def random_scene(
     seed: int,
     count: int = 90,
     size: tuple[int, int] = (61, 43),

@@ -1,4 +1,4 @@
-"""A disk that is full, as far as a process can have one of its own."""
+"""A full disk, simulated by a limit on the file size of a process."""
 
 import resource
 import signal

@@ -88,7 +88,7 @@ TEXTUAL = {
 
 
 @st.composite
-def spoiled(draw: st.DrawFn, data: bytes) -> bytes:
+def corrupted(draw: st.DrawFn, data: bytes) -> bytes:
     """Bytes cut, exchanged, repeated or left out, at one to four places."""
     for _ in range(draw(st.integers(1, 4))):
         at, length = draw(st.integers(0, len(data))), draw(st.sampled_from([1, 2, 4, 8, 30, 1000]))
@@ -114,7 +114,7 @@ def spoiled(draw: st.DrawFn, data: bytes) -> bytes:
 
 
 @st.composite
-def spoiled_text(draw: st.DrawFn, text: str) -> bytes:
+def corrupted_text(draw: st.DrawFn, text: str) -> bytes:
     """Numbers and words exchanged, lines repeated, left out and nested."""
     for _ in range(draw(st.integers(1, 3))):
         lines = text.split("\n")
@@ -146,14 +146,14 @@ def spoiled_text(draw: st.DrawFn, text: str) -> bytes:
                 lines[at] = lines[at][: draw(st.integers(0, len(lines[at])))]
         text = "\n".join(lines)
     data = text.encode("utf-8", "surrogatepass")
-    return draw(spoiled(data)) if draw(st.integers(0, 4)) == 0 else data
+    return draw(corrupted(data)) if draw(st.integers(0, 4)) == 0 else data
 
 
 @st.composite
-def spoiled_json(draw: st.DrawFn, text: str) -> bytes:
+def corrupted_json(draw: st.DrawFn, text: str) -> bytes:
     """Values exchanged, left out or repeated, in JSON that stays valid; or its text damaged."""
     if draw(st.integers(0, 3)) == 0:
-        return draw(spoiled_text(text))
+        return draw(corrupted_text(text))
     root = [json.loads(text)]
     for _ in range(draw(st.integers(1, 3))):
         places = list(_places(root))
@@ -180,7 +180,7 @@ def _places(value: Any) -> Iterator[tuple[Any, Any]]:
 
 
 @st.composite
-def spoiled_array(draw: st.DrawFn, array: np.ndarray) -> np.ndarray:
+def corrupted_array(draw: st.DrawFn, array: np.ndarray) -> np.ndarray:
     """An array with other values, another shape or another type."""
     match draw(st.integers(0, 6)):
         case 0:
@@ -210,34 +210,34 @@ def spoiled_array(draw: st.DrawFn, array: np.ndarray) -> np.ndarray:
 
 
 @st.composite
-def spoiled_npz(draw: st.DrawFn, data: bytes) -> bytes:
+def corrupted_npz(draw: st.DrawFn, data: bytes) -> bytes:
     with np.load(io.BytesIO(data)) as file:
         arrays = dict(file)
     for _ in range(draw(st.integers(1, 2))):
         name = draw(st.sampled_from(sorted(arrays)))
         if arrays[name].dtype.kind == "U" and arrays[name].ndim == 0:
-            text = draw(spoiled_json(str(arrays[name]))).decode("utf-8", "replace")
+            text = draw(corrupted_json(str(arrays[name]))).decode("utf-8", "replace")
             arrays[name] = np.array(text)
         elif draw(st.integers(0, 5)) == 0:
             del arrays[name]
             if not arrays:
                 break
         else:
-            arrays[name] = draw(spoiled_array(arrays[name]))
+            arrays[name] = draw(corrupted_array(arrays[name]))
     stream = io.BytesIO()
     np.savez(stream, **arrays)
     return stream.getvalue()
 
 
 @st.composite
-def spoiled_npy(draw: st.DrawFn, data: bytes) -> bytes:
+def corrupted_npy(draw: st.DrawFn, data: bytes) -> bytes:
     stream = io.BytesIO()
-    np.save(stream, draw(spoiled_array(np.load(io.BytesIO(data)))))
+    np.save(stream, draw(corrupted_array(np.load(io.BytesIO(data)))))
     return stream.getvalue()
 
 
 @st.composite
-def spoiled_zip(draw: st.DrawFn, data: bytes) -> bytes:
+def corrupted_zip(draw: st.DrawFn, data: bytes) -> bytes:
     """A ZIP file with a damaged member."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {info.filename: archive.read(info) for info in archive.infolist()}
@@ -256,7 +256,7 @@ def spoiled_zip(draw: st.DrawFn, data: bytes) -> bytes:
 
 
 @st.composite
-def spoiled_frames(draw: st.DrawFn, data: bytes) -> bytes:
+def corrupted_frames(draw: st.DrawFn, data: bytes) -> bytes:
     """An SPZ file of version 4 with a damaged array in a valid frame, or changed sizes in its table."""
     streams, table = data[15], int.from_bytes(data[16:20], "little")
     sizes = [struct.unpack_from("<QQ", data, table + 16 * k) for k in range(streams)]
@@ -266,7 +266,7 @@ def spoiled_frames(draw: st.DrawFn, data: bytes) -> bytes:
         place += packed
     number = draw(st.integers(0, streams - 1))
     content, size = frames[number]
-    content = draw(st.one_of(spoiled(content), st.just(bytes(draw(st.sampled_from([0, 2**24]))))))
+    content = draw(st.one_of(corrupted(content), st.just(bytes(draw(st.sampled_from([0, 2**24]))))))
     frames[number] = (content, draw(st.sampled_from([size, len(content), 2**40, 2**64 - 1])))
     packed = [zstd.compress(content) for content, _ in frames]
     rows = [struct.pack("<QQ", len(frame), size) for frame, (_, size) in zip(packed, frames, strict=True)]
@@ -278,28 +278,28 @@ def damaged(path: Path, data: bytes | None = None) -> st.SearchStrategy[bytes]:
     data = path.read_bytes() if data is None else data
     inside: st.SearchStrategy[bytes] | None = None
     if path.suffix in TEXTUAL:
-        inside = spoiled_text(data.decode())
+        inside = corrupted_text(data.decode())
     elif path.suffix in (".json", ".gltf"):
-        inside = spoiled_json(data.decode())
+        inside = corrupted_json(data.decode())
     elif path.suffix == ".npz":
-        inside = spoiled_npz(data)
+        inside = corrupted_npz(data)
     elif path.suffix == ".npy":
-        inside = spoiled_npy(data)
+        inside = corrupted_npy(data)
     elif path.suffix in (".sog", ".usdz"):
-        inside = spoiled_zip(data)
+        inside = corrupted_zip(data)
     elif path.suffix == ".spz" and data[:2] == b"\x1f\x8b":
-        inside = spoiled(gzip.decompress(data)).map(gzip.compress)
+        inside = corrupted(gzip.decompress(data)).map(gzip.compress)
     elif path.suffix == ".spz":
-        inside = spoiled_frames(data)
+        inside = corrupted_frames(data)
     elif path.suffix == ".ply":
         head, end, body = data.partition(b"end_header\n")
-        inside = spoiled_text(head.decode()).map(lambda text: text + end + body)
+        inside = corrupted_text(head.decode()).map(lambda text: text + end + body)
     elif path.suffix == ".glb":
         size = int.from_bytes(data[12:16], "little")
-        inside = spoiled_json(data[20 : 20 + size].decode()).map(lambda text: _glb(text, data[20 + size :]))
+        inside = corrupted_json(data[20 : 20 + size].decode()).map(lambda text: _glb(text, data[20 + size :]))
     if inside is None:
-        return spoiled(data)
-    return st.one_of(inside, inside, spoiled(data))
+        return corrupted(data)
+    return st.one_of(inside, inside, corrupted(data))
 
 
 def _glb(text: bytes, rest: bytes) -> bytes:
@@ -309,7 +309,7 @@ def _glb(text: bytes, rest: bytes) -> bytes:
 
 
 class HangError(BaseException):
-    """Raised by the alarm; no handler of ours may take it for an error of the input."""
+    """Raised by the alarm; not an Exception, so that no handler converts it to an input error."""
 
 
 def _hang(*_: Any) -> None:

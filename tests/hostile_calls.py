@@ -40,7 +40,7 @@ TAG = fs.marker("aruco:4x4_50:7", size=0.1, mixture="exact")
 
 
 def draw(scene: Any) -> None:
-    """Draw what was made, be it a cloud, a scene or a marker."""
+    """Render a cloud, a scene or a marker."""
     RENDERER.render(scene, CAMERA)
 
 
@@ -52,7 +52,7 @@ def _frame() -> Any:
     return RENDERER.render(CLOUD, CAMERA, ["rgb", "depth"])
 
 
-def _seen_by(made: Any) -> None:
+def _render_camera(made: Any) -> None:
     RENDERER.render(CLOUD, made)
 
 
@@ -77,7 +77,7 @@ def _rig() -> Rig:
 
 
 @cache
-def _pictures() -> Any:
+def _rig_images() -> Any:
     return _rig().render({"box": POSES})
 
 
@@ -88,7 +88,7 @@ def _store(folder: Path) -> fs.Store:
 
 
 @cache
-def _pictures_of(folder: Path) -> Path:
+def _image_folder(folder: Path) -> Path:
     """A data set of VIEWS."""
     poses = np.stack([np.linalg.inv(view.camera.world_to_camera) for view in VIEWS])
     names = [f"{number}.png" for number in range(len(VIEWS))]
@@ -101,7 +101,7 @@ def _pictures_of(folder: Path) -> Path:
 
 
 @cache
-def _several() -> fs.SeveralDevices:
+def _two_devices() -> fs.SeveralDevices:
     return fs.SeveralDevices(["reference", "reference"])
 
 
@@ -173,12 +173,12 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     "Frame.read_rows": lambda _: (_frame().read_rows, {"name": "rgb", "first": 1, "end": 3, "into": None}, None),
     "FrameBatch.frame": lambda _: (RENDERER.render_batch(CLOUD, [CAMERA]).frame, {"number": 0}, dict),
     "SeveralDevices": lambda _: (fs.SeveralDevices, {"devices": ["reference"], "memory_budget": None}, None),
-    "SeveralDevices.upload": lambda _: (_several().upload, {"scene": CLOUD}, None),
+    "SeveralDevices.upload": lambda _: (_two_devices().upload, {"scene": CLOUD}, None),
     "SeveralDevices.render": lambda _: (
-        _several().render, {"scene": CLOUD, "capture": CAMERA, "outputs": ("rgb",), "quality": None}, dict
+        _two_devices().render, {"scene": CLOUD, "capture": CAMERA, "outputs": ("rgb",), "quality": None}, dict
     ),
     "SeveralDevices.render_views": lambda _: (
-        _several().render_views, {"scene": CLOUD, "captures": [CAMERA], "outputs": ("rgb",), "quality": None}, _rows
+        _two_devices().render_views, {"scene": CLOUD, "captures": [CAMERA], "outputs": ("rgb",), "quality": None}, _rows
     ),
     "Store": lambda folder: (fs.Store, {"path": _store(folder).path}, None),
     "Store.bounds": lambda folder: (_store(folder).bounds, {"sigmas": 3.0}, None),
@@ -229,7 +229,7 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     "Trainer.save": lambda folder: (Trainer(DATASET, RENDERER, SETTINGS).save, {"path": folder / "trained.ply"}, None),
     "Trainer.evaluate": lambda _: (Trainer(DATASET, RENDERER, SETTINGS).evaluate, {"views": VIEWS}, None),
     "load_dataset": lambda folder: (
-        load_dataset, {"path": _pictures_of(folder), "hold_out": None, "random_points": 3, "seed": 0, "progress": None}, None
+        load_dataset, {"path": _image_folder(folder), "hold_out": None, "random_points": 3, "seed": 0, "progress": None}, None
     ),
     "splats_within": lambda _: (splats_within, {"settings": SETTINGS, "budget": 2**30, "dataset": DATASET}, None),
     "refine": lambda _: (
@@ -254,10 +254,10 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     ),
     "Rig.outputs_of": lambda _: (_rig().outputs_of, {"camera": "eye"}, None),
     "Rig.placed": lambda _: (_rig().placed, {"bodies": {"box": POSES[0]}}, None),
-    "RigImages.camera": lambda _: (_pictures().camera, {"name": "eye", "environment": 0}, None),
-    "RigImages.of": lambda _: (_pictures().of, {"camera": "eye"}, None),
-    "RigImages.placed": lambda _: (_pictures().placed, {"environment": 0}, None),
-    "RigImages[]": lambda _: (_pictures().__getitem__, {"name": "rgb"}, None),
+    "RigImages.camera": lambda _: (_rig_images().camera, {"name": "eye", "environment": 0}, None),
+    "RigImages.of": lambda _: (_rig_images().of, {"camera": "eye"}, None),
+    "RigImages.placed": lambda _: (_rig_images().placed, {"environment": 0}, None),
+    "RigImages[]": lambda _: (_rig_images().__getitem__, {"name": "rgb"}, None),
     "read_description": lambda folder: (read_description, {"path": folder / "none.sdf", "models": ()}, None),
     "read_back": lambda _: (read_back, {"frame": np.zeros((16, 24, 3), np.uint8), "scene": fs.Scene(markers=[PlacedMarker(TAG)]), "camera": CAMERA}, None),
     "truth_of": lambda _: (truth_of, {"frame": _frame(), "scene": fs.Scene(markers=[PlacedMarker(TAG)]), "camera": CAMERA}, None),
@@ -308,40 +308,40 @@ CALLS: dict[str, Callable[[Path], Call]] = {
             "width": 24, "height": 16, "fx": 20.0, "fy": 20.0, "cx": 12.0, "cy": 8.0, "world_to_camera": np.eye(4),
             "near": 0.1, "far": 100.0, "position": None, "lens": None,
         },
-        _seen_by,
+        _render_camera,
     ),
     "Camera.look_at": lambda _: (
         fs.Camera.look_at,
         {"width": 24, "height": 16, "fov_x": 1.0, "position": (0, 0, -9), "target": (0, 0, 0), "up": (0, -1, 0)},
-        _seen_by,
+        _render_camera,
     ),
     "Camera.fisheye": lambda _: (
-        fs.Camera.fisheye, {"width": 24, "height": 16, "fov_x": 2.0}, _seen_by
+        fs.Camera.fisheye, {"width": 24, "height": 16, "fov_x": 2.0}, _render_camera
     ),
     "Camera.orthographic": lambda _: (
-        fs.Camera.orthographic, {"width": 24, "height": 16, "metres_wide": 3.0, "near": 0.1, "far": 50.0}, _seen_by
+        fs.Camera.orthographic, {"width": 24, "height": 16, "metres_wide": 3.0, "near": 0.1, "far": 50.0}, _render_camera
     ),
-    "Camera.equirectangular": lambda _: (fs.Camera.equirectangular, {"width": 24, "height": 12}, _seen_by),
+    "Camera.equirectangular": lambda _: (fs.Camera.equirectangular, {"width": 24, "height": 12}, _render_camera),
     "Camera.from_colmap": lambda _: (
         fs.Camera.from_colmap,
         {"camera": ("PINHOLE", 24, 16, [20.0, 20.0, 12.0, 8.0]), "world_to_camera": np.eye(4)},
-        _seen_by,
+        _render_camera,
     ),
     "Camera.from_nerfstudio": lambda _: (
         fs.Camera.from_nerfstudio,
         {"transforms": {"w": 24, "h": 16, "fl_x": 20.0, "frames": [{"transform_matrix": np.eye(4).tolist()}]}, "frame": 0},
-        _seen_by,
+        _render_camera,
     ),
-    "Camera.with_size": lambda _: (CAMERA.with_size, {"width": 12, "height": 8}, _seen_by),
+    "Camera.with_size": lambda _: (CAMERA.with_size, {"width": 12, "height": 8}, _render_camera),
     "Camera.project": lambda _: (CAMERA.project, {"points": MEANS}, None),
     "Camera.rays": lambda _: (CAMERA.rays, {"pixels": np.ones((2, 2))}, None),
     "BrownConrady": lambda _: (
         fs.BrownConrady,
         {"k1": 0.1, "p1": 0.01, "k4": 0.0, "s2": 0.0},
-        lambda lens: _seen_by(fs.Camera.pinhole(24, 16, 20, 20, 12, 8, lens=lens)),
+        lambda lens: _render_camera(fs.Camera.pinhole(24, 16, 20, 20, 12, 8, lens=lens)),
     ),
     "Fisheye": lambda _: (
-        fs.Fisheye, {"k1": 0.1, "k4": 0.01}, lambda lens: _seen_by(fs.Camera.pinhole(24, 16, 20, 20, 12, 8, lens=lens))
+        fs.Fisheye, {"k1": 0.1, "k4": 0.01}, lambda lens: _render_camera(fs.Camera.pinhole(24, 16, 20, 20, 12, 8, lens=lens))
     ),
     "Trajectory": lambda _: (
         fs.Trajectory, {"times": [0.0, 1.0], "poses": np.stack([np.eye(4)] * 2), "smooth": True}, lambda path: path(0.5)

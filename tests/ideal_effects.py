@@ -70,7 +70,7 @@ _MARGIN = 8
 
 
 def _samples(placed: PlacedMarker, view: View) -> np.ndarray:
-    """What the samples of one pose see (h, w, 3)."""
+    """Values of the samples of one pose, (h, w, 3)."""
     y, x = np.mgrid[: view.height, : view.width] + 0.5
     light = np.empty((view.height, view.width, 3))
     light[:] = view.background

@@ -23,8 +23,8 @@ def pose(rotation: np.ndarray, translation) -> np.ndarray:
 
 
 def draw(bits, size, placed, camera, quiet=1, samples=4, ground=0.5) -> tuple[np.ndarray, np.ndarray]:
-    """A code of ``size`` metres at ``placed`` (4, 4) seen by ``camera``: (h, w) float in [0, 1], corners
-    (4, 2).
+    """Ideal image of a code of ``size`` metres at the pose ``placed`` (4, 4): (h, w) float in [0, 1], and
+    corners (4, 2).
 
     Each pixel is the mean of samples x samples points, as a camera's pixel averages over its area. An edge
     along the rows or columns therefore lies up to 1 / (2 samples) px beside where it should.

@@ -1,5 +1,5 @@
-"""Kernels that tests compile for processors are hardly optimised: that takes half the time and gives the same
-bits, which tests/compile/test_optimised.py holds. `pytest --optimised` compiles them as users do.
+"""Tests compile kernels for CPUs with little optimisation, in half the time and with the same bits
+(tests/compile/test_optimised.py). `pytest --optimised` compiles them as users do.
 
 A plugin of pytest, which conftest.py names.
 """
@@ -26,10 +26,10 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     if not config.getoption("--optimised") and not _has_gpu():
-        hardly()
+        compile_quickly()
 
 
-def hardly() -> None:
+def compile_quickly() -> None:
     """From now on this process compiles with hardly any optimisation."""
     os.environ.update(_OPENCL)
     if runtime.installed():
@@ -77,8 +77,8 @@ def _memoise_overloads() -> None:
 
 
 def _one_instance() -> None:
-    """Warp compiles a kernel twice: for any arrays, and for contiguous ones, where it is faster. The first
-    serves both and takes seven eighths of the time."""
+    """Warp compiles a kernel twice: for any arrays, and for contiguous arrays, where it is faster. The
+    first version serves both, and is compiled in seven eighths of the time."""
     codegen = importlib.import_module("warp._src.codegen")
     for name in ("cpu_linear_contiguous_specialization_candidate", "cpu_linear_tid_specialization_candidate"):
         if hasattr(codegen, name):
@@ -105,7 +105,8 @@ def as_users_compile() -> Iterator[None]:
 
 @pytest.fixture
 def optimised():
-    """For tests of large images, which take PoCL longer than to compile: within `as_users_compile`."""
+    """For tests of large images, which PoCL renders more slowly than it compiles: within
+    `as_users_compile`."""
     with as_users_compile():
         yield
 

@@ -1,4 +1,4 @@
-"""What the base's kernels take of an NVIDIA GPU: registers, spills, private and local memory.
+"""Resources of the base's kernels on an NVIDIA GPU: registers, spills, private and local memory.
 
     PYTHONPATH=. python tests/registers.py [--device opencl:nvidia] [--record]
 
@@ -40,7 +40,7 @@ def generation(backend: OpenCLBackend) -> str | None:
 
 
 def of_log(log: str) -> Numbers:
-    """What ptxas --verbose says of each kernel: registers; bytes of stack, spill_stores and spill_loads."""
+    """Figures of ptxas --verbose for each kernel: registers; bytes of stack, spill_stores and spill_loads."""
     names_and_texts = _ENTRY.split(log)[1:]
     numbers: Numbers = {}
     for name, text in zip(names_and_texts[::2], names_and_texts[1::2], strict=True):
@@ -54,7 +54,7 @@ def of_log(log: str) -> Numbers:
 
 
 def measure(backend: OpenCLBackend) -> Numbers:
-    """By kernel of the base: what the log says, and the private and local memory that OpenCL tells.
+    """By kernel of the base: figures of the log, and the private and local memory that OpenCL reports.
 
     Raises:
         DeviceError: the driver's log does not say.

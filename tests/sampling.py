@@ -1,4 +1,4 @@
-"""Sweeps of which plain pytest takes a sample, and `pytest -m exhaustive` the rest."""
+"""Sweeps, of which plain pytest runs a sample and `pytest -m exhaustive` the rest."""
 
 from collections.abc import Mapping, Sequence
 from itertools import product

@@ -27,18 +27,18 @@ def splats(seed, thick=False, sh_degree=None):
     return fs.SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, colors=cloud.colors)
 
 
-def made_store(folder, cloud, name):
+def build_small_store(folder, cloud, name):
     source = source_of(cloud, folder / name, "test")
     return fs.Store(fs.build_store([source], folder / f"{name}.fss", chunk=64))
 
 
-def made_stores(folder):
+def build_small_stores(folder):
     """Disks, 3D Gaussians, disks with SH, and a wall of many disks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(build_plan, "_MIN_MEMORY", 0)
         clouds = {"disks": splats(1), "thick": splats(2, thick=True), "sh": splats(3, sh_degree=2)}
         clouds["wall"] = random_splats(3 * COUNT, 5, depth=(3, 3.2), scale=(7e-3, 0.02), across=3.0)
-        return {name: made_store(folder, cloud, name) for name, cloud in clouds.items()}
+        return {name: build_small_store(folder, cloud, name) for name, cloud in clouds.items()}
 
 
 def look(fov=60.0, turn=(1.0, 0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0), aspect=1.0, **given):

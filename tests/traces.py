@@ -1,4 +1,4 @@
-"""What passes between the stages of a device."""
+"""Data between the stages of a device."""
 
 import numpy as np
 import pytest

@@ -51,8 +51,8 @@ def scene(views=4, held_out=1, size=(24, 18), count=16, renderer=None):
 
 
 def run_and_resumed(whole, renderer, settings, steps, folder):
-    """Bytes of the PLY of a trainer that has run, and of one that is stopped after so many steps and goes on
-    from its checkpoint."""
+    """Bytes of the PLY files of an uninterrupted training run, and of a run that is stopped after some
+    steps and resumes from its checkpoint."""
     checkpoint = folder / "run.training.npz"
     first = Trainer(whole.dataset, renderer, checkpoint=checkpoint, **settings)
     for _ in range(steps):

@@ -1,4 +1,4 @@
-"""A cloud of which nothing is known but what decides the features of its image."""
+"""A cloud without splats that has only the traits by which features are selected."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What tests of the viewer share: a scene, a client that is no browser."""
+"""Shared code of the tests of the viewer: a scene, and a client that is not a browser."""
 
 import threading
 from types import SimpleNamespace
@@ -16,7 +16,7 @@ def scene(**parts) -> fs.Scene:
 
 
 class Client(SimpleNamespace):
-    """What the server uses of viser's handle of a browser."""
+    """The part of viser's client handle that the server uses."""
 
     def __init__(self, number=1):
         sent: list = []

@@ -31,8 +31,8 @@ class CommandTable(Mapping[str, type]):
         """First docstring line of a command, read from its source without importing it."""
         module, _, kind = self._classes[name].partition(".")
         tree = ast.parse(Path(__file__).with_name(f"{module}.py").read_text("utf-8"))
-        found = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == kind)
-        return (ast.get_docstring(found) or "").partition("\n")[0]
+        definition = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == kind)
+        return (ast.get_docstring(definition) or "").partition("\n")[0]
 
 
 COMMANDS = CommandTable(

@@ -47,17 +47,17 @@ class Calibrate:
         file = new_file(str(folder / "calibrate.json"), self.overwrite)
         renderer = fs.Renderer(self.device)
         views = list(show_progress("views", rendered_views(settings, renderer), settings.views))
-        found = [one for one in views if one is not None]
-        if len(found) < 3:
+        detected = [one for one in views if one is not None]
+        if len(detected) < 3:
             raise FidsplatError(
-                f"the board was found in {len(found)} of {len(views)} views; use a larger size"
+                f"the board was found in {len(detected)} of {len(views)} views; use a larger size"
             )
-        rows = list(errors_by_count(settings, [one.view for one in found]))
-        corner = float(np.sqrt(np.mean(np.concatenate([one.errors for one in found]) ** 2)))
+        rows = list(errors_by_count(settings, [one.view for one in detected]))
+        corner = float(np.sqrt(np.mean(np.concatenate([one.errors for one in detected]) ** 2)))
         facts = {
             "settings": asdict(settings),
             "device": renderer.device.title,
-            "found": len(found),
+            "found": len(detected),
             "corner_rms_px": corner,
         }
         facts |= {"truth": parameters(settings.truth), "rows": rows, "needed": needed(rows)}
@@ -69,7 +69,7 @@ class Calibrate:
             for row in rows
         ]
         noise = f"corners: RMS error {corner:.3f} pixels in x and y"
-        few = facts["needed"] or f"more than {len(found)}"
+        few = facts["needed"] or f"more than {len(detected)}"
         return report(
             self.json,
             facts,
@@ -77,7 +77,7 @@ class Calibrate:
             noise,
             str(file),
             table=(
-                f"Median errors, {settings.lens}, {len(found)} views",
+                f"Median errors, {settings.lens}, {len(detected)} views",
                 ("views", "RMS [px]", *names),
                 table,
             ),

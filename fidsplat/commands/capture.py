@@ -46,9 +46,9 @@ class Capture:
         from fidsplat.photographs.steps import photographs_to_scene
 
         with delayed_progress() as progress:
-            made = photographs_to_scene(self.photos, self.out, self.settings, progress, self.overwrite)
-        facts = _facts(made)
-        return report(self.json, facts, *_words(made, facts, self.out, self.settings.lens))
+            captured = photographs_to_scene(self.photos, self.out, self.settings, progress, self.overwrite)
+        facts = _facts(captured)
+        return report(self.json, facts, *_words(captured, facts, self.out, self.settings.lens))
 
 
 def _facts(made: Captured) -> dict[str, Any]:
@@ -68,11 +68,11 @@ def _facts(made: Captured) -> dict[str, Any]:
     tags = {}
     for spec, pose in zip(adjusted.poses, made.tags, strict=True):
         views = sum(view.tag == spec for view in adjusted.used)
-        own = adjusted.scales.get(spec)
+        scale = adjusted.scales.get(spec)
         tags[spec] = {
             "views": views,
             "rejected": sum(view.tag == spec for view in adjusted.rejected),
-            "scale_alone": None if own is None else own[0] / adjusted.scale,
+            "scale_alone": None if scale is None else scale[0] / adjusted.scale,
             "pose": pose.pose,
         }
     return facts | {

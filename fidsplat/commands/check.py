@@ -90,14 +90,14 @@ class Check:
         from fidsplat.selftest.tables import digest_table
 
         expected = digests.read_table()
-        found: dict[int, digests.Digest] = {}
+        measured: dict[int, digests.Digest] = {}
         with delayed_progress() as progress:
             for seed in expected:
-                progress(digests.kind_of(seed).name, len(found) / len(expected))
-                found[seed] = digests.digest_of(renderer, seed)
+                progress(digests.kind_of(seed).name, len(measured) / len(expected))
+                measured[seed] = digests.digest_of(renderer, seed)
         differing = {
             seed: digest.differing(expected[seed])
-            for seed, digest in found.items()
+            for seed, digest in measured.items()
             if digest != expected[seed]
         }
         if self.json:
@@ -106,17 +106,19 @@ class Check:
                     "seed": seed,
                     "scenes": digests.kind_of(seed).name,
                     "differing": names,
-                    "outputs": found[seed].outputs,
+                    "outputs": measured[seed].outputs,
                     "stages": digests.stage_digests(renderer, seed),
                 }
                 for seed, names in differing.items()
             ]
-            sums = {seed: digest.sha256 for seed, digest in found.items()}
+            sums = {seed: digest.sha256 for seed, digest in measured.items()}
             name, passed = renderer.device.name, not differing
             print_json({"device": name, "passed": passed, "sha256": sums, "differing": details})
         else:
-            print_table(where, *digest_table(found, differing, renderer.device.title))
-            print_lines(where, f"{len(found) - len(differing)} of {len(found)} scenes are bit-identical")
+            print_table(where, *digest_table(measured, differing, renderer.device.title))
+            print_lines(
+                where, f"{len(measured) - len(differing)} of {len(measured)} scenes are bit-identical"
+            )
         return 1 if differing else 0
 
     def _fuzz(self, renderer: "Renderer", folder: Path, where: "Console") -> int:

@@ -104,8 +104,8 @@ class Convert:
         lines += [f"lost: {words}" if not words.startswith("rounds") else words for words in lost]
         if error := facts["error"]:
             psnr = "bit-identical" if math.isinf(error["psnr"]) else f"{error['psnr']:.1f} dB"
-            apart = f"image error: largest {error['largest']:.2g}, mean {error['mean']:.2g}"
-            lines.append(f"{apart}; {psnr}")
+            difference = f"image error: largest {error['largest']:.2g}, mean {error['mean']:.2g}"
+            lines.append(f"{difference}; {psnr}")
         return report(self.json, facts, *lines)
 
     def _mesh(self) -> int:
@@ -118,15 +118,15 @@ class Convert:
             scene = load_source(self.source, progress=progress)
             views = None if self.mesh.cameras is None else cameras_of(self.mesh.cameras, scene)
             renderer = fs.Renderer(self.device or scene.device)
-            made = fs.scene_mesh(scene, views, self.mesh.voxel, renderer, progress)
+            mesh = fs.scene_mesh(scene, views, self.mesh.voxel, renderer, progress)
         if self.mesh.faces is not None:
-            made = made.simplified(self.mesh.faces)
-        files = save_mesh(made, target, self.mesh.parts)
+            mesh = mesh.simplified(self.mesh.faces)
+        files = save_mesh(mesh, target, self.mesh.parts)
         facts: dict[str, Any] = {"source": self.source, "target": self.target, "format": "mesh"}
-        facts |= {"vertices": len(made.vertices), "faces": len(made.faces), "area_m2": made.area}
+        facts |= {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "area_m2": mesh.area}
         facts["files"] = [str(file) for file in files]
         more = f" and {len(files) - 1} convex parts" if len(files) > 1 else ""
-        return report(self.json, facts, f"{len(made.faces):,} triangles: {self.target}{more}")
+        return report(self.json, facts, f"{len(mesh.faces):,} triangles: {self.target}{more}")
 
     def _page(self) -> int:
         from fidsplat.scenes.sources import load_source

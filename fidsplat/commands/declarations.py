@@ -70,8 +70,8 @@ _UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "m
 
 def parse_bytes(option: str, text: str) -> int:
     """Parse a number of bytes with or without a unit."""
-    found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([a-z]*)\s*", text.lower())
-    size = int(float(found[1]) * _UNITS.get(found[2], 0)) if found else 0
+    match = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([a-z]*)\s*", text.lower())
+    size = int(float(match[1]) * _UNITS.get(match[2], 0)) if match else 0
     if size <= 0:
         raise InputError(
             f"{option} must be a number of bytes above 0, got {text!r}; write for example 500MB or 2GiB"
@@ -168,7 +168,7 @@ def _default_of(field: dataclasses.Field, parent: Any) -> Any:
 def _field_docstrings(kind: type) -> dict[str, str]:
     """Docstrings of a dataclass's fields, including inherited ones, as help texts: without a capital and a
     full stop."""
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for each in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(each):
             continue
@@ -176,9 +176,9 @@ def _field_docstrings(kind: type) -> dict[str, str]:
         assert isinstance(definition, ast.ClassDef)
         for field, text in zip(definition.body, definition.body[1:], strict=False):
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
-                found.pop(field.target.id, None)
+                texts.pop(field.target.id, None)
                 if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
                     words = " ".join(str(text.value.value).split()).removesuffix(".")
                     lower = words[1:2].islower() or (words[1:2] == " " and not words[2:3].isupper())
-                    found[field.target.id] = words[0].lower() + words[1:] if lower else words
-    return found
+                    texts[field.target.id] = words[0].lower() + words[1:] if lower else words
+    return texts

@@ -143,8 +143,8 @@ class Detect:
             readings, others = read_back(image, scene, families=families)
         except InputError as error:
             raise InputError(f"{name} and {self.scene}: {error}") from None
-        found = [reading.detection for reading in readings if reading.detection is not None]
-        facts["detections"] = [_describe(code) for code in (*found, *others)]
+        detections = [reading.detection for reading in readings if reading.detection is not None]
+        facts["detections"] = [_describe(code) for code in (*detections, *others)]
         facts["markers"] = [reading.as_dict() for reading in readings]
         facts["not_in_scene"] = [code.name for code in others]
         assert scene.camera is not None
@@ -178,18 +178,18 @@ _ERRORS = (("position_error_mm", 2), ("angle_error_deg", 3), ("corner_error_px",
 
 def reading_row(reading: "Reading") -> tuple[str, ...]:
     facts = reading.as_dict()
-    found, share = "yes" if facts["found"] else "no", facts["visible"]
+    verdict, share = "yes" if facts["found"] else "no", facts["visible"]
     if share == 0 and not facts["found"]:
-        found = "faces away" if reading.tilt > math.pi / 2 else "not in view"
+        verdict = "faces away" if reading.tilt > math.pi / 2 else "not in view"
     elif share <= 0.995:
-        found += f", {100 * share:.0f} % in view"
-    return (facts["marker"], found, f"{facts['distance_m']:.3f}", *_errors(facts))
+        verdict += f", {100 * share:.0f} % in view"
+    return (facts["marker"], verdict, f"{facts['distance_m']:.3f}", *_errors(facts))
 
 
 def _bundle_row(reading: "BundleReading") -> tuple[str, ...]:
     facts = reading.as_dict() | {"corner_error_px": None}
-    found = f"{facts['found']} of {facts['markers']}"
-    return (f"bundle {facts['bundle']}", found, f"{facts['distance_m']:.3f}", *_errors(facts))
+    count = f"{facts['found']} of {facts['markers']}"
+    return (f"bundle {facts['bundle']}", count, f"{facts['distance_m']:.3f}", *_errors(facts))
 
 
 def _errors(facts: dict[str, Any]) -> tuple[str, ...]:

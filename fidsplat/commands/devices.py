@@ -30,9 +30,9 @@ class Devices:
     def run(self) -> int:
         import fidsplat as fs
 
-        found = fs.devices()
-        table = "Devices", ("device", "description", "memory", "usable"), map(_row, found)
-        return report(self.json, {"devices": [asdict(info) for info in found]}, table=table)
+        devices = fs.devices()
+        table = "Devices", ("device", "description", "memory", "usable"), map(_row, devices)
+        return report(self.json, {"devices": [asdict(info) for info in devices]}, table=table)
 
 
 def _row(info: DeviceInfo) -> tuple[str, ...]:

@@ -97,9 +97,11 @@ class Plants:
 
         environment = self.environment or default_environment()
         with delayed_progress() as progress:
-            made = list(plants.write_plants(self.plants, Path(self.out), environment, self.device, progress))
-        facts = {"plants": [{"file": str(file), "psnr": score} for file, score in made]}
-        rows = [(str(file), "" if score is None else f"{score:.1f}") for file, score in made]
+            written = list(
+                plants.write_plants(self.plants, Path(self.out), environment, self.device, progress)
+            )
+        facts = {"plants": [{"file": str(file), "psnr": score} for file, score in written]}
+        rows = [(str(file), "" if score is None else f"{score:.1f}") for file, score in written]
         return report(self.json, facts, table=("plants", ("file", "PSNR of test views [dB]"), rows))
 
 

@@ -83,14 +83,14 @@ class Localise:
             for record in sweep.run():
                 done += 1
                 step(record.key["variant"], 0.0)
-        found, device = found_of(sweep.results), renderer.device.title
-        page = write_report(folder, drive, device, found)
+        results, device = found_of(sweep.results), renderer.device.title
+        page = write_report(folder, drive, device, results)
         self._record(drive, renderer, None if has_log else source)
-        rows, length = table_of(found), found[names[0]]["length_m"]
+        rows, length = table_of(results), results[names[0]]["length_m"]
         rows = rows.iloc[:, :7]  # the width of a terminal; the page has all columns
         return report(
             self.json,
-            {"run": sweep.results.run, "variants": found},
+            {"run": sweep.results.run, "variants": results},
             *(name for name in (str(page), self.log, self.video) if name is not None),
             table=(f"{length:.1f} m", rows.columns, rows.itertuples(index=False)),
         )

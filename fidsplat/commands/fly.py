@@ -236,11 +236,11 @@ def _load_images(folder: FlightFolder, k: int) -> dict[str, np.ndarray]:
     from fidsplat.images.files import read_image
     from fidsplat.render.output_files import load_output, suffixes_of
 
-    found, camera = {}, folder.flight.capture.camera
+    images, camera = {}, folder.flight.capture.camera
     assert camera is not None
     for name in folder.flight.capture.outputs:
         if ".npy" in suffixes_of(name):
-            found[name] = load_output(folder.file(k, name, ".npy"), (camera.height, camera.width))
+            images[name] = load_output(folder.file(k, name, ".npy"), (camera.height, camera.width))
         elif name == "rgb":
-            found[name] = read_image(folder.file(k, name, ".png"))
-    return found
+            images[name] = read_image(folder.file(k, name, ".png"))
+    return images

@@ -37,16 +37,16 @@ class Greenhouse:
 
         stock = None if self.plants_from is None else load_plants(self.plants_from)
         settings = self.layout
-        made = World(**vars(settings), stock=stock)
+        world = World(**vars(settings), stock=stock)
         folder = path_of(self.out)
         scene_file, model = folder / "greenhouse.toml", folder / "greenhouse.xml"
         refuse_existing(scene_file, self.overwrite)
-        scene = made.scene
+        scene = world.scene
         writable_folder(folder)
-        write_file(model, made.mjcf())
+        write_file(model, world.mjcf())
         scene.save(scene_file)  # written last, since the scene file marks a complete greenhouse
-        plants, splats, markers = settings.rows * settings.plants, len(scene.cloud()), len(made.markers)
+        plants, splats, markers = settings.rows * settings.plants, len(scene.cloud()), len(world.markers)
         facts = {"scene": str(scene_file), "model": str(model), "splats": splats, "markers": markers}
-        facts |= {"rows": settings.rows, "plants": plants, "length_m": made.length}
+        facts |= {"rows": settings.rows, "plants": plants, "length_m": world.length}
         words = f"{plants} plants in {settings.rows} rows, {splats} splats, {markers} markers"
         return report(self.json, facts, words, f"render it: fidsplat render {scene_file}")

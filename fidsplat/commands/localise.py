@@ -82,7 +82,7 @@ class Localise:
         for path in self.images:
             for name, image in read_images(path):
                 try:
-                    found = fs.localise(
+                    localised = fs.localise(
                         image,
                         scene,
                         None if start is None else camera.with_pose(camera_to_world=(start[:3], start[3:])),
@@ -96,8 +96,8 @@ class Localise:
                     continue
                 except InputError as error:
                     raise InputError(f"{name} and {self.scene}: {error}") from None
-                results[name] = found
-                previous = [found.camera] if found.found else []
+                results[name] = localised
+                previous = [localised.camera] if localised.found else []
         if missing and not any(results.values()):
             raise InputError(f"{', '.join(results)} and {self.scene}: {missing}")
         files = [] if self.out is None else [_write(self.out, results, camera)]
@@ -132,9 +132,9 @@ def _write(out: str, results: dict[str, Localisation | None], camera: Camera) ->
     from fidsplat.cameras import Trajectory
     from fidsplat.formats import save_trajectory
 
-    found = {name: one.camera.camera_to_world for name, one in results.items() if one and one.found}
-    if not found:
+    poses = {name: one.camera.camera_to_world for name, one in results.items() if one and one.found}
+    if not poses:
         raise InputError(f"a pose must be found to write {out}, got none of {len(results)} images")
-    trajectory = Trajectory(np.arange(len(found)), np.array(list(found.values())))
-    save_trajectory(trajectory, out, camera, list(found))
+    trajectory = Trajectory(np.arange(len(poses)), np.array(list(poses.values())))
+    save_trajectory(trajectory, out, camera, list(poses))
     return out

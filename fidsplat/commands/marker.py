@@ -174,58 +174,60 @@ class Marker:
         if refined and self.quality is None:
             quality = fs.MarkerQuality(template=LADDER)
         with delayed_progress() as progress:
-            made = fs.marker(
+            marker = fs.marker(
                 self.spec, self.size, mixture, quality=quality, progress=progress, **limit, **changed
             )
             if refined:
-                made = self._refine(made, progress)
+                marker = self._refine(marker, progress)
         if file is not None:
-            fs.save_ply(made.gaussians, file, native_2dgs=self.native_2dgs)
-        written = "fitted" if made.mixture == "exact" else made.mixture
-        dark = int(made.is_dark.sum())
+            fs.save_ply(marker.gaussians, file, native_2dgs=self.native_2dgs)
+        written = "fitted" if marker.mixture == "exact" else marker.mixture
+        dark = int(marker.is_dark.sum())
         facts: dict[str, Any] = {
-            "spec": made.spec,
-            "kind": made.kind,
-            "family": made.family,
-            "id": made.id,
-            "payload": made.payload,
-            "shape": list(made.bits.shape),
-            "quiet_zone": made.quiet_zone,
-            "components": made.components,
-            "rectangles": {"dark": dark, "light": len(made.boxes) - dark},
-            "splats": len(made.cloud),
-            "seconds": made.seconds,
-            "mixture": made.mixture,
-            "written": None if file is None else {"mixture": written, "splats": len(made.gaussians)},
-            "surface": None if made.shape is None else {"kind": made.shape.kind} | changes_of(made.shape),
-            "wear": None if made.wear is None else changes_of(made.wear),
-            "size_m": made.size,
-            "module_m": made.module,
+            "spec": marker.spec,
+            "kind": marker.kind,
+            "family": marker.family,
+            "id": marker.id,
+            "payload": marker.payload,
+            "shape": list(marker.bits.shape),
+            "quiet_zone": marker.quiet_zone,
+            "components": marker.components,
+            "rectangles": {"dark": dark, "light": len(marker.boxes) - dark},
+            "splats": len(marker.cloud),
+            "seconds": marker.seconds,
+            "mixture": marker.mixture,
+            "written": None if file is None else {"mixture": written, "splats": len(marker.gaussians)},
+            "surface": None
+            if marker.shape is None
+            else {"kind": marker.shape.kind} | changes_of(marker.shape),
+            "wear": None if marker.wear is None else changes_of(marker.wear),
+            "size_m": marker.size,
+            "module_m": marker.module,
             "file": str(file) if file else None,
         }
         rows = [
-            ("modules", f"{made.bits.shape[0]} x {made.bits.shape[1]}, quiet zone {made.quiet_zone}"),
-            ("size", f"{made.size:g} m, a module {made.module * 1e3:.4g} mm"),
-            ("components", made.components),
-            ("rectangles", f"{dark} dark, {len(made.boxes) - dark} light"),
-            ("splats", f"{len(made.cloud)} ({made.mixture})"),
+            ("modules", f"{marker.bits.shape[0]} x {marker.bits.shape[1]}, quiet zone {marker.quiet_zone}"),
+            ("size", f"{marker.size:g} m, a module {marker.module * 1e3:.4g} mm"),
+            ("components", marker.components),
+            ("rectangles", f"{dark} dark, {len(marker.boxes) - dark} light"),
+            ("splats", f"{len(marker.cloud)} ({marker.mixture})"),
             *((name, text) for name, text in changed.items() if text is not None),
-            ("seconds", f"{made.seconds:.3f}"),
+            ("seconds", f"{marker.seconds:.3f}"),
         ]
         if file is not None:
             rows.append(("written", file))
-        if file is not None and made.mixture == "exact":
-            rows.append(("", f"as {len(made.gaussians)} Gaussians (fitted), as a PLY file has no boxes"))
-        if file is not None and made.mixture == "facets":
+        if file is not None and marker.mixture == "exact":
+            rows.append(("", f"as {len(marker.gaussians)} Gaussians (fitted), as a PLY file has no boxes"))
+        if file is not None and marker.mixture == "facets":
             rows.append(("", "for --quality order=pixel; sorted by their centres they occlude each other"))
         lines = []
         if placing:
-            facts["placed"], block = self.placing.placed(made, self.device)
+            facts["placed"], block = self.placing.placed(marker, self.device)
             share, roughness = 100 * facts["placed"]["inlier_share"], 1e3 * facts["placed"]["roughness_m"]
             rows.append(("surface", f"{share:.0f} % of the patch in one plane, {roughness:.2g} mm RMS"))
             appended = f"appended to {self.placing.scene}"
             lines = [appended if self.placing.append else f"\n{block.rstrip()}"]
-        return report(self.json, facts, *lines, table=(made.spec, ("", ""), rows))
+        return report(self.json, facts, *lines, table=(marker.spec, ("", ""), rows))
 
     def _refine(self, made: fs.Marker, progress: Callable[[str, float], None]) -> fs.Marker:
         """The marker with Gaussians that are optimised on a device."""

@@ -148,11 +148,11 @@ def _plain(value: Any) -> Any:
 
 def run_sweeps(sweeps: Iterable[Sweep]) -> list[Record]:
     """Measure the missing points of the sweeps, one sweep after the other; returns their records."""
-    found = []
+    records = []
     for sweep in sweeps:
         total, left = len(sweep.points), len(sweep.left)
-        found += show_progress(sweep.name, sweep.run(), total, total - left, lambda r: point_label(r.key))
-    return found
+        records += show_progress(sweep.name, sweep.run(), total, total - left, lambda r: point_label(r.key))
+    return records
 
 
 def point_label(key: Key) -> str:

@@ -64,10 +64,10 @@ class Scan:
             scene = load_source(self.source, None, progress, self.pose)
         with console(self.json).status("scanning"):
             renderer = fs.Renderer(self.device or scene.device)
-            found = fs.scan(scene, lidar, renderer=renderer, label=self.labels)
-        found.save(self.out, self.frame)
-        hit = found.range > 0
-        ranges = found.range[hit]
+            scan = fs.scan(scene, lidar, renderer=renderer, label=self.labels)
+        scan.save(self.out, self.frame)
+        hit = scan.range > 0
+        ranges = scan.range[hit]
         facts = {
             "lidar": self.lidar.lower(),
             "beams": hit.shape[1],

@@ -102,8 +102,8 @@ def load_user_scenes(
             "--cameras must be given together with --scene FILE, got no --scene; add it, or omit --cameras"
         )
     path = None if cameras is None else load_trajectory(cameras)
-    found: dict[str, BenchScene] = {}
+    scenes: dict[str, BenchScene] = {}
     for name in files:
         with delayed_progress() as progress:
-            found |= own_scenes(name, load_source(name, None, progress), path, most_views or MOST_VIEWS)
-    return found
+            scenes |= own_scenes(name, load_source(name, None, progress), path, most_views or MOST_VIEWS)
+    return scenes

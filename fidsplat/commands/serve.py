@@ -195,12 +195,14 @@ class _Driver:
         self._place(self._base @ exponential(self._twist * max(0.0, min(time, self._until) - self._time)))
         self._time = time
         for stamped in self._log.received("/pose", "geometry_msgs/msg/PoseStamped"):
-            at, turn = stamped.pose.position, stamped.pose.orientation
+            at, rotation = stamped.pose.position, stamped.pose.orientation
             frames = {self._log.world: np.eye(4), SCENE: self._log.world_from_scene, "base_link": self._base}
             # a wrong frame or an invalid pose from another program must not end the server
             with suppress(InputError, KeyError):
                 frame = frames[stamped.header.frame_id or self._log.world]
-                self._place(frame @ rigid_matrix((at.x, at.y, at.z), (turn.w, turn.x, turn.y, turn.z)))
+                self._place(
+                    frame @ rigid_matrix((at.x, at.y, at.z), (rotation.w, rotation.x, rotation.y, rotation.z))
+                )
         for twist in self._log.received("/cmd_vel", "geometry_msgs/msg/Twist"):
             parts = [getattr(part, axis) for part in (twist.angular, twist.linear) for axis in "xyz"]
             self._twist, self._until = np.array(parts), time + TIMEOUT

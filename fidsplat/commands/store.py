@@ -181,11 +181,11 @@ class Measure:
         from fidsplat.accuracy.detail_errors import measure_detail
 
         with delayed_progress() as progress:
-            made = measure_detail(fs.Store(self.store), fs.Renderer(self.device), self.settings, progress)
+            measured = measure_detail(fs.Store(self.store), fs.Renderer(self.device), self.settings, progress)
         if self.json:
-            print_json({"store": self.store, "details": [vars(one) for one in made]})
+            print_json({"store": self.store, "details": [vars(one) for one in measured]})
             return 0
-        for one in made:
+        for one in measured:
             rows = (
                 (f"{size:.3f}", "not measured" if error is None else f"{error:.4f}")
                 for size, error in zip(one.sizes, one.errors, strict=True)

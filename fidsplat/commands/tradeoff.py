@@ -68,13 +68,15 @@ class Tradeoff:
             check_plot(self.plot, "pandas")
         folder = Path(self.out or DEFAULT_FOLDER + ("-quick" if self.measurement.quick else ""))
         devices = tuple(dict.fromkeys(self.device)) or (default_device(),)
-        most = QUICK_VIEWS if self.measurement.quick else None
-        own = user_views(load_user_scenes(self.scene, self.cameras, self.measurement.scenes or (), most))
+        max_views = QUICK_VIEWS if self.measurement.quick else None
+        views = user_views(
+            load_user_scenes(self.scene, self.cameras, self.measurement.scenes or (), max_views)
+        )
         folders = [folder / name.replace(":", "-") for name in devices] if len(devices) > 1 else [folder]
         with ExitStack() as stack:
             # open all devices first, so that a missing device is reported before others are measured
             sweeps = [
-                stack.enter_context(prepared(self.measurement, out, device, own))
+                stack.enter_context(prepared(self.measurement, out, device, views))
                 for out, device in zip(folders, devices, strict=True)
             ]
             for sweep in sweeps:
@@ -119,11 +121,11 @@ def _print_estimate(sweep: Sweep) -> None:
 def _print_results(sweeps: Sequence[Sweep], as_json: bool) -> None:
     """Print each setting's time relative to the baseline and largest error, for each device."""
     for sweep in sweeps:
-        found: dict[tuple[str, str], list[dict[str, Any]]] = {}
+        by_scene: dict[tuple[str, str], list[dict[str, Any]]] = {}
         for record in sweep.records:
             if not record.failed:
-                found.setdefault((record.key["knob"], record.key["value"]), []).append(record.result)
-        if found:
+                by_scene.setdefault((record.key["knob"], record.key["value"]), []).append(record.result)
+        if by_scene:
             rows = [
                 (
                     *names,
@@ -131,7 +133,7 @@ def _print_results(sweeps: Sequence[Sweep], as_json: bool) -> None:
                     f"{statistics.median(result['ratio'] for result in results):.2f}",
                     f"{max(result['maximum'] for result in results):.2g}",
                 )
-                for names, results in found.items()
+                for names, results in by_scene.items()
             ]
             title = f"{sweep.name}: {len(sweep.records)} of {len(sweep.points)} points"
             heads = ("setting", "value", "views", "time / baseline", "largest error")

@@ -134,11 +134,11 @@ def find_checkpoint(source: Path) -> Path | None:
     """
     if source.name.endswith(CHECKPOINT):
         return source
-    found = sorted(source.glob(f"*{CHECKPOINT}")) if source.is_dir() else []
-    if len(found) > 1:
-        names = ", ".join(file.name for file in found)
+    files = sorted(source.glob(f"*{CHECKPOINT}")) if source.is_dir() else []
+    if len(files) > 1:
+        names = ", ".join(file.name for file in files)
         raise InputError(f"{source} must hold one training run, got several; name one of {names} there")
-    return found[0] if found else None
+    return files[0] if files else None
 
 
 def flight_source(folder: Path) -> tuple[str, str]:
@@ -193,7 +193,7 @@ class Training:
 
     def _stamp(self) -> tuple[int, int] | None:
         try:
-            found = self.file.stat()
+            status = self.file.stat()
         except OSError:
             return None
-        return found.st_mtime_ns, found.st_size
+        return status.st_mtime_ns, status.st_size

@@ -24,7 +24,7 @@ QUICK_TILTS = "0:60:20,64:88:2"
 
 def parse_tilts(text: str) -> list[float]:
     """Ascending degrees for "first:last:step[,first:last:step...]". Raises InputError for another format."""
-    found: set[float] = set()
+    tilts: set[float] = set()
     for span in text.split(","):
         try:
             first, last, step = (float(number) for number in span.split(":"))
@@ -36,8 +36,8 @@ def parse_tilts(text: str) -> list[float]:
                 f"e.g. {FULL_TILTS}, got {text!r}"
             ) from None
         count = math.floor((last - first) / step + 1e-6) + 1
-        found |= {round(first + i * step, 6) for i in range(count)}
-    return sorted(found)
+        tilts |= {round(first + i * step, 6) for i in range(count)}
+    return sorted(tilts)
 
 
 def measure_angles(point: dict, markers: MarkerRenderer, seed: int, pool: Executor, workers: int) -> dict:
@@ -48,16 +48,16 @@ def measure_angles(point: dict, markers: MarkerRenderer, seed: int, pool: Execut
     """
     category, protocol = CATEGORIES[point["category"]], PROTOCOLS[point["protocol"]]
     spec = category.spec(point["index"], seed)
-    made = marker(spec)
-    module = protocol.module(made.grid.shape[0])
+    printed = marker(spec)
+    module = protocol.module(printed.grid.shape[0])
     render = markers.prepare(point["method"], f"{category.name}-{point['index']}", spec, module)
     names = readers(category.kind)
-    outline = made.corners / made.module * module
+    outline = printed.corners / printed.module * module
     in_pool = point["method"] == IDEAL  # threads cannot share a renderer
 
     def detect(image: np.ndarray, camera: Camera) -> list[Attempt]:
         corners = camera.project(outline)
-        target = Target(category.kind, made.family or "", made.id, made.payload, corners)
+        target = Target(category.kind, printed.family or "", printed.id, printed.payload, corners)
         grey = to_uint8(image)
         return [attempt(name, grey, target) for name in names]
 
@@ -69,7 +69,7 @@ def measure_angles(point: dict, markers: MarkerRenderer, seed: int, pool: Execut
 
     attempts = interrupts.ordered_results(map(submitted, parse_tilts(point["tilts"])), 2 * workers)
     return {
-        "spec": spec if category.kind == "apriltag" else made.family,
+        "spec": spec if category.kind == "apriltag" else printed.family,
         "readers": {
             name: {key: "".join("01"[getattr(one, key)] for one in by_tilt) for key in ("found", "read")}
             for name, by_tilt in zip(names, zip(*attempts, strict=True), strict=True)

@@ -82,15 +82,18 @@ def install(environment: Path, progress: Callable[[str], None] = lambda text: No
     if python is None:
         raise InputError(f"python3.11 must be on the path for {BPY}, got none; install Python 3.11")
     writable_folder(environment.parent)
-    own = environment_python(environment)
+    interpreter = environment_python(environment)
     for text, command in (
         (f"making the environment {environment}", [python, "-m", "venv", "--clear", str(environment)]),
-        (f"installing {BPY}, about 400 MB", [str(own), "-m", "pip", "install", "--quiet", BPY, "numpy<2"]),
-        ("first start", [str(own), "-c", "import bpy"]),
+        (
+            f"installing {BPY}, about 400 MB",
+            [str(interpreter), "-m", "pip", "install", "--quiet", BPY, "numpy<2"],
+        ),
+        ("first start", [str(interpreter), "-c", "import bpy"]),
     ):
         progress(text)
         _call(command)
-    return own
+    return interpreter
 
 
 def environment_python(environment: Path) -> Path:

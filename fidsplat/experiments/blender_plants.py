@@ -43,16 +43,16 @@ def build(one: dict):
     painted = mesh.color_attributes.new("surface", "FLOAT_COLOR", "POINT")
     painted.data.foreach_set("color", np.column_stack([linear, np.ones(len(linear))]).ravel())
     mesh.materials.append(material())
-    made = bpy.data.objects.new(one["name"], mesh)
-    bpy.context.scene.collection.objects.link(made)
-    return made
+    plant = bpy.data.objects.new(one["name"], mesh)
+    bpy.context.scene.collection.objects.link(plant)
+    return plant
 
 
 def material():
     """Make a translucent material with the vertex colours."""
-    made = bpy.data.materials.new("leaf")
-    made.use_nodes = True
-    tree = made.node_tree
+    leaf = bpy.data.materials.new("leaf")
+    leaf.use_nodes = True
+    tree = leaf.node_tree
     tree.nodes.clear()
     colour = tree.nodes.new("ShaderNodeVertexColor")
     colour.layer_name = "surface"
@@ -63,7 +63,7 @@ def material():
         tree.links.new(colour.outputs["Color"], shader.inputs["Color"])
         tree.links.new(shader.outputs[0], mixed.inputs[place])
     tree.links.new(mixed.outputs[0], output.inputs["Surface"])
-    return made
+    return leaf
 
 
 if __name__ == "__main__":

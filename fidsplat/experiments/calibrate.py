@@ -137,12 +137,12 @@ def errors_by_count(settings: CalibrationSettings, views: list[BoardView]) -> It
         for _ in range(1 if count == len(views) else DRAWS):
             chosen = rng.choice(len(views), count, replace=False)
             try:
-                found = calibrate([views[k] for k in chosen], settings.truth)
+                calibrated = calibrate([views[k] for k in chosen], settings.truth)
             except InputError:  # OpenCV fails for some subsets of few views
                 projection.append(math.inf)
                 continue
-            projection.append(float(np.sqrt((projection_errors(found, settings.truth) ** 2).mean())))
-            each.append([abs(value - true[name]) for name, value in parameters(found).items()])
+            projection.append(float(np.sqrt((projection_errors(calibrated, settings.truth) ** 2).mean())))
+            each.append([abs(value - true[name]) for name, value in parameters(calibrated).items()])
         # the median without interpolation, since failures are infinite
         low, middle, high = np.percentile(projection, (25, 50, 75), method="nearest").tolist()
         errors = np.median(each, axis=0).tolist() if each else [math.inf] * len(true)
@@ -157,12 +157,12 @@ def errors_by_count(settings: CalibrationSettings, views: list[BoardView]) -> It
 def needed(rows: list[dict[str, Any]]) -> int | None:
     """The smallest number of views from which on three of four calibrations are within `TARGET`; None if
     there is none."""
-    found = None
+    count = None
     for row in reversed(rows):
         if row["quartiles_px"][1] > TARGET:
             break
-        found = row["views"]
-    return found
+        count = row["views"]
+    return count
 
 
 def write_chart(rows: list[dict[str, Any]], file: Path) -> None:

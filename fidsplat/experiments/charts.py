@@ -107,10 +107,10 @@ def label_points(figure: Figure, axes: Axes, points: Sequence[tuple[float, float
     figure.canvas.draw()
     inside = axes.get_window_extent()
     dots = [axes.transData.transform((x, y)) for x, y, _ in points]
-    taken = [Bbox.from_bounds(x - 5, y - 5, 10, 10) for x, y in dots]
-    taken += [text.get_window_extent() for text in axes.texts]
+    occupied = [Bbox.from_bounds(x - 5, y - 5, 10, 10) for x, y in dots]
+    occupied += [text.get_window_extent() for text in axes.texts]
     across = [line for line in axes.lines if line.get_transform() == axes.get_yaxis_transform(which="grid")]
-    taken += [line.get_window_extent() for line in across]
+    occupied += [line.get_window_extent() for line in across]
     for x, y, name in points:
         for far, (right, up) in product((9, 18, 30, 44, 60, 80), _DIRECTIONS):
             label = axes.annotate(
@@ -126,8 +126,8 @@ def label_points(figure: Figure, axes: Axes, points: Sequence[tuple[float, float
             label.set_in_layout(False)
             label.update_positions(figure.canvas.get_renderer())  # type: ignore[attr-defined]
             box = Text.get_window_extent(label).padded(2)  # the text without the line to its point
-            if _contains(inside, box) and not any(box.overlaps(other) for other in taken):
-                taken.append(box)
+            if _contains(inside, box) and not any(box.overlaps(other) for other in occupied):
+                occupied.append(box)
                 break
             label.remove()
 

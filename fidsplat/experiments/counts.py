@@ -33,9 +33,9 @@ def measure_counts(point: dict, seed: int) -> dict:
     result["components"] = {"dark": int(first.sum()), "light": int(plain.components - first.sum())}
     result["gaussians"], result["seconds"] = {}, {}
     for mixture in mixtures():
-        made = [marker(spec, mixture=mixture) for _ in range(1 + point["repeats"])]
-        result["seconds"][mixture] = [one.seconds for one in made[1:]]
-        result["gaussians"][mixture] = {"rectangles": len(made[0].cloud)} | {
+        repeats = [marker(spec, mixture=mixture) for _ in range(1 + point["repeats"])]
+        result["seconds"][mixture] = [one.seconds for one in repeats[1:]]
+        result["gaussians"][mixture] = {"rectangles": len(repeats[0].cloud)} | {
             name: count
             for name in ("cells", "runs")
             if (count := _gaussians(mixture, boxes[name])) is not None

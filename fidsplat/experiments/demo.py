@@ -286,9 +286,9 @@ def captured_views(name: str) -> dict[str, Camera]:
     """Cameras on an arc in front of a captured scene, slightly above it."""
     layout, views = _LAYOUTS[name], {}
     for degrees in _ANGLES:
-        turn = math.radians(degrees)
-        away = layout.distance * np.array([math.sin(turn), -0.12, -math.cos(turn)])
-        position = np.array(layout.target) + away
+        azimuth = math.radians(degrees)
+        offset = layout.distance * np.array([math.sin(azimuth), -0.12, -math.cos(azimuth)])
+        position = np.array(layout.target) + offset
         views[f"{degrees:+.0f} degrees"] = Camera.look_at(_WIDTH, _HEIGHT, _FOV_X, position, layout.target)
     return views
 

@@ -67,7 +67,7 @@ def camera_at(distance: float, tilt: float, seed: str) -> Camera:
     a, b = math.radians(tilt), generator.uniform(0, 2 * math.pi)
     direction = np.array([math.sin(a) * math.cos(b), math.sin(a) * math.sin(b), -math.cos(a)])
     roll = math.radians(generator.uniform(-20, 20))
-    reach = distance * math.tan(math.radians(3.0))
-    aim = [generator.uniform(-reach, reach), generator.uniform(-reach, reach), 0.0]
+    max_offset = distance * math.tan(math.radians(3.0))
+    aim = [generator.uniform(-max_offset, max_offset), generator.uniform(-max_offset, max_offset), 0.0]
     up = (math.sin(roll), -math.cos(roll), 0.0)
     return Camera.look_at(WIDTH, HEIGHT, math.radians(FOV), distance * direction, aim, up)

@@ -249,8 +249,8 @@ class Drive:
         for k in range(1, len(run.times)):
             seconds = float(run.times[k] - run.times[k - 1])
             wheels = np.full(2, speed * seconds) if without == "wheels" else run.wheels[k]
-            turned = float(wheels[1] - wheels[0]) / robot.TRACK / seconds
-            localiser.move(wheels, turned if without == "gyroscope" else float(run.gyro[k]), seconds)
+            rate = float(wheels[1] - wheels[0]) / robot.TRACK / seconds
+            localiser.move(wheels, rate if without == "gyroscope" else float(run.gyro[k]), seconds)
             for code, tag in by_pose.get(k, []):
                 pose = marker_pose(code.corners, tag.marker.size, camera)
                 if np.linalg.norm(pose[:3, 3]) <= variant.reach and code.id in tags:

@@ -54,9 +54,9 @@ def method_names(chosen: tuple[str, ...] = (), trained: Path | None = None) -> t
     for name in chosen:
         if name not in known:
             raise InputError(unknown("mixture", name, known))
-    own = [f"{m}/{f}" for m in known if (m in chosen if chosen else m != "facets") for f in FILTERS]
+    names = [f"{m}/{f}" for m in known if (m in chosen if chosen else m != "facets") for f in FILTERS]
     models = [] if trained is None else [f"2dgs-{n}" for n in COLLECTIONS if (trained / f"2dgs-{n}").is_dir()]
-    return (IDEAL, *own, *models)
+    return (IDEAL, *names, *models)
 
 
 def with_linear_light(methods: Iterable[str]) -> list[str]:

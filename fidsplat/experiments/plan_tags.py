@@ -161,40 +161,45 @@ def plan_tags(
     survey = Survey(scene, path, settings, renderer, progress)
     poses = survey.candidate_poses()
     tag = survey.tag
-    seen = survey.sightings([PlacedMarker(tag, pose) for pose in poses])
-    visible = [k for k, one in enumerate(seen) if len(one.poses)]
+    candidates = survey.sightings([PlacedMarker(tag, pose) for pose in poses])
+    visible = [k for k, one in enumerate(candidates) if len(one.poses)]
     if not visible:
         raise InputError(
             "the trajectory must have a flat surface of a tag's size in view below 70 degrees, got none; "
             + survey.remedy(poses)
         )
-    seen, poses = [seen[k] for k in visible], poses[visible]
+    candidates, poses = [candidates[k] for k in visible], poses[visible]
     conflicts = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2) < 2.2 * tag.radius
     np.fill_diagonal(conflicts, False)
     covariance, target = survey.covariance, settings.target or 0.0
     objective = OBJECTIVES[settings.objective]
     survey.report("selecting", 0.8)
     selection = greedy(
-        covariance, seen, settings.count, conflicts, lambda now: position_error(now) <= target, objective
+        covariance,
+        candidates,
+        settings.count,
+        conflicts,
+        lambda now: position_error(now) <= target,
+        objective,
     )
     if settings.target is None:
-        selection = local_search(covariance, seen, selection, conflicts, objective)
+        selection = local_search(covariance, candidates, selection, conflicts, objective)
     errors = [position_error(covariance)]
     for k in selection.chosen:
-        covariance = updated(covariance, seen[k])
+        covariance = updated(covariance, candidates[k])
         errors.append(position_error(covariance))
-    made = tuple(
+    planned = tuple(
         PlacedMarker(marker(f"apriltag:{settings.family}:{ids[number]}", settings.size), poses[k])
         for number, k in enumerate(selection.chosen)
     )
     survey.report("selecting", 1.0)
     return Plan(
-        replace(scene, markers=(*scene.markers, *made)),
-        made,
-        tuple(len(seen[k].poses) for k in selection.chosen),
+        replace(scene, markers=(*scene.markers, *planned)),
+        planned,
+        tuple(len(candidates[k].poses) for k in selection.chosen),
         tuple(errors),
         selection,
-        len(seen),
+        len(candidates),
         survey.path,
     )
 
@@ -230,16 +235,18 @@ class Survey:
 
     def candidate_poses(self) -> np.ndarray:
         """Poses (n, 4, 4) of tags on flat surfaces, except at the scene's markers."""
-        settings, found = self._settings, []
+        settings, candidates = self._settings, []
         every = range(0, len(self.cameras), max(1, -(-len(self.cameras) // settings.views)))
         for n, k in enumerate(every):
-            seen = surface_candidates(self._depths[k], _smaller(self.cameras[k]), self.tag, self.up)
-            found += [one for one in seen if not settings.walls or abs(one[0].normal @ self.up) < STEEP]
+            surfaces = surface_candidates(self._depths[k], _smaller(self.cameras[k]), self.tag, self.up)
+            candidates += [
+                one for one in surfaces if not settings.walls or abs(one[0].normal @ self.up) < STEEP
+            ]
             self.report("searching surfaces", 0.3 + 0.4 * (n + 1) / len(every))
-        poses = spread_out(found, self.tag)
+        poses = spread_out(candidates, self.tag)
         for one in self._scene.markers:  # markers are flat surfaces too
-            apart = np.linalg.norm(poses[:, :3, 3] - one.pose[:3, 3], axis=1)
-            poses = poses[apart > self.tag.radius + one.marker.radius]
+            distances = np.linalg.norm(poses[:, :3, 3] - one.pose[:3, 3], axis=1)
+            poses = poses[distances > self.tag.radius + one.marker.radius]
         return poses
 
     def remedy(self, poses: np.ndarray) -> str:
@@ -262,12 +269,12 @@ class Survey:
     def sightings(self, tags: Sequence[PlacedMarker]) -> list[Sightings]:
         """Images in which each tag is readable."""
         noise = corner_noise(self._scene.sensor or Sensor(), self._settings.corner_noise)
-        seen = sightings_of(tags, self.cameras, self._depths, noise, self._exposed)
+        sightings = sightings_of(tags, self.cameras, self._depths, noise, self._exposed)
         if not self._settings.planar:
-            return seen
+            return sightings
         return [
             Sightings(one.poses, planar_information(one.information, self.path[one.poses], self.up))
-            for one in seen
+            for one in sightings
         ]
 
     def with_tags(self, tags: Sequence[PlacedMarker]) -> np.ndarray:
@@ -291,7 +298,7 @@ def surface_candidates(
     depth: np.ndarray, camera: Camera, tag: Marker, up: np.ndarray
 ) -> list[tuple[Surface, np.ndarray]]:
     """Flat surfaces of a tag's size in a depth image, each with the pose (4, 4) of a tag on it."""
-    found = []
+    candidates = []
     view = camera.world_to_camera
     for y in (np.arange(ROWS) + 0.5) * camera.height / ROWS:
         for x in (np.arange(STEPS) + 0.5) * camera.width / STEPS:
@@ -306,20 +313,20 @@ def surface_candidates(
             except InputError:
                 continue
             if surface.inlier_share >= SHARE and surface.roughness <= FLAT * tag.size:
-                found.append((surface, surface.pose([up, -view[1, :3], view[2, :3]])))
-    return found
+                candidates.append((surface, surface.pose([up, -view[1, :3], view[2, :3]])))
+    return candidates
 
 
 def spread_out(found: Sequence[tuple[Surface, np.ndarray]], tag: Marker) -> np.ndarray:
     """Poses (n, 4, 4) of candidates; of nearby ones only that with the largest inlier share remains."""
     order = sorted(range(len(found)), key=lambda k: (-found[k][0].inlier_share, found[k][0].roughness))
-    kept: list[np.ndarray] = []
+    chosen: list[np.ndarray] = []
     for k in order:
         pose = found[k][1]
-        near = [one for one in kept if np.linalg.norm(one[:3, 3] - pose[:3, 3]) < tag.size]
+        near = [one for one in chosen if np.linalg.norm(one[:3, 3] - pose[:3, 3]) < tag.size]
         if not any(one[:3, 2] @ pose[:3, 2] > 0.8 for one in near):
-            kept.append(pose)
-    return np.array(kept).reshape(-1, 4, 4)
+            chosen.append(pose)
+    return np.array(chosen).reshape(-1, 4, 4)
 
 
 def sightings_of(
@@ -352,8 +359,8 @@ def sightings_of(
     known: list[list[np.ndarray]] = [[] for _ in tags]
     for k, (camera, depth) in enumerate(zip(cameras, depths, strict=True)):
         rays = camera.position - middles
-        away = np.linalg.norm(rays, axis=1)
-        facing = (rays * normals).sum(1) / np.maximum(away, 1e-9) >= INCIDENCE
+        distances = np.linalg.norm(rays, axis=1)
+        facing = (rays * normals).sum(1) / np.maximum(distances, 1e-9) >= INCIDENCE
         some = np.flatnonzero(facing)
         if not len(some):
             continue
@@ -362,9 +369,9 @@ def sightings_of(
         with np.errstate(invalid="ignore"):
             inside = ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all((1, 2))
             edge = np.linalg.norm(np.roll(code, -1, axis=1) - code, axis=2).min(1)
-        kept = np.flatnonzero(inside & (edge >= MODULE * sides[some]))
-        kept = kept[_unoccluded(camera, depth, samples[some[kept]])]
-        some = some[kept]
+        readable = np.flatnonzero(inside & (edge >= MODULE * sides[some]))
+        readable = readable[_unoccluded(camera, depth, samples[some[readable]])]
+        some = some[readable]
         if not len(some):
             continue
         moved = None
@@ -388,8 +395,8 @@ def _unoccluded(camera: Camera, depth: np.ndarray, samples: np.ndarray) -> np.nd
     measured = depth[y, x]
     local = flat - image.position
     along_ray = image.lens is not None and image.lens.along_ray
-    away = np.linalg.norm(local, axis=1) if along_ray else local @ image.world_to_camera[2, :3]
-    hidden = (measured > 0) & (measured < away - _DEPTH[0] - _DEPTH[1] * away)
+    expected = np.linalg.norm(local, axis=1) if along_ray else local @ image.world_to_camera[2, :3]
+    hidden = (measured > 0) & (measured < expected - _DEPTH[0] - _DEPTH[1] * expected)
     return ~np.any(np.reshape(hidden, samples.shape[:2]), axis=1)
 
 

@@ -56,8 +56,8 @@ def _edges(grid: np.ndarray, contrast: float, paper: float) -> tuple[np.ndarray,
     parts = []
     for jumps, swapped in ((across, False), (down, True)):
         # runs along each line: columns of `jumps` are lines
-        found = runs(jumps.T)
-        line, first, last, size = (each[found[3] != 0] for each in found)
+        all_runs = runs(jumps.T)
+        line, first, last, size = (each[all_runs[3] != 0] for each in all_runs)
         a, b = np.stack([line, first], 1), np.stack([line, last], 1)
         # the right side of a segment that points down is the left side of one that points right
         parts.append((a[:, ::-1], b[:, ::-1], -size) if swapped else (a, b, size))
@@ -103,8 +103,10 @@ def _accumulate(begin: np.ndarray, end: np.ndarray, jump: np.ndarray, shape: tup
     column = np.maximum(column, 0).astype(int)
     flat = row * (w + 1) + column
     size = h * (w + 1)
-    own = np.bincount(flat, rise * share, size) + np.bincount(flat + 1, rise * (1 - share), size + 1)[:size]
-    return np.cumsum(own.reshape(h, w + 1), axis=1)[:, :w]
+    contributions = (
+        np.bincount(flat, rise * share, size) + np.bincount(flat + 1, rise * (1 - share), size + 1)[:size]
+    )
+    return np.cumsum(contributions.reshape(h, w + 1), axis=1)[:, :w]
 
 
 def _pieces(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -116,10 +118,10 @@ def _pieces(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray,
         low, high = np.minimum(begin, end)[:, axis], np.maximum(begin, end)[:, axis]
         first = np.floor(low) + 1
         count = np.maximum(np.ceil(high) - first, 0).astype(int)
-        own = np.repeat(np.arange(n), count)
-        line = first[own] + np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
-        owner.append(own)
-        cut.append((line - begin[own, axis]) / (end - begin)[own, axis])
+        segments = np.repeat(np.arange(n), count)
+        line = first[segments] + np.arange(len(segments)) - np.repeat(np.cumsum(count) - count, count)
+        owner.append(segments)
+        cut.append((line - begin[segments, axis]) / (end - begin)[segments, axis])
     who, t = np.concatenate(owner), np.clip(np.concatenate(cut), 0.0, 1.0)
     order = np.lexsort((t, who))
     who, t = who[order], t[order]

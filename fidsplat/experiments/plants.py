@@ -89,13 +89,13 @@ def cameras_around(mesh: Mesh, count: int, shift: float = 0.0) -> list[Camera]:
     distance = 1.01 * radius * math.hypot(1, 2 * FOCAL / HEIGHT)  # the bounding sphere fills the image height
     width = min(HEIGHT, 2 * math.ceil(FOCAL * side / (distance - radius)))
     fov = 2 * math.atan(width / 2 / FOCAL)
-    found = []
+    cameras = []
     for i in range(count):
         elevation, azimuth = _LOW + (_HIGH - _LOW) * (i + 0.5) / count, GOLDEN * (i + shift)
         flat = math.cos(elevation)
         ray = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
-        found.append(Camera.look_at(width, HEIGHT, fov, middle + distance * ray, middle, (0, 0, 1)))
-    return found
+        cameras.append(Camera.look_at(width, HEIGHT, fov, middle + distance * ray, middle, (0, 0, 1)))
+    return cameras
 
 
 def write_plants(
@@ -140,17 +140,17 @@ def _record(settings: PlantSettings, folder: Path) -> None:
     """Record the settings in the folder. Raises InputError if other settings are recorded there."""
     file = folder / SETTINGS
     # the numbers of plants may be increased later
-    own = {name: value for name, value in asdict(settings).items() if name not in ("kind", "each")}
-    own["sources"] = code_hash()
+    recorded = {name: value for name, value in asdict(settings).items() if name not in ("kind", "each")}
+    recorded["sources"] = code_hash()
     try:
-        before = from_json(read_text(file)) if file.exists() else own
+        before = from_json(read_text(file)) if file.exists() else recorded
     except ValueError as error:
         raise InputError(f"cannot read {file}: {error}") from error
-    if before != own:
+    if before != recorded:
         raise InputError(
-            f"plants in {folder} must be of the settings {own}, got {before}; give another folder"
+            f"plants in {folder} must be of the settings {recorded}, got {before}; give another folder"
         )
-    write_json(file, own)
+    write_json(file, recorded)
 
 
 def _render(settings: PlantSettings, mesh: Mesh, out: Path, python: Path, progress: Progress) -> None:

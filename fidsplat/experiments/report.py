@@ -69,10 +69,10 @@ def category_order(names: Iterable[str]) -> list[str]:
 
 def method_order(names: Iterable[str]) -> list[str]:
     """Occurring methods of the report: the ideal, mixtures without a low-pass, trained models."""
-    own = with_linear_light(f"{mixture}/{name}" for mixture in mixtures() for name in FILTERS)
-    own = [name for name in own if not name.endswith("/screen")]
+    known = with_linear_light(f"{mixture}/{name}" for mixture in mixtures() for name in FILTERS)
+    known = [name for name in known if not name.endswith("/screen")]
     names = set(names)
-    return [name for name in (IDEAL, *own, *(f"2dgs-{n}" for n in COLLECTIONS)) if name in names]
+    return [name for name in (IDEAL, *known, *(f"2dgs-{n}" for n in COLLECTIONS)) if name in names]
 
 
 def _titles(categories: Iterable[str]) -> list[str]:
@@ -82,32 +82,32 @@ def _titles(categories: Iterable[str]) -> list[str]:
 def _counts(rows: Frame, folder: Path) -> dict[str, Frame]:
     """Tables 1 and 2, and their charts."""
     categories = category_order(rows["category"])
-    made = [name for name in mixtures() if name in set(rows["mixture"])]
+    used = [name for name in mixtures() if name in set(rows["mixture"])]
     means = rows.pivot_table(["gaussians", "seconds"], "category", "mixture", sort=False).reindex(categories)
     first = rows.groupby(["category", "marker"]).first().groupby("category").mean(numeric_only=True)
     sizes, seconds = [], []
     for name in categories:
-        category, own = CATEGORIES[name], first.loc[name]
+        category, values = CATEGORIES[name], first.loc[name]
         sizes.append(
             {
                 "category": category.title,
                 "characters": category.length or NOTHING,
                 "QR version": category.version or NOTHING,
                 "modules a side": 8 if category.version is None else 17 + 4 * category.version,
-                "components": f"{own['components_dark'] + own['components_light']:.0f}",
-                "rectangles": f"{own['rectangles_dark'] + own['rectangles_light']:.0f}",
+                "components": f"{values['components_dark'] + values['components_light']:.0f}",
+                "rectangles": f"{values['rectangles_dark'] + values['rectangles_light']:.0f}",
             }
-            | {f"splats, {m}": fixed(means["gaussians"][m][name], 0) for m in made}
+            | {f"splats, {m}": fixed(means["gaussians"][m][name], 0) for m in used}
         )
-        seconds.append({"category": category.title} | {m: number(means["seconds"][m][name]) for m in made})
-    seconds.append({"category": "all"} | {m: number(means["seconds"][m].mean()) for m in made})
-    seconds.append({"category": PAPER} | {m: f"{CONSTRUCTION_SECONDS:.2f}" for m in made})
+        seconds.append({"category": category.title} | {m: number(means["seconds"][m][name]) for m in used})
+    seconds.append({"category": "all"} | {m: number(means["seconds"][m].mean()) for m in used})
+    seconds.append({"category": PAPER} | {m: f"{CONSTRUCTION_SECONDS:.2f}" for m in used})
     for file, column, label in (
         ("counts.svg", "gaussians", "splats of a marker"),
         ("seconds.svg", "seconds", "seconds from text to splats"),
     ):
         with chart(folder / file) as (figure, (axes,)):
-            series = {f"mixture {m}": means[column][m].tolist() for m in made}
+            series = {f"mixture {m}": means[column][m].tolist() for m in used}
             bars(axes, _titles(categories), series, logarithmic=True)
             if column == "seconds":
                 for time, style, text in (
@@ -131,15 +131,15 @@ def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
     paper_read = {name: {key: value[1] for key, value in row.items()} for name, row in ANGLES.items()}
     tables, series = {}, {}
     for protocol in (name for name in PROTOCOLS if name in set(rows["protocol"])):
-        own = rows[rows["protocol"] == protocol]
+        selected = rows[rows["protocol"] == protocol]
         cells = {
             key: f"{_angle(group['found'])}/{_angle(group['read'])}"
-            for key, group in own.groupby(["category", "method"])
+            for key, group in selected.groupby(["category", "method"])
         }
         # only this protocol is the paper's
         theirs = paper if protocol == "fixed-plane" else {}
-        tables[protocol] = _table(categories, method_order(own["method"]), cells, theirs)
-        means = own.groupby(["category", "method"])["read"].mean()
+        tables[protocol] = _table(categories, method_order(selected["method"]), cells, theirs)
+        means = selected.groupby(["category", "method"])["read"].mean()
         series[protocol] = _series(categories, methods, means, paper_read)
     _panels(folder / "angles.svg", categories, series, "largest tilt that is read, degrees")
     return tables
@@ -168,9 +168,9 @@ def _views(rows: Frame, folder: Path) -> dict:
     tables, series = {}, {}
     for truth in filter(None, (next((n for n in names if n in measured), None) for names in _TRUTHS)):
         linear = truth in LINEAR
-        own = rows[rows["truth"] == truth]
-        methods = method_order(own["method"])
-        means = own.groupby(["category", "method"])[["psnr", "ssim"]].mean()
+        selected = rows[rows["truth"] == truth]
+        methods = method_order(selected["method"])
+        means = selected.groupby(["category", "method"])[["psnr", "ssim"]].mean()
         cells = {key: f"{fixed(row.psnr)}/{fixed(row.ssim, 3)}" for key, row in means.iterrows()}
         paper = {
             name: {key: f"{value[0]:.1f}/{value[1]:.2f}" for key, value in row.items()}
@@ -193,10 +193,10 @@ def _localisation(rows: Frame) -> Frame:
     methods = method_order(rows["method"])
     rows = rows[rows["distance_m"].isin(sorted(set(rows["distance_m"]))[::2])]
     table = []
-    for (category, distance), own in rows.groupby(["category", "distance_m"]):
+    for (category, distance), group in rows.groupby(["category", "distance_m"]):
         row = {"marker, distance": f"{CATEGORIES[str(category)].title}, {distance:g} m"}
         for method in methods:
-            one = own[own["method"] == method]
+            one = group[group["method"] == method]
             read, every = one["read"].sum(), one["amount"].sum()
             missed = f" ({read}/{every})" if read < every else ""
             row[method] = number(one["position_mm"].median()) + missed if read else "not read"
@@ -227,9 +227,9 @@ def _series(
 ) -> dict[str, list[float]]:
     """Figures of fidsplat by method, then the paper's, for `_panels`."""
     names = {m: f"mixture {m.partition('/')[0]}" if "/" in m else m for m in methods}
-    own = {name: [values.get((c, method), _NAN) for c in categories] for method, name in names.items()}
+    measured = {name: [values.get((c, method), _NAN) for c in categories] for method, name in names.items()}
     theirs = ((PAPER, "ours"), (TRAINED, 17))
-    return own | {text: [paper.get(c, {}).get(key, _NAN) for c in categories] for text, key in theirs}
+    return measured | {text: [paper.get(c, {}).get(key, _NAN) for c in categories] for text, key in theirs}
 
 
 def _panels(
@@ -305,7 +305,7 @@ def load(folders: Sequence[Path]) -> dict[str, Summary]:
 
     Raises InputError if there are no results, or they are from another version.
     """
-    where, found = ", ".join(map(str, folders)), {}
+    where, results = ", ".join(map(str, folders)), {}
     for name, kind in KINDS.items():
         records = [record for folder in folders for record in folder_records(folder, name)]
         summaries = [read_summary(file) for folder in folders if (file := folder / f"{name}.csv").is_file()]
@@ -313,23 +313,23 @@ def load(folders: Sequence[Path]) -> dict[str, Summary]:
             if records:
                 summaries.insert(0, summarise(records, kind.rows, (*kind.keys, "amount", *kind.columns)))
             if summaries:
-                found[name] = join(summaries, kind.keys)
-                rows = found[name].rows
+                results[name] = join(summaries, kind.keys)
+                rows = results[name].rows
                 rows[list(kind.columns)] = rows[list(kind.columns)].apply(pd.to_numeric)
-    if not found:
+    if not results:
         raise InputError(f"results must be in {where}, got none; run fidsplat experiment all first")
-    return found
+    return results
 
 
 def _counts_rows(record: Record) -> Rows:
-    key, found = record.key, record.result
-    for mixture, numbers in found["gaussians"].items():
-        seconds = found["seconds"][mixture]
+    key, result = record.key, record.result
+    for mixture, numbers in result["gaussians"].items():
+        seconds = result["seconds"][mixture]
         row = {"category": key["category"], "marker": key["index"], "mixture": mixture}
         row |= {"amount": len(seconds), "gaussians": numbers["rectangles"]}
         row |= {f"gaussians_of_{name}": numbers.get(name) for name in ("runs", "cells")}
         for name in ("components", "cells", "runs", "rectangles"):
-            row |= {f"{name}_{colour}": found[name][colour] for colour in ("dark", "light")}
+            row |= {f"{name}_{colour}": result[name][colour] for colour in ("dark", "light")}
         spread = statistics.stdev(seconds) if len(seconds) > 1 else 0.0
         yield row | {"seconds": statistics.median(seconds), "seconds_spread": spread}
 

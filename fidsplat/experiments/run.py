@@ -89,8 +89,8 @@ def _points(name: str, options: Any) -> list[Key]:
         return [{**one, "method": m, **spans} for one, m in product(located, options.methods)]
     tilts = options.tilts or (angles.QUICK_TILTS if options.quick else angles.FULL_TILTS)
     scans = product(_markers(categories, count), options.methods)
-    own = [{**one, "method": m, "tilts": tilts} for one, m in scans]
-    return [{"protocol": p, **one} for p in options.protocol or PROTOCOLS for one in own]
+    scans_of_markers = [{**one, "method": m, "tilts": tilts} for one, m in scans]
+    return [{"protocol": p, **one} for p in options.protocol or PROTOCOLS for one in scans_of_markers]
 
 
 def _markers(categories: Iterable[Category], count: int) -> list[Key]:

@@ -205,7 +205,7 @@ def read_records(file: Path) -> list[Record]:
         text = read_text(file)
     except UnicodeDecodeError as error:
         raise InputError(f"cannot read {file}: {error}") from error
-    found: list[Record] = []
+    records: list[Record] = []
     run: dict[str, Any] | None = None
     for number, line in enumerate(text.split("\n")[:-1], 1):
         try:
@@ -220,8 +220,8 @@ def read_records(file: Path) -> list[Record]:
             raise InputError(
                 f"{file}, line {number}: not a result of this version of fidsplat; give another folder"
             ) from None
-        found.append(Record(key, result, run))
-    return found
+        records.append(Record(key, result, run))
+    return records
 
 
 def folder_records(folder: Path, name: str) -> list[Record]:
@@ -258,23 +258,23 @@ def merge(files: Sequence[Path], target: Path) -> Merged:
 
     Raises InputError for a missing file or another format.
     """
-    found: dict[str, Record] = {}
+    records: dict[str, Record] = {}
     repeated = 0
     for file in files:
         if not file.is_file():
             raise InputError(f"results of shards must be .jsonl files, got {file}, which does not exist")
         for record in read_records(file):
-            repeated += record.name in found
-            found.setdefault(record.name, record)
+            repeated += record.name in records
+            records.setdefault(record.name, record)
     for record in read_records(target):
-        found.setdefault(record.name, record)
-    runs = [record.run for record in found.values()]
+        records.setdefault(record.name, record)
+    runs = [record.run for record in records.values()]
     # runs without rendering have no device
     first = next((run for run in runs if run.get("device")), runs[0] if runs else {})
     differ = {name for run in runs for name in differences(run, first)}
     writable_folder(target.parent)
-    _write(target, found.values())
-    return Merged(len(found), repeated, tuple(sorted(differ)))
+    _write(target, records.values())
+    return Merged(len(records), repeated, tuple(sorted(differ)))
 
 
 def result_files(folders: Sequence[Path], name: str) -> list[Path]:

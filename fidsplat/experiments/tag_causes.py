@@ -90,8 +90,10 @@ def placed_in(scene: str, spec: str) -> PlacedMarker:
 @lru_cache(32)
 def _changed(placed: PlacedMarker, light: Lighting | None = None, **parts: Any) -> PlacedMarker:
     """The marker in a light, or with a shape or wear."""
-    made = placed.marker
-    return replace(placed, marker=marker_of(made.spec, made.size, light is not None, **parts), light=light)
+    printed = placed.marker
+    return replace(
+        placed, marker=marker_of(printed.spec, printed.size, light is not None, **parts), light=light
+    )
 
 
 @lru_cache(8)
@@ -209,13 +211,14 @@ def view_of(scene: str, spec: str, seed: str) -> View:
 
 @dataclass(frozen=True)
 class Cause:
-    """Cause of failed detection: maps a severity to a physical amount and applies it to a view."""
+    """Cause of failed detection: maps a severity from 0 to 1 to an amount in physical units, and applies it
+    to a view."""
 
     title: str
     group: str
     """figure that contains the cause"""
     amount: Callable[[float], float]
-    """physical amount of a severity from 0 to 1"""
+    """function from a severity to the amount in `unit`"""
     form: str
     """format of the amount, e.g. "{:.0f}" """
     unit: str
@@ -232,8 +235,8 @@ class Cause:
         return self.form.format(self.amount(severity))
 
 
-def _linear(most: float, least: float = 0.0) -> Callable[[float], float]:
-    return lambda severity: least + severity * (most - least)
+def _linear(last: float, first: float = 0.0) -> Callable[[float], float]:
+    return lambda severity: first + severity * (last - first)
 
 
 def _geometric(first: float, last: float) -> Callable[[float], float]:
@@ -241,47 +244,56 @@ def _geometric(first: float, last: float) -> Callable[[float], float]:
 
 
 def _distance(view: View, edges: float) -> View:
+    """Move the camera to a distance in edges of the code."""
     return replace(view, edges=view.edges * edges / EDGES)
 
 
 def _angle(view: View, degrees: float) -> View:
+    """Tilt the camera by degrees from the marker's normal."""
     return replace(view, tilt=math.copysign(math.radians(degrees), view.tilt))
 
 
 def _lens(view: View, k1: float) -> View:
-    """Distort the image strongly; the marker is near a corner, where distortion is large."""
+    """Distort the image by the radial coefficient -k1; the marker is near a corner, where distortion is
+    large."""
     signs = view.rng.choice((-1.0, 1.0), 2)
     view = replace(view, aim=(float(0.36 * signs[0]), float(0.24 * signs[1])), tilt=view.tilt / 4)
     return view.changed(camera=replace(view.camera, lens=BrownConrady(k1=-k1)))
 
 
 def _blur(view: View, pixels: float) -> View:
+    """Move the camera during the exposure, so that the marker moves by pixels."""
     return view.moving(pixels, Shutter(exposure_time=1.0, sub_poses=max(2, math.ceil(pixels / 2))))
 
 
 def _rolling(view: View, pixels: float) -> View:
+    """Move the camera during the readout of the rows, so that the marker moves by pixels per frame."""
     return view.moving(pixels, Shutter(readout=1.0, rows_per_band=6))
 
 
 def _noise(view: View, electrons: float) -> View:
+    """Add shot noise of a sensor with this full well in electrons."""
     return view.exposed(full_well=electrons)
 
 
 def _underexposed(view: View, share: float, gain: float = 1.0) -> View:
+    """Reduce the exposure to a fraction of the light, with shot noise and read noise."""
     return view.exposed(exposure=share, full_well=10_000.0, read_noise=5.0, gain=gain)
 
 
 def _overexposed(view: View, factor: float) -> View:
+    """Multiply the exposure by a factor; light above 1 saturates."""
     return view.exposed(exposure=factor)
 
 
 def _fog(view: View, transmittance: float) -> View:
+    """Add fog with this transmittance between camera and marker, 0 to 1."""
     distance = view.edges * view.placed.marker.size
     return view.changed(fog=Fog(-math.log(transmittance) / distance))
 
 
 def _covered(view: View, share: float) -> View:
-    """Cover one side of the code by a dark leaf, at random."""
+    """Cover a fraction of the code by a dark leaf, from a random side."""
     size, rng = view.placed.marker.size, view.rng
     angle = math.pi / 2 * int(rng.integers(4)) + rng.uniform(-0.2, 0.2)
     middle = size * (0.5 - share + 1.0)  # the leaf is two edges wide and ends at the share
@@ -292,15 +304,17 @@ def _covered(view: View, share: float) -> View:
 
 
 def _transparent(view: View, opacity: float) -> View:
-    made, cloud = view.placed.marker, view.placed.marker.cloud
+    """Multiply the opacities of the marker's splats by a factor, 0 to 1."""
+    printed, cloud = view.placed.marker, view.placed.marker.cloud
     thin = SplatCloud(
         cloud.world_means(), cloud.quats, cloud.scales, opacity * cloud.opacities, colors=cloud.colors
     ).with_coplanar_groups(cloud.coplanar_groups)
     thin = thin.with_boxes(cloud.boxes)
-    return replace(view, placed=replace(view.placed, marker=replace(made, cloud=thin)))
+    return replace(view, placed=replace(view.placed, marker=replace(printed, cloud=thin)))
 
 
 def _defocused(view: View, radius: float) -> View:
+    """Blur the image by a disk with a radius in pixels."""
     return replace(view, defocus=radius)
 
 
@@ -311,12 +325,14 @@ def _direction(placed: PlacedMarker, vector: tuple[float, float, float]) -> tupl
 
 
 def _backlight(view: View, share: float) -> View:
-    """Make the marker darker than its surroundings, to which the camera is exposed."""
+    """Reduce the light of the marker to a fraction of that of its surroundings, for which the camera is
+    exposed."""
     return replace(view, placed=_changed(view.placed, Lighting(exposure=share)))
 
 
 def _shadow(view: View, ratio: float) -> View:
-    """Cast shadows of planks in the sun; the camera is exposed for sunlit areas."""
+    """Cast shadows of planks; ratio: irradiance by the sun over irradiance in the shade. The camera is
+    exposed for sunlit areas."""
     cover, sun = _planks(view.placed.marker.size, view.seed % VARIANTS)
     # paper in the sun is as bright as paper without a cause
     light = Lighting(source="lights", exposure=1 / (1 + ratio))
@@ -348,7 +364,8 @@ def _planks(size: float, number: int) -> tuple[SplatCloud, tuple[float, float, f
 
 
 def _glare(view: View, ratio: float) -> View:
-    """Add a lamp that a laminated marker reflects into the camera."""
+    """Add a lamp that a laminated marker reflects into the camera; ratio: irradiance by the lamp over the
+    other light."""
     placed = _changed(view.placed, Lighting("lights", roughness=0.25, view="camera"))
     distance = view.edges * placed.marker.size
     towards = placed.pose[:3, :3].T @ (view.camera.position - placed.pose[:3, 3])
@@ -361,34 +378,38 @@ def _glare(view: View, ratio: float) -> View:
 
 
 def _dusk(view: View, share: float) -> View:
-    """Reduce the light, and compensate it by gain."""
+    """Reduce the light to a fraction, and compensate it by gain."""
     return _underexposed(view, share, 1 / share)
 
 
 def _flare(view: View, share: float) -> View:
-    """Add veiling glare from a window outside of the image."""
+    """Add veiling glare from a window outside of the image, as a fraction of the light."""
     return view.exposed(veiling_glare=share, glare_light=(0.6,) * 3)
 
 
 def _cylinder(view: View, degrees: float) -> View:
+    """Bend the code to an arc of this many degrees on a cylinder."""
     radius = view.placed.marker.size / math.radians(max(degrees, 1e-5))
     axis = "xy"[view.seed % 2]
     return replace(view, placed=_changed(view.placed, shape=Cylinder(radius, axis=axis)))
 
 
 def _crumpled(view: View, height: float) -> View:
+    """Crumple the sheet to a height in edges of the code."""
     size = view.placed.marker.size
     sheet = Crumpled(height * size, size, seed=view.seed % VARIANTS)
     return replace(view, placed=_changed(view.placed, shape=sheet))
 
 
 def _box_edge(view: View, share: float) -> View:
+    """Bend a fraction of the code around the edge of a box."""
     size, axis = view.placed.marker.size, "xy"[view.seed % 2]
     edge = BoxEdge(0.03 * size, (0.5 - share) * size, axis=axis)
     return replace(view, placed=_changed(view.placed, shape=edge))
 
 
 def _faded(view: View, contrast: float) -> View:
+    """Reduce the contrast of the print to a fraction."""
     return _worn("fading")(view, 1 - contrast)
 
 

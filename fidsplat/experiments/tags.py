@@ -146,27 +146,27 @@ def detectors_of(
     Raises InputError for an unknown name, a missing package, or a function that cannot be imported.
     """
     kind, _, dictionary = family.partition(":")
-    found: dict[str, Callable[[np.ndarray, Target], Attempt]] = {
+    detectors: dict[str, Callable[[np.ndarray, Target], Attempt]] = {
         name: partial(attempt, name) for name in readers(kind, dictionary or None)
     }
-    found[OWN] = partial(
+    detectors[OWN] = partial(
         attempt_by,
         lambda grey: [
             (one.name, one.corners) for one in detect(grey, (family,) if dictionary else (), not dictionary)
         ],
     )
     if not names:
-        return {name: function for name, function in found.items() if name != SLOW}
+        return {name: function for name, function in detectors.items() if name != SLOW}
     every = {OWN, *TITLES}
     for name in names:
         if ":" in name:
-            found[name] = partial(attempt_by, own_detector(name))
+            detectors[name] = partial(attempt_by, own_detector(name))
         elif name in missing_readers():
             package = missing_readers()[name]
             raise InputError(f"the detector {name} requires {package}; pip install {package}")
         elif name not in every:
             raise InputError(unknown("detector", name, every) + "; or module:function for your own")
-    return {name: found[name] for name in names if name in found}
+    return {name: detectors[name] for name in names if name in detectors}
 
 
 def own_detector(text: str) -> Detector:
@@ -198,9 +198,11 @@ def own_detector(text: str) -> Detector:
 
 def attempt_by(function: Detector, grey: np.ndarray, target: Target) -> Attempt:
     """Attempt of a detector that returns pairs of spec and corners."""
-    own = target.payload if target.id is None else target.id
-    spec = f"{target.kind}:{own if target.id is None else f'{target.family}:{own}'}"
-    pairs = ((own if name == spec else None, np.asarray(quad, np.float64)) for name, quad in function(grey))
+    expected = target.payload if target.id is None else target.id
+    spec = f"{target.kind}:{expected if target.id is None else f'{target.family}:{expected}'}"
+    pairs = (
+        (expected if name == spec else None, np.asarray(quad, np.float64)) for name, quad in function(grey)
+    )
     return attempt_of(pairs, target)
 
 
@@ -243,14 +245,14 @@ def _detect(
     detectors: dict[str, Callable[[np.ndarray, Target], Attempt]],
 ) -> dict[str, Any]:
     """Errors of each view by detector, as `Errors`."""
-    found: dict[str, list[Errors]] = {name: [] for name in key["detectors"]}
+    errors: dict[str, list[Errors]] = {name: [] for name in key["detectors"]}
     for view, grey in shots:
-        made, camera = view.placed.marker, view.camera
+        printed, camera = view.placed.marker, view.camera
         corners = camera.project(view.placed.corners)
-        target = Target(made.kind, made.family or "", made.id, made.payload, corners)
-        for name in found:
-            found[name].append(errors_of(detectors[name](grey, target).corners, view))
-    return {"errors": found}
+        target = Target(printed.kind, printed.family or "", printed.id, printed.payload, corners)
+        for name in errors:
+            errors[name].append(errors_of(detectors[name](grey, target).corners, view))
+    return {"errors": errors}
 
 
 def errors_of(corners: np.ndarray | None, view: View) -> Errors:

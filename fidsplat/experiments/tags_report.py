@@ -44,19 +44,19 @@ def statistics_of(rows: Frame, seed: int, by: Sequence[str] = _GROUP) -> Frame:
 
 def _statistics(group: Frame, seed: int) -> dict[str, Any]:
     read = group[group["read"]]
-    found: dict[str, Any] = {"amount": len(group)}
+    row: dict[str, Any] = {"amount": len(group)}
     for name, hits in (("rate", len(read)), ("precise", int((read["corner_px"] <= PRECISE).sum()))):
-        found[name] = hits / len(group)
-        found[f"{name}_low"], found[f"{name}_high"] = wilson(hits, len(group))
+        row[name] = hits / len(group)
+        row[f"{name}_low"], row[f"{name}_high"] = wilson(hits, len(group))
     for name, statistics in (
         ("corner_px", {"rms": root_mean_square}),
         *((name, {"p50": percentile(50), "p99": percentile(99)}) for name in _ERRORS[1:]),
     ):
         values = read[name].to_numpy(float)
         for ending, statistic in statistics.items():
-            found[f"{name}_{ending}"] = float(statistic(values)) if len(values) else math.nan
-            found[f"{name}_{ending}_low"], found[f"{name}_{ending}_high"] = bootstrap(values, statistic, seed)
-    return found
+            row[f"{name}_{ending}"] = float(statistic(values)) if len(values) else math.nan
+            row[f"{name}_{ending}_low"], row[f"{name}_{ending}_high"] = bootstrap(values, statistic, seed)
+    return row
 
 
 def breaking_severity(severities: Sequence[float], rates: Sequence[float]) -> float | None:
@@ -77,12 +77,12 @@ def breaks_of(rates: Frame) -> Frame:
     """
     table = []
     for cause in (name for name in CAUSES if name in set(rates["cause"])):
-        own = rates[rates["cause"].isin((cause, NONE))]
+        selected = rates[rates["cause"].isin((cause, NONE))]
         for family in (name for name in FAMILIES if name in set(rates["family"])):
             row = {"cause": f"{CAUSES[cause].title} [{CAUSES[cause].unit}]"}
             row |= {"to": CAUSES[cause].text(1.0), "family": family.rpartition(":")[2]}
             for detector in _detectors(rates):
-                each = own[(own["family"] == family) & (own["detector"] == detector)]
+                each = selected[(selected["family"] == family) & (selected["detector"] == detector)]
                 severity = breaking_severity(each["severity"].tolist(), each["rate"].tolist())
                 row[detector] = NEVER if severity is None else CAUSES[cause].text(severity)
                 row[detector] = row[detector] if len(each) else NOTHING
@@ -187,16 +187,16 @@ def _curves(rates: Frame, causes: Sequence[str], file: Path) -> None:
     with chart(file, len(causes), size, rows=len(families)) as (figure, axes):
         for place, (family, cause) in zip(axes, [(f, c) for f in families for c in causes], strict=True):
             for number, detector in enumerate(detectors):
-                own = rates[(rates["family"] == family) & (rates["detector"] == detector)]
-                own = own[own["cause"].isin((cause, NONE))].sort_values("severity")
+                selected = rates[(rates["family"] == family) & (rates["detector"] == detector)]
+                selected = selected[selected["cause"].isin((cause, NONE))].sort_values("severity")
                 colour = COLOURS[number % len(COLOURS)]
-                x = own["severity"].to_numpy()
+                x = selected["severity"].to_numpy()
                 label = detector if place is axes[0] else None
-                if not len(own):
+                if not len(selected):
                     place.plot([], [], color=colour, label=label)
                     continue
-                place.plot(x, 100 * own["rate"].to_numpy(), color=colour, label=label, linewidth=1.3)
-                low, high = (100 * own[f"rate_{end}"].to_numpy() for end in ("low", "high"))
+                place.plot(x, 100 * selected["rate"].to_numpy(), color=colour, label=label, linewidth=1.3)
+                low, high = (100 * selected[f"rate_{end}"].to_numpy() for end in ("low", "high"))
                 place.fill_between(x, low, high, color=colour, alpha=0.12, linewidth=0)
             place.set_xticks([0.0, 0.5, 1.0], ["", "", ""])
             place.set_ylim(-4, 104)

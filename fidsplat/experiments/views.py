@@ -125,12 +125,12 @@ def measure_views(
             )
         ours, theirs = image / 255.0, reference / 255.0
         ratio = psnr(ours, theirs)
-        found = {"psnr": None if np.isinf(ratio) else ratio, "ssim": ssim(ours, theirs)}
+        metrics = {"psnr": None if np.isinf(ratio) else ratio, "ssim": ssim(ours, theirs)}
         if point["flip"]:
-            found["flip"] = flip(ours, theirs)
+            metrics["flip"] = flip(ours, theirs)
         if lpips is not None:
-            found["lpips"] = lpips(ours, theirs)
-        return found
+            metrics["lpips"] = lpips(ours, theirs)
+        return metrics
 
     images = _images_of(markers, point["method"], category, index, seed, point["views"])
     pending = [pool.submit(compare, number, image) for number, image in enumerate(images)]

@@ -88,12 +88,12 @@ def _read_part(
 
     Returns which splats are valid, (n,) bool or None for all, and the number of invalid splats by reason.
     """
-    given = part if scratch is None else part | {"scales": scratch[: len(part["scales"])]}
+    read = part if scratch is None else part | {"scales": scratch[: len(part["scales"])]}
     with np.errstate(over="ignore", invalid="ignore"):
-        rows.fill(first, given)
+        rows.fill(first, read)
     if scratch is not None:
-        _split(given["quats"], given["scales"], part)
-    return find_defects({name: given[name] for name in _CHECKED if name in given})
+        _split(read["quats"], read["scales"], part)
+    return find_defects({name: read[name] for name in _CHECKED if name in read})
 
 
 def _split(quats: np.ndarray, three: np.ndarray, part: dict[str, np.ndarray]) -> None:

@@ -140,7 +140,7 @@ def load_colmap(folder: Path) -> ColmapModel:
     """
     lenses = dict(_read(folder, "cameras", _binary_cameras, _text_cameras))
     views = sorted(_read(folder, "images", _binary_images, _text_images), key=lambda view: view[0])
-    found = list(_read(folder, "points3D", _binary_points, _text_points, needed=False))
+    points = list(_read(folder, "points3D", _binary_points, _text_points, needed=False))
     if not views:
         raise InputError(f"the COLMAP model in {folder} must have images, got none")
     cameras = []
@@ -153,7 +153,7 @@ def load_colmap(folder: Path) -> ColmapModel:
             matrix[:3, :3], matrix[:3, 3] = quaternion_to_matrix(np.array(pose[:4])), pose[4:]
         with error_prefix(f"{folder}: image {name}"):
             cameras.append(Camera.from_colmap(lenses[number], matrix))
-    values = np.array(found, np.float64).reshape(-1, 6)
+    values = np.array(points, np.float64).reshape(-1, 6)
     return ColmapModel(
         tuple(name for name, _, _ in views),
         tuple(cameras),

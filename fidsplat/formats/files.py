@@ -165,15 +165,15 @@ def check_writable(path: str | os.PathLike[str]) -> Format:
 
 def losses(cloud: SplatCloud, path: str | os.PathLike[str]) -> list[str]:
     """Descriptions of the data of a cloud that a file's format loses; empty for a lossless round trip."""
-    known, found = format_of(path), []
+    known, descriptions = format_of(path), []
     if cloud.sh_degree > 0 and not known.harmonics:
-        found.append(f"SH of degree {cloud.sh_degree}: colours do not change with the view")
+        descriptions.append(f"SH of degree {cloud.sh_degree}: colours do not change with the view")
     if cloud.labels.any() and not known.labels:
-        found.append(f"labels ({len(np.unique(cloud.labels))} different)")
+        descriptions.append(f"labels ({len(np.unique(cloud.labels))} different)")
     if cloud.coplanar_groups is not None and not known.coplanar_groups:
-        found.append("coplanar groups: the splats are sorted by depth only")
+        descriptions.append("coplanar groups: the splats are sorted by depth only")
     if cloud.origin.any() and not known.origin:
         means = cloud.world_means()
         off = float(np.abs(means - means.astype(np.float32)).max(initial=0.0))
-        found.append(f"the origin: positions are rounded by up to {off:.2g} m")
-    return found + ([f"rounds {known.rounds}"] if known.rounds else [])
+        descriptions.append(f"the origin: positions are rounded by up to {off:.2g} m")
+    return descriptions + ([f"rounds {known.rounds}"] if known.rounds else [])

@@ -82,18 +82,18 @@ def save_gltf(cloud: SplatCloud, path: Path) -> None:
     for k in range(sh.shape[1]):
         degree = int(np.sqrt(k))
         arrays[f"{prefix}SH_DEGREE_{degree}_COEF_{k - degree * degree}"] = sh[:, k]
-    for name, whole in (
+    for name, integers in (
         ("label", cloud.labels if cloud.labels.any() else None),
         ("plane", cloud.coplanar_groups),
     ):
-        if whole is None:
+        if integers is None:
             continue
-        if (largest := np.abs(whole.astype(np.int64)).max()) >= 2**24:
+        if (largest := np.abs(integers.astype(np.int64)).max()) >= 2**24:
             raise InputError(
                 f"{name}s in glTF must be less than 2^24, since they are floats, got {largest}; "
                 "use smaller ones"
             )
-        arrays[f"_{name.upper()}"] = whole[:, None].astype(np.float32)
+        arrays[f"_{name.upper()}"] = integers[:, None].astype(np.float32)
     document, binary = gltf_document(
         [(array, 5126) for array in arrays.values()], _primitive(list(arrays)), "fidsplat, z forward"
     )
@@ -229,12 +229,14 @@ class _Reader:
         self._visited.add(number)
         node = self._document["nodes"][number]
         matrix = above @ _matrix(node)
-        found = []
+        primitives = []
         if "mesh" in node:
             for primitive in self._document["meshes"][node["mesh"]]["primitives"]:
                 if EXTENSION in primitive.get("extensions", {}):
-                    found.append((primitive, matrix))
-        return found + [pair for child in node.get("children", []) for pair in self._below(child, matrix)]
+                    primitives.append((primitive, matrix))
+        return primitives + [
+            pair for child in node.get("children", []) for pair in self._below(child, matrix)
+        ]
 
     def _cloud(self, primitive: dict[str, Any]) -> SplatCloud:
         kernel = primitive["extensions"][EXTENSION].get("kernel", "ellipse")

@@ -72,8 +72,8 @@ class TriangleMesh:
         colors = self.colors
         if len(colors):
             _, _, where = simplification.replay_simplification(local, self.faces.astype(np.int32), collapses)
-            kept = where >= 0
-            where, colors = where[kept], colors[kept]
+            remaining = where >= 0
+            where, colors = where[remaining], colors[remaining]
             counts = np.bincount(where, minlength=len(points))[:, None]
             sums = np.stack([np.bincount(where, colors[:, k], len(points)) for k in range(3)], 1)
             colors = sums / np.maximum(counts, 1)

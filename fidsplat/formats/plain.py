@@ -82,8 +82,8 @@ def cloud_of(
             f"{path}: coplanar groups must have the shape ({len(means)},), got {coplanar_groups.shape}"
         )
     if cloud.dropped:
-        given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
-        valid, _ = find_defects({name: np.asarray(array, np.float32) for name, array in given.items()})
+        arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+        valid, _ = find_defects({name: np.asarray(array, np.float32) for name, array in arrays.items()})
         coplanar_groups = coplanar_groups[valid]
     with error_prefix(str(path)):
         return cloud.with_coplanar_groups(coplanar_groups)
@@ -102,11 +102,12 @@ def content(path: Path, magic: tuple[bytes, ...]) -> bytes:
 
 
 def neighbour(path: Path, name: str) -> Path:
-    """A file in the folder of `path` or below it. Raises InputError for a name outside it."""
+    """A file in the folder of `path` or below it. Raises InputError for a name outside it, or a
+    URL."""
     folder = path.parent.resolve()
     try:
         file = (folder / name).resolve()
-        inside = file.is_relative_to(folder)
+        inside = "://" not in name and file.is_relative_to(folder)
     except (OSError, ValueError, RuntimeError):  # a name with NUL, a loop of symbolic links
         inside = False
     if not inside:

@@ -175,14 +175,14 @@ def _lines(file: Path, head: bytes) -> tuple[list[str], int]:
         raise InputError(f"cannot read {file} as PLY: it is empty")
     if not re.match(rb"ply\r?\n", head):
         raise InputError(f"cannot read {file} as PLY: its first line must be 'ply'")
-    found = re.search(rb"\nend_header\r?\n", head)
-    if found is None:
+    end = re.search(rb"\nend_header\r?\n", head)
+    if end is None:
         raise InputError(f"{file}: a PLY header must have end_header within {MAX_HEADER} bytes, got none")
     try:
-        text = head[: found.start()].decode("utf-8")
+        text = head[: end.start()].decode("utf-8")
     except UnicodeDecodeError:
         raise InputError(f"{file}: the PLY header must be text, got other bytes") from None
-    return text.replace("\r", "").split("\n")[1:], found.end()
+    return text.replace("\r", "").split("\n")[1:], end.end()
 
 
 def _count(file: Path, line: str, word: str) -> int:

@@ -88,10 +88,10 @@ def _cloud(path: Path, part: Parts) -> SplatCloud:
     def pixels(name: str, number: int = 0) -> np.ndarray:
         """Pixels (count, 4) uint8 of an image with one pixel per splat."""
         file = meta[name]["files"][number]
-        found = _image(path, part, file, count).reshape(-1, 4)
-        if not 0 <= count <= len(found):
-            raise InputError(f"{path}: {file} must have a pixel for each of {count} splats, got {len(found)}")
-        return found[:count]
+        image = _image(path, part, file, count).reshape(-1, 4)
+        if not 0 <= count <= len(image):
+            raise InputError(f"{path}: {file} must have a pixel for each of {count} splats, got {len(image)}")
+        return image[:count]
 
     low, high = pixels("means", 0)[:, :3].astype(np.uint16), pixels("means", 1)[:, :3].astype(np.uint16)
     lowest, highest = (np.array(meta["means"][end], np.float64).reshape(3) for end in ("mins", "maxs"))

@@ -58,9 +58,9 @@ class StreamedSog:
         of_level = [(leaf[level], number) for number, leaf in enumerate(self.leaves) if level in leaf]
         order = sorted(of_level, key=lambda pair: (pair[0].file, pair[0].first))
         for file, group in groupby(order, key=lambda pair: pair[0].file):
-            whole = load_sog_folder(self.files[file])
+            cloud = load_sog_folder(self.files[file])
             for span, number in group:
-                yield number, self._part(whole, span)
+                yield number, self._part(cloud, span)
 
     def _part(self, whole: SplatCloud, span: Span) -> SplatCloud:
         path = self.files[span.file]
@@ -103,11 +103,11 @@ def _leaves(path: Path, tree: dict[str, Any], levels: int, files: int) -> Iterat
         node = todo.pop()
         todo += reversed(node.get("children") or [])
         spans = {}
-        for name, said in (node.get("lods") or {}).items():
-            level, span = int(name), Span(*(int(said[key]) for key in ("file", "offset", "count")))
+        for name, entry in (node.get("lods") or {}).items():
+            level, span = int(name), Span(*(int(entry[key]) for key in ("file", "offset", "count")))
             if not (0 <= level < levels and 0 <= span.file < files and min(span.first, span.count) >= 0):
                 raise InputError(
-                    f"{path}: a leaf must refer to levels below {levels} and files below {files}, got {said}"
+                    f"{path}: a leaf must refer to levels below {levels} and files below {files}, got {entry}"
                 )
             if span.count:
                 spans[level] = span

@@ -115,14 +115,14 @@ def _gzip(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.nda
     try:
         # limited by the declared size, and by gzip's maximum ratio of about 1040
         stream = zlib.decompressobj(31)
-        whole = stream.decompress(data, size + 1) if size <= 1040 * len(data) else b""
+        data_bytes = stream.decompress(data, size + 1) if size <= 1040 * len(data) else b""
     except zlib.error as error:
         raise InputError(f"{path}: the SPZ file is damaged ({error})") from None
-    if len(whole) < size or (len(whole) == size and not stream.eof):
-        raise InputError(f"{path}: truncated: its header declares {size} bytes, got {len(whole)}")
+    if len(data_bytes) < size or (len(data_bytes) == size and not stream.eof):
+        raise InputError(f"{path}: truncated: its header declares {size} bytes, got {len(data_bytes)}")
     parts, place = {}, _HEAD.size
     for name, width in widths.items():
-        parts[name] = np.frombuffer(whole, np.uint8, n * width, place).reshape(n, width)
+        parts[name] = np.frombuffer(data_bytes, np.uint8, n * width, place).reshape(n, width)
         place += n * width
     return version, n, degree, point, parts, b""
 
@@ -163,10 +163,10 @@ def _frames(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.n
                 f"{path}: truncated: {name} must end by byte {len(data)}, got the end {place + packed}"
             )
         try:
-            whole = zstd.decompress(memoryview(data)[place : place + packed], size)
+            array = zstd.decompress(memoryview(data)[place : place + packed], size)
         except ValueError as error:
             raise InputError(f"{path}: the SPZ file is damaged ({name}: {error})") from None
-        parts[name] = np.frombuffer(whole, np.uint8).reshape(n, width)
+        parts[name] = np.frombuffer(array, np.uint8).reshape(n, width)
         place += packed
     return version, n, degree, point, parts, data[_HEAD_4.size : table] if flags & _HAS_EXTENSIONS else b""
 
@@ -175,7 +175,7 @@ def _known(
     path: Path, extensions: bytes, n: int
 ) -> tuple[tuple[int, int, int], np.ndarray | None, np.ndarray | None]:
     """Signs of the axes, labels and coplanar groups from extensions; other extensions are ignored."""
-    axes, whole, place = _TO_RDF[0], {}, 0
+    axes, integers, place = _TO_RDF[0], {}, 0
     while place < len(extensions):
         if len(extensions) - place < _RECORD.size:
             raise InputError(f"{path}: the SPZ file is damaged: an extension is truncated")
@@ -195,10 +195,10 @@ def _known(
             axes = _TO_RDF[system]
         elif kind in (_LABELS, _GROUPS):
             try:
-                whole[kind] = np.frombuffer(zstd.decompress(value, 4 * n), "<i4").astype(np.int32)
+                integers[kind] = np.frombuffer(zstd.decompress(value, 4 * n), "<i4").astype(np.int32)
             except ValueError as error:
                 raise InputError(f"{path}: the SPZ file is damaged (extension: {error})") from None
-    return axes, whole.get(_LABELS), whole.get(_GROUPS)
+    return axes, integers.get(_LABELS), integers.get(_GROUPS)
 
 
 def save_spz(cloud: SplatCloud, path: Path, version: int = 4) -> None:
@@ -214,10 +214,10 @@ def save_spz(cloud: SplatCloud, path: Path, version: int = 4) -> None:
         raise InputError(f"version of SPZ must be 3 or 4, got {version!r}")
     rotated = cloud.transformed(HALF_TURN)
     means, sh = means_of(rotated).astype(np.float64), coefficients(rotated)
-    furthest = float(np.abs(means).max(initial=0.0))
-    point = min(_FINEST, int(np.floor(_BITS - np.log2(max(furthest, 1e-9) * (1 + 1e-6)) - 1e-9)))
+    largest = float(np.abs(means).max(initial=0.0))
+    point = min(_FINEST, int(np.floor(_BITS - np.log2(max(largest, 1e-9) * (1 + 1e-6)) - 1e-9)))
     if point < 0:
-        raise InputError(f"coordinates in SPZ must be at most {2**_BITS:,} m, got {furthest:g} m")
+        raise InputError(f"coordinates in SPZ must be at most {2**_BITS:,} m, got {largest:g} m")
     degree, n = int(np.sqrt(sh.shape[1])) - 1, len(cloud)
     fixed = np.rint(means * 2.0**point).astype("<i4")
     parts = [
@@ -238,8 +238,8 @@ def save_spz(cloud: SplatCloud, path: Path, version: int = 4) -> None:
 
 def _version_4(cloud: SplatCloud, degree: int, point: int, parts: list[bytes]) -> bytes:
     extensions = b""
-    whole = {_LABELS: cloud.labels if cloud.labels.any() else None, _GROUPS: cloud.coplanar_groups}
-    for kind, numbers in whole.items():
+    integers = {_LABELS: cloud.labels if cloud.labels.any() else None, _GROUPS: cloud.coplanar_groups}
+    for kind, numbers in integers.items():
         if numbers is not None:
             value = zstd.compress(numbers.astype("<i4").tobytes())
             extensions += _RECORD.pack(kind, len(value)) + value

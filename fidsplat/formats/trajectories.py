@@ -264,11 +264,11 @@ def _transforms(file: Path, text: str) -> tuple[list[float] | None, list[np.ndar
 
 def _colmap(file: Path) -> list[np.ndarray]:
     """Camera-to-world matrices of COLMAP's images, sorted by name."""
-    found = [
+    poses = [
         _pose(f"{file}, image {name}", _numbers(f"{file}, image {name}", pose)[4:], pose[:4])
         for name, pose in image_poses(file)
     ]
-    return list(Trajectory(np.arange(len(found)), np.array(found)).inverse().poses) if found else []
+    return list(Trajectory(np.arange(len(poses)), np.array(poses)).inverse().poses) if poses else []
 
 
 _MODELS = (".", "sparse/0", "sparse", "colmap/sparse/0")
@@ -287,19 +287,19 @@ def load_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
         if has_colmap(place):
             model = load_colmap(place)
             return dict(zip(model.names, model.cameras, strict=True))
-    found = [one for one in (file, *(file / name for name in _TRANSFORMS)) if one.is_file()]
-    if not found:
+    files = [one for one in (file, *(file / name for name in _TRANSFORMS)) if one.is_file()]
+    if not files:
         raise InputError(
             "path must be a transforms.json, or a folder with one or with a COLMAP model (cameras.bin), "
             f"got {file}"
         )
     try:
-        transforms = from_json(read_text(found[0]))
+        transforms = from_json(read_text(files[0]))
         names = [str(frame["file_path"]) for frame in transforms["frames"]]
     except (ValueError, TypeError, KeyError) as error:
-        raise InputError(f"cannot read {found[0]} as a transforms.json: {error}") from None
+        raise InputError(f"cannot read {files[0]} as a transforms.json: {error}") from None
     cameras = {}
     for number, name in enumerate(names):
-        with error_prefix(f"{found[0]}: {name}"):
+        with error_prefix(f"{files[0]}: {name}"):
             cameras[name] = Camera.from_nerfstudio(transforms, number)
     return cameras

@@ -66,13 +66,13 @@ def load_usd(path: Path) -> SplatCloud:
                 f"exit status {done.returncode} of its process; if you trust it, set {VARIABLE}={4 * limit}"
             )
         with np.load(arrays, allow_pickle=False) as stored:
-            found = dict(stored)
+            arrays_by_name = dict(stored)
     clouds = []
-    for k in range(len([name for name in found if name.startswith("matrix")])):
+    for k in range(len([name for name in arrays_by_name if name.startswith("matrix")])):
         names = ("means", "quats", "scales", "opacities", "sh", "labels", "coplanar_groups")
-        fields: dict[str, Any] = {name: found.get(f"{name} {k}") for name in names}
+        fields: dict[str, Any] = {name: arrays_by_name.get(f"{name} {k}") for name in names}
         cloud = cloud_of(path, **fields)
-        matrix = found[f"matrix {k}"]
+        matrix = arrays_by_name[f"matrix {k}"]
         clouds.append(cloud if np.abs(matrix - np.eye(4)).max() < 1e-12 else cloud.transformed(matrix))
     return clouds[0] if len(clouds) == 1 else SplatCloud.concatenate(clouds)
 
@@ -113,10 +113,10 @@ def _set_limits(limit: int, seconds: int) -> None:
 
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, resource.getrlimit(resource.RLIMIT_CPU)[1]))
         pages = int(Path("/proc/self/statm").read_bytes().split()[0])
-        most = min(pages * resource.getpagesize() + limit, 2**62)
+        max_bytes = min(pages * resource.getpagesize() + limit, 2**62)
         soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-        if soft == resource.RLIM_INFINITY or most < soft:
-            resource.setrlimit(resource.RLIMIT_AS, (most, hard))
+        if soft == resource.RLIM_INFINITY or max_bytes < soft:
+            resource.setrlimit(resource.RLIMIT_AS, (max_bytes, hard))
 
 
 def _check_layers(pxr: Any, source: str) -> None:
@@ -139,14 +139,14 @@ def _read(pxr: Any, name: str) -> dict[str, Any]:
         raise InputError("the stage must have a ParticleField, got none")
     up = HALF_TURN if pxr.UsdGeom.GetStageUpAxis(stage) == "Y" else np.eye(4)
     metres = pxr.UsdGeom.GetStageMetersPerUnit(stage) if stage.HasAuthoredMetadata("metersPerUnit") else 1.0
-    found = {}
+    arrays_by_field = {}
     for k, prim in enumerate(prims):
         # USD multiplies row vectors
         placed = np.array(pxr.UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0)).T
         matrix = np.diag([metres, metres, metres, 1.0]) @ up @ placed
         arrays = {"matrix": matrix, **_field(prim)}
-        found |= {f"{name} {k}": array for name, array in arrays.items()}
-    return found
+        arrays_by_field |= {f"{name} {k}": array for name, array in arrays.items()}
+    return arrays_by_field
 
 
 def save_usd(cloud: SplatCloud, path: Path) -> None:
@@ -181,8 +181,8 @@ def save_usd(cloud: SplatCloud, path: Path) -> None:
     }
     for name, value in values.items():
         prim.GetAttribute(name).Set(value)
-    whole = {"labels": cloud.labels if cloud.labels.any() else None, "planes": cloud.coplanar_groups}
-    for name, numbers in whole.items():
+    integers = {"labels": cloud.labels if cloud.labels.any() else None, "planes": cloud.coplanar_groups}
+    for name, numbers in integers.items():
         if numbers is not None:
             attribute = prim.CreateAttribute(f"fidsplat:{name}", pxr.Sdf.ValueTypeNames.IntArray, True)
             attribute.Set(vt.IntArray.FromNumpy(numbers))
@@ -206,10 +206,10 @@ def _field(prim: Any) -> dict[str, np.ndarray]:
         raise InputError(f"the kernel of {prim.GetPath()} must be the Gaussian surflet, got another kernel")
 
     def array(name: str, *columns: int) -> np.ndarray:
-        found = prim.GetAttribute(name).Get() or prim.GetAttribute(f"{name}h").Get()  # h: half precision
-        if found is None:
+        stored = prim.GetAttribute(name).Get() or prim.GetAttribute(f"{name}h").Get()  # h: half precision
+        if stored is None:
             raise InputError(f"{prim.GetPath()} must have {name}, got none")
-        values = np.array(found, np.float32)
+        values = np.array(stored, np.float32)
         if values.shape[1:] != columns or values.ndim != 1 + len(columns):
             raise InputError(
                 f"{name} of {prim.GetPath()} must have the shape n x {columns}, got {values.shape}"
@@ -224,12 +224,12 @@ def _field(prim: Any) -> dict[str, np.ndarray]:
     n, k = len(means), (degree + 1) ** 2
     if len(sh) != n * k:
         raise InputError(f"{prim.GetPath()} must have {n * k} SH coefficients, got {len(sh)}")
-    found = {"means": means, "scales": scales, "sh": sh.reshape(n, k, 3), "opacities": array("opacities")}
-    found["quats"] = array("orientations", 4)[:, [3, 0, 1, 2]]  # USD stores w last
+    fields = {"means": means, "scales": scales, "sh": sh.reshape(n, k, 3), "opacities": array("opacities")}
+    fields["quats"] = array("orientations", 4)[:, [3, 0, 1, 2]]  # USD stores w last
     for name, attribute in (("labels", "labels"), ("coplanar_groups", "planes")):
         if (numbers := prim.GetAttribute(f"fidsplat:{attribute}").Get()) is not None:
-            found[name] = np.array(numbers, np.int32)
-    return found
+            fields[name] = np.array(numbers, np.int32)
+    return fields
 
 
 def _pxr() -> Any:

@@ -12,5 +12,5 @@ def canonical_family(name: str) -> str:
 def foreign_family(name: str) -> tuple[str, str] | None:
     """Kind and family of a name in another project, such as ("apriltag", "36h11") for "tag36h11"; None for
     other names."""
-    found = re.fullmatch(r"(tag|dict_apriltag_|dict_aruco_|dict_)(\w+)", name.lower())
-    return found and ("apriltag" if "tag" in found[1] else "aruco", found[2])
+    match = re.fullmatch(r"(tag|dict_apriltag_|dict_aruco_|dict_)(\w+)", name.lower())
+    return match and ("apriltag" if "tag" in match[1] else "aruco", match[2])

@@ -40,8 +40,8 @@ def disparity_of(left: np.ndarray, right: np.ndarray, most: int) -> np.ndarray:
     )
     # padding on the left, so that near surfaces at the left edge are matched too
     padded = [cv2.copyMakeBorder(image, 0, 0, most, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
-    found = matcher.compute(*padded)[:, most:].astype(np.float32) / 16
-    return _refined(left.astype(np.float32), right.astype(np.float32), np.maximum(found, 0))
+    disparity = matcher.compute(*padded)[:, most:].astype(np.float32) / 16
+    return _refined(left.astype(np.float32), right.astype(np.float32), np.maximum(disparity, 0))
 
 
 def _refined(left: np.ndarray, right: np.ndarray, found: np.ndarray) -> np.ndarray:

@@ -112,18 +112,20 @@ def draw_outlines(
         cv2.polylines(marked, [points.reshape(-1, 1, 2)], True, _OUTLINE, thickness, cv2.LINE_AA, _SHIFT)
         cv2.circle(marked, points[0].tolist(), (2 + thickness) * 2**_SHIFT, _OUTLINE, -1, cv2.LINE_AA, _SHIFT)
     line, bottom = round(36 * size), image.shape[0] - 8
-    taken = [(*corners.min(axis=0), *corners.max(axis=0)) for corners, _ in marks]  # left, top, right, foot
+    occupied = [
+        (*corners.min(axis=0), *corners.max(axis=0)) for corners, _ in marks
+    ]  # left, top, right, foot
     for corners, text in sorted(marks, key=lambda mark: mark[0][:, 1].max()):
         wide = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, max(1, round(2 * size)))[0][0]
         left = round(min(max(corners[:, 0].mean() - wide / 2, 4), max(image.shape[1] - wide - 4, 4)))
         foot = round(min(corners[:, 1].max() + line, bottom))
         while foot < bottom and any(
             left - 4 < right and left + wide + 4 > begin and foot - line + 8 < low and foot + 8 > high
-            for begin, high, right, low in taken
+            for begin, high, right, low in occupied
         ):
             foot += 1
         box = (left - 4, foot - line + 8, left + wide + 4, foot + 8)
-        taken.append(box)
+        occupied.append(box)
         cv2.rectangle(marked, box[:2], box[2:], (_SHEET,) * 3, -1)
         write(marked, text, (left, foot), size=size)
     return marked

@@ -102,7 +102,7 @@ def stages_of(camera: Camera, mask: np.ndarray | None = None) -> list[tuple[Alig
     shrinks = [2**k for k in range(MAX_LEVELS) if k == 0 or short >> k >= MIN_SIDE]
     coarsest = shrinks[-1]
     finer = [(shrink, 0.7, 8 if shrink > 2 else 5) for shrink in reversed(shrinks[:-1] or [1])]
-    found = []
+    stages = []
     for shrink, blur, steps in [(coarsest, 2.0, 10), (coarsest, 1.0, 6), *finer, (1, 0.0, 0)]:
         width, height = camera.width // shrink, camera.height // shrink
         side = max(MIN_BLOCK, min(width, height) // BLOCKS)
@@ -111,8 +111,8 @@ def stages_of(camera: Camera, mask: np.ndarray | None = None) -> list[tuple[Alig
             shares = smoothed(resized(ignored, width, height)[:, :, None], max(blur, 0.7))
             hidden = shares[:, :, 0] > 1e-3
         stage = AlignmentStage(camera.resampled(width, height), hidden, taps_of(blur), side)
-        found.append((stage, steps))
-    return found
+        stages.append((stage, steps))
+    return stages
 
 
 def align(
@@ -222,9 +222,9 @@ def _minimise(at: _State, stage: _Stage, steps: int, settled: float = _SETTLED) 
         tried, size = at.moved(sums, step), stage.pixels(step[:6], sums)
         if size < settled or number == steps - 1:
             return tried
-        found = stage.sums(stage.frame(tried.pose), tried, sums.noise)
-        if found.cost_before <= sums.cost:
-            at, sums, damping = tried, found, max(damping / 10, 1e-6)
+        candidate = stage.sums(stage.frame(tried.pose), tried, sums.noise)
+        if candidate.cost_before <= sums.cost:
+            at, sums, damping = tried, candidate, max(damping / 10, 1e-6)
         else:
             damping *= 10
     return at
@@ -233,8 +233,8 @@ def _minimise(at: _State, stage: _Stage, steps: int, settled: float = _SETTLED) 
 def _finish(at: _State, stage: _Stage) -> Alignment:
     """Run the last steps; if they do not converge, run them again after steps with Huber's loss. Tukey's loss
     is not convex, and ignores edges displaced by more than a fraction of a pixel."""
-    found, settled = _last_steps(at, stage)
-    return found if settled else _last_steps(_minimise(at, stage, _FULL_STEPS, _FULL_SETTLED), stage)[0]
+    alignment, settled = _last_steps(at, stage)
+    return alignment if settled else _last_steps(_minimise(at, stage, _FULL_STEPS, _FULL_SETTLED), stage)[0]
 
 
 def _last_steps(at: _State, stage: _Stage) -> tuple[Alignment, bool]:
@@ -266,8 +266,8 @@ def _last_steps(at: _State, stage: _Stage) -> tuple[Alignment, bool]:
     covariance = np.diag(np.full(6, np.inf)) if inverse is None else _covariance(sums, inverse)
     inliers, excess = _agreement(sums, stage.image_noise / float(np.median(at.fit.gain)))
     camera = stage.camera.with_pose(at.pose)
-    found = Alignment(camera, excess * covariance, inliers, sums.noise, at.fit.gain)
-    return found, bool(settled) and not rejected
+    alignment = Alignment(camera, excess * covariance, inliers, sums.noise, at.fit.gain)
+    return alignment, bool(settled) and not rejected
 
 
 def _agreement(sums: AlignmentSums, noise: float) -> tuple[float, float]:
@@ -306,11 +306,13 @@ def _bread(at: _State, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.nda
     """
     channels = len(sums.matrix)
     columns = np.concatenate([np.zeros((channels, 8, 6)), sums.matrix[:, :, 6:]], axis=2)
-    turn = _DIFFERENCE / max(stage.camera.fx, stage.camera.fy)
+    angle_step = _DIFFERENCE / max(stage.camera.fx, stage.camera.fy)
     pinhole = stage.camera.lens is None
     for axis in (0, 1, 3, 4) if pinhole else range(6):
         motion = np.zeros(6)
-        motion[axis] = size = turn if axis < 3 else turn / max(math.sqrt(sums.inverse_depth), 1e-3)
+        motion[axis] = size = (
+            angle_step if axis < 3 else angle_step / max(math.sqrt(sums.inverse_depth), 1e-3)
+        )
         other = stage.frame(offset_pose(at.pose, motion))
         rhs = stage.sums(frame, at, sums.noise, moved=MovedFrame(other, size, axis % 3)).rhs
         columns[:, :, axis] = rhs[:, :, 0]
@@ -337,8 +339,8 @@ def _covariance(sums: AlignmentSums, inverse: np.ndarray) -> np.ndarray:
     count, size = len(sums.block_rhs), len(inverse)
     matrices = np.zeros((count, size, size))
     for channel in range(sums.block_rhs.shape[1]):
-        own = np.array(_parameters(channel))
-        matrices[:, own[:, None], own] += sums.block_matrices[:, channel]
+        used = np.array(_parameters(channel))
+        matrices[:, used[:, None], used] += sums.block_matrices[:, channel]
     # more than 1: a single block may determine the pose, which makes the difference singular
     others = 1.000001 * np.eye(size) - inverse @ matrices
     errors = np.linalg.solve(others, (_scores(sums) @ inverse.T)[:, :, None])[:, :6, 0]
@@ -374,9 +376,9 @@ def _assembled(matrices: np.ndarray) -> np.ndarray:
     the channels."""
     total = np.zeros((6 + 2 * len(matrices),) * 2)
     for channel, matrix in enumerate(matrices):
-        own = _parameters(channel)
-        total[np.ix_(own, own)] += matrix
-        total[own[6:], own[6:]] += 1e-9 * (1 + matrix[6, 6] + matrix[7, 7])
+        used = _parameters(channel)
+        total[np.ix_(used, used)] += matrix
+        total[used[6:], used[6:]] += 1e-9 * (1 + matrix[6, 6] + matrix[7, 7])
     return total
 
 

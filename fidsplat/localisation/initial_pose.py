@@ -36,8 +36,8 @@ def pose_of_markers(image: np.ndarray, scene: Scene, camera: Camera) -> tuple[Ca
         if contents.count(content) == 1
     }
     qr = any(placed.marker.kind == "qr" for placed in markers)
-    found = detect(to_uint8(image), families_of(placed.marker for placed in markers), qr=qr)
-    pairs = [(code, known[content_of(code)]) for code in found if content_of(code) in known]
+    detections = detect(to_uint8(image), families_of(placed.marker for placed in markers), qr=qr)
+    pairs = [(code, known[content_of(code)]) for code in detections if content_of(code) in known]
     if not pairs:
         return None
     if len(pairs) == 1:

@@ -183,8 +183,8 @@ def localise(
         best = most_similar(pixels, camera, candidates, render_all, TRIED)
         tried = [align(pixels, mask, one, render, kernels, coarse=True) for one in best]
         starts = [min(tried, key=lambda one: one.noise).camera]
-    found = align(pixels, mask, starts[0], render, kernels, max_side=max_side)
-    return Localisation(found.camera, found.covariance, found.inliers, found.noise, source)
+    alignment = align(pixels, mask, starts[0], render, kernels, max_side=max_side)
+    return Localisation(alignment.camera, alignment.covariance, alignment.inliers, alignment.noise, source)
 
 
 def _pixels(image: Any) -> np.ndarray:

@@ -99,8 +99,8 @@ class HostAlignment(AlignmentKernels):
         """Values, slopes and inverse depths of a frame; those of the last frame are cached."""
         if not self._rendered or self._rendered[0] is not target or self._rendered[1] is not frame:
             image, rows = target.blurred(frame), target.rows
-            found = _at(image, rows), _slopes(image, rows), _nearest(frame["depth"], rows)
-            self._rendered = target, frame, found
+            features = _at(image, rows), _slopes(image, rows), _nearest(frame["depth"], rows)
+            self._rendered = target, frame, features
         return self._rendered[2]
 
 

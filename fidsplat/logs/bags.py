@@ -58,9 +58,9 @@ def log_messages(path: Path) -> Iterator[Message]:
     for file in (regular_file(path / name) for name in names):
         with tempfile.TemporaryDirectory() as folder:
             if compressed == "file":
-                whole, file = file, Path(folder, file.stem)
-                with open_input(whole) as source, file.open("wb") as target:
-                    _decompress(source, target, whole)
+                compressed_file, file = file, Path(folder, file.stem)
+                with open_input(compressed_file) as source, file.open("wb") as target:
+                    _decompress(source, target, compressed_file)
             mcap = metadata.get("storage_identifier") == "mcap" or file.suffix == ".mcap"
             for topic, kind, time, data in (_mcap_messages if mcap else _sqlite_messages)(file):
                 if compressed == "message":
@@ -100,10 +100,10 @@ def _sqlite_messages(path: Path) -> Iterator[Message]:
         connection.execute("PRAGMA trusted_schema = OFF")
         # a view instead of a table may compute endlessly
         kinds = connection.execute("SELECT type FROM sqlite_master WHERE name IN ('messages', 'topics')")
-        found = sorted(kind for (kind,) in kinds)
-        if found != ["table", "table"]:
+        types = sorted(kind for (kind,) in kinds)
+        if types != ["table", "table"]:
             raise InputError(
-                f"{path} must have the tables messages and topics, got {', '.join(found) or 'none'}; give a "
+                f"{path} must have the tables messages and topics, got {', '.join(types) or 'none'}; give a "
                 "rosbag2 database"
             )
         cursor = connection.execute(
@@ -155,8 +155,10 @@ def _expanded(chunk: Chunk) -> int:
     elif chunk.compression == "lz4":
         size = lz4.frame.get_frame_info(chunk.data)["content_size"]
         if not size:
-            most = min(chunk.uncompressed_size, input_limit(len(chunk.data))) + 1
-            size = len(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most))
-            if size == most:
-                raise InputError(f"a chunk must expand to the {most - 1:,} bytes that it declares, got more")
+            max_size = min(chunk.uncompressed_size, input_limit(len(chunk.data))) + 1
+            size = len(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=max_size))
+            if size == max_size:
+                raise InputError(
+                    f"a chunk must expand to the {max_size - 1:,} bytes that it declares, got more"
+                )
     return max(chunk.uncompressed_size, size)

@@ -54,9 +54,9 @@ class RclpyTopics:
             self._node.create_subscription(_class(kind), topic, lambda one: messages.append(one), DEPTH)
         for _ in range(DEPTH):
             self._executor.spin_once(timeout_sec=0)
-        found = list(self._received[topic])
+        new_messages = list(self._received[topic])
         self._received[topic].clear()
-        return found
+        return new_messages
 
     def close(self, keep: bool) -> None:
         """End the node."""

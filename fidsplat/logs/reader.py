@@ -62,7 +62,7 @@ def messages(path: str | os.PathLike[str], *topics: str) -> Iterator[tuple[str, 
 def log_images(path: str | os.PathLike[str], topic: str | None = None) -> Iterator[LogImage]:
     """Yield the colour images of a log in order: rgb8, bgr8, rgba8, bgra8, mono8 and compressed. topic: topic
     to read; None for all. Raises InputError if there are none."""
-    file, store, found = path_of(path), typestore(), False
+    file, store, has_images = path_of(path), typestore(), False
     with _as_input_error(file):
         for name, kind, time, data in log_messages(file):
             if kind not in (_IMAGE, _COMPRESSED) or (topic is not None and name != topic):
@@ -70,11 +70,11 @@ def log_images(path: str | os.PathLike[str], topic: str | None = None) -> Iterat
             message = store.deserialize_cdr(data, kind)
             image = _decode_image(message)
             if image is not None:
-                found = True
+                has_images = True
                 yield LogImage(
                     f"{name} {time / 1e9:.3f} s", image, message.header.frame_id, _stamp(message.header)
                 )
-    if not found:
+    if not has_images:
         on_topic = f" on {topic}" if topic else ""
         raise InputError(f"{file} must have colour images{on_topic}, got none; give another file or topic")
 
@@ -82,17 +82,17 @@ def log_images(path: str | os.PathLike[str], topic: str | None = None) -> Iterat
 def log_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int], np.ndarray]:
     """Poses (4, 4) in the scene by frame and nanoseconds, from `/tf`: relative to the frame `scene`, or else
     to the frame without a parent. Each frame in between must have a pose of the same time."""
-    file, store, found = path_of(path), typestore(), {}
+    file, store, transforms = path_of(path), typestore(), {}
     with _as_input_error(file):
         for _, kind, _, data in log_messages(file):
             for one in store.deserialize_cdr(data, kind).transforms if kind == _TRANSFORMS else ():
-                found[one.child_frame_id, _stamp(one.header)] = one
-    children = {frame for frame, _ in found}
+                transforms[one.child_frame_id, _stamp(one.header)] = one
+    children = {frame for frame, _ in transforms}
     poses = {}
-    for frame, stamp in found:
+    for frame, stamp in transforms:
         pose, parent = np.eye(4), frame
         for _ in range(MAX_DEPTH):
-            one = found.get((parent, stamp))
+            one = transforms.get((parent, stamp))
             if one is None:
                 break
             pose, parent = _pose(one.transform) @ pose, one.header.frame_id
@@ -118,11 +118,11 @@ def _as_input_error(file: Path) -> Iterator[None]:
 
 def detections_of(message: Any) -> list[Detection]:
     """Tags of an AprilTagDetectionArray, as `RobotLog.detections` writes them."""
-    found = []
+    detections = []
     for one in message.detections:
         corners = np.array([(corner.x, corner.y) for corner in one.corners]) + PIXEL_OFFSET
-        found.append(Detection("apriltag", one.family, one.id, None, corners))
-    return found
+        detections.append(Detection("apriltag", one.family, one.id, None, corners))
+    return detections
 
 
 def points_of(message: Any) -> np.ndarray:
@@ -145,8 +145,8 @@ def _stamp(header: Any) -> int:
 
 
 def _pose(transform: Any) -> np.ndarray:
-    at, turn = transform.translation, transform.rotation
-    return rigid_matrix((at.x, at.y, at.z), (turn.w, turn.x, turn.y, turn.z))
+    at, rotation = transform.translation, transform.rotation
+    return rigid_matrix((at.x, at.y, at.z), (rotation.w, rotation.x, rotation.y, rotation.z))
 
 
 def _decode_image(message: Any) -> np.ndarray | None:

@@ -150,8 +150,8 @@ class RobotLog:
         """
         if self.world_from_scene is None:
             return self.transform(time, camera, pose)
-        given = _rigid(pose, f"the pose of {text('the name of a frame', camera)}")
-        link, parent = self.world_from_scene @ given @ np.linalg.inv(LINK_FROM_OPTICAL), self.world
+        in_scene = _rigid(pose, f"the pose of {text('the name of a frame', camera)}")
+        link, parent = self.world_from_scene @ in_scene @ np.linalg.inv(LINK_FROM_OPTICAL), self.world
         transforms = [(self.world, SCENE, self.world_from_scene)]
         if base is not None:
             carrier, parent = _rigid(base, "the pose of base_link"), "base_link"
@@ -170,9 +170,9 @@ class RobotLog:
     def transform(self, time: float, frame: str, pose: Any, parent: str | None = None) -> None:
         """Write the pose of a frame in its parent (4, 4), by default the world, as `/tf`. A camera's frame
         has OpenCV's axes, like ROS's optical frames."""
-        given = _rigid(pose, f"the pose of {text('the name of a frame', frame)}")
+        checked = _rigid(pose, f"the pose of {text('the name of a frame', frame)}")
         self._transforms(
-            time, (self.world, frame, self._in_world(given)) if parent is None else (parent, frame, given)
+            time, (self.world, frame, self._in_world(checked)) if parent is None else (parent, frame, checked)
         )
 
     def odometry(
@@ -181,13 +181,13 @@ class RobotLog:
     ) -> None:  # fmt: skip
         """Write the odometry of a body: pose in the world (4, 4), velocities (3,) in m/s and rad/s in the
         body's axes, and covariance of the pose (6, 6)."""
-        position, turn = self._pose_parts(self._in_world(_rigid(pose, "the pose of odometry")))
+        position, rotation = self._pose_parts(self._in_world(_rigid(pose, "the pose of odometry")))
         spread = np.zeros((6, 6)) if covariance is None else real_array("covariance", covariance)
         if spread.shape != (6, 6):
             raise invalid("covariance", "(6, 6) numbers", covariance)
         text("frame", frame)
         vector, point = self._of("geometry_msgs/msg/Vector3"), self._of("geometry_msgs/msg/Point")
-        body = self._of("geometry_msgs/msg/Pose")(point(*position), turn)
+        body = self._of("geometry_msgs/msg/Pose")(point(*position), rotation)
         twist = self._of("geometry_msgs/msg/Twist")(
             vector(*three_numbers("velocity", velocity)),
             vector(*three_numbers("angular_velocity", angular_velocity)),
@@ -225,11 +225,11 @@ class RobotLog:
     ) -> None:
         """Write positions of joints: radians, or metres for prismatic joints."""
         named = list(items("names", names, str, "names of joints"))
-        given = real_array("positions", positions, "a number for each joint")
-        if given.shape != (len(named),) or not np.isfinite(given).all():
+        values = real_array("positions", positions, "a number for each joint")
+        if values.shape != (len(named),) or not np.isfinite(values).all():
             raise invalid("positions", f"{len(named)} finite numbers", positions)
         message = self._of("sensor_msgs/msg/JointState")
-        self._write(topic, time, message(self._header(time, ""), named, given, np.zeros(0), np.zeros(0)))
+        self._write(topic, time, message(self._header(time, ""), named, values, np.zeros(0), np.zeros(0)))
 
     def points(self, time: float, lidar: str, cloud: np.ndarray, topic: str | None = None) -> None:
         """Write the points of a scan (`Scan.cloud`) as `/LIDAR/points`: PointCloud2 in the frame LIDAR.
@@ -241,14 +241,14 @@ class RobotLog:
         names = getattr(getattr(cloud, "dtype", None), "names", None)
         if names is None or cloud.ndim != 1:
             raise invalid("the points of a scan", "a structured array (n,), as of Scan.cloud()", cloud)
-        made = self._of("sensor_msgs/msg/PointField")
+        field_type = self._of("sensor_msgs/msg/PointField")
         little = np.dtype([(name, cloud.dtype[name].newbyteorder("<")) for name in names])
         fields = []
         for name in names:
             code = little[name].str[1:]
             if code not in _POINT_FIELDS:
                 raise invalid(f"the field {name} of points", f"one of {', '.join(_POINT_FIELDS)}", code)
-            fields.append(made(name, little.fields[name][1], _POINT_FIELDS[code], 1))  # type: ignore[index]
+            fields.append(field_type(name, little.fields[name][1], _POINT_FIELDS[code], 1))  # type: ignore[index]
         data = np.frombuffer(cloud.astype(little).tobytes(), np.uint8)
         message = self._of("sensor_msgs/msg/PointCloud2")(
             self._header(time, lidar), 1, len(cloud), fields, False, little.itemsize, data.size, data, True
@@ -293,12 +293,12 @@ class RobotLog:
         """Write one `/tf` message of parents, frames and poses."""
         stamped = []
         for parent, frame, pose in transforms:
-            position, turn = self._pose_parts(pose)
-            made = self._of("geometry_msgs/msg/Transform")(
-                self._of("geometry_msgs/msg/Vector3")(*position), turn
+            position, rotation = self._pose_parts(pose)
+            transform = self._of("geometry_msgs/msg/Transform")(
+                self._of("geometry_msgs/msg/Vector3")(*position), rotation
             )
             stamped.append(
-                self._of("geometry_msgs/msg/TransformStamped")(self._header(time, parent), frame, made)
+                self._of("geometry_msgs/msg/TransformStamped")(self._header(time, parent), frame, transform)
             )
         self._write("/tf", time, self._of("tf2_msgs/msg/TFMessage")(stamped))
 
@@ -350,9 +350,9 @@ def _nanoseconds(time: float) -> int:
 
 def _rigid(pose: Any, name: str) -> np.ndarray:
     """A rigid matrix (4, 4) or pair as float64. Raises InputError."""
-    given = pose_matrix(pose, name)
-    check_similarity(given, name, rigid=True)
-    return np.asarray(given, np.float64)
+    matrix = pose_matrix(pose, name)
+    check_similarity(matrix, name, rigid=True)
+    return np.asarray(matrix, np.float64)
 
 
 def _distortion(camera: Camera) -> tuple[str, list[float]]:

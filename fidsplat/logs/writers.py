@@ -86,8 +86,8 @@ def _source_of(path: Path) -> str | None:
             return bag_metadata(path)["custom_data"][_METADATA]
         if path.is_file():
             with path.open("rb") as stream:
-                found = make_reader(stream).iter_metadata()
-                return next((one.metadata["source"] for one in found if one.name == _METADATA), None)
+                metadata = make_reader(stream).iter_metadata()
+                return next((one.metadata["source"] for one in metadata if one.name == _METADATA), None)
     except Exception:  # the errors of two packages: not a readable log
         pass
     return None

@@ -58,11 +58,13 @@ def subdivide(
     done_boxes, done_owner, done = [], [], 0
     while len(boxes):
         length = boxes[:, 2:] - boxes[:, :2]
-        apart, by_axis = _deviations(printed, surface, boxes, owner)
+        deviations, by_axis = _deviations(printed, surface, boxes, owner)
         if surface.across is not None:
             width = length * printed.module * (np.abs(surface.across) if printed.angles is None else 1.0)
             by_axis = np.where(width > surface.longest(deviation), width, by_axis)
-        halved = (np.maximum(apart, by_axis.max(1)) > MARGIN * deviation) & ~(whole & (length.max(1) <= 1))
+        halved = (np.maximum(deviations, by_axis.max(1)) > MARGIN * deviation) & ~(
+            whole & (length.max(1) <= 1)
+        )
         done_boxes.append(boxes[~halved])
         done_owner.append(owner[~halved])
         done += len(boxes) - int(halved.sum())
@@ -71,11 +73,11 @@ def subdivide(
         angles = None if printed.angles is None else printed.angles[owner]
         boxes = _halves(boxes, by_axis, MARGIN * deviation / 2, whole, angles)
         owner = np.concatenate([owner, owner])
-    found, owner = np.concatenate(done_boxes), np.concatenate(done_owner)
+    pieces, owner = np.concatenate(done_boxes), np.concatenate(done_owner)
     order = np.argsort(owner, kind="stable")
-    found, owner = found[order], owner[order]
+    pieces, owner = pieces[order], owner[order]
     return printed._replace(
-        boxes=np.rint(found).astype(np.int64) if whole else found,
+        boxes=np.rint(pieces).astype(np.int64) if whole else pieces,
         values=printed.values[owner],
         angles=None if printed.angles is None else printed.angles[owner],
     )
@@ -127,9 +129,9 @@ def _deviations(
     at = surface.frames(centre)
     true = surface.frames((centre[:, None] + offset).reshape(-1, 2)).points.reshape(*offset.shape[:2], 3)
     flat = at.points[:, None] + offset[..., :1] * at.along_x[:, None] + offset[..., 1:] * at.along_y[:, None]
-    apart = np.linalg.norm(true - flat, axis=2)
-    on_axis = [apart[:, steps[:, 1 - axis] == 0].max(1) for axis in (0, 1)]
-    return apart.max(1), np.column_stack(on_axis)
+    distances = np.linalg.norm(true - flat, axis=2)
+    on_axis = [distances[:, steps[:, 1 - axis] == 0].max(1) for axis in (0, 1)]
+    return distances.max(1), np.column_stack(on_axis)
 
 
 def bend(
@@ -144,8 +146,8 @@ def bend(
     """
     gap = GAP * deviation
     at = surface.frames(cloud.means[:, :2].astype(np.float64))
-    turn = np.stack([at.along_x, at.along_y, at.normals], -1)
-    quats = quaternion_multiply(matrices_to_quaternions(turn), cloud.quats).astype(np.float32)
+    rotations = np.stack([at.along_x, at.along_y, at.normals], -1)
+    quats = quaternion_multiply(matrices_to_quaternions(rotations), cloud.quats).astype(np.float32)
     scales = cloud.scales if cloud.boxes is None else (cloud.scales + gap).astype(np.float32)
     rows, groups, copies = _groups(cloud, surface, half, overlap)
     means = at.points[rows] + np.where(copies, gap, 0.0)[:, None] * at.normals[rows]
@@ -171,15 +173,18 @@ def _groups(
     borders = [] if way is None else _borders(surface, way, -extent, extent)
     if way is None or len(borders) == 2:
         return every, np.zeros(len(cloud), np.int32), np.zeros(len(cloud), bool)
-    middle, reach = cloud.means[:, :2] @ way, cloud.half_extents(2.0)[:, :2] @ np.abs(way)
-    own = np.searchsorted(borders[1:-1], middle)
+    middle, half_extent = cloud.means[:, :2] @ way, cloud.half_extents(2.0)[:, :2] @ np.abs(way)
+    home_group = np.searchsorted(borders[1:-1], middle)
     rows = [
-        np.flatnonzero((middle + reach > low - overlap) & (middle - reach < high + overlap) | (own == number))
+        np.flatnonzero(
+            (middle + half_extent > low - overlap) & (middle - half_extent < high + overlap)
+            | (home_group == number)
+        )
         for number, (low, high) in enumerate(pairwise(borders))
     ]
     groups = np.repeat(np.arange(len(rows), dtype=np.int32), [len(each) for each in rows])
-    found = np.concatenate(rows)
-    return found, groups, own[found] != groups
+    row_indices = np.concatenate(rows)
+    return row_indices, groups, home_group[row_indices] != groups
 
 
 def _borders(surface: SheetShape, way: np.ndarray, low: float, high: float) -> list[float]:

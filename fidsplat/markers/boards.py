@@ -32,16 +32,16 @@ class BoardSpec(Spec):
 
 def _parse(text: str, head: str, rest: str) -> BoardSpec:
     kind = head.lower()
-    found = re.fullmatch(r"([0-9]{1,4})[xX]([0-9]{1,4}):(.+)", rest)
-    if not found:
+    match = re.fullmatch(r"([0-9]{1,4})[xX]([0-9]{1,4}):(.+)", rest)
+    if not match:
         raise InputError(
             f"a board must be COLUMNSxROWS:FAMILY, got {text!r}; for example {kind}:{_EXAMPLES[kind]}"
         )
-    columns, rows = int(found[1]), int(found[2])
+    columns, rows = int(match[1]), int(match[2])
     smallest = 2 if kind == "charuco" else 1
     if not (smallest <= columns <= MAX_TAGS and smallest <= rows <= MAX_TAGS):
         raise InputError(f"a board must have {smallest} to {MAX_TAGS} columns and rows, got {text!r}")
-    return BoardSpec(text=text, kind=kind, family=canonical_family(found[3]), columns=columns, rows=rows)
+    return BoardSpec(text=text, kind=kind, family=canonical_family(match[3]), columns=columns, rows=rows)
 
 
 def tag_places(spec: BoardSpec, side: int) -> list[tuple[int, int]]:

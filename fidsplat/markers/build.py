@@ -285,9 +285,9 @@ def marker(
     progress = (lambda task, share: None) if progress is None else progress
     max_splats = whole_number("max_splats", max_splats, 1, 2**31 - 1)
     parsed = parse_spec(spec)
-    given = {"levels": levels, "density": density, "growth": growth, "template": template}
-    given["duplicates"] = None if duplicates is None else flag("duplicates", duplicates)
-    chosen = _chosen(MarkerQuality() if quality is None else quality, mixture, given)
+    changes = {"levels": levels, "density": density, "growth": growth, "template": template}
+    changes["duplicates"] = None if duplicates is None else flag("duplicates", duplicates)
+    chosen = _chosen(MarkerQuality() if quality is None else quality, mixture, changes)
     templates, growth = _mixture(chosen, bool(duplicates))
     # outside, a module or a splat's scale would exceed the range of float32
     size = number("size", size, "a length from 1e-9 to 1e9 metres", 1e-9, 1e9)
@@ -381,9 +381,11 @@ class _Sheet(NamedTuple):
         """Gaussians of each rectangle, or of each piece of it."""
         filled = without_slivers(printed)
         if self.surface is not None:
-            whole = printed.regions is None
-            filled = fine(filled) if whole and printed.module == self.module else filled
-            filled = subdivide(self.spec, filled, self.surface, self._deviation, self.max_splats, whole)
+            along_modules = printed.regions is None
+            filled = fine(filled) if along_modules and printed.module == self.module else filled
+            filled = subdivide(
+                self.spec, filled, self.surface, self._deviation, self.max_splats, along_modules
+            )
         refuse_more(
             self.spec, int(count_gaussians(aspect_of(filled.boxes), templates).sum()), self.max_splats
         )
@@ -394,8 +396,8 @@ class _Sheet(NamedTuple):
     def _deviation(self) -> float:
         """Deviation of the pieces; copies of pieces at the borders of coplanar groups are farther by `GAP`
         times this deviation."""
-        own = None if self.surface is None else self.surface.deviation
-        return (self.size / FINE if own is None else own) / (1 + GAP)
+        requested = None if self.surface is None else self.surface.deviation
+        return (self.size / FINE if requested is None else requested) / (1 + GAP)
 
     def _bent(self, flat: SplatCloud, printed: Printed) -> SplatCloud:
         assert self.surface is not None
@@ -409,15 +411,15 @@ def _inks(parsed: Spec, black: Ink | None, white: Ink | None) -> tuple[Ink, Ink]
         raise InputError(
             f"black and white must be left out for a drawing with own colours, got {parsed.text}"
         )
-    found = []
+    inks = []
     for name, given, default in zip(("black", "white"), (black, white), _INKS, strict=True):
         color = real_array(name, default if given is None else given, "three numbers from 0 to 1")
         if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
             raise invalid(name, "three numbers from 0 to 1", given)
-        found.append(tuple(color.tolist()))
-    if not np.mean(found[0]) < np.mean(found[1]):
-        raise InputError(f"black must be darker than white, got {found[0]} and {found[1]}")
-    return found[0], found[1]
+        inks.append(tuple(color.tolist()))
+    if not np.mean(inks[0]) < np.mean(inks[1]):
+        raise InputError(f"black must be darker than white, got {inks[0]} and {inks[1]}")
+    return inks[0], inks[1]
 
 
 def _quiet_zone(spec: str, parsed: Spec, bits: np.ndarray, modules: int | None) -> int:
@@ -474,8 +476,8 @@ def _chosen(quality: MarkerQuality, mixture: str | None, given: dict[str, Any]) 
 def _mixture(quality: MarkerQuality, duplicates: bool) -> tuple[tuple[Template, ...], float]:
     """Templates and growth of a mixture; for `exact`, those of `Marker.gaussians`."""
     if quality.mixture == "paper":
-        whole = paper_template(quality.levels, quality.density, duplicates)
-        templates, growth = (Template(math.inf, whole),), 0.0
+        gaussians = paper_template(quality.levels, quality.density, duplicates)
+        templates, growth = (Template(math.inf, gaussians),), 0.0
     else:
         templates, growth = fitted_templates(quality.template), fitted_growth()
     return templates, growth if quality.growth is None else float(quality.growth)

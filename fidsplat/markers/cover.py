@@ -45,7 +45,7 @@ class _Sides(NamedTuple):
 def cover_all(
     regions: tuple[shapely.MultiPolygon, ...], shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cover of several regions: rectangles and angles like `cover`, and the region of each, (n,) uint8."""
+    """Cover of several regions: rectangles (n, 4), their angles (n,), and the region of each, (n,) uint8."""
     covers = {value: cover(region, shape) for value, region in enumerate(regions) if not region.is_empty}
     boxes, angles = (np.concatenate(parts) for parts in zip(*covers.values(), strict=True))
     values = np.repeat(np.array(list(covers), np.uint8), [len(own) for _, own in covers.values()])
@@ -102,15 +102,15 @@ def _bands(region: shapely.MultiPolygon) -> np.ndarray:
     tree = shapely.STRtree(list(shapely.get_parts(shapely.linestrings(edges))))
     within = shapely.buffer(region, SLACK, join_style="mitre")
     shapely.prepare(within)
-    found = []
+    bands = []
     while len(sides.start):
         rectangles = _rectangles(sides, _widths(sides, edges, tree))
         long = np.linalg.norm(sides.stop - sides.start, axis=1) > SHORTEST
         done = shapely.covers(within, shapely.polygons(rectangles))
-        found.append(rectangles[done])
+        bands.append(rectangles[done])
         rest = ~done & (long | (sides.turn > SHARP))
         sides = _halves(_Sides(*(values[rest] for values in sides)), long[rest])
-    return np.concatenate(found)
+    return np.concatenate(bands)
 
 
 def _sides(region: shapely.MultiPolygon) -> tuple[np.ndarray, _Sides]:
@@ -198,13 +198,13 @@ def grow_rotated(
     grown = boxes.copy()
     for value, region in enumerate(regions):
         shapely.prepare(region)
-        own = np.flatnonzero(values == value)
-        reach = growth * np.minimum(1, (boxes[own, 2:] - boxes[own, :2]).min(1))
+        rows = np.flatnonzero(values == value)
+        extension = growth * np.minimum(1, (boxes[rows, 2:] - boxes[rows, :2]).min(1))
         for side in range(4):
-            tried = grown[own]
-            tried[:, side] += np.where(side < 2, -reach, reach)
-            free = shapely.covers(region, shapely.polygons(rotated(tried, boxes[own], angles[own])))
-            grown[own[free]] = tried[free]
+            tried = grown[rows]
+            tried[:, side] += np.where(side < 2, -extension, extension)
+            free = shapely.covers(region, shapely.polygons(rotated(tried, boxes[rows], angles[rows])))
+            grown[rows[free]] = tried[free]
     return grown
 
 

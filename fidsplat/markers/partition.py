@@ -164,11 +164,11 @@ def partition_colors(grid: np.ndarray) -> np.ndarray:
         return partition(grid)
     boxes = []
     for color in np.unique(grid):
-        own = (grid == color).astype(np.uint8)
-        cut = partition(own)
-        boxes.append(cut[own[cut[:, 1], cut[:, 0]] == 1])
-    found = np.concatenate(boxes)
-    return found[np.lexsort((found[:, 0], found[:, 1]))]
+        mask = (grid == color).astype(np.uint8)
+        cut = partition(mask)
+        boxes.append(cut[mask[cut[:, 1], cut[:, 0]] == 1])
+    rectangles = np.concatenate(boxes)
+    return rectangles[np.lexsort((rectangles[:, 0], rectangles[:, 1]))]
 
 
 def merge_runs(grid: np.ndarray) -> np.ndarray:

@@ -42,8 +42,8 @@ def polygon_rings(points: str) -> Rings:
 
 def circle_rings(cx: float, cy: float, rx: float, ry: float) -> Rings:
     """Ring of an ellipse."""
-    turn = np.linspace(0, 2 * np.pi, 4 * PIECES, endpoint=False)
-    return [np.column_stack([cx + rx * np.cos(turn), cy + ry * np.sin(turn)])]
+    angle = np.linspace(0, 2 * np.pi, 4 * PIECES, endpoint=False)
+    return [np.column_stack([cx + rx * np.cos(angle), cy + ry * np.sin(angle)])]
 
 
 def rectangle_rings(x: float, y: float, w: float, h: float, rx: float, ry: float) -> Rings:
@@ -53,10 +53,10 @@ def rectangle_rings(x: float, y: float, w: float, h: float, rx: float, ry: float
     rx, ry = min(rx, w / 2), min(ry, h / 2)
     if not (rx > 0 and ry > 0):
         return [np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]])]
-    turn = np.linspace(0, np.pi / 2, PIECES + 1)
+    angle = np.linspace(0, np.pi / 2, PIECES + 1)
     centres = ((x + w - rx, y + h - ry), (x + rx, y + h - ry), (x + rx, y + ry), (x + w - rx, y + ry))
     corners = [
-        np.column_stack([cx + rx * np.cos(turn + i * np.pi / 2), cy + ry * np.sin(turn + i * np.pi / 2)])
+        np.column_stack([cx + rx * np.cos(angle + i * np.pi / 2), cy + ry * np.sin(angle + i * np.pi / 2)])
         for i, (cx, cy) in enumerate(centres)
     ]
     return [np.concatenate(corners)]
@@ -93,11 +93,11 @@ def path_rings(text: str) -> Rings:
             points.append(end)
             here = end
         else:
-            given = v.reshape(-1, 2) + base
+            vertices = v.reshape(-1, 2) + base
             if kind in "ST":  # reflection of the previous control point
                 smooth = before in ("CS" if kind == "S" else "QT")
-                given = np.vstack([2 * here - control if smooth else here, given])
-            curve = np.vstack([here, given])
+                vertices = np.vstack([2 * here - control if smooth else here, vertices])
+            curve = np.vstack([here, vertices])
             points += list(_bezier(curve))
             control, here = curve[-2], curve[-1]
         before = kind
@@ -105,18 +105,18 @@ def path_rings(text: str) -> Rings:
 
 
 def _commands(text: str) -> Iterator[tuple[str, np.ndarray]]:
-    """Commands with their arguments; further pairs of a move are lines."""
+    """Commands of an SVG path with their arguments; pairs after the first one of a move are lines."""
     command, numbers = "", []
     place = _skip(text, 0)
     while place <= len(text):
         in_flag = command in ("A", "a") and len(numbers) % 7 in (3, 4)
-        found = (_FLAG if in_flag else _TOKEN).match(text, place)
-        if found is None and place < len(text):
+        match = (_FLAG if in_flag else _TOKEN).match(text, place)
+        if match is None and place < len(text):
             raise ValueError(
                 f"a path must have commands and numbers, got {text[place : place + 10].split()[0]!r}"
             )
-        letter, digits = ("Z", "") if found is None else found.groups(default="")
-        place = len(text) + 1 if found is None else _skip(text, found.end())
+        letter, digits = ("Z", "") if match is None else match.groups(default="")
+        place = len(text) + 1 if match is None else _skip(text, match.end())
         if not letter:
             numbers.append(number(digits))
             continue

@@ -87,7 +87,7 @@ def aspect_of(boxes: np.ndarray) -> np.ndarray:
 def gaussian_cloud(
     printed: Printed, templates: tuple[Template, ...], growth: float, progress: Progress
 ) -> SplatCloud:
-    """Cloud of the Gaussians of a mixture."""
+    """Cloud of Gaussians that approximate the printed rectangles."""
     aspect = aspect_of(printed.boxes)
     grown = _grown(printed, growth)
     ends = np.cumsum(count_gaussians(aspect, templates))
@@ -110,8 +110,8 @@ def _grown(printed: Printed, growth: float) -> np.ndarray:
         return grow(grid, boxes, growth)
     grown = boxes.astype(np.float64)
     for value in np.unique(values):
-        own = values == value
-        grown[own] = grow((grid == value).astype(np.uint8), boxes[own], growth)
+        mask = values == value
+        grown[mask] = grow((grid == value).astype(np.uint8), boxes[mask], growth)
     return grown
 
 
@@ -220,8 +220,8 @@ def grow(grid: np.ndarray, rectangles: np.ndarray, growth: float) -> np.ndarray:
                 strip[each, side] += way
                 x0, y0, x1, y1 = strip.T
                 c = color[moving]
-                own = sums[c, y1, x1] - sums[c, y0, x1] - sums[c, y1, x0] + sums[c, y0, x0]
-                free = own == (x1 - x0) * (y1 - y0)
+                area = sums[c, y1, x1] - sums[c, y0, x1] - sums[c, y1, x0] + sums[c, y0, x0]
+                free = area == (x1 - x0) * (y1 - y0)
                 moving, side = moving[free], side[free]
                 cells[moving, side] += way
                 grown[moving, side] += way * np.minimum(left[moving], 1.0)

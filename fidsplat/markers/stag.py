@@ -72,8 +72,8 @@ def _bits(spec: Spec) -> tuple[Spec, np.ndarray]:
     angle = (angle + np.pi / 2 * np.arange(4)[:, None]).ravel()
     points = 0.5 + 0.7 * np.tile(radius, 4)[:, None] * np.column_stack([np.cos(angle), -np.sin(angle)])
     dark = codes()[spec.family or ""][spec.id or 0] == 1
-    apart = np.linalg.norm(points[:, None] - points, axis=2)
-    one, other = np.nonzero(np.triu(apart < _NEAR, 1) & dark[:, None] & dark)
+    distances = np.linalg.norm(points[:, None] - points, axis=2)
+    one, other = np.nonzero(np.triu(distances < _NEAR, 1) & dark[:, None] & dark)
 
     def circles(centres: np.ndarray, radius: float) -> shapely.Geometry:
         sides = 4 if radius < _DISK else 16  # of a quadrant: 1/1000 of the edge from the circle
@@ -102,8 +102,8 @@ def _detect(grey: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
         raise DeviceError("detection of stag requires stag-python; pip install stag-python") from error
     for library in codes():
         corners, ids, _ = detectMarkers(grey, int(library[2:]), errorCorrection=_CORRECTED)
-        for number, found in zip(np.ravel(ids), corners, strict=True):
-            yield f"stag:{library}:{number}", np.reshape(found, (4, 2)) + 0.5
+        for number, quad in zip(np.ravel(ids), corners, strict=True):
+            yield f"stag:{library}:{number}", np.reshape(quad, (4, 2)) + 0.5
 
 
 KINDS = (Kind("stag", "stag:LIBRARY:ID", 2, _parse, _bits, detect=_detect, default=False),)

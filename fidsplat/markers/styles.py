@@ -59,10 +59,10 @@ class Rule(NamedTuple):
 def declarations(text: str) -> dict[str, str]:
     """Parse the declarations of a `style`: names and values. Raises ValueError for !important."""
     parts = (part.partition(":") for part in _COMMENT.sub("", text).split(";"))
-    found = {key.strip().lower(): value.strip() for key, colon, value in parts if colon}
-    if any("!" in value for value in found.values()):
+    values = {key.strip().lower(): value.strip() for key, colon, value in parts if colon}
+    if any("!" in value for value in values.values()):
         raise ValueError("!important")
-    return found
+    return values
 
 
 def rules(text: str) -> list[Rule]:
@@ -72,7 +72,7 @@ def rules(text: str) -> list[Rule]:
     left = _RULE.sub("", text).strip()
     if left:
         raise ValueError(f"{left[:20]!r}")
-    found = []
+    parsed = []
     for selectors, body in _RULE.findall(text):
         for selector in map(str.strip, selectors.split(",")):
             match = _SELECTOR.fullmatch(selector)
@@ -84,8 +84,8 @@ def rules(text: str) -> list[Rule]:
                 raise ValueError(f"{selector[:20]!r}")
             tag = "" if tag == "*" else tag
             rank = (len(ids), len(classes), int(bool(tag)))
-            found.append(Rule(rank, tag, "".join(ids), frozenset(classes), declarations(body)))
-    return sorted(found, key=lambda rule: rule.rank)
+            parsed.append(Rule(rank, tag, "".join(ids), frozenset(classes), declarations(body)))
+    return sorted(parsed, key=lambda rule: rule.rank)
 
 
 def styled(sheet: Iterable[Rule], tag: str, attributes: dict[str, str]) -> dict[str, str]:

@@ -122,9 +122,9 @@ class _Profile(_Along):
         xy = np.asarray(xy, np.float64)
         side, axis = np.array([*self.across, 0.0]), np.array([*axis_of(self.axis), 0.0])
         p, q, angle = self._profile(xy @ side[:2])
-        away = np.array([0.0, 0.0, 1.0])
-        points = p[:, None] * side + (xy @ axis[:2])[:, None] * axis + q[:, None] * away
-        tangent = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * away
+        viewing = np.array([0.0, 0.0, 1.0])
+        points = p[:, None] * side + (xy @ axis[:2])[:, None] * axis + q[:, None] * viewing
+        tangent = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * viewing
         return Frames(points, side[0] * tangent + axis[0] * axis, side[1] * tangent + axis[1] * axis)
 
 
@@ -169,10 +169,10 @@ class BentSheet(_Profile):
         return self.length if height > deviation / 4 else math.inf
 
     def _profile(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        wave, most = 2 * math.pi / self.length, self.length / (2 * math.pi * self.radius)
+        wave, max_slope = 2 * math.pi / self.length, self.length / (2 * math.pi * self.radius)
 
         def angle(at: np.ndarray) -> np.ndarray:
-            return most * np.sin(wave * at)
+            return max_slope * np.sin(wave * at)
 
         # complete waves do not rise; the quadrature is exact to rounding for half a wave
         at, weight = (np.polynomial.legendre.leggauss(24) + np.array([[1.0], [0.0]])) / 2
@@ -259,11 +259,11 @@ class Cone(_Along):
         far, angle = self._unrolled(xy, self.radius)
         sine, cosine = self._sine, 1 / math.hypot(1, self.taper)
         x, y = axis_of(self.axis)
-        side, down, away = np.array([y, -x, 0.0]), np.array([x, y, 0.0]), np.array([0.0, 0.0, 1.0])
-        outwards, axis = sine * down - cosine * away, cosine * down + sine * away
-        turn = (angle / sine)[:, None]
-        line = sine * (np.cos(turn) * outwards + np.sin(turn) * side) + cosine * axis
-        around = np.cos(turn) * side - np.sin(turn) * outwards
+        side, down, viewing = np.array([y, -x, 0.0]), np.array([x, y, 0.0]), np.array([0.0, 0.0, 1.0])
+        outwards, axis = sine * down - cosine * viewing, cosine * down + sine * viewing
+        rotation = (angle / sine)[:, None]
+        line = sine * (np.cos(rotation) * outwards + np.sin(rotation) * side) + cosine * axis
+        around = np.cos(rotation) * side - np.sin(rotation) * outwards
         points = far[:, None] * line - self.radius / sine * down
         c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
         by_side, by_down = s * line + c * around, c * line - s * around
@@ -298,8 +298,8 @@ class Crumpled(SheetShape):
     def frames(self, xy: np.ndarray) -> Frames:
         xy = np.asarray(xy, np.float64)
         rng = np.random.default_rng(self.seed)
-        turn = np.pi * (np.arange(WAVES) + rng.random(WAVES)) / WAVES
-        ways = np.column_stack([np.cos(turn), np.sin(turn)])
+        azimuth = np.pi * (np.arange(WAVES) + rng.random(WAVES)) / WAVES
+        ways = np.column_stack([np.cos(azimuth), np.sin(azimuth)])
         wave = 2 * np.pi / self.length * rng.uniform(0.6, 1.4, WAVES)
         share = rng.uniform(0.5, 1.5, WAVES)
         tall = self.height * share / share.sum()
@@ -362,10 +362,10 @@ def axis_of(axis: str | tuple[float, ...]) -> np.ndarray:
         if axis not in ("x", "y"):
             raise InputError(f"shape: axis must be x, y or two numbers, got {axis!r}")
         return np.array([1.0, 0.0] if axis == "x" else [0.0, 1.0])
-    found = real_array("shape: axis", axis, "x, y or two numbers")
-    if found.shape != (2,) or not np.isfinite(found).all() or not found.any():
+    numbers = real_array("shape: axis", axis, "x, y or two numbers")
+    if numbers.shape != (2,) or not np.isfinite(numbers).all() or not numbers.any():
         raise InputError(f"shape: axis must be x, y or two numbers, not both 0, got {axis!r}")
-    return found / np.linalg.norm(found)
+    return numbers / np.linalg.norm(numbers)
 
 
 def _require_length(length: float, smallest: float) -> None:

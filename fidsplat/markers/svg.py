@@ -70,10 +70,10 @@ class _File(NamedTuple):
 
 
 def _parse(text: str, head: str, rest: str) -> DrawingSpec:
-    found = _HEAD.fullmatch(head)
-    if found is None:
+    match = _HEAD.fullmatch(head)
+    if match is None:
         raise InputError(f"a drawing must be svg:FILE.svg or svg-512:FILE.svg, got {head!r}")
-    modules = int(found["modules"] or MODULES)
+    modules = int(match["modules"] or MODULES)
     if not 1 <= modules <= MAX_MODULES:
         raise InputError(f"a drawing must have 1 to {MAX_MODULES} modules across, got {text!r}")
     if not rest:
@@ -198,8 +198,8 @@ def _shapes(
 
 def _inherited(style: _Style, look: dict[str, str]) -> _Style:
     names = {"fill": "fill", "rule": "fill-rule", "visibility": "visibility", "color": "color"}
-    given = {field.name: look.get(names[field.name], "inherit") for field in fields(style)}
-    return replace(style, **{key: value for key, value in given.items() if value != "inherit"})
+    values = {field.name: look.get(names[field.name], "inherit") for field in fields(style)}
+    return replace(style, **{key: value for key, value in values.items() if value != "inherit"})
 
 
 def _first(switch: ElementTree.Element) -> list[ElementTree.Element]:
@@ -236,13 +236,13 @@ def _rings(element: ElementTree.Element, tag: str, name: str | None) -> Rings:
 def _look(element: ElementTree.Element, tag: str, file: _File) -> dict[str, str]:
     """Attributes of an element, overridden by style sheets and `style`."""
     try:
-        said = styled(file.sheet, tag, element.attrib)
+        attributes = styled(file.sheet, tag, element.attrib)
     except ValueError as error:
         raise InputError(f"{file.name}: the style of <{tag}> must be plain properties, got {error}") from None
     for key in (*_MOVES, *(() if tag in _GROUPS else _OF_SHAPES)):
-        if key in said or (key == "transform-origin" and key in element.attrib):
+        if key in attributes or (key == "transform-origin" and key in element.attrib):
             raise InputError(f"{file.name}: {key} of <{tag}> must be an attribute, got a style property")
-    return element.attrib | said
+    return element.attrib | attributes
 
 
 def _is_one(text: str) -> bool:
@@ -259,8 +259,8 @@ def _color(text: str, name: str | None) -> tuple[float, float, float]:
         digits = word[1:] if len(word) == 7 else "".join(2 * digit for digit in word[1:])
         r, g, b = (int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4))
         return r, g, b
-    if found := re.fullmatch(r"rgb\(\s*(\d{1,9})[\s,]+(\d{1,9})[\s,]+(\d{1,9})\s*\)", word):
-        r, g, b = (min(int(part), 255) / 255 for part in found.groups())
+    if match := re.fullmatch(r"rgb\(\s*(\d{1,9})[\s,]+(\d{1,9})[\s,]+(\d{1,9})\s*\)", word):
+        r, g, b = (min(int(part), 255) / 255 for part in match.groups())
         return r, g, b
     raise InputError(f"{name}: a fill must be #rrggbb, rgb(r, g, b) or a name, got {text!r}")
 

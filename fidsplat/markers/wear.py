@@ -165,16 +165,16 @@ def _indexed(sheet: Sheet) -> tuple[np.ndarray, np.ndarray]:
     while True:
         known, index = [], np.zeros(len(colors), np.int64)
         for channel in colors.T:
-            levels, own = np.unique(channel, return_inverse=True)
+            levels, indices = np.unique(channel, return_inverse=True)
             known.append(levels)
-            index = index * len(levels) + own
+            index = index * len(levels) + indices
         used, index = np.unique(index, return_inverse=True)
         if len(used) < HOLE:
             break
         steps = steps // 2 or 32
         colors = np.rint(colors * steps) / steps
     places = np.unravel_index(used, [len(levels) for levels in known])
-    palette = np.column_stack([levels[own] for levels, own in zip(known, places, strict=True)])
+    palette = np.column_stack([levels[indices] for levels, indices in zip(known, places, strict=True)])
     values = np.full(sheet.present.shape, HOLE, np.uint8)
     values[sheet.present] = index
     return values, palette.astype(np.float32)
@@ -196,21 +196,23 @@ def _coarse(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
 
 def _bled(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
     """Ink spreads, unevenly along the edges, and keeps the colour of the nearest ink."""
-    reach = SMEAR * severity * sheet.cells * (0.7 + 0.6 * _noise(sheet, 0.4, rng))
+    distances = SMEAR * severity * sheet.cells * (0.7 + 0.6 * _noise(sheet, 0.4, rng))
     ink = sheet.present & (sheet.color != sheet.paper).any(2)
-    most = math.ceil(reach.max())
-    steps = np.arange(-most, most + 1)
+    max_distance = math.ceil(distances.max())
+    steps = np.arange(-max_distance, max_distance + 1)
     dy, dx = (each.ravel() for each in np.meshgrid(steps, steps, indexing="ij"))
     distance = np.hypot(dy, dx)
-    padded, color = np.pad(ink, most), sheet.color.copy()
+    padded, color = np.pad(ink, max_distance), sheet.color.copy()
     todo, (h, w) = sheet.present & ~ink, ink.shape
-    colors = np.pad(sheet.color, ((most, most), (most, most), (0, 0)))
+    colors = np.pad(sheet.color, ((max_distance, max_distance), (max_distance, max_distance), (0, 0)))
     for i in np.argsort(distance, kind="stable"):
-        if distance[i] > reach.max():
+        if distance[i] > distances.max():
             break
-        shifted = np.s_[most + dy[i] : most + dy[i] + h, most + dx[i] : most + dx[i] + w]
+        shifted = np.s_[
+            max_distance + dy[i] : max_distance + dy[i] + h, max_distance + dx[i] : max_distance + dx[i] + w
+        ]
         # 0.5 cells: the edge of the ink is half a cell nearer than the centre of the inked cell
-        spread = todo & padded[shifted] & (distance[i] - 0.5 <= reach)
+        spread = todo & padded[shifted] & (distance[i] - 0.5 <= distances)
         color[spread] = colors[shifted][spread]
         todo &= ~spread
     return sheet._replace(color=color)
@@ -226,13 +228,13 @@ def _scratched(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet
     h, w = sheet.size
     color, left = sheet.color.copy(), SCRATCHED * severity * h * w
     while left > 0:
-        middle, turn = rng.random(2) * (h, w), rng.uniform(0, math.pi)
+        middle, angle = rng.random(2) * (h, w), rng.uniform(0, math.pi)
         length, width = rng.uniform(0.05, 0.5) * max(h, w), SCRATCH * rng.uniform(0.7, 1.3)
         length = min(length, left / width)
         left -= length * width
         near, dy, dx = _around(sheet, middle, length / 2 + width)
-        along = np.abs(math.cos(turn) * dx + math.sin(turn) * dy)
-        across = np.abs(math.cos(turn) * dy - math.sin(turn) * dx)
+        along = np.abs(math.cos(angle) * dx + math.sin(angle) * dy)
+        across = np.abs(math.cos(angle) * dy - math.sin(angle) * dx)
         color[near][(along < length / 2) & (across < width / 2)] = sheet.paper
     return sheet._replace(color=color)
 
@@ -289,22 +291,22 @@ def _torn(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
     """A part torn off from a corner along a ragged line, with a rim of bare paper."""
     (y, x), (h, w) = sheet.at, sheet.size
     bottom, right = rng.integers(0, 2, 2)
-    turn = rng.uniform(0.15, 0.35) * math.pi
+    angle = rng.uniform(0.15, 0.35) * math.pi
     down, in_ = (h - y if bottom else y), (w - x if right else x)
     ragged = 0.6 * (_noise(sheet, 1.2, rng) + 0.5 * _noise(sheet, 0.4, rng))
-    away = math.sin(turn) * down + math.cos(turn) * in_ + ragged
-    rank = _ranks(sheet, away)
+    distance = math.sin(angle) * down + math.cos(angle) * in_ + ragged
+    rank = _ranks(sheet, distance)
     gone = rank < TORN * severity
-    edge = away[~gone & sheet.present].min(initial=math.inf)
+    edge = distance[~gone & sheet.present].min(initial=math.inf)
     color = sheet.color.copy()
-    color[away < edge + 0.15] = sheet.paper
+    color[distance < edge + 0.15] = sheet.paper
     return sheet._replace(color=color, present=sheet.present & ~gone)
 
 
 def _covered(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
     """An opaque object over one side."""
-    (y, x), turn = sheet.at, rng.uniform(0, 2 * math.pi)
-    rank = _ranks(sheet, math.cos(turn) * x + math.sin(turn) * y)
+    (y, x), angle = sheet.at, rng.uniform(0, 2 * math.pi)
+    rank = _ranks(sheet, math.cos(angle) * x + math.sin(angle) * y)
     color = sheet.color.copy()
     color[rank < severity] = COVER
     return sheet._replace(color=color)
@@ -349,7 +351,7 @@ def _ranks(sheet: Sheet, values: np.ndarray) -> np.ndarray:
     """Rank of each cell: share of the sheet's cells with a lower value, 0 to 1; 1 without paper."""
     rank = np.ones(sheet.present.shape)
     order = np.argsort(values[sheet.present], kind="stable")
-    own = np.empty(len(order))
-    own[order] = np.arange(len(order)) / max(len(order), 1)
-    rank[sheet.present] = own
+    ranks = np.empty(len(order))
+    ranks[order] = np.arange(len(order)) / max(len(order), 1)
+    rank[sheet.present] = ranks
     return rank

@@ -94,22 +94,24 @@ def adjust(cameras: Sequence[Camera], views: Sequence[TagView], sizes: Mapping[s
             "photographs with the complete tag"
         )
     typical, used, rejected, scales, poses = float(np.median(known)), [], [], {}, {}
-    for tag, own in units.items():
+    for tag, estimates in units.items():
         found = seen[tag]
-        poses[tag] = _first_pose(_Corners(cameras, found, sizes, [tag]), tag, relative[tag], own or typical)
-        if own is not None:
+        poses[tag] = _first_pose(
+            _Corners(cameras, found, sizes, [tag]), tag, relative[tag], estimates or typical
+        )
+        if estimates is not None:
             for _ in range(2):
-                good = _inliers(cameras, found, sizes, own, poses)
+                good = _inliers(cameras, found, sizes, estimates, poses)
                 if len(found) - len(good) > MAX_REJECTED * len(found) or len(good) < 2:
                     raise InputError(
                         f"{tag} must be at one place in all photographs, got {len(found) - len(good)} of "
                         f"{len(found)} detections elsewhere; remove photographs of a second copy of the tag, "
                         "or in which it was moved"
                     )
-                own, moved, error = _solve(cameras, good, sizes, own, {tag: poses[tag]})
+                estimates, moved, error = _solve(cameras, good, sizes, estimates, {tag: poses[tag]})
                 poses |= moved
-            good = _inliers(cameras, found, sizes, own, poses)
-            scales[tag] = (1 / own, error)
+            good = _inliers(cameras, found, sizes, estimates, poses)
+            scales[tag] = (1 / estimates, error)
             rejected += [view for view in found if view not in good]
             found = good
         used += found
@@ -133,9 +135,9 @@ def _check_sizes(scales: Mapping[str, tuple[float, float]], sizes: Mapping[str, 
 
 def _tag_in_axes_of_world(camera: Camera, view: TagView, size: float) -> np.ndarray:
     """Pose (4, 4) of the tag relative to the camera's position, in metres, in the axes of the world."""
-    turned = np.eye(4)
-    turned[:3, :3] = camera.world_to_camera[:3, :3].T
-    return turned @ marker_pose(view.corners, size, camera)
+    rotation = np.eye(4)
+    rotation[:3, :3] = camera.world_to_camera[:3, :3].T
+    return rotation @ marker_pose(view.corners, size, camera)
 
 
 def _first_unit(positions: np.ndarray, offsets: np.ndarray) -> float | None:
@@ -144,10 +146,10 @@ def _first_unit(positions: np.ndarray, offsets: np.ndarray) -> float | None:
     positions: (n, 3) of the cameras, in the unit of the model. offsets: (n, 3) to the tag, in metres.
     """
     i, j = np.triu_indices(len(positions), 1)
-    apart, moved = offsets[i] - offsets[j], positions[j] - positions[i]
-    squares = (apart**2).sum(1)
+    distance, moved = offsets[i] - offsets[j], positions[j] - positions[i]
+    squares = (distance**2).sum(1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = (moved * apart).sum(1) / squares
+        ratios = (moved * distance).sum(1) / squares
     usable = (squares > (MIN_PARALLAX * np.linalg.norm(offsets[i], axis=1)) ** 2) & (ratios > 0)
     if not usable.any():
         return None

@@ -42,7 +42,7 @@ def write_images(
 
     Returns the images' cameras, and the tags with the inks of their print.
     """
-    found: list[Camera] = []
+    undistorted: list[Camera] = []
     inks: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in tags]
     for name in ("images", "masks"):
         shutil.rmtree(folder / name, ignore_errors=True)
@@ -67,8 +67,8 @@ def write_images(
             stream.write(encode_image(image, kind, _QUALITY))
         if not inside.all():
             write_png(folder / "masks" / f"{target.name}.png", inside)
-        found.append(small)
-    return found, [_printed(tag, colors) for tag, colors in zip(tags, inks, strict=True)]
+        undistorted.append(small)
+    return undistorted, [_printed(tag, colors) for tag, colors in zip(tags, inks, strict=True)]
 
 
 def _image_name(name: str) -> str:
@@ -96,9 +96,12 @@ def _printed(tag: PlacedMarker, colors: Sequence[tuple[np.ndarray, np.ndarray]])
     if not colors:
         return tag
     black, white = np.round(np.median(np.array(colors), axis=0), 3)
-    made = tag.marker
+    print_marker = tag.marker
     return replace(
-        tag, marker=marker(made.spec, made.size, black=tuple(black.tolist()), white=tuple(white.tolist()))
+        tag,
+        marker=marker(
+            print_marker.spec, print_marker.size, black=tuple(black.tolist()), white=tuple(white.tolist())
+        ),
     )
 
 

@@ -180,14 +180,14 @@ def read_model(folder: Path) -> Model:
     ids = sorted(model.points3D)
     index = {point: i for i, point in enumerate(ids)}
     images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
-    seen = [image.get_observation_points2D() for image in images]
+    observations = [image.get_observation_points2D() for image in images]
     return Model(
         tuple(image.name for image in images),
         tuple(Camera.from_colmap(image.camera, image) for image in images),
         np.array([model.points3D[i].xyz for i in ids], np.float64).reshape(-1, 3),
         np.array([model.points3D[i].color for i in ids], np.uint8).reshape(-1, 3),
-        tuple(np.array([point.xy for point in points], np.float64).reshape(-1, 2) for points in seen),
-        tuple(np.array([index[point.point3D_id] for point in points], np.int64) for points in seen),
+        tuple(np.array([point.xy for point in points], np.float64).reshape(-1, 2) for points in observations),
+        tuple(np.array([index[point.point3D_id] for point in points], np.int64) for points in observations),
     )
 
 
@@ -203,7 +203,7 @@ def unregistered(database: Path, registered: Sequence[str]) -> list[tuple[str, s
                 if not registered or images[partner] in registered:
                     best[each] = max(best[each], count)
         features = {each: data.num_keypoints_for_image(each) for each in images}
-    found = []
+    missing = []
     for each, name in sorted(images.items(), key=lambda item: item[1]):
         if name in registered:
             continue
@@ -215,5 +215,5 @@ def unregistered(database: Path, registered: Sequence[str]) -> list[tuple[str, s
             )
         else:
             reason = f"{best[each]} matches with another, but too few with points of the others"
-        found.append((name, reason))
-    return found
+        missing.append((name, reason))
+    return missing

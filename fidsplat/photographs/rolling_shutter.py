@@ -37,8 +37,8 @@ def readout_motion(model: Model) -> tuple[float, float]:
         motion = np.linalg.lstsq(flat / size, wanted, rcond=1e-6)[0] / size
         left = wanted - flat @ motion
         before, after = before + wanted @ wanted, after + left @ left
-        own = wanted @ wanted / len(wanted)
-        by_chance, variance = by_chance + 6 * own, variance + 12 * own**2
+        energy = wanted @ wanted / len(wanted)
+        by_chance, variance = by_chance + 6 * energy, variance + 12 * energy**2
         moved = by_pose @ motion
         displacements.append(float(np.median(np.linalg.norm(moved, axis=1))))
     if not displacements or before == 0:

@@ -200,10 +200,10 @@ def scale_of(model: Model, first: Pick, second: Pick, metres: float) -> float:
 
     Raises InputError for an unknown photograph, or a pick without a feature nearby.
     """
-    apart = float(np.linalg.norm(_picked(model, first) - _picked(model, second)))
-    if not apart > 0:
+    distance = float(np.linalg.norm(_picked(model, first) - _picked(model, second)))
+    if not distance > 0:
         raise InputError("--scale must be two different points, got one; pick corners far from each other")
-    return metres / apart
+    return metres / distance
 
 
 def _picked(model: Model, pick: Pick) -> np.ndarray:
@@ -212,9 +212,9 @@ def _picked(model: Model, pick: Pick) -> np.ndarray:
     if name not in model.names:
         raise InputError(unknown("photograph of --scale", name, model.names))
     number = model.names.index(name)
-    apart = np.hypot(*(model.pixels[number] - (x, y)).T)
-    nearest = int(np.argmin(apart))
-    if apart[nearest] > SNAP * model.cameras[number].width:
+    distances = np.hypot(*(model.pixels[number] - (x, y)).T)
+    nearest = int(np.argmin(distances))
+    if distances[nearest] > SNAP * model.cameras[number].width:
         raise InputError(
             f"--scale must have pixels at features, got {name}:{x:g}:{y:g}; the nearest feature is at "
             "{:.0f}:{:.0f}".format(*model.pixels[number][nearest])

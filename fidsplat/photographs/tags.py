@@ -26,7 +26,7 @@ _MIN_CONTRAST = 0.1
 
 def parse_tags(texts: Sequence[str]) -> dict[str, Marker]:
     """Markers of `SPEC=METRES`, by their specs. Raises InputError."""
-    found: dict[str, Marker] = {}
+    tags: dict[str, Marker] = {}
     for text in texts:
         spec, equals, size = text.rpartition("=")
         try:
@@ -38,15 +38,15 @@ def parse_tags(texts: Sequence[str]) -> dict[str, Marker]:
                 f"--tag must be a marker spec and the edge of its black square in metres, got {text!r}; "
                 "write for example apriltag:36h11:5=0.16"
             )
-        made = marker(spec, metres)
-        other = same_tag(found, made)
+        printed = marker(spec, metres)
+        other = same_tag(tags, printed)
         if other is not None:
             raise InputError(
-                f"each tag must have one size, got {other.size:g} and {made.size:g} m for {made.spec}; "
+                f"each tag must have one size, got {other.size:g} and {printed.size:g} m for {printed.spec}; "
                 "measure the edge of the black square and give it once"
             )
-        found[made.spec] = made
-    return found
+        tags[printed.spec] = printed
+    return tags
 
 
 def same_tag(tags: Mapping[str, Marker], made: Marker) -> Marker | None:
@@ -66,24 +66,24 @@ def detect_tags(
 
     Raises InputError for a tag that occurs twice in a photograph.
     """
-    families, qr = families_of(tags.values()), any(made.kind == "qr" for made in tags.values())
-    found: list[TagView] = []
+    families, qr = families_of(tags.values()), any(printed.kind == "qr" for printed in tags.values())
+    views: list[TagView] = []
     for number, (name, camera) in enumerate(zip(names, cameras, strict=True)):
         progress("tags", number / len(names))
         detections = detect(read_image(folder / name), families, qr)
-        for spec, made in tags.items():
-            own = [code for code in detections if content_of(code) == content_of(made)]
-            if len(own) > 1:
+        for spec, printed in tags.items():
+            matches = [code for code in detections if content_of(code) == content_of(printed)]
+            if len(matches) > 1:
                 raise InputError(
-                    f"{spec} must occur once in the scene, got {len(own)} of it in {name}; remove copies, or "
+                    f"{spec} must occur once in the scene, got {len(matches)} in {name}; remove copies, or "
                     "print tags with other ids"
                 )
-            for code in own:
+            for code in matches:
                 rays = camera.rays(code.corners)
                 corners = rays[:, :2] / rays[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
                 if np.isfinite(corners).all() and (rays[:, 2] > 0).all():
-                    found.append(TagView(spec, number, corners))
-    return found
+                    views.append(TagView(spec, number, corners))
+    return views
 
 
 def box_of(tag: PlacedMarker) -> np.ndarray:
@@ -97,16 +97,16 @@ def module_colors(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Median colours (3,) of the dark and the light modules in a photograph (h, w, 3) uint8, display values;
     None if the modules are too small or too few are in the image."""
-    made = placed.marker
-    rows, columns = np.indices(made.bits.shape) + 0.5
-    middle = np.array(made.bits.shape) / 2
-    flat = np.stack([columns - middle[1], rows - middle[0], 0 * rows], -1).reshape(-1, 3) * made.module
+    printed = placed.marker
+    rows, columns = np.indices(printed.bits.shape) + 0.5
+    middle = np.array(printed.bits.shape) / 2
+    flat = np.stack([columns - middle[1], rows - middle[0], 0 * rows], -1).reshape(-1, 3) * printed.module
     at = camera.project(flat @ placed.pose[:3, :3].T + placed.pose[:3, 3])
     with np.errstate(invalid="ignore"):
         inside = ((at >= 0) & (at < (camera.width, camera.height))).all(1)
-    edges = np.linalg.norm(np.diff(at.reshape(*made.bits.shape, 2), axis=1), axis=-1)
+    edges = np.linalg.norm(np.diff(at.reshape(*printed.bits.shape, 2), axis=1), axis=-1)
     if not inside.all() or edges.min() < _MIN_MODULE:
         return None
     values = image[at[:, 1].astype(int), at[:, 0].astype(int)] / 255.0
-    dark, light = (np.median(values[made.bits.ravel() == bit], axis=0) for bit in (1, 0))
+    dark, light = (np.median(values[printed.bits.ravel() == bit], axis=0) for bit in (1, 0))
     return (dark, light) if (light - dark).min() > _MIN_CONTRAST else None

@@ -78,7 +78,7 @@ class FlightRenderer:
     def __call__(self, k: int) -> Files:
         flight = self._flight
         frame = self._renderer.render(self._resident, flight.captures[k])
-        found: Files = {}
+        contents: Files = {}
         with tempfile.TemporaryDirectory() as folder:
             for name in frame.outputs:
                 files: dict[Path, str] = {}
@@ -88,8 +88,8 @@ class FlightRenderer:
                     return path
 
                 save_output(name, frame[name], place, flight.capture.sensor.bits)
-                found |= {(name, suffix): path.read_bytes() for path, suffix in files.items()}
-        return found
+                contents |= {(name, suffix): path.read_bytes() for path, suffix in files.items()}
+        return contents
 
 
 def render_flight(folder: FlightFolder, engine: Engine, workers: int) -> Iterator[int]:

@@ -142,8 +142,8 @@ def ray_engine(address: str, make: Make, workers: int | None = None) -> Iterator
         FidsplatError: workers end while they start.
     """
     ray = _ray()
-    own = not ray.is_initialized()
-    if own:
+    is_own = not ray.is_initialized()
+    if is_own:
         try:
             ray.init(
                 None if address == "local" else address,
@@ -167,7 +167,7 @@ def ray_engine(address: str, make: Make, workers: int | None = None) -> Iterator
         finally:
             engine.close()
     finally:
-        if own:
+        if is_own:
             ray.shutdown()
 
 

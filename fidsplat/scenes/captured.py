@@ -84,20 +84,20 @@ def fetch_meanwhile(name: str) -> Callable[[], str]:
     This module must not import zxing-cpp: a thread that hangs at the end of the process keeps the globals of
     its module alive, which zxing-cpp would report as leaks.
     """
-    found: list[str] = []
+    results: list[str] = []
 
     def fetch() -> None:
         try:
             fetch_scene(name)
-            found.append("")
+            results.append("")
         except InputError as error:
-            found.append(str(error))
+            results.append(str(error))
 
     thread = Thread(target=fetch, daemon=True)  # a hanging download must not block the end of the command
     thread.start()
 
     def missing() -> str:
         thread.join(_WAIT)
-        return found[0] if found else f"the download of {name} takes longer than the other views"
+        return results[0] if results else f"the download of {name} takes longer than the other views"
 
     return missing

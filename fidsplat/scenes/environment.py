@@ -74,15 +74,15 @@ def read_quality(top: Table, render: Table) -> Quality | str | None:
     """Quality of a scene file: the table [quality], or the key `quality` of [render]."""
     # samples, lowpass and first_hit are keys of [render] in files without [quality]
     older = {"samples": render.whole, "lowpass": render.text, "first_hit": render.number}
-    given = [key for key in ("quality", *older) if key in render]
+    keys = [key for key in ("quality", *older) if key in render]
     if "quality" not in top:
-        words = [f"{key}={older[key](key)}" if key in older else render.text(key) for key in given]
+        words = [f"{key}={older[key](key)}" if key in older else render.text(key) for key in keys]
         text = ",".join(words) or None
         with render.at("quality"):
             Quality.of(text)
         return text
-    if given:
-        raise render.error(given[0], "and the table [quality] exclude each other; write it there")
+    if keys:
+        raise render.error(keys[0], "and the table [quality] exclude each other; write it there")
     table = top.table("quality", ("preset", *setting_types(Quality), "marker"))
     with table.at("preset"):
         plain = Quality.named(table.text("preset", "standard"))

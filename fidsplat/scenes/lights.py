@@ -208,15 +208,15 @@ _ANGLES = {"angle", "inner", "outer"}
 
 def read_lights(top: Table) -> tuple[Light, ...]:
     """The lights of the tables [[lights]]. Raises InputError with the key."""
-    found = []
+    lights = []
     every = {_key(name) for kind in LIGHTS.values() for name in names_of(kind)}
     for any_kind in top.tables("lights", ("kind", *sorted(every))):
         kind, table = any_kind.of_kind(LIGHTS, _key)
         with table.at():
             values = table.values(kind, _key)
             values |= {name: math.radians(values[name]) for name in _ANGLES & values.keys()}
-            found.append(kind(**values))
-    return tuple(found)
+            lights.append(kind(**values))
+    return tuple(lights)
 
 
 def light_tables(lights: tuple[Light, ...]) -> Iterator[dict[str, Any]]:

@@ -50,8 +50,8 @@ class PlacedMarker(PickledByFields):
     colours. The light of a moving marker is that at its initial pose."""
 
     def __post_init__(self) -> None:
-        given = pose_matrix(self.pose, "a marker's pose")
-        check_similarity(given, "a marker's pose", rigid=True)
+        matrix = pose_matrix(self.pose, "a marker's pose")
+        check_similarity(matrix, "a marker's pose", rigid=True)
         if self.motion is not None and not callable(self.motion):
             raise InputError(
                 "a marker's motion must be an fs.Trajectory or a function of time, got a "
@@ -64,7 +64,7 @@ class PlacedMarker(PickledByFields):
                 f"marker must be an fs.Marker, got {self.marker!r}; e.g. fs.marker('apriltag:36h11:5')"
             )
         object.__setattr__(self, "light", Lighting.of(self.light))
-        pose = np.array(given, dtype=np.float64)
+        pose = np.array(matrix, dtype=np.float64)
         pose.flags.writeable = False
         object.__setattr__(self, "pose", pose)
 
@@ -189,9 +189,9 @@ class SceneParts(PickledByFields):
         if not self.cloud_motions:
             return {}
         still = [cloud.labels for i, cloud in enumerate(self.clouds) if i not in self.cloud_motions]
-        taken = {int(label) for labels in still for label in np.unique(labels)}
-        taken |= {label for store in self.stores for label in store.labels()}
-        free = (label for label in itertools.count(len(self.markers) + 1) if label not in taken)
+        used = {int(label) for labels in still for label in np.unique(labels)}
+        used |= {label for store in self.stores for label in store.labels()}
+        free = (label for label in itertools.count(len(self.markers) + 1) if label not in used)
         return dict(zip(sorted(self.cloud_motions), free, strict=False))
 
 
@@ -224,11 +224,11 @@ def _all_of(values: Iterable, kind: type[T], name: str) -> tuple[T, ...]:
     if isinstance(values, kind):
         raise invalid(name, f"a list of {kind.__name__}", values, "put it into a list")
     try:
-        found: tuple[Any, ...] = (values,) if isinstance(values, str) else tuple(values)
+        items: tuple[Any, ...] = (values,) if isinstance(values, str) else tuple(values)
     except TypeError:
-        found = (values,)
-    for value in found:
+        items = (values,)
+    for value in items:
         if not isinstance(value, kind):
             hint = _INSTEAD.get("str" if isinstance(value, PathLike) else type(value).__name__, "")
             raise invalid(name, f"a list of {kind.__name__}", value, hint)
-    return found
+    return items

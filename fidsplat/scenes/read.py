@@ -224,9 +224,9 @@ def _splats(table: Table, load: Callable[[str], SplatCloud]) -> tuple[SplatCloud
 def _shape(table: Table) -> SheetShape:
     """Shape of a marker from the table `shape`."""
     names = dict.fromkeys(name for kind in SHAPES.values() for name in names_of(kind))
-    kind, own = table.table("shape", ("kind", *names)).of_kind(SHAPES)
-    with own.at():
-        return kind(**own.values(kind))
+    kind, shape_table = table.table("shape", ("kind", *names)).of_kind(SHAPES)
+    with shape_table.at():
+        return kind(**shape_table.values(kind))
 
 
 def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progress | None) -> PlacedMarker:
@@ -235,7 +235,7 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progre
         raise table.error("size", f"must be above 0 metres, got {size!r}")
     pose, motion = _pose(table), read_keyframes(table, POSE, _pose)
     quiet_zone, max_splats = table.whole("quiet_zone", None), table.whole("max_splats", None)
-    own, light = table.values(MarkerQuality), read_lighting(table)
+    settings, light = table.values(MarkerQuality), read_lighting(table)
     if quiet_zone is not None and quiet_zone < 0:
         raise table.error("quiet_zone", f"must be 0 or more modules, got {quiet_zone}")
     from fidsplat.markers import marker, with_file  # lazy: heavy imports
@@ -250,6 +250,6 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progre
     known = {"quiet_zone": quiet_zone, "quality": quality, "progress": progress, **limit}
     with table.at():
         spec = with_file(spec, lambda name: str(folder / name))
-        built = marker(spec, size, **known, **own)
+        built = marker(spec, size, **known, **settings)
         bundle = table.text("bundle", None)
         return PlacedMarker(built, pose, motion=motion, bundle=bundle, light=light)

@@ -108,11 +108,11 @@ class Scene(SceneParts, Summarised):
         from fidsplat.markers import Marker  # lazy: heavy imports
 
         instance("marker", marker, Marker, "a Marker, e.g. fs.marker('apriltag:36h11:5', 0.16)")
-        found = self.surface_at(camera, pixel, **{"radius": marker.radius} | options)
+        surface = self.surface_at(camera, pixel, **{"radius": marker.radius} | options)
         view = camera or self.camera
         if options.get("ray") is not None or view is None:
             directions = [options["ray"][1], *np.eye(3)]
         else:
             directions = [-view.world_to_camera[1, :3], view.world_to_camera[2, :3]]
-        pose = found.pose([scene_up(self) if up is None else up, *directions], lift)
+        pose = surface.pose([scene_up(self) if up is None else up, *directions], lift)
         return replace(self, markers=(*self.markers, PlacedMarker(marker, pose, bundle=bundle, light=light)))

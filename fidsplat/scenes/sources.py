@@ -128,9 +128,9 @@ def framing_camera(
     corners = half * np.stack(np.meshgrid(*([-1, 1],) * 3), -1).reshape(-1, 3)
     corners = corners @ start.world_to_camera[:3, :3].T
     tangent = math.tan(FOV_X / 2) * np.array([1.0, height / width])
-    away = (MARGIN * np.abs(corners[:, :2]) / tangent - corners[:, 2:]).max()
-    position = middle - away * start.world_to_camera[2, :3]
-    camera = Camera.look_at(width, height, FOV_X, position, middle, up, near=min(0.01, away / 100))
+    distance = (MARGIN * np.abs(corners[:, :2]) / tangent - corners[:, 2:]).max()
+    position = middle - distance * start.world_to_camera[2, :3]
+    camera = Camera.look_at(width, height, FOV_X, position, middle, up, near=min(0.01, distance / 100))
     return pose.applied(camera, middle)
 
 
@@ -139,10 +139,10 @@ def _extent(cloud: SplatCloud | Store) -> tuple[np.ndarray, np.ndarray]:
         return -np.ones(3), np.ones(3)
     if isinstance(cloud, Store):  # by the boxes of its chunks, which are small compared with the scene
         return cloud.bounds(REACH)
-    reach = cloud.half_extents(REACH)
+    half_extents = cloud.half_extents(REACH)
     share = 0.5 if len(cloud) >= MANY else 0.0
-    low = np.percentile(cloud.means - reach, share, axis=0)
-    high = np.percentile(cloud.means + reach, 100 - share, axis=0)
+    low = np.percentile(cloud.means - half_extents, share, axis=0)
+    high = np.percentile(cloud.means + half_extents, 100 - share, axis=0)
     return low + cloud.origin, high + cloud.origin
 
 

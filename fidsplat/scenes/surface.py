@@ -115,9 +115,9 @@ def fit_surface(points: np.ndarray, origin: np.ndarray, ray: np.ndarray, radius:
             "the surface must face the camera, got one that is parallel to the ray; give another pixel"
         )
     normal = -np.sign(slope) * normal
-    away = float((centre + middle - origin) @ normal) / -abs(slope)
+    distance = float((centre + middle - origin) @ normal) / -abs(slope)
     rms = float(np.sqrt(np.mean(residuals[inside] ** 2)))
-    return Surface(origin + away * ray, normal, share, rms, float(radius))
+    return Surface(origin + distance * ray, normal, share, rms, float(radius))
 
 
 def _refusal(got: str) -> str:

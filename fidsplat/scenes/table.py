@@ -141,7 +141,7 @@ class Table:
             "tuple[float, ...]": self.any_numbers,
             "tuple[str, ...]": self.texts,
         }
-        found = {}
+        values = {}
         for field in fields(kind):
             has_own_table = field.default_factory is not MISSING
             name = key(field.name)
@@ -149,12 +149,12 @@ class Table:
                 continue
             type_name = str(field.type).removesuffix(" | None")
             if " | " in type_name:  # by the type of the value
-                given = type(self._get(name, _MISSING))
-                type_name = {str: "str", list: "tuple[float, ...]"}.get(given, "float")
+                value_type = type(self._get(name, _MISSING))
+                type_name = {str: "str", list: "tuple[float, ...]"}.get(value_type, "float")
             infinite = field.default == math.inf
             read = readers.get(type_name, lambda key, infinite=infinite: self.number(key, infinite=infinite))
-            found[field.name] = read(name)
-        return found
+            values[field.name] = read(name)
+        return values
 
     def table(self, key: str, known: tuple[str, ...]) -> "Table":
         """The table of a key; empty if absent."""

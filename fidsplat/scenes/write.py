@@ -107,8 +107,8 @@ def _render(scene: SceneParts) -> tuple[dict, dict[str, dict]]:
     table: dict = {"outputs": list(scene.outputs)}
     if isinstance(scene.background, tuple):
         table["background"] = list(scene.background)
-    own, tables = quality_tables(scene.quality)
-    table |= own
+    keys, tables = quality_tables(scene.quality)
+    table |= keys
     if scene.device is not None:
         table["device"] = scene.device
     return table, tables

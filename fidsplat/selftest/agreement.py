@@ -114,13 +114,13 @@ def reference_images(
 def compare(images: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], outputs) -> list[Difference]:
     """Compare images of a device with those of `reference_images`, for each of `outputs`."""
     risky = float((truth["certificate"] > RISKY).mean())
-    found = []
+    differences = []
     for name in outputs:
         errors = _flips if declared_output(name).discontinuous else _errors
         worst, beyond = errors(name, images[name], truth)
         finite = bool(np.isfinite(images[name]).all())
-        found.append(Difference(name, worst, beyond - tolerance_of(name), risky, finite))
-    return found
+        differences.append(Difference(name, worst, beyond - tolerance_of(name), risky, finite))
+    return differences
 
 
 def _errors(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tuple[float, float]:

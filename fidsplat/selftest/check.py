@@ -135,14 +135,16 @@ def run_case(renderer: Renderer, case: Case, worst: Worst | None = None) -> tupl
     begun = time.perf_counter()
     result = CaseResult(case)
     try:
-        for found in case.run(renderer):
-            if isinstance(found, FrameSpec):
+        for agreement in case.run(renderer):
+            if isinstance(agreement, FrameSpec):
                 result.frames += 1
-                worst = _compared(renderer, found, result, worst)
+                worst = _compared(renderer, agreement, result, worst)
             else:
-                result.findings.append(found)
-                if not found.holds:
-                    result.wrong.append(f"{found.what} is {found.value:.3g}, above {found.bound:.3g}")
+                result.findings.append(agreement)
+                if not agreement.holds:
+                    result.wrong.append(
+                        f"{agreement.what} is {agreement.value:.3g}, above {agreement.bound:.3g}"
+                    )
     except DeviceError as error:
         result.wrong.append(str(error))
     result.seconds = time.perf_counter() - begun

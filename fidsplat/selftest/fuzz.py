@@ -79,11 +79,11 @@ def scene_of(seed: int) -> FrameSpec:
     if generator.random() < 0.5:
         if (planes >= 0).any():
             _separate(np.random.default_rng([seed, 3]), np.flatnonzero((kind == 3) & (planes < 0)), means)
-        turn = generator.normal(size=4)
-        turn /= np.linalg.norm(turn)
-        pose[:3, :3] = quaternion_to_matrix(turn)
+        rotation = generator.normal(size=4)
+        rotation /= np.linalg.norm(rotation)
+        pose[:3, :3] = quaternion_to_matrix(rotation)
         means = means @ pose[:3, :3]
-        quats = quaternion_multiply(turn * [1, -1, -1, -1], quats)
+        quats = quaternion_multiply(rotation * [1, -1, -1, -1], quats)
     cloud = SplatCloud(
         means.astype(np.float32),
         quats,
@@ -134,11 +134,11 @@ def _tilt(generator: np.random.Generator, planes: np.ndarray, means: np.ndarray,
         angle = generator.uniform(0, math.pi / 2)
         if generator.random() < 0.5:
             continue
-        own = np.flatnonzero(planes == plane)
-        turn = np.array([math.cos(angle / 2), *(math.sin(angle / 2) * axis / np.linalg.norm(axis))])
-        middle = means[own].mean(axis=0)
-        means[own] = middle + (means[own] - middle) @ quaternion_to_matrix(turn).T
-        quats[own] = quaternion_multiply(turn, quats[own])
+        rows = np.flatnonzero(planes == plane)
+        rotation = np.array([math.cos(angle / 2), *(math.sin(angle / 2) * axis / np.linalg.norm(axis))])
+        middle = means[rows].mean(axis=0)
+        means[rows] = middle + (means[rows] - middle) @ quaternion_to_matrix(rotation).T
+        quats[rows] = quaternion_multiply(rotation, quats[rows])
 
 
 def _separate(generator: np.random.Generator, chosen: np.ndarray, means: np.ndarray) -> None:

@@ -163,17 +163,17 @@ def b4(renderer: Renderer) -> Found:
     error = np.abs(depth / want - 1)[visible].max()
     yield Finding("relative depth error of a tilted plane", float(error), 1e-4)
     needle = splats([[0.1, 0.05, 4]], rotation((0, 1, 0), 89.99), (1e-3, 5e-3))
-    reach = math.sqrt(2 * math.log(255)) * 5e-3
+    extent = math.sqrt(2 * math.log(255)) * 5e-3
     depth = render(renderer, FrameSpec(needle, view, outputs=("depth",)))["depth"]
-    yield Finding("depth beyond that of the disk [m]", float(depth.max()) - 4 - reach, 1e-5)
+    yield Finding("depth beyond that of the disk [m]", float(depth.max()) - 4 - extent, 1e-5)
 
 
 def _shifted(shift: np.ndarray) -> FrameSpec:
     """A cloud and a camera, both translated by `shift`."""
     cloud = random_splats(150, seed=8, depth=(1.0, 6.0), scale=(1e-2, 0.5))
     origin, position, target = np.add(shift, ((0.5, -0.25, 2.0), (0.25, -0.125, -0.5), (0.75, 0.5, 6.0)))
-    own = {"colors": cloud.colors, "labels": cloud.labels, "origin": origin}
-    cloud = SplatCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, **own)
+    arrays = {"colors": cloud.colors, "labels": cloud.labels, "origin": origin}
+    cloud = SplatCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, **arrays)
     return FrameSpec(cloud, Camera.look_at(100, 80, 1.0, position, target), outputs=ALL_OUTPUTS)
 
 

@@ -104,7 +104,7 @@ def composited_parts(
     quality = Quality(alpha_cutoff=1 / 250, transmittance_stop=0.0, order=order)
     # all outputs, since kernels for them are compiled by other tests
     frames = [render(renderer, FrameSpec(part, camera, quality, ALL_OUTPUTS, (0, 0, 0))) for part in parts]
-    whole = FrameSpec(SplatCloud.concatenate(parts), camera, quality, ALL_OUTPUTS, (0, 0, 0))
+    together = FrameSpec(SplatCloud.concatenate(parts), camera, quality, ALL_OUTPUTS, (0, 0, 0))
     rgb, alpha, depth = (np.stack([frame[name] for frame in frames]) for name in ("rgb", "alpha", "depth"))
     ranks = np.argsort(np.where(alpha > 0, depth, np.inf), axis=0)
     light, expected = np.ones(alpha.shape[1:]), np.zeros(rgb.shape[1:])
@@ -115,18 +115,18 @@ def composited_parts(
     ranked = np.sort(np.where(alpha > 0, depth, np.inf), axis=0)
     with np.errstate(invalid="ignore"):
         clear = 1.0 - np.any(np.diff(ranked, axis=0) < 1e-4, axis=0)[..., None]
-    return render(renderer, whole)["rgb"] * clear, expected * clear
+    return render(renderer, together)["rgb"] * clear, expected * clear
 
 
 def faint_between(opacity: float) -> FrameSpec:
     """A black and a white splat of a group tilted by 40 degrees, and a faint ungrouped splat whose centre is
     between theirs in depth.
     """
-    turn = rotation((0, 1, 0), 40)
-    along = quaternion_to_matrix(turn)[:, 0]
+    rotated = rotation((0, 1, 0), 40)
+    along = quaternion_to_matrix(rotated)[:, 0]
     means = [(0, 0, 2) - 0.1 * along, (0, 0, 2) + 0.1 * along, (0, 0, 2)]
     colors = [(0, 0, 0), (1, 1, 1), (0.5, 0.5, 0.5)]
-    cloud = splats(means, turn, 0.15, [0.9, 0.9, opacity], colors).with_coplanar_groups([0, 0, -1])
+    cloud = splats(means, rotated, 0.15, [0.9, 0.9, opacity], colors).with_coplanar_groups([0, 0, -1])
     return FrameSpec(cloud, Camera.pinhole(33, 33, 60.0, 60.0, 16.5, 16.5), outputs=("rgb",))
 
 
@@ -145,13 +145,13 @@ def largest_jump(renderer: Renderer, specs: Iterator[FrameSpec]) -> tuple[float,
 def fronto_parallel(away: float, count: int = 200) -> FrameSpec:
     """Splats at depth 5 that face a rotated camera, `away` metres from the origin: many depths tie."""
     generator = np.random.default_rng(int(away) + 1)
-    turn = generator.normal(size=4)
-    turn /= np.linalg.norm(turn)
+    about_z = generator.normal(size=4)
+    about_z /= np.linalg.norm(about_z)
     pose = np.eye(4)
-    pose[:3, :3] = quaternion_to_matrix(turn)
+    pose[:3, :3] = quaternion_to_matrix(about_z)
     pose[:3, 3] = -pose[:3, :3] @ np.array([0.6, -0.64, 0.48]) * away
     means = np.column_stack([generator.uniform(-2, 2, (count, 2)), np.full(count, 5.0)]) - pose[:3, 3]
-    facing = turn * [1, -1, -1, -1]
+    facing = about_z * [1, -1, -1, -1]
     grey = np.repeat(generator.integers(0, 2, (count, 1)), 3, axis=1)
     world = (means @ pose[:3, :3]).astype(np.float32)
     return FrameSpec(
@@ -195,8 +195,8 @@ def _shuffled(cloud: SplatCloud) -> SplatCloud:
 
 def _c1_order(renderer: Renderer) -> Iterator[Finding]:
     wrong_keys = wrong_order = 0
-    for away in (0.0, 1.0, 1000.0):
-        spec = fronto_parallel(away)
+    for distance in (0.0, 1.0, 1000.0):
+        spec = fronto_parallel(distance)
         keys, unsorted = _keys_and_order(renderer, spec)
         wrong_keys += keys
         wrong_order += unsorted
@@ -239,8 +239,8 @@ def _c1_layers(renderer: Renderer) -> Iterator[Finding]:
 
 @case("C1", "coplanar splats and depth ties", "200 splats at depth 5, 0 to 1000 m from the origin; tags")
 def c1(renderer: Renderer) -> Found:
-    for away in (0.0, 1.0, 1000.0):
-        yield fronto_parallel(away)
+    for distance in (0.0, 1.0, 1000.0):
+        yield fronto_parallel(distance)
     yield _tilted_planes(Quality())
     yield _tilted_planes(Quality(order="centre"))
     yield _three_tags(Quality())
@@ -294,9 +294,9 @@ def _key_specs() -> Iterator[FrameSpec]:
 @case("C2", "precision and sign of keys", "depths 1 ulp apart, below 0, 1e12 m")
 def c2(renderer: Renderer) -> Found:
     yield from _key_specs()
-    found = [_keys_and_order(renderer, spec) for spec in _key_specs()]
-    yield Finding("keys beyond 2 ulp of their depth", sum(pair[0] for pair in found), 0)
-    yield Finding("splats that violate the order by depth and index", sum(pair[1] for pair in found), 0)
+    orders = [_keys_and_order(renderer, spec) for spec in _key_specs()]
+    yield Finding("keys beyond 2 ulp of their depth", sum(pair[0] for pair in orders), 0)
+    yield Finding("splats that violate the order by depth and index", sum(pair[1] for pair in orders), 0)
     keys = trace(renderer, next(_key_specs()))["keys"]
     yield Finding("neighbouring depths with one key", len(keys) - len(np.unique(keys)), 0)
 

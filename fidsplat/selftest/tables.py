@@ -15,7 +15,7 @@ Table = tuple[str, Sequence[str], Iterable[Sequence[object]]]
 
 
 def arithmetic_table(facts: Arithmetic, device: str) -> Table:
-    """Errors of the device's functions next to their bounds."""
+    """Table with a row for each arithmetic function of the device: its largest error and the bound."""
     rows = [
         (name, f"{ulp:.2f}", f"{BOUNDS[name]:g}", "ok" if ulp <= BOUNDS[name] * 1.001 else "too large")
         for name, ulp in facts.ulp.items()
@@ -34,24 +34,30 @@ def _case_row(letter: str, results: list[CaseResult]) -> tuple[str, ...]:
     cells = [f"{letter} {GROUPS[letter]}", str(len(results)), str(sum(one.frames for one in results))]
     for outputs in (("rgb", "alpha"), ("depth",)):
         for errors in ("largest", "uncertified"):
-            found = [getattr(one, errors) for one in results]
-            values = [one[name] for one in found for name in outputs if name in one]
+            maxima = [getattr(one, errors) for one in results]
+            values = [one[name] for one in maxima for name in outputs if name in one]
             cells.append(f"{max(values, key=rank_of):.0e}" if values else "-")
     return (*cells, "ok" if all(one.passed for one in results) else "failed")
 
 
 def digest_table(seeds: Iterable[int], differing: Mapping[int, Sequence[str]], device: str) -> Table:
     """Number of bit-identical scenes of each kind. differing: differing outputs by the seed of the scene."""
-    own = {kind: [seed for seed in seeds if digests.kind_of(seed) is kind] for kind in digests.KINDS}
+    seeds_of_kind = {
+        kind: [seed for seed in seeds if digests.kind_of(seed) is kind] for kind in digests.KINDS
+    }
     rows = [
         (
             kind.name,
-            f"{sum(seed not in differing for seed in own[kind])} of {len(own[kind])}",
-            ", ".join(n for n in digests.OUTPUTS if any(n in differing.get(seed, ()) for seed in own[kind])),
-            " ".join(str(seed) for seed in own[kind] if seed in differing),
+            f"{sum(seed not in differing for seed in seeds_of_kind[kind])} of {len(seeds_of_kind[kind])}",
+            ", ".join(
+                n
+                for n in digests.OUTPUTS
+                if any(n in differing.get(seed, ()) for seed in seeds_of_kind[kind])
+            ),
+            " ".join(str(seed) for seed in seeds_of_kind[kind] if seed in differing),
         )
         for kind in digests.KINDS
-        if own[kind]
+        if seeds_of_kind[kind]
     ]
     return f"Digests on {device}", ("scenes", "identical", "outputs that differ", "seeds"), rows
 

@@ -95,12 +95,12 @@ def number(parent: ElementTree.Element, tag: str, default: float, place: Place) 
 
 def pose_of_angles(position: list[float], angles: list[float]) -> np.ndarray:
     """Pose (7,) from x y z and roll, pitch, yaw in radians about the fixed axes x, y, z."""
-    turn = np.array([1.0, 0.0, 0.0, 0.0])
+    rotation = np.array([1.0, 0.0, 0.0, 0.0])
     for axis, angle in enumerate(angles):
-        own = np.zeros(4)
-        own[0], own[1 + axis] = math.cos(angle / 2), math.sin(angle / 2)
-        turn = quaternion_multiply(own, turn)
-    return np.array([*position, *turn])
+        about_axis = np.zeros(4)
+        about_axis[0], about_axis[1 + axis] = math.cos(angle / 2), math.sin(angle / 2)
+        rotation = quaternion_multiply(about_axis, rotation)
+    return np.array([*position, *rotation])
 
 
 def pose_element(parent: ElementTree.Element, place: Place) -> np.ndarray:

@@ -120,8 +120,8 @@ class ActiveStereo(DepthCamera):
         self, renderer: Renderer, scene: Scene, camera: Camera, rng: np.random.Generator
     ) -> np.ndarray:
         # the nearest surface that can be matched is in the view of the projector
-        reach = max(self.near, camera.fx * self.baseline / self.max_disparity)
-        middle = _projector(camera, self.baseline / 2, reach)
+        nearest = max(self.near, camera.fx * self.baseline / self.max_disparity)
+        middle = _projector(camera, self.baseline / 2, nearest)
         cameras = (camera, _shifted(camera, self.baseline), middle)
         views = [_view(renderer, scene, each) for each in cameras]
         dots = rng.integers(0, 2, (1024, 1024))  # the device's pattern; each frame has another one
@@ -132,8 +132,8 @@ class ActiveStereo(DepthCamera):
         images = [np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8) for image in noisy]
         disparity = disparity_of(images[0], images[1], self.max_disparity)
         # surfaces of the two cameras are matched, never the empty background
-        found = (disparity > 0) & (views[0].depth > 0)
-        return np.where(found, camera.fx * self.baseline / np.where(found, disparity, 1), 0)
+        matched = (disparity > 0) & (views[0].depth > 0)
+        return np.where(matched, camera.fx * self.baseline / np.where(matched, disparity, 1), 0)
 
     def _light(
         self, view: DepthView, camera: Camera, projector: Camera, shadow: np.ndarray, dots: np.ndarray
@@ -203,12 +203,12 @@ class TimeOfFlight(DepthCamera):
         # several frequencies determine the whole period: that of the mean distance
         period = 2 * math.pi / wave
         phase = np.angle(phasor) / wave
-        found = phase + period * np.rint((mean - phase) / period)
+        measured = phase + period * np.rint((mean - phase) / period)
         amplitude = np.abs(phasor)
         with np.errstate(divide="ignore"):
             deviation = np.sqrt(self.floor**2 + self.noise**2 / amplitude)
         valid = (amplitude >= self.faintest) & (total <= self.brightest)
-        noisy = found + np.where(valid, deviation, 0.0) * rng.normal(size=found.shape)
+        noisy = measured + np.where(valid, deviation, 0.0) * rng.normal(size=measured.shape)
         return np.where(valid, noisy / _stretch(camera), 0.0)
 
 
@@ -261,9 +261,9 @@ class StructuredLight(DepthCamera):
         rows = np.clip(np.arange(h)[:, None] + moved[0], 0, h - 1)
         columns = np.clip(np.arange(w) + moved[1], 0, w - 1)
         # the neighbour decides which surface is matched; use the depth of that surface's plane at this pixel
-        other, own = view.depth[rows, columns], view.depth
-        same = np.abs(other - own) < 0.05 * own
-        depth, valid = np.where(same, own, other), np.where(same, valid, valid[rows, columns])
+        other, centre = view.depth[rows, columns], view.depth
+        same = np.abs(other - centre) < 0.05 * centre
+        depth, valid = np.where(same, centre, other), np.where(same, valid, valid[rows, columns])
         strength = camera.fx * self.baseline
         disparity = strength / np.where(valid, depth, 1.0) + rng.normal(0, self.noise, (h, w))
         disparity = np.rint(disparity / self.step) * self.step if self.step else disparity
@@ -281,7 +281,7 @@ PRESETS: dict[str, tuple[DepthCamera, tuple[int, int, float]]] = {
 def depth_camera(name: str, **pose: Any) -> tuple[DepthCamera, Camera]:
     """A depth camera by name, "d435", "azure-kinect" or "kinect-v1", and its pinhole.
 
-    pose: that of the pinhole, as in `Camera.with_pose`; default the identity.
+    pose: arguments of `Camera.with_pose` for the pinhole; default the identity.
 
     Raises:
         InputError: an unknown name, or an invalid pose.

@@ -79,20 +79,20 @@ def read_description(
     if file.is_dir():
         file = file / "model.sdf"
     root, place = parse(file)
-    found = Description()
+    description = Description()
     if root.tag == "robot":
-        _read_robot(root, found, place)
+        _read_robot(root, description, place)
     elif root.tag == "sdf":
         folders = [Path(folder) for folder in models]
         for variable in ("GZ_SIM_RESOURCE_PATH", "SDF_PATH"):
             folders += [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
-        reader = _Sdf(found, folders, max_models)
+        reader = _Sdf(description, folders, max_models)
         reader.group(root, "", IDENTITY, place, ())
         for world in root.findall("world"):
             reader.group(world, "", IDENTITY, place.within("world"), ())
     else:
         raise place.wrong(f"the root must be <sdf> or <robot>, got <{root.tag}>")
-    return found
+    return description
 
 
 @dataclass
@@ -153,8 +153,8 @@ class _Sdf:
     ) -> None:
         """Read one model. at: pose of the parent. name, pose: of an include; they replace those of the
         model."""
-        own = name or name_of(model, place)
-        place = place.within(own)
+        model_name = name or name_of(model, place)
+        place = place.within(model_name)
         self.models += 1
         if self.models > self.max_models:
             raise place.wrong(
@@ -166,7 +166,7 @@ class _Sdf:
         here = compose(at, pose_element(model, place) if pose is None else pose)
         frames = _Frames(model, place)
         for link in model.findall("link"):
-            body = f"{prefix}{own}::{name_of(link, place)}"
+            body = f"{prefix}{model_name}::{name_of(link, place)}"
             within = place.within(name_of(link, place))
             self.found.bodies[body] = compose(here, frames.pose(link.get("name", "")))
             for sensor in link.findall("sensor"):
@@ -174,7 +174,7 @@ class _Sdf:
                 inside = within.within(sensed)
                 camera = camera_sensor(sensor, body, pose_element(sensor, inside), inside)
                 self.found.add(sensed, camera, inside)
-        self.group(model, f"{prefix}{own}::", here, place, files)
+        self.group(model, f"{prefix}{model_name}::", here, place, files)
 
 
 class _Frames:
@@ -194,13 +194,13 @@ class _Frames:
         if name in visited:
             raise self._place.wrong(f"the pose of {name!r} must not be relative to itself")
         part = self._parts[name]
-        own = pose_element(part, self._place.within(name))
+        relative = pose_element(part, self._place.within(name))
         element = part.find("pose")
         base = "" if element is None else element.get("relative_to", "")
         if not base:
             base = part.get("attached_to", "") if part.tag == "frame" else ""
             base = part.findtext("child", "").strip() if part.tag == "joint" else base
-        return compose(self.pose(base, (*visited, name)), own) if base else own
+        return compose(self.pose(base, (*visited, name)), relative) if base else relative
 
 
 def _read_robot(root: ElementTree.Element, found: Description, place: Place) -> None:

@@ -44,15 +44,15 @@ class SplatObservation(gymnasium.ObservationWrapper):
             )
         self._rig, self._poses = rig, poses
         old = env.observation_space
-        own = dict(old.spaces) if isinstance(old, spaces.Dict) else {"state": old}
+        observed = dict(old.spaces) if isinstance(old, spaces.Dict) else {"state": old}
         self._whole = not isinstance(old, spaces.Dict)
-        self.observation_space = spaces.Dict(own | self._image_spaces())
+        self.observation_space = spaces.Dict(observed | self._image_spaces())
 
     def observation(self, observation: Any) -> dict[str, Any]:
         """The environment's observation and images of its current state."""
         env = self.env.unwrapped
-        given = (env.data,) if self._poses is None else self._poses(env)  # type: ignore[attr-defined]
-        images = self._rig.render(*given)
+        arguments = (env.data,) if self._poses is None else self._poses(env)  # type: ignore[attr-defined]
+        images = self._rig.render(*arguments)
         observed = {
             f"{name}_{output}": _as_observed(output, images.of(name)[output][0])
             for name in self._rig.cameras
@@ -61,15 +61,15 @@ class SplatObservation(gymnasium.ObservationWrapper):
         return ({"state": observation} if self._whole else dict(observation)) | observed
 
     def _image_spaces(self) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        image_spaces: dict[str, Any] = {}
         for name, camera in self._rig.cameras.items():
             size = camera.camera.height, camera.camera.width
             for output in self._rig.outputs_of(name):
                 if output == "rgb":
-                    found[f"{name}_rgb"] = spaces.Box(0, 255, (*size, 3), np.uint8)
+                    image_spaces[f"{name}_rgb"] = spaces.Box(0, 255, (*size, 3), np.uint8)
                 else:
-                    found[f"{name}_{output}"] = _space(declared_output(output), size)
-        return found
+                    image_spaces[f"{name}_{output}"] = _space(declared_output(output), size)
+        return image_spaces
 
 
 def _space(output: Output, size: tuple[int, int]) -> Any:

@@ -154,9 +154,9 @@ class TiledCamera:
         if positions is not None:
             poses[which, :3] = _host(positions)
         if orientations is not None:
-            turned = np.zeros((len(poses[which]), 7))
-            turned[:, 3:] = _host(orientations)[..., self._to_wxyz]
-            poses[which, 3:] = compose(turned, _FROM_ROS[convention])[:, 3:]
+            rotations = np.zeros((len(poses[which]), 7))
+            rotations[:, 3:] = _host(orientations)[..., self._to_wxyz]
+            poses[which, 3:] = compose(rotations, _FROM_ROS[convention])[:, 3:]
         self._poses = poses
         self._outdated[which] = True
 
@@ -178,9 +178,9 @@ class TiledCamera:
 
     def _body_poses(self) -> dict[str, np.ndarray]:
         """Poses (N, 7) of the bodies in the world of the simulation."""
-        given = {} if self._bodies is None else self._bodies()
+        current = {} if self._bodies is None else self._bodies()
         order = [0, 1, 2, *(3 + k for k in self._to_wxyz)]
-        return {name: _host(poses)[:, order] for name, poses in given.items()}
+        return {name: _host(poses)[:, order] for name, poses in current.items()}
 
     def _world_poses(self, bodies: Mapping[str, np.ndarray]) -> np.ndarray:
         """Poses (N, 7) of the cameras in the world of the simulation, OpenCV axes."""

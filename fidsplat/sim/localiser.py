@@ -66,19 +66,19 @@ class Localiser:
         """Predict the state from readings of wheels (2,) [m] and gyroscope [rad/s] over some seconds."""
         rolled = float(wheels.mean())
         heading, bias, scale = self.state[2:]
-        turned = (gyro - bias) * seconds
-        middle, distance = heading + turned / 2, scale * rolled
+        rotation = (gyro - bias) * seconds
+        middle, distance = heading + rotation / 2, scale * rolled
         cos, sin = math.cos(middle), math.sin(middle)
-        self.state[:3] += [distance * cos, distance * sin, turned]
+        self.state[:3] += [distance * cos, distance * sin, rotation]
         transition = np.eye(len(self.covariance))
         transition[0, 2:5] = -distance * sin, distance * sin * seconds / 2, rolled * cos
         transition[1, 2:5] = distance * cos, -distance * cos * seconds / 2, rolled * sin
         transition[2, 3] = -seconds
-        slip, turn = 0.003**2 * abs(rolled), (0.003 * seconds) ** 2 + 1e-6 * abs(rolled)
+        slip, rotation_variance = 0.003**2 * abs(rolled), (0.003 * seconds) ** 2 + 1e-6 * abs(rolled)
         slip += self._drift**2 * seconds
         walk = self._bias_walk**2 * seconds
         self.covariance = transition @ self.covariance @ transition.T
-        self.covariance[range(5), range(5)] += slip, slip, turn, walk, 1e-9 * abs(rolled)
+        self.covariance[range(5), range(5)] += slip, slip, rotation_variance, walk, 1e-9 * abs(rolled)
 
     def set_reference(self) -> None:
         """Set the pose of the reference scan to the current pose."""

@@ -142,13 +142,13 @@ class MujocoRig(SimulatorRig):
             ids = wp.array(
                 ptr=pairs.ptr, dtype=wp.int32, shape=pairs.shape, strides=pairs.strides, device=pairs.device
             )
-            found, first = {}, 0
+            images, first = {}, 0
             for name, each in self.cameras.items():
                 size = each.camera.height, each.camera.width
-                own = slice(first, first := first + size[0] * size[1])
-                arrays = context.rgb_data[:, own], context.depth_data[:, own], ids[:, own]
-                found[name] = device_surface(self.renderer, *arrays, size, red_bit=16)
-        return found
+                pixels = slice(first, first := first + size[0] * size[1])
+                arrays = context.rgb_data[:, pixels], context.depth_data[:, pixels], ids[:, pixels]
+                images[name] = device_surface(self.renderer, *arrays, size, red_bit=16)
+        return images
 
     def _meshes(self, data: Sequence[Any], groups: list[int]) -> dict[str, list[ExternalDepth]]:
         """Images of the model's geoms for each camera and environment, by MuJoCo."""
@@ -158,11 +158,11 @@ class MujocoRig(SimulatorRig):
         option = mujoco.MjvOption()
         option.geomgroup[:] = 0
         option.geomgroup[groups] = 1
-        found: dict[str, list[ExternalDepth]] = {}
+        images: dict[str, list[ExternalDepth]] = {}
         for (name, camera), number in zip(self.cameras.items(), self._camera_ids, strict=True):
             renderer = self._mesh_renderer(camera.camera.width, camera.camera.height)
-            found[name] = [_mesh_image(renderer, one, number, option) for one in data]
-        return found
+            images[name] = [_mesh_image(renderer, one, number, option) for one in data]
+        return images
 
     def _mesh_renderer(self, width: int, height: int) -> Any:
         """MuJoCo's renderer for a size, without antialiasing, which would mix surfaces with the sky."""
@@ -235,7 +235,7 @@ def _outputs_of(model: Any, number: int) -> tuple[str, ...] | None:
 def _arrays_of(data: Any, bodies: int, cameras: int) -> list[np.ndarray]:
     """Positions (env, n, 3), quaternions (env, n, 4) of the model's bodies, positions and axes (env, n, 3, 3)
     of its cameras."""
-    found = []
+    arrays = []
     kinds = ("xpos", 3, bodies), ("xquat", 4, bodies), ("cam_xpos", 3, cameras), ("cam_xmat", 9, cameras)
     for name, width, count in kinds:
         array = getattr(data, name, None)
@@ -249,6 +249,6 @@ def _arrays_of(data: Any, bodies: int, cameras: int) -> list[np.ndarray]:
                 f"data.{name} must have {count} rows as the rig's model, got {rows}; give data of that model"
             )
         numbers = numbers.reshape(-1, count, width)
-        found.append(numbers)
-    found[3] = found[3].reshape(*found[3].shape[:2], 3, 3)
-    return found
+        arrays.append(numbers)
+    arrays[3] = arrays[3].reshape(*arrays[3].shape[:2], 3, 3)
+    return arrays

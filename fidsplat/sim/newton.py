@@ -82,7 +82,7 @@ class NewtonRig(SimulatorRig):
             self._sensor = meshes = self._sensor or newton.sensors.SensorCamera(self._model)
         instance("meshes", meshes, newton.sensors.SensorCamera, "True or a newton.sensors.SensorCamera")
         self._model.bvh_refit_shapes(state)
-        device, found = self._model.device, {}
+        device, depth_images = self._model.device, {}
         for name, each in self.cameras.items():
             camera = each.camera
             size = camera.width, camera.height
@@ -101,7 +101,7 @@ class NewtonRig(SimulatorRig):
             meshes.update(state, transforms, self._rays[name], **images)
             colors, depths, ids = (array.reshape((len(places), -1)) for array in images.values())
             ids = ids.view(wp.int32)
-            found[name] = device_surface(
+            depth_images[name] = device_surface(
                 self.renderer, colors, depths, ids, (camera.height, camera.width), red_bit=0
             )
-        return found
+        return depth_images

@@ -142,20 +142,20 @@ class Rig:
             InputError: an unknown body or camera, a body without a pose, a pose that is not rigid or not
                 finite, numbers of environments that differ.
         """
-        given = _by_name("body", bodies, self.bodies)
+        body_poses = _by_name("body", bodies, self.bodies)
         views = _by_name("camera", cameras, tuple(self.cameras))
-        missing = [name for name in self.bodies if name not in given]
+        missing = [name for name in self.bodies if name not in body_poses]
         if missing:
             raise InputError(
                 f"bodies must have a pose for every body ({', '.join(self.bodies)}), got none for "
                 f"{missing[0]!r}"
             )
-        count = _environments(given, views)
-        poses = {name: self._mounted_pose(name, given, count) for name in self.cameras} | views
+        count = _environments(body_poses, views)
+        poses = {name: self._mounted_pose(name, body_poses, count) for name in self.cameras} | views
         names = None if outputs is None else output_names(outputs)
         external = {name: () for name in self.cameras} | self._external_of(external_depths, count)
         groups = {
-            label: compose(given[name], self._rest[name]) if name in self._rest else given[name]
+            label: compose(body_poses[name], self._rest[name]) if name in self._rest else body_poses[name]
             for label, name in self.labels.items()
         }
         batches = {}
@@ -169,7 +169,7 @@ class Rig:
                 mask=mask,
             )
         self._rendered += count
-        return RigImages(self, batches, given, poses)
+        return RigImages(self, batches, body_poses, poses)
 
     def outputs_of(self, camera: str) -> tuple[str, ...]:
         """Names of a camera's output images, when `render` is called without `outputs`."""
@@ -225,9 +225,9 @@ class Rig:
     ) -> list[Capture]:
         """Captures of a camera: one for all environments, or one for each if there is noise or an external
         depth image."""
-        own = self.cameras[name]
+        rig_camera = self.cameras[name]
         capture = self._capture.with_(
-            camera=own.camera, sensor=own.sensor, outputs=outputs or self.outputs_of(name)
+            camera=rig_camera.camera, sensor=rig_camera.sensor, outputs=outputs or self.outputs_of(name)
         )
         noisy = "noise" in capture.sensor.steps
         if isinstance(external, ExternalDepth):
@@ -278,16 +278,16 @@ class SimulatorRig(Rig):
         Raises:
             InputError: as `Rig.render`; a state without poses; meshes with external_depths.
         """
-        bodies, own = self.poses(state)
-        given = _by_name("body", bodies, self.bodies)
-        mounts = {name: self._mounted_pose(name, given, len(bodies)) for name in self.cameras}
-        views = mounts | _by_name("camera", own, tuple(self.cameras))
+        bodies, camera_poses = self.poses(state)
+        body_poses = _by_name("body", bodies, self.bodies)
+        mounts = {name: self._mounted_pose(name, body_poses, len(bodies)) for name in self.cameras}
+        views = mounts | _by_name("camera", camera_poses, tuple(self.cameras))
         views |= _by_name("camera", cameras, tuple(self.cameras))
         if meshes is not False:
             if external_depths is not None:
                 raise InputError("meshes and external_depths exclude each other; give one of them")
             external_depths = self._geometry(state, views, meshes)
-        return super().render(given, views, outputs=outputs, external_depths=external_depths, mask=mask)
+        return super().render(body_poses, views, outputs=outputs, external_depths=external_depths, mask=mask)
 
     def _pinholes(self) -> None:
         """Raise InputError for a camera with a lens."""
@@ -372,8 +372,10 @@ class RigImages(Mapping):
 
     def placed(self, environment: int = 0) -> list[PlacedMarker]:
         """The scene's markers with their poses in an environment."""
-        most = min((len(poses) for poses in (*self.bodies.values(), *self.cameras.values())), default=1) - 1
-        whole_number("environment", environment, 0, most)
+        max_count = (
+            min((len(poses) for poses in (*self.bodies.values(), *self.cameras.values())), default=1) - 1
+        )
+        whole_number("environment", environment, 0, max_count)
         return self.rig.placed({body: pose[environment] for body, pose in self.bodies.items()})
 
 
@@ -389,23 +391,23 @@ def _cameras_of(cameras: Any) -> dict[str, RigCamera]:
         ]
     except (TypeError, ValueError):
         raise invalid("cameras", "{name: Camera or RigCamera}", cameras) from None
-    found: dict[str, RigCamera] = {}
+    rig_cameras: dict[str, RigCamera] = {}
     for name, camera in pairs:
         if not isinstance(name, str) or not name:
             raise invalid("the name of a camera", "text", name)
-        if name in found:
+        if name in rig_cameras:
             raise InputError(f"the names of cameras must be unique, got {name!r} twice; rename one")
-        found[name] = camera if isinstance(camera, RigCamera) else RigCamera(camera)
-    if not found:
+        rig_cameras[name] = camera if isinstance(camera, RigCamera) else RigCamera(camera)
+    if not rig_cameras:
         raise InputError("cameras must have at least one camera, got none; give cameras={name: Camera}")
-    return found
+    return rig_cameras
 
 
 def _bodies_of(bodies: Mapping[int, str], scene: Scene) -> dict[int, str]:
     if not isinstance(bodies, Mapping):
         raise invalid("bodies", "{label of splats: name of the body}", bodies)
     known = set(np.unique(scene.cloud().labels).tolist()) if bodies else set()  # stores are read completely
-    found: dict[int, str] = {}
+    names: dict[int, str] = {}
     for label, name in bodies.items():
         if isinstance(label, bool) or not isinstance(label, int | np.integer) or not isinstance(name, str):
             raise invalid("bodies", "{label of splats: name of the body}", {label: name})
@@ -415,8 +417,8 @@ def _bodies_of(bodies: Mapping[int, str], scene: Scene) -> dict[int, str]:
                 f"the label of the body {name!r} must be the label of a splat, got {label}; known: "
                 f"{listed or 'none'}"
             )
-        found[int(label)] = name
-    return found
+        names[int(label)] = name
+    return names
 
 
 def _by_name(what: str, poses: Any, names: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -50,8 +50,8 @@ class ScanMatcher:
         if scan[0].size() < MINIMUM:
             return False
         if self._reference is not None:
-            found = self._match(scan[0], localiser.relative)
-            matched = found is not None and localiser.match(*found)
+            alignment = self._match(scan[0], localiser.relative)
+            matched = alignment is not None and localiser.match(*alignment)
         moved = localiser.relative
         near = np.linalg.norm(moved[:2, 3]) < KEY_DISTANCE and moved[0, 0] > math.cos(KEY_TURN)
         if self._reference is None or not near:
@@ -63,19 +63,19 @@ class ScanMatcher:
         """x, y, heading (3,) of a scan in the reference scan and their covariance (3, 3); None without
         convergence."""
         assert self._reference is not None
-        found = small_gicp.align(
+        alignment = small_gicp.align(
             self._reference[0], scan, self._reference[1], start, registration_type="GICP",
             max_correspondence_distance=REACH, max_iterations=30,
         )  # fmt: skip
-        if not found.converged or found.num_inliers < MINIMUM:
+        if not alignment.converged or alignment.num_inliers < MINIMUM:
             return None
-        pose = found.T_target_source
+        pose = alignment.T_target_source
         # the error is a small motion of the scan in its own axes: rotation, then translation
         axes = np.eye(3)
         axes[:2, :2] = pose[:2, :2]
         # residuals of points are correlated whose neighbourhoods overlap: within twice their radius
-        variance = 4 * NEIGHBOURS * 2 * found.error / found.num_inliers
-        inverse = np.linalg.inv(_information(found, scan.points()[:, :3]))[np.ix_([3, 4, 2], [3, 4, 2])]
+        variance = 4 * NEIGHBOURS * 2 * alignment.error / alignment.num_inliers
+        inverse = np.linalg.inv(_information(alignment, scan.points()[:, :3]))[np.ix_([3, 4, 2], [3, 4, 2])]
         noise = variance * axes @ inverse @ axes.T + 2 * self._sway
         return np.array([*pose[:2, 3], math.atan2(pose[1, 0], pose[0, 0])]), noise
 
@@ -86,8 +86,8 @@ def _information(found: Any, points: np.ndarray) -> np.ndarray:
     The Hessian has a spurious value of 1/2 for each point along its plane, as the Gaussians of points are
     truncated, and about as much by noise of the normals.
     """
-    turned = np.cross(points[:, None], np.eye(3)).swapaxes(1, 2)
-    by = np.concatenate([turned, np.broadcast_to(-np.eye(3), turned.shape)], 2)
+    derivatives = np.cross(points[:, None], np.eye(3)).swapaxes(1, 2)
+    by = np.concatenate([derivatives, np.broadcast_to(-np.eye(3), derivatives.shape)], 2)
     along = np.einsum("nki,nkj->ij", by, by) * found.num_inliers / len(points)
     values, vectors = np.linalg.eigh(found.H - along)
     return vectors * np.maximum(values, 1e-8 * values[-1]) @ vectors.T

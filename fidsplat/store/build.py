@@ -219,8 +219,8 @@ class _Build:
         order = np.argsort(rows["code"].copy(), kind="stable")
         records = []
         for part in np.array_split(order, -(-count // plan.settings.chunk)):
-            taken = rows[part]
-            splats = {name: np.ascontiguousarray(taken[name]) for name in self.columns.kinds}
+            chunk = rows[part]
+            splats = {name: np.ascontiguousarray(chunk[name]) for name in self.columns.kinds}
             records.append(node_record(splats, first))
             self.columns.write(first, splats)
             first += len(part)

@@ -132,16 +132,16 @@ def plan_build(sources: Sequence[Source], settings: BuildSettings | None = None)
         degree = min(degree, settings.sh_degree) or -1
     kinds = {"means": "<f4", "quats": "<f4", "scales": "<f4", "opacities": "<f4"}
     kinds["colors" if degree < 0 else "sh"] = "<f4" if settings.colors == "float32" else "<f2"
-    given = [source.rows for source in sources]
-    if any(rows.thick for rows in given):
+    inputs = [source.rows for source in sources]
+    if any(rows.thick for rows in inputs):
         kinds["thickness"] = "<f4"
     kinds |= {
-        name: "<i4" for name in ("labels", "coplanar_groups") if any(name in rows.columns for rows in given)
+        name: "<i4" for name in ("labels", "coplanar_groups") if any(name in rows.columns for rows in inputs)
     }
     means, origin = sample(sources)
     grid = grid_around(means)
     splat_bytes = sum(row_bytes(kind, shapes_of(degree)[name]) for name, kind in kinds.items()) + 8
-    rows = sum(each.count for each in given)
+    rows = sum(each.count for each in inputs)
     if rows > MAX_SPLATS:
         raise InputError(f"a store must have at most {MAX_SPLATS:,} splats, got {rows:,}")
     buckets = int(np.clip(-(-rows * splat_bytes // (memory // 16)), 1, _MAX_BUCKETS))
@@ -150,9 +150,9 @@ def plan_build(sources: Sequence[Source], settings: BuildSettings | None = None)
     splitters = np.unique(splitters)
     plan = BuildPlan(tuple(sources), settings, degree, kinds, origin, grid, splitters)
     if settings.levels and plan.merge_bytes > memory:
-        most, needed = memory * min(chunk, rows) // plan.merge_bytes, plan.merge_bytes / 2**20
+        max_chunk, needed = memory * min(chunk, rows) // plan.merge_bytes, plan.merge_bytes / 2**20
         raise InputError(
-            f"chunk must be at most {most:,} for levels of detail in {memory / 2**20:,.0f} MiB of memory, "
+            f"chunk must be at most {max_chunk:,} for levels of detail in {memory / 2**20:,.0f} MiB, "
             f"got {chunk:,}, which needs {needed:,.0f} MiB; allow more memory, or no levels"
         )
     return plan

@@ -166,8 +166,8 @@ class ChunkedSplats:
                 rows = np.array(selection.rows[number], np.int64).reshape(-1, 2)
                 starts, counts = np.where(starts < 0, -1, starts + rows[:, 0]), rows[:, 1]
             for start, count in zip(starts, counts, strict=True):
-                own = np.full(count, -1) if start < 0 else np.arange(first + start, first + start + count)
-                ids.append(own.astype(np.int32))
+                indices = np.full(count, -1) if start < 0 else np.arange(first + start, first + start + count)
+                ids.append(indices.astype(np.int32))
             first += len(store)
         ids.append(np.arange(first, first + len(self.in_memory), dtype=np.int32))
         return np.concatenate(ids)
@@ -214,8 +214,8 @@ class ChunkedSplats:
     def _first_groups(self) -> list[int]:
         """Offsets added to the group ids of each store, and of the cloud in memory."""
         ids = self.in_memory.coplanar_groups
-        own = -1 if ids is None else int(ids.max(initial=-1))
-        return group_offsets([*(store.last_group() for store in self.stores), own])
+        last_group = -1 if ids is None else int(ids.max(initial=-1))
+        return group_offsets([*(store.last_group() for store in self.stores), last_group])
 
     def _relative(self, arrays: dict[str, np.ndarray], origin: np.ndarray) -> dict[str, np.ndarray]:
         """The arrays with means relative to this scene's origin. origin: that of the given means."""

@@ -63,13 +63,13 @@ def allowed_cell_size(measured: Iterable[DetailErrors], level: int, error: float
     if not any(one.level == level for one in near):
         return 0.0
     pairs = [pair for one in near for pair in zip(one.sizes, one.errors, strict=True)]
-    largest, found = 0.0, 0.0
+    largest, allowed = 0.0, 0.0
     for size in sorted({size for size, _ in pairs}):
         errors = [own for at, own in pairs if at == size and own is not None]
         if errors:
             largest = max(largest, *errors)
-            found = size if largest * MARGIN <= error else found
-    return found
+            allowed = size if largest * MARGIN <= error else allowed
+    return allowed
 
 
 def save_detail_errors(folder: Path, identity: str, measured: Sequence[DetailErrors]) -> None:

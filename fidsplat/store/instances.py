@@ -66,28 +66,28 @@ def place_store(
             f"{source.path} has coplanar groups, which cannot be instanced; put markers into a scene file"
         )
     try:
-        given = np.stack([real_array("a pose", pose_matrix(pose, "a pose")) for pose in poses])
+        matrices = np.stack([real_array("a pose", pose_matrix(pose, "a pose")) for pose in poses])
     except (TypeError, ValueError):
-        given = np.empty(0)
-    if given.ndim != 3 or not len(given):
+        matrices = np.empty(0)
+    if matrices.ndim != 3 or not len(matrices):
         raise InputError(f"poses must be a list of at least one rigid 4x4 matrix, got {str(poses)[:80]}")
-    for number, pose in enumerate(given):
+    for number, pose in enumerate(matrices):
         check_similarity(pose, f"pose {number}", rigid=True)
-    if len(given) * len(source) > MAX_SPLATS:
+    if len(matrices) * len(source) > MAX_SPLATS:
         raise InputError(
-            f"a scene must have at most {MAX_SPLATS:,} splats, got {len(given)} times {len(source):,}"
+            f"a scene must have at most {MAX_SPLATS:,} splats, got {len(matrices)} times {len(source):,}"
         )
     folder = store_folder(out)
     check_replaceable(folder, overwrite)
     with staged(folder) as part:
         clear(part)
-        save_npy(part / PLACES, given)
+        save_npy(part / PLACES, matrices)
         header = replace(
             source.header,
-            splats=len(source) * len(given),
-            rows=source.header.rows * len(given),
+            splats=len(source) * len(matrices),
+            rows=source.header.rows * len(matrices),
             store=os.path.relpath(source.path.resolve(), folder.resolve()),
-            places_crc=zlib.crc32(given.tobytes()),
+            places_crc=zlib.crc32(matrices.tobytes()),
         )
         header.save(part)
     return folder

@@ -223,17 +223,17 @@ def map_column(folder: Path, name: str, kind: str, shape: tuple[int, ...], start
     size = NPY_HEADER + row_bytes(kind, shape[1:]) * shape[0]
     try:
         with open_input(file) as stream:
-            start, found = stream.read(NPY_HEADER), os.fstat(stream.fileno()).st_size
+            start, found_size = stream.read(NPY_HEADER), os.fstat(stream.fileno()).st_size
     except InputError as error:
         raise InputError(f"{error}; the store is incomplete") from error
-    if found < size:
-        lost = max(found - NPY_HEADER, 0) // max(row_bytes(kind, shape[1:]), 1)
+    if found_size < size:
+        lost = max(found_size - NPY_HEADER, 0) // max(row_bytes(kind, shape[1:]), 1)
         chunk = max(int(np.searchsorted(starts, lost, "right")) - 1, 0)
         raise InputError(
-            f"{file} is truncated: it has {found} bytes of {size}, so that rows from {lost} on are missing, "
+            f"{file} is truncated: it has {found_size} bytes of {size}, so rows from {lost} on are missing, "
             f"from chunk {chunk} on; build the store again"
         )
-    if start != header or found > size:
+    if start != header or found_size > size:
         raise InputError(
             f"{file} does not belong to this store, or its header is damaged; build the store again"
         )

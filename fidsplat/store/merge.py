@@ -41,8 +41,8 @@ def merged(splats: dict[str, np.ndarray], grid: Grid) -> tuple[dict[str, np.ndar
     keys, shift = _cells(grid.codes(splats["means"]), classes.astype(np.uint64))
     keys = _split_edges(keys, splats)
     order, starts = _runs(keys)
-    given = {name: array[order] for name, array in splats.items()}
-    result = _by_moments(given, (u[:, order], v[:, order], normal[:, order]), starts)
+    ordered = {name: array[order] for name, array in splats.items()}
+    result = _by_moments(ordered, (u[:, order], v[:, order], normal[:, order]), starts)
     return result, grid.size(shift)
 
 
@@ -60,10 +60,12 @@ def _split_edges(keys: np.ndarray, splats: dict[str, np.ndarray]) -> np.ndarray:
     light = colors.astype(np.float64).mean(axis=1)[order]
     lengths = np.diff(np.append(starts, len(keys)))
     mean = np.add.reduceat(light, starts) / lengths
-    away = light - np.repeat(mean, lengths)
-    edge = np.add.reduceat(away * away, starts) > EDGE**2 * lengths
+    difference = light - np.repeat(mean, lengths)
+    edge = np.add.reduceat(difference * difference, starts) > EDGE**2 * lengths
     split = np.empty(len(keys), np.int64)
-    split[order] = np.repeat(2 * np.arange(len(starts)), lengths) + ((away > 0) & np.repeat(edge, lengths))
+    split[order] = np.repeat(2 * np.arange(len(starts)), lengths) + (
+        (difference > 0) & np.repeat(edge, lengths)
+    )
     return split
 
 
@@ -114,18 +116,18 @@ def _by_moments(
     total = np.add.reduceat(weights, starts)
     # relative to the first splat of the run, to avoid cancellation
     base = splats["means"][starts].astype(np.float64).T
-    away = splats["means"].T - np.repeat(base, lengths, axis=1)
+    offsets = splats["means"].T - np.repeat(base, lengths, axis=1)
     u, v = frames[0] * scales[0], frames[1] * scales[1]
 
     def mean(values: np.ndarray) -> np.ndarray:
         return np.add.reduceat(values * weights, starts, axis=1) / total
 
-    moments = [u[i] * u[j] + v[i] * v[j] + away[i] * away[j] for i, j in _PAIRS]
+    moments = [u[i] * u[j] + v[i] * v[j] + offsets[i] * offsets[j] for i, j in _PAIRS]
     if thickness is not None:
         moments = [
             m + third * third * frames[2][i] * frames[2][j] for m, (i, j) in zip(moments, _PAIRS, strict=True)
         ]
-    middle, second = mean(away), mean(np.stack(moments))
+    middle, second = mean(offsets), mean(np.stack(moments))
     spread = np.empty((len(starts), 3, 3))
     for (i, j), values in zip(_PAIRS, second, strict=True):
         spread[:, i, j] = spread[:, j, i] = values - middle[i] * middle[j]
@@ -135,20 +137,24 @@ def _by_moments(
     rotations[:, :, 2] = np.cross(rotations[:, :, 0], rotations[:, :, 1])
     opacities = np.add.reduceat(light, starts) / (sigma[:, 0] * sigma[:, 1])
     copies = np.maximum(np.ceil(opacities / MAX_OPACITY), 1).astype(np.int64)
-    made = {"means": (base + middle).T, "quats": matrices_to_quaternions(rotations), "scales": sigma[:, :2]}
-    made["opacities"] = opacities / copies
+    combined = {
+        "means": (base + middle).T,
+        "quats": matrices_to_quaternions(rotations),
+        "scales": sigma[:, :2],
+    }
+    combined["opacities"] = opacities / copies
     for name in {"colors", "sh"} & set(splats):
         flat = splats[name].reshape(count, -1).T.astype(np.float64)
-        made[name] = mean(flat).T.reshape(-1, *splats[name].shape[1:])
+        combined[name] = mean(flat).T.reshape(-1, *splats[name].shape[1:])
     if thickness is not None:
-        made["thickness"] = np.where(np.logical_or.reduceat(thickness > 0, starts), sigma[:, 2], 0.0)
+        combined["thickness"] = np.where(np.logical_or.reduceat(thickness > 0, starts), sigma[:, 2], 0.0)
     single, heaviest = lengths == 1, _first_of_largest(weights, starts, lengths)
     result = {}
     for name, array in splats.items():
-        if name not in made:  # labels, coplanar groups
+        if name not in combined:  # labels, coplanar groups
             result[name] = array[heaviest]
             continue
-        result[name] = made[name].astype(array.dtype)
+        result[name] = combined[name].astype(array.dtype)
         result[name][single] = array[starts[single]]
     return {name: np.repeat(array, copies, axis=0) for name, array in result.items()}
 

@@ -47,20 +47,20 @@ class Store(Summarised):
         header = self.header = layout.read_header(self.path)
         self.poses: np.ndarray | None = None
         """(p, 4, 4) float64 poses of an instanced store"""
-        self._folder, own = self.path, header
+        self._folder, column_header = self.path, header
         if header.store is not None:
             self._folder = path_of(self.path / header.store)
-            own = layout.read_header(self._folder)
-            if own.identity != header.identity or own.store is not None:
+            column_header = layout.read_header(self._folder)
+            if column_header.identity != header.identity or column_header.store is not None:
                 raise InputError(
                     f"{self._folder} has changed since {self.path} was placed; place the store again"
                 )
             self.poses = _read_poses(self.path, header.places_crc)
             if (
                 replace(
-                    own,
-                    splats=own.splats * len(self.poses),
-                    rows=own.rows * len(self.poses),
+                    column_header,
+                    splats=column_header.splats * len(self.poses),
+                    rows=column_header.rows * len(self.poses),
                     store=header.store,
                     places_crc=header.places_crc,
                 )
@@ -70,16 +70,16 @@ class Store(Summarised):
                     f"{self.path / layout.HEADER} does not match the poses of the store; "
                     "place the store again"
                 )
-        self._own = own
-        self.nodes = layout.read_nodes(self._folder, own)
+        self._own = column_header
+        self.nodes = layout.read_nodes(self._folder, column_header)
         """(n,) records of `layout.NODE`: chunks and nodes of levels of detail, of one instance"""
-        starts, shapes = self.nodes["first"], layout.shapes_of(own.sh_degree)
+        starts, shapes = self.nodes["first"], layout.shapes_of(column_header.sh_degree)
         self._columns = {
-            name: layout.map_column(self._folder, name, kind, (own.rows, *shapes[name]), starts)
-            for name, kind in own.columns.items()
+            name: layout.map_column(self._folder, name, kind, (column_header.rows, *shapes[name]), starts)
+            for name, kind in column_header.columns.items()
         }
         if self.has_coplanar_groups:  # the host prepares coplanar splats, which must be valid
-            rows = self._rows(own.pinned, own.splats, None)
+            rows = self._rows(column_header.pinned, column_header.splats, None)
             if wrong := _unrenderable(rows):
                 raise InputError(
                     f"coplanar splats of {self._folder} must be valid, got {wrong}; build the store again"
@@ -119,10 +119,10 @@ class Store(Summarised):
         facts |= {"instanced_store": header.store, "bytes": self.nbytes, "columns": dict(header.columns)}
         facts |= {"sources": list(header.sources), "left_out": dict(header.dropped), "levels": []}
         for level in np.unique(nodes["level"]).tolist():
-            own = nodes[nodes["level"] == level]
-            count = {"nodes": len(own), "splats": int(own["count"].sum())}
+            level_nodes = nodes[nodes["level"] == level]
+            count = {"nodes": len(level_nodes), "splats": int(level_nodes["count"].sum())}
             row = {name: number * self.instances for name, number in count.items()}
-            facts["levels"].append({"level": level, **row, "cell_m": float(np.median(own["size"]))})
+            facts["levels"].append({"level": level, **row, "cell_m": float(np.median(level_nodes["size"]))})
         return facts | {"bounds": list(self.bounds()) if len(self) else None}
 
     # properties that select kernels (`CloudTraits`)
@@ -254,8 +254,8 @@ class Store(Summarised):
     def first_of(self, numbers: np.ndarray) -> np.ndarray:
         """Index (k,) int64 of the first splat of chunks, by number; -1 for nodes of levels of detail."""
         instance, node = np.divmod(self._checked(numbers), max(len(self.nodes), 1))
-        own = self.nodes[node]
-        return np.where(own["level"] == 0, own["first"] + instance * self._own.splats, -1)
+        records = self.nodes[node]
+        return np.where(records["level"] == 0, records["first"] + instance * self._own.splats, -1)
 
     def counts(self, numbers: np.ndarray) -> np.ndarray:
         """Numbers of splats (k,) of nodes, by number."""
@@ -263,10 +263,10 @@ class Store(Summarised):
 
     def _checked(self, numbers: np.ndarray) -> np.ndarray:
         """Numbers of nodes (k,) as int64. Raises InputError if one does not exist."""
-        given, count = real_array("numbers", numbers), self.instances * len(self.nodes)
-        if not ((given == np.rint(given)) & (given >= 0) & (given < count)).all():
+        values, count = real_array("numbers", numbers), self.instances * len(self.nodes)
+        if not ((values == np.rint(values)) & (values >= 0) & (values < count)).all():
             raise invalid("numbers", f"whole numbers of nodes, 0 to {count - 1}", numbers)
-        return given.astype(np.int64)
+        return values.astype(np.int64)
 
     def load(self, number: int, placed: bool = True) -> dict[str, np.ndarray]:
         """Splats of a node, by number, as arrays of a cloud relative to `origin`.
@@ -292,11 +292,11 @@ class Store(Summarised):
         """All labels of the splats. Reads the complete column."""
         if "labels" not in self._columns:
             return {0} if len(self) else set()
-        made: set[int] = set()
+        labels: set[int] = set()
         for node in self.nodes[self.nodes["level"] == 0]:  # by chunks, for bounded memory
             rows = self._columns["labels"][node["first"] : node["first"] + node["count"]]
-            made.update(np.unique(rows).tolist())
-        return made
+            labels.update(np.unique(rows).tolist())
+        return labels
 
     def last_group(self) -> int:
         """Largest coplanar group id; -1 without groups."""
@@ -340,12 +340,12 @@ class Store(Summarised):
 def _unrenderable(rows: dict[str, np.ndarray], merged: bool = False) -> str:
     """Describe invalid values and their counts; empty if there are none. merged: opacities may exceed 1."""
     names = rows.keys() - {"labels", "coplanar_groups"}
-    _, found = find_defects({name: rows[name].astype(np.float32, copy=False) for name in names})
+    _, defects = find_defects({name: rows[name].astype(np.float32, copy=False) for name in names})
     if merged:
-        found.pop("opacity outside [0, 1]", None)
+        defects.pop("opacity outside [0, 1]", None)
     if "thickness" in rows and (thin := int((rows["thickness"] < 0).sum())):
-        found["thickness below 0"] = thin
-    return ", ".join(f"{reason}: {count}" for reason, count in found.items())
+        defects["thickness below 0"] = thin
+    return ", ".join(f"{reason}: {count}" for reason, count in defects.items())
 
 
 def _rounded(middles: np.ndarray, around: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

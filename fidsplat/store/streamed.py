@@ -96,14 +96,14 @@ def import_streamed(path: Path, folder: Path, progress: Progress) -> None:
 
 def _arrays(cloud: SplatCloud, degree: int) -> dict[str, np.ndarray]:
     thickness = np.zeros(len(cloud), np.float32) if cloud.thickness is None else cloud.thickness
-    given = {"means": cloud.means, "sh": cloud.sh}
+    columns = {"means": cloud.means, "sh": cloud.sh}
     return {
         "means": cloud.means.astype(np.float32),
         "quats": cloud.quats,
         "scales": cloud.scales,
         "opacities": cloud.opacities,
         "thickness": thickness,
-    } | colors_of_degree({name: array for name, array in given.items() if array is not None}, degree)
+    } | colors_of_degree({name: array for name, array in columns.items() if array is not None}, degree)
 
 
 def _area(means: np.ndarray) -> float:

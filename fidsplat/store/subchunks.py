@@ -55,8 +55,8 @@ class SubchunkTable:
     def of(self, numbers: np.ndarray) -> Subchunks:
         """The subchunks of nodes (k,), by number."""
         store = self._store
-        instances, own = np.divmod(numbers, max(len(store.nodes), 1))
-        each = [self._boxes(node) for node in own.tolist()]
+        instances, own_nodes = np.divmod(numbers, max(len(store.nodes), 1))
+        each = [self._boxes(node) for node in own_nodes.tolist()]
         counts = np.array([len(max_sigma) for _, _, max_sigma in each], np.int64)
         nodes, instance = np.repeat(numbers, counts), np.repeat(instances, counts)
         low, high = (np.concatenate([np.empty((0, 3)), *(one[corner] for one in each)]) for corner in (0, 1))

@@ -83,7 +83,7 @@ def without_markers(views: Sequence[TrainingView], boxes: Sequence[MarkerBox]) -
     """Replace visible markers in the images by the background colour; mask markers that may be occluded."""
     if not boxes:
         return list(views)
-    found = []
+    masks = []
     for number, view in enumerate(views):
         grey = GREYS[number % len(GREYS)]
         image = view.image.copy()
@@ -95,5 +95,5 @@ def without_markers(views: Sequence[TrainingView], boxes: Sequence[MarkerBox]) -
                 mask |= region
             else:
                 mask &= ~region
-        found.append(replace(view, image=image, mask=mask, background=(grey,) * 3))
-    return found
+        masks.append(replace(view, image=image, mask=mask, background=(grey,) * 3))
+    return masks

@@ -143,23 +143,23 @@ class Dataset:
     @cached_property
     def digest(self) -> str:
         """SHA-256 of all inputs of training."""
-        found = hashlib.sha256(json.dumps(self.background).encode())
+        sha = hashlib.sha256(json.dumps(self.background).encode())
 
         def update(*arrays: np.ndarray | None) -> None:
             for array in arrays:
                 # with type and shape, so that a mask and an image of equal bytes differ
-                found.update(b"-" if array is None else f"{array.dtype.str} {array.shape}".encode())
-                found.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+                sha.update(b"-" if array is None else f"{array.dtype.str} {array.shape}".encode())
+                sha.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
 
         for view in self.views:
             camera = view.camera
             lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-            found.update(json.dumps([view.name, *lens, camera.near, camera.far]).encode())
+            sha.update(json.dumps([view.name, *lens, camera.near, camera.far]).encode())
             update(camera.world_to_camera, view.image, view.mask)
             if view.background is not None:
-                found.update(json.dumps(view.background).encode())
+                sha.update(json.dumps(view.background).encode())
         update(self.points, self.colors)
-        return found.hexdigest()
+        return sha.hexdigest()
 
     def with_random_points(self, count: int, seed: int) -> Dataset:
         """The data set with random points of random colours, in the cube that most cameras face, or else in
@@ -188,15 +188,15 @@ def viewed_cube(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, bool
     middle = centers.mean(0)
     shift = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centers - middle), rcond=1e-6)[0]
     focus = middle + shift
-    away = np.linalg.norm(focus - centers, axis=1)
+    distances = np.linalg.norm(focus - centers, axis=1)
     reach = np.mean(
         [
             far * max(camera.width / camera.fx, camera.height / camera.fy) / 2
-            for far, camera in zip(away, cameras, strict=True)
+            for far, camera in zip(distances, cameras, strict=True)
         ]
     )
     along = np.einsum("ni,ni->n", axes, focus - centers)
-    return focus - reach, focus + reach, bool(along.mean() > _FACING * away.mean())
+    return focus - reach, focus + reach, bool(along.mean() > _FACING * distances.mean())
 
 
 def _points_in_frustums(cameras: Sequence[Camera], draws: np.ndarray, depth: float) -> np.ndarray:

@@ -65,18 +65,18 @@ def load_dataset(
     chosen = Masks(None if masks is None else path_of(masks), flag("alpha_masks", alpha_masks))
     if chosen.folder is not None and not chosen.folder.is_dir():
         raise InputError(f"--masks must be a folder of masks NAME.png, got {chosen.folder}")
-    found = (load_transforms if has_transforms(folder) else _load_colmap)(folder, report, chosen)
-    names = [view.name for view in found.views]
+    contents = (load_transforms if has_transforms(folder) else _load_colmap)(folder, report, chosen)
+    names = [view.name for view in contents.views]
     if chosen.folder is not None and not any(mask_file(chosen.folder, name) for name in names):
         example = names[0] if names else "NAME"
         raise InputError(f"{chosen.folder} must have masks of the images, e.g. {example}.png, got none")
-    views, held_out = _divided(found.views, found.held_out, hold_out)
-    points, colors = found.points, found.colors
+    views, held_out = _divided(contents.views, contents.held_out, hold_out)
+    points, colors = contents.points, contents.colors
     if not len(points) and not random_points:
         raise InputError(
             f"{folder} must have initial points, got none; give --random-points 5000, or a model with points"
         )
-    dataset = Dataset(str(folder), views, held_out, points, colors, found.background, found.boxes)
+    dataset = Dataset(str(folder), views, held_out, points, colors, contents.background, contents.boxes)
     return dataset.with_random_points(random_points, seed) if random_points else dataset
 
 

@@ -38,13 +38,13 @@ class Densification(NamedTuple):
 
     def apply(self, splats: Splats) -> Splats:
         """The splats after densification."""
-        made = splats.select(self.rows)
-        made.values["means"][self.first_split :] = self.means
-        made.values["log_scales"][self.first_split :] = self.log_scales
-        for moments in (made.first, made.second):
+        densified = splats.select(self.rows)
+        densified.values["means"][self.first_split :] = self.means
+        densified.values["log_scales"][self.first_split :] = self.log_scales
+        for moments in (densified.first, densified.second):
             for array in moments.values():
                 array[self.remaining :] = 0
-        return with_statistics_reset(made)
+        return with_statistics_reset(densified)
 
 
 def densification(splats: Splats, settings: TrainSettings, iteration: int, extent: float) -> Densification:

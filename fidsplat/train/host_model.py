@@ -127,7 +127,7 @@ def visible(splats: Splats, camera: Camera, origin: np.ndarray) -> np.ndarray:
     rotation = camera.world_to_camera[:3, :3].astype(np.float32)
     translation = (rotation.astype(np.float64) @ (origin - camera.position)).astype(np.float32)
     x, y, z = (splats.values["means"] @ rotation.T + translation).T
-    reach = _REACH * splats.scales.max(axis=1)
+    extents = _REACH * splats.scales.max(axis=1)
     inside = z > camera.near
     for coordinate, focal, center, size in (
         (x, camera.fx, camera.cx, camera.width),
@@ -135,6 +135,6 @@ def visible(splats: Splats, camera: Camera, origin: np.ndarray) -> np.ndarray:
     ):
         # lengths are in pixels times depth, to avoid a division by a depth of 0
         at = np.float32(focal) * coordinate + np.float32(center) * z
-        radius = np.float32(focal) * reach
+        radius = np.float32(focal) * extents
         inside &= (at + radius > 0) & (at - radius < np.float32(size) * z)
     return inside

@@ -158,11 +158,11 @@ def normal_loss(
     valid &= has_depth[1:-1, 2:] & has_depth[1:-1, :-2]
     valid = valid[:, :, None] & (length > 0)
     unit = np.where(valid, crossed, 0) / np.where(valid, length, 1)
-    own = normal[1:-1, 1:-1]
+    inner = normal[1:-1, 1:-1]
     share = np.where(valid, alpha[1:-1, 1:-1, None], 0) / depth.size
-    along = (unit * own).sum(2, keepdims=True)
+    along = (unit * inner).sum(2, keepdims=True)
     by_normal[1:-1, 1:-1] = -share * unit
-    by_crossed = -share * (own - along * unit) / np.where(valid, length, 1)
+    by_crossed = -share * (inner - along * unit) / np.where(valid, length, 1)
     by_down, by_across = np.cross(across, by_crossed), np.cross(by_crossed, down)
     by_points = np.zeros_like(points)
     by_points[2:, 1:-1] += by_down

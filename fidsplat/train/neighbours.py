@@ -23,17 +23,17 @@ def mean_square_distances(points: np.ndarray) -> np.ndarray:
     boxes = _boxes(points)
     low = np.array([points[box].min(0) for box in boxes])
     high = np.array([points[box].max(0) for box in boxes])
-    found = np.zeros(len(points))
+    distances = np.zeros(len(points))
     for number, box in enumerate(boxes):
         mine = points[box]
         nearest = _nearest(mine, mine)
-        reach = nearest[:, -1].max() if nearest.shape[1] == _NEAREST else np.inf
+        max_distance = nearest[:, -1].max() if nearest.shape[1] == _NEAREST else np.inf
         gap = np.maximum(np.maximum(low - high[number], low[number] - high), 0)
-        near = np.flatnonzero((gap * gap).sum(1) <= reach)
+        near = np.flatnonzero((gap * gap).sum(1) <= max_distance)
         if len(near) > 1:
             nearest = _nearest(mine, points[np.concatenate([boxes[k] for k in near])])
-        found[box] = nearest.mean(1)
-    return found
+        distances[box] = nearest.mean(1)
+    return distances
 
 
 def _boxes(points: np.ndarray) -> list[np.ndarray]:

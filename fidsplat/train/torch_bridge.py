@@ -64,8 +64,8 @@ def render(
     if sh is not None and sh.shape[1] == 1:  # degree 0 is rendered as colours, which are clamped at 0
         colors, sh = torch.clamp(C0 * sh[:, 0] + 0.5, min=0), None
     quats = torch.nn.functional.normalize(quats, dim=1)
-    given = (means, quats, scales, opacities, colors, sh, background, pose)
-    images = _Rendered.apply(renderer, capture, *given)
+    inputs = (means, quats, scales, opacities, colors, sh, background, pose)
+    images = _Rendered.apply(renderer, capture, *inputs)
     return dict(zip(capture.outputs, images, strict=True))
 
 
@@ -96,25 +96,29 @@ class _Rendered(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *by_images: Any) -> tuple[Any, ...]:
-        given = {
+        image_gradients = {
             name: by.cpu().numpy() for name, by in zip(ctx.outputs, by_images, strict=True) if by is not None
         }
-        found = ctx.frame.backward(given)
+        input_gradients = ctx.frame.backward(image_gradients)
         if ctx.pose is not None:
-            found["pose"] = offset_gradient(found["pose"].astype(np.float64), ctx.pose.astype(np.float64))
+            input_gradients["pose"] = offset_gradient(
+                input_gradients["pose"].astype(np.float64), ctx.pose.astype(np.float64)
+            )
         if ctx.thick:
-            third = found.get("thickness", np.zeros(len(ctx.rows), np.float32))  # without one: all are disks
-            found["scales"] = np.column_stack([found["scales"], third])
+            third = input_gradients.get(
+                "thickness", np.zeros(len(ctx.rows), np.float32)
+            )  # without one: all are disks
+            input_gradients["scales"] = np.column_stack([input_gradients["scales"], third])
         gradients: list[Any] = [None, None]  # the renderer and the capture have no gradient
         for name, like, needed in zip(_INPUTS, ctx.like, ctx.needs_input_grad[2:], strict=True):
             if like is None or not needed:
                 gradients.append(None)
                 continue
             device, dtype = like
-            array = found[name]
+            array = input_gradients[name]
             if name not in ("background", "pose") and len(ctx.rows) < ctx.count:
                 array = np.zeros((ctx.count, *array.shape[1:]), array.dtype)
-                array[ctx.rows] = found[name]
+                array[ctx.rows] = input_gradients[name]
             gradients.append(_tensor(array).to(device=device, dtype=dtype))
         return tuple(gradients)
 

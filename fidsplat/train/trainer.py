@@ -311,10 +311,10 @@ class Trainer:
         image = view.image.astype(np.float32) / 255
         kernels = alignment_kernels(self.renderer, resident)
         try:
-            found = align(image, view.mask, view.camera, render, kernels)
+            alignment = align(image, view.mask, view.camera, render, kernels)
         except InputError:  # all pixels of the coarsest level are masked
             return capture
-        both = capture, capture.with_(camera=found.camera)
+        both = capture, capture.with_(camera=alignment.camera)
         frames = self.renderer.render_views(resident, both)
         psnr = [score_view(view, with_exposure_of(frame["rgb"], view)).psnr for frame in frames]
         return both[psnr[1] > psnr[0]]

@@ -84,8 +84,8 @@ def _views(file: Path, table: dict, progress: Progress, label: str, masks: Masks
                 f"numbers, got {str(frame)[:80]!r}"
             ) from None
         source = _image_file(file, name, others)
-        given = file.parent / str(frame["mask_path"]) if "mask_path" in frame else None
-        image, mask = read_on_background(source, _BLACK), masks.of(source, name, given)
+        mask_file = file.parent / str(frame["mask_path"]) if "mask_path" in frame else None
+        image, mask = read_on_background(source, _BLACK), masks.of(source, name, mask_file)
         views.append(undistorted_view(name, _camera(f"{file}: {name}", table, number, image), image, mask))
     return sorted(views, key=lambda view: view.name)
 

@@ -132,8 +132,8 @@ class ViewRefinement:
     def pose_changes(self) -> np.ndarray:
         """(views, 2): metres and degrees between the cameras of the data set and the aligned ones."""
         pairs = zip(self._initial, self.aligned(), strict=True)
-        apart = [pose_error(a.camera_to_world, b.camera_to_world) for a, b in pairs]
-        return np.array(apart) * (1, 180 / math.pi)
+        differences = [pose_error(a.camera_to_world, b.camera_to_world) for a, b in pairs]
+        return np.array(differences) * (1, 180 / math.pi)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The state, for a checkpoint."""
@@ -216,6 +216,6 @@ def with_exposure_of(rendered: np.ndarray, view: TrainingView) -> np.ndarray:
 
 def _median_depth(view: TrainingView, dataset: Dataset) -> float:
     """Median depth of the points in front of a camera; the scene extent without any."""
-    found = depths(view.camera, dataset.points)
-    found = found[found > view.camera.near]
-    return float(np.median(found)) if len(found) else dataset.extent
+    all_depths = depths(view.camera, dataset.points)
+    all_depths = all_depths[all_depths > view.camera.near]
+    return float(np.median(all_depths)) if len(all_depths) else dataset.extent

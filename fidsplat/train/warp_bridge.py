@@ -64,9 +64,9 @@ def render(
         raise DeviceError(
             f"renderer must use a Warp device, got {renderer.device.name}; use 'warp:cpu' or 'warp:cuda'"
         )
-    given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
-    given |= {name: array for name, array in (("colors", colors), ("sh", sh)) if array is not None}
-    inputs = given | {"background": background, "pose": pose}
+    arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    arrays |= {name: array for name, array in (("colors", colors), ("sh", sh)) if array is not None}
+    inputs = arrays | {"background": background, "pose": pose}
     with_grad = {name: array for name, array in inputs.items() if getattr(array, "requires_grad", False)}
     if background is not None:
         capture = replace(capture, background=tuple(_numbers("background", background, 3).tolist()))
@@ -75,7 +75,7 @@ def render(
         if capture.camera is None:
             raise InputError("capture must have a camera for a pose, got none; give fs.Capture(camera)")
         capture = replace(capture, camera=offset_camera(capture.camera, offset))
-    frame = renderer.render_differentiable(renderer.wrap_arrays(**given), capture)
+    frame = renderer.render_differentiable(renderer.wrap_arrays(**arrays), capture)
     images = {name: wp.clone(frame.device_array(name), requires_grad=True) for name in capture.outputs}
 
     def backward() -> None:

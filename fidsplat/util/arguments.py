@@ -56,10 +56,10 @@ def number(
     high: float = math.inf,
 ) -> float:
     """Check that a value is a finite number within [low, high], and return it as a float."""
-    found = as_float(value)
-    if not (math.isfinite(found) and low <= found <= high):
+    checked = as_float(value)
+    if not (math.isfinite(checked) and low <= checked <= high):
         raise invalid(what, requirement, value)
-    return found
+    return checked
 
 
 def three_numbers(name: str, value: Any) -> tuple[float, float, float]:
@@ -87,12 +87,12 @@ def direction(name: str, value: Any) -> np.ndarray:
 def whole_number(what: str, value: Any, low: int, high: int) -> int:
     """Check that a value is a whole number within [low, high], and return it as an int."""
     try:
-        found = None if isinstance(value, bool) else operator.index(value)
+        checked = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
-        found = None
-    if found is None or not low <= found <= high:
+        checked = None
+    if checked is None or not low <= checked <= high:
         raise invalid(what, f"a whole number from {low} to {high}", value)
-    return found
+    return checked
 
 
 def flag(what: str, value: Any) -> bool:
@@ -129,10 +129,10 @@ def callback(what: str, value: Any) -> Any:
 
 def items(what: str, value: Any, kind: type[T], requirement: str) -> tuple[T, ...]:
     """Check that a value is an iterable of instances of a class, and return its items."""
-    found = tuple(value) if isinstance(value, Iterable) and getattr(value, "shape", None) != () else None
-    if found is None or not all(isinstance(item, kind) for item in found):
+    checked = tuple(value) if isinstance(value, Iterable) and getattr(value, "shape", None) != () else None
+    if checked is None or not all(isinstance(item, kind) for item in checked):
         raise invalid(what, requirement, value)
-    return found
+    return checked
 
 
 def settings_with(kind: type[T], settings: T | None, changes: dict[str, Any]) -> T:
@@ -148,13 +148,13 @@ def settings_with(kind: type[T], settings: T | None, changes: dict[str, Any]) ->
 
 def parse_settings(what: str, kind: type, parts: Iterable[str]) -> dict[str, Any]:
     """Values of a dataclass's fields from texts `key=value`, in the types of the fields."""
-    found = {}
+    settings = {}
     for part in parts:
         name, equals, value = (text.strip() for text in part.partition("="))
         if not equals:
             raise InputError(f"{what} must be settings as key=value, got {part!r}")
-        found[name] = parse_setting(what, kind, name, value)
-    return found
+        settings[name] = parse_setting(what, kind, name, value)
+    return settings
 
 
 def parse_setting(what: str, kind: type, name: str, text: str) -> Any:

@@ -27,20 +27,20 @@ def download(
     if target.is_file() and target.stat().st_size == size:
         progress(size)
         return target
-    found, received = hashlib.sha256(), 0
+    digest, received = hashlib.sha256(), 0
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with urllib.request.urlopen(url, timeout=_SECONDS) as source, atomic_write(target) as stream:
             while received <= size and (block := source.read(_BLOCK)):
                 interrupts.check()
                 received += len(block)
-                found.update(block)
+                digest.update(block)
                 stream.write(block)
                 progress(len(block))
-            if received != size or found.hexdigest() != sha256:
+            if received != size or digest.hexdigest() != sha256:
                 raise InputError(
                     f"{url} must have {size:,} bytes and the SHA-256 {sha256}, got {received:,} and "
-                    f"{found.hexdigest()}; the file has changed or a proxy has replaced it"
+                    f"{digest.hexdigest()}; the file has changed or a proxy has replaced it"
                 )
     except (OSError, ValueError, http.client.HTTPException) as error:  # urllib's errors are OSErrors
         reason = getattr(error, "reason", None) or error

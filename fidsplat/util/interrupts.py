@@ -63,8 +63,8 @@ def handled() -> Iterator[None]:
     try:
         yield
     finally:
-        for number, own in before.items():
-            signal.signal(number, own)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         if before:
             _number = None
 

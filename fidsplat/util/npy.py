@@ -47,8 +47,10 @@ def load_npz(file: Path, names: Collection[str] | None = None) -> dict[str, np.n
                     )
                 if sum(entry.file_size for entry in entries) > os.fstat(stream.fileno()).st_size:
                     raise ValueError("its arrays must be smaller than the file, got larger ones")
-                found = {entry.filename.removesuffix(".npy"): entry for entry in entries}
-                return {name: _array(members.read(found[name])) for name in names or found}
+                members_by_name = {entry.filename.removesuffix(".npy"): entry for entry in entries}
+                return {
+                    name: _array(members.read(members_by_name[name])) for name in names or members_by_name
+                }
         except KeyError as error:
             raise ValueError(f"the array {error} is missing") from None
         except (BadZipFile, EOFError, RuntimeError, OverflowError) as error:  # RuntimeError: encrypted

@@ -57,23 +57,23 @@ class _Digest:
 def code_hash() -> str:
     """SHA-256 of all files of the package and the kernels, as 16 hexadecimal digits; a checkout and its wheel
     have the same."""
-    found = hashlib.sha256()
+    sha = hashlib.sha256()
     for name, file in sorted(sources().items()):
         content = file.read_bytes()
-        found.update(f"{name}\0{len(content)}\0".encode() + content)
-    return found.hexdigest()[:16]
+        sha.update(f"{name}\0{len(content)}\0".encode() + content)
+    return sha.hexdigest()[:16]
 
 
 def sources() -> dict[str, Path]:
     """Files of `code_hash` by their paths relative to `fidsplat` and `kernels`."""
-    found = {}
+    files = {}
     for top, folder in (("fidsplat", _PACKAGE), ("kernels", kernels_folder())):
         for file in folder.rglob("*"):
             inside = file.relative_to(folder)
             hidden = file.name.startswith(".") or _WITHOUT_SOURCES & set(inside.parts)
             if file.is_file() and not hidden:
-                found[f"{top}/{inside.as_posix()}"] = file
-    return found
+                files[f"{top}/{inside.as_posix()}"] = file
+    return files
 
 
 def run_facts(device: str | None, seed: int, versions: Mapping[str, str] | None = None) -> dict:

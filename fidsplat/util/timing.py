@@ -59,7 +59,7 @@ class Timer:
         try:
             begun = self._clock()
             parts = self._work()
-            taken = 1e3 * (self._clock() - begun)
+            milliseconds = 1e3 * (self._clock() - begun)
             if self._parts is not None:
                 parts = self._parts(parts)
         except FidsplatError as error:
@@ -68,10 +68,10 @@ class Timer:
             self.error = str(error)
             return math.nan
         if timed:
-            self.ms.append(taken)
+            self.ms.append(milliseconds)
             for name, ms in parts.items() if isinstance(parts, Mapping) else ():
                 self.parts.setdefault(name, []).append(ms)
-        return taken
+        return milliseconds
 
     @property
     def median(self) -> float:

@@ -16,14 +16,14 @@ def decompress(data: bytes | memoryview, size: int) -> bytes:
     try:
         # other calls allocate the size that the frame declares, unchecked
         with library.ZstdDecompressor(max_window_size=2**27).stream_reader(bytes(data)) as stream:
-            found = stream.read(size + 1)
+            content = stream.read(size + 1)
     except library.ZstdError as error:
         raise ValueError(str(error)) from None
-    if len(found) != size:
+    if len(content) != size:
         raise ValueError(
-            f"a frame must expand to {size} bytes, got {'more' if len(found) > size else len(found)}"
+            f"a frame must expand to {size} bytes, got {'more' if len(content) > size else len(content)}"
         )
-    return found
+    return content
 
 
 def _library() -> Any:

@@ -141,8 +141,8 @@ class Controls:
 
 
 def _lenses(scene: Scene) -> list[str]:
-    own = scene.camera is not None and scene.camera.lens is not None
-    return [lens for lens in LENSES if lens != "scene" or own]
+    has_lens = scene.camera is not None and scene.camera.lens is not None
+    return [lens for lens in LENSES if lens != "scene" or has_lens]
 
 
 def _span(scene: Scene) -> tuple[float, float]:

@@ -85,16 +85,16 @@ def guarded(make: Callable[[], Any], listens: str) -> Any:
 
         server.serve = guarding  # type: ignore[misc, assignment]
         try:
-            made = make()
+            guard = make()
         finally:
             server.serve = serve  # type: ignore[misc]
     if not started:
-        made.stop()
+        guard.stop()
         raise FidsplatError(
             "this version of viser starts its server in a way that fidsplat cannot guard against pages of "
             "other sites; pip install 'viser==1.1.1'"
         )
-    return made
+    return guard
 
 
 async def _answer(listens: str, further: Callable[..., Any] | None, connection: Any, request: Any) -> Any:

@@ -114,8 +114,8 @@ def engine_files(run: Callable[[list[str]], str] | None = None) -> tuple[str, st
 
     Raises InputError if npm is missing or the files differ from their checksums.
     """
-    if (own := os.environ.get(ENGINE)) is not None:
-        engine = path_of(own)
+    if (own_engine := os.environ.get(ENGINE)) is not None:
+        engine = path_of(own_engine)
         licence = engine.with_name("LICENSE")
         text = read_input(licence).decode() if licence.is_file() else "MIT, https://playcanvas.com"
         return read_input(engine).decode("utf-8", "replace"), text
@@ -128,9 +128,9 @@ def engine_files(run: Callable[[list[str]], str] | None = None) -> tuple[str, st
 
 def _checked(file: Path, name: str) -> bytes:
     data = read_input(file)
-    found = hashlib.sha256(data).hexdigest()
-    if found != _FILES[name]:
-        raise InputError(f"{file} must have the SHA-256 {_FILES[name]}, got {found}; remove it")
+    sha256 = hashlib.sha256(data).hexdigest()
+    if sha256 != _FILES[name]:
+        raise InputError(f"{file} must have the SHA-256 {_FILES[name]}, got {sha256}; remove it")
     return data
 
 
@@ -143,9 +143,9 @@ def _obtain(folder: Path, run: Callable[[list[str]], str]) -> None:
             for name, expected in _FILES.items():
                 member = members.extractfile(f"package/{name}")
                 data = b"" if member is None else member.read()
-                found = hashlib.sha256(data).hexdigest()
-                if found != expected:
-                    raise InputError(f"{name} of playcanvas must have the SHA-256 {expected}, got {found}")
+                sha256 = hashlib.sha256(data).hexdigest()
+                if sha256 != expected:
+                    raise InputError(f"{name} of playcanvas must have the SHA-256 {expected}, got {sha256}")
                 write_file(folder / Path(name).name, data)
 
 

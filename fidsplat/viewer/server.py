@@ -227,10 +227,10 @@ class Viewer:
         if self._controls.new_marker is not None:
             message.content = self._place(view, *event.screen_pos)
             return
-        found = view.pick(*event.screen_pos)
-        depth = "nothing" if found["depth"] is None else f"{found['depth']:.4f} m"
-        rows = [f"pixel {found['pixel']}", f"depth {depth}", f"label {found['label']}"]
-        rows += [f"splat {found['splat_id']}", f"marker {escaped(found['marker'] or '-')}"]
+        picked = view.pick(*event.screen_pos)
+        depth = "nothing" if picked["depth"] is None else f"{picked['depth']:.4f} m"
+        rows = [f"pixel {picked['pixel']}", f"depth {depth}", f"label {picked['label']}"]
+        rows += [f"splat {picked['splat_id']}", f"marker {escaped(picked['marker'] or '-')}"]
         message.content = "  \n".join(rows)
 
     def _place(self, view: StillImage, x: float, y: float) -> str:
@@ -407,14 +407,14 @@ def _viser() -> Any:
 def _viewpoint(camera: Any) -> Viewpoint:
     """The viewpoint of a browser's viser camera. Raises InputError for unusable numbers."""
     position, wxyz = np.asarray(camera.position, float), np.asarray(camera.wxyz, float)
-    away = float(np.linalg.norm(np.asarray(camera.look_at, float) - position))
+    distance = float(np.linalg.norm(np.asarray(camera.look_at, float) - position))
     return Viewpoint(
         tuple(position.tolist()),
         tuple(wxyz.tolist()),
         float(camera.fov),
         max(1, camera.image_width),
         max(1, camera.image_height),
-        max(away, 1e-3),
+        max(distance, 1e-3),
     )
 
 

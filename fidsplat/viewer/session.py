@@ -64,8 +64,8 @@ class StillImage:
         label, splat = (int(self.frame[name][row, column]) for name in ("label", "splat_id"))
         depth = float(self.frame["depth"][row, column])
         markers = {placed.label: placed.marker.spec for placed in self.state.scene.markers}
-        found: dict[str, object] = {"label": label, "splat_id": splat, "depth": depth if depth > 0 else None}
-        return found | {"marker": markers.get(label), "pixel": (column, row)}
+        picked: dict[str, object] = {"label": label, "splat_id": splat, "depth": depth if depth > 0 else None}
+        return picked | {"marker": markers.get(label), "pixel": (column, row)}
 
     def place(self, marker: Marker, x: float, y: float) -> PlacedMarker:
         """The marker on the surface at a position in the image, 0 to 1 from the left and from the top.

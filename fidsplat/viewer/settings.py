@@ -100,9 +100,9 @@ class Viewpoint:
         if lens == "scene" and scene.camera is not None and scene.camera.lens is not None:
             f = scene.camera.fx * width / scene.camera.width
             ratio = scene.camera.fy / scene.camera.fx
-            middle, given = (width / 2, height / 2), scene.camera.lens
+            middle, scene_lens = (width / 2, height / 2), scene.camera.lens
             return Camera.pinhole(
-                width, height, f, f * ratio, *middle, world_to_camera, near, far, lens=given
+                width, height, f, f * ratio, *middle, world_to_camera, near, far, lens=scene_lens
             )
         if lens not in ("pinhole", "scene"):
             raise InputError(f"unknown lens {lens!r}; known: {', '.join(LENSES)}")
@@ -169,24 +169,26 @@ class Settings:
 
     def capture(self, scene: Scene, camera: Camera) -> Capture:
         """Capture of the exact image. Raises InputError for a value out of range."""
-        own = scene.capture
-        color = _FOG_COLOR if own.fog is None else own.fog.color
+        scene_capture = scene.capture
+        color = _FOG_COLOR if scene_capture.fog is None else scene_capture.fog.color
         shutter = replace(
-            own.shutter,
+            scene_capture.shutter,
             time=self.time,
             exposure_time=self.exposure_ms / 1e3,
             readout=self.readout_ms / 1e3,
         )
         # the square of smaller noise may underflow to 0
         full_well = max(1.0, 1 / self.noise**2) if self.noise > 1e-9 else math.inf
-        read_noise = 0.0 if math.isinf(full_well) else min(own.sensor.read_noise, full_well)
-        sensor = replace(own.sensor, exposure=self.exposure, full_well=full_well, read_noise=read_noise)
+        read_noise = 0.0 if math.isinf(full_well) else min(scene_capture.sensor.read_noise, full_well)
+        sensor = replace(
+            scene_capture.sensor, exposure=self.exposure, full_well=full_well, read_noise=read_noise
+        )
         still = not scene.motion.groups
         return replace(
-            own,
+            scene_capture,
             camera=camera,
             outputs=AT_REST,
-            quality=own.quality if self.quality is None else Quality.of(self.quality),
+            quality=scene_capture.quality if self.quality is None else Quality.of(self.quality),
             motion=Motion(None, scene.motion.groups),
             shutter=Shutter() if still else shutter,
             sensor=sensor,

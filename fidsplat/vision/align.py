@@ -43,12 +43,12 @@ def align(
     Returns (4, 2) float64, or None if the fit does not converge near the given corners.
     """
     rough = np.asarray(corners, np.float64)
-    found = _fit_from(grey, rough, bits)
+    fitted = _fit_from(grey, rough, bits)
     for corner in unsure:
-        if found is not None:
+        if fitted is not None:
             break
-        found = _fit_from(grey, _best_start(grey, rough, bits, corner), bits)
-    return found
+        fitted = _fit_from(grey, _best_start(grey, rough, bits, corner), bits)
+    return fitted
 
 
 def fit(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> float:
@@ -107,14 +107,14 @@ def _best_start(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, unsure:
     smooth = cv2.GaussianBlur(image, (0, 0), FINE_BLUR)
     before, after = start[unsure - 1], start[(unsure + 1) % 4]
     steps = np.arange(-4, 5) / 2 / bits.shape[0]
-    best, most = start, -1.0
+    best, best_score = start, -1.0
     for along in steps:
         for across in steps:
             tried = start.copy()
             tried[unsure] += along * (start[unsure] - before) + across * (start[unsure] - after)
             fit = model.correlation(smooth, _homography(_SQUARE, tried), FINE_BLUR)
-            if fit > most:
-                best, most = tried, fit
+            if fit > best_score:
+                best, best_score = tried, fit
     return best * shrink + offset
 
 
@@ -189,10 +189,10 @@ def _step(model: _Model, smooth: np.ndarray, homography: np.ndarray, blur: float
     residual = -(observed - gain * ideal - base)
     normal = columns.T @ (columns * weight[:, None])
     try:
-        found = np.linalg.solve(normal, columns.T @ (weight * residual))
+        solution = np.linalg.solve(normal, columns.T @ (weight * residual))
     except np.linalg.LinAlgError:
         return None
-    return np.append(found, 0.0).reshape(3, 3)
+    return np.append(solution, 0.0).reshape(3, 3)
 
 
 def _contrast(ideal: np.ndarray, observed: np.ndarray, weight: np.ndarray) -> tuple[float, float]:

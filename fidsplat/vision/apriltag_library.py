@@ -26,9 +26,9 @@ def read_tags(grey: np.ndarray, family: str) -> list[tuple[int, np.ndarray]]:
         detector = idle.pop()  # one image at a time: a detector has scratch memory
     except IndexError:
         detector = _detector(family)
-    found: Any = detector.detect(grey)  # a list, in spite of the annotation
+    detections: Any = detector.detect(grey)  # a list, in spite of the annotation
     idle.append(detector)
-    return [(tag.tag_id, tag.corners[::-1].copy()) for tag in found]
+    return [(tag.tag_id, tag.corners[::-1].copy()) for tag in detections]
 
 
 def _detector(family: str):
@@ -53,8 +53,8 @@ def _detector(family: str):
     library.apriltag_detector_clear_families(pointer)
     create = getattr(library, f"tag{family.capitalize()}_create")
     create.restype = type(next(iter(detector.tag_families.values())))
-    made = create()
-    bits = 1 if made.contents.ncodes > MANY_CODES else 2
-    library.apriltag_detector_add_family_bits(pointer, made, bits)
-    detector.tag_families["added"] = made
+    created = create()
+    bits = 1 if created.contents.ncodes > MANY_CODES else 2
+    library.apriltag_detector_add_family_bits(pointer, created, bits)
+    detector.tag_families["added"] = created
     return detector

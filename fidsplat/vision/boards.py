@@ -38,12 +38,12 @@ def board_pose(
     origin = marker.flat_corners[0]
     points, observed = [], []
     for number, (y, x) in enumerate(tag_places(spec, side)):
-        own = [tag for tag in left if (tag.kind, tag.family, tag.id) == (kind, family, number)]
+        matches = [tag for tag in left if (tag.kind, tag.family, tag.id) == (kind, family, number)]
         corners = np.array([(x, y), (x + side, y), (x + side, y + side), (x, y + side)], float)
         where = origin + corners * marker.module
-        if own:
+        if matches:
             true = camera.project(marker.points(where) @ placed.pose[:3, :3].T + placed.pose[:3, 3])
-            tag = min(own, key=lambda tag: np.nan_to_num(np.linalg.norm(tag.corners - true), nan=np.inf))
+            tag = min(matches, key=lambda tag: np.nan_to_num(np.linalg.norm(tag.corners - true), nan=np.inf))
             left.remove(tag)
             points.append(where)
             observed.append(tag.corners)
@@ -69,9 +69,9 @@ def chess_corners(image: np.ndarray, spec: BoardSpec, side: int) -> tuple[np.nda
     dictionary = predefined(*parse_family(spec.family or ""))
     board = cv2.aruco.CharucoBoard((spec.columns, spec.rows), square, side, dictionary)
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    found, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
-    if ids is None or found is None:
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
+    if ids is None or corners is None:
         return np.zeros((0, 2)), np.zeros((0, 2))
     row, column = np.divmod(np.asarray(ids).ravel(), spec.columns - 1)
     # OpenCV's origin is the centre of the first pixel
-    return np.column_stack([column + 1, row + 1]) * float(square), np.asarray(found).reshape(-1, 2) + 0.5
+    return np.column_stack([column + 1, row + 1]) * float(square), np.asarray(corners).reshape(-1, 2) + 0.5

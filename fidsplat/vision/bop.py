@@ -127,11 +127,11 @@ def check_bop_camera(camera: Camera) -> None:
 
 
 def _visibility(marker: MarkerTruth, truth: Truth, mask: np.ndarray) -> dict[str, Any]:
-    whole, group = outline(marker.placed, truth.camera), truth.groups.get(marker.placed.label)
+    polygon, group = outline(marker.placed, truth.camera), truth.groups.get(marker.placed.label)
     return {
-        "bbox_obj": _box(whole.box),
+        "bbox_obj": _box(polygon.box),
         "bbox_visib": _box(None if group is None else group.box),
-        "px_count_all": round(whole.area),
+        "px_count_all": round(polygon.area),
         "px_count_visib": int(mask.sum()),
         "visib_fract": marker.visible,
     }
@@ -143,13 +143,13 @@ def _box(box: Box | None) -> list[float]:
 
 
 def _model(marker: MarkerTruth) -> dict[str, Any]:
-    made = marker.placed.marker
-    across = np.linspace(-1, 1, POINTS) * np.abs(made.flat_corners[:1].T)
-    at = 1000 * made.points(np.stack(np.meshgrid(*across), -1).reshape(-1, 2))
+    printed = marker.placed.marker
+    across = np.linspace(-1, 1, POINTS) * np.abs(printed.flat_corners[:1].T)
+    at = 1000 * printed.points(np.stack(np.meshgrid(*across), -1).reshape(-1, 2))
     low, high = at.min(0), at.max(0)
     names = "xyz"
     return {
-        "spec": made.spec,
+        "spec": printed.spec,
         "diameter": float(np.linalg.norm(high - low)),
         **{f"min_{n}": float(v) for n, v in zip(names, low, strict=True)},
         **{f"size_{n}": float(v) for n, v in zip(names, high - low, strict=True)},

@@ -100,9 +100,9 @@ _PINHOLE_FLAGS = ("CALIB_FIX_K1", "CALIB_FIX_K2", "CALIB_FIX_K3", "CALIB_ZERO_TA
 
 def parameters(camera: Camera) -> dict[str, float]:
     """Intrinsics and estimated lens coefficients by name; the centre of the first pixel is at 0.5."""
-    found = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
+    values = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
     lens = camera.lens
-    return found | {name: getattr(lens, name) for name in ESTIMATED.get(type(lens), ())}
+    return values | {name: getattr(lens, name) for name in ESTIMATED.get(type(lens), ())}
 
 
 def projection_errors(estimate: Camera, truth: Camera) -> np.ndarray:

@@ -92,13 +92,13 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
             f"{pixels.shape[0]}; crop or downsample it"
         )
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if pixels.ndim == 3 else np.ascontiguousarray(pixels)
-    found: list[Detection] = []
+    detections: list[Detection] = []
     for kind, family in dict.fromkeys(requested):
-        found += [tag for tag in _tags(grey, kind, family) if not _known(tag, found)]
+        detections += [tag for tag in _tags(grey, kind, family) if not _known(tag, detections)]
     for name in names:
         if name in hooks:
-            found += [_of_hook(*code) for code in hooks[name](grey)]
-    return found + (_qr_codes(grey) if qr else [])
+            detections += [_of_hook(*code) for code in hooks[name](grey)]
+    return detections + (_qr_codes(grey) if qr else [])
 
 
 def _of_hook(text: str, corners: np.ndarray) -> Detection:
@@ -108,14 +108,14 @@ def _of_hook(text: str, corners: np.ndarray) -> Detection:
 
 def _tags(grey: np.ndarray, kind: str, family: str) -> list[Detection]:
     """Tags of one family, sorted by id."""
-    found: list[Detection] = []
+    detections: list[Detection] = []
     if family in LAYOUTS:
         ring = outside(family)
         for number, corners in read_tags(grey, family):
             inner = dictionary_bits(kind, family, number)[ring:-ring, ring:-ring]
             better = align(grey, corners, inner * (inner != HOLE))
-            found.append(Detection(kind, family, number, None, corners if better is None else better))
-        return sorted(found, key=lambda tag: tag.id or 0)
+            detections.append(Detection(kind, family, number, None, corners if better is None else better))
+        return sorted(detections, key=lambda tag: tag.id or 0)
     loose: list[Detection] = []
     # OpenCV's AprilTag method finds tags whose white margin is crossed by a thin dark line, which breaks the
     # contours of the first method. At half size it costs no more; the first method finds the small tags.
@@ -123,18 +123,18 @@ def _tags(grey: np.ndarray, kind: str, family: str) -> list[Detection]:
         (cv2.aruco.CORNER_REFINE_SUBPIX, 0.0),
         (cv2.aruco.CORNER_REFINE_APRILTAG, 2.0),
     ):
-        _read_tags(grey, kind, family, refinement, decimate, found, loose)
-    if any(not _known(tag, found) for tag in loose):
+        _read_tags(grey, kind, family, refinement, decimate, detections, loose)
+    if any(not _known(tag, detections) for tag in loose):
         # OpenCV approximates a contour by four points to within 3 % of its length: on a steeply tilted tag
         # corners can be modules away from the true ones, outside the window of the refinement. Fitting lines
         # to the sides solves this, but dark lines that touch the tag rotate them.
-        _read_tags(grey, kind, family, cv2.aruco.CORNER_REFINE_CONTOUR, 0.0, found, loose)
+        _read_tags(grey, kind, family, cv2.aruco.CORNER_REFINE_CONTOUR, 0.0, detections, loose)
     # if the fit converges from none of the candidate corners, use those with the best correlation
     bits = {tag.id: dictionary_bits(kind, family, int(tag.id or 0)) for tag in loose}
     for tag in sorted(loose, key=lambda tag: -fit(grey, tag.corners, bits[tag.id])):
-        if not _known(tag, found):
-            found.append(tag)
-    return sorted(found, key=lambda tag: tag.id or 0)
+        if not _known(tag, detections):
+            detections.append(tag)
+    return sorted(detections, key=lambda tag: tag.id or 0)
 
 
 def _read_tags(

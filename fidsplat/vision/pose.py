@@ -110,9 +110,9 @@ def _undistorted(corners: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.nd
 
 def pose_error(estimate: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     """Distance in metres and angle in radians between two rigid poses (4, 4)."""
-    apart = float(np.linalg.norm(estimate[:3, 3] - truth[:3, 3]))
+    distance = float(np.linalg.norm(estimate[:3, 3] - truth[:3, 3]))
     delta = estimate[:3, :3].T @ truth[:3, :3]
     sine = (
         np.linalg.norm([delta[2, 1] - delta[1, 2], delta[0, 2] - delta[2, 0], delta[1, 0] - delta[0, 1]]) / 2
     )
-    return apart, math.atan2(float(sine), (float(np.trace(delta)) - 1) / 2)
+    return distance, math.atan2(float(sine), (float(np.trace(delta)) - 1) / 2)

@@ -88,8 +88,10 @@ def read_back(
     image = to_uint8(pixels_of(frame["rgb"] if isinstance(frame, Mapping) else frame))
     label = frame["label"] if isinstance(frame, Mapping) and "label" in frame else None
     camera, markers = at_shutter(frame, scene, camera, image.shape)
-    found = detect(image, families_of(placed.marker for placed in markers) if families is None else families)
-    codes, left = match(found, markers, camera)
+    detections = detect(
+        image, families_of(placed.marker for placed in markers) if families is None else families
+    )
+    codes, left = match(detections, markers, camera)
     for number, placed in enumerate(markers):
         if placed.marker.kind in BOARDS:
             codes[number], left = board_pose(image, left, placed, camera)
@@ -108,16 +110,16 @@ def match(
     left = list(detections)
     expected = [camera.project(placed.corners) for placed in markers]
     pairs = [
-        (_distance(found.corners, expected[i]), i, found)
+        (_distance(code.corners, expected[i]), i, code)
         for i, placed in enumerate(markers)
-        for found in left
-        if content_of(found) == content_of(placed.marker)
+        for code in left
+        if content_of(code) == content_of(placed.marker)
     ]
     chosen: dict[int, Detection] = {}
-    for _, i, found in sorted(pairs, key=lambda pair: pair[0]):
-        if i not in chosen and found in left:
-            chosen[i] = found
-            left.remove(found)
+    for _, i, code in sorted(pairs, key=lambda pair: pair[0]):
+        if i not in chosen and code in left:
+            chosen[i] = code
+            left.remove(code)
     codes = [
         (chosen[i], marker_pose(chosen[i].corners, placed.marker.size, camera)) if i in chosen else None
         for i, placed in enumerate(markers)
@@ -127,8 +129,8 @@ def match(
 
 def own_code(made: Marker, image: np.ndarray) -> Detection | None:
     """Detect a marker's code in an image, (h, w) or (h, w, 3) display values; None if not found."""
-    found = detect(to_uint8(image), families_of([made]), qr=made.kind == "qr")
-    return next((code for code in found if content_of(code) == content_of(made)), None)
+    detections = detect(to_uint8(image), families_of([made]), qr=made.kind == "qr")
+    return next((code for code in detections if content_of(code) == content_of(made)), None)
 
 
 def corner_error(code: Detection, corners: np.ndarray) -> float:
@@ -177,13 +179,13 @@ def _reading(
     reading = Reading(**{field.name: getattr(truth, field.name) for field in fields(truth)})
     if code is None:
         return reading
-    found, pose = code
+    detection, pose = code
     position, angle = pose_error(pose, truth.truth)
     return replace(
         reading,
-        detection=found,
+        detection=detection,
         pose=pose,
         position_error=position,
         angle_error=angle,
-        corner_error=corner_error(found, truth.corners),
+        corner_error=corner_error(detection, truth.corners),
     )

@@ -79,19 +79,21 @@ def _pupil(grey: np.ndarray, target: Target) -> Attempt:
 
 def _locus(grey: np.ndarray, target: Target) -> Attempt:
     """locus-tag with its defaults. It reports only decoded tags."""
-    found = _locus_detector(target.family).detect(grey)
-    return attempt_of(zip(found.ids.tolist(), found.corners.astype(np.float64), strict=True), target)
+    detections = _locus_detector(target.family).detect(grey)
+    return attempt_of(
+        zip(detections.ids.tolist(), detections.corners.astype(np.float64), strict=True), target
+    )
 
 
 def _locus_detector(family: str) -> Any:
     """A detector for each thread, as threads that share one abort the process."""
     import locus  # type: ignore[import-not-found]
 
-    own = _of_thread.__dict__
-    if family not in own:
+    cache = _of_thread.__dict__
+    if family not in cache:
         tags = [getattr(locus.TagFamily, _LOCUS_FAMILIES[family])]
-        own[family] = locus.Detector(families=tags, threads=1)
-    return own[family]
+        cache[family] = locus.Detector(families=tags, threads=1)
+    return cache[family]
 
 
 def _cv2_qr(grey: np.ndarray, target: Target) -> Attempt:
@@ -121,16 +123,16 @@ def _zxing_tall(grey: np.ndarray, target: Target) -> Attempt:
     top, bottom = _content_rows(grey)
     part = np.ascontiguousarray(grey[top:bottom])
     moved = Target(target.kind, target.family, target.id, target.payload, target.corners - (0.0, top))
-    found = False
+    was_found = False
     for across, taller in product(ENLARGE, UNFORESHORTEN):
         # cubic interpolation preserves the contrast of modules of one pixel
         tall = cv2.resize(part, None, fx=across, fy=across * taller, interpolation=cv2.INTER_CUBIC)
         attempt = _zxing(tall, moved, (across, tall.shape[0] / part.shape[0]))
-        found = found or attempt.found
+        was_found = was_found or attempt.found
         if attempt.read:
             assert attempt.corners is not None
             return Attempt(True, True, attempt.corners + np.array([0.0, top]))
-    return Attempt(found, False)
+    return Attempt(was_found, False)
 
 
 _READERS: dict[str, dict[str, Callable[[np.ndarray, Target], Attempt]]] = {
@@ -174,8 +176,8 @@ def attempt_of(
     decoded: Iterable[tuple[int | str | None, np.ndarray]], target: Target, every: Iterable[np.ndarray] = ()
 ) -> Attempt:
     """The result for a target among ids or texts with corners. every: quadrilaterals, decoded or not."""
-    own = target.payload if target.id is None else target.id
-    corners = [quad for name, quad in decoded if name is not None and name == own]
+    expected = target.payload if target.id is None else target.id
+    corners = [quad for name, quad in decoded if name is not None and name == expected]
     if not corners:
         return Attempt(_any_over(every, target), False)
     nearest = min(corners, key=lambda quad: float(np.linalg.norm(quad - target.corners)))
@@ -199,13 +201,13 @@ def attempt(name: str, grey: np.ndarray, target: Target) -> Attempt:
 
 def reader_versions() -> dict[str, str]:
     """Versions of the detectors' packages."""
-    found = {"opencv": cv2.__version__}
+    versions = {"opencv": cv2.__version__}
     for package in ("zxing-cpp", *(package for _, package in _OPTIONAL.values())):
         try:
-            found[package] = version(package)
+            versions[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return versions
 
 
 def overlap(one: np.ndarray, other: np.ndarray) -> float:

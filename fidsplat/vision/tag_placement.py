@@ -86,8 +86,8 @@ def odometry_covariance(
         moved = np.zeros((6, 6))  # adjoint of the inverse step
         moved[:3, :3] = moved[3:, 3:] = rotation
         moved[:3, 3:] = -rotation @ _cross(shift)
-        turn = np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))
-        share = float(np.linalg.norm(shift) + turn) + 1e-6
+        angle = np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))
+        share = float(np.linalg.norm(shift) + angle) + 1e-6
         row, before = slice(6 * k, 6 * k + 6), slice(0, 6 * k)
         out[row, before] = moved @ out[6 * k - 6 : 6 * k, before]
         out[before, row] = out[row, before].T
@@ -104,24 +104,24 @@ def planar_information(information: np.ndarray, poses: np.ndarray, up: np.ndarra
         poses: (k, 4, 4) camera-to-world.
         up: (3,) vertical of the floor.
     """
-    own = poses[:, :3, :3].transpose(0, 2, 1) @ (up / np.linalg.norm(up))
+    vertical = poses[:, :3, :3].transpose(0, 2, 1) @ (up / np.linalg.norm(up))
     others = np.zeros((len(poses), 6, 4))
-    others[:, :3, 0] = TILT[1] * own
-    others[:, 3:, 1:] = TILT[0] * (np.eye(3) - own[:, :, None] * own[:, None, :])
-    seen = information @ others
-    inner = np.eye(4) + others.transpose(0, 2, 1) @ seen
-    return information - seen @ np.linalg.solve(inner, seen.transpose(0, 2, 1))
+    others[:, :3, 0] = TILT[1] * vertical
+    others[:, 3:, 1:] = TILT[0] * (np.eye(3) - vertical[:, :, None] * vertical[:, None, :])
+    coupling = information @ others
+    inner = np.eye(4) + others.transpose(0, 2, 1) @ coupling
+    return information - coupling @ np.linalg.solve(inner, coupling.transpose(0, 2, 1))
 
 
 def _drift(pose: np.ndarray, deviations: Sequence[float], up: np.ndarray | None) -> np.ndarray:
     """Covariance (6, 6) of an error of translation and rotation in the camera's axes."""
     out = np.zeros((6, 6))
-    level = turn = np.eye(3)
+    level = rotation = np.eye(3)
     if up is not None:
-        own = pose[:3, :3].T @ (up / np.linalg.norm(up))
-        turn = np.outer(own, own)
-        level = np.eye(3) - turn
-    out[:3, :3], out[3:, 3:] = deviations[0] ** 2 * level, deviations[1] ** 2 * turn
+        vertical = pose[:3, :3].T @ (up / np.linalg.norm(up))
+        rotation = np.outer(vertical, vertical)
+        level = np.eye(3) - rotation
+    out[:3, :3], out[3:, 3:] = deviations[0] ** 2 * level, deviations[1] ** 2 * rotation
     return out
 
 
@@ -141,8 +141,11 @@ def error_gain(covariance: np.ndarray, sightings: Sightings) -> float:
     if not k:
         return 0.0
     positions = covariance[:, sightings.rows].reshape(-1, 6, k, 6)[:, :3].reshape(-1, k, 6)
-    seen = np.einsum("nka,kai->nki", positions, sightings.roots).reshape(-1, 6 * k)
-    return float((seen * np.linalg.solve(_spread(covariance, sightings), seen.T).T).sum() / (len(seen) / 3))
+    projected = np.einsum("nka,kai->nki", positions, sightings.roots).reshape(-1, 6 * k)
+    return float(
+        (projected * np.linalg.solve(_spread(covariance, sightings), projected.T).T).sum()
+        / (len(projected) / 3)
+    )
 
 
 def updated(covariance: np.ndarray, sightings: Sightings, sign: float = 1.0) -> np.ndarray:
@@ -151,8 +154,10 @@ def updated(covariance: np.ndarray, sightings: Sightings, sign: float = 1.0) -> 
     if not k:
         return covariance
     columns = covariance[:, sightings.rows].reshape(-1, k, 6)
-    seen = np.einsum("nka,kai->nki", columns, sightings.roots).reshape(-1, 6 * k)
-    result = covariance - sign * seen @ np.linalg.solve(_spread(covariance, sightings, sign), seen.T)
+    projected = np.einsum("nka,kai->nki", columns, sightings.roots).reshape(-1, 6 * k)
+    result = covariance - sign * projected @ np.linalg.solve(
+        _spread(covariance, sightings, sign), projected.T
+    )
     return (result + result.T) / 2
 
 
@@ -180,17 +185,17 @@ def greedy(
     value = 0.0
     while len(chosen) < count and free.any() and not enough(covariance):
         interrupts.check()
-        best, most = -1, 0.0
+        best, best_gain = -1, 0.0
         for k in np.argsort(-np.where(free, limits, -np.inf), kind="stable"):
-            if not free[k] or (objective is gain and limits[k] <= most):
+            if not free[k] or (objective is gain and limits[k] <= best_gain):
                 break
             limits[k] = objective(covariance, candidates[k])
-            if limits[k] > most:
-                best, most = int(k), float(limits[k])
+            if limits[k] > best_gain:
+                best, best_gain = int(k), float(limits[k])
         if best < 0:
             break
         chosen.append(best)
-        value += most
+        value += best_gain
         covariance = updated(covariance, candidates[best])
         free[best] = False
         if conflicts is not None:
@@ -217,15 +222,15 @@ def local_search(
             interrupts.check()
             others = chosen[:place] + chosen[place + 1 :]
             without = updated(after, candidates[chosen[place]], -1.0)
-            best, most = chosen[place], objective(without, candidates[chosen[place]]) * (1 + _MORE)
+            best, best_gain = chosen[place], objective(without, candidates[chosen[place]]) * (1 + _MORE)
             for k in order:
-                if objective is gain and limits[k] <= most:
+                if objective is gain and limits[k] <= best_gain:
                     break
                 if k in chosen or (conflicts is not None and conflicts[k, others].any()):
                     continue
-                found = objective(without, candidates[k])
-                if found > most:
-                    best, most = int(k), found
+                candidate_gain = objective(without, candidates[k])
+                if candidate_gain > best_gain:
+                    best, best_gain = int(k), candidate_gain
             if best == chosen[place]:
                 continue
             # computed anew, as downdates lose digits after precise tags
@@ -269,8 +274,8 @@ def _bound(
 def _spread(covariance: np.ndarray, sightings: Sightings, sign: float = 1.0) -> np.ndarray:
     """I + L^T S L (6 k, 6 k), S being the covariance of the poses of the sightings."""
     k, rows, roots = len(sightings.poses), sightings.rows, sightings.roots
-    own = covariance[np.ix_(rows, rows)].reshape(k, 6, k, 6)
-    half = np.einsum("kai,kalb->kilb", roots, own)
+    block = covariance[np.ix_(rows, rows)].reshape(k, 6, k, 6)
+    half = np.einsum("kai,kalb->kilb", roots, block)
     return np.eye(6 * k) + sign * np.einsum("kilb,lbj->kilj", half, roots).reshape(6 * k, 6 * k)
 
 

@@ -144,13 +144,13 @@ def groups_of(label: np.ndarray) -> dict[int, GroupTruth]:
     starts[:, 1:] = label[:, 1:] != label[:, :-1]
     at = np.flatnonzero(starts)
     values, ends = label.reshape(-1)[at], np.append(at[1:], label.size)
-    found = {}
+    groups = {}
     for value in np.unique(values[values >= 0]).tolist():
         first, last = at[values == value], ends[values == value] - 1
         (top, bottom), width = first[[0, -1]] // label.shape[1], label.shape[1]
         box = (first % width).min(), top, (last % width).max() + 1, bottom + 1
-        found[value] = GroupTruth(value, label, tuple(map(float, box)))  # type: ignore[arg-type]
-    return found
+        groups[value] = GroupTruth(value, label, tuple(map(float, box)))  # type: ignore[arg-type]
+    return groups
 
 
 def points_of(depth: np.ndarray, camera: Camera) -> np.ndarray:
@@ -197,7 +197,7 @@ def optical_flow(
         motion = pose_matrix(motion, f"the motion of label {value}")
         check_similarity(motion, f"the motion of label {value}", rigid=True)
         if label is not None:
-            matrix, own = np.asarray(motion, np.float64), label == value
-            points[own] = points[own] @ matrix[:3, :3].T + matrix[:3, 3]
+            matrix, mask = np.asarray(motion, np.float64), label == value
+            points[mask] = points[mask] @ matrix[:3, :3].T + matrix[:3, 3]
     moved = after.project(points.reshape(-1, 3)).reshape(*depth.shape, 2)
     return (moved - before.pixel_centres).astype(np.float32)

@@ -42,8 +42,8 @@ def _motion(before: np.ndarray, after: np.ndarray) -> float:
     corners = cv2.goodFeaturesToTrack(before, _CORNERS, _QUALITY, _APART)
     if corners is None or len(corners) < _MIN_TRACKED:
         return LOST
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, np.empty_like(corners))
-    tracked = found.ravel() > 0
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, np.empty_like(corners))
+    tracked = status.ravel() > 0
     if tracked.sum() < max(_MIN_TRACKED, len(corners) // 4):
         return LOST
     return float(np.median(np.linalg.norm((moved - corners)[tracked, 0], axis=1))) / before.shape[1]

@@ -36,8 +36,8 @@ def visible_part(placed: PlacedMarker, camera: Camera) -> tuple[shapely.Geometry
     marker = placed.marker
     margin = min(MARGIN, marker.quiet_zone) * marker.module
     corners = marker.flat_corners + margin * np.sign(marker.flat_corners)
-    whole = (_flat if marker.shape is None else _bent)(placed, camera, corners)
-    return whole, shapely.intersection(whole, shapely.box(0, 0, camera.width, camera.height))
+    area = (_flat if marker.shape is None else _bent)(placed, camera, corners)
+    return area, shapely.intersection(area, shapely.box(0, 0, camera.width, camera.height))
 
 
 def _flat(placed: PlacedMarker, camera: Camera, corners: np.ndarray) -> shapely.Geometry:
@@ -83,16 +83,16 @@ def visible(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = Non
 
     label: (h, w) int32, the labels of the image; None: no occlusion.
     """
-    whole, part = visible_part(placed, camera)
+    area, part = visible_part(placed, camera)
     if shapely.is_empty(part):
         return Visible(0.0, None)
-    share = min(float(shapely.area(part) / shapely.area(whole)), 1.0)
+    share = min(float(shapely.area(part) / shapely.area(area)), 1.0)
     x0, y0, x1, y1 = shapely.bounds(part).tolist()
     if label is not None:
         y, x = np.mgrid[int(y0) : min(int(y1) + 1, camera.height), int(x0) : min(int(x1) + 1, camera.width)]
         inside = shapely.contains_xy(part, x + 0.5, y + 0.5)
-        own = label[y[inside], x[inside]] == placed.label
-        share *= float(own.mean()) if own.size else 0.0
+        labelled = label[y[inside], x[inside]] == placed.label
+        share *= float(labelled.mean()) if labelled.size else 0.0
     return Visible(share, (x0, y0, x1, y1))
 
 
@@ -111,11 +111,11 @@ class Outline(NamedTuple):
 
 def outline(placed: PlacedMarker, camera: Camera) -> Outline:
     """Outline of a marker in a camera's image."""
-    whole, part = visible_part(placed, camera)
+    area, part = visible_part(placed, camera)
     parts = [p for p in shapely.get_parts(part) if p.geom_type == "Polygon"]
-    box = None if shapely.is_empty(whole) else tuple(shapely.bounds(whole).tolist())
+    box = None if shapely.is_empty(area) else tuple(shapely.bounds(area).tolist())
     rings = [shapely.get_coordinates(shapely.get_exterior_ring(p))[:-1] for p in parts]
-    return Outline(float(shapely.area(whole)), box, float(shapely.area(part)), rings)
+    return Outline(float(shapely.area(area)), box, float(shapely.area(part)), rings)
 
 
 def _clipped(points: np.ndarray, ahead: np.ndarray) -> np.ndarray:

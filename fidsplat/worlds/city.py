@@ -114,8 +114,8 @@ class City:
         while done < count:
             block, start = divmod(first + done, WINDOW)
             take = min(WINDOW - start, count - done)
-            for name, made in self._block(block).items():
-                arrays[name][done : done + take] = made[start : start + take]
+            for name, splats in self._block(block).items():
+                arrays[name][done : done + take] = splats[start : start + take]
             done += take
 
     def _block(self, number: int) -> dict[str, np.ndarray]:
@@ -135,13 +135,13 @@ class City:
         line = ~walls["windows"][wall] & (wall == 0) & (np.abs(x % PITCH) < 0.15) & (y % 4 < 2)
         colors[line] = 0.85
         scales = OVERLAP * spacing * np.exp(generator.normal(0, 0.2, (WINDOW, 2)))
-        made = {
+        arrays = {
             "means": means,
             "quats": self._frames[wall],
             "scales": scales,
             "colors": np.clip(colors, 0, 1),
         }
-        return made | {"opacities": np.full(WINDOW, OPACITY, np.float32)}
+        return arrays | {"opacities": np.full(WINDOW, OPACITY, np.float32)}
 
 
 def flight(city: City) -> tuple[Camera, Trajectory]:

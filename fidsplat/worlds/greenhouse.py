@@ -102,7 +102,7 @@ class Greenhouse(GreenhouseSettings):
     def markers(self) -> list[PlacedMarker]:
         """AprilTags 36h11 with ids from 0 on both sides and ends of every bench, and a QR code above each
         row's near end."""
-        found, number = [], 0
+        markers, number = [], 0
         half = BENCH[0] / 2 + 0.005
         for row, y in enumerate(self.row_positions):
             places = [((-0.005, y), (-1, 0)), ((self.length + 0.005, y), (1, 0))]
@@ -113,29 +113,29 @@ class Greenhouse(GreenhouseSettings):
             for place, towards in places:
                 pose = facing((*place, TAG_HEIGHT), towards)
                 tag = marker(f"apriltag:36h11:{number % 587}", TAG, self.mixture)
-                found.append(PlacedMarker(tag, pose))
+                markers.append(PlacedMarker(tag, pose))
                 number += 1
             code = marker(f"qr:row {row + 1}", QR, self.mixture)
-            found.append(PlacedMarker(code, facing((-0.02, y, 0.75), (-1, 0))))
-        return found
+            markers.append(PlacedMarker(code, facing((-0.02, y, 0.75), (-1, 0))))
+        return markers
 
     def _plants(self) -> SplatCloud:
         rng = np.random.default_rng([self.seed, 1])
         kinds = list(KINDS if self.stock is None else self.stock)
-        found = []
+        plants = []
         for row, y in enumerate(self.row_positions):
             kind = kinds[row % len(kinds)]
             for k in range(self.plants):
-                turn = rng.uniform(0, 2 * math.pi)
+                azimuth = rng.uniform(0, 2 * math.pi)
                 foot = ((k + 0.5) * SPACING + rng.normal(0, 0.03), y + rng.normal(0, 0.02), BENCH[1])
-                pose = rigid_matrix(foot, (math.cos(turn / 2), 0, 0, math.sin(turn / 2)))
+                pose = rigid_matrix(foot, (math.cos(azimuth / 2), 0, 0, math.sin(azimuth / 2)))
                 plant = (
                     KINDS[kind](rng).splats(PLANT_SPLATS)
                     if self.stock is None
                     else _one_of(self.stock[kind], rng)
                 )
-                found.append(plant.transformed(pose))
-        return SplatCloud.concatenate(found)
+                plants.append(plant.transformed(pose))
+        return SplatCloud.concatenate(plants)
 
     def _ground(self) -> SplatCloud:
         rng = np.random.default_rng([self.seed, 2])
@@ -148,36 +148,36 @@ class Greenhouse(GreenhouseSettings):
         colors = np.asarray(EARTH) * rng.uniform(0.75, 1.2, (count, 1))
         sizes = rng.uniform(0.07, 0.11, (count, 2))
         up = np.tile([0.0, 0, 1], (count, 1))
-        turn = rng.uniform(0, math.pi, count)
-        along = np.stack([np.cos(turn), np.sin(turn), np.zeros(count)], 1)
+        azimuths = rng.uniform(0, math.pi, count)
+        along = np.stack([np.cos(azimuths), np.sin(azimuths), np.zeros(count)], 1)
         return disks(centers, along, up, sizes, colors)
 
     def _benches(self) -> SplatCloud:
         width, height = BENCH
-        found = []
+        benches = []
         for y in self.row_positions:
             middle = self.length / 2
-            found.append(_panel((middle, y, height), (1, 0, 0), (0, 1, 0), self.length, width, DARK))
+            benches.append(_panel((middle, y, height), (1, 0, 0), (0, 1, 0), self.length, width, DARK))
             for side in (-1, 1):
                 at = (middle, y + side * width / 2, height / 2)
-                found.append(_panel(at, (1, 0, 0), (0, 0, 1), self.length, height, FRAME))
+                benches.append(_panel(at, (1, 0, 0), (0, 0, 1), self.length, height, FRAME))
                 at = (middle + side * self.length / 2, y, height / 2)
-                found.append(_panel(at, (0, 1, 0), (0, 0, 1), width, height, FRAME))
-        return SplatCloud.concatenate(found)
+                benches.append(_panel(at, (0, 1, 0), (0, 0, 1), width, height, FRAME))
+        return SplatCloud.concatenate(benches)
 
     def _roof(self) -> SplatCloud:
         """Glass roof and its frame."""
         low, high = -AISLE, self.row_positions[-1] + AISLE
         middle, across = (low + high) / 2, high - low
         long = self.length + 2 * END
-        found = [
+        panes = [
             _panel((self.length / 2, middle, ROOF), (1, 0, 0), (0, 1, 0), long, across, FRAME, opacity=0.04)
         ]
         for x in np.linspace(-END, self.length + END, max(2, round(long / 2))):
-            found.append(_panel((x, middle, ROOF - 0.02), (1, 0, 0), (0, 1, 0), 0.06, across, FRAME))
+            panes.append(_panel((x, middle, ROOF - 0.02), (1, 0, 0), (0, 1, 0), 0.06, across, FRAME))
             for y in (low, high):
-                found.append(_panel((x, y, ROOF / 2), (1, 0, 0), (0, 0, 1), 0.06, ROOF, FRAME))
-        return SplatCloud.concatenate(found)
+                panes.append(_panel((x, y, ROOF / 2), (1, 0, 0), (0, 0, 1), 0.06, ROOF, FRAME))
+        return SplatCloud.concatenate(panes)
 
     def mjcf(self, robot: str = "") -> str:
         """MuJoCo model of the floor and the benches for collisions, and of a robot if its XML is given."""

@@ -93,20 +93,20 @@ def tomato(rng: np.random.Generator) -> Mesh:
     height = rng.uniform(1.1, 1.4)
     stem = _stem(rng, height)
     parts = [_tube(stem, 0.008, STALK)]
-    for at, turn, share in _nodes(rng, stem, 18):
+    for at, azimuth, share in _nodes(rng, stem, 18):
         length = rng.uniform(0.26, 0.34) * (1.15 - 0.5 * share)
-        rachis = _placed(_arc(length, rng.uniform(0.2, 0.5), 1.3), at, turn)
+        rachis = _placed(_arc(length, rng.uniform(0.2, 0.5), 1.3), at, azimuth)
         parts.append(_tube(rachis, 0.003, STALK))
         shade = _shade(rng, LEAF)
         for where, side in ((0.4, 1.1), (0.65, 1.0), (0.85, 0.9)):
             foot = rachis[round(where * (len(rachis) - 1))]
             for sign in (-1, 1):
                 parts.append(
-                    _blade(rng, foot, turn + sign * side, 0.45 * length * (1.2 - 0.5 * where), 0.55, shade)
+                    _blade(rng, foot, azimuth + sign * side, 0.45 * length * (1.2 - 0.5 * where), 0.55, shade)
                 )
-        parts.append(_blade(rng, rachis[-1], turn, 0.45 * length, 0.6, shade))
-    for at, turn, _ in _nodes(rng, stem, 4, 0.25, 0.7):
-        truss = _placed(_arc(0.13, 0.3, 2.2), at, turn)
+        parts.append(_blade(rng, rachis[-1], azimuth, 0.45 * length, 0.6, shade))
+    for at, azimuth, _ in _nodes(rng, stem, 4, 0.25, 0.7):
+        truss = _placed(_arc(0.13, 0.3, 2.2), at, azimuth)
         parts.append(_tube(truss, 0.003, STALK))
         for foot in truss[2::2]:
             radius = rng.uniform(0.02, 0.032)
@@ -121,13 +121,13 @@ def cucumber(rng: np.random.Generator) -> Mesh:
     height = rng.uniform(1.3, 1.7)
     stem = _stem(rng, height)
     parts = [_tube(stem, 0.007, STALK)]
-    for at, turn, share in _nodes(rng, stem, 20):
-        stalk = _placed(_arc(rng.uniform(0.1, 0.16) * (1.15 - 0.4 * share), 0.6, 0.6), at, turn)
+    for at, azimuth, share in _nodes(rng, stem, 20):
+        stalk = _placed(_arc(rng.uniform(0.1, 0.16) * (1.15 - 0.4 * share), 0.6, 0.6), at, azimuth)
         parts.append(_tube(stalk, 0.004, STALK))
         size = rng.uniform(0.18, 0.26) * (1.15 - 0.5 * share)
-        parts.append(_blade(rng, stalk[-1], turn, size, 1.05, _shade(rng, LEAF), lobes=0.18, droop=0.9))
-    for at, turn, _ in _nodes(rng, stem, 5, 0.3, 0.75):
-        stalk = _placed(_arc(0.07, 0.2, 2.0), at, turn)
+        parts.append(_blade(rng, stalk[-1], azimuth, size, 1.05, _shade(rng, LEAF), lobes=0.18, droop=0.9))
+    for at, azimuth, _ in _nodes(rng, stem, 5, 0.3, 0.75):
+        stalk = _placed(_arc(0.07, 0.2, 2.0), at, azimuth)
         half = rng.uniform(0.08, 0.13)
         parts.append(_tube(stalk, 0.003, STALK))
         parts.append(_ball(stalk[-1] - [0, 0, half], (0.02, 0.02, half), _shade(rng, CUCUMBER, 0.1)))
@@ -169,17 +169,17 @@ def load_plants(folder: str | Path) -> dict[str, list[SplatCloud]]:
 
     Raises InputError if there is no such file, or one cannot be read.
     """
-    found: dict[str, list[SplatCloud]] = {}
+    stock: dict[str, list[SplatCloud]] = {}
     files = {file: re.fullmatch(r"(.+)-(\d+)", file.stem) for file in Path(folder).glob("*.ply")}
     numbered = [(match[1], int(match[2]), file) for file, match in files.items() if match]
     for kind, _, file in sorted(numbered):
-        found.setdefault(kind, []).append(_plain(load_ply(file)))
-    if not found:
+        stock.setdefault(kind, []).append(_plain(load_ply(file)))
+    if not stock:
         raise InputError(
             f"{folder} must have plants as KIND-NUMBER.ply, e.g. tomato-0.ply, got none; "
             "`fidsplat experiment plants` writes them"
         )
-    return found
+    return stock
 
 
 def _plain(cloud: SplatCloud) -> SplatCloud:
@@ -216,7 +216,8 @@ def _nodes(
 
 
 def _arc(length: float, rise: float, bend: float, points: int = 8) -> np.ndarray:
-    """(points, 3) arc from the origin along x, from elevation `rise` down by `bend` radians."""
+    """Points (n, 3) of an arc that starts at the origin along x with the elevation `rise` and bends down by
+    `bend`, in radians."""
     angles = rise - bend * np.linspace(0, 1, points - 1) ** 1.5
     steps = length / (points - 1) * np.column_stack([np.cos(angles), 0 * angles, np.sin(angles)])
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])

@@ -122,11 +122,11 @@ def drive(mjcf: str, path: np.ndarray, speed: float = 0.5, errors: Errors | None
     model = mujoco.MjModel.from_xml_string(mjcf.replace("</mujoco>\n", _DRIVES))
     data = mujoco.MjData(model)
     first = corners[1] - corners[0]
-    turn = math.atan2(first[1], first[0])
-    data.qpos[:7] = [*corners[0], WHEEL, math.cos(turn / 2), 0, 0, math.sin(turn / 2)]
+    heading_change = math.atan2(first[1], first[0])
+    data.qpos[:7] = [*corners[0], WHEEL, math.cos(heading_change / 2), 0, 0, math.sin(heading_change / 2)]
     steps = round(CONTROL / model.opt.timestep)
     address = [model.joint(name).qposadr[0] for name in ("left", "right")]
-    times, poses, rolled, turned = [], [], [], []
+    times, poses, rolled, rotations = [], [], [], []
 
     def record() -> None:
         # the floor is one wheel radius below the body
@@ -136,7 +136,7 @@ def drive(mjcf: str, path: np.ndarray, speed: float = 0.5, errors: Errors | None
         times.append(data.time)
         poses.append(pose)
         rolled.append(WHEEL * data.qpos[address])
-        turned.append(float(data.sensordata[2]))
+        rotations.append(float(data.sensordata[2]))
 
     mujoco.mj_forward(model, data)
     record()
@@ -155,7 +155,9 @@ def drive(mjcf: str, path: np.ndarray, speed: float = 0.5, errors: Errors | None
                 raise InputError(
                     f"the robot must be able to follow its path, got stuck at {at}; remove obstacles"
                 )
-    return _measured(np.array(times), np.array(poses), np.array(rolled), np.array(turned), errors or Errors())
+    return _measured(
+        np.array(times), np.array(poses), np.array(rolled), np.array(rotations), errors or Errors()
+    )
 
 
 def _command(

@@ -9,7 +9,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 from agreement import random_splats
-from combined import LENSES, combination, everything
+from combined import LENSES, all_effects, combination
 
 import fidsplat as fs
 from fidsplat.backends.opencl.assemble import KernelSource, assemble, layouts_of
@@ -27,7 +27,7 @@ from fidsplat.selftest.agreement import compare
 BACKEND = "opencl"
 SETS = {
     "nothing": (),
-    **{str(lens): everything(lens) for lens in (None, *LENSES)},
+    **{str(lens): all_effects(lens) for lens in (None, *LENSES)},
     "double": ("boxes and Gaussians", "planes", "output normal", "output label"),
 }
 
@@ -77,7 +77,7 @@ def test_records_have_equal_layouts_on_host_and_device(renderer, name):
 @pytest.mark.parametrize("shape", [cpu_shape(), gpu_shape(256)], ids=["lanes", "group"])
 def test_kernels_have_the_declared_arguments(renderer, shape):
     """Names, types and address spaces of all arguments, as reported by the compiler."""
-    requested = combination(everything("fisheye") if shape.schedule == "lanes" else everything(None))
+    requested = combination(all_effects("fisheye") if shape.schedule == "lanes" else all_effects(None))
     source = assemble(requested.features(), shape)
     programs = [
         build(renderer.backend, program.compiled, "-cl-kernel-arg-info")
@@ -235,7 +235,7 @@ def test_compiler_errors_name_the_kernel_file_and_line(renderer, toys):
 def test_line_directives_match_the_lines_of_the_files():
     from fidsplat.util.files import kernels_folder
 
-    source = assemble(combination(everything("distortion")).features(), cpu_shape())
+    source = assemble(combination(all_effects("distortion")).features(), cpu_shape())
     assert source.listing.count("\n") == source.text.count("\n")
     compared = 0
     for program in source.programs.values():

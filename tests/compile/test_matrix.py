@@ -7,7 +7,7 @@ import re
 from itertools import combinations
 
 import pytest
-from combined import LENSES, SWITCHES, assert_drawn, combination, everything, goes
+from combined import LENSES, SWITCHES, all_effects, assert_renders, combination, is_compatible
 from sampling import sampled
 
 from fidsplat.backends.opencl.assemble import assemble
@@ -16,7 +16,7 @@ from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
 BACKEND = "opencl"
 
 SHAPES = (cpu_shape(), gpu_shape())
-PAIRS = [pair for pair in combinations(SWITCHES, 2) if goes(pair)]
+PAIRS = [pair for pair in combinations(SWITCHES, 2) if is_compatible(pair)]
 
 
 def assert_well_formed(names, shapes=SHAPES):
@@ -64,7 +64,7 @@ def test_most_feature_sets_share_the_program_of_lists():
 
 @pytest.mark.parametrize("lens", [None, *LENSES])
 def test_texts_of_all_effects_and_of_all_but_one(lens):
-    names = everything(lens)
+    names = all_effects(lens)
     assert_well_formed(names)
     for left_out in names:
         assert_well_formed([name for name in names if name != left_out])
@@ -73,19 +73,19 @@ def test_texts_of_all_effects_and_of_all_but_one(lens):
 # tests/contract has each effect on every device in a file of its own
 @pytest.mark.parametrize("name", sampled(list(SWITCHES), 3, 12))
 def test_each_single_effect(renderer, name):
-    assert_drawn(renderer, (name,))
+    assert_renders(renderer, (name,))
 
 
 @pytest.mark.parametrize("lens", [None, *LENSES])
 def test_all_effects(renderer, lens):
-    assert_drawn(renderer, everything(lens))
+    assert_renders(renderer, all_effects(lens))
 
 
-@pytest.mark.parametrize("left_out", sampled(everything("fisheye"), 1, 13))
+@pytest.mark.parametrize("left_out", sampled(all_effects("fisheye"), 1, 13))
 def test_all_effects_but_one(renderer, left_out):
-    assert_drawn(renderer, [name for name in everything("fisheye") if name != left_out])
+    assert_renders(renderer, [name for name in all_effects("fisheye") if name != left_out])
 
 
 @pytest.mark.parametrize("pair", sampled(PAIRS, 5, 11), ids=" and ".join)
 def test_pairs(renderer, pair):
-    assert_drawn(renderer, pair)
+    assert_renders(renderer, pair)

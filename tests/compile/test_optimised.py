@@ -7,7 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 import pytest
-from combined import LENSES, combination, everything
+from combined import LENSES, all_effects, combination
 from optimisation import as_users_compile, level
 
 import fidsplat as fs
@@ -17,8 +17,8 @@ from fidsplat.selftest.check import run_case
 LENS = "fisheye"
 FRAMES = {
     "base": {"base": ()},
-    LENS: {LENS: everything(LENS)},
-    "the others": {str(lens): everything(lens) for lens in (None, *LENSES) if lens != LENS},
+    LENS: {LENS: all_effects(LENS)},
+    "the others": {str(lens): all_effects(lens) for lens in (None, *LENSES) if lens != LENS},
 }
 """effects of each frame: none, and all with every lens"""
 DEVICES = [

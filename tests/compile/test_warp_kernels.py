@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from cubin import taken
+from cubin import resources_of
 
 from fidsplat.backends.warp import runtime
 from fidsplat.effects import OUTPUTS
@@ -48,7 +48,7 @@ def measured(kernel, folder, block):
     with runtime.quiet():
         wp.compile_aot_module(kernel.module, arch=90, module_dir=folder, use_ptx=False)
     (result,) = folder.glob("*.cubin")
-    return without_comments(folder), taken(result.read_bytes())
+    return without_comments(folder), resources_of(result.read_bytes())
 
 
 def without_comments(folder):
@@ -66,8 +66,8 @@ def everything():
 
 
 def blending(*effects, outputs=None, on_gpu=True, area=256, k_buffer_size=8):
-    """The kernel with these effects, and with all that outputs add to blending. k_buffer_size: each
-    entry takes CUDA's compiler a second."""
+    """The kernel with these effects, and with all code that outputs add to blending. k_buffer_size:
+    small, since CUDA's compiler needs a second for each entry."""
     if outputs is None:
         outputs = made("output.having", everything(), "attributes", "state", "samples")
     return made("blend.make_blend", effects, outputs, on_gpu, area, k_buffer_size)[0]

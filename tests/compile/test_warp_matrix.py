@@ -5,7 +5,7 @@ Warp compiles a stage in seconds, so plain pytest runs a sample; `pytest -m exha
 from itertools import combinations
 
 import pytest
-from combined import LENSES, SWITCHES, assert_drawn, combination, everything, goes
+from combined import LENSES, SWITCHES, all_effects, assert_renders, combination, is_compatible
 from sampling import sampled
 
 from fidsplat.backends.warp.program import unsupported
@@ -19,7 +19,7 @@ def has(name):
 
 
 OWN = [name for name in SWITCHES if has(name)]
-PAIRS = [pair for pair in combinations(OWN, 2) if goes(pair)]
+PAIRS = [pair for pair in combinations(OWN, 2) if is_compatible(pair)]
 
 
 def test_warp_has_all_effects():
@@ -28,15 +28,15 @@ def test_warp_has_all_effects():
 
 @pytest.mark.parametrize("name", sampled(OWN, 3, 12))
 def test_each_single_effect(renderer, name):
-    assert_drawn(renderer, (name,))
+    assert_renders(renderer, (name,))
 
 
 # other combinations are in test_combinations.py and test_gpu_schedule.py of tests/contract
 @pytest.mark.parametrize("lens", sampled([None, *LENSES], 3, 2))
 def test_all_effects(renderer, lens):
-    assert_drawn(renderer, [name for name in everything(lens) if has(name)])
+    assert_renders(renderer, [name for name in all_effects(lens) if has(name)])
 
 
 @pytest.mark.parametrize("pair", sampled(PAIRS, 3, 12), ids=" and ".join)
 def test_pairs(renderer, pair):
-    assert_drawn(renderer, pair)
+    assert_renders(renderer, pair)

@@ -1,4 +1,4 @@
-"""Whole images against the float64 reference, from the same float32 inputs."""
+"""Complete images against the float64 reference, from the same float32 inputs."""
 
 import math
 
@@ -48,7 +48,8 @@ def test_splats_around_and_behind_the_camera(renderer, quality):
 
 
 def test_near_and_far_planes_amid_the_splats(renderer):
-    """Whole disks end at the far plane, fragments at the near one, where disks that cross it are wide."""
+    """Complete disks are culled at the far plane, fragments at the near plane; disks that cross it are
+    wide."""
     camera = fs.Camera.look_at(97, 71, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0), near=1.0, far=4.0)
     for seed in (1, 2):
         assert_agrees(renderer, random_splats(200, seed), camera)
@@ -119,9 +120,8 @@ def test_principal_point_outside_the_image_and_odd_sizes(renderer):
 
 
 def test_no_sample_that_a_rim_just_reaches_is_lost(renderer):
-    """Twenty disks whose lowest point lies 2e-5 samples below the centre of a sample, in row 12,000 of a
-    image, where float32 rounds a place to a thousandth: more than the relative room of bounds makes up for.
-    """
+    """Twenty disks whose lowest point is 2e-5 samples below the centre of a sample, in row 12,000 of an
+    image, where float32 rounds a position to a thousandth: more than the relative margin of bounds."""
     quality, top = fs.Quality(lowpass="none", alpha_cutoff=1 / 255), 12_000
     samples = 5.0 * np.arange(20) - 46.5  # rows of their centres, from there
     radii = np.random.default_rng(1).uniform(0.15, 0.45, 20)
@@ -142,7 +142,7 @@ def test_no_sample_that_a_rim_just_reaches_is_lost(renderer):
 
 @pytest.mark.parametrize("focal", FOCAL_LENGTHS)
 def test_the_shortest_and_the_longest_focal_lengths(renderer, focal):
-    """What Camera lets pass is rendered as it should be: splats that fill the sphere, or the pixel."""
+    """Extreme cameras that Camera accepts: splats that fill the sphere, or a pixel."""
     camera = fs.Camera.pinhole(41, 31, focal, focal, 20.0, 15.0)
     assert_agrees(renderer, random_splats(60, seed=3, depth=(2, 4), scale=(0.05, 0.8)), camera)
 

@@ -34,7 +34,8 @@ def functions(renderer, exponents=EXPONENTS, shares=SHARES):
 
 
 def test_short_functions_keep_their_bounds_on_every_device(renderer, monkeypatch):
-    """As the device compiles them; where the choice is ours also one value at a time, and nothing fused."""
+    """Compiled as the device compiles kernels; if we choose the mode, also one value at a time and
+    without fused operations."""
     for shape in renderer.backend.shapes("arithmetic").values():
         monkeypatch.setattr(renderer.backend, "shape", shape)
         exponential, logarithm = functions(renderer)

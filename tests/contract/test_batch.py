@@ -35,7 +35,7 @@ def assert_same(batch, frames):
 
 
 def moved(pose):
-    """The motion that stands at a pose (7,)."""
+    """A motion that is constantly at a pose (7,)."""
     return lambda time: rigid_matrix(pose[:3], pose[3:])
 
 
@@ -129,8 +129,8 @@ LENSES = {
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_effects_are_those_of_single_views(renderer, cloud, lens):
-    """Rays of samples, fog, a sensor that counts in pixels, several samples; view by view where an image has
-    more of its own than a batch can hold."""
+    """Rays per sample, fog, a sensor with noise by pixel, several samples; rendered one by one if a batch
+    cannot hold the additional buffers."""
     capture = fs.Capture(
         LENSES[lens], ("rgb", "normal"), "standard,samples=2", (0.1, 0.2, 0.3), fog=fs.Fog(0.1),
         sensor=fs.Sensor(full_well=1000.0, vignetting=(-0.3, 0.0, 0.0)),

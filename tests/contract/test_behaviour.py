@@ -1,4 +1,5 @@
-"""What users rely on, on every device: determinism, backgrounds, resident clouds, outputs, errors."""
+"""Behaviour of every device that users rely on: determinism, backgrounds, resident clouds, outputs,
+errors."""
 
 import numpy as np
 import pytest
@@ -61,7 +62,8 @@ def test_everything_behind_the_camera_is_background(renderer):
 
 
 def test_camera_inside_a_splat(renderer):
-    """The camera's centre lies in the disk's plane and within it: an edge-on splat through the eye."""
+    """The camera's centre is in the plane of the disk and within it: an edge-on splat through the centre
+    of projection."""
     cloud = fs.SplatCloud([[0, 0, 0]], [[0.5, 0.5, 0.5, 0.5]], [[1.0, 2.0]], [0.9], colors=[[1, 0, 0]])
     camera = fs.Camera.pinhole(40, 30, 30.0, 30.0, 20.0, 15.0)
     assert_agrees(renderer, cloud, camera)

@@ -1,4 +1,4 @@
-"""Box footprints: what they cover, that they leave no seams, and every device against the reference."""
+"""Box footprints: their coverage, no seams between them, and every device against the reference."""
 
 import math
 from dataclasses import replace
@@ -26,7 +26,7 @@ def overlap(edges, pixels):
 
 
 def area_sampled(made, px_per_module, center, size, background):
-    """The printed marker, seen frontally: every pixel the exact mean of the texture over its area."""
+    """The printed marker from the front: every pixel is the exact mean of the texture over its area."""
     h, w = made.grid.shape
     across = overlap(center[0] + (np.arange(w + 1) - w / 2) * px_per_module, size[0])
     down = overlap(center[1] + (np.arange(h + 1) - h / 2) * px_per_module, size[1])
@@ -111,7 +111,7 @@ def test_depth_over_boxes_that_are_a_small_part_of_a_pixel_is_their_planes(rende
 
 
 def test_boxes_of_one_plane_that_overlap_are_no_more_than_opaque(renderer):
-    """Their areas add up, but not beyond the whole."""
+    """The areas add up, at most to the complete pixel."""
     twice = boxes_of(np.zeros((2, 2)), np.full((2, 2), 0.5))
     camera = fs.Camera.look_at(123, 97, 0.9, (0, 0, -3), (0, 0, 0))
     frame = renderer.render(twice, camera, ALL_OUTPUTS, EXACT.with_(transmittance_stop=0.0))
@@ -205,7 +205,7 @@ def test_a_scene_of_both_footprints(renderer, lowpass, samples):
 
 
 def test_the_footprint_is_a_choice_of_each_splat(renderer):
-    """What else is in the scene does not change a bit of a Gaussian or of a box."""
+    """Boxes do not change the bits of Gaussians, nor Gaussians those of boxes."""
     cloud = random_splats(40, seed=9, depth=(1.0, 4.0))
     behind = random_splats(1, seed=2, depth=(50.0, 51.0))
     for kind in (False, True):

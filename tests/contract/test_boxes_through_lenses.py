@@ -32,7 +32,8 @@ def test_small_boxes_of_all_shapes(renderer, camera):
 
 @each_camera
 def test_boxes_end_at_the_near_plane_and_the_far(renderer, camera):
-    """Fragments at the near one, whole boxes at the far one, of which one side may be much the longer."""
+    """Fragments are culled at the near plane, complete boxes at the far plane; one side may be much
+    longer."""
     cloud = random_splats(80, 2, depth=(-3.0, 5.0), scale=(0.02, 1.0), across=1.5).with_boxes()
     cut_off = replace(camera, near=1.0, far=3.0)
     frame = assert_agrees(renderer, cloud, cut_off, quality=EXACT)
@@ -88,7 +89,7 @@ def test_a_small_box_is_listed_for_few_tiles(renderer, camera):
     assert boxes.stats["pairs"] < 1.2 * disks.stats["pairs"]
 
 
-def seen_from(camera, tilt, distance, spin=20.0):
+def camera_from(camera, tilt, distance, spin=20.0):
     """The camera before the middle of a sheet 1 m wide at z = 0, off its axis."""
     a, b = math.radians(tilt), math.radians(spin)
     target = np.array((0.11, 0.07, 0.0))
@@ -120,7 +121,7 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, camera, tilt, distance):
     sheet = boxes_of(middle / 9, half / 9)
     whole = boxes_of(np.zeros((1, 2)), np.full((1, 2), 0.5))
     # parallel rays would see the near plane cut the sheet
-    looking = seen_from(camera, tilt, 0.7 if camera.lens.kind == "orthographic" else distance)
+    looking = camera_from(camera, tilt, 0.7 if camera.lens.kind == "orthographic" else distance)
     quality = EXACT.with_(transmittance_stop=0.0)
     parts, one = (renderer.render(cloud, looking, ALL_OUTPUTS, quality) for cloud in (sheet, whole))
     assert one["alpha"].max() > 0.3
@@ -139,7 +140,7 @@ def test_light_is_that_of_the_image(renderer, camera, size, shifts):
     box = fs.SplatCloud(
         [(0.1, 0.1, 0.1)], [turn], [(size, 1.5 * size)], [1.0], colors=[(1, 1, 1)]
     ).with_boxes()
-    looking = seen_from(camera, 10, 2.0)
+    looking = camera_from(camera, 10, 2.0)
     edge = np.linspace(-1, 1, 50)
     around = [(edge, -1 + 0 * edge), (1 + 0 * edge, edge), (-edge, 1 + 0 * edge), (-1 + 0 * edge, -edge)]
     outline = np.concatenate([np.stack(side, 1)[:-1] for side in around]) * (size, 1.5 * size)

@@ -1,4 +1,4 @@
-"""What the reference leaves open is little: certificates excuse no errors of a device in any scene."""
+"""The reference leaves few pixels undetermined: certificates excuse no errors of a device in any scene."""
 
 import numpy as np
 import pytest
@@ -25,8 +25,8 @@ SCENES = {
 
 @pytest.mark.parametrize("name", SCENES)
 def test_certificates_leave_little_open(name):
-    """Nine pixels of ten are held to the tolerance of colours alone; decisions that may turn out otherwise
-    (where is half of the light, what is heaviest) are a matter of one in forty."""
+    """Nine of ten pixels have the tolerance of colours alone; at most one in forty has a decision that
+    rounding may change (median depth, heaviest label)."""
     truth = reference_images(FrameSpec(*SCENES[name], fs.Quality(), tuple(OUTPUTS)))
     bound = truth["certificate"]
     assert np.median(bound) < 1e-5

@@ -44,7 +44,7 @@ def sliding(time):
     return pose
 
 
-def turning(time):
+def rotating(time):
     """A camera that turns about its z axis."""
     pose, angle = np.eye(4), 0.6 * time
     pose[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
@@ -88,7 +88,7 @@ def test_effects_of_the_image_under_a_shutter(renderer, around, shutter):
     quality = fs.Quality(lowpass="pixel" if around == "pixel" else "screen")
     behind = {"sky": SKY, "panorama": PANORAMA}.get(around, (0.1, 0.2, 0.3))
     fog = FOG if around == "fog" else None
-    motion = fs.Motion(turning, {0: sliding})
+    motion = fs.Motion(rotating, {0: sliding})
     outputs = ("rgb", "alpha", "distance", "depth_median", "splat_id", "normal_world")
     capture = fs.Capture(PLAIN, outputs, quality, behind, motion, shutter, SENSOR, fog)
     frame = renderer.render(cloud, capture)
@@ -100,7 +100,7 @@ def test_effects_of_the_image_under_a_shutter(renderer, around, shutter):
 
 
 def test_fog_is_averaged_over_the_poses_of_a_shutter(renderer):
-    """What fog hides of a wall that only one of two sub-poses sees counts half."""
+    """Fog in front of a wall that is visible in one of two sub-poses counts half."""
     wall = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[50, 50]], [1.0], colors=[[0, 0, 0]])
 
     def away(time):

@@ -1,4 +1,4 @@
-"""3D Gaussians on devices, beside disks and boxes in one image, against the reference."""
+"""3D Gaussians on devices, together with disks and boxes in one image, against the reference."""
 
 import math
 from dataclasses import replace
@@ -63,8 +63,8 @@ ALONE = {
 @pytest.mark.parametrize("order", ["centre", "pixel"])
 @pytest.mark.parametrize("place", ALONE)
 def test_ellipsoids_are_bit_identical_in_any_cloud(renderer, place, order):
-    """Clouds of nothing else have kernels without what disks need (`ellipsoids_only`), in either order the
-    same: every fragment has its centre's depth."""
+    """Clouds of 3D Gaussians only have kernels without the code of disks (`ellipsoids_only`). Both orders
+    are equal, since every fragment has the depth of its centre."""
     alone, quality = ALONE[place](), fs.Quality(lowpass="none", order=order)
     behind = fs.SplatCloud([[0, 0, -5]], [[1, 0, 0, 0]], [[0.1, 0.1]], [1.0], colors=[[1, 1, 1]])
     both = fs.SplatCloud.concatenate([alone, behind])

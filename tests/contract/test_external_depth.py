@@ -156,7 +156,8 @@ def test_an_empty_surface_changes_no_bit(renderer):
 
 
 def test_our_depth_is_an_external_depth_image(renderer):
-    """What is rendered in two parts, each behind the other where it is: opaque splats give the same image."""
+    """A scene rendered in two parts, each occluded by the depth of the other: opaque splats have the same
+    image."""
     boxes = fs.SplatCloud(
         [[-0.2, 0, 1.5], [0.2, 0, 2.0], [0, 0.1, 1.8]],
         np.tile([1, 0, 0, 0], (3, 1)),

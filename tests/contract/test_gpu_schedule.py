@@ -9,7 +9,7 @@ import multiprocessing
 import numpy as np
 import pytest
 from agreement import random_splats, reference_images
-from optimisation import hardly
+from optimisation import compile_quickly
 from test_lens_frames import CAMERAS
 
 import fidsplat as fs
@@ -87,7 +87,7 @@ def draw_with_guarded_rays():
     """The image "distortion" on Warp's CPU."""
     import warp as wp
 
-    hardly()
+    compile_quickly()
     backend = fs.Renderer("warp:cpu").backend
     kept = []
 

@@ -4,7 +4,7 @@ device this is: where these run there is no GPU."""
 import numpy as np
 import pytest
 from agreement import compare, random_splats, some_thick
-from combined import LENSES, SIZE, Combination, combination, everything, sliding, turning
+from combined import LENSES, SIZE, Combination, all_effects, combination, rotating, sliding
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
@@ -35,12 +35,12 @@ def gaussians_and_an_external_depth_image():
 
 
 PICTURES = {
-    **{f"all behind {lens}": lambda lens=lens: combination(everything(lens)) for lens in [None, *LENSES]},
+    **{f"all behind {lens}": lambda lens=lens: combination(all_effects(lens)) for lens in [None, *LENSES]},
     "3D Gaussians and an external depth image": gaussians_and_an_external_depth_image,
     "disks under a shutter": lambda: taken(
         SPLATS,
         quality="standard,order=pixel",
-        motion=fs.Motion(turning, {0: sliding}),
+        motion=fs.Motion(rotating, {0: sliding}),
         shutter=fs.Shutter(exposure_time=0.2, sub_poses=2, readout=0.4, rows_per_band=8),
     ),
     "splats whose centres a fisheye does not see": lambda: Combination(

@@ -17,7 +17,7 @@ from derivative_errors import (
     derivatives,
     differences,
     random_loss,
-    random_picture,
+    random_scene,
     reference_derivatives,
     rotation_floor,
 )
@@ -66,14 +66,14 @@ def backend(renderer):
 
 @pytest.mark.parametrize("case", CASES)
 def test_derivatives_are_the_references(backend, case):
-    found = assert_same(backend, *random_picture(1, **CASES[case]))
+    found = assert_same(backend, *random_scene(1, **CASES[case]))
     assert all(np.abs(array).max() > 0 for array in found.values())
 
 
 @pytest.mark.parametrize("seeds", [(0, 1, 31), pytest.param(range(200), marks=pytest.mark.exhaustive)])
 def test_derivatives_of_random_scenes_are_the_references(backend, seeds):
     for seed in seeds:
-        assert_same(backend, *random_picture(seed))
+        assert_same(backend, *random_scene(seed))
 
 
 def spheres(cloud, capture):
@@ -89,10 +89,10 @@ def spheres(cloud, capture):
 def test_derivatives_of_3d_gaussians_are_the_references(backend, projection, solid):
     quality = fs.Quality(ellipsoid=projection)
     scenes = [
-        random_picture(0, solid=solid, quality=quality),
-        random_picture(1, solid=solid, quality=quality, scale=(3e-3, 0.03), depth=(1.0, 5.0)),
-        random_picture(2, solid=solid, quality=quality, scale=(1e-2, 1.0), depth=(-0.5, 1.5), across=0.5),
-        spheres(*random_picture(1, solid=1.0, quality=quality)),
+        random_scene(0, solid=solid, quality=quality),
+        random_scene(1, solid=solid, quality=quality, scale=(3e-3, 0.03), depth=(1.0, 5.0)),
+        random_scene(2, solid=solid, quality=quality, scale=(1e-2, 1.0), depth=(-0.5, 1.5), across=0.5),
+        spheres(*random_scene(1, solid=1.0, quality=quality)),
     ]
     for cloud, capture in scenes:
         loss = certain_loss(cloud, capture)
@@ -107,7 +107,7 @@ def test_derivatives_of_3d_gaussians_are_the_references(backend, projection, sol
 
 def test_the_schedule_of_gpus_has_the_references_derivatives(backend):
     for shape in backend.shapes("schedule").values():
-        assert_same(backend, *random_picture(2), shape=shape)
+        assert_same(backend, *random_scene(2), shape=shape)
         assert_same(backend, *long_lists(), shape=shape)
 
 
@@ -117,7 +117,7 @@ def test_distortions_and_their_derivatives_are_the_references(backend):
     near = {"depth": (0.1, 0.4), "scale": (0.1, 1.0), "across": 0.3}
     cases: list[dict] = [{"depth": (2.0, 2.002)}, {"depth": (0.3, 30.0), "scale": (0.1, 1.0)}, near]
     for case in cases:
-        cloud, capture = random_picture(3, **case)
+        cloud, capture = random_scene(3, **case)
         by_distortion = {"distortion": np.random.default_rng(1).normal(size=(43, 61)).astype(np.float32)}
         assert_same(backend, cloud, capture, by_distortion)
         features, view = prepare(cloud, capture)
@@ -133,7 +133,7 @@ def test_distortions_and_their_derivatives_are_the_references(backend):
 
 def test_opaque_splats_have_derivatives(backend):
     """Nothing shines through them, and their own opacity counts."""
-    cloud, capture = random_picture(3, scale=(0.3, 1.0), depth=(1.5, 4.0))
+    cloud, capture = random_scene(3, scale=(0.3, 1.0), depth=(1.5, 4.0))
     opaque = fs.SplatCloud(
         cloud.means, cloud.quats, cloud.scales, np.ones(90), sh=cloud.sh, origin=cloud.origin
     )
@@ -147,7 +147,7 @@ def test_scales_below_the_smallest_have_no_derivative_and_leave_others_theirs(ba
     """Splats with every combination of tiny scales, from none to all."""
     quality = fs.Quality(ellipsoid="exact") if solid else None
     shape = {"scale": (0.05, 0.3), "depth": (1.5, 4.0), "solid": solid, "quality": quality}
-    cloud, capture = random_picture(5, count=40, **shape)
+    cloud, capture = random_scene(5, count=40, **shape)
     third = [] if cloud.thickness is None else [cloud.thickness]
     scales = np.column_stack([cloud.scales, *third])
     tiny = np.arange(40)[:, None] // [1, 2, 4][: scales.shape[1]] % 2 == 1
@@ -162,7 +162,7 @@ def test_scales_below_the_smallest_have_no_derivative_and_leave_others_theirs(ba
 
 def long_lists():
     """Hundreds of faint splats in each tile, in windows and beyond them: light is left at the end."""
-    cloud, capture = random_picture(
+    cloud, capture = random_scene(
         4, count=400, scale=(0.2, 1.5), depth=(2.0, 5.0), across=1.0, size=(150, 40)
     )
     opacities = 0.004 + 0.01 * cloud.opacities
@@ -179,7 +179,7 @@ def test_long_lists_are_taken_back_in_chunks(backend):
 
 
 def test_the_same_bits_on_every_run_and_those_of_render(backend, renderer):
-    cloud, capture = random_picture(5, count=400)
+    cloud, capture = random_scene(5, count=400)
     first, again = derivatives(backend, cloud, capture), derivatives(backend, cloud, capture)
     for name, array in first.items():
         assert array.tobytes() == again[name].tobytes(), name
@@ -191,7 +191,7 @@ def test_the_same_bits_on_every_run_and_those_of_render(backend, renderer):
 
 
 def test_a_differentiable_frame_has_the_bits_of_render_and_of_the_backends_gradients(backend, renderer):
-    cloud, capture = random_picture(5)
+    cloud, capture = random_scene(5)
     expected = derivatives(backend, cloud, capture, distorted=False)
     weights = random_loss(*prepare(cloud, capture))
     frame = renderer.render_differentiable(cloud, capture)
@@ -211,30 +211,30 @@ def test_frames_that_are_not_awaited_have_the_same_derivatives(backend, renderer
     """Where lists are made before their length is known, one that had too little room says so when it is
     taken back, and the next has enough."""
     (shape,) = backend.shapes("schedule").values()
-    few, crowd = random_picture(2), random_picture(2, count=3000, scale=(0.2, 1.0))
+    few, crowd = random_scene(2), random_scene(2, count=3000, scale=(0.2, 1.0))
     pipeline = backend.differentiate(with_distortion(prepare(*few)[0]), shape=shape)
 
-    def taken_back(cloud, capture, waits):
+    def backpropagated(cloud, capture, waits):
         features, view = prepare(cloud, capture)
         images = pipeline.forward(backend.upload(cloud), view, waits)
         found = pipeline.backward(images, random_loss(features, view))
         return {name: on_host(array).tobytes() for name, array in found.items()}
 
-    first = taken_back(*few, waits=True)
-    assert taken_back(*few, waits=False) == first
+    first = backpropagated(*few, waits=True)
+    assert backpropagated(*few, waits=False) == first
     if renderer.device.name.startswith("opencl"):
         with pytest.raises(CapacityExceeded):
-            taken_back(*crowd, waits=False)
-    many = taken_back(*crowd, waits=True)
-    assert taken_back(*crowd, waits=False) == many
-    assert taken_back(*few, waits=False) == first
+            backpropagated(*crowd, waits=False)
+    many = backpropagated(*crowd, waits=True)
+    assert backpropagated(*crowd, waits=False) == many
+    assert backpropagated(*few, waits=False) == first
 
 
 def test_a_cloud_outlives_what_is_under_way(renderer, backend):
     """A processor reads the host's arrays: they go when no one reads them any more."""
     if renderer.device.kind != "cpu" or not renderer.device.name.startswith("opencl"):
         pytest.skip("reads no arrays of the host, or does not work beside it")
-    reported, (cloud, capture) = [], random_picture(6)
+    reported, (cloud, capture) = [], random_scene(6)
     weakref.finalize(cloud.quats, reported.append, "gone")
     features, view = prepare(cloud, capture)
     gradients, resident = backend.differentiate(features), backend.upload(cloud)
@@ -254,7 +254,7 @@ def test_a_cloud_outlives_what_is_under_way(renderer, backend):
 
 
 def test_outputs_without_a_gradient_given_have_one_of_zero(backend):
-    cloud, capture = random_picture(6)
+    cloud, capture = random_scene(6)
     features, view = prepare(cloud, capture)
     weights = random_loss(features, view)
     alone = derivatives(backend, cloud, capture, {"rgb": weights["rgb"]})
@@ -265,7 +265,7 @@ def test_outputs_without_a_gradient_given_have_one_of_zero(backend):
 
 
 def test_derivatives_are_timed_and_another_frame_in_between_is_an_error(backend, renderer):
-    cloud, capture = random_picture(6)
+    cloud, capture = random_scene(6)
     features, view = prepare(cloud, capture)
     pipeline = backend.differentiate(with_distortion(features))
     images = pipeline.forward(backend.upload(cloud), view)
@@ -279,7 +279,7 @@ def test_derivatives_are_timed_and_another_frame_in_between_is_an_error(backend,
 
 def test_a_frame_without_a_visible_splat_has_the_backgrounds_derivative(backend):
     """No splat at all, or all of them behind the camera."""
-    cloud, capture = random_picture(7)
+    cloud, capture = random_scene(7)
     behind = fs.SplatCloud(
         cloud.means - (0.0, 0.0, 40.0), cloud.quats, 0.1 * cloud.scales, cloud.opacities, sh=cloud.sh,
         origin=cloud.origin,

@@ -1,5 +1,5 @@
-"""Images through lenses against the reference, which sees every splat at every pixel: what bounds lose
-shows."""
+"""Images through lenses against the reference, which evaluates every splat at every pixel, so that errors
+of bounds are visible."""
 
 import math
 from dataclasses import replace
@@ -19,7 +19,7 @@ from fidsplat.splats.rotations import matrix_to_quaternion
 POSE = fs.Camera.look_at(64, 48, 1.0, (0.3, 0.2, -0.1), (0.1, 0.0, 3.0)).world_to_camera
 
 
-def seen_through(lens, width=75, height=62, f=50.0):
+def camera_with_lens(lens, width=75, height=62, f=50.0):
     return fs.Camera.pinhole(width, height, f, 1.02 * f, 0.47 * width, 0.52 * height, POSE, lens=lens)
 
 
@@ -28,12 +28,12 @@ EVERY_TERM = BrownConrady(
     -0.3, 0.1, 0.02, 0.05, 0.03, 0.04, p1=0.01, p2=-0.005, s1=0.01, s2=0.02, s3=-0.01, s4=-0.015
 )
 CAMERAS = {
-    "distortion": seen_through(EVERY_TERM),
-    "pincushion": seen_through(BrownConrady(0.4, 0.1)),
+    "distortion": camera_with_lens(EVERY_TERM),
+    "pincushion": camera_with_lens(BrownConrady(0.4, 0.1)),
     # the corners lie beyond the fold
-    "fold": seen_through(BrownConrady(-0.35)),
+    "fold": camera_with_lens(BrownConrady(-0.35)),
     "fisheye 200": fs.Camera.fisheye(70, 66, math.radians(200), POSE),
-    "fisheye": seen_through(Fisheye(0.1, -0.05, 0.01, 0.004), f=35.0),
+    "fisheye": camera_with_lens(Fisheye(0.1, -0.05, 0.01, 0.004), f=35.0),
     "panorama": fs.Camera.equirectangular(110, 55, POSE),
     "parallel": fs.Camera.pinhole(75, 62, 19.0, 24.0, 36.0, 32.5, POSE, lens=fs.Orthographic()),
 }
@@ -50,7 +50,7 @@ def test_splats_all_around_the_camera(renderer, camera, seed):
 
 @pytest.mark.parametrize("name", ["distortion", "fisheye 200", "panorama", "parallel"])
 def test_near_and_far_planes_amid_the_splats(renderer, name):
-    """Whole disks end at the far plane, fragments at the near one."""
+    """Complete disks are culled at the far plane, fragments at the near plane."""
     camera = replace(CAMERAS[name], near=1.0, far=3.0)
     cloud = random_splats(100, 2, depth=(-3.0, 6.0))
     frame = assert_agrees(renderer, cloud, camera)
@@ -61,7 +61,7 @@ def test_near_and_far_planes_amid_the_splats(renderer, name):
 @pytest.mark.parametrize("name", ["pinhole", "distortion", "fisheye 200", "panorama", "parallel"])
 def test_depths_of_a_tilted_wall_are_right_to_a_hundred_thousandth(renderer, name):
     """Without a certificate: nothing is hard here."""
-    camera = CAMERAS.get(name, seen_through(None))
+    camera = CAMERAS.get(name, camera_with_lens(None))
     center = np.linalg.inv(camera.world_to_camera) @ (0.1, -0.2, 3.0, 1.0)
     turn = (0.9, 0.25, -0.2, 0.1)
     wall = fs.SplatCloud([center[:3]], [turn], [(1.5, 1.5)], [1.0], colors=[(1, 1, 1)])
@@ -229,7 +229,7 @@ def test_a_splat_next_to_the_camera_that_is_viewed_edge_on_leaves_its_dot(render
 
 def test_a_slight_distortion_is_nearly_a_pinhole(renderer):
     cloud = random_splats(200, 1, depth=(0.5, 6.0), scale=(0.02, 0.3))
-    plain, bent = seen_through(None), seen_through(BrownConrady(k1=1e-7))
+    plain, bent = camera_with_lens(None), camera_with_lens(BrownConrady(k1=1e-7))
     assert bent.lens is not None
     a, b = (renderer.render(cloud, camera, ALL_OUTPUTS) for camera in (plain, bent))
     for name in ("rgb", "normal"):

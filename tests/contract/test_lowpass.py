@@ -1,4 +1,4 @@
-"""The low-passes: every device against the reference, and what `pixel` promises."""
+"""Low-pass filters: every device against the reference, and the properties of `pixel`."""
 
 import math
 

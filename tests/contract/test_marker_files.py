@@ -29,7 +29,7 @@ def towards(tilt: float, azimuth: float) -> fs.Camera:
 
 @pytest.fixture(scope="module", params=["apriltag:36h11:5", "qr-v1-L:splats"])
 def pair(request, tmp_path_factory):
-    """A marker and what its file holds, read again: without planes, labels or boxes."""
+    """A marker and its file, read again: without coplanar groups, labels or boxes."""
     made = fs.marker(request.param)
     path = tmp_path_factory.mktemp("files") / "marker.ply"
     fs.save_ply(made.gaussians, path)

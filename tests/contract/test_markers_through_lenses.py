@@ -52,7 +52,7 @@ def eight_bits(rgb):
 
 
 def images(renderer, placed, camera, **effects):
-    """What the splats show, and what the ideal plane does under the same effects."""
+    """Image of the splats, and image of the ideal plane with the same effects."""
     scene = fs.Scene([], camera, [placed], background=GREY, quality=DENSE)
     rendered = renderer.render(scene, **effects)["rgb"]
     ideal = ideal_image(scene.markers[0], camera, DENSE.samples, GREY, **effects)

@@ -1,4 +1,4 @@
-"""A memory budget changes how an image is rendered, never what it shows."""
+"""A memory budget changes how an image is rendered, never its values."""
 
 import sys
 import weakref
@@ -28,7 +28,8 @@ def opencl(renderer):
 
 
 def small(renderer, mebibytes, cloud=None):
-    """The same device with little memory, beside that of the cloud where it does not read the host's."""
+    """The same device with little memory in addition to that of the cloud, which it does not read from
+    the host."""
     budget = round(mebibytes * 2**20)
     if renderer.device.kind != "cpu":
         budget += 2 << 20  # tables of the ordered lists, which have many pieces there, and more for pairs
@@ -225,7 +226,7 @@ def test_views_are_rendered_like_single_frames(renderer):
 
 
 def test_frames_of_many_sizes_leave_no_heap_of_buffers(opencl):
-    """Images go back to the pool when their frame dies; those of another size are let go."""
+    """Image buffers return to the pool when their frame is deleted; buffers of another size are released."""
     some = random_splats(50, seed=5)
     own = fs.Renderer(opencl.device.name)
     held = []
@@ -242,8 +243,8 @@ def test_frames_of_many_sizes_leave_no_heap_of_buffers(opencl):
 
 @machines
 def test_a_pool_keeps_to_the_budget_whatever_was_rendered_before(opencl, machine):
-    """Images at once and in chunks, few and many outputs: what one kind has left does not count against
-    the next."""
+    """Images at once and in chunks, few and many outputs: buffers of one kind do not count against the
+    budget of the next."""
     budget = 8 * 2**20
     own, opencl = machine(opencl, budget), machine(opencl)
     for count, outputs in ((35000, ("rgb",)), (200000, ALL_OUTPUTS), (50000, ("rgb",)), (200000, ("rgb",))):

@@ -38,7 +38,7 @@ def test_a_part_of_a_batch_on_the_device_keeps_its_images(opencl):
 
 
 class LessAtOnce:
-    """A device that gives less memory in one piece."""
+    """A device with a small maximum size of one allocation."""
 
     def __init__(self, device, largest):
         self._device, self.max_mem_alloc_size = device, largest
@@ -62,7 +62,7 @@ def test_a_batch_is_cut_where_no_buffer_holds_all_its_splats(opencl):
 
 
 def test_cached_views_do_not_retain_their_surroundings(opencl, monkeypatch):
-    """Each view has a panorama of its own, as it may have a layer: their arrays are not kept without end."""
+    """Each view has its own panorama or external depth image; the number of cached arrays is limited."""
     monkeypatch.setattr(recorded_frame, "_VIEWS_BYTES", 20_000)
     machine, rng = as_on_a_gpu(opencl), np.random.default_rng(1)
     resident, known = machine.upload(random_splats(20, seed=1)), []
@@ -76,7 +76,7 @@ def test_cached_views_do_not_retain_their_surroundings(opencl, monkeypatch):
 
 
 def test_lenses_that_come_and_go_leave_no_rays_on_the_device(opencl):
-    """A zoom: each image has rays of its own."""
+    """A zoom: each image has its own rays."""
     machine = as_on_a_gpu(opencl)
     resident = machine.upload(random_splats(20, seed=1))
     for k in range(10):

@@ -1,4 +1,4 @@
-"""Every output on every device against the reference, and what the outputs have to do with each other."""
+"""Every output on every device against the reference, and relations between the outputs."""
 
 import math
 

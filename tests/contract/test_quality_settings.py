@@ -1,4 +1,5 @@
-"""Knobs of Quality beside those of the presets: what each may change in an image, against the reference."""
+"""Quality settings in addition to those of the presets: the permitted changes of an image, against the
+reference."""
 
 from dataclasses import replace
 

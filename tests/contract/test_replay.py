@@ -21,7 +21,7 @@ def opencl(renderer):
 
 
 def test_kernels_see_new_buffers_at_old_addresses(opencl):
-    """Arguments are kept from image to image, buffers are not: each cloud is rendered, not the last one."""
+    """Arguments are cached between images, buffers are not: each cloud is rendered, not the previous one."""
     expected = [random_splats(50, seed=seed) for seed in range(6)]
     first = [opencl.render(cloud, CAMERA)["rgb"] for cloud in expected]
     for _ in range(3):
@@ -31,7 +31,8 @@ def test_kernels_see_new_buffers_at_old_addresses(opencl):
 
 
 def test_a_frame_is_replayed_for_each_view(opencl):
-    """Of its kind, on a GPU: other poses, groups, colours and sizes come between, and frames are kept."""
+    """The same on a GPU: other poses, groups, colours and sizes are rendered in between, and frames are
+    retained."""
     machine, own = as_on_a_gpu(opencl), as_on_a_gpu(opencl)
     some = (
         random_splats(300, seed=4)

@@ -1,5 +1,5 @@
-"""Fog, backgrounds and the steps of the sensor: every device against the reference, and what each
-promises."""
+"""Fog, backgrounds and the steps of the sensor: every device against the reference, and the properties of
+each."""
 
 import math
 from dataclasses import replace

@@ -53,7 +53,7 @@ SHUTTERS = {
 MOTION = fs.Motion(pose_at, {3: turned, 5: lambda time: turned(-time)})
 
 
-def truth(cloud, camera, quality, outputs, motion, shutter):
+def reference_images(cloud, camera, quality, outputs, motion, shutter):
     capture = fs.Capture(camera, (*outputs, "alpha"), quality, BACKGROUND, motion, shutter)
     features, view = prepare(cloud, capture)
     reference = ReferenceBackend()
@@ -65,7 +65,7 @@ def assert_exposed(renderer, cloud, camera, motion, shutter, quality=None, outpu
     frame = renderer.render(
         cloud, camera, outputs, quality, background=BACKGROUND, motion=motion, shutter=shutter
     )
-    differences = compare(frame, truth(cloud, camera, quality, outputs, motion, shutter), outputs)
+    differences = compare(frame, reference_images(cloud, camera, quality, outputs, motion, shutter), outputs)
     assert all(difference.agrees for difference in differences), differences
     return frame
 

@@ -1,8 +1,8 @@
-"""The kernels of training: they do as NumPy does, and their losses of depths what these are for."""
+"""Kernels of training: they agree with NumPy, and the depth losses have their intended effect."""
 
 import numpy as np
 import pytest
-from derivative_errors import COSINE, NORM, derivatives, differences, random_picture
+from derivative_errors import COSINE, NORM, derivatives, differences, random_scene
 from training_scene import QUICK, scene
 
 import fidsplat as fs
@@ -72,7 +72,7 @@ def test_splats_are_made_by_kernels_as_by_numpy(renderer, dataset):
 
 def test_depths_and_normals_without_distortions_have_the_references_derivatives(renderer):
     """As the loss of normals asks for them, whose kernels are others than those of distortions."""
-    cloud, capture = random_picture(8, degree=None, quality="surfel")
+    cloud, capture = random_scene(8, degree=None, quality="surfel")
     expected = derivatives(ReferenceBackend(), cloud, capture, distorted=False)
     backend = renderer.backend
     for shape in (None, *backend.shapes("schedule").values()):

@@ -40,7 +40,7 @@ def views():
 
 @pytest.fixture
 def works(renderer, views):
-    """What makes the kernels' work and its twin, with the same splats."""
+    """Constructor of the kernels' training state and of its NumPy twin, with the same splats."""
     assert renderer.backend.has("training")
 
     def make(lanes=0, **changes):
@@ -72,7 +72,7 @@ def on_device(renderer, array):
 
 
 def rendered(renderer, image):
-    """Images as a pipeline gives them."""
+    """Images as a pipeline returns them."""
     array = on_device(renderer, image)
     return SimpleNamespace(device_buffer=lambda name: (array.data, array.shape), read=lambda name: image)
 
@@ -178,9 +178,9 @@ def test_a_step_and_its_frame(renderer, views, works, strategy, sparse, lanes):
     for step, degree in ((1, 0), (2, 0), (3, 2), (4, 3)):
         for work in (device, host):
             work.load(before_a_wall(near, 0.5 if step == 1 else -9.0, step < 4))
-        shown = drawn_alike(renderer, device, host, degree, f"before step {step}", ORIGIN)
+        shown = assert_equal_splats(renderer, device, host, degree, f"before step {step}", ORIGIN)
         by = ("depth",) if step == 2 else ("rgb",)
-        taken = taken_back(renderer, device, view, shown, lanes, by)
+        taken = backpropagated(renderer, device, view, shown, lanes, by)
         gradients = {name: on_host(array) for name, array in taken.gradients().items()}
         capture = fs.Capture(view.camera, outputs=("rgb", "depth"), quality="surfel")
         features, seen = prepare(shown, capture)
@@ -199,7 +199,7 @@ def test_a_step_and_its_frame(renderer, views, works, strategy, sparse, lanes):
         device.step(taken, rate, step, counted, ORIGIN)
         host.step(gradients, rate, step, counted, ORIGIN)
         agree(device, host)
-        drawn_alike(renderer, device, host, degree, f"after step {step}", ORIGIN)
+        assert_equal_splats(renderer, device, host, degree, f"after step {step}", ORIGIN)
         rested = device.read().select(np.flatnonzero(idle))
         same = [np.array_equal(rested.first[name], before.first[name]) for name in NAMES]
         assert all(same) == (sparse or not idle.any())
@@ -213,8 +213,8 @@ def moved_by_origin(camera):
     return fs.Camera.pinhole(*lens, matrix, position=camera.position + ORIGIN)
 
 
-def drawn_alike(renderer, device, host, degree, when, origin):
-    """What the device renders, which is what its twin does."""
+def assert_equal_splats(renderer, device, host, degree, when, origin):
+    """Whether the device and its NumPy twin render the same."""
     shown = [work.resident(degree, origin) for work in (device, host)]
     for name in ("means", "quats", "scales", "opacities", "sh" if degree else "colors"):
         a, b = (read(renderer, one, name).reshape(COUNT, -1) for one in shown)
@@ -236,7 +236,7 @@ def before_a_wall(camera, color=0.5, behind=True):
     return made
 
 
-def taken_back(renderer, device, view, resident, lanes, outputs=("rgb",)):
+def backpropagated(renderer, device, view, resident, lanes, outputs=("rgb",)):
     """An image of splats on the device, taken back from a random loss of these outputs."""
     capture = fs.Capture(view.camera, outputs=("rgb", "depth"), quality="surfel")
     features, seen = prepare(resident, capture)
@@ -255,7 +255,7 @@ def test_a_resumed_run_renders_the_same(renderer, views, works, sparse):
     device.load(before_a_wall(view.camera))
     names = ("means", "quats", "scales", "opacities", "sh")
     for step in range(1, 6):
-        taken = taken_back(renderer, device, view, device.resident(3, np.zeros(3)), 0)
+        taken = backpropagated(renderer, device, view, device.resident(3, np.zeros(3)), 0)
         device.step(taken, rate, step, None, np.zeros(3))
     went_on = [read(renderer, device.resident(3, np.zeros(3)), name) for name in names]
     device.load(device.read())
@@ -267,7 +267,7 @@ def test_a_step_by_an_outdated_frame_is_refused(renderer, views, works):
     device, _ = works(sh_degree=2)
     device.load(before_a_wall(views[2].camera))
     resident = device.resident(2, np.zeros(3))
-    late, last = (taken_back(renderer, device, views[2], resident, 0) for _ in range(2))
+    late, last = (backpropagated(renderer, device, views[2], resident, 0) for _ in range(2))
     kept = device.read().values["means"].tobytes()
     with pytest.raises(InputError, match="before the next frame"):
         device.step(late, learning_rates(TrainSettings(), 100, 1.5), 1, None, np.zeros(3))
@@ -290,7 +290,7 @@ def test_visibility_statistics(renderer, views, works):
     device, host = works()
     origin = np.array([0.2, 0.1, -0.3])
     for view in views:
-        taken = taken_back(renderer, device, view, device.resident(0, origin), 0)
+        taken = backpropagated(renderer, device, view, device.resident(0, origin), 0)
         gradients = taken.gradients()
         device.accumulate_statistics(taken, view.camera, origin)
         host.accumulate_statistics(gradients, view.camera, origin)

@@ -180,8 +180,8 @@ def test_an_interrupt_during_compilation_leaves_the_statistics_unchanged(rendere
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
 def test_a_failed_densification_keeps_the_checkpoint(renderer, dataset, tmp_path, monkeypatch, strategy):
-    """Arrays of two lengths are neither rendered nor kept: the last checkpoint stays, and gives the same
-    run."""
+    """Arrays of two lengths are neither rendered nor saved: the last checkpoint remains, and yields the
+    same run."""
     settings = {**QUICK, "iterations": 24, "sh_degree": 1, "strategy": strategy, "growth": 1.5}
     file, pool = tmp_path / "run.training.npz", renderer.backend.pool
     whole = Trainer(dataset, renderer, **settings)

@@ -1,5 +1,5 @@
-"""Training on every device that has gradients: it raises the PSNR, and gives the same bytes twice and after a
-stop."""
+"""Training on every device with gradients: it raises the PSNR, and writes the same bytes twice and after
+an interruption."""
 
 import hashlib
 
@@ -25,8 +25,8 @@ def settings(request):
 
 
 def test_a_run_raises_the_psnr_and_repeats_to_the_byte(renderer, dataset, settings, tmp_path):
-    """By 3 dB on the views that are trained on, with noise by half of that; the second run is stopped, and
-    goes on from its checkpoint."""
+    """By 3 dB on the training views, with noise by half of that; the second run is interrupted and
+    resumes from its checkpoint."""
     whole = Trainer(dataset, renderer, **settings)
     before = whole.evaluate(dataset.views)
     whole.run()

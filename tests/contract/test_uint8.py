@@ -31,7 +31,7 @@ def rendered(renderer, width, height):
 
 
 def put(frame, values):
-    """Other values in the place of what the device has rendered."""
+    """Replaces the values that the device has rendered."""
     images = frame.wait()._images
     if hasattr(images, "arrays"):
         images.arrays["rgb"].assign(values.ravel())
@@ -62,7 +62,7 @@ def test_every_kind_of_value(renderer, size):
 
 
 def test_every_kind_of_value_by_a_gpus_work_items(renderer):
-    """On whatever device this is; they take four values each, not sixteen."""
+    """On any device; each work-item converts four values, not sixteen."""
     if not renderer.device.name.startswith("opencl"):
         pytest.skip("the OpenCL backend")
     frame = rendered(fs.Renderer(renderer.device.name), 37, 23)

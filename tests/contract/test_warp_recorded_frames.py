@@ -1,12 +1,12 @@
-"""Warp's images that are rendered without waiting for what their lists take, and those that a captured graph
-renders: CUDA's, here on the CPU too."""
+"""Warp frames rendered without waiting for the sizes of their tile lists, and by a captured graph: CUDA
+graphs, here simulated on the CPU too."""
 
 import gc
 import weakref
 
 import numpy as np
 import pytest
-from derivative_errors import random_picture
+from derivative_errors import random_scene
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare, prepare_batch
@@ -17,7 +17,7 @@ from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.capture.views import views_of
 
 BACKEND = "warp"
-WHOLE = random_picture(1, count=3000, degree=None, quality="surfel", outputs=("rgb",))
+WHOLE = random_scene(1, count=3000, degree=None, quality="surfel", outputs=("rgb",))
 """as tests/contract/test_gradients.py renders, whose kernels it shares"""
 CLOUD, CAPTURE = WHOLE
 ELSEWHERE = fs.Camera.look_at(61, 43, 1.1, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0))
@@ -26,7 +26,7 @@ FAR = fs.Camera.look_at(61, 43, 1.1, (0.0, 0.0, -60.0), (0.0, 0.0, 3.0))
 
 @pytest.fixture
 def ahead(renderer):
-    """Its backend; what it waits for is restored."""
+    """The Warp backend; its synchronisation is restored."""
     backend = renderer.backend
     before, backend.asynchronous = backend.asynchronous, True
     yield backend
@@ -84,7 +84,7 @@ def test_a_batch_of_views_waits_for_the_first_only(renderer, ahead):
 
 
 def test_adopted_arrays_are_waited_for(renderer, ahead):
-    """Who gave them may change them before an image would have to be rendered again."""
+    """The caller may change the arguments before a frame has to be rendered again."""
     arrays = {
         name: getattr(CLOUD, name).copy() for name in ("means", "quats", "scales", "opacities", "colors")
     }
@@ -106,7 +106,7 @@ def test_a_budget_that_is_full_is_waited_for(renderer, ahead):
 
 
 def test_unread_images_are_released_immediately(ahead):
-    """A loop that renders and never looks takes no more of the device."""
+    """A loop that renders and never reads images needs no more memory of the device."""
     resident = ahead.upload(CLOUD)
     features, view = prepare(resident, CAPTURE)
     pipeline = ahead.pipeline(features)
@@ -125,7 +125,7 @@ def test_unread_images_are_released_immediately(ahead):
 
 @pytest.fixture
 def replayed(ahead, monkeypatch):
-    """What graphs have rendered, of its backend, which captures what it launches."""
+    """Frames rendered by graphs of the backend, which captures its launches."""
     drawn, own = [], RecordedFrame.replay
 
     def counted(replay, stack):
@@ -191,7 +191,7 @@ def test_what_another_kind_reallocated_is_not_replayed(renderer, ahead, replayed
 
 
 def test_what_moves_is_replayed(renderer, replayed):
-    """Groups, planes and what resolving reads are filled for each image."""
+    """Groups, coplanar groups and inputs of the resolve step are filled for each image."""
     cloud = CLOUD.with_labels(np.arange(3000) % 2).with_coplanar_groups(np.arange(3000) // 2900 - 1)
     resident, places = renderer.upload(cloud), (0.0, 0.1, 0.2, 0.3, 0.4)
 
@@ -319,7 +319,7 @@ def test_views_together_in_blocks_of_threads(renderer):
 
 
 def test_a_device_that_captures_nothing_renders_nevertheless(renderer, replayed, monkeypatch):
-    """That is said once."""
+    """The warning is issued once."""
 
     wp, resident = runtime.load(), renderer.upload(CLOUD)
     own = wp.utils.array_scan

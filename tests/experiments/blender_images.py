@@ -1,4 +1,4 @@
-"""Small images by Blender, and what the exact renderer makes of the same.
+"""Small images by Blender, and the same images by the exact renderer.
 
     python tests/experiments/blender_images.py [ENVIRONMENT]
 
@@ -109,7 +109,7 @@ def compare() -> None:
 
 
 def draw(environment: Path) -> None:
-    """Draw what is missing."""
+    """Render missing images."""
     for name, (_, camera, view, pixel_filter) in IMAGES.items():
         grid = grid_of(name)
         shot = blender.image_job(DATA / f"{name}.png", CAMERAS[camera])

@@ -32,7 +32,7 @@ def test_edges_agree_where_blender_averages_over_the_pixel(name):
 
 
 def test_edges_differ_by_the_pixel_filter_and_by_nothing_else():
-    """Blender's default filter, put over our finely divided image, gives Blender's image again."""
+    """Blender's default filter, applied to our supersampled image, reproduces Blender's image."""
     name = "tag-blackman-harris"
     edges = ~flat(name, 2)
     seen = theirs(name)
@@ -46,7 +46,8 @@ def test_edges_differ_by_the_pixel_filter_and_by_nothing_else():
 
 
 def test_the_standard_view_averages_linear_light():
-    """Beside an image of display means, Blender's 'Standard' view is lighter at edges, and only there."""
+    """Compared with an image of mean display values, Blender's 'Standard' view is lighter at edges, and
+    only there."""
     display, standard = ours("tag-raw"), theirs("tag-standard")
     edges = ~flat("tag-standard", 2)
     assert psnr(display[edges], standard[edges]) < 25

@@ -31,7 +31,7 @@ print(json.dumps({"images": images, "points": points, "cameras": len(lenses)}))
 
 
 def colmap(folder, suffix, work) -> dict:
-    """What pycolmap reads in the files of one kind."""
+    """Content of the files of one kind, read by pycolmap."""
     for name in ("cameras", "images", "points3D"):
         shutil.copy(folder / f"{name}{suffix}", work)
     done = subprocess.run([sys.executable, "-c", READ, str(work)], capture_output=True, text=True)

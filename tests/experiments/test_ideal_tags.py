@@ -1,4 +1,4 @@
-"""Printed tags among splats: what each pixel shows of them, and where they are."""
+"""Ideal images of printed tags among splats: colours and depths of each pixel."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Each experiment on a small point: what it measures is what it says."""
+"""Each experiment at a small point: its measurements agree with independent ones."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -169,7 +169,7 @@ def test_views_of_the_ideal_texture(pool, tmp_path):
 
 
 def test_images_are_rendered_once_for_all_truths(pool, tmp_path):
-    """And what is kept is the right marker's, method's and truth's."""
+    """Cached images belong to the right marker, method and ground truth."""
     rendered = []
 
     class Counting(MarkerRenderer):

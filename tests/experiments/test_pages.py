@@ -1,4 +1,4 @@
-"""The pages of results are what their tables give, short, and their data are small."""
+"""Reports follow from their tables, are short, and have small data files."""
 
 import shutil
 from pathlib import Path

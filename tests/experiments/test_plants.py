@@ -1,4 +1,4 @@
-"""Plants as meshes, and from Blender: what is grown, rendered, trained and stitched into a greenhouse."""
+"""Plants as meshes and from Blender: growth, images, training, and placement in a greenhouse."""
 
 import json
 import sys

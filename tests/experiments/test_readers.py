@@ -1,4 +1,4 @@
-"""Off-the-shelf detectors, each asked by itself."""
+"""Off-the-shelf detectors, each tested separately."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

@@ -275,7 +275,7 @@ def test_without_the_apriltag_library_the_table_shows_opencv(tmp_path):
 
 
 def test_tables_that_are_joined_keep_the_runs_of_their_rows():
-    """Of rows about the same thing the one of most measurements stays, with the run that it is of."""
+    """Of rows with equal keys, the row with the most measurements remains, with its run."""
     one = Summary(pd.DataFrame({"name": ["a", "b"], "amount": [1, 5], "run": [0, 1]}), [{"k": 0}, {"k": 1}])
     other = Summary(pd.DataFrame({"name": ["a", "c"], "amount": [2, 1], "run": [1, 0]}), [{"k": 2}, {"k": 3}])
     joined = join([one, other], ["name"])

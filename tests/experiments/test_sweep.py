@@ -67,7 +67,7 @@ def test_facts_of_a_run_are_written_once(tmp_path):
 
 
 def test_a_batch_is_begun_before_its_first_end(tmp_path):
-    """So that what the host does with an image disturbs no timing."""
+    """Evaluation of images on the host must not disturb timing."""
     order = []
 
     def begin(key):

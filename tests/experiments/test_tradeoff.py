@@ -1,4 +1,4 @@
-"""`fidsplat tradeoff`: what is measured, how it is compared with the truth."""
+"""`fidsplat tradeoff`: measurements, and their comparison with the reference."""
 
 import dataclasses
 import json
@@ -44,7 +44,7 @@ def session():
 
 
 def faint_rim() -> TradeScene:
-    """One opaque splat on black, facing the camera: its rim is what a cut-off takes."""
+    """One opaque splat on black that faces the camera: a cut-off removes its rim."""
     cloud = splats([[0.0, 0.0, 2.0]], FACING, (0.2, 0.2), 1.0, (1.0, 0.5, 0.25))
     return TradeScene("rim", cloud, camera(64, 48, 60.0))
 
@@ -131,7 +131,7 @@ def test_the_hard_scene_is_the_same_each_time_and_fills_its_cells(session):
 
 @pytest.mark.sweep
 def test_3d_gaussians_are_compared_with_the_gaussians_themselves(monkeypatch):
-    """What EWA widens and what its linear image is wrong by are errors. A few of the scene's splats."""
+    """The widening and the linearisation of EWA are errors. A few splats of the scene."""
     small = dataclasses.replace(SCENES["r100k_720p_3d"], count=3_000, width=160, height=90)
     monkeypatch.setitem(SCENES, "r100k_720p_3d", small)
     session = Session(fs.Renderer("opencl"))
@@ -231,7 +231,7 @@ def test_omissions_of_standard_are_invisible(session):
 
 
 def test_captured_3d_gaussians_are_compared_with_themselves():
-    """Captures look as they did to their trainer, who drew them by EWA."""
+    """Captures are rendered by EWA, as in their training."""
     scene = make_view("r100k_720p_3d", BASE.marker)
     own = Session(fs.Renderer("reference"), {"own.ply": dataclasses.replace(scene, name="own.ply")})
     assert own.definition("own.ply", BASE).ellipsoid == "ewa"

@@ -1,4 +1,4 @@
-"""The report of `fidsplat tradeoff`: what it says follows from the numbers of the results."""
+"""The report of `fidsplat tradeoff`: its statements follow from the numbers of the results."""
 
 import json
 import xml.dom.minidom

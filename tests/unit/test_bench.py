@@ -1,4 +1,4 @@
-"""fidsplat bench: what is measured, what becomes of errors and interrupts, the record for programs."""
+"""fidsplat bench: measurements, errors and interrupts, JSON output."""
 
 import json
 import xml.dom.minidom
@@ -123,7 +123,7 @@ def test_rendered_fragments_are_counted_exactly(renderer):
 
 
 def test_fragments_are_counted_through_the_lens(renderer):
-    """A lens has kernels of its own."""
+    """A lens has its own kernels."""
     measurable(renderer)
     camera = fs.Camera.pinhole(64, 48, CAMERA.fx, CAMERA.fy, 32, 24, lens=fs.BrownConrady(-0.3, 0.1))
     spread = random_cloud(200, 0.2)
@@ -299,7 +299,7 @@ def test_the_wall_fills_the_image_with_200_codes(monkeypatch):
 
 
 def test_ones_own_scene_from_ones_own_cameras(tmp_path, monkeypatch, capsys):
-    """Each pose is timed by itself, so many at most, and renders what it sees."""
+    """Each pose is timed separately, up to a maximum number, and renders its own view."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(catalogue, "MOST_VIEWS", 3)
     fs.save_ply(random_cloud(50, 0.2), "own.ply")

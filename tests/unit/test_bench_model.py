@@ -1,4 +1,4 @@
-"""What a frame must at least cost, and how times grow."""
+"""Minimum cost of a frame (roofline), and growth of times."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The measuring scripts: tables from figures, and a growth run that goes on where it was."""
+"""Benchmark scripts: tables from figures, and a resumed growth run."""
 
 import json
 from pathlib import Path

@@ -24,7 +24,7 @@ ONE = fs.SplatCloud([[0, 0, 1.0]], [[1.0, 0, 0, 0]], [[0.1, 0.1]], [0.5], colors
 
 
 def png_header(width, height):
-    """A PNG that ends behind its header: what declares its size."""
+    """A PNG that ends after its header, which declares its size."""
     head = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head))
 
@@ -128,7 +128,8 @@ def test_a_usd_file_that_refers_to_a_pipe(tmp_path):
 
 
 def images():
-    """Beginnings of images of 16384 x 16384 pixels, and small whole ones whose size is changed."""
+    """Beginnings of images of 16384 x 16384 pixels, and small complete ones whose declared size is
+    changed."""
     small = {
         kind: cv2.imencode(f".{kind}", np.zeros((5, 7, 3), np.uint8))[1].tobytes()
         for kind in ("jpg", "bmp", "tiff")
@@ -161,7 +162,7 @@ def test_images_that_small_files_declare(tmp_path, kind, data):
 
 @pytest.mark.parametrize("kind", [b"\x42\xff\xff\xff", b"IDAT", b"tEXt", b"iCCP"])
 def test_a_png_chunk_that_is_longer_than_its_file(tmp_path, kind):
-    """libpng takes the memory of a chunk before it reads it."""
+    """libpng allocates the memory of a chunk before it reads it."""
     whole = cv2.imencode(".png", np.zeros((8, 12, 3), np.uint8))[1].tobytes()
     path = tmp_path / "a.png"
     for length in (0x7FFFFFFF, 0xFFFFFF7F, len(whole) + 100):

@@ -1,4 +1,4 @@
-"""Markers of one rigid thing: one pose from all that is read of them."""
+"""Bundles of markers on one rigid object: one pose from all detected markers."""
 
 import json
 from dataclasses import replace
@@ -34,7 +34,7 @@ def markers():
 
 
 def reading(placed, camera, noise=None):
-    """As if it had been seen, with corners that are off by so much; None: not visible."""
+    """Reading of a marker with corners that are off by an offset; None: not visible."""
     truth = marker_truth(placed, camera)
     found = Reading(placed, truth.truth, truth.corners, truth.visible, truth.box)
     code = Detection(

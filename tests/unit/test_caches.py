@@ -1,4 +1,4 @@
-"""Drivers get a place for what they keep where their own cannot be written."""
+"""Cache folders of drivers are replaced if they cannot be written."""
 
 import os
 import subprocess
@@ -16,7 +16,7 @@ NAMES = ("POCL_CACHE_DIR", "XDG_CACHE_HOME")
 
 @pytest.fixture
 def ensure(monkeypatch, tmp_path):
-    """Calls `ensure_caches` with some places, and returns what it warned of."""
+    """Calls `ensure_caches` with some folders, and returns its warnings."""
     made = []
 
     def call(**places) -> str:

@@ -1,4 +1,4 @@
-"""Calibration by OpenCV: exact corners give the camera back; `fidsplat experiment calibrate`."""
+"""Calibration by OpenCV: exact corners reproduce the camera; `fidsplat experiment calibrate`."""
 
 import json
 from dataclasses import replace

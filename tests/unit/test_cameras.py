@@ -1,4 +1,4 @@
-"""The pinhole camera: projection, poses, and what makes no camera."""
+"""The pinhole camera: projection, poses, and invalid arguments."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Capture: what it takes, and what it says of values that it cannot have."""
+"""Capture: valid arguments, and errors for invalid ones."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""`fidsplat render` and what it writes, and `fidsplat detect --scene` on what it wrote."""
+"""`fidsplat render` and its files, and `fidsplat detect --scene` on these files."""
 
 import json
 
@@ -40,7 +40,7 @@ def tag_cloud() -> fs.SplatCloud:
     return fs.marker("apriltag:36h11:5", size=0.4).gaussians
 
 
-def said(capsys) -> dict:
+def printed_json(capsys) -> dict:
     return json.loads(capsys.readouterr().out)
 
 
@@ -52,7 +52,7 @@ def test_a_budget_is_measured_and_reported(scene, tmp_path, capsys, monkeypatch)
     monkeypatch.setattr("fidsplat.accuracy.quality_within.cache_folder", lambda: tmp_path / "cache")
     words = ["render", scene, "--max-error", "1e-3", "--max-ms", "60000"]
     assert main([*words, "--json"]) == 0
-    chosen = said(capsys)["chosen"]
+    chosen = printed_json(capsys)["chosen"]
     assert 0 < chosen["error"] <= 1e-3
     assert 0 < chosen["ms"] <= chosen["ms_p90"] <= 60000
     assert chosen["source"] == "measured"
@@ -64,7 +64,7 @@ def test_a_budget_is_measured_and_reported(scene, tmp_path, capsys, monkeypatch)
     assert "chosen: alpha_cutoff" in printed
     assert "measured error" in printed
     assert main(["render", scene, "--json"]) == 0
-    assert said(capsys)["chosen"] is None
+    assert printed_json(capsys)["chosen"] is None
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_impossible_bounds(scene, tmp_path, capsys, monkeypatch, words, message)
 
 def test_a_scene_is_rendered_and_read_back(scene, tmp_path, capsys):
     assert main(["render", scene, "--json"]) == 0
-    facts = said(capsys)
+    facts = printed_json(capsys)
     assert facts["files"] == ["scene.png"]
     assert (facts["width"], facts["height"], facts["outputs"]) == (160, 120, ["rgb"])
     assert facts["stats"]["splats"] > 0
@@ -94,7 +94,7 @@ def test_a_scene_is_rendered_and_read_back(scene, tmp_path, capsys):
     assert read_image("scene.png").shape == (120, 160, 3)
 
     assert main(["detect", "scene.png", "--scene", scene, "--json"]) == 0
-    facts = said(capsys)
+    facts = printed_json(capsys)
     (marker,) = facts["markers"]
     assert marker["found"]
     assert marker["position_error_mm"] < 6
@@ -129,7 +129,7 @@ look_at = [0.12, 0.0, 0.0]
     assert main(["render", scene]) == 0
     capsys.readouterr()
     assert main(["detect", "scene.png", "--scene", scene, "--json"]) == 0
-    (marker,) = said(capsys)["markers"]
+    (marker,) = printed_json(capsys)["markers"]
     assert marker["found"]
     assert marker["position_error_mm"] < 6
     assert marker["corner_error_px"] < 0.5
@@ -138,7 +138,9 @@ look_at = [0.12, 0.0, 0.0]
 def test_every_output_is_a_file(scene, tmp_path, capsys):
     words = "rgb,alpha,depth,depth_median,distance_first,normal,normal_world,label,splat_id,blended"
     assert main(["render", scene, "-o", "frames", "--outputs", words, "--json"]) == 0
-    assert sorted(said(capsys)["files"]) == sorted(f"frames/{name}" for name in names(tmp_path / "frames"))
+    assert sorted(printed_json(capsys)["files"]) == sorted(
+        f"frames/{name}" for name in names(tmp_path / "frames")
+    )
     assert names(tmp_path / "frames") == {
         *("rgb.png", "alpha.png", "normal.png", "label.png", "label.npy"),
         *("depth.png", "depth.npy", "depth-turbo.png"),
@@ -166,7 +168,7 @@ def test_the_outputs_and_the_device_of_the_scene_are_the_default(scene, tmp_path
     small = SCENE.replace("width = 160", "width = 16").replace("height = 120", "height = 12")
     (tmp_path / "scene.toml").write_text(small + 'outputs = ["depth"]\ndevice = "reference"\n')
     assert main(["render", scene, "--json"]) == 0
-    assert said(capsys)["device"] == "reference"
+    assert printed_json(capsys)["device"] == "reference"
     assert {"scene-depth.npy", "scene-depth.png", "scene-depth-turbo.png"} <= names(tmp_path)
     assert "scene.png" not in names(tmp_path)
 
@@ -174,7 +176,7 @@ def test_the_outputs_and_the_device_of_the_scene_are_the_default(scene, tmp_path
 def test_a_bare_splat_file_is_framed(scene, tmp_path, capsys):
     fs.save_ply(tag_cloud(), "tag.ply")
     assert main(["render", "tag.ply", "--json"]) == 0
-    facts = said(capsys)
+    facts = printed_json(capsys)
     assert facts["files"] == ["tag.png"]
     image = read_image("tag.png")
     assert image.shape == (720, 1280, 3)
@@ -183,7 +185,7 @@ def test_a_bare_splat_file_is_framed(scene, tmp_path, capsys):
     assert rows[-1] < 714
     assert rows[-1] - rows[0] > 400, "it fills the image"
     assert main(["detect", "tag.png", "--json"]) == 0
-    assert [code["name"] for code in said(capsys)["detections"]] == ["apriltag:36h11:5"]
+    assert [code["name"] for code in printed_json(capsys)["detections"]] == ["apriltag:36h11:5"]
 
 
 def test_nothing_to_render_is_the_background(scene, tmp_path):
@@ -290,7 +292,7 @@ def test_the_frame_holds_a_cloud_that_is_long_along_one_axis(axis):
 
 def test_every_eighth_pixel_of_the_reference(scene, tmp_path, capsys):
     assert main(["render", scene, "--device", "reference", "--every", "8", "-o", "some.png", "--json"]) == 0
-    facts = said(capsys)
+    facts = printed_json(capsys)
     assert (facts["width"], facts["height"]) == (20, 15)
     loaded = fs.Scene.load(scene)
     pixels = fs.Renderer("reference").render_subsampled(8, loaded)["rgb"]

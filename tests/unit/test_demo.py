@@ -23,12 +23,12 @@ def scene():
 
 @pytest.fixture(scope="module")
 def pictures():
-    """What the demo has rendered, by the camera's place."""
+    """Images that the demo has rendered, by the position of the camera."""
     return {}
 
 
 @pytest.fixture(autouse=True)
-def drawn_once(pictures, monkeypatch):
+def rendered_once(pictures, monkeypatch):
     """One frame of each view is timed, and none is rendered again for a second demo."""
     draw = demo._render
 
@@ -44,7 +44,7 @@ def drawn_once(pictures, monkeypatch):
 
 @pytest.fixture
 def blob(tmp_path, monkeypatch):
-    """A single splat stands for a capture, which would be downloaded."""
+    """A single splat replaces a captured scene, which would be downloaded."""
     cloud = fs.SplatCloud([[0, -1.6, 0]], [[1, 0, 0, 0]], [[0.1, 0.1]], [0.9], colors=[[1, 0, 0]])
     fs.save_splats(cloud, tmp_path / "blob.ply")
     for module in (demo, captured):

@@ -86,7 +86,7 @@ def test_structured_light_follows_the_published_error_and_casts_a_shadow(rendere
 
 
 def test_the_given_camera_replaces_the_motion_of_the_scene(renderer):
-    """A step, whose shadow shows the projector beside the camera."""
+    """A depth step; the projector next to the camera casts a shadow at it."""
     scene = fs.Scene([board(1.0, left=0.0), board(1.5)])
     back = np.eye(4)
     back[2, 3] = 0.5

@@ -58,7 +58,7 @@ def test_a_rotation_vector_rotates_by_its_length():
 
 
 def test_gradients_of_a_frame_reach_a_pose_that_is_not_0():
-    """Central differences of the float32 images: what they round is 1e-4 of these derivatives."""
+    """Central differences of the float32 images; their rounding is 1e-4 of these derivatives."""
     renderer, cloud, pose = fs.Renderer("reference"), fs.SplatCloud(**arrays()), np.array(POSES[2] / 10)
 
     def rendered(at):
@@ -155,7 +155,7 @@ class Function:
 
 
 def test_the_bridge_without_torch_itself(monkeypatch):
-    """A stand-in for PyTorch, which is too large to be installed for tests: what goes through and back."""
+    """A replacement of PyTorch, which is too large for the tests: forward and backward."""
     torch = SimpleNamespace(
         autograd=SimpleNamespace(
             Function=Function, function=SimpleNamespace(once_differentiable=lambda f: f)

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all."""
+"""Files are written atomically."""
 
 import ctypes
 import json
@@ -285,7 +285,7 @@ def test_pages_and_charts_of_names_that_are_not_utf8(tmp_path):
 
 
 def test_a_script_of_ffmpeg_is_not_a_video_and_opens_no_other_file(tmp_path):
-    """FFmpeg knows them by their content, whatever they are called."""
+    """FFmpeg recognises videos by their content, with any name."""
     write_avi(tmp_path / "secret.avi")
     for text in ("ffconcat version 1.0\nfile secret.avi\n", "#EXTM3U\n#EXTINF:1,\nsecret.avi\n"):
         (tmp_path / "a.mp4").write_text(text)
@@ -382,7 +382,7 @@ LINES = [
 
 @pytest.mark.skipif(sys.platform != "linux", reason="root has Linux's capabilities")
 def test_paths_without_permission_are_one_line(tmp_path):
-    """As any user but root, who may access all folders."""
+    """As a user other than root, who may access all folders."""
     library = ctypes.CDLL(None)
     save_splats(random_splats(3, 0), tmp_path / "good.ply")
     (tmp_path / "closed").mkdir(mode=0)

@@ -1,4 +1,4 @@
-"""Flights: what each image shows, going on after a stop, sheets and videos; `fidsplat fly`."""
+"""Flights: content of the images, resumption, contact sheets and videos; `fidsplat fly`."""
 
 import json
 
@@ -231,7 +231,7 @@ def test_frames_are_not_mixed_with_those_of_another_flight(here, capsys):
 
 
 def test_what_a_flight_is_of(here):
-    """Its key changes with each thing that its images depend on, and with nothing else."""
+    """The key changes with everything that determines the images, and with nothing else."""
     key = small_flight().key("a")
     assert key == small_flight().key("a")
     others = [

@@ -1,4 +1,4 @@
-"""Files of other writers, which use what ours leave out: strides, units, axes, encodings, frames."""
+"""Files of other writers with features that ours lack: strides, units, axes, encodings, frames."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Splat files beside PLY: what comes back, what an independent reader finds, and what is refused."""
+"""Splat files other than PLY: round trips, content for an independent reader, and errors."""
 
 import gzip
 import json
@@ -232,7 +232,7 @@ def test_a_gltf_of_nodes_bytes_and_a_neighbouring_file(tmp_path):
     (tmp_path / "inside/loop.bin").symlink_to("loop.bin")
     for uri, words in (
         ("link.bin", "must be in its folder, got 'link.bin"),
-        ("loop.bin", "damaged|cannot read"),
+        ("loop.bin", "must be in its folder, got 'loop.bin'"),
     ):
         document["buffers"][0]["uri"] = uri
         (tmp_path / "inside/a.gltf").write_text(json.dumps(document))

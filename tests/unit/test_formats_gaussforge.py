@@ -22,9 +22,9 @@ def converted(file, to: str, **more):
     return written
 
 
-def theirs(file) -> fs.SplatCloud:
-    """What GaussForge reads, by its own arrays: scales as logarithms, opacities as logits. Its Python
-    module hands on no cloud without higher SH."""
+def gaussforge_splats(file) -> fs.SplatCloud:
+    """Splats read by GaussForge, from its own arrays: logarithms of scales, logits of opacities. Its
+    Python module returns no cloud without higher SH."""
     found = gaussforge.GaussForge().read(file.read_bytes(), file.suffix[1:])
     assert "error" not in found, found
     found = found["data"]
@@ -61,7 +61,7 @@ def test_a_file_of_ours_by_another_reader(tmp_path, degree, suffix):
     file = tmp_path / f"a{suffix}"
     fs.save_splats(some(degree=degree), file)
     ours = fs.load_splats(file)
-    assert_same(theirs(file), ours.transformed(TURN) if suffix == ".spz" else ours)
+    assert_same(gaussforge_splats(file), ours.transformed(TURN) if suffix == ".spz" else ours)
 
 
 def test_a_splat_file_of_ours_by_another_reader(tmp_path):
@@ -85,7 +85,7 @@ def test_a_file_of_another_writer(tmp_path, kind, more, degrees):
     ours, cloud = fs.load_splats(written), some(degree=1)
     if kind == "spz":
         ours = ours.transformed(TURN)
-        assert_same(theirs(written), ours)
+        assert_same(gaussforge_splats(written), ours)
     np.testing.assert_allclose(ours.means, cloud.means, atol=4e-3)  # 11 bits of a compressed PLY's 6 m
     np.testing.assert_allclose(ours.opacities, cloud.opacities, atol=1 / 255)  # it rounds down
     np.testing.assert_allclose(ours.sh[:, 0], cloud.sh[:, 0], atol=0.02)
@@ -99,4 +99,4 @@ def test_a_file_of_another_writer(tmp_path, kind, more, degrees):
 
 def test_a_sog_file_by_another_reader(tmp_path):
     sog(tmp_path / "a.sog")
-    assert_same(theirs(tmp_path / "a.sog"), fs.load_splats(tmp_path / "a.sog"))
+    assert_same(gaussforge_splats(tmp_path / "a.sog"), fs.load_splats(tmp_path / "a.sog"))

@@ -1,5 +1,5 @@
-"""Files of gigabytes: what is none of ours is visible by its first bytes, and no more is read than is
-meant."""
+"""Files of gigabytes: other formats are recognised by their first bytes, and no more is read than
+necessary."""
 
 import base64
 import json

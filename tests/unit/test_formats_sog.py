@@ -1,4 +1,4 @@
-"""SOG files: what is read, and what is refused."""
+"""SOG files: reading, and errors."""
 
 import json
 import math

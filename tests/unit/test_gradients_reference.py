@@ -1,4 +1,4 @@
-"""The reference's derivatives: against central differences of its own images, decisions as they were."""
+"""Derivatives of the reference against central differences of its own images, with constant decisions."""
 
 from dataclasses import replace
 
@@ -28,8 +28,8 @@ def splats(n=5, seed=0, *, scale=0.35, opacity=(0.2, 0.9), degree=-1, depth=(1.2
 
 
 def edge_on():
-    """Seen along their planes but for little: most of what is visible are dots of the low-pass, whose rays
-    miss the plane or meet it far away."""
+    """Splats nearly edge-on: most visible ones are circles of the low-pass, whose rays miss the plane or
+    meet it far away."""
     cloud = splats(6, 5)
     tilt = np.deg2rad(89.0 + np.arange(6) / 6) / 2
     quats = np.stack([np.cos(tilt), np.sin(tilt), 0 * tilt, 0 * tilt], 1)
@@ -37,7 +37,7 @@ def edge_on():
 
 
 def before_the_camera():
-    """A floor that goes through the near plane and the camera's own."""
+    """A floor that crosses the near plane and the plane of the camera."""
     quats = [[np.cos(0.7), np.sin(0.7), 0, 0], [np.cos(0.75), np.sin(0.75), 0, 0.1]]
     means = [[0.1, 0.4, 0.6], [-0.2, 0.5, 0.1]]
     return fs.SplatCloud(means, quats, [[0.5, 0.6], [0.7, 0.5]], [0.7, 0.8], colors=np.eye(3)[:2])
@@ -74,7 +74,7 @@ SCENES = {
 }
 
 
-def pictured(name, background=(0.2, 0.5, 0.1)):
+def rendered_scene(name, background=(0.2, 0.5, 0.1)):
     cloud, quality = SCENES[name]
     capture = fs.Capture(CAMERA, outputs=OUTPUTS[:4], quality=quality, background=background)
     features, view = prepare(cloud, capture)
@@ -90,7 +90,7 @@ def weights_of(images, seed=0):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_frozen_images_are_the_references(name):
-    cloud, features, view = pictured(name)
+    cloud, features, view = rendered_scene(name)
     backend = ReferenceBackend()
     rendered = backend.pipeline(features).render_view(backend.upload(cloud), view)
     frozen = FrozenFrame(cloud, view, features)
@@ -102,7 +102,7 @@ def test_frozen_images_are_the_references(name):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_derivatives_are_those_of_central_differences(name):
-    cloud, features, view = pictured(name)
+    cloud, features, view = rendered_scene(name)
     frozen = FrozenFrame(cloud, view, features)
     at = frozen.parameters
     weights = weights_of(frozen.images(at))
@@ -133,7 +133,7 @@ def test_derivatives_are_those_of_central_differences(name):
 def test_every_decision_occurs():
     made = {}
     for name in SCENES:
-        cloud, features, view = pictured(name)
+        cloud, features, view = rendered_scene(name)
         ((_, _, made[name]),) = FrozenFrame(cloud, view, features)._blocks
     assert made["dots"].by_disc[made["dots"].contributes].all()
     both = made["dots and disks"]
@@ -150,8 +150,9 @@ def test_every_decision_occurs():
 
 
 def test_the_screen_statistic_is_the_derivative_by_the_centres_place():
-    """What the 2DGS authors call dL_dmean2D: by the centre's place in the image, in half images."""
-    cloud, features, view = pictured("dots")
+    """dL_dmean2D of the 2DGS authors: gradient with respect to the position of the centre in the image,
+    in half images."""
+    cloud, features, view = rendered_scene("dots")
     found = FrozenFrame(cloud, view, features).backward({"rgb": np.ones((view.height, view.width, 3))})
     z, (x, y, _) = cloud.means[:, 2].astype(float), found["means"].T
     across = 0.5 * z * np.hypot(view.width * x / view.focal_x, view.height * y / view.focal_y)

@@ -1,4 +1,4 @@
-"""Images of GPUs on the host: page-locked memory that is used again when no one holds what lies there."""
+"""Images of GPUs on the host: page-locked memory, reused when no array refers to it."""
 
 import math
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 from hostile import JUNK, NUMBERS, TEXTS, damaged, limits
-from hostile_calls import CALLS, DATASET, RENDERER, SETTINGS, _pictures_of
+from hostile_calls import CALLS, DATASET, RENDERER, SETTINGS, _image_folder
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from test_formats_sog import sog
@@ -92,7 +92,7 @@ def streamed(folder):
 
 
 def gltf(folder):
-    """The same splats as a GLB, with its buffer beside it."""
+    """The same splats as a glTF file, with its buffer in a separate file."""
     fs.save_splats(cloud(), folder / "a.glb")
     data = (folder / "a.glb").read_bytes()
     (folder / "a.glb").unlink()
@@ -231,7 +231,7 @@ def checkpoint(folder):
 
 
 def views(folder):
-    _pictures_of(folder)
+    _image_folder(folder)
 
 
 COLMAP = {
@@ -364,7 +364,7 @@ def use_results(file):
 
 
 def signed(folder):
-    """Give a damaged store the checksums that fit, as somebody who knows them."""
+    """Set the checksums of a damaged store to match its content, as an attacker could."""
     with contextlib.suppress(Exception):
         header, nodes = json.loads((folder / "store.json").read_text()), np.load(folder / "nodes.npy")
         with contextlib.suppress(Exception):
@@ -570,8 +570,8 @@ ODD = (object(), [10**400] * 3, np.float16(1), np.zeros((0, 3)), 10**400, "\ud80
 @pytest.mark.sweep
 @pytest.mark.parametrize("name", sorted(CALLS))
 def test_every_argument_is_validated(name, tmp_path, monkeypatch):
-    """Each argument of a public function in turn takes four values that nobody expects: it does its work, or
-    refuses them with an error of ours."""
+    """Each argument of a public function in turn has four unexpected values: the function works, or
+    raises an error of fidsplat."""
     monkeypatch.chdir(tmp_path)
     ground(tmp_path)
     monkeypatch.setattr(warnings, "showwarning", lambda *_: None)

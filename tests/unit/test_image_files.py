@@ -1,4 +1,4 @@
-"""Image files: round trips, one-bit images, damaged input, whole files or none."""
+"""Image files: round trips, one-bit images, damaged input, atomic writes."""
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ def test_floats_are_clamped_and_rounded():
 
 
 def test_a_large_image_is_converted_as_its_rows_are():
-    """In shares, by threads; the last share is not whole."""
+    """In shares, by threads; the last share is smaller."""
     random = np.random.default_rng(3)
     large = random.uniform(-0.1, 1.1, (900, 857, 3)).astype(np.float32)
     large[-1, -1] = (np.nan, np.inf, -np.inf)

@@ -1,4 +1,4 @@
-"""Sensors, fog and backgrounds: values, scene files, and what is wrong with them."""
+"""Sensors, fog and backgrounds: values, scene files, and errors."""
 
 import math
 from dataclasses import replace

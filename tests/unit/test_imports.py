@@ -107,7 +107,7 @@ MODULES = {
 
 @cache
 def statements(path: Path) -> list[ast.Import | ast.ImportFrom]:
-    """The import statements of a file, wherever they stand."""
+    """The import statements of a file, also within functions."""
     tree = ast.parse(path.read_text("utf-8"))
     return [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
 

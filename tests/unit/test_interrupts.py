@@ -94,8 +94,8 @@ def test_a_library_that_is_being_loaded_is_not_interrupted(name, status, said):
     ],
 )
 def test_a_signal_in_a_finalizer_is_not_lost(name, then, status, said):
-    """Python drops what is raised there: the command went on, and its status was 0. An error that
-    follows is a consequence of the signal."""
+    """Python discards exceptions of a finalizer: the command continued, with status 0. A later error is a
+    consequence of the signal."""
     code = WHERE_EXCEPTIONS_ARE_DROPPED.format(name=name, then=then)
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr) == (status, f"fidsplat: {said}\n")

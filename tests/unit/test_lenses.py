@@ -1,4 +1,4 @@
-"""Lenses: OpenCV's projections, their inverses, what is not visible, scene files."""
+"""Lenses: OpenCV's projections, their inverses, invisible points, scene files."""
 
 import math
 
@@ -96,7 +96,7 @@ def test_beyond_the_fold_nothing_is_visible():
 
 
 def test_opencv_fills_its_rational_model_up_with_zeros():
-    """calibrateCamera gives 14 numbers for CALIB_RATIONAL_MODEL, which has 8."""
+    """calibrateCamera returns 14 numbers for CALIB_RATIONAL_MODEL, which has 8."""
     eight = [0.1, -0.2, 0.001, 0.002, 0.03, 0.04, -0.05, 0.06]
     assert BrownConrady.opencv([eight + [0.0] * 6]) == BrownConrady.opencv(eight)
 

@@ -202,7 +202,7 @@ def test_splats_behind_and_very_near_do_not_occlude():
 
 
 def test_an_obstacle_next_to_a_marker_darkens_its_half():
-    """A wall that stands on the marker's right edge occludes half of the sky there."""
+    """A wall at the right edge of the marker occludes half of the sky there."""
     pose = np.eye(4)
     pose[:3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]
     pose[:3, 3] = (0.1, 0, -0.5)

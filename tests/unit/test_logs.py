@@ -1,4 +1,4 @@
-"""Logs: what is written is read by the packages that robotics tools are made of."""
+"""Logs: other packages of robotics read what is written."""
 
 import contextlib
 import json

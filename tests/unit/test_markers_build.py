@@ -1,4 +1,4 @@
-"""marker(): the splats that it makes, their frame, and what it refuses."""
+"""marker(): its splats, their frame, and errors."""
 
 import random
 import string
@@ -249,7 +249,7 @@ def test_clouds_are_filled_part_by_part_bit_identically(noise, monkeypatch):
 
 
 def test_a_large_checkerboard(tmp_path):
-    """Every module a rectangle: what grows faster than the image would not end."""
+    """Every module becomes a rectangle: an algorithm of more than linear time would not end."""
     bits = np.indices((1000, 1000)).sum(0) % 2 == 1
     spec = f"image:{write_png(tmp_path / 'board.png', bits)}"
     made = marker(spec, mixture="exact")

@@ -173,7 +173,7 @@ def test_no_template_is_stretched_beyond_what_it_was_fitted_for(size):
 
 
 def grown_by_definition(grid: np.ndarray, box: list[int], growth: float) -> list[float]:
-    """What `grow` says of one rectangle, cell by cell."""
+    """Expected result of `grow` for one rectangle, computed cell by cell."""
     own = grid[box[1], box[0]]
     lengths = (box[2] - box[0], box[3] - box[1])
     cells, grown = list(box), [float(edge) for edge in box]

@@ -1,4 +1,4 @@
-"""Marker specs and the bits that they stand for."""
+"""Marker specs and their bits."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Markers bent to a surface: positions and normals of splats, true corners, and what is refused."""
+"""Markers bent to a surface: positions and normals of splats, true corners, and errors."""
 
 import math
 

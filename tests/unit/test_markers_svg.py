@@ -1,4 +1,4 @@
-"""Drawings: SVG outlines, the rectangles that cover them, their colours, and what is refused."""
+"""Drawings: SVG outlines, the rectangles that cover them, their colours, and errors."""
 
 import time
 

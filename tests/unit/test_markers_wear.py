@@ -1,4 +1,4 @@
-"""Worn markers: areas and contrast by severity, seeds, detection, and what is refused."""
+"""Worn markers: areas and contrast by severity, seeds, detection, and errors."""
 
 from dataclasses import replace
 

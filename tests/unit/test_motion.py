@@ -183,7 +183,7 @@ def test_scene_files_say_what_moves(tmp_path):
 
 
 def test_a_marker_moves_from_where_it_is_rendered(tmp_path):
-    """Its own pose is where its splats lie in the cloud; the motion takes it from there."""
+    """A marker's own pose is that of its splats in the cloud; the motion starts from it."""
     text = SCENE.replace("size = 0.2", "size = 0.2\nposition = [0.0, 3.0, 0.0]")
     (tmp_path / "a.toml").write_text(text)
     scene = fs.Scene.load(tmp_path / "a.toml")
@@ -255,7 +255,7 @@ def splats(tmp_path):
 
 
 def test_splat_files_move_by_themselves(tmp_path, splats):
-    """Each moves from where it is put; as a file that lies where the moving one is then."""
+    """Each cloud moves from its initial pose; compared with a file that is at the moved pose."""
     splats.save(tmp_path / "b.toml")
     start = SPLATS.index("motion")
     there = SPLATS.replace(SPLATS[start : SPLATS.index("]\n\n[[markers]]") + 2], "", 1)

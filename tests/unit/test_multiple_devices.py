@@ -4,7 +4,7 @@ import threading
 
 import numpy as np
 import pytest
-from test_store_rendering import TURNED, look, made_store, splats
+from test_store_rendering import TURNED, build_small_store, look, splats
 
 import fidsplat as fs
 from fidsplat.store import build_plan
@@ -14,7 +14,7 @@ from fidsplat.store import build_plan
 def store(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(build_plan, "_MIN_MEMORY", 0)
-        return made_store(tmp_path_factory.mktemp("several"), splats(1), "disks")
+        return build_small_store(tmp_path_factory.mktemp("several"), splats(1), "disks")
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ def run(code: str, names: dict):
 
 @pytest.fixture
 def shown(request, tmp_path, monkeypatch):
-    """What each code cell shows, and the names that the notebook leaves."""
+    """Output of each code cell, and the names that the notebook defines."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FIDSPLAT_DEVICE", "reference")
     names: dict = {}

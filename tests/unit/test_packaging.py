@@ -37,7 +37,7 @@ for path in sorted([*folder.rglob("*.cl"), *folder.rglob("*.py")]):
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory):
-    """A copy of what git holds, so that building writes nothing into the repository."""
+    """A copy of the files in git, so that building writes nothing into the repository."""
     copy = tmp_path_factory.mktemp("tree")
     for name in PARTS:
         shutil.copytree(TREE / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -70,7 +70,7 @@ def install(source, target, *options):
 
 
 def kernels_seen_from(target) -> tuple[Path, set[str]]:
-    """What a fresh interpreter finds when ``target`` is its site-packages and no checkout is near."""
+    """Kernels that a fresh interpreter finds if ``target`` is its site-packages, without a checkout."""
     folder, *files = run([sys.executable, "-c", ASK, str(target)], target).splitlines()
     return Path(folder), set(files)
 

@@ -192,7 +192,7 @@ def test_two_picked_features_give_the_scale():
 
 @pytest.mark.parametrize("speed", [0.0, 0.01])
 def test_a_rolling_shutter_of_moving_cameras_is_found(speed):
-    """Cameras at the middle of the readout, each with a motion of its own; 0.3 pixels of noise."""
+    """Cameras at the middle of the readout, each with its own motion; 0.3 pixels of noise."""
     rng = np.random.default_rng(0)
     points, cameras, seen = rng.uniform((-1, -1, -0.5), (1, 1, 0.5), (300, 3)), [], []
     for _ in range(6):

@@ -1,4 +1,4 @@
-"""What is plain data pickles and copies; what holds a device says that it does not, and not across a fork."""
+"""Plain data can be pickled and copied; objects with a device raise an error for it, and after a fork."""
 
 import copy
 import multiprocessing
@@ -84,7 +84,7 @@ def test_what_holds_a_device(way):
 
 
 def test_an_output_that_was_not_rendered():
-    """An InputError to people, a missing key to whatever takes a mapping."""
+    """An InputError for users, and a KeyError for code that uses a mapping."""
     frame = fs.Renderer("reference").render(CLOUD, CAMERA)
     for name in ("depth", 5, None, np.zeros(3), LookupError):
         for take in (frame.__getitem__, frame.device_array):
@@ -132,7 +132,7 @@ def test_a_worker_opens_its_own(device, method):
 
 
 def parent_that_only_forks(device) -> None:
-    """Runs in a process of its own, which has opened nothing: its fork may open what it wants."""
+    """Runs in its own process, which has opened no device: its fork may open any."""
     expected = np.asarray(fs.Renderer("reference").render(CLOUD, CAMERA)["rgb"])
 
     def close() -> None:

@@ -47,7 +47,7 @@ def installed(tmp_path_factory):
 
 @pytest.fixture
 def plugin(installed, monkeypatch):
-    """The package is importable; what it registers is removed again."""
+    """The package is importable; its registrations are removed afterwards."""
     registries = (kinds._kinds, CATALOGUE, IMAGES, OUTPUTS, LAYOUTS, extensions.EXTENSIONS)
     before = [dict(registry) for registry in registries]
     monkeypatch.syspath_prepend(str(installed))

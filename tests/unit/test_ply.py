@@ -1,4 +1,4 @@
-"""PLY files: what is written, and what comes back from the layouts of 2DGS and 3DGS."""
+"""PLY files: content of written files, and reading of the layouts of 2DGS and 3DGS."""
 
 import math
 import os

@@ -208,8 +208,8 @@ ROWS = 400_000
 
 
 def sparse(path, content, rows=ROWS, good=0):
-    """A file that says it has that many splats: good ones of `content` at its end, and zeros, of which none
-    stands on the disk."""
+    """A file that declares a number of splats: valid ones of `content` at its end, and zeros that are
+    holes of a sparse file."""
     head, _, data = content.partition(b"end_header\n")
     head = head.replace(b"vertex 300", b"vertex %d" % rows) + b"end_header\n"
     with path.open("wb") as stream:

@@ -27,7 +27,7 @@ DAMAGES = {
 
 @pytest.fixture(scope="module")
 def full_cache(tmp_path_factory):
-    """The cache that a process leaves which renders one image, and what it printed."""
+    """The cache of a process that renders one image, and its output."""
     folder = tmp_path_factory.mktemp("pocl")
     done = draw(folder)
     if "opencl:pocl" in done.stderr and done.returncode:
@@ -72,7 +72,7 @@ def test_a_damaged_cache_is_compiled_again(full_cache, tmp_path):
 
 
 def test_a_program_without_kernels_is_built_again(monkeypatch):
-    """As PoCL gives it where another process has not finished writing."""
+    """The error of PoCL for a cache entry that another process has not finished."""
     pytest.importorskip("pyopencl")
     import fidsplat as fs
     from fidsplat.backends.opencl import program

@@ -1,4 +1,4 @@
-"""What is prepared for a capture is kept where nothing moves, and only there."""
+"""Prepared data of a capture are cached if nothing moves, and only then."""
 
 import numpy as np
 

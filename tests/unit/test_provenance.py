@@ -1,4 +1,4 @@
-"""The hash under which results are kept covers every source that may change them."""
+"""The hash of the code, under which results are stored, covers every source that may change them."""
 
 import json
 import pickle

@@ -271,7 +271,7 @@ def test_a_device_without_a_setting(renderer, held_out, monkeypatch):
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Frames take ten milliseconds per decade of the cut-off."""
+    """A frame takes ten milliseconds per decade of the cut-off."""
 
     def timer(self, quality):
         clock = Clock()

@@ -1,4 +1,4 @@
-"""Reading back: what is visible, which detection is whose, poses of boards."""
+"""Reading markers back from images: visibility, assignment of detections to markers, poses of boards."""
 
 import pickle
 from dataclasses import replace
@@ -139,7 +139,7 @@ def test_what_the_images_edge_cuts_off():
 
 @pytest.mark.parametrize("spec", ["charuco:5x4:4x4_50", "gridboard:3x2:5x5_100", "aprilgrid:3x2:36h11"])
 def test_a_board_gives_one_pose(renderer, spec):
-    """From half of its tags too, and a tag of another place in the image stays what it is."""
+    """Also from half of its tags; a tag elsewhere in the image is not assigned to the board."""
     board = PlacedMarker(fs.marker(spec, size=0.3))
     camera = fs.Camera.look_at(640, 480, 0.9, (0.2, -0.15, -0.5), (0, 0, 0))
     scene = fs.Scene(markers=[board], camera=camera, background=(0.5, 0.5, 0.5))
@@ -160,8 +160,8 @@ def test_a_board_gives_one_pose(renderer, spec):
 
 
 def test_the_truth_is_where_the_frames_own_capture_had_camera_and_markers(renderer):
-    """Not where the scene has them: after a camera, a shutter and a motion given to `render`, in a batch, and
-    after pickling, which functions do not survive."""
+    """The true poses are those of the frame's own capture, not of the scene: with a camera, a shutter and
+    a motion given to `render`, in a batch, and after pickling, which omits functions."""
     placed, own = outlined()
     aside = fs.Camera.look_at(320, 240, 1.0, (0.3, 0.1, -0.7), (0.05, 0, 0))
 

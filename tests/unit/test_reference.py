@@ -1,4 +1,4 @@
-"""The reference: what it leaves out as unseen changes nothing."""
+"""The reference: invisible splats that it skips change nothing."""
 
 import numpy as np
 import pytest

@@ -16,7 +16,7 @@ from fidsplat.scenes import PlacedMarker
 
 
 class Here:
-    """An engine of this process, whose workers die at a given item."""
+    """An engine in this process whose workers die at a given item."""
 
     def __init__(self, work=lambda item: item, dies=()):
         self.work, self.dies = work, list(dies)

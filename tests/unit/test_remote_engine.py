@@ -26,7 +26,7 @@ class Ticket:
 
 
 class Actor:
-    """Calls at once; keeps what came of it as a ticket."""
+    """A replacement of Ray that calls immediately; its results are tickets."""
 
     def __init__(self, worker):
         for name in ("do", "title"):
@@ -81,7 +81,7 @@ def cluster(monkeypatch):
 
 
 def work(do, titles=("a device",)):
-    """What workers make: the n-th has the n-th title, the last from there on."""
+    """Results of workers: the n-th worker has the n-th title, all further ones the last."""
     made = []
 
     def make():

@@ -18,7 +18,7 @@ VIEWS = 12
 
 @pytest.fixture(scope="module", autouse=True)
 def cluster():
-    """Kept open, as one that others started."""
+    """A cluster that stays open, as if another program had started it."""
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
     yield
     ray.shutdown()

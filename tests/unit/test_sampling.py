@@ -1,4 +1,4 @@
-"""What plain pytest leaves to `pytest -m exhaustive`."""
+"""Cases that plain pytest leaves to `pytest -m exhaustive`."""
 
 from types import SimpleNamespace
 
@@ -28,7 +28,7 @@ class Item:
         self.marks.append(mark.name)
 
 
-def kept(turn, devices=DEVICES, files="abcdefgh", cases=2):
+def selected_cases(turn, devices=DEVICES, files="abcdefgh", cases=2):
     """Of the cases per file and device, those that plain pytest runs, as (file, device, case)."""
     items = [Item(file, device, case) for file in files for device in devices for case in range(cases)]
     take_turns(items, DEVICES[:2], turn)
@@ -37,37 +37,42 @@ def kept(turn, devices=DEVICES, files="abcdefgh", cases=2):
 
 
 def test_each_file_runs_on_one_device_of_the_processor_and_on_every_gpu():
-    run = kept(0)
+    run = selected_cases(0)
     own = {file: device for file, device, _ in run if device != "gpu"}
     assert run == {(file, device, case) for file in own for device in (own[file], "gpu") for case in "01"}
     assert set(own.values()) == {"one", "two"}
     # a selection of files keeps their devices
-    assert kept(0, files="c") == {each for each in run if each[0] == "c"}
+    assert selected_cases(0, files="c") == {each for each in run if each[0] == "c"}
 
 
 def test_a_sweep_of_kernels_runs_every_other_case():
     for cases in (sampling.SWEEP, 9):
-        run = kept(0, files="a", devices=("one",), cases=cases)
+        run = selected_cases(0, files="a", devices=("one",), cases=cases)
         assert abs(len(run) - cases / 2) <= 0.5
         assert len({int(case) % 2 for *_, case in run}) == 2
     others = {
-        name: kept(0, files=[f"tests/unit/{name}.py"], devices=("one",), cases=8) for name in ("a", "swept")
+        name: selected_cases(0, files=[f"tests/unit/{name}.py"], devices=("one",), cases=8)
+        for name in ("a", "swept")
     }
     assert [len(run) for run in others.values()] == [8, 4]
-    runs = [kept(turn, files=["swept"], devices=("one",), cases=1) for turn in (0, 4)]
+    runs = [selected_cases(turn, files=["swept"], devices=("one",), cases=1) for turn in (0, 4)]
     assert sorted(map(len, runs)) == [0, 1]
 
 
 def test_all_turns_have_every_case_on_every_device():
-    runs = [kept(turn, cases=9) for turn in range(8)]
+    runs = [selected_cases(turn, cases=9) for turn in range(8)]
     assert len(set.union(*runs)) == 8 * 3 * 9
     assert set.intersection(*runs) == set()
     assert max(map(len, runs)) < 8 * 3 * 9 / 2
 
 
 def test_tests_of_one_device_run_always():
-    assert kept(0, ("one", "gpu")) == kept(1, ("one", "gpu")) == kept(4, ("one", "gpu"))
-    assert len(kept(0, ("one", "gpu"))) == 8 * 2 * 2
+    assert (
+        selected_cases(0, ("one", "gpu"))
+        == selected_cases(1, ("one", "gpu"))
+        == selected_cases(4, ("one", "gpu"))
+    )
+    assert len(selected_cases(0, ("one", "gpu"))) == 8 * 2 * 2
 
 
 def test_a_chessboard_and_a_sample():

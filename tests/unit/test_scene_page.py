@@ -1,4 +1,5 @@
-"""Self-contained HTML pages: their content, how the engine is obtained, and what a headless Chromium shows.
+"""Self-contained HTML pages: their content, the download of the engine, and images of a headless
+Chromium.
 
 The browser's test is skipped without Chromium (Debian: apt-get install chromium), and without the PlayCanvas
 Engine in the user's cache, which `fidsplat convert SCENE.toml SCENE.html` downloads once by npm.

@@ -1,5 +1,5 @@
-"""Live messages, read by clients that know Foxglove's protocol and ROS 2's CDR, and by a DDS participant with
-types of its own."""
+"""Live messages, read by clients with Foxglove's protocol and ROS 2's CDR, and by a DDS participant with
+its own types."""
 
 import json
 import os
@@ -219,7 +219,8 @@ LOOPBACK = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface address
 
 
 def test_a_ros2_node_receives_and_drives(served):
-    """Names, types and frames as another participant knows them; then it places and drives the robot."""
+    """Names, types and frames of topics, read by another participant, which then places and drives the
+    robot."""
     file, _, number = served
     domain = Domain(number, LOOPBACK)
     node = DomainParticipant(number)

@@ -1,4 +1,4 @@
-"""The command line where the machine lacks something: a stream, room, files, folders of its own."""
+"""The command line if a resource is missing: a stream, memory, files, folders."""
 
 import os
 import subprocess
@@ -17,7 +17,7 @@ NO_ROOM = "fidsplat: No space left on device; free space there or on the disk of
 
 
 def shell(text, folder, **environment):
-    """Exit status, stdout and stderr of a shell's line; `fidsplat` is ours."""
+    """Exit status, stdout and stderr of a line of a shell, in which `fidsplat` is this installation."""
     done = subprocess.run(
         ["bash", "-c", f'fidsplat() {{ {FIDSPLAT} "$@"; }}; {text}'],
         cwd=folder,
@@ -55,7 +55,7 @@ def test_output_that_goes_nowhere(line, status, says, tmp_path):
 
 
 def test_no_file_takes_the_place_of_a_closed_stream(tmp_path):
-    """What is printed does not go into the file that is written."""
+    """Printed text is not written into the output file."""
     words = "marker aruco:4x4_50:7 --mixture fitted"
     assert shell(f"fidsplat {words} -o whole.ply", tmp_path)[0] == 0
     status, _, err = shell(f"fidsplat {words} -o closed.ply <&- >&-", tmp_path)

@@ -55,7 +55,7 @@ def world(tmp_path):
 
 
 def in_the_world(found, name):
-    """The camera of the description where its link stands."""
+    """The camera of the description at the pose of its link."""
     camera = found.cameras[name]
     pose = compose(found.bodies[camera.body], camera.mount)
     return replace(camera.camera, world_to_camera=matrix_of(inverse(pose)), position=None)

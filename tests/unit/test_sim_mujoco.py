@@ -74,7 +74,8 @@ def moved(model, seed):
 
 
 def test_a_tag_is_read_where_mujoco_says_it_is(model, rig):
-    """The axes of bodies and cameras, by images: the truth is computed from MuJoCo's own matrices."""
+    """Axes of bodies and cameras, tested by images: the expected positions are computed from MuJoCo's own
+    matrices."""
     states = [moved(model, seed) for seed in (0, 1)]
     images = rig.render(states)
     assert tuple(rig.cameras) == ("above", "front", "lens", "plain")

@@ -1,4 +1,4 @@
-"""SplatCloud: checks, what is left out, origins, joining."""
+"""SplatCloud: validation, dropped splats, origins, concatenation."""
 
 import warnings
 

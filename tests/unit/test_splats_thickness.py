@@ -1,4 +1,4 @@
-"""SplatCloud: 3D Gaussians, which have a thickness, beside disks and boxes."""
+"""SplatCloud: 3D Gaussians, which have a thickness, together with disks and boxes."""
 
 import pickle
 

@@ -110,7 +110,7 @@ def test_chunks_too_large_for_the_memory_are_refused(files, tmp_path, monkeypatc
 
     monkeypatch.setattr(build_plan, "_MERGE_BYTES", (400, 6))
     monkeypatch.setattr(build, "merged", merged)
-    with pytest.raises(fs.InputError, match=r"at most .* in 1 MiB of memory, got 500") as refused:
+    with pytest.raises(fs.InputError, match=r"at most .* in 1 MiB, got 500") as refused:
         fs.build_store(files, tmp_path / "both.fss", **SMALL)
     fitting = int(re.findall("at most ([0-9]+) for", str(refused.value))[0])
     fs.build_store(files, tmp_path / "both.fss", **SMALL | {"chunk": fitting})

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pyopencl as cl
 import pytest
-from store_views import TURNED, look, made_stores
+from store_views import TURNED, build_small_stores, look
 
 import fidsplat as fs
 from fidsplat.backends.opencl import buffers, chunk_cache
@@ -22,7 +22,7 @@ from fidsplat.streaming.device_chunks import DeviceChunks
 
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory):
-    return made_stores(tmp_path_factory.mktemp("stores"))
+    return build_small_stores(tmp_path_factory.mktemp("stores"))
 
 
 def test_chunks_are_sent_to_a_device_once(stores, tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS
-from store_views import TURNED, look, made_store, splats
+from store_views import TURNED, build_small_store, look, splats
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
@@ -44,7 +44,7 @@ def bushes():
 @pytest.fixture(scope="module")
 def town(tmp_path_factory):
     folder = tmp_path_factory.mktemp("town")
-    stores = (made_store(folder, cloud(), cloud.__name__) for cloud in (walls, bushes))
+    stores = (build_small_store(folder, cloud(), cloud.__name__) for cloud in (walls, bushes))
     return fs.Scene(stores=tuple(stores))
 
 
@@ -196,7 +196,7 @@ def test_transparent_splats_occlude_nothing(tmp_path, culling, monkeypatch):
     faint = fs.SplatCloud(
         cloud.means, cloud.quats, cloud.scales, np.full(len(cloud), 0.05, np.float32), colors=cloud.colors
     )
-    store, renderer = made_store(tmp_path, faint, "faint"), fs.Renderer("opencl")
+    store, renderer = build_small_store(tmp_path, faint, "faint"), fs.Renderer("opencl")
     resident = renderer.upload(store)
     for _ in range(4):
         assert np.array_equal(renderer.render(resident, look())["rgb"], renderer.render(faint, look())["rgb"])

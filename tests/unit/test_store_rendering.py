@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import pytest
 from small_stores import contents
-from store_views import COUNT, SIZE, TURNED, look, made_store, made_stores, splats
+from store_views import COUNT, SIZE, TURNED, build_small_store, build_small_stores, look, splats
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
@@ -54,7 +54,7 @@ CAPTURES = {
 
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory):
-    return made_stores(tmp_path_factory.mktemp("stores"))
+    return build_small_stores(tmp_path_factory.mktemp("stores"))
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +160,7 @@ def test_walls_next_to_the_camera_under_the_low_pass_pixel(tmp_path, lens):
     street = fs.SplatCloud(
         means, quats, sizes, np.full(count, 0.7), colors=generator.uniform(0, 1, (count, 3))
     )
-    store, renderer = made_store(tmp_path, street, "street"), fs.Renderer("opencl")
+    store, renderer = build_small_store(tmp_path, street, "street"), fs.Renderer("opencl")
     whole, resident = renderer.upload(store.cloud()), renderer.upload(store)
     quality, read = fs.Quality(lowpass="pixel", alpha_cutoff=1e-8), []
     for number in range(12):
@@ -198,7 +198,7 @@ def test_a_needle_that_ewa_widens_is_in_the_frustum(reference):
 
 def test_moving_groups_are_culled_at_their_poses(tmp_path, reference):
     behind = random_splats(200, 6, depth=(-4, -2), scale=(0.05, 0.1), across=0.5).with_labels(3)
-    store = made_store(tmp_path, behind, "behind")
+    store = build_small_store(tmp_path, behind, "behind")
     half_turn = rigid_matrix((0, 0, 0), (0, 0, 1, 0))
     capture = fs.Capture(look(), motion=fs.Motion(groups={3: lambda t: half_turn}))
     ours, whole = (reference.render(each, capture)["rgb"] for each in (store, store.cloud()))
@@ -308,7 +308,7 @@ def test_stores_with_different_origins(tmp_path, reference):
     ahead = [random_splats(300, seed, depth=(1, 4), scale=(0.01, 0.1), across=0.8) for seed in (11, 12)]
     given = {name: getattr(ahead[1], name) for name in ("quats", "scales", "opacities", "colors")}
     moved = fs.SplatCloud(ahead[1].means - np.float32([8, 0, 0]), origin=(8.0, 0, 0), **given)
-    stores = (made_store(tmp_path, ahead[0], "here"), made_store(tmp_path, moved, "there"))
+    stores = (build_small_store(tmp_path, ahead[0], "here"), build_small_store(tmp_path, moved, "there"))
     assert stores[1].origin.tolist() == [8, 0, 0]
     scene = fs.Scene(stores=stores, camera=look())
     ours = reference.render(scene, outputs=("rgb", "splat_id"))
@@ -334,7 +334,7 @@ def test_coplanar_groups_of_stores_are_part_of_every_frame(tmp_path, reference):
         rigid_matrix((0, 0, 2))
     )
     cloud = fs.SplatCloud.concatenate([marker, random_splats(500, 4, depth=(1.5, 4), scale=(0.01, 0.05))])
-    store = made_store(tmp_path, cloud, "tag")
+    store = build_small_store(tmp_path, cloud, "tag")
     near = look(5, at=(0.19, 0.19, 1.0))
     ours, whole = (reference.render(each, near)["rgb"] for each in (store, store.cloud()))
     assert np.array_equal(ours, whole)

@@ -9,7 +9,8 @@ from fidsplat.util.timing import Clock, Timer, quartiles, ratios, time_interleav
 
 
 def timers(order, *seconds):
-    """A timer for each list of seconds, by one clock that they move on; `order` gets who runs."""
+    """A timer for each list of seconds, with a common clock that they advance; `order` receives the
+    timers in the order of their runs."""
     clock = Clock()
 
     def work(number, left):

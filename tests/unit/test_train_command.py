@@ -1,4 +1,4 @@
-"""The command `fidsplat train`: what it writes, says and keeps."""
+"""The command `fidsplat train`: its files, messages and checkpoints."""
 
 import json
 import os
@@ -72,7 +72,7 @@ def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
 
 
 def test_a_run_that_is_interrupted_keeps_what_it_has_done(folder, tmp_path, capsys, monkeypatch):
-    """At the step's end, whenever the signal comes; the second one does not wait."""
+    """At the end of the step, whenever the signal arrives; the second signal does not wait."""
     words = ["train", str(folder), "--device", "reference", "--iterations", "6", "-o"]
     assert main([*words, str(tmp_path / "whole.ply")]) == 0
     advance, interrupts = Trainer._advance, [1]

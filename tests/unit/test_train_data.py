@@ -1,4 +1,4 @@
-"""Data sets from disk: what is read, and what is said about those that cannot be trained on."""
+"""Data sets from disk: reading, and errors for unusable ones."""
 
 import json
 import struct
@@ -151,7 +151,7 @@ def test_points_as_text(made, tmp_path):
 
 
 def test_images_of_colmap_are_read_as_they_are_stored(made, folder):
-    """Not turned as EXIF says; what is transparent shows the background; 16 bits are cut to 8."""
+    """Not rotated by EXIF; transparent pixels show the background; 16 bits are truncated to 8."""
     import cv2
 
     images = folder / "images"

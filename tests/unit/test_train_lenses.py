@@ -51,7 +51,7 @@ def taken(camera):
 
 
 def flat_as_wanted(view, lens, mask):
-    """Whether a view has the image that a pinhole would have taken, where what it is made of was there."""
+    """Whether a view has the image of a pinhole camera, where its source pixels exist."""
     camera = view.camera
     assert camera.lens is None
     there = np.ones(mask.shape, bool) if view.mask is None else view.mask

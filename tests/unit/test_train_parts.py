@@ -154,7 +154,7 @@ def test_coefficients_that_were_not_rendered_stay():
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
 @pytest.mark.parametrize("plain", [False, True])
 def test_gradients_by_inner_values_are_those_of_central_differences(strategy, plain):
-    """Of a made-up loss that is linear in what the cloud shows, with the penalties that mcmc adds."""
+    """For a loss that is linear in the rendered images, with the penalties that mcmc adds."""
     settings = TrainSettings(strategy=strategy)
     splats, random = splats_of(4, degree=0 if plain else 1), np.random.default_rng(3)
     cloud = splats.cloud(0 if plain else 1, np.zeros(3))

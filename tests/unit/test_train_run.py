@@ -1,4 +1,5 @@
-"""Training runs: they raise the PSNR, give the same bytes twice and after a stop, and lose nothing."""
+"""Training runs: they raise the PSNR, write the same bytes twice and after an interruption, and lose
+nothing."""
 
 import hashlib
 import json
@@ -94,7 +95,7 @@ def test_training_raises_the_psnr_and_lowers_the_loss(whole, dataset):
 
 
 def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(whole, dataset, tmp_path):
-    """Stopped between two checkpoints, amid sums of gradients, and made longer when it goes on."""
+    """Interrupted between two checkpoints, within sums of gradients, and continued with more iterations."""
     renderer, checkpoint = whole[0].renderer, tmp_path / "scene.training.npz"
     first = Trainer(dataset, renderer, iterations=20, checkpoint=checkpoint, **QUICK)
     for _ in range(13):
@@ -115,7 +116,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(whole, dataset, tmp_pa
 
 
 def test_a_frame_that_exceeds_its_capacity_is_rendered_again(whole, dataset, tmp_path):
-    """A device that did not wait finds out when it takes the image back: the run gives the same bytes."""
+    """A device that did not wait detects the error when it reads the image: the run writes the same bytes."""
     trainer, refused = Trainer(dataset, whole[0].renderer, iterations=ITERATIONS, **QUICK), []
     differentiate = trainer._differentiate
 
@@ -143,7 +144,7 @@ def test_a_frame_that_exceeds_its_capacity_is_rendered_again(whole, dataset, tmp
 
 
 def test_a_run_that_ends_where_opacities_fall_keeps_its_own(whole, dataset, tmp_path):
-    """Splats are made and opacities fall at iteration 16, where a run that goes on then has them fall."""
+    """Splats are added and opacities reset at iteration 16, where the resumed run starts."""
     checkpoint = tmp_path / "scene.training.npz"
     renderer = whole[0].renderer
     ended = Trainer(dataset, renderer, iterations=16, checkpoint=checkpoint, **QUICK)
@@ -272,7 +273,7 @@ def test_a_checkpoint_of_another_run_is_refused(dataset, tmp_path):
 
 
 def test_a_checkpoint_whose_arrays_do_not_fit_is_refused(dataset, tmp_path):
-    """Before a device writes beyond a buffer that is too short, or trains on what it misreads."""
+    """Raised before a device writes beyond a buffer that is too short, or trains on misread data."""
     file, renderer = tmp_path / "scene.training.npz", fs.Renderer("reference")
     settings = {"iterations": 4, "checkpoint": file, **QUICK}
     Trainer(dataset, renderer, iterations=3, checkpoint=file, **QUICK).run()
@@ -313,7 +314,7 @@ def test_a_checkpoint_whose_arrays_do_not_fit_is_refused(dataset, tmp_path):
 
 
 def test_a_data_set_has_the_digest_of_all_that_training_depends_on(dataset):
-    """One thing at a time, so that none is left out."""
+    """One change at a time, so that each is tested."""
 
     def other(place, **changes):
         views = list(dataset.views)
@@ -407,7 +408,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(dataset, tmp_path, monkeypatch):
 
 
 def test_memory_that_runs_out_leaves_the_last_checkpoint(whole, dataset, tmp_path, monkeypatch):
-    """The same command goes on from it, to the bytes of a run that had enough."""
+    """The same command resumes from the checkpoint, with the same bytes as a run on an empty disk."""
     _, _, _, file = whole
     checkpoint, renderer = tmp_path / "run.training.npz", fs.Renderer("reference")
     trainer = Trainer(dataset, renderer, iterations=ITERATIONS, checkpoint=checkpoint, **QUICK)

@@ -1,4 +1,4 @@
-"""Truth with every image: markers, groups, flow; as COCO and BOP, poses as TUM."""
+"""Ground truth of images: markers, groups, optical flow; as COCO and BOP, poses as TUM."""
 
 import contextlib
 import io

@@ -140,7 +140,7 @@ def test_a_localisation_that_matches_worse_is_not_used(renderer, cloud, given, m
 
 
 def test_refinement_does_not_drift_by_a_similarity(given):
-    """Cameras that turn, move and grow together are those that were given."""
+    """Cameras that are rotated, moved and scaled together are aligned with the original ones."""
     refinement = ViewRefinement(given, TrainSettings(refine_poses=True))
     drift = 1.03 * rigid_matrix((0.2, -0.1, 0.4), (0.98, 0.1, -0.1, 0.15))
     drift[3, 3] = 1.0

@@ -1,4 +1,4 @@
-"""The viewer without a browser: images of given settings."""
+"""The viewer without a browser: images for given settings."""
 
 import math
 import threading

@@ -1,4 +1,4 @@
-"""Who may speak to the viewer, and where it listens."""
+"""Access control of the viewer, and the address on which it listens."""
 
 import socket
 from types import SimpleNamespace

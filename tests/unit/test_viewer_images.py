@@ -194,7 +194,7 @@ def test_clicks_name_what_is_at_their_pixel(viewer, client):
 
 
 class Page:
-    """Keeps what is added to a page of viser."""
+    """Records what is added to a page of viser."""
 
     def __init__(self):
         self.added = {}

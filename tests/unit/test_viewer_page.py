@@ -193,7 +193,7 @@ def test_a_gizmo_moves_a_marker_and_its_file(viewer, tmp_path):
 
 
 def test_a_gizmo_moves_a_splat_file(viewer, tmp_path):
-    """Its scale stays, and what the file says is what is shown."""
+    """The scale is unchanged, and the controls show the content of the file."""
     viewer.close()
     path = tmp_path / "scene.toml"
     cloud = fs.SplatCloud(
@@ -272,7 +272,7 @@ def test_a_file_that_is_edited_is_shown(viewer, tmp_path):
 
 
 def test_what_an_edit_changes_is_taken_and_the_controls_follow(viewer, tmp_path):
-    """What it leaves stays as the controls have it."""
+    """Settings that the edit omits keep the values of the controls."""
     path, sliders = tmp_path / "scene.toml", viewer._controls._sliders
     sliders["exposure"].value = 2.0
     assert viewer.session.settle()

@@ -20,7 +20,7 @@ class Clock:
 
 
 def looked_at(moving_takes=lambda scale: 0.0):
-    """A stream with a clock of its own, and what it drew."""
+    """A stream with a simulated clock, and the images that it rendered."""
     clock, rendered = Clock(), []
 
     def moving(viewpoint, scale):

@@ -1,4 +1,4 @@
-"""Detectors on ideal images: what is found, where its corners are, what is not there is not found."""
+"""Detectors on ideal images: detected codes, their corners, and no false detections."""
 
 import cv2
 import numpy as np

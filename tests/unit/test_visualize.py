@@ -1,4 +1,4 @@
-"""Output images as images: what a colour means, what nothing looks like."""
+"""Output images as colours: meaning of the colours, and of empty pixels."""
 
 import cv2
 import numpy as np

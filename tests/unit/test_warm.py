@@ -1,4 +1,4 @@
-"""fidsplat warm: what it compiles, and what it says."""
+"""fidsplat warm: compiled kernels, and its report."""
 
 import json
 from dataclasses import replace

@@ -1,8 +1,9 @@
-"""Images on a Warp tape: gradients through our rendering and somebody's own kernels; training on Warp."""
+"""Images on a Warp tape: gradients through our rendering and through kernels of other programs; training
+on Warp."""
 
 import numpy as np
 import pytest
-from derivative_errors import derivatives, random_picture
+from derivative_errors import derivatives, random_scene
 from training_scene import QUICK, run_and_resumed, scene
 
 import fidsplat as fs
@@ -36,7 +37,7 @@ def render():
 
 def picture():
     """As tests/contract/test_gradients.py renders, whose kernels it shares."""
-    return random_picture(1, degree=None, quality="surfel", outputs=("rgb",), origin=(0.0, 0.0, 0.0))
+    return random_scene(1, degree=None, quality="surfel", outputs=("rgb",), origin=(0.0, 0.0, 0.0))
 
 
 def on_device(cloud, gradients=tuple(TYPES)):
@@ -72,7 +73,7 @@ def test_a_tape_differentiates_frames_and_kernels(renderer, render):
 
 def test_a_tape_differentiates_3d_gaussians(renderer, render):
     style = {"degree": None, "quality": "gsplat", "outputs": ("rgb",), "origin": (0.0, 0.0, 0.0)}
-    cloud, capture = random_picture(0, solid=1.0, **style)
+    cloud, capture = random_scene(0, solid=1.0, **style)
     arrays, ones = on_device(cloud), wp.ones((43, 61, 3), dtype=float, device="cpu")
     tape = wp.Tape()
     images = render(tape, renderer, capture, **arrays)
@@ -211,7 +212,7 @@ def test_derivatives_that_cannot_be_taken_are_errors(renderer):
 
 
 def test_training_on_warp_repeats_to_the_byte_and_after_a_stop(renderer, tmp_path):
-    """3D Gaussians, by the work of a step in NumPy, as Warp has no kernels of its own for it."""
+    """3D Gaussians, trained by the step in NumPy, since Warp has no kernels for them."""
     settings = {**QUICK, "iterations": 20, "sh_degree": 0, "growth": 1.2, "primitive": "3d"}
     dataset = scene()
     whole = Trainer(dataset, renderer, **settings)

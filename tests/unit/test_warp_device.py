@@ -1,4 +1,4 @@
-"""The Warp backend: its devices, what it says when it is missing, arrays that are shared without a copy."""
+"""The Warp backend: its devices, its error if the package is missing, arrays shared without a copy."""
 
 import gc
 import os
@@ -83,7 +83,7 @@ def test_nothing_is_said_on_stdout_or_stderr():
         "fs.Renderer('warp:cpu').render(fs.SplatCloud.empty(), view)"
     )
     if optimisation.level() == "hardly":
-        code = f"import optimisation; optimisation.hardly(); {code}"
+        code = f"import optimisation; optimisation.compile_quickly(); {code}"
     # what was compiled above is loaded there: Warp would tell of either
     cache = Path(wp.config.kernel_cache_dir).parent  # Warp adds its version
     env = {"PATH": "", "WARP_CACHE_PATH": str(cache), "PYTHONPATH": ":".join(sys.path)}
@@ -320,7 +320,7 @@ def test_arrays_of_another_device_are_refused():
 
 
 def test_debug_builds_are_launched_by_one_thread(monkeypatch):
-    """What they share among threads they would crash by."""
+    """State that threads share, which would crash without a lock."""
     assert fs.Renderer("warp:cpu").backend._launches.threads > 1 or len(os.sched_getaffinity(0)) == 1
     monkeypatch.setattr(wp.config, "mode", "debug")
     assert fs.Renderer("warp:cpu").backend._launches.threads == 1

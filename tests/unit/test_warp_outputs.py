@@ -1,5 +1,5 @@
-"""What an output and a step after blending cost on Warp: one file each. Toys of both stand in a folder that
-the kernels' own do not know."""
+"""An output and a step after blending need one file each on Warp. Toy versions of both are in a folder
+that is not part of the kernels."""
 
 import sys
 from dataclasses import replace
@@ -84,7 +84,7 @@ def two_splats():
 
 @pytest.fixture
 def beside(tmp_path, monkeypatch):
-    """Puts a file beside those of a package of the kernels."""
+    """Add a file to the modules of a package of the kernels."""
 
     def put(package, name, text):
         folder, home = tmp_path / package, runtime.kernels(package)
@@ -106,7 +106,7 @@ def rendered(outputs, post_steps):
 
 
 def make_anew(stage, monkeypatch):
-    """Kernels of a stage are made again until the test ends; those of pipelines that live on stay theirs."""
+    """Kernels of a stage are rebuilt until the test ends; existing pipelines keep theirs."""
     made = getattr(runtime.kernels(stage), f"make_{stage}")
     fresh = cache(made.__wrapped__)
     for module in list(sys.modules.values()):

@@ -47,9 +47,9 @@ class Server:
             self._repeat(setting, before, WARM_UP)
         begun, busy = time.perf_counter(), time.process_time()
         self.rendered = self.adapter.render(setting, views)
-        taken = {"ms": 1e3 * (time.perf_counter() - begun), "cpu_ms": 1e3 * (time.process_time() - busy)}
+        times = {"ms": 1e3 * (time.perf_counter() - begun), "cpu_ms": 1e3 * (time.process_time() - busy)}
         device = getattr(self.adapter, "device_ms", None)
-        return taken if device is None else taken | {"device_ms": device(self.rendered)}
+        return times if device is None else times | {"device_ms": device(self.rendered)}
 
     def image(self, file: str) -> dict:
         """Write the images of the latest frame (v, h, w, 3); returns the renderer's memory in bytes."""

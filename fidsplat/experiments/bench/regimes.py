@@ -61,9 +61,9 @@ class Views:
         arrays = {name: getattr(cloud, name) for name in ARRAYS}
         arrays["means"] = cloud.means + cloud.origin.astype(np.float32)
         arrays["scales"] = all_scales(cloud)
-        given = {name: array for name, array in arrays.items() if array is not None}
+        present = {name: array for name, array in arrays.items() if array is not None}
         size = (camera.width, camera.height)
-        np.savez(file, poses=self.poses, matrix=camera.matrix, size=size, near=camera.near, **given)
+        np.savez(file, poses=self.poses, matrix=camera.matrix, size=size, near=camera.near, **present)
         return file
 
 
@@ -91,8 +91,8 @@ def _single(cloud: SplatCloud, camera: Camera, scene: Scene | None = None) -> Vi
 
 def _changed(cloud: SplatCloud, **arrays: np.ndarray) -> SplatCloud:
     """The cloud with some arrays replaced."""
-    given = {name: getattr(cloud, name) for name in ("means", "quats", "opacities", "colors")}
-    return SplatCloud(**{**given, "scales": all_scales(cloud), **arrays})
+    columns = {name: getattr(cloud, name) for name in ("means", "quats", "opacities", "colors")}
+    return SplatCloud(**{**columns, "scales": all_scales(cloud), **arrays})
 
 
 def huge(thick: bool) -> Views:
@@ -147,8 +147,8 @@ def tags(boxes: bool) -> Views:
     quality, placed = MarkerQuality("exact" if boxes else "fitted"), []
     for number in range(24):
         row, column = divmod(number, 6)
-        tilt, turn = math.radians(60.0 * row / 3), 2 * math.pi * column / 6
-        axis = np.array([math.cos(turn), math.sin(turn), 0.0]) * math.sin(tilt / 2)
+        tilt, azimuth = math.radians(60.0 * row / 3), 2 * math.pi * column / 6
+        axis = np.array([math.cos(azimuth), math.sin(azimuth), 0.0]) * math.sin(tilt / 2)
         place = ((column - 2.5) * 0.3, (row - 1.5) * 0.3, 1.6 + 0.1 * (number % 3))
         pose = rigid_matrix(place, (math.cos(tilt / 2), *axis))
         placed.append(PlacedMarker(marker(f"apriltag:36h11:{number}", size=0.16, quality=quality), pose))
@@ -165,9 +165,9 @@ def captured(name: str, width: int, height: int, frames: int = 1) -> Views:
     assert colors is not None
     cloud = _changed(cloud, means=means, colors=np.maximum(colors, 0))
     middle = np.median(means, 0)
-    reach = 1.2 * np.percentile(np.linalg.norm(means - middle, axis=1), 95)
+    radius = 1.2 * np.percentile(np.linalg.norm(means - middle, axis=1), 95)
     angles = 0.68 + np.linspace(0, 2 * math.pi, frames, endpoint=False)
-    eyes = [middle + reach * np.array([0.95 * math.sin(a), -0.3, -0.95 * math.cos(a)]) for a in angles]
+    eyes = [middle + radius * np.array([0.95 * math.sin(a), -0.3, -0.95 * math.cos(a)]) for a in angles]
     camera = Camera.look_at(width, height, 1.0, eyes[0], middle)
     return Views(cloud, camera, np.stack([look_at_matrix(eye, middle) for eye in eyes]))
 
@@ -219,22 +219,22 @@ def _series() -> dict[str, SuiteScene]:
     splats (overdraw).
     """
     million = 1_000_000
-    found: dict[str, SuiteScene] = {}
+    scenes: dict[str, SuiteScene] = {}
     for count in (10_000, 30_000, 100_000, 300_000, million, 3 * million, 10 * million):
         make = partial(scaled, count, 0.012 * math.sqrt(million / count), 1280, 720)
-        found[f"splats@{count}"] = SuiteScene(
+        scenes[f"splats@{count}"] = SuiteScene(
             "scaling", f"{count:,} disks of the same covered area", make, large=count > million, x=count
         )
     for height in (180, 360, 720, 1440, 2160):
         pixels = height * height * 16 // 9
         make = partial(scaled, _COUNT, _SCALE, height * 16 // 9, height)
         about = f"{_COUNT:,} disks, {height} rows"
-        found[f"pixels@{pixels}"] = SuiteScene("scaling", about, make, large=height > 1440, x=pixels)
+        scenes[f"pixels@{pixels}"] = SuiteScene("scaling", about, make, large=height > 1440, x=pixels)
     for factor in (0.5, 1.0, 2.0, 4.0, 8.0):
         make = partial(scaled, 30_000, _SCALE * factor, 1280, 720)
         about = f"30,000 disks, {factor:g} times the size"
-        found[f"size@{factor:g}"] = SuiteScene("scaling", about, make, large=factor > 4, x=factor)
-    return found
+        scenes[f"size@{factor:g}"] = SuiteScene("scaling", about, make, large=factor > 4, x=factor)
+    return scenes
 
 
 SUITE: dict[str, SuiteScene] = {

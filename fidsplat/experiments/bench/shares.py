@@ -46,12 +46,12 @@ def without_effects(scene: Scene, capture: Capture) -> dict[str, Reduced]:
         "background": replace(capture, background=(0.0, 0.0, 0.0)),
     }
     features = select(cloud, capture)
-    found = {name: Reduced(less) for name, less in reduced.items() if select(cloud, less) != features}
+    variants = {name: Reduced(less) for name, less in reduced.items() if select(cloud, less) != features}
     if scene.markers and (scene.clouds or scene.stores):
         rest = replace(scene, markers=())
         motion = Motion(capture.motion.camera, rest.motion.groups)
-        found["markers"] = Reduced(replace(capture, motion=motion), rest)
-    return found
+        variants["markers"] = Reduced(replace(capture, motion=motion), rest)
+    return variants
 
 
 def middle_camera(capture: Capture) -> Camera:

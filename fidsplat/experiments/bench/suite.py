@@ -123,18 +123,18 @@ class RendererProcess:
     ) -> dict[str, float]:
         """Render a submission after untimed submissions `before`; the clock advances by its time.
         Returns `ms`, `cpu_ms`, and if known `device_ms`."""
-        taken = self.ask("frame", setting=setting, views=views, before=before)
-        self.clock.seconds += taken["ms"] / 1e3
-        return taken
+        answer = self.ask("frame", setting=setting, views=views, before=before)
+        self.clock.seconds += answer["ms"] / 1e3
+        return answer
 
     def _answer(self) -> dict[str, Any]:
         line = next(self._answers, None)
         if line is None:
             raise AdapterError(f"the process ended with status {self._process.wait()}")
-        found = from_json(line)
-        if "error" in found:
-            raise AdapterError(found["error"])
-        return found
+        answer = from_json(line)
+        if "error" in answer:
+            raise AdapterError(answer["error"])
+        return answer
 
     def close(self) -> None:
         assert self._process.stdin is not None
@@ -166,12 +166,12 @@ def other_renderers(folder: Path) -> dict[str, Opener]:
     files = sorted(folder.glob("*/adapter.py"))
     if not files:
         raise InputError(f"--adapters must be a folder with NAME/adapter.py, got {folder}")
-    found = {}
+    renderers = {}
     for file in files:
-        own = file.parent / ".venv" / "bin" / "python"
-        python = str(own) if own.is_file() else sys.executable
-        found[file.parent.name] = partial(RendererProcess, file.parent.name, file, python=python)
-    return found
+        interpreter = file.parent / ".venv" / "bin" / "python"
+        python = str(interpreter) if interpreter.is_file() else sys.executable
+        renderers[file.parent.name] = partial(RendererProcess, file.parent.name, file, python=python)
+    return renderers
 
 
 class Measurement:
@@ -192,10 +192,10 @@ class Measurement:
         # preceded by earlier views of a flight, so that the camera is new to the renderer, as in a flight
         before = [self.submissions[number - k] for k in range(min(8, len(self.submissions) - 1), 0, -1)]
         views = self.submissions[number]
-        taken = self.process.frame(
+        answer = self.process.frame(
             self.setting, views, (before or [views]) if self.second_ms < SHORT else None
         )
-        return {name: ms for name, ms in taken.items() if name != "ms"}
+        return {name: ms for name, ms in answer.items() if name != "ms"}
 
     def first(self, references: References, claim: Mapping[str, Any], file: Path) -> np.ndarray:
         """Render the first frames; adds times and errors to `result`, returns the first image (h, w, 3).
@@ -206,9 +206,9 @@ class Measurement:
 
         Raises AdapterError.
         """
-        taken, images, memory = [], [], {}
+        milliseconds, images, memory = [], [], {}
         for view in references.chosen:
-            taken.append(self.process.frame(self.setting, [view])["ms"])
+            milliseconds.append(self.process.frame(self.setting, [view])["ms"])
             memory = self.process.ask("image", file=str(file))
             images.append(np.load(file)[0])
         self.second_ms = self.timer.run()
@@ -218,7 +218,7 @@ class Measurement:
         if not np.isfinite(off).all():
             raise AdapterError(f"{self.setting}: the image has values that are not finite")
         self.result |= {
-            "first_frame_ms": taken[0],
+            "first_frame_ms": milliseconds[0],
             **memory,
             "largest_error": float(off.max()),
             "mean_error": float(off.mean()),
@@ -384,21 +384,21 @@ class Suite:
         chosen = np.unique(np.linspace(0, count - 1, compared).astype(int)).tolist()
         references = References(self._reference, views, chosen)
         submissions = [list(range(count))] if scene.batch else [[view] for view in range(count)]
-        found: list[Measurement] = []
+        measurements: list[Measurement] = []
         with tempfile.TemporaryDirectory() as folder:
             file = views.save(Path(folder) / "scene.npz")
             for renderer in missing:
                 report(f"first frames of {renderer}")
                 try:
-                    found += self._first_frames(name, renderer, views, references, file, submissions)
+                    measurements += self._first_frames(name, renderer, views, references, file, submissions)
                 except AdapterError as error:
                     self._failed(renderer)
                     self._add(name, [renderer], {"error": str(error)})
         report("interleaved frames")
         effort = self._effort
         seconds = effort.seconds * (0.5 if scene.x is not None else 1.0)
-        fast = [one for one in found if one.second_ms <= effort.fast]
-        slow = [one for one in found if one.second_ms > effort.fast]
+        fast = [one for one in measurements if one.second_ms <= effort.fast]
+        slow = [one for one in measurements if one.second_ms > effort.fast]
         for one in fast:  # discard the first frame, which had no warm-up
             one.timer.ms.clear()
             one.timer.parts.clear()
@@ -412,7 +412,7 @@ class Suite:
                 tick=interrupts.check,
             )
         metered: set[str] = set()
-        for one in found:
+        for one in measurements:
             # energy is measured for the first setting of each renderer
             first = one.process.name not in metered and scene.x is None
             metered.add(one.process.name)
@@ -433,7 +433,7 @@ class Suite:
         submissions: list[list[int]],
     ) -> list[Measurement]:
         """Load a scene and render the first frames of each setting. Raises AdapterError."""
-        process, found = self._process(renderer), []
+        process, times = self._process(renderer), []
         settings = {key: claims for key, claims in process.settings.items() if views.kind in claims}
         reason = process.skipped or ("" if settings else f"does not render {views.kind}")
         if reason:
@@ -451,10 +451,10 @@ class Suite:
                 reason = f"a frame takes {one.second_ms / 1e3:.3g} s, more than {TOO_SLOW / 1e3:g} s"
                 self._add(name, [renderer], {"setting": setting, "skipped": reason})
             else:
-                found.append(one)
+                times.append(one)
             if one.second_ms > self._effort.slow or self._scenes[name].x is not None:
                 break
-        return found
+        return times
 
     def _failed(self, renderer: str) -> None:
         """End the process of a renderer that failed; the next scene starts a new one."""

@@ -150,21 +150,21 @@ def points(
         every_value: vary each setting; False: only presets and marker qualities.
     """
     settings = tuple(settings)
-    found = [BASE_POINT]
+    chosen = [BASE_POINT]
     if PRESET in settings:
         # surfel has the same constants as gsplat
-        found += [Point(PRESET, name, preset(name)) for name in PRESETS if name != "surfel"]
+        chosen += [Point(PRESET, name, preset(name)) for name in PRESETS if name != "surfel"]
     if ABLATION in settings and not on_marker:
-        found.append(Point(ABLATION, "exact", EXACT))
-        found += map(ablation, _ABLATIONS[:6] if quick else _ABLATIONS)
+        chosen.append(Point(ABLATION, "exact", EXACT))
+        chosen += map(ablation, _ABLATIONS[:6] if quick else _ABLATIONS)
     if MARKER in settings and on_marker:
-        found += _marker_points(quick)
+        chosen += _marker_points(quick)
     for setting, values in (_QUICK_VALUES if quick else _VALUES).items():
         if every_value and setting in settings and setting != "ellipsoid":
-            found += [_variation(setting, value) for value in values]
+            chosen += [_variation(setting, value) for value in values]
     if COMBINED in settings and not on_marker:
-        found += _combinations(quick)
-    return list({(point.setting, point.value): point for point in found}.values())
+        chosen += _combinations(quick)
+    return list({(point.setting, point.value): point for point in chosen}.values())
 
 
 def ellipsoid_points(settings: Iterable[str]) -> list[Point]:

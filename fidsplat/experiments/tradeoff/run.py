@@ -124,7 +124,7 @@ def all_points(names: tuple[str, ...], settings: tuple[str, ...], quick: bool) -
         InputError: an unknown scene or setting.
     """
     settings = points.setting_names(settings)
-    found: list[tuple[int, Key]] = []
+    ordered: list[tuple[int, Key]] = []
     for name in scenes.scene_names(names, quick):
         on_marker = scenes.is_marker(name)
         every_value = name not in scenes.FEW_SETTINGS and not (on_marker and quick)
@@ -134,8 +134,8 @@ def all_points(names: tuple[str, ...], settings: tuple[str, ...], quick: bool) -
         if name == "r1m_1080p":  # 18 million samples take minutes on a CPU; the smaller scene suffices
             varied = [point for point in varied if point.quality.samples <= 2]
         for view in scenes.views_of(name):
-            found += _view_points(view, varied, quick)
-    return _by_priority(found)
+            ordered += _view_points(view, varied, quick)
+    return _by_priority(ordered)
 
 
 def own_points(views: Iterable[str], settings: tuple[str, ...], quick: bool) -> list[Key]:

@@ -106,7 +106,7 @@ def time_point(session: Session, view: str, quality: Quality, effort: Effort) ->
     begun = time.perf_counter()
     frame = session.render(view, quality).wait()
     slow = effort is QUICK and time.perf_counter() - begun > SLOW
-    own, base = (
+    timer, base = (
         frame_timer(
             session.renderer,
             session.resident(view, timed.marker),
@@ -116,14 +116,14 @@ def time_point(session: Session, view: str, quality: Quality, effort: Effort) ->
         for timed in (quality, BASE)
     )
     time_interleaved(
-        [own, base],
+        [timer, base],
         effort.maximum,
         min_rounds=1 if slow else effort.minimum,
         seconds=effort.seconds,
         warm_up=1,
     )
-    result: dict = {"repeats": len(own.ms)}
-    for name, values in (("ms", own.ms), ("base_ms", base.ms), ("ratio", ratios(own, base))):
+    result: dict = {"repeats": len(timer.ms)}
+    for name, values in (("ms", timer.ms), ("base_ms", base.ms), ("ratio", ratios(timer, base))):
         low, result[name], high = quartiles(values)
         result[f"{name.removesuffix('_ms')}_quartiles"] = [low, high]
     return frame, result | {name: frame.stats[name] for name in ("splats", "pairs")}
@@ -141,11 +141,11 @@ def compare_image(image: np.ndarray, reference: np.ndarray, scene: TradeScene, q
     Returns `maximum`, `rmse`, `maximum_sure` (`beyond_certificates`), and for markers the result of
     `compare_marker`.
     """
-    found = errors(image, reference)
+    differences = errors(image, reference)
     difference = np.abs(image - reference).max(-1)
     result = {
-        "maximum": found.maximum,
-        "rmse": found.rmse,
+        "maximum": differences.maximum,
+        "rmse": differences.rmse,
         "maximum_sure": beyond_certificates(difference, scene, quality),
     }
     return result if scene.marker is None else result | compare_marker(image, scene)

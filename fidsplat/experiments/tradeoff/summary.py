@@ -29,20 +29,20 @@ TILT = 60
 
 def rows_of(record: Record) -> Iterator[dict[str, Any]]:
     """Rows of a record; none for markers at tilts other than `TILT`."""
-    key, found = record.key, record.result
+    key, result = record.key, record.result
     if is_marker(key["scene"]) and not key["scene"].endswith(f"@{TILT}"):
         return
     row: dict[str, Any] = {name: key.get(name) for name in KEYS}
     row["amount"] = 0 if record.failed else 1 if key.get("quick") else 2
     if record.failed:
-        row["error"] = found["error"]
+        row["error"] = result["error"]
     else:
-        low, high = found["ratio_quartiles"]
-        row |= {name: found[name] for name in COLUMNS if name in found}
-        row |= {"ratio_low": low, "ratio_high": high, "beyond": found["maximum_sure"]}
+        low, high = result["ratio_quartiles"]
+        row |= {name: result[name] for name in COLUMNS if name in result}
+        row |= {"ratio_low": low, "ratio_high": high, "beyond": result["maximum_sure"]}
         row["quality"] = quality_text(key["quality"])
-        if "rectangles" in found:
-            row["per_rectangle"] = found["splats"] / found["rectangles"]
+        if "rectangles" in result:
+            row["per_rectangle"] = result["splats"] / result["rectangles"]
     yield row
 
 
@@ -104,18 +104,18 @@ class DeviceResults:
 
         `ms` is the ratio of the time to the base's, times the median time of the base.
         """
-        found: Frame = self.points[self.points["scene"] == scene]
-        order = found["knob"].map(list(("base", *SETTINGS)).index)
-        found = found.iloc[order.argsort(kind="stable")]
-        return found.assign(ms=self.base_ms(scene) * found["ratio"])
+        rows: Frame = self.points[self.points["scene"] == scene]
+        order = rows["knob"].map(list(("base", *SETTINGS)).index)
+        rows = rows.iloc[order.argsort(kind="stable")]
+        return rows.assign(ms=self.base_ms(scene) * rows["ratio"])
 
     def same_definition(self, scene: str) -> Frame:
         """Rows with the low-pass, samples and order of the base setting, whose errors are comparable."""
-        found = self.of(scene)
+        rows = self.of(scene)
         # gsplat's stop requires the order of centres, which equals the base's without coplanar groups
-        constants = found["quality"].str.replace("order=centre ", "")
-        changed = found["quality"].where(found["knob"] == "order", constants).str.split(r"[ =]")
-        return found[[not set(DEFINITION) & set(words) for words in changed]]
+        constants = rows["quality"].str.replace("order=centre ", "")
+        changed = rows["quality"].where(rows["knob"] == "order", constants).str.split(r"[ =]")
+        return rows[[not set(DEFINITION) & set(words) for words in changed]]
 
     def base_ms(self, scene: str) -> float:
         """Median time of the base in milliseconds."""
