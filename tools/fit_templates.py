@@ -30,7 +30,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from fidsplat.markers import marker
-from fidsplat.markers.mixture import in_pieces
+from fidsplat.markers.mixture import split_rectangles
 from fidsplat.markers.partition import partition
 from fidsplat.markers.printing import grow
 from fidsplat.util.files import atomic_write
@@ -174,7 +174,7 @@ class Layout:
         grown = grow(self.grid, boxes, GROWTH)
         w, h = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
         limits = [limit for limit, _ in CLASSES]
-        pieces, aspect, source = in_pieces(grown, w / h, limits[-1])
+        pieces, aspect, source = split_rectangles(grown, w / h, limits[-1])
         kind = np.searchsorted(limits, np.maximum(aspect, 1 / aspect) - 1e-9)
         first = np.array(self.model.first)
         n = np.diff(first)[kind]

@@ -160,9 +160,9 @@ class Bench:
         names = tuple(dict.fromkeys(self.device)) or tuple(usable)
         large = any(Renderer(name).device.kind == "gpu" for name in names)
         scenes = suite_scenes(self.scenes, self.quick, large)
-        renderers = suite.own_renderers(names)
+        renderers = suite.fidsplat_renderers(names)
         if self.adapters is not None:
-            renderers |= suite.other_renderers(self.adapters)
+            renderers |= suite.adapter_renderers(self.adapters)
         file = writable_file(self.json or f"fidsplat-suite{'-quick' if self.quick else ''}.json")
         command = " ".join(["fidsplat", *sys.argv[1:]])
         measuring = suite.Suite(

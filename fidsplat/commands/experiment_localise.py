@@ -23,9 +23,9 @@ class Localise:
     MuJoCo drives the robot up one aisle and down the next; an error-state filter fuses wheels, gyroscope,
     tags and matches of LiDAR scans from logs of ROS 2 messages (MCAP). Variants: odometry only, ideal
     corners, an ideal texture, mixtures of the markers, lens, blur, rolling shutter, noise, speeds, the
-    largest distance of tags, and a LiDAR with each sensor left out. Results: absolute and relative trajectory
-    errors, corner errors by distance, logs, trajectories as TUM for evo, a page. An interrupted run resumes.
-    Needs the extras `sim` and `logs`.
+    largest distance of tags, and a LiDAR without each sensor in turn. Results: absolute and relative
+    trajectory errors, corner errors by distance, logs, trajectories as TUM for evo, a page. An interrupted
+    run resumes. Needs the extras `sim` and `logs`.
 
     Examples:
       fidsplat experiment localise --quick
@@ -38,7 +38,7 @@ class Localise:
     quick: bool = False
     """measure one row of four plants and the first three variants"""
     sensors: bool = False
-    """measure with a LiDAR and each sensor left out"""
+    """measure with a LiDAR, and without each sensor in turn"""
     drive: Drive = field(default_factory=Drive)
     variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME: variant to measure, repeat for several (default: all)"""

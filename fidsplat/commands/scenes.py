@@ -91,7 +91,7 @@ def load_user_scenes(
     Raises:
         InputError: --scene and --scenes, --cameras without --scene, or an unreadable file.
     """
-    from fidsplat.experiments.bench.catalogue import MOST_VIEWS, own_scenes
+    from fidsplat.experiments.bench.catalogue import MOST_VIEWS, user_scenes
     from fidsplat.formats import load_trajectory
     from fidsplat.scenes.sources import load_source
 
@@ -105,5 +105,5 @@ def load_user_scenes(
     scenes: dict[str, BenchScene] = {}
     for name in files:
         with delayed_progress() as progress:
-            scenes |= own_scenes(name, load_source(name, None, progress), path, most_views or MOST_VIEWS)
+            scenes |= user_scenes(name, load_source(name, None, progress), path, most_views or MOST_VIEWS)
     return scenes

@@ -31,7 +31,7 @@ COUNTS = (3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 DRAWS = 15
 """random subsets of views for each number of views"""
 TARGET = 0.1
-"""error of the projection in pixels to which `needed` refers"""
+"""maximum error of the projection in pixels for `needed`"""
 TILT = 45.0
 """largest tilt of the board in degrees"""
 SHARE = 0.45, 0.9
@@ -100,7 +100,7 @@ class CalibrationSettings:
         return self.truth.with_pose(looking.world_to_camera)
 
 
-class Found(NamedTuple):
+class DetectedBoard(NamedTuple):
     """A detected board with the errors of its corners."""
 
     view: BoardView
@@ -108,7 +108,7 @@ class Found(NamedTuple):
     """(n, 2) pixels, detected minus true corners"""
 
 
-def rendered_views(settings: CalibrationSettings, renderer: Renderer) -> Iterator[Found | None]:
+def rendered_views(settings: CalibrationSettings, renderer: Renderer) -> Iterator[DetectedBoard | None]:
     """Render views of the board and detect its corners; yields None if too few corners are found."""
     rng, scene = np.random.default_rng(settings.seed), Scene(markers=(PlacedMarker(settings.made),))
     resident = renderer.upload(scene)
@@ -121,7 +121,7 @@ def rendered_views(settings: CalibrationSettings, renderer: Renderer) -> Iterato
             yield None
             continue
         points = settings.made.corners[0] + np.pad(view.points, ((0, 0), (0, 1)))
-        yield Found(view, view.corners - camera.project(points))
+        yield DetectedBoard(view, view.corners - camera.project(points))
 
 
 def errors_by_count(settings: CalibrationSettings, views: list[BoardView]) -> Iterator[dict[str, Any]]:

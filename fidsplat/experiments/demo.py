@@ -29,7 +29,7 @@ from fidsplat.markers import marker
 from fidsplat.render.output_files import save_output
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import PlacedMarker, Scene
-from fidsplat.scenes.captured import captured_scenes, fetch_meanwhile, fetch_scene
+from fidsplat.scenes.captured import captured_scenes, fetch_in_background, fetch_scene
 from fidsplat.scenes.lights import Lighting
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util.files import writable_folder, write_json
@@ -118,7 +118,7 @@ def run_demo(
     begun = time.perf_counter()
     folder = writable_folder(out)
     name = "biker" if captured is None else captured
-    missing = fetch_meanwhile(name) if captured is None else None
+    missing = fetch_in_background(name) if captured is None else None
     if captured not in (None, "none"):
         progress(f"fetching the captured scene {captured}")
         fetch_scene(captured)  # before other work, since it may fail

@@ -14,7 +14,7 @@ from fidsplat.experiments.setup import CATEGORIES
 from fidsplat.markers import Marker, marker
 from fidsplat.util import interrupts
 from fidsplat.vision.pose import marker_pose, pose_error
-from fidsplat.vision.readback import corner_error, own_code
+from fidsplat.vision.readback import corner_error, detect_marker
 
 NAME = "localisation"
 LOCATED = ("apriltag", "small")
@@ -50,7 +50,7 @@ def measure_localisation(point: dict, markers: MarkerRenderer, seed: int, pool: 
 
 
 def _errors(plain: Marker, camera: Camera, image: np.ndarray) -> dict[str, float | None]:
-    code = own_code(plain, image)
+    code = detect_marker(plain, image)
     if code is None:
         return {"position_mm": None, "angle_deg": None, "corners_px": None}
     metres, radians = pose_error(marker_pose(code.corners, SIZE, camera), camera.world_to_camera)

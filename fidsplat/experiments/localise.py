@@ -109,9 +109,9 @@ VARIANTS = {
     "sparse tags, no wheels": Variant(lidar=True, without="wheels", spacing=3.0),
 }
 """variants by name: odometry only, ideal corners, mixtures, effects, speeds and tag distances of `exact`, and
-a LiDAR with each sensor left out"""
+a LiDAR without each sensor in turn"""
 SENSORS = "odometry", *(name for name, variant in VARIANTS.items() if variant.lidar)
-"""variants with each sensor left out"""
+"""variants that omit each sensor in turn"""
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ class Drive:
             variant: its maximum distance and spacing of tags, and the ignored sensor.
         """
         variant = variant or Variant()
-        without, tags = variant.without, self._spaced(variant.spacing)
+        without, tags = variant.without, self._tags_with_spacing(variant.spacing)
         first = run.poses[0]
         localiser = Localiser(
             np.array([*first[:2, 3], math.atan2(first[1, 0], first[0, 0])]),
@@ -265,7 +265,7 @@ class Drive:
         facts |= {"tags": used, "scans": matched, "refused": localiser.rejected}
         return Trajectory(run.times, np.array(poses)), facts
 
-    def _spaced(self, spacing: float) -> set[int]:
+    def _tags_with_spacing(self, spacing: float) -> set[int]:
         """Ids of tags with at least this distance from each other on each side of a bench."""
         ids, last = set(), {}
         for number, tag in sorted(self.tags.items(), key=lambda each: each[1].pose[0, 3]):

@@ -27,7 +27,7 @@ from fidsplat.util.provenance import digest_of, run_facts
 from fidsplat.worlds.robot import Run
 
 RESULTS, REPORT, CHART = "localise.jsonl", "localise.md", "localise.svg"
-Found = Mapping[str, Mapping[str, Any]]
+VariantResults = Mapping[str, Mapping[str, Any]]
 """results by variant"""
 _PLOTTED = ("odometry", "paper", "exact", "no tags", "no wheels")
 """variants with a plotted trajectory"""
@@ -114,7 +114,7 @@ def found_of(results: Results) -> dict[str, dict[str, Any]]:
     return {record.key["variant"]: record.result for record in results.done.values()}
 
 
-def table_of(found: Found) -> Frame:
+def table_of(found: VariantResults) -> Frame:
     """Table with a row per variant: errors in centimetres, degrees and pixels, and numbers of tags."""
     no_corners = [{"median_px": None}] * len(_SPANS)
     return pd.DataFrame(
@@ -136,7 +136,7 @@ def table_of(found: Found) -> Frame:
     )
 
 
-def write_report(folder: Path, drive: Drive, device: str, found: Found) -> Path:
+def write_report(folder: Path, drive: Drive, device: str, found: VariantResults) -> Path:
     _write_chart(folder, found)
     context = {
         "length": next(iter(found.values()))["length_m"],
@@ -150,7 +150,7 @@ def write_report(folder: Path, drive: Drive, device: str, found: Found) -> Path:
     return folder / REPORT
 
 
-def _write_chart(folder: Path, found: Found) -> None:
+def _write_chart(folder: Path, found: VariantResults) -> None:
     """Write a chart of true and estimated trajectories, and of the errors of all variants."""
     errors = {name: 100 * facts["ate_m"] for name, facts in found.items()}
     shown = [name for name in _PLOTTED if name in errors]

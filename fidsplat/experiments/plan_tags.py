@@ -220,7 +220,7 @@ class Survey:
         count = settings.poses if len(path) > 1 else 1
         times = np.linspace(float(path.times[0]), float(path.times[-1]), count)
         self.cameras = [camera.with_pose(camera_to_world=path(float(time))) for time in times]
-        self._exposed = _exposed(scene, camera, path, times)
+        self._exposure_cameras = _exposure_cameras(scene, camera, path, times)
         self._depths = []
         for k, frame in enumerate(_depth_frames(scene, self.cameras, renderer)):
             self._depths.append(frame["depth_first"])
@@ -238,12 +238,12 @@ class Survey:
         settings, candidates = self._settings, []
         every = range(0, len(self.cameras), max(1, -(-len(self.cameras) // settings.views)))
         for n, k in enumerate(every):
-            surfaces = surface_candidates(self._depths[k], _smaller(self.cameras[k]), self.tag, self.up)
+            surfaces = surface_candidates(self._depths[k], _depth_camera(self.cameras[k]), self.tag, self.up)
             candidates += [
                 one for one in surfaces if not settings.walls or abs(one[0].normal @ self.up) < STEEP
             ]
             self.report("searching surfaces", 0.3 + 0.4 * (n + 1) / len(every))
-        poses = spread_out(candidates, self.tag)
+        poses = suppress_nearby(candidates, self.tag)
         for one in self._scene.markers:  # markers are flat surfaces too
             distances = np.linalg.norm(poses[:, :3, 3] - one.pose[:3, 3], axis=1)
             poses = poses[distances > self.tag.radius + one.marker.radius]
@@ -269,7 +269,7 @@ class Survey:
     def sightings(self, tags: Sequence[PlacedMarker]) -> list[Sightings]:
         """Images in which each tag is readable."""
         noise = corner_noise(self._scene.sensor or Sensor(), self._settings.corner_noise)
-        sightings = sightings_of(tags, self.cameras, self._depths, noise, self._exposed)
+        sightings = sightings_of(tags, self.cameras, self._depths, noise, self._exposure_cameras)
         if not self._settings.planar:
             return sightings
         return [
@@ -317,7 +317,7 @@ def surface_candidates(
     return candidates
 
 
-def spread_out(found: Sequence[tuple[Surface, np.ndarray]], tag: Marker) -> np.ndarray:
+def suppress_nearby(found: Sequence[tuple[Surface, np.ndarray]], tag: Marker) -> np.ndarray:
     """Poses (n, 4, 4) of candidates; of nearby ones only that with the largest inlier share remains."""
     order = sorted(range(len(found)), key=lambda k: (-found[k][0].inlier_share, found[k][0].roughness))
     chosen: list[np.ndarray] = []
@@ -370,7 +370,7 @@ def sightings_of(
             inside = ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all((1, 2))
             edge = np.linalg.norm(np.roll(code, -1, axis=1) - code, axis=2).min(1)
         readable = np.flatnonzero(inside & (edge >= MODULE * sides[some]))
-        readable = readable[_unoccluded(camera, depth, samples[some[readable]])]
+        readable = readable[_visible(camera, depth, samples[some[readable]])]
         some = some[readable]
         if not len(some):
             continue
@@ -387,9 +387,9 @@ def sightings_of(
     ]
 
 
-def _unoccluded(camera: Camera, depth: np.ndarray, samples: np.ndarray) -> np.ndarray:
+def _visible(camera: Camera, depth: np.ndarray, samples: np.ndarray) -> np.ndarray:
     """Whether all samples (n, m, 3) of a tag are in front of the depth image, within the tolerance."""
-    image = _smaller(camera)
+    image = _depth_camera(camera)
     flat = samples.reshape(-1, 3)
     x, y = np.clip(image.project(flat).astype(int), 0, (image.width - 1, image.height - 1)).T
     measured = depth[y, x]
@@ -406,7 +406,7 @@ def _camera(scene: Scene) -> Camera:
     return scene.camera
 
 
-def _smaller(camera: Camera) -> Camera:
+def _depth_camera(camera: Camera) -> Camera:
     """The camera of the depth images, at most `WIDEST` pixels wide."""
     if camera.width <= WIDEST:
         return camera
@@ -415,11 +415,11 @@ def _smaller(camera: Camera) -> Camera:
 
 def _depth_frames(scene: Scene, cameras: Sequence[Camera], renderer: Renderer):
     still = median_depth_capture(scene.capture)
-    captures = [replace(still, camera=_smaller(camera)) for camera in cameras]
+    captures = [replace(still, camera=_depth_camera(camera)) for camera in cameras]
     return renderer.render_views(renderer.upload(scene), captures)
 
 
-def _exposed(
+def _exposure_cameras(
     scene: Scene, camera: Camera, path: Trajectory, times: np.ndarray
 ) -> list[tuple[Camera, Camera]] | None:
     half = 0.0 if scene.shutter is None else scene.shutter.exposure_time / 2

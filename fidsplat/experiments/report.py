@@ -259,7 +259,7 @@ ANGLES = {
     "large": {"ours": (82.0, 81.8), 3: (77.8, 58.0), 5: (80.0, 67.2), 9: (82.0, 77.8), 17: (82.2, 76.6)},
     "huge": {"ours": (84.0, 82.2), 3: (77.8, 56.8), 5: (79.4, 65.4), 9: (82.2, 72.0), 17: (82.6, 75.4)},
 }
-"""table 3: degrees up to which a code is detected and decoded; the table has no AprilTags"""
+"""table 3: largest tilt in degrees at which a code is detected, and decoded; the table has no AprilTags"""
 
 VIEWS = {
     "apriltag": {

@@ -39,7 +39,7 @@ _COVER = 0.16, 0.3, 0.09
 """colour of an object in front of the marker"""
 
 
-class Place(NamedTuple):
+class MarkerSite(NamedTuple):
     """Captured scene with the position of its marker, in front of the figure and facing -z; y points down."""
 
     position: tuple[float, float, float]
@@ -50,8 +50,8 @@ class Place(NamedTuple):
 
 GREENHOUSE = "greenhouse"
 CAPTURED = {
-    "biker": Place((-0.1, -1.6, -0.75), 0.3, (0.72, 0.74, 0.76)),
-    "playbot": Place((0.0, -0.45, -0.75), 0.15, (0.16, 0.17, 0.2)),
+    "biker": MarkerSite((-0.1, -1.6, -0.75), 0.3, (0.72, 0.74, 0.76)),
+    "playbot": MarkerSite((0.0, -0.45, -0.75), 0.15, (0.16, 0.17, 0.2)),
 }
 """captured scenes by name"""
 SCENES = (GREENHOUSE, *CAPTURED)

@@ -150,7 +150,7 @@ def detectors_of(
         name: partial(attempt, name) for name in readers(kind, dictionary or None)
     }
     detectors[OWN] = partial(
-        attempt_by,
+        attempt_with,
         lambda grey: [
             (one.name, one.corners) for one in detect(grey, (family,) if dictionary else (), not dictionary)
         ],
@@ -160,7 +160,7 @@ def detectors_of(
     every = {OWN, *TITLES}
     for name in names:
         if ":" in name:
-            detectors[name] = partial(attempt_by, own_detector(name))
+            detectors[name] = partial(attempt_with, load_detector(name))
         elif name in missing_readers():
             package = missing_readers()[name]
             raise InputError(f"the detector {name} requires {package}; pip install {package}")
@@ -169,7 +169,7 @@ def detectors_of(
     return {name: detectors[name] for name in names if name in detectors}
 
 
-def own_detector(text: str) -> Detector:
+def load_detector(text: str) -> Detector:
     """Import the function module:function from the path or the working folder. It maps (h, w) uint8 to pairs
     of spec and corners (4, 2) of each detected code. Raises InputError if it cannot be imported."""
     module, _, name = text.partition(":")
@@ -196,7 +196,7 @@ def own_detector(text: str) -> Detector:
     return checked
 
 
-def attempt_by(function: Detector, grey: np.ndarray, target: Target) -> Attempt:
+def attempt_with(function: Detector, grey: np.ndarray, target: Target) -> Attempt:
     """Attempt of a detector that returns pairs of spec and corners."""
     expected = target.payload if target.id is None else target.id
     spec = f"{target.kind}:{expected if target.id is None else f'{target.family}:{expected}'}"

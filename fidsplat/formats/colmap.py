@@ -193,7 +193,7 @@ def _read(folder: Path, name: str, binary, text, needed: bool = True) -> list:
 def _read_file(file: Path, binary, text) -> list:
     try:
         if file.suffix.lower() == ".bin":
-            return list(binary(_Bytes(read_input(file))))
+            return list(binary(_BinaryReader(read_input(file))))
         lines = read_text(file).splitlines()
         return list(text([line.strip() for line in lines if not line.lstrip().startswith("#")]))
     except InputError:
@@ -202,7 +202,7 @@ def _read_file(file: Path, binary, text) -> list:
         raise InputError(f"cannot read {file} as COLMAP: {error}; export the model again") from error
 
 
-class _Bytes:
+class _BinaryReader:
     """Sequential reader of a binary file."""
 
     def __init__(self, data: bytes) -> None:
@@ -238,7 +238,7 @@ _Intrinsics = tuple[str, int, int, tuple[float, ...]]
 _View = tuple[str, int, tuple[float, ...]]
 
 
-def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, _Intrinsics]]:
+def _binary_cameras(data: _BinaryReader) -> Iterator[tuple[int, _Intrinsics]]:
     for _ in range(data.count()):
         number, model, width, height = data.take("iiQQ")
         if model not in _MODELS:
@@ -258,7 +258,7 @@ def _text_cameras(lines: list[str]) -> Iterator[tuple[int, _Intrinsics]]:
         yield int(number), (model, int(width), int(height), tuple(map(float, parameters)))
 
 
-def _binary_images(data: _Bytes) -> Iterator[_View]:
+def _binary_images(data: _BinaryReader) -> Iterator[_View]:
     for _ in range(data.count()):
         _, *pose, camera = data.take("i7di")
         name = data.word()
@@ -276,7 +276,7 @@ def _text_images(lines: list[str]) -> Iterator[_View]:
             yield words[9], int(words[8]), tuple(map(float, words[1:8]))
 
 
-def _binary_points(data: _Bytes) -> Iterator[tuple]:
+def _binary_points(data: _BinaryReader) -> Iterator[tuple]:
     for _ in range(data.count()):
         _, *values, _ = data.take("Q3d3Bd")
         data.skip(8 * data.count())  # track

@@ -76,7 +76,7 @@ class Header:
     elements: dict[str, Element]
     comments: tuple[str, ...]
     text: bool = False
-    """whether rows are text; the offset of all elements is then that of the first"""
+    """whether rows are text; the offset of all elements is then the offset of the first one"""
 
     def rows(self, name: str, first: int, end: int) -> np.ndarray:
         """Rows [first, end) of an element as a read-only structured array, memory-mapped for binary files.

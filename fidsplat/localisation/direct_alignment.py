@@ -364,7 +364,7 @@ def _solved(sums: AlignmentSums, damping: float) -> np.ndarray:
 
 
 def _right(sums: AlignmentSums) -> np.ndarray:
-    """The score (6 + 2 c,): right side of the normal equations."""
+    """Right side (6 + 2 c,) of the normal equations: the gradient of the log-likelihood."""
     right = np.zeros(6 + 2 * len(sums.matrix))
     for channel, column in enumerate(sums.rhs[:, :, 0]):
         right[_parameters(channel)] += column

@@ -96,7 +96,7 @@ class HostAlignment(AlignmentKernels):
         )
 
     def _features(self, target: _Target, frame: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Values, slopes and inverse depths of a frame; those of the last frame are cached."""
+        """Values, slopes and inverse depths of a frame; cached for the last frame."""
         if not self._rendered or self._rendered[0] is not target or self._rendered[1] is not frame:
             image, rows = target.blurred(frame), target.rows
             features = _at(image, rows), _slopes(image, rows), _nearest(frame["depth"], rows)

@@ -42,8 +42,8 @@ def bag_metadata(folder: Path) -> dict[str, Any]:
 
 
 def log_messages(path: Path) -> Iterator[Message]:
-    """CDR messages of an MCAP file or a rosbag2 folder. Raises InputError for missing files and those that
-    expand to more than `input_limit`, and errors of the packages that decode."""
+    """CDR messages of an MCAP file or a rosbag2 folder. Raises InputError for missing files and for files
+    that expand to more than `input_limit`, and errors of the packages that decode."""
     if not path.is_dir():
         yield from _mcap_messages(path)
         return

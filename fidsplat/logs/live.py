@@ -43,7 +43,7 @@ class LiveLog(RobotLog):
         if not text("host", host):
             raise InputError("host must be an address, got ''; 127.0.0.1 is this machine only")
         self._path, self.port, self._topics = host, None, None
-        self._file = _Both()
+        self._file = _LogFiles()
         if ros2:
             self._topics = _ros2_topics(self._store, host)
             self._file.append(self._topics)
@@ -73,7 +73,7 @@ def _ros2_topics(store: Any, host: str) -> Any:
     return RclpyTopics(host)
 
 
-class _Both(list[LogFile]):
+class _LogFiles(list[LogFile]):
     """A `LogFile` that passes messages to several."""
 
     def write(self, topic: str, kind: str, time: int, data: bytes) -> None:

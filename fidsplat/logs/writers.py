@@ -106,7 +106,7 @@ def _target(path: str | os.PathLike[str], overwrite: bool) -> Path:
     return target
 
 
-class _Dropped(Exception):
+class _Discarded(Exception):
     """Exception that discards a log."""
 
 
@@ -131,9 +131,9 @@ class _McapFile:
         self._count += 1
 
     def close(self, keep: bool) -> None:
-        with suppress(_Dropped), self._file:
+        with suppress(_Discarded), self._file:
             if not keep:
-                raise _Dropped
+                raise _Discarded
             if self._source:
                 self._writer.add_metadata(_METADATA, {"source": self._source})
             self._writer.finish()

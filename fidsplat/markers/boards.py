@@ -44,7 +44,7 @@ def _parse(text: str, head: str, rest: str) -> BoardSpec:
     return BoardSpec(text=text, kind=kind, family=canonical_family(match[3]), columns=columns, rows=rows)
 
 
-def tag_places(spec: BoardSpec, side: int) -> list[tuple[int, int]]:
+def tag_positions(spec: BoardSpec, side: int) -> list[tuple[int, int]]:
     """Positions of the tags of a board by id: row and column, in modules, of the top left corner. side: edge
     of a tag in modules.
 
@@ -72,7 +72,7 @@ def _bits(spec: BoardSpec) -> tuple[Spec, np.ndarray]:
         )
     predefined(kind, family)  # refuses families that board detectors lack
     side, known = families(kind)[family]
-    places, step = tag_places(spec, side), side + GAP
+    places, step = tag_positions(spec, side), side + GAP
     if len(places) > known:
         raise InputError(
             f"{spec.text!r} needs {len(places)} tags, but {family} has {known}; use a smaller board"

@@ -121,7 +121,7 @@ class Marker(PickledByFields):
     components: int
     """number of components, all colours"""
     palette: np.ndarray = field(repr=False)
-    """(k, 3) float32 RGB, colours of the grid's values: white and black, or those of a drawing, paper
+    """(k, 3) float32 RGB, colours of the grid's values: white and black, or a drawing's colours, paper
     first"""
     cloud: SplatCloud = field(repr=False)
     """the splats in the marker's frame: plane z = 0, x right, y down as printed, origin at the code's
@@ -474,7 +474,7 @@ def _chosen(quality: MarkerQuality, mixture: str | None, given: dict[str, Any]) 
 
 
 def _mixture(quality: MarkerQuality, duplicates: bool) -> tuple[tuple[Template, ...], float]:
-    """Templates and growth of a mixture; for `exact`, those of `Marker.gaussians`."""
+    """Templates and growth of a mixture; for `exact`, of `Marker.gaussians`."""
     if quality.mixture == "paper":
         gaussians = paper_template(quality.levels, quality.density, duplicates)
         templates, growth = (Template(math.inf, gaussians),), 0.0

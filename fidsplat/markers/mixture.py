@@ -126,7 +126,7 @@ def place(
     first axis is along the longer side. Rectangles that are too long for all templates are cut into equal
     pieces. Returns (m, 5) float64 x, y, sigma_x, sigma_y, opacity and (m,) int64 the rectangle of each.
     """
-    pieces, aspect, source = in_pieces(rectangles, aspect, templates[-1].max_aspect)
+    pieces, aspect, source = split_rectangles(rectangles, aspect, templates[-1].max_aspect)
     upright = aspect < 1
     which = _which(np.maximum(aspect, 1 / aspect), templates)
     counts = np.array([len(t.gaussians) for t in templates])
@@ -149,7 +149,7 @@ def place(
     return out.T, np.repeat(source, n)
 
 
-def in_pieces(
+def split_rectangles(
     rectangles: np.ndarray, aspect: np.ndarray, longest: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cut n rectangles across their longer sides into the fewest equal pieces of at most an aspect ratio.

@@ -30,7 +30,7 @@ MAX_NEIGHBORS = 5_000_000
 
 
 def refuse_tangles(rings: Rings, name: str | None) -> None:
-    """Raise InputError for outlines with more crossings than polygons can be made of."""
+    """Raise InputError for outlines with too many crossings to make polygons of them."""
     pieces = np.concatenate(
         [np.zeros((0, 2, 2)), *(np.stack([ring, np.roll(ring, -1, 0)], 1) for ring in rings)]
     )

@@ -27,8 +27,8 @@ _NEAR = 0.7 * 4 * 0.062482177287080
 _SMOOTHED = 0.015
 """radius of the smoothing of the outline between code circles, relative to the edge"""
 _CORRECTED = 2
-"""bits that the detector corrects, so that no code is read as one of another library; but hd17:78 and hd19:23
-are the same code"""
+"""bits that the detector corrects, so that no code is read as a code of another library; but hd17:78 and
+hd19:23 are the same code"""
 # radius relative to 0.7 edges, and angle, of the 12 code circles of a quadrant
 _POLAR = (
     (0.088363142525988, np.pi / 4),

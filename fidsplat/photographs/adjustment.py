@@ -31,7 +31,7 @@ MAX_REJECTED = 0.3
 SAME_SIZE, SIGMAS = 0.05, 5.0
 """scales of two tags contradict each other beyond this relative difference and number of standard errors"""
 MIN_PARALLAX = 0.02
-"""minimum distance of two cameras relative to that of the tag"""
+"""minimum distance of two cameras relative to the distance of the tag"""
 _SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
 
 

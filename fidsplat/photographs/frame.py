@@ -10,7 +10,8 @@ import numpy as np
 from fidsplat.cameras import Camera
 
 PITCHED = 0.002
-"""weight of the cameras' mean up direction, which decides if all cameras have the same horizontal axis"""
+"""weight of the cameras' mean up direction, which determines the vertical if the x axes of all cameras are
+parallel"""
 
 
 @dataclass(frozen=True, eq=False)

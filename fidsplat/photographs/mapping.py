@@ -30,7 +30,8 @@ NEIGHBOURS, STRIDE = 12, 10
 AT_ONCE, PAIRS = min(8, os.cpu_count() or 1), 16
 """photographs and pairs between two reports of progress"""
 FEATURE_SIDE, FEATURES = 2000, 4096
-"""pixels: side to which photographs are reduced for features; and largest number of features of each"""
+"""maximum side in pixels of the photographs in which features are detected; maximum number of features of
+each"""
 FEW_FEATURES = 200
 MIN_MATCHES = 15
 """matches that COLMAP's mapper needs of a pair"""

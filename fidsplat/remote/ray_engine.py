@@ -45,7 +45,7 @@ class Worker:
 
 
 def identity() -> tuple[str, str]:
-    """Version and code hash of fidsplat; workers must have the same, so that their images agree."""
+    """Version and code hash of fidsplat, which must be equal on all workers, so that their images agree."""
     return __version__, code_hash()
 
 

@@ -78,7 +78,7 @@ def fetch_scene(name: str, progress: Progress = no_progress) -> Path:
     return folder / scene.open
 
 
-def fetch_meanwhile(name: str) -> Callable[[], str]:
+def fetch_in_background(name: str) -> Callable[[], str]:
     """Download a captured scene in a thread. Returns a function that returns why the scene is missing, or "".
 
     This module must not import zxing-cpp: a thread that hangs at the end of the process keeps the globals of

@@ -110,7 +110,7 @@ def quality_tables(quality: Quality | str | None) -> tuple[dict[str, Any], dict[
 
 
 def _changes(given: Quality | MarkerQuality, plain: Quality | MarkerQuality) -> dict[str, Any]:
-    """Settings of `given` that differ from those of `plain`."""
+    """Settings of `given` that differ from the settings of `plain`."""
     pairs = {name: (getattr(given, name), getattr(plain, name)) for name in setting_types(type(given))}
     return {name: value for name, (value, before) in pairs.items() if value != before}
 

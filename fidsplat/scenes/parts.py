@@ -108,7 +108,7 @@ class SceneParts(PickledByFields):
     """splats on disk, in the world, with their own labels; visible chunks are read"""
     cloud_motions: Mapping[int, Pose] = field(default_factory=dict)
     """rigid world motion at a time [s] of moving clouds, by index; these clouds have unique labels above
-    those of markers"""
+    the labels of markers"""
     lights: tuple[Light, ...] = ()
     """lights that illuminate the markers with `light`"""
 

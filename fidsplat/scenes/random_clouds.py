@@ -26,7 +26,7 @@ class StandardScene:
     width: int
     height: int
     thick: bool = False
-    """whether the splats are 3D Gaussians, like those of captures, instead of disks"""
+    """whether the splats are 3D Gaussians, as in captures, instead of disks"""
 
 
 SCENES = {

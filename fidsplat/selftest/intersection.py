@@ -99,7 +99,7 @@ def b1(renderer: Renderer) -> Found:
 
 
 def _edge_on(angle: float) -> FrameSpec:
-    """A splat seen from 3 m at `angle` radians to its plane; its centre projects to (16.2, 12.4)."""
+    """A splat at 3 m whose plane is at `angle` radians to the ray; its centre projects to (16.2, 12.4)."""
     position = 3 * math.sin(angle), 0.0, -3 * math.cos(angle)
     view = Camera.look_at(32, 24, 0.6, position, (0, 0, 0))
     moved = Camera.pinhole(32, 24, view.fx, view.fy, 16.2, 12.4, view.world_to_camera, position=position)

@@ -14,7 +14,7 @@ import numpy as np
 from fidsplat.cameras import Camera, focal_length
 from fidsplat.sim.camera_element import (
     KINDS,
-    Place,
+    ElementPath,
     camera_sensor,
     name_of,
     numbers,
@@ -40,12 +40,12 @@ class Description:
     bodies: dict[str, np.ndarray] = field(default_factory=dict)
     """poses (7,) of links in the world by name, MODEL::LINK in SDF; of a robot with all joints at 0"""
 
-    def add(self, name: str, camera: RigCamera | None, place: Place) -> None:
+    def add(self, name: str, camera: RigCamera | None, where: ElementPath) -> None:
         """Add a camera. Raises InputError for a name that exists."""
         if camera is None:
             return
         if name in self.cameras:
-            raise place.wrong(
+            raise where.error(
                 f"two cameras have the name {name!r}, on {self.cameras[name].body} and on {camera.body}; "
                 "rename one"
             )
@@ -78,20 +78,20 @@ def read_description(
     file = path_of(path)
     if file.is_dir():
         file = file / "model.sdf"
-    root, place = parse(file)
+    root, where = parse(file)
     description = Description()
     if root.tag == "robot":
-        _read_robot(root, description, place)
+        _read_robot(root, description, where)
     elif root.tag == "sdf":
         folders = [Path(folder) for folder in models]
         for variable in ("GZ_SIM_RESOURCE_PATH", "SDF_PATH"):
             folders += [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
         reader = _Sdf(description, folders, max_models)
-        reader.group(root, "", IDENTITY, place, ())
+        reader.group(root, "", IDENTITY, where, ())
         for world in root.findall("world"):
-            reader.group(world, "", IDENTITY, place.within("world"), ())
+            reader.group(world, "", IDENTITY, where.child("world"), ())
     else:
-        raise place.wrong(f"the root must be <sdf> or <robot>, got <{root.tag}>")
+        raise where.error(f"the root must be <sdf> or <robot>, got <{root.tag}>")
     return description
 
 
@@ -101,100 +101,110 @@ class _Sdf:
     folders: list[Path]
     max_models: int
     models: int = 0
-    parsed: dict[Path, tuple[ElementTree.Element, Place]] = field(default_factory=dict)
+    parsed: dict[Path, tuple[ElementTree.Element, ElementPath]] = field(default_factory=dict)
     """cached files of includes"""
 
     def group(
-        self, parent: ElementTree.Element, prefix: str, at: np.ndarray, place: Place, files: tuple[Path, ...]
+        self,
+        parent: ElementTree.Element,
+        prefix: str,
+        at: np.ndarray,
+        where: ElementPath,
+        files: tuple[Path, ...],
     ) -> None:
         """Read the models and includes of a world, a model or a file."""
         for model in parent.findall("model"):
-            self.model(model, prefix, at, place, files)
+            self.model(model, prefix, at, where, files)
         for include in parent.findall("include"):
-            self.include(include, prefix, at, place, files)
+            self.include(include, prefix, at, where, files)
 
     def include(
-        self, include: ElementTree.Element, prefix: str, at: np.ndarray, place: Place, files: tuple[Path, ...]
+        self,
+        include: ElementTree.Element,
+        prefix: str,
+        at: np.ndarray,
+        where: ElementPath,
+        files: tuple[Path, ...],
     ) -> None:
         uri = include.findtext("uri", "").strip()
-        place = place.within(f"include {uri}")
-        file = self._file_of(uri, place)
+        where = where.child(f"include {uri}")
+        file = self._file_of(uri, where)
         if file in files or len(files) >= DEEPEST:
-            raise place.wrong("an include must not include itself; remove it")
+            raise where.error("an include must not include itself; remove it")
         if file not in self.parsed:
             self.parsed[file] = parse(file)
         root, inner = self.parsed[file]
         model = root.find("model")
         if model is None:
-            raise inner.wrong("an included file must have a <model>, got none")
-        pose = None if include.find("pose") is None else pose_element(include, place)
+            raise inner.error("an included file must have a <model>, got none")
+        pose = None if include.find("pose") is None else pose_element(include, where)
         name = include.findtext("name", "").strip() or None
         self.model(model, prefix, at, inner, (*files, file), name, pose)
 
-    def _file_of(self, uri: str, place: Place) -> Path:
+    def _file_of(self, uri: str, where: ElementPath) -> Path:
         name = uri.removeprefix("model://").removeprefix("file://")
-        parent = place.file.resolve().parent
+        parent = where.file.resolve().parent
         for folder in (*self.folders, parent, parent.parent):
             for candidate in (folder / name, folder / name / "model.sdf"):
                 if name and candidate.is_file():
                     return candidate.resolve()
         places = ", ".join(map(str, (*self.folders, parent, parent.parent)))
-        raise place.wrong(f"cannot find the model in {places}; give its folder as models=[...]")
+        raise where.error(f"cannot find the model in {places}; give its folder as models=[...]")
 
     def model(
         self,
         model: ElementTree.Element,
         prefix: str,
         at: np.ndarray,
-        place: Place,
+        where: ElementPath,
         files: tuple[Path, ...],
         name: str | None = None,
         pose: np.ndarray | None = None,
     ) -> None:
         """Read one model. at: pose of the parent. name, pose: of an include; they replace those of the
         model."""
-        model_name = name or name_of(model, place)
-        place = place.within(model_name)
+        model_name = name or name_of(model, where)
+        where = where.child(model_name)
         self.models += 1
         if self.models > self.max_models:
-            raise place.wrong(
+            raise where.error(
                 f"the file must have at most {self.max_models:,} models with its includes, got more; "
                 "read_description(..., max_models=N) allows N"
             )
         if prefix.count("::") >= DEEPEST:
-            raise place.wrong(f"models must be nested at most {DEEPEST} deep, got more; flatten them")
-        here = compose(at, pose_element(model, place) if pose is None else pose)
-        frames = _Frames(model, place)
+            raise where.error(f"models must be nested at most {DEEPEST} deep, got more; flatten them")
+        here = compose(at, pose_element(model, where) if pose is None else pose)
+        frames = _Frames(model, where)
         for link in model.findall("link"):
-            body = f"{prefix}{model_name}::{name_of(link, place)}"
-            within = place.within(name_of(link, place))
+            body = f"{prefix}{model_name}::{name_of(link, where)}"
+            within = where.child(name_of(link, where))
             self.found.bodies[body] = compose(here, frames.pose(link.get("name", "")))
             for sensor in link.findall("sensor"):
                 sensed = name_of(sensor, within)
-                inside = within.within(sensed)
+                inside = within.child(sensed)
                 camera = camera_sensor(sensor, body, pose_element(sensor, inside), inside)
                 self.found.add(sensed, camera, inside)
-        self.group(model, f"{prefix}{model_name}::", here, place, files)
+        self.group(model, f"{prefix}{model_name}::", here, where, files)
 
 
 class _Frames:
     """Poses of a model's links, frames and joints relative to the model."""
 
-    def __init__(self, model: ElementTree.Element, place: Place) -> None:
+    def __init__(self, model: ElementTree.Element, where: ElementPath) -> None:
         kinds = ("link", "frame", "joint", "model")
         self._parts = {part.get("name", ""): part for kind in kinds for part in model.findall(kind)}
-        self._place = place
+        self._where = where
 
     def pose(self, name: str, visited: tuple[str, ...] = ()) -> np.ndarray:
         """Pose (7,) of a part, model from part."""
         if name == "__model__":
             return IDENTITY
         if name not in self._parts:
-            raise self._place.wrong(unknown("frame", name, self._parts))
+            raise self._where.error(unknown("frame", name, self._parts))
         if name in visited:
-            raise self._place.wrong(f"the pose of {name!r} must not be relative to itself")
+            raise self._where.error(f"the pose of {name!r} must not be relative to itself")
         part = self._parts[name]
-        relative = pose_element(part, self._place.within(name))
+        relative = pose_element(part, self._where.child(name))
         element = part.find("pose")
         base = "" if element is None else element.get("relative_to", "")
         if not base:
@@ -203,15 +213,15 @@ class _Frames:
         return compose(self.pose(base, (*visited, name)), relative) if base else relative
 
 
-def _read_robot(root: ElementTree.Element, found: Description, place: Place) -> None:
+def _read_robot(root: ElementTree.Element, found: Description, where: ElementPath) -> None:
     parents: dict[str, tuple[str, np.ndarray]] = {}
     for joint in root.findall("joint"):
-        inside = place.within(name_of(joint, place))
+        inside = where.child(name_of(joint, where))
         parent, child = (_link_of(joint, tag, inside) for tag in ("parent", "child"))
         if child in parents:
-            raise inside.wrong(f"the link {child!r} must have one parent, got two")
+            raise inside.error(f"the link {child!r} must have one parent, got two")
         parents[child] = parent, _origin(joint, inside)
-    links = [name_of(link, place) for link in root.findall("link")]
+    links = [name_of(link, where) for link in root.findall("link")]
     for name in links:
         pose, at = IDENTITY, name
         for _ in range(len(links) + 1):
@@ -220,59 +230,59 @@ def _read_robot(root: ElementTree.Element, found: Description, place: Place) -> 
             at, step = parents[at]
             pose = compose(step, pose)
         else:
-            raise place.wrong(f"the joints above the link {name!r} must not form a cycle")
+            raise where.error(f"the joints above the link {name!r} must not form a cycle")
         found.bodies[name] = pose
     for gazebo in root.findall("gazebo"):
         link = gazebo.get("reference", "")
         for sensor in gazebo.findall("sensor"):
-            inside = place.within(link).within(name_of(sensor, place))
+            inside = where.child(link).child(name_of(sensor, where))
             if link not in links:
-                raise inside.wrong(unknown("link", link, links))
+                raise inside.error(unknown("link", link, links))
             camera = camera_sensor(sensor, link, pose_element(sensor, inside), inside)
             found.add(sensor.get("name", ""), camera, inside)
     for sensor in root.findall("sensor"):
-        inside = place.within(name_of(sensor, place))
+        inside = where.child(name_of(sensor, where))
         if sensor.find("camera/image") is not None:
             link = _link_of(sensor, "parent", inside)
             if link not in links:
-                raise inside.wrong(unknown("link", link, links))
+                raise inside.error(unknown("link", link, links))
             found.add(sensor.get("name", ""), _own_camera(sensor, link, inside), inside)
 
 
-def _link_of(element: ElementTree.Element, tag: str, place: Place) -> str:
+def _link_of(element: ElementTree.Element, tag: str, where: ElementPath) -> str:
     child = element.find(tag)
     name = "" if child is None else child.get("link", "")
     if not name:
-        raise place.wrong(f"<{tag}> must name a link, got none")
+        raise where.error(f"<{tag}> must name a link, got none")
     return name
 
 
-def _origin(element: ElementTree.Element, place: Place) -> np.ndarray:
-    origin, place = element.find("origin"), place.within("origin")
+def _origin(element: ElementTree.Element, where: ElementPath) -> np.ndarray:
+    origin, where = element.find("origin"), where.child("origin")
     if origin is None:
         return IDENTITY
     return pose_of_angles(
-        numbers(origin.get("xyz", "0 0 0"), 3, place), numbers(origin.get("rpy", "0 0 0"), 3, place)
+        numbers(origin.get("xyz", "0 0 0"), 3, where), numbers(origin.get("rpy", "0 0 0"), 3, where)
     )
 
 
-def _own_camera(sensor: ElementTree.Element, link: str, place: Place) -> RigCamera:
+def _own_camera(sensor: ElementTree.Element, link: str, where: ElementPath) -> RigCamera:
     """Camera of a URDF `<sensor>`."""
     image = sensor.find("camera/image")
     assert image is not None
-    inside = place.within("camera/image")
+    inside = where.child("camera/image")
 
     def attribute(name: str, default: str | None = None) -> float:
-        return numbers(image.get(name, default), 1, inside.within(name))[0]
+        return numbers(image.get(name, default), 1, inside.child(name))[0]
 
-    mount = compose(_origin(sensor, place), OPTICAL)
+    mount = compose(_origin(sensor, where), OPTICAL)
     width, height = int(attribute("width")), int(attribute("height"))
     try:
         f = focal_length(width, attribute("hfov"))
         near, far = attribute("near", "0.01"), attribute("far") if image.get("far") else math.inf
         camera = Camera(width, height, f, f, width / 2, height / 2, matrix_of(inverse(mount)), near, far)
     except InputError as error:
-        raise error if str(error).startswith(str(place.file)) else inside.wrong(str(error)) from None
+        raise error if str(error).startswith(str(where.file)) else inside.error(str(error)) from None
     rate = sensor.get("update_rate")
     outputs = KINDS.get(sensor.get("type", "camera"), ("rgb",))
-    return RigCamera(camera, link, None, outputs, numbers(rate, 1, place)[0] if rate else None)
+    return RigCamera(camera, link, None, outputs, numbers(rate, 1, where)[0] if rate else None)

@@ -147,8 +147,8 @@ class TiledCamera:
         env_ids: Any = None,
         convention: Literal["opengl", "ros", "world"] = "ros",
     ) -> None:
-        """Set positions (n, 3) and orientations (n, 4) in the world of the simulation, instead of those of
-        the camera's mount; None: unchanged. convention: axes of the orientations, as in `CameraData`."""
+        """Set positions (n, 3) and orientations (n, 4) in the world of the simulation, instead of the
+        camera's mount; None: unchanged. convention: axes of the orientations, as in `CameraData`."""
         _known("convention", convention, _FROM_ROS)
         which, poses = self._which(env_ids), self._world_poses(self._body_poses())
         if positions is not None:

@@ -201,7 +201,7 @@ def _mesh_image(renderer: Any, data: Any, camera: int, option: Any) -> ExternalD
 
 
 def camera_of(model: Any, name: str, default: bool = True) -> RigCamera:
-    """RigCamera of a MuJoCo camera. A camera without a resolution has that of the off-screen buffer.
+    """RigCamera of a MuJoCo camera. A camera without a resolution has the size of the off-screen buffer.
 
     default: whether to use the outputs that the model declares.
     """

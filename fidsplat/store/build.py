@@ -308,6 +308,7 @@ def _groups(nodes: np.ndarray, level: int, pinned: int) -> list[np.ndarray]:
 
 
 def _is_root(nodes: np.ndarray, level: int) -> bool:
-    """Whether no level above is worthwhile: the level has few splats, or more than half of those below."""
+    """Whether no level above is worthwhile: the level has few splats, or more than half of the splats
+    below."""
     counts = [int(nodes["count"][nodes["level"] == at].sum()) for at in (level - 1, level)]
     return counts[1] <= _MIN_ROOT or (level > 0 and 2 * counts[1] > counts[0])

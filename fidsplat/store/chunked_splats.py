@@ -218,7 +218,7 @@ class ChunkedSplats:
         return group_offsets([*(store.last_group() for store in self.stores), last_group])
 
     def _relative(self, arrays: dict[str, np.ndarray], origin: np.ndarray) -> dict[str, np.ndarray]:
-        """The arrays with means relative to this scene's origin. origin: that of the given means."""
+        """The arrays with means relative to this scene's origin. origin: origin of the given means."""
         offset = origin - self.origin
         if not offset.any():
             return arrays

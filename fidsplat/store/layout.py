@@ -47,7 +47,7 @@ NPY_HEADER = 128
 _MAX_NODE = 2**24
 """limit on the splats of a node of the levels of detail, which merges four of the level below"""
 _MAX_ROWS = 2**32
-"""limit on the rows of a store: its splats and those of all levels of detail"""
+"""limit on the rows of a store: its splats and the merged splats of all levels of detail"""
 _TYPES = dict.fromkeys(("means", "quats", "scales", "opacities", "thickness"), ("<f4",))
 _TYPES |= dict.fromkeys(("labels", "coplanar_groups"), ("<i4",))
 """allowed NumPy types of each column"""

@@ -42,7 +42,7 @@ def merged(splats: dict[str, np.ndarray], grid: Grid) -> tuple[dict[str, np.ndar
     keys = _split_edges(keys, splats)
     order, starts = _runs(keys)
     ordered = {name: array[order] for name, array in splats.items()}
-    result = _by_moments(ordered, (u[:, order], v[:, order], normal[:, order]), starts)
+    result = _merge_moments(ordered, (u[:, order], v[:, order], normal[:, order]), starts)
     return result, grid.size(shift)
 
 
@@ -96,7 +96,7 @@ def _cells(codes: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
         shift += 1
 
 
-def _by_moments(
+def _merge_moments(
     splats: dict[str, np.ndarray], frames: tuple[np.ndarray, np.ndarray, np.ndarray], starts: np.ndarray
 ) -> dict[str, np.ndarray]:
     """One splat for each run of splats, or several copies where the opacity exceeds `MAX_OPACITY`.

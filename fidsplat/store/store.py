@@ -170,7 +170,7 @@ class Store(Summarised):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the files; of an instanced store, those of the other store."""
+        """Bytes of the files; for an instanced store, of the other store's files."""
         return sum(file.stat().st_size for file in self._folder.iterdir() if file.is_file())
 
     @property
@@ -190,7 +190,7 @@ class Store(Summarised):
 
     @cached_property
     def detail_errors(self) -> list[DetailErrors]:
-        """Measured errors of the levels of detail; of an instanced store, those of the other store."""
+        """Measured errors of the levels of detail; for an instanced store, of the other store's levels."""
         return load_detail_errors(self._folder, self.header.identity)
 
     @property

@@ -67,7 +67,7 @@ def save_checkpoint(
         "dataset": dataset.digest,
         "origin": dataset.origin.tolist(),
         "background": list(dataset.background),
-        "by": _made_by(device),
+        "by": _settings_of_run(device),
     }
     splats = state.splats
     arrays = {f"{group}.{name}": getattr(splats, group)[name] for group in _GROUPS for name in NAMES}
@@ -122,7 +122,7 @@ def load_checkpoint(
         arrays = load_npz(file)
         facts = _facts(arrays)
         iteration = whole_number("iteration", facts["iteration"], 0, MAX_ITERATIONS)
-        before = [str(facts["by"][name]) for name in _made_by(device)]
+        before = [str(facts["by"][name]) for name in _settings_of_run(device)]
         differ = _differences(facts, settings, digest)
         views = {name.removeprefix(_VIEWS): arrays.pop(name) for name in [*arrays] if name.startswith(_VIEWS)}
         state = None if differ else TrainingState(iteration, *_state(arrays, settings, iteration), views)
@@ -135,7 +135,7 @@ def load_checkpoint(
             f"checkpoint {file} must belong to the same run, got another {' and another '.join(differ)}; "
             "give another name with -o, or --overwrite to start again"
         )
-    now = zip(_made_by(device).items(), before, strict=True)
+    now = zip(_settings_of_run(device).items(), before, strict=True)
     return state, [f"another {name} ({was}, not {here})" for (name, here), was in now if was != here]
 
 
@@ -179,7 +179,7 @@ def _checked(arrays: Arrays, name: str, shape: tuple[int, ...], dtype: type = np
     return np.array(array, order="C")
 
 
-def _made_by(device: str) -> dict[str, str]:
+def _settings_of_run(device: str) -> dict[str, str]:
     """Device and version of the code; results depend on them in addition to settings and data."""
     return {"device": device, "fidsplat": f"{__version__}, sources {code_hash()}"}
 

@@ -38,7 +38,7 @@ class TrainingView:
     mask: np.ndarray | None = None
     """(h, w) bool, False for ignored pixels"""
     background: tuple[float, float, float] | None = None
-    """background colour of this view, display values; None: that of the data set"""
+    """background colour of this view, display values; None: the data set's"""
 
     def __post_init__(self) -> None:
         text("the name of a training view", self.name)

@@ -38,7 +38,7 @@ def relocate_and_grow(splats: Splats, settings: TrainSettings, iteration: int) -
         )
     if len(dead):
         sources = alive[_sample(opacities[alive], len(dead), settings, Purpose.RELOCATION, iteration)]
-        _share_among_copies(splats, sources, settings)
+        _divide_among_copies(splats, sources, settings)
         for name in NAMES:
             splats.values[name][dead] = splats.values[name][sources]
         for moments in (splats.first, splats.second):
@@ -47,7 +47,7 @@ def relocate_and_grow(splats: Splats, settings: TrainSettings, iteration: int) -
     target = min(settings.max_splats, int(settings.growth * len(splats)))
     if target > len(splats):
         sources = _sample(splats.opacities, target - len(splats), settings, Purpose.GROWTH, iteration)
-        _share_among_copies(splats, sources, settings)
+        _divide_among_copies(splats, sources, settings)
         splats = splats.append({name: splats.values[name][sources] for name in NAMES})
     return with_statistics_reset(splats)
 
@@ -75,7 +75,7 @@ def _sample(
     return np.minimum(np.searchsorted(sums, draws, side="right"), len(weights) - 1)
 
 
-def _share_among_copies(splats: Splats, sources: np.ndarray, settings: TrainSettings) -> None:
+def _divide_among_copies(splats: Splats, sources: np.ndarray, settings: TrainSettings) -> None:
     """Set the opacity and scales of each source so that it and its copies render like the source alone
     (section 4.2 of the paper)."""
     rows, copies = np.unique(sources, return_counts=True)

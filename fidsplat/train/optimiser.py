@@ -65,7 +65,7 @@ def parameter_gradients(
 
 
 def contributing(gradients: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Mask (n,) of the splats that contribute to a frame: those with a gradient."""
+    """Mask (n,) of the splats that contribute to a frame, which have a gradient."""
     color = gradients["sh"][:, 0] if "sh" in gradients else gradients["colors"]
     return (gradients["opacities"] != 0) | gradients["means"].any(axis=1) | color.any(axis=1)
 

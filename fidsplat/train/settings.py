@@ -29,7 +29,7 @@ _COUNTS = {
     "reset_every": (1, MAX_ITERATIONS),
     "relocate_until": (0, MAX_ITERATIONS),
 }
-"""range of each whole number"""
+"""range of each setting that is an integer"""
 
 
 @dataclass(frozen=True)

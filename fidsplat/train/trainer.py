@@ -215,7 +215,7 @@ class Trainer:
         return tuple(replace(view, camera=camera) for view, camera in pairs)
 
     def pose_changes(self) -> np.ndarray:
-        """(views, 2): metres and degrees by which the refined poses differ from those of the data set."""
+        """(views, 2): metres and degrees by which the refined poses differ from the data set's."""
         self._refine_cameras()
         if self._refinement is None or not self.settings.refine_poses:
             return np.zeros((len(self.dataset.views), 2))

@@ -125,7 +125,7 @@ class ViewRefinement:
         return alignment(self.cameras, self._initial)
 
     def aligned(self) -> list[Camera]:
-        """The refined cameras, aligned with those of the data set."""
+        """The refined cameras, aligned with the cameras of the data set."""
         matrix = self.to_dataset()
         return [moved(camera, matrix) for camera in self.cameras]
 

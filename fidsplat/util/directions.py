@@ -7,7 +7,7 @@ GOLDEN = np.pi * (3 - np.sqrt(5))
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) of length 1; (0, 0, 1) for those of length 0."""
+    """Vectors (..., 3) of length 1; (0, 0, 1) for vectors of length 0."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > 0, vectors / np.where(length > 0, length, 1), (0.0, 0.0, 1.0))
 

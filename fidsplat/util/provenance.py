@@ -55,8 +55,8 @@ class _Digest:
 
 @cache
 def code_hash() -> str:
-    """SHA-256 of all files of the package and the kernels, as 16 hexadecimal digits; a checkout and its wheel
-    have the same."""
+    """SHA-256 of all files of the package and the kernels, as 16 hexadecimal digits; equal for a checkout
+    and its wheel."""
     sha = hashlib.sha256()
     for name, file in sorted(sources().items()):
         content = file.read_bytes()

@@ -80,7 +80,7 @@ class Viewpoint:
         return rigid_matrix(self.position, self.quaternion)
 
     def camera(self, scene: Scene, lens: str = "pinhole", scale: float = 1.0) -> Camera:
-        """The camera of an image whose size is that of the page times `scale`.
+        """The camera of an image of the page's size times `scale`.
 
         Raises InputError for an unknown lens.
         """

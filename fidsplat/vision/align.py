@@ -43,11 +43,11 @@ def align(
     Returns (4, 2) float64, or None if the fit does not converge near the given corners.
     """
     rough = np.asarray(corners, np.float64)
-    fitted = _fit_from(grey, rough, bits)
+    fitted = _fit(grey, rough, bits)
     for corner in unsure:
         if fitted is not None:
             break
-        fitted = _fit_from(grey, _best_start(grey, rough, bits, corner), bits)
+        fitted = _fit(grey, _best_start(grey, rough, bits, corner), bits)
     return fitted
 
 
@@ -64,7 +64,7 @@ def fit(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> float:
     return model.correlation(smooth, _homography(_SQUARE, start), FINE_BLUR)
 
 
-def _fit_from(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
+def _fit(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
     window = _window(grey, corners, bits, _LARGE)
     if window is None:
         return None

@@ -7,7 +7,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.images.tag_dictionaries import families, parse_family, predefined
-from fidsplat.markers.boards import GAP, BoardSpec, tag_places
+from fidsplat.markers.boards import GAP, BoardSpec, tag_positions
 from fidsplat.markers.kinds import parse_spec
 from fidsplat.scenes import PlacedMarker
 from fidsplat.vision.detect import Detection
@@ -37,7 +37,7 @@ def board_pose(
     side = families(kind)[family].size
     origin = marker.flat_corners[0]
     points, observed = [], []
-    for number, (y, x) in enumerate(tag_places(spec, side)):
+    for number, (y, x) in enumerate(tag_positions(spec, side)):
         matches = [tag for tag in left if (tag.kind, tag.family, tag.id) == (kind, family, number)]
         corners = np.array([(x, y), (x + side, y), (x + side, y + side), (x, y + side)], float)
         where = origin + corners * marker.module

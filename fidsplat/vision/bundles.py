@@ -16,7 +16,8 @@ from fidsplat.vision.readback import Reading
 
 @dataclass(frozen=True, eq=False)
 class BundleReading:
-    """True and estimated pose of a bundle of markers. Its frame is that of its first marker in the scene."""
+    """True and estimated pose of a bundle of markers. Its frame is the frame of its first marker in the
+    scene."""
 
     name: str
     markers: int

@@ -167,10 +167,10 @@ def _read_tags(
 
 
 def _known(tag: Detection, found: Iterable[Detection]) -> bool:
-    return any(_same_place(tag, old) for old in found)
+    return any(_overlapping(tag, old) for old in found)
 
 
-def _same_place(one: Detection, other: Detection) -> bool:
+def _overlapping(one: Detection, other: Detection) -> bool:
     edge, second = (np.linalg.norm(t.corners - np.roll(t.corners, 1, 0), axis=1).max() for t in (one, other))
     # a tag in the hole of a recursive tag is less than half as large
     alike = 0.5 < edge / max(second, 1e-9) < 2

@@ -16,7 +16,7 @@ _CORNERS, _QUALITY, _APART = 200, 0.01, 8
 STEP, FEW = 0.02, 20
 """motion between chosen frames as a share of the image's width; number of frames below which it is less"""
 LOST = 0.3
-"""motion of a pair of frames of which too few corners can be tracked"""
+"""motion of a pair of frames with too few tracked corners"""
 _MIN_TRACKED = 8
 
 

@@ -255,7 +255,8 @@ def _blade(
     lobes: float = 0.08,
     waves: float = 0.05,
 ) -> Mesh:
-    """Leaf towards azimuth `turn`, folded and darker at its midrib. Its width is `wide` times its length."""
+    """Leaf towards the azimuth `turn` [rad], folded and darker at its midrib. Its width is `wide` times its
+    length."""
     rows, columns = 11, 9
     u, v = np.linspace(0, 1, rows)[:, None], np.linspace(-1, 1, columns)
     half = wide / 2 * length * np.sin(math.pi * np.clip(u, 0.02, 0.99) ** 0.75) ** 0.8

@@ -12,7 +12,7 @@ import shapely
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.experiments.tag_causes import CAUSES, EDGES, view_of
-from fidsplat.experiments.tags import begin_point, detectors_of, errors_of, own_detector
+from fidsplat.experiments.tags import begin_point, detectors_of, errors_of, load_detector
 from fidsplat.experiments.tags_report import (
     bootstrap,
     breaking_severity,
@@ -191,7 +191,7 @@ def test_a_missing_package_is_named(capsys, tmp_path, monkeypatch):
 
 def test_a_failing_detector_of_the_user_is_named():
     with pytest.raises(fs.InputError, match=r"--detector math:sqrt must return pairs .*, got TypeError: "):
-        own_detector("math:sqrt")(np.zeros((4, 4), np.uint8))
+        load_detector("math:sqrt")(np.zeros((4, 4), np.uint8))
 
 
 def test_own_detectors_shards_and_the_page(capsys, tmp_path, monkeypatch):

@@ -391,7 +391,7 @@ def test_a_scenes_shutter_moves_along_the_cameras(tmp_path, monkeypatch):
     fs.save_ply(random_cloud(20, 0.2), "own.ply")
     (tmp_path / "own.toml").write_text(REQUESTS)
     path = fs.Trajectory([0.0, 1.0], np.array([np.eye(4), np.eye(4) + 0.3 * np.eye(4, k=3)]))
-    scenes = catalogue.own_scenes("own.toml", fs.Scene.load("own.toml"), path)
+    scenes = catalogue.user_scenes("own.toml", fs.Scene.load("own.toml"), path)
     first = scenes["own.toml@0"].capture
     np.testing.assert_allclose(np.linalg.inv(first.motion.camera_at(0.5))[:3, 3], (0.15, 0, 0), atol=1e-12)
     np.testing.assert_allclose(scenes["own.toml@1"].make()[1].position, (0.3, 0, 0), atol=1e-12)

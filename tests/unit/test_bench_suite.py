@@ -58,7 +58,7 @@ def cheap_references(monkeypatch):
 def toy(folder: Path, text: str = TOY, name: str = "toy") -> dict:
     (folder / name).mkdir()
     (folder / name / "adapter.py").write_text(text)
-    return suite.other_renderers(folder)
+    return suite.adapter_renderers(folder)
 
 
 def run(file: Path, names, renderers, slow: float = 1000.0, **how) -> list[dict]:

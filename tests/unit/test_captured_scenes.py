@@ -77,7 +77,7 @@ def test_fetch_reports_a_server_that_ends_early(mirror, monkeypatch):
 
 def test_a_download_that_hangs_ends_with_the_process(tmp_path):
     code = """import fidsplat.experiments.demo as demo
-print(demo.fetch_meanwhile("biker")())"""
+print(demo.fetch_in_background("biker")())"""
     with socket.create_server(("127.0.0.1", 0)) as server:
         url = f"http://127.0.0.1:{server.getsockname()[1]}"
         changed = {"FIDSPLAT_SCENES": url, "XDG_CACHE_HOME": str(tmp_path)}

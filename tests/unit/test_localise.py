@@ -387,7 +387,7 @@ def test_with_ideal_corners_it_knows_its_way():
     assert seeing["ate_m"] < 0.01 < blind["ate_m"]
     _, near = requested.localise(moved, sightings, requested.camera, 0.05, variant=Variant(reach=1.0))
     assert 0 < near["tags"] < seeing["tags"]
-    assert Drive(1, 6)._spaced(3.0) == {0, 1, 2, 3}  # of two each at 0.9 and 2.7 m, and the ends
+    assert Drive(1, 6)._tags_with_spacing(3.0) == {0, 1, 2, 3}  # of two each at 0.9 and 2.7 m, and the ends
     blind_too = requested.localise(moved, sightings, requested.camera, variant=Variant(without="tags"))[1]
     assert blind_too["ate_m"] == blind["ate_m"]
     aside = np.array([0.6, 0.8])

@@ -17,9 +17,9 @@ from fidsplat.markers.mixture import (
     Template,
     fitted_growth,
     fitted_templates,
-    in_pieces,
     paper_template,
     place,
+    split_rectangles,
 )
 from fidsplat.markers.partition import partition
 from fidsplat.markers.printing import LONG, grow
@@ -149,7 +149,7 @@ def test_place_scales_a_template_along_the_longer_side():
 
 def test_long_rectangles_are_cut_into_equal_pieces_that_overlap():
     boxes = np.array([[0, 0, 24, 2], [5, 1, 6, 5], [0, 0, 2, 10], [0, 0, 9, 2]], float)
-    pieces, aspect, owner = in_pieces(boxes, np.array([12, 0.25, 0.2, 4.5]), 4.0)
+    pieces, aspect, owner = split_rectangles(boxes, np.array([12, 0.25, 0.2, 4.5]), 4.0)
     assert owner.tolist() == [0, 0, 0, 1, 2, 2, 3, 3]
     assert OVERLAP == 0.2  # as docs/markers.md says; the shipped templates were fitted with it
     reach = 2 * OVERLAP

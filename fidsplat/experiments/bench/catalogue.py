@@ -12,7 +12,7 @@ import numpy as np
 from fidsplat.cameras import Camera, Trajectory
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
-from fidsplat.experiments.bench.shares import Reduced, middle_camera, without_effects
+from fidsplat.experiments.bench.shares import ReducedScene, middle_camera, without_effects
 from fidsplat.markers import marker
 from fidsplat.render.flight import Flight
 from fidsplat.scenes import PlacedMarker, Scene
@@ -34,7 +34,7 @@ class BenchScene:
     make: Callable[[], tuple[SplatCloud, Camera]]
     capture: Capture | None = None
     """timed capture; None: rgb of the camera at the quality `TIMED`"""
-    without: Mapping[str, Reduced] = field(default_factory=dict)
+    without: Mapping[str, ReducedScene] = field(default_factory=dict)
     """effect of the capture -> the same frame without this effect, timed for comparison"""
 
 
@@ -87,7 +87,7 @@ MOST_VIEWS = 8
 """maximum number of views of a user's scene, evenly distributed over the trajectory"""
 
 
-def own_scenes(
+def user_scenes(
     name: str, scene: Scene, path: Trajectory | None, most_views: int = MOST_VIEWS
 ) -> dict[str, BenchScene]:
     """Benchmark scenes of a user's scene by name, such as `room.toml@2`, with everything that it requests.

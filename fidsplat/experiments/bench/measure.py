@@ -19,7 +19,7 @@ from fidsplat.capture.quality import Quality
 from fidsplat.effects import select
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED, BenchScene
 from fidsplat.experiments.bench.model import Counts, roofline_ms
-from fidsplat.experiments.bench.shares import Reduced, middle_camera
+from fidsplat.experiments.bench.shares import ReducedScene, middle_camera
 from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
@@ -180,7 +180,7 @@ class SceneRun:
         rates: Rates | None,
         cloud: SplatCloud,
         capture: Camera | Capture,
-        without: Mapping[str, Reduced] = MappingProxyType({}),
+        without: Mapping[str, ReducedScene] = MappingProxyType({}),
     ) -> None:
         self.renderer = Renderer(device)
         self.capture = Capture(capture, quality=TIMED) if isinstance(capture, Camera) else capture

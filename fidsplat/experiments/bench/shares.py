@@ -14,7 +14,7 @@ from fidsplat.splats.cloud import SplatCloud
 
 
 @dataclass(frozen=True)
-class Reduced:
+class ReducedScene:
     """A frame without an effect."""
 
     capture: Capture
@@ -26,7 +26,7 @@ class Reduced:
         return None if self.scene is None else self.scene.cloud()
 
 
-def without_effects(scene: Scene, capture: Capture) -> dict[str, Reduced]:
+def without_effects(scene: Scene, capture: Capture) -> dict[str, ReducedScene]:
     """Frames that each lack one effect of a capture, by the name of the effect.
 
     An effect is included if its removal changes the selected kernels; `markers` are if the scene has other
@@ -46,11 +46,11 @@ def without_effects(scene: Scene, capture: Capture) -> dict[str, Reduced]:
         "background": replace(capture, background=(0.0, 0.0, 0.0)),
     }
     features = select(cloud, capture)
-    variants = {name: Reduced(less) for name, less in reduced.items() if select(cloud, less) != features}
+    variants = {name: ReducedScene(less) for name, less in reduced.items() if select(cloud, less) != features}
     if scene.markers and (scene.clouds or scene.stores):
         rest = replace(scene, markers=())
         motion = Motion(capture.motion.camera, rest.motion.groups)
-        variants["markers"] = Reduced(replace(capture, motion=motion), rest)
+        variants["markers"] = ReducedScene(replace(capture, motion=motion), rest)
     return variants
 
 

@@ -150,14 +150,14 @@ class RendererProcess:
 Opener = Callable[[], RendererProcess]
 
 
-def own_renderers(devices: Sequence[str]) -> dict[str, Opener]:
+def fidsplat_renderers(devices: Sequence[str]) -> dict[str, Opener]:
     """fidsplat on each device, by name."""
     file = Path(own_adapter.__file__)
     names = {f"fidsplat {device}": device for device in devices}
     return {name: partial(RendererProcess, name, file, device) for name, device in names.items()}
 
 
-def other_renderers(folder: Path) -> dict[str, Opener]:
+def adapter_renderers(folder: Path) -> dict[str, Opener]:
     """Renderers of the adapters `NAME/adapter.py` in a folder, each with the Python of `NAME/.venv` if it
     exists.
 

@@ -63,7 +63,7 @@ def prepared(
     """
     own, quick = own or {}, options.quick
     keys = (
-        own_points(own, options.settings or (), quick)
+        user_points(own, options.settings or (), quick)
         if own
         else all_points(options.scenes or (), options.settings or (), quick)
     )
@@ -138,7 +138,7 @@ def all_points(names: tuple[str, ...], settings: tuple[str, ...], quick: bool) -
     return _by_priority(ordered)
 
 
-def own_points(views: Iterable[str], settings: tuple[str, ...], quick: bool) -> list[Key]:
+def user_points(views: Iterable[str], settings: tuple[str, ...], quick: bool) -> list[Key]:
     """Points of the user's views, by view name.
 
     Raises:

@@ -23,7 +23,7 @@ from fidsplat.selftest.agreement import FrameSpec, reference_images
 from fidsplat.util.errors import FidsplatError
 from fidsplat.util.timing import frame_timer, quartiles, ratios, time_interleaved
 from fidsplat.vision.metrics import psnr
-from fidsplat.vision.readback import corner_error, own_code
+from fidsplat.vision.readback import corner_error, detect_marker
 
 _SCENES, _REFERENCES = 12, 6
 """maximum numbers of cached scenes and reference images"""
@@ -190,7 +190,7 @@ def compare_marker(image: np.ndarray, scene: TradeScene) -> dict:
     assert marker is not None
     ideal = plane_image(marker.grid, marker.module, scene.camera, background=BACKGROUND)
     grey = np.asarray(image[:, :, 0], np.float64)
-    code = own_code(marker, grey)
+    code = detect_marker(marker, grey)
     ratio = psnr(grey, ideal)
     return {
         "ideal_psnr": ratio if math.isfinite(ratio) else None,
