@@ -19,7 +19,7 @@ from .records import Layout
 from .splat import make_splat
 from .staging import STAGED, alone, make_staging
 
-_PLAIN = frozenset({"lowpass_screen", "stop_exclusive", "arithmetic_fast"})
+_PLAIN = frozenset({"lowpass_screen", "stop_exclusive", "arithmetic_fast", "ellipsoids_only"})
 _CELL = CELL_W * CELL_H
 _NONE, _ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
@@ -57,7 +57,7 @@ def make_blend(
     Splat, Rays, Pixel = splats.Splat, pixels.Rays, pixels.Pixel
     start, unfinished = pixels.start, pixels.unfinished
     blend_one, end_pass, cover, finish = pixels.blend, pixels.end, pixels.cover, pixels.finish
-    repeats, opaque = end_pass is not None, cover is not None
+    repeats, opaque, branchless = end_pass is not None, cover is not None, pixels.branchless
     limits = make_bounds("lowpass_screen" in effects)
     Samples = make_samples(tuple(sample_fields(outputs).items()))
     stores, words = output.functions(outputs, "store"), output.digest(outputs)
@@ -108,6 +108,15 @@ def make_blend(
         return p
 
     @wp.func
+    def intersect(s: Splat, column: wp.vec3, ray: wp.vec3, slopes: SLOPES, x: float, y: float, view: View):
+        if wp.static(curved):
+            return cross_slopes(s, ray, slopes, x, y, view)
+        elif wp.static(bent):
+            return cross_ray(s, ray, x, y, view)
+        else:
+            return cross(s, column[0], column[1], column[2], x, y, view)
+
+    @wp.func
     def blend_splat(
         pixel: Pixel,
         s: Splat,
@@ -124,26 +133,25 @@ def make_blend(
     ):
         """Blend the splat at `place` in the list."""
         p = pixel
-        if unfinished(p, view):
-            if wp.static(curved):
-                c = cross_slopes(s, ray, slopes, x, y, view)
-            elif wp.static(bent):
-                c = cross_ray(s, ray, x, y, view)
-            else:
-                c = cross(s, column[0], column[1], column[2], x, y, view)
+        if wp.static(branchless):
+            c = intersect(s, column, ray, slopes, x, y, view)
+            p = blend_one(p, s, c, place, lines, lists, coplanar_groups, view)
+        elif unfinished(p, view):
+            c = intersect(s, column, ray, slopes, x, y, view)
             if wp.static(asking):
                 p = observe(p, s, c, x, y, view)
             if c.contributes:
                 p = blend_one(p, s, c, place, lines, lists, coplanar_groups, view)
         return p
 
-    # 1024 threads at once: at most 64 registers, enough for two samples without other outputs
-    launched = (threads, 1024 // threads) if not outputs and _PLAIN.issuperset(effects) else threads
+    # 768 threads at once: at most 80 registers, enough for two samples without other outputs
+    launched = (threads, 768 // threads) if not outputs and _PLAIN.issuperset(effects) else threads
     options = {"module": "unique", "module_options": STRICT, "enable_backward": False}
 
     @wp.kernel(name=f"blend_gpu_{words}", launch_bounds=launched, **options)
     def blend_gpu(
-        band_first: int,  # tile of block 0
+        band_first: int,
+        tile_order: wp.array(dtype=wp.int32),  # tile of block 0 at band_first
         views: wp.array(dtype=View),
         rays: Rays,
         lines: wp.array(dtype=wp.vec4),
@@ -153,7 +161,7 @@ def make_blend(
         samples: Samples,  # out
     ):
         thread = wp.tid()
-        tile = band_first + thread / threads
+        tile = tile_order[band_first + thread / threads]
         item = thread % threads
         number, tile_column, tile_row = locate_tile(tile, views)
         view = views[reread(number)]

@@ -16,9 +16,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from .bounds import Bounds, make_bounds, window_tile
-from .common import STRICT, View, lowest
+from .common import STRICT, View, lowest, with_numbers
 from .fragment_backward import make_fragments
-from .staging import with_numbers
 
 CHUNK = 32
 """splats of a tile's list that are evaluated forward and then backward together"""
@@ -96,17 +95,18 @@ def make_slots(screen: bool):
     def find_slots(
         first: int,
         views: wp.array(dtype=View),  # (1)
-        tiles: wp.array(dtype=wp.int32),  # (pairs) in the order of the lists
+        tiles: int,
+        starts: wp.array(dtype=wp.int32),
         lists: wp.array(dtype=wp.int32),
         windows: wp.array(dtype=wp.uint64),
         bounds: wp.array(dtype=Bounds),
-        counts: wp.array(dtype=wp.int64),
-        ends_by_index: wp.array(dtype=wp.int64),  # inclusive sums
+        counts: wp.array(dtype=wp.int32),
+        ends_by_index: wp.array(dtype=wp.int32),  # inclusive sums
         slots: wp.array(dtype=wp.int32),  # (pairs) out
     ):
         view = views[0]
         k = first + wp.tid()
-        index, tile = lists[k], tiles[k]
+        index, tile = lists[k], wp.lower_bound(starts, 0, tiles + 1, k + 1) - 1
         corner = int(windows[index] >> _WINDOW)
         bits = wp.uint32(windows[index] & _BITS)
         rank = int(0)
@@ -121,7 +121,7 @@ def make_slots(screen: bool):
         while bits != NONE and window_tile(corner, lowest(bits), view) != tile:
             bits = bits & (bits - ONE)
             rank += 1
-        slots[k] = int(ends_by_index[index] - counts[index]) + rank
+        slots[k] = ends_by_index[index] - counts[index] + rank
 
     return find_slots
 

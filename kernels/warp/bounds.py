@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .common import View, fma, population, to_sample
+from .common import View, divide, fma, population, to_sample
 
 # margins for the rounding of the fields and of the per-sample test: in samples, and relative
 PAD = wp.constant(0.02)
@@ -81,8 +81,8 @@ def window_tile(corner: int, bit: int, view: View) -> int:
 
 @cache
 def make_bounds(screen: bool) -> SimpleNamespace:
-    """Make functions of bounds with or without the low-pass disc: rows, span, tile rows and spans, window
-    bits, and `touched`."""
+    """Make functions of bounds with or without the low-pass disc: rows, span, tile rows, spans and
+    rectangle, window bits, and `touched`."""
 
     @wp.func
     def rows(b: Bounds, height: int):
@@ -130,7 +130,7 @@ def make_bounds(screen: bool) -> SimpleNamespace:
     def tile_rows(b: Bounds, view: View):
         """Rows of tiles [first, end)."""
         first, end = rows(b, view.height)
-        return first / view.tile_h, (end + view.tile_h - 1) / view.tile_h
+        return divide(first, view.tile_h), divide(end + view.tile_h - 1, view.tile_h)
 
     @wp.func
     def tile_span(b: Bounds, row: int, view: View):
@@ -141,7 +141,20 @@ def make_bounds(screen: bool) -> SimpleNamespace:
         first, end = span(b, y0, wp.min(y0 + view.tile_h, view.height), view.width)
         if first >= end:
             return 0, 0
-        return first / view.tile_w, (end + view.tile_w - 1) / view.tile_w
+        return divide(first, view.tile_w), divide(end + view.tile_w - 1, view.tile_w)
+
+    @wp.func
+    def tile_rectangle(b: Bounds, view: View):
+        """Rectangle that contains the tiles of `tile_span` in all rows: left, top, columns, rows."""
+        low, high = b.x - b.half_x, b.x + b.half_x
+        if wp.static(screen):
+            if b.disc_r >= 0.0:
+                low = wp.min(low, b.disc_x - (b.disc_r + PAD))
+                high = wp.max(high, b.disc_x + (b.disc_r + PAD))
+        left = divide(wp.max(to_sample(wp.ceil(low - 0.5), view.width), 0), view.tile_w)
+        end = wp.min(to_sample(wp.floor(high - 0.5) + 1.0, view.width), view.width)
+        top, bottom = tile_rows(b, view)
+        return left, top, divide(end + view.tile_w - 1, view.tile_w) - left, bottom - top
 
     @wp.func
     def window_bits(b: Bounds, left: int, columns: int, top: int, height: int, view: View) -> wp.uint32:
@@ -172,4 +185,11 @@ def make_bounds(screen: bool) -> SimpleNamespace:
                 tiles += end - begin
         return bits, tiles
 
-    return SimpleNamespace(rows=rows, span=span, tile_rows=tile_rows, tile_span=tile_span, touched=touched)
+    return SimpleNamespace(
+        rows=rows,
+        span=span,
+        tile_rows=tile_rows,
+        tile_span=tile_span,
+        tile_rectangle=tile_rectangle,
+        touched=touched,
+    )

@@ -13,7 +13,7 @@ from functools import cache
 
 import warp as wp
 
-from .common import View
+from .common import View, fast_reciprocal, fast_sqrt
 from .ellipsoids import EXACT
 from .records import BOXES
 from .splat import make_splat
@@ -46,7 +46,7 @@ class Conic:
 @wp.func
 def half_chord(c: Conic, y: float) -> float:
     above = y - c.y
-    return wp.sqrt(wp.max(c.square - c.bend * above * above, 0.0)) + c.pad
+    return fast_sqrt(wp.max(c.square - c.bend * above * above, 0.0)) + c.pad
 
 
 @cache
@@ -75,7 +75,7 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
         d = wp.abs(d0) + wp.abs(dx) * far_x + wp.abs(dy) * far_y
         steep = ux * ux + vx * vx
         bent = h * dx * dx
-        inverse = 1.0 / (steep - bent)
+        inverse = fast_reciprocal(steep - bent)
         # components of a x b: at y = 0, and per y
         ud, vd, uv = ux * d0 - dx * u0, vx * d0 - dx * v0, ux * v0 - vx * u0
         ud_y, vd_y, uv_y = ux * dy - dx * uy, vx * dy - dx * vy, ux * vy - vx * uy
@@ -85,7 +85,7 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
         q1 = h * (ud * ud_y + vd * vd_y) - uv * uv_y
         grows = h * (ud_y * ud_y + vd_y * vd_y)
         q2 = uv_y * uv_y - grows
-        shrinks = 1.0 / q2
+        shrinks = fast_reciprocal(q2)
         c = Conic()
         c.middle = (h * dx * d0 - ux * u0 - vx * v0) * inverse
         c.slope = (h * dx * dy - ux * uy - vx * vy) * inverse
@@ -97,8 +97,9 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
         c.bend = q2 * inverse * inverse
         c.square = square_height * c.bend
         c.pad = _PAD + _PAD_RELATIVE * far_x
-        c.half_height = wp.sqrt(square_height) + _PAD + _PAD_RELATIVE * far_y
-        c.tip = c.slope * square_height / wp.sqrt(c.slope * c.slope * square_height + c.square + _FLAT)
+        c.half_height = fast_sqrt(square_height) + _PAD + _PAD_RELATIVE * far_y
+        steepness = fast_sqrt(c.slope * c.slope * square_height + c.square + _FLAT)
+        c.tip = c.slope * square_height * fast_reciprocal(steepness)
         return c
 
     @wp.func
@@ -129,6 +130,7 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
             far_x = wp.max(wp.abs(shift), wp.abs(shift - float(view.tile_w)))
             above = float(top) - s.c[0]
             c = conic_of(s, far_x, wp.max(wp.abs(above), wp.abs(above + float(view.tile_h))))
+        disc_square = s.half_r2 * fast_reciprocal(view.per_pixel) * (1.0 + _PAD_RELATIVE)
         bits = wp.uint32(0)
         for row in range(first_row, end_row):
             y0 = float(top + row * CELL_H) - s.c[0]
@@ -138,9 +140,9 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
                 low, high = chord(c, y0, y1)
                 if wp.static(screen):
                     away = wp.clamp(s.disc_y, y0, y1) - s.disc_y
-                    rest = s.half_r2 / view.per_pixel * (1.0 + _PAD_RELATIVE) - away * away
+                    rest = disc_square - away * away
                     if rest >= 0.0 and s.disc_x < _NO_DISC:
-                        half = wp.sqrt(rest) + _PAD
+                        half = fast_sqrt(rest) + _PAD
                         low, high = wp.min(low, s.disc_x - half), wp.max(high, s.disc_x + half)
             first = wp.max(int(wp.clamp(wp.ceil(low + shift), 0.0, last + 1.0)), box[0] - left)
             end = wp.min(int(wp.clamp(wp.floor(high + shift), -1.0, last)), box[1] - left - 1)

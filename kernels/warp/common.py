@@ -1,5 +1,7 @@
 """Code shared by all stages: module options, uniforms, fused multiply-adds, packed loads."""
 
+import re
+
 import warp as wp
 
 # Order and culling must not depend on the compiler: contraction is off, and fused operations are written as
@@ -92,9 +94,60 @@ def struct_of(name: str, words: str, fields: dict):
     return wp.struct(type(name, (), {"__annotations__": fields, "__doc__": words, "__module__": __name__}))
 
 
+def with_numbers(text: str, numbers: dict[str, int]) -> str:
+    """Replace names by numbers in a text."""
+    return re.sub("|".join(numbers), lambda name: str(numbers[name[0]]), text)
+
+
 @wp.func_native("return fmaf(a, b, c);")
 def fma(a: float, b: float, c: float) -> float:
     """a b + c, rounded once."""
+    ...
+
+
+# Instructions of GPUs within 2 ulp, for conservative bounds; other square roots and divisions have a branch
+# for denormals.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float y;
+    asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+#else
+    return sqrtf(x);
+#endif
+""")
+def fast_sqrt(x: float) -> float:
+    """The square root, within 2 ulp."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float y;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+#else
+    return 1.0f / x;
+#endif
+""")
+def fast_reciprocal(x: float) -> float:
+    """1 / x, within 2 ulp."""
+    ...
+
+
+# Two instructions, correctly rounded for normal x with a normal reciprocal; a division has a branch for all
+# others.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float y;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return fmaf(fmaf(-x, y, 1.0f), y, y);
+#else
+    return 1.0f / x;
+#endif
+""")
+def reciprocal(x: float) -> float:
+    """1 / x for normal x with a normal reciprocal."""
     ...
 
 
@@ -171,6 +224,12 @@ def population(bits: wp.uint32) -> int:
 def lowest(bits: wp.uint32) -> int:
     """Index of the lowest set bit of a nonzero word."""
     ...
+
+
+@wp.func
+def divide(x: int, size: int) -> int:
+    """x / size, for x >= 0 and a power of two; a division takes a GPU 20 instructions."""
+    return x >> population(wp.uint32(size - 1))
 
 
 @wp.func

@@ -11,6 +11,9 @@ from .fast import make_log
 
 EXACT = "ellipsoid_exact"
 EWA = ("ellipsoid_ewa", "ellipsoid_ewa_antialiased")
+FACING = "ellipsoids_only"
+"""effect of EWA without disks: all splats face the camera, with D = 1 and an n_u that is constant along
+columns"""
 
 
 @cache

@@ -8,7 +8,7 @@ import warp as wp
 
 from .boxes import between, between_curves
 from .common import View, fma, line_of, struct_of
-from .ellipsoids import EXACT
+from .ellipsoids import EXACT, FACING
 from .fast import fast_exp
 from .rays import SLOPES
 from .records import BOXES, Layout
@@ -29,7 +29,7 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
     screen, bent, parallel, all_boxes = (
         name in effects for name in ("lowpass_screen", "rays", "camera_orthographic", "footprint_box")
     )
-    thick = EXACT in effects
+    thick, facing = EXACT in effects, FACING in effects and not parallel
     boxes = any(name in effects for name in BOXES)
     curved, edged = boxes and bent, boxes and not bent  # edges from each sample's ray, or from a record
     exp = fast_exp if "arithmetic_fast" in effects else wp.exp
@@ -66,8 +66,17 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
         x, y: the sample, relative to the splat's anchor. column_*: `column` of the affine forms n_u, n_v and
         D at x.
         """
-        nu, nv, d = fma(s.u[2], y, column_u), fma(s.v[2], y, column_v), fma(s.d[2], y, column_d)
-        return meet(s, nu, nv, d, x, y, view)
+        if wp.static(facing):
+            # bit-identical to the general case
+            c, nv = Intersection(), fma(s.v[2], y, column_v)
+            c.d = 1.0
+            c.q = fma(column_u, column_u, nv * nv)
+            c.inside = c.q <= s.half_r2
+            c.contributes = c.inside
+            return c
+        else:
+            nu, nv, d = fma(s.u[2], y, column_u), fma(s.v[2], y, column_v), fma(s.d[2], y, column_d)
+            return meet(s, nu, nv, d, x, y, view)
 
     @wp.func
     def forms_of(s: Splat, ray: wp.vec3) -> wp.vec3:
@@ -184,6 +193,7 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
         cross_ray=cross_ray,
         cross_slopes=cross_slopes if curved else None,
         is_box=is_box,
+        facing=facing,
         opacity_of=opacity_of,
         depth_of=depth_of,
     )

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import output
-from .common import MIN_ALPHA, View, fma, line_of, struct_of
+from .common import MIN_ALPHA, View, fma, line_of, reciprocal, struct_of
 from .coplanar import make_layer
 from .intersection import make_intersection
 from .k_buffer import make_k_buffer, make_k_buffer_struct
@@ -24,7 +24,7 @@ from .splat import make_splat
 @cache
 def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size: int) -> SimpleNamespace:
     """Make the structs Rays and Pixel, and functions of a sample: start, unfinished, blend, end (None
-    without a second pass), cover (None without an opaque surface), finish.
+    without a second pass), cover (None without an opaque surface), finish; and whether blend needs no branch.
     """
     Splat, intersection = make_splat(effects, outputs).Splat, make_intersection(effects, outputs)
     Intersection, is_box = intersection.Intersection, intersection.is_box
@@ -65,6 +65,9 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
     fields |= {"k_buffer": make_k_buffer_struct(k_buffer_size)} if k_buffered else {}
     fields |= {"layers": layer.Layers} if layer else {}
     Pixel = struct_of("Pixel", "State of a sample.", fields)
+    # Fragments without a contribution are then blended with weight 0 instead of skipped: without a branch,
+    # the samples of a thread are executed in parallel.
+    branchless = {"t", "r", "g", "b", "finished"}.issuperset(fields)
 
     @wp.func
     def pixel_at(x: int, y: int, number: int, view: View) -> int:
@@ -124,14 +127,15 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
     def composite(pixel: Pixel, attributes: Attributes, opacity: float, view: View):
         """Composite a fragment or layer in front of all later fragments, unless the pixel is terminated."""
         p = pixel
-        if not (p.t > view.stop):
-            return p
+        if wp.static(not branchless):
+            if not (p.t > view.stop):
+                return p
+        weight = p.t * opacity
         if wp.static(exclusive):
             # parity with gsplat and the 2DGS authors: the fragment that would terminate the pixel is dropped
             if p.t * (1.0 - opacity) <= view.stop:
                 p.finished = 1
-                return p
-        weight = p.t * opacity
+                weight = 0.0
         p.r = fma(weight, attributes.rgb[0], p.r)
         p.g = fma(weight, attributes.rgb[1], p.g)
         p.b = fma(weight, attributes.rgb[2], p.b)
@@ -167,10 +171,16 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         coplanar_groups: wp.array(dtype=wp.int32),
         view: View,
     ):
-        """Blend a contributing fragment of the splat at `place` in the list into an unfinished pixel."""
+        """Blend a fragment of the splat at `place` in the list. The pixel is unfinished and the fragment
+        contributes, unless `branchless`.
+        """
         index = lists[place]
-        inverse_d = 1.0 / c.d
+        inverse_d = float(1.0)
+        if wp.static(not intersection.facing):
+            inverse_d = reciprocal(c.d)
         opacity = opacity_of(s, c, inverse_d, view)
+        if wp.static(branchless):
+            opacity = wp.where(c.contributes and unfinished(pixel, view), opacity, 0.0)
         z, group = float(0.0), int(-1)
         if wp.static(layered):
             if pixel.layers.exist != 0:
@@ -257,6 +267,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         end=end if k_buffered or layered else None,
         cover=cover if opaque else None,
         finish=finish,
+        branchless=branchless,
     )
 
 

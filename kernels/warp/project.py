@@ -9,7 +9,7 @@ from . import output
 from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, make_bounds
 from .boxes import make_boxes
 from .color import make_color
-from .common import CULLED, STRICT, View, as_bits, reread, sortable, store_line
+from .common import CULLED, STRICT, View, as_bits, divide, reread, sortable, store_line
 from .disk import make_disk
 from .ellipsoids import EWA, EXACT, make_ellipsoids
 from .fast import make_log
@@ -19,12 +19,13 @@ from .lowpass import make_filter
 from .records import Layout
 from .slopes import make_slopes
 from .splat_pose import make_splat_pose
+from .tile_lists import count_tiles
 
 # [m]; invisible, and large enough that quotients are not float32 denormals
 SMALLEST_SCALE = wp.constant(wp.float32(1e-20))
 BLOCK = 128
 """threads of a block on a GPU"""
-LIMITS = (BLOCK, 5)  # threads per block, blocks at once: limits the kernel to 96 registers instead of 116
+LIMITS = (BLOCK, 5)  # threads per block, blocks at once: limits the kernel to 96 registers instead of 103
 GROUP_KEYS = wp.constant(wp.uint32(0x00800000))
 """sort key of the first coplanar group; keys of groups are below all keys of depths, so that groups are first
 in lists"""
@@ -106,8 +107,9 @@ def make_project(
             dtype=wp.uint64
         ),  # (views n) out: window's first tile, then bits of the tiles; 0: more tiles than a window
         keys: wp.array(dtype=wp.uint32),  # (views n) out: depth key, or CULLED
-        counts: wp.array(dtype=wp.int64),  # (views n) out: number of tiles that the splat may overlap
-        visible: wp.array(dtype=wp.int32),  # (views n) out: 1 or 0
+        counts: wp.array(dtype=wp.int32),  # (views n) out: number of tiles that the splat may overlap
+        counters: wp.array(dtype=wp.int32),  # in, out: see `count_tiles`
+        big: wp.array(dtype=wp.int32),  # (views n) out: big splats, in any order
     ):
         at = wp.tid() + first
         number = at / views[0].splats
@@ -117,8 +119,7 @@ def make_project(
         opacity, size = float(opacities[i]), wp.vec2(scales[i])
         quat, center = wp.vec4(quats[i]), wp.vec3(means[i])
         keys[at] = CULLED
-        counts[at] = wp.int64(0)
-        visible[at] = 0
+        counts[at] = 0
         # conditions are written so that a NaN culls
         log_opacity = float(ln(real(opacity)))
         half_r2 = log_opacity - view.log_cut
@@ -260,10 +261,10 @@ def make_project(
         first_column, end_column = limits.span(box, row_first, row_end, view.width)
         if row_first >= row_end or first_column >= end_column:
             return
-        left = first_column / view.tile_w
-        columns = (end_column - 1) / view.tile_w - left + 1
-        top = row_first / view.tile_h
-        tile_rows = (row_end - 1) / view.tile_h - top + 1
+        left = divide(first_column, view.tile_w)
+        columns = divide(end_column - 1, view.tile_w) - left + 1
+        top = divide(row_first, view.tile_h)
+        tile_rows = divide(row_end - 1, view.tile_h) - top + 1
         bits, tiles = limits.touched(box, left, columns, top, tile_rows, view)
         if tiles == 0:
             return
@@ -310,13 +311,13 @@ def make_project(
             )
         if wp.static(every_bounds) or bits == NONE:
             bounds[at] = box
-        corner = wp.uint64((number * view.tiles_y + top) * view.tiles_x + left)
-        windows[at] = (corner << BITS) | wp.uint64(bits)
+        corner = (number * view.tiles_y + top) * view.tiles_x + left
+        windows[at] = (wp.uint64(corner) << BITS) | wp.uint64(bits)
         keys[at] = sortable(key)
         if wp.static(layers):
             if coplanar_groups[i] >= 0:
                 keys[at] = GROUP_KEYS + wp.uint32(coplanar_groups[i])
-        counts[at] = wp.int64(tiles)
-        visible[at] = 1
+        counts[at] = tiles
+        count_tiles(at, corner, bits, view, counters, big)
 
     return project

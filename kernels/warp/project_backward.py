@@ -96,8 +96,8 @@ def make_project_backward(
         colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_terms)
         lines: wp.array(dtype=wp.vec4),
         keys: wp.array(dtype=wp.uint32),
-        counts: wp.array(dtype=wp.int64),
-        ends_by_index: wp.array(dtype=wp.int64),
+        counts: wp.array(dtype=wp.int32),
+        ends_by_index: wp.array(dtype=wp.int32),
         moments: wp.array(dtype=Moments),  # by slot
         by_means: wp.array(dtype=wp.vec3),  # out, as all arrays below; 0 for culled splats
         by_quats: wp.array(dtype=wp.vec4),
@@ -125,7 +125,7 @@ def make_project_backward(
         if keys[i] == CULLED:
             return
         total = Totals()
-        for slot in range(int(ends_by_index[i] - counts[i]), int(ends_by_index[i])):
+        for slot in range(ends_by_index[i] - counts[i], ends_by_index[i]):
             values = moments[slot]
             for field in range(wp.static(fields)):
                 total[field] = total[field] + wp.float64(values[field])

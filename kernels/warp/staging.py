@@ -6,11 +6,11 @@ On the CPU a block is one thread: records are read from global memory, and the l
 batch.
 """
 
-import re
 from types import SimpleNamespace
 
 import warp as wp
 
+from .common import with_numbers
 from .records import Layout
 
 STAGED = 128
@@ -112,11 +112,6 @@ _ALONE = """
     return true;
 #endif
 """
-
-
-def with_numbers(text: str, numbers: dict[str, int]) -> str:
-    """Replace names by numbers in a text."""
-    return re.sub("|".join(numbers), lambda name: str(numbers[name[0]]), text)
 
 
 @wp.func_native(_ALONE)

@@ -73,7 +73,7 @@ def test_marked_cells_contain_all_fragments_and_few_others(renderer, cloud, qual
     resident = backend.upload(CLOUDS[cloud]())
     features, view = prepare(resident, fs.Capture(CAMERA, quality=fs.Quality.of(quality), outputs=("rgb",)))
     frame = backend.pipeline(features).render_counted(resident, view)[0]
-    visible = frame.named["visible"].numpy()[: resident.count] != 0
+    visible = frame.named["keys"].numpy()[: resident.count] != 0xFFFFFFFF
     found = marked(frame)[visible]
     lines = frame.named["lines"].numpy()[: resident.count * frame.program.layout.lines]
     records = lines.reshape(resident.count, -1)[visible]

@@ -19,7 +19,7 @@ BLOCK = 256
 _MIN_THREADS = 2048
 """minimum threads of one part of a CPU launch; smaller parts cost more time than they save"""
 _MIN_TILES = 4
-"""minimum tiles of one part of a CPU launch"""
+"""minimum tiles or blocks of one part of a CPU launch"""
 
 
 @cache
@@ -92,14 +92,21 @@ class Launcher:
         """Launch `count` threads undivided on every device, with all arguments from `given`."""
         self._cache.launch(kernel, count, _arguments(kernel, given), block)
 
-    def launch_tiles(self, kernel: Any, first: int, end: int, area: int, given: Mapping[str, Any]) -> None:
-        """Launch a CPU thread per tile. The kernel's first parameter is the first tile of a part of the
-        launch, its last parameter the offset of the `area` samples of state of this part."""
+    def launch_blocks(
+        self, kernel: Any, first: int, end: int, given: Mapping[str, Any], block: int = BLOCK, area: int = 0
+    ) -> None:
+        """Launch a block of threads on a GPU, or a thread on the CPU, for each number from first to end. The
+        kernel's first parameter is the first number of a part of the launch. area: on the CPU, samples of
+        state of a part, whose offset is the last parameter."""
+        if self._workers is None:
+            self._cache.launch(kernel, (end - first) * block, [first, *_arguments(kernel, given, 1)], block)
+            return
         parts = min(self.parts, -(-(end - first) // _MIN_TILES))
         cuts = [first + (end - first) * k // parts for k in range(parts + 1)]
-        args = _arguments(kernel, {**given, "state_first": 0}, 1)[:-1]
+        args = _arguments(kernel, {**given, "state_first": 0}, 1)
+        args = args[:-1] if area else args
         spans = enumerate(pairwise(cuts))
-        self._run(kernel, [(b - a, [a, *args, k * area]) for k, (a, b) in spans])
+        self._run(kernel, [(b - a, [a, *args, *([k * area] if area else [])]) for k, (a, b) in spans])
 
     def _run(self, kernel: Any, parts: list[tuple[int, list[Any]]]) -> None:
         """Launch the parts of a kernel launch, each with its number of threads and arguments."""

@@ -1,15 +1,15 @@
-"""The stages of a frame with one or many views: project, sort, bin, blend, resolve.
+"""The stages of a frame with one or many views: project, bin, sort, blend, resolve.
 
-Splats, tiles and samples of all views are numbered consecutively, view after view. Between the stages the
-host reads the numbers of visible splats and of (splat, tile) pairs, which are sizes of arrays and launches. A
-frame with more pairs than the memory budget allows is rendered in bands of tiles. A frame like an earlier one
-does not wait for these numbers: its lists have the `Capacity` of earlier frames, and are empty if `totals` on
-the device exceeds it; pipeline.py then renders the frame again.
+Splats, tiles and samples of all views are numbered consecutively, view after view. After projection the host
+reads the number of (splat, tile) pairs, which is the size of the lists. A frame with more pairs than the
+memory budget allows is rendered in bands of tiles. A frame like an earlier one does not wait for this
+number: its lists have the capacity that earlier frames needed, and are empty if `totals` on the device
+exceeds it; pipeline.py then renders the frame again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,18 +30,12 @@ from fidsplat.util.errors import DeviceError
 class ImageArrays:
     """Output arrays of a frame."""
 
-    arrays: Mapping[str, Any]
-    """by the names of the outputs"""
+    allocate: Callable[[], Mapping[str, Any]]
+    """returns arrays by the names of the outputs, the same at each call"""
     indices: Any
     """(views,) int32 on the device: batch index of each view in these arrays"""
     reserved: int
     """size in bytes of the images of all views of the batch"""
-
-
-@dataclass(frozen=True)
-class Capacity:
-    visible: int
-    pairs: int
 
 
 class DeviceFrame:
@@ -55,11 +49,12 @@ class DeviceFrame:
         stack: ViewBatch,
         launcher: Launcher,
         reserved: int = 0,
-        capacity: Capacity | None = None,
+        capacity: int | None = None,
         inputs: ArrayPool | None = None,
     ) -> None:
-        """reserved: bytes of the frame or batch that contains this frame. capacity: capacity of the lists;
-        None: the host waits for their sizes. inputs: pool of the arrays that the host fills for the views."""
+        """reserved: bytes of the frame or batch that contains this frame. capacity: pairs for which the
+        lists have capacity; None: the host waits for their number. inputs: pool of the arrays that the host
+        fills for the views."""
         self.program, self.planner, self.workspace = program, planner, planner.workspace
         self.pool = self.workspace.pool
         self.resident, self.launcher = resident, launcher
@@ -132,21 +127,19 @@ class DeviceFrame:
     def _render_pose(self) -> Any:
         """Run all stages except resolve for one pose; returns the sample buffers."""
         wp, n, program = self.wp, self.splats, self.program
-        self._take("starts", self.tiles + 1, wp.int32)
-        self._take("lists", 1, wp.int32)
-        self._take("order", 1, wp.int32)
+        for name, size in {"starts": 1, "cursors": 0, "tile_order": 0}.items():
+            self._take(name, self.tiles + size, wp.int32)
         self._take("bounds", n, kernels("bounds").Bounds)
         self._take("lines", n * program.layout.lines, wp.vec4)
         self.launcher.stage("project")
-        visible, pairs = self._project() if n else (0, 0)
-        self.launcher.stage("sort")
-        if pairs:
-            self._sort(visible)
+        visible, pairs = self._project()
         samples = self._samples("raw")
-        for first, end, listed in self._bands(visible, pairs):
+        for first, end, listed in self._bands(pairs):
             self.bands += 1
             self.launcher.stage("bin")
-            self._bin(visible, first, end, listed, complete=listed == pairs)
+            self._bin(first, end, listed, complete=listed == pairs)
+            self.launcher.stage("sort")
+            self.launcher.launch_blocks(self.program.lists.sort_lists, first, end, self.named)
             self.launcher.stage("blend")
             self._blend(first, end, samples)
         if program.backdrop:
@@ -162,66 +155,69 @@ class DeviceFrame:
     # stages
 
     def _project(self) -> tuple[int, int]:
-        wp, n, sort = self.wp, self.splats, self.program.sort
+        """Project, and count the pairs of each tile. Returns the numbers of visible splats and of pairs, or
+        the capacity."""
+        wp, n, first_tile = self.wp, self.splats, self.program.lists.COUNTERS
         self._take("windows", n, wp.uint64)
         self._take("keys", n, wp.uint32)
-        counts, ends = self._exact("counts", n, wp.int64), self._exact("ends_by_index", n, wp.int64)
-        visible, offsets = self._exact("visible", n, wp.int32), self._exact("offsets", n, wp.int32)
-        # placeholders, which kernels do not read if all splats have one primitive
-        cloud = {"boxes": visible, "coplanar_groups": visible, "thickness": self.resident.arrays["opacities"]}
-        cloud |= self.resident.arrays
-        self._launch(self.program.project, n, block=self.program.project_block, **cloud)
-        wp.utils.array_scan(visible, offsets, inclusive=True)
-        wp.utils.array_scan(counts, ends, inclusive=True)
+        self._take("big", n, wp.int32)
+        self._take("pairs", 1, wp.uint64)
+        counts = self._exact("counts", n, wp.int32)
+        counters = self._exact("counters", first_tile + self.tiles, wp.int32)
         totals = self._take("totals", 2, wp.int64)
-        self.launcher.launch_undivided(sort.sum_up, 1, {**self.named, "splats": n})
-        if self.capacity:
-            return self.capacity.visible, self.capacity.pairs
+        counters.zero_()
+        # placeholders, which kernels do not read if all splats have one primitive
+        cloud = {"boxes": counts, "coplanar_groups": counts, "thickness": self.resident.arrays["opacities"]}
+        cloud |= self.resident.arrays
+        if n:
+            self._launch(self.program.project, n, block=self.program.project_block, **cloud)
+            self._list_big({"cursors": counters, "first_cursor": first_tile, "capacity": 0})
+        unlimited = 2**31 - 1
+        self._start_lists(0, self.tiles, unlimited if self.capacity is None else self.capacity)
+        if self.capacity is not None:
+            return 0, self.capacity
         visible, pairs = self.launcher.read_back(totals, self.pool.host("totals", 2, wp.int64))
         return visible, pairs
 
-    def _sort(self, visible: int) -> None:
-        """Sort visible splats by depth, ties by index."""
-        # the second half is scratch memory of the sort
-        keys = self._take("sorted_keys", 2 * visible, self.wp.uint32)
-        order = self._take("order", 2 * visible, self.wp.int32)
-        self._launch(self.program.sort.compact, self.splats, capacity=visible)
-        self.wp.utils.radix_sort_pairs(keys, order, visible)
+    def _list_big(self, given: dict[str, Any], first: int = 0, end: int | None = None) -> None:
+        """Count or list the tiles of big splats."""
+        blocks = 8 * self.pool.device.sm_count if self.pool.device.is_cuda else 64
+        band = {"band_first": first, "band_end": self.tiles if end is None else end, "blocks": blocks}
+        self.launcher.launch_blocks(self.program.list_big, 0, blocks, self.named | band | given)
 
-    def _bands(self, visible: int, pairs: int) -> Iterator[tuple[int, int, int]]:
+    def _start_lists(self, first: int, end: int, capacity: int) -> None:
+        """Compute the starts of the lists of a band of tiles."""
+        given, lists = {"band_end": end, "capacity": capacity}, self.program.lists
+        self.launcher.launch_blocks(
+            lists.start_lists, first, first + 1, self.named | given, lists.START_BLOCK
+        )
+
+    def _bands(self, pairs: int) -> Iterator[tuple[int, int, int]]:
         """Split the tiles into ranges (first, end, pairs) whose lists fit the budgets; usually one."""
-        limit = self.planner.max_pairs(self.resident, self.stack, visible, self.reserved)
+        limit = self.planner.max_pairs(self.resident, self.stack, self.reserved)
         if pairs <= limit:
             return iter([(0, self.tiles, pairs)])
-        totals = self._take("tile_totals", self.tiles, self.wp.int32)
-        totals.zero_()
-        self.program.load_banding()
-        # undivided, as atomic additions on the CPU are ordinary additions
-        self.launcher.launch_undivided(self.program.lists.histogram, visible, {**self.named, "first": 0})
-        return split_by_cost(totals.numpy()[: self.tiles], limit)
+        lengths = self.named["counters"].numpy()[self.program.lists.COUNTERS :]
+        return split_by_cost(lengths[: self.tiles], limit)
 
-    def fits(self, capacity: Capacity) -> bool:
-        """Whether a frame of this capacity fits the budgets in one band."""
+    def fits(self, capacity: int) -> bool:
+        """Whether a frame with this number of pairs fits the budgets in one band."""
         try:
-            limit = self.planner.max_pairs(self.resident, self.stack, capacity.visible, self.reserved)
+            return capacity <= self.planner.max_pairs(self.resident, self.stack, self.reserved)
         except DeviceError:
             return False
-        return capacity.pairs <= limit
 
-    def _bin(self, visible: int, first: int, end: int, pairs: int, complete: bool) -> None:
-        """Write the tile lists of one band in depth order. complete: whether the band has all tiles."""
-        wp, lists, sort = self.wp, self.program.lists, self.program.sort
-        tiles = self._take("tiles", 2 * pairs, wp.int32)
-        listed = self._take("lists", 2 * pairs, wp.int32)
-        band = {"band_first": first, "band_end": end}
-        if pairs:
-            lengths, ends = self._exact("lengths", visible, wp.int64), self._exact("ends", visible, wp.int64)
-            count = sort.gather if complete else lists.count
-            self._launch(count, visible, **band, capacity=visible, pairs=pairs)
-            wp.utils.array_scan(lengths, ends, inclusive=True)
-            self._launch(lists.emit, visible, **band, capacity=visible, pairs=pairs, end_tile=self.tiles)
-            wp.utils.radix_sort_pairs(tiles, listed, pairs, 0, self.tiles.bit_length())
-        self._launch(sort.find_starts, end - first + 1, **band, pairs=pairs)
+    def _bin(self, first: int, end: int, pairs: int, complete: bool) -> None:
+        """Write the pairs of one band. complete: whether the band has all tiles."""
+        self._take("pairs", pairs, self.wp.uint64)
+        self._take("lists", pairs, self.wp.int32)
+        if not complete:
+            self._start_lists(first, end, pairs)
+        band = {"band_first": first, "band_end": end, "capacity": pairs, "splats": self.splats}
+        if self.splats:
+            self._list_big({"first_cursor": 0, "capacity": pairs}, first, end)
+            # complete blocks
+            self._launch(self.program.lists.list_windows, -(-self.splats // BLOCK) * BLOCK, **band)
 
     def _samples(self, kind: str) -> Any:
         samples = self.program.samples_type()
@@ -243,7 +239,7 @@ class DeviceFrame:
             )
             return
         given["state"] = self._take("state", self.launcher.parts * area, program.state)
-        self.launcher.launch_tiles(program.blend, first, end, area, given)
+        self.launcher.launch_blocks(program.blend, first, end, given, area=area)
 
     def resolve(self, into: ImageArrays, launcher: Launcher) -> None:
         """Run the resolve stage: images from samples."""
@@ -251,7 +247,8 @@ class DeviceFrame:
         view, wp, program = self.view, self.wp, self.program
         width, pixels = view.width // view.samples, view.width * view.height // view.samples**2
         out = program.images_type()
-        for name, array in into.arrays.items():
+        arrays = into.allocate()
+        for name, array in arrays.items():
             setattr(out, name, array)
         for name in program.cloud_arrays:
             setattr(out, name, self.resident.arrays[name])
@@ -268,7 +265,7 @@ class DeviceFrame:
         launcher.launch(program.resolve, self.views * pixels, given)
         if program.sensor:
             settings = program.sensor.settings(view, self.inputs)
-            given = {"settings": settings, "batch_indices": into.indices, "rgb": into.arrays["rgb"]}
+            given = {"settings": settings, "batch_indices": into.indices, "rgb": arrays["rgb"]}
             sizes = {"width": width, "pixels": pixels}
             launcher.launch(program.sensor.kernel, self.views * pixels, given | sizes)
         launcher.stage(None)

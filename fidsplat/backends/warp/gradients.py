@@ -108,7 +108,10 @@ class _Backward:
         wp, frame, made, pairs = self._wp, self._frame, self._made, self._pairs
         if not pairs:
             return
-        self._given["slots"] = self._take("slots", pairs, wp.int32)
+        self._take("slots", pairs, wp.int32)
+        ends = self._take("ends_by_index", self._count, wp.int32)
+        wp.utils.array_scan(self._given["counts"], ends, inclusive=True)
+        self._given["tiles"] = frame.tiles
         self._launcher.launch(made.slots, pairs, self._given)
         self._given["moments"] = moments = frame.pool.exact("moments", pairs, made.blend.Moments)
         moments.zero_()
@@ -126,7 +129,7 @@ class _Backward:
         self._given["lights"] = self._take("lights", states, wp.float32)
         self._given["losses"] = self._take("losses", states, made.blend.Loss)
         self._given["fragments"] = self._take("fragments", states * chunk, wp.vec2)
-        self._launcher.launch_tiles(kernel, 0, tiles, area, self._given)
+        self._launcher.launch_blocks(kernel, 0, tiles, self._given, area=area)
 
     def _sum_rows(self, parts: Any, rows: int, columns: int, result: Any) -> None:
         """Sum all rows in a fixed order."""

@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -58,18 +59,30 @@ class WarpImages(Images):
         views: int = 1,
         splats: int = 0,
     ) -> None:
-        """Allocate images of (rows, columns) pixels. Raises DeviceError if they exceed the memory budget."""
+        """Images of (rows, columns) pixels. Raises DeviceError if they exceed the memory budget."""
         self._outputs, self._size, self.views, self._splats = outputs, size, views, splats
         self.nbytes, pixels = 0, views * size[0] * size[1]
-        self.arrays: dict[str, Any] = {}
-        """arrays by output; complete after `wait`"""
+        sizes = {}
         for name, output in outputs.items():
             self.nbytes += 4 * pixels * output.channels
             if views > 1:  # single frames include images in their plan
                 check_batch_memory(views, self.nbytes, workspace.memory_budget)
             dtype = getattr(load(), output.dtype)
-            self.arrays[name] = workspace.pool.allocate(name, pixels * output.channels, dtype)
+            sizes[name] = pixels * output.channels, dtype
+        pool = workspace.pool
+
+        @cache
+        def allocate() -> dict[str, Any]:
+            return {name: pool.allocate(name, *size) for name, size in sizes.items()}
+
+        self.allocate = allocate
+        """returns `arrays`; allocated at the first call, so that the host submits the frame before"""
         self.rendered: list[Rendered] = []
+
+    @property
+    def arrays(self) -> dict[str, Any]:
+        """Arrays by output, complete after `wait`."""
+        return self.allocate()
 
     def blank(self) -> None:
         """Fill the images of all views with their empty value, as some views are masked out."""

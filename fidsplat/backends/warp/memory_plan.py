@@ -15,12 +15,10 @@ from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.util.errors import DeviceError, bytes_words
 
 _BOUNDS = 44
-_PROJECTED = 36
-"""bytes per splat of rectangle of tiles, sort key, counts and sums"""
-_VISIBLE = 40
-"""bytes of a visible splat in the sort and in the lists"""
-_PAIR = 24
-"""bytes of a (splat, tile) pair, including scratch memory of the sort"""
+_PROJECTED = 20
+"""bytes per splat of window of tiles, sort key, number of tiles, and index as a big splat"""
+_PAIR = 12
+"""bytes of a (splat, tile) pair, before and after the sort"""
 _MAX_PART_BYTES = {True: 1 << 31, False: 1 << 28}
 """maximum bytes of a part of a batch on CUDA and on the CPU; larger parts are not faster"""
 _MAX_NUMBERED = 1 << 30
@@ -46,11 +44,11 @@ class MemoryPlanner:
         columns, rows = -(-view.width // self._tile_width), -(-view.height // self._tile_height)
         return rows * columns * self._tile_width * self._tile_height
 
-    def max_pairs(self, resident: Resident, stack: ViewBatch, visible: int, reserved: int) -> int:
+    def max_pairs(self, resident: Resident, stack: ViewBatch, reserved: int) -> int:
         """Maximum number of (splat, tile) pairs in the lists at once. reserved: bytes of other arrays. Raises
         DeviceError if the rest of the frame exceeds the memory budget."""
         workspace = self.workspace
-        fixed = resident.memory_bytes + self._splat_bytes * len(stack) * resident.count + _VISIBLE * visible
+        fixed = resident.memory_bytes + self._splat_bytes * len(stack) * resident.count
         fixed += len(stack) * self.sample_bytes(stack.view) + reserved + memory_bytes(stack.view, workspace)
         pairs = (workspace.memory_budget - fixed) // _PAIR
         if pairs < 1:
@@ -66,7 +64,7 @@ class MemoryPlanner:
         count, workspace = len(batch), self.workspace
         if not count or not batch.stacked or (self._same_settings and batch.numbers):
             return even_parts(count, 1)
-        each = resident.count * (self._splat_bytes + _VISIBLE) + self.sample_bytes(batch.view)
+        each = resident.count * self._splat_bytes + self.sample_bytes(batch.view)
         external = batch.view.external_depth
         each += external.nbytes // count if external and external.stacked else 0
         free = workspace.memory_budget - resident.memory_bytes - reserved

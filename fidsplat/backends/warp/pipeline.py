@@ -1,9 +1,9 @@
 """The stages compiled for one FeatureSet on one Warp device, and the replay of frames.
 
-The second frame with the same cloud, image size and number of views does not wait for its counts: its lists
-have the largest capacity that earlier frames needed, plus an eighth. If its counts exceed the capacity, it is
-rendered again when it is read. From the third frame on, all stages except resolve are one captured CUDA graph
-with constant arguments; values that differ between views are in input arrays.
+The second frame with the same cloud, image size and number of views does not wait for its number of pairs:
+its lists have the largest capacity that earlier frames needed, plus an eighth. If its pairs exceed the
+capacity, it is rendered again when it is read. From the third frame on, all stages except resolve are one
+captured CUDA graph with constant arguments; values that differ between views are in input arrays.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import Pipeline
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.command_list import LaunchCache, Launcher, capture
-from fidsplat.backends.warp.frame import Capacity, DeviceFrame, ImageArrays
+from fidsplat.backends.warp.frame import DeviceFrame, ImageArrays
 from fidsplat.backends.warp.images import Rendered, WarpImages
 from fidsplat.backends.warp.memory_plan import MemoryPlanner
 from fidsplat.backends.warp.program import Program
@@ -53,7 +53,8 @@ class _CachedFrame:
 
     inputs: ArrayPool
     """pool of the input arrays that the host fills for the views"""
-    capacity: Capacity
+    capacity: int
+    """of the lists, in pairs"""
     token: tuple[Any, ...] = ()
     recorded: RecordedFrame | None = None
 
@@ -104,12 +105,12 @@ class WarpPipeline(Pipeline):
 
     def _new_images(self, resident: Resident, views: ViewBatch) -> tuple[WarpImages, ImageArrays]:
         images = WarpImages(self.workspace, self.outputs, views.size, views.total, resident.count)
-        return images, ImageArrays(images.arrays, self.workspace.first_index, images.nbytes)
+        return images, ImageArrays(images.allocate, self.workspace.first_index, images.nbytes)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
-        """Render one view, and return the data between the stages: keys (n,) uint32; order (visible,), splat
-        indices by depth; starts (tiles + 1,); lists (pairs,), of the last band; records (n, words) float32;
-        raw (4, rows, columns) float32: r, g, b, transmittance; output images by name."""
+        """Render one view, and return the data between the stages: keys (n,) uint32; starts (tiles + 1,);
+        lists (pairs,), of the last band; records (n, words) float32; raw (4, rows, columns) float32: r, g,
+        b, transmittance; output images by name."""
         frame, images = self.render_counted(resident, view)
         named, stats, n = frame.named, images.stats, resident.count
         rows, stride = frame.grid
@@ -117,7 +118,6 @@ class WarpPipeline(Pipeline):
         lines = named["lines"].numpy()[: n * self.program.layout.lines]
         return {
             "keys": named["keys"].numpy()[:n].copy(),
-            "order": named["order"].numpy()[: stats["visible"]].astype(np.uint32),
             "starts": named["starts"].numpy()[: frame.tiles + 1].astype(np.uint32),
             "lists": named["lists"].numpy()[: stats["pairs"]].astype(np.uint32),
             "records": lines.reshape(n, -1).copy(),
@@ -133,7 +133,7 @@ class WarpPipeline(Pipeline):
         self.workspace.frames += 1
         frame.render()
         if not views.view.sub_frames:
-            self._update_capacity(resident, views, frame.stats["visible"], frame.stats["pairs"])
+            self._update_capacity(resident, views, frame.stats["pairs"])
         frame.resolve(into, launcher)
         return frame, Rendered(launcher, frame.stats)
 
@@ -170,12 +170,12 @@ class WarpPipeline(Pipeline):
         self,
         resident: Resident,
         views: ViewBatch,
-        capacity: Capacity,
+        capacity: int,
         frame: DeviceFrame,
         launcher: Launcher,
         into: ImageArrays,
     ) -> Rendered:
-        """A submitted frame whose numbers of splats and pairs are compared with the capacities later."""
+        """A submitted frame whose number of pairs is compared with the capacity later."""
         workspace, pool = self.workspace, frame.pool
         counts = pool.lend("totals", 2, load().int64)
         load().copy(counts, frame.named["totals"])
@@ -191,8 +191,8 @@ class WarpPipeline(Pipeline):
             with workspace.working("while rendering"):
                 visible, pairs = counts.numpy().tolist()
                 stats.update(visible=visible, pairs=pairs)
-                self._update_capacity(resident, views, visible, pairs)
-                if visible > capacity.visible or pairs > capacity.pairs:
+                self._update_capacity(resident, views, pairs)
+                if pairs > capacity:
                     return self._render_counted(resident, views, into)[1]
             return None
 
@@ -201,8 +201,8 @@ class WarpPipeline(Pipeline):
             with workspace.working("while rendering"):
                 own = into
                 if len(views) == 1:
-                    arrays = {name: load().empty_like(array) for name, array in into.arrays.items()}
-                    own = replace(into, arrays=arrays)
+                    arrays = {name: load().empty_like(array) for name, array in into.allocate().items()}
+                    own = replace(into, allocate=lambda: arrays)
                 return self._render_counted(resident, views, own)[1].timings()
 
         rendered.complete = complete
@@ -231,16 +231,12 @@ class WarpPipeline(Pipeline):
         external = view.external_depth and view.external_depth.depth.shape
         return cached.capacity, budgets, states, view.raster, view.environment_map, labels, external
 
-    def _update_capacity(self, resident: Resident, views: ViewBatch, visible: int, pairs: int) -> None:
+    def _update_capacity(self, resident: Resident, views: ViewBatch, pairs: int) -> None:
         kinds, kind = self._cached.setdefault(resident, {}), (views.view.width, views.view.height, len(views))
         cached = kinds.get(kind)
         if cached is None:
             if len(kinds) >= _MAX_KINDS:
                 kinds.clear()
-            cached = kinds[kind] = _CachedFrame(ArrayPool(self.workspace.device), Capacity(-1, -1))
-        before = cached.capacity
-        if visible > before.visible or pairs > before.pairs:
-            cached.capacity = Capacity(
-                min(max(visible + visible // 8 + _SPARE, before.visible), len(views) * resident.count),
-                max(pairs + pairs // 8 + _SPARE, before.pairs),
-            )
+            cached = kinds[kind] = _CachedFrame(ArrayPool(self.workspace.device), -1)
+        if pairs > cached.capacity:
+            cached.capacity = pairs + pairs // 8 + _SPARE

@@ -26,8 +26,7 @@ EFFECTS = frozenset(
     | {"background_constant", "background_gradient", "background_panorama"}
     | {"arithmetic_precise", "arithmetic_fast", "arithmetic_approximate"}
     | {"motion_groups", "shutter_exposure", "external_depth"}
-    # effects without influence on images
-    | {"shutter_rows", "ellipsoids_only"}
+    | {"ellipsoids_only", "shutter_rows"}  # without influence on images
 )
 """supported features, in addition to outputs and post-processing steps, which have a file each"""
 _SETTINGS = {"blend_half": "blend_precision='float16'", "blend_double": "blend_precision='float64'"}
@@ -41,7 +40,7 @@ _PROJECT = (
     *(*_RECORD, "lowpass_pixel", "motion_groups", "ellipsoid_ewa", "ellipsoid_ewa_antialiased"),
     *("camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
 )
-_SAMPLE = (*_RECORD, "stop_exclusive", "arithmetic_fast", "rays_length", "external_depth")
+_SAMPLE = (*_RECORD, "ellipsoids_only", "stop_exclusive", "arithmetic_fast", "rays_length", "external_depth")
 
 
 def known() -> frozenset[str]:
@@ -122,10 +121,11 @@ class Program:
             self._make_lists(features, needs)
             self._make_blend(needs)
             self._make_resolve(features, needs)
-            made = (self.project, self.lists.emit, self.blend, self.resolve, *self.expose.values())
-            common = (self.sort.compact, self.sort.gather, self.sort.find_starts, self.sort.sum_up)
+            made = (self.project, self.list_big, self.blend, self.resolve, *self.expose.values())
+            common = (self.lists.start_lists, self.lists.list_windows, self.lists.sort_lists)
             further = (self.backdrop, self.sensor and self.sensor.kernel)
             blocks = {self.blend: self.blend_block, self.project: self.project_block}
+            blocks[self.lists.start_lists] = self.lists.START_BLOCK
             for kernel in (*made, *common, *filter(None, further)):
                 self.compile(kernel, blocks.get(kernel, BLOCK))
 
@@ -137,8 +137,8 @@ class Program:
             features.setup_precision,
             self.shape.schedule == "tiles",
         )
-        self.sort = kernels("tile_lists")
-        self.lists = self.sort.make_lists("lowpass_screen" in needs.effects)
+        self.lists = kernels("tile_lists")
+        self.list_big = self.lists.make_list_big("lowpass_screen" in needs.effects)
 
     def _make_blend(self, needs: _Needs) -> None:
         buffers, blending = kernels("buffers"), needs.blending
@@ -188,12 +188,6 @@ class Program:
             raise DeviceError(f"{self._name} cannot compile {kernel.key}: {error}") from error
         if loaded is None:
             raise DeviceError(f"{self._name} cannot compile {kernel.key}; read Warp's messages on stderr")
-
-    def load_banding(self) -> None:
-        """Compile the kernels for frames with several bands."""
-        with _MAKING, quiet():
-            self.compile(self.lists.histogram)
-            self.compile(self.lists.count)
 
 
 class GradientKernels:
