@@ -9,16 +9,19 @@ from itertools import product
 from pathlib import Path
 from typing import IO, Any
 
-import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.text import Text
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from matplotlib.transforms import Bbox
 
+from fidsplat.util.errors import required_package
 from fidsplat.util.files import atomic_write, printable
+
+with required_package("matplotlib", "experiments"):
+    import matplotlib
+    from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.text import Text
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    from matplotlib.transforms import Bbox
 
 Values = Sequence[float]
 _STYLE: dict[Any, Any] = {
