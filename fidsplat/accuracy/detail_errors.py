@@ -1,4 +1,4 @@
-"""Measurement of the error of a store's levels of detail: frames with merged cells against exact frames."""
+"""Measurement of the errors of a store's levels of detail: frames with merged cells and exact frames."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ class Shutter:
         ]
 
     def times(self, middle: float) -> list[float]:
-        """Times of the sub-poses of an exposure, from the middle of its exposure time."""
+        """Times of the sub-poses of an exposure with its middle at a time."""
         middle = number("the middle of an exposure", middle)
         n = self.sub_poses if self.exposure_time > 0 else 1
         return [middle + self.exposure_time * ((k + 0.5) / n - 0.5) for k in range(n)]

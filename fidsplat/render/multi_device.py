@@ -199,7 +199,7 @@ class _Worker:
         self._captures.put(capture)
 
     def end(self) -> None:
-        """Queue the end of the captures."""
+        """Signal that no captures follow."""
         self._captures.put(self._END)
 
     def result(self) -> Frame:

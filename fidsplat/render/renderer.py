@@ -98,7 +98,7 @@ class Renderer:
     def upload(self, scene: Scene | SplatCloud | Store) -> ResidentCloud:
         """Copy a scene's splats to the device, to render them many times.
 
-        The result has the scene's capture. Chunks of a store are read when a view needs them.
+        `render` uses the capture of this scene by default. Chunks of a store are read when a view needs them.
         """
         check_process(self._pid, "Renderer")
         capture = scene.capture if isinstance(scene, Scene) else _DEFAULT_CAPTURE

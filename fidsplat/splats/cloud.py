@@ -157,7 +157,7 @@ class SplatCloud(PickledByFields, Summarised):
         return cloud
 
     def _finish(self, means, float32: dict[str, np.ndarray], labels, origin, dropped: dict[str, int]) -> None:
-        """Freeze validated splats, arrays by name. means: in the type of the caller."""
+        """Normalise quaternions, choose the origin, freeze validated arrays. means: in the caller's type."""
         float32["quats"] = unit_quaternions(float32["quats"])
         if "thickness" in float32 and not float32["thickness"].any():
             del float32["thickness"]

@@ -35,7 +35,7 @@ class Up(NamedTuple):
 
 
 def describe(cloud: SplatCloud) -> dict[str, Any]:
-    """Figures of a cloud: lengths in the file's metres, percentiles of `PERCENTILES`."""
+    """Statistics of a cloud by name: lengths in metres, percentiles of `PERCENTILES`."""
     facts: dict[str, Any] = {
         "splats": len(cloud),
         "kind": "2D" if cloud.thickness is None else "3D",

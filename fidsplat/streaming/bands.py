@@ -66,7 +66,7 @@ class Band:
         return replace(self, rows=(first, end), subset=None, subchunks=None)
 
     def with_nodes(self, nodes: NodeMasks) -> Band:
-        """The same rows, rendered from some of the visible nodes."""
+        """This band, rendered from some of its visible nodes."""
         return self._with_cache(replace(self, subset=nodes, subchunks=None))
 
     def _with_cache(self, band: Band) -> Band:
@@ -75,13 +75,13 @@ class Band:
         return band
 
     def without_occluded(self, termination: TerminationDepths) -> Band:
-        """The same rows, without occluded nodes and subchunks."""
+        """This band without occluded nodes and subchunks."""
         occluded = self.occluded(termination)
         nodes = tuple(a & ~b for a, b in zip(self.nodes, occluded, strict=True))
         return self.with_nodes(nodes).without_occluded_subchunks(termination)
 
     def without_occluded_subchunks(self, termination: TerminationDepths) -> Band:
-        """The same rows, rendered from the subchunks that can contribute only."""
+        """This band, rendered only from the subchunks of its nodes that can contribute."""
         parts = self.scene.subchunks(self.nodes)
         masked = tuple((part, self._can_contribute(part, termination)) for part in parts)
         return self._with_cache(replace(self, subchunks=masked))

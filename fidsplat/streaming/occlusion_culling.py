@@ -81,7 +81,7 @@ class OcclusionCulling:
 
         Args:
             fits, render_band: functions of a band and the index of its first splat among all bands.
-            copy_tiles: copies tiles (rows, columns) bool of the second images into the first.
+            copy_tiles: copies the tiles of a mask (rows, columns) from the second images to the first.
         """
         bands, frame, tiles = [self.initial_guess(full)], None, np.array(True)
         for _ in range(_MAX_PASSES):
