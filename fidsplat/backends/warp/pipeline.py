@@ -177,24 +177,23 @@ class WarpPipeline(Pipeline):
     ) -> Rendered:
         """A submitted frame whose number of pairs is compared with the capacity later."""
         workspace, pool = self.workspace, frame.pool
-        counts = pool.lend("totals", 2, load().int64)
-        load().copy(counts, frame.named["totals"])
+        acquired = pool.acquire("totals", 2, load().int64)
+        load().copy(acquired[0], frame.named["totals"])
         frame.resolve(into, launcher)
         rendered = Rendered(launcher, {"splats": resident.count, "visible": 0, "pairs": 0})
         # return the array to the pool for later frames
-        weakref.finalize(rendered, pool.release, "totals", counts)
+        weakref.finalize(rendered, pool.release, "totals", acquired)
         stats = rendered.counts  # the closure references only the counts, so that the object can be released
 
         def complete() -> Rendered | None:
             with workspace.failing("while rendering"):
                 launcher.finish()
+            visible, pairs = acquired[1].tolist()
+            stats.update(visible=visible, pairs=pairs)
+            if pairs <= capacity:
+                return None
             with workspace.working("while rendering"):
-                visible, pairs = counts.numpy().tolist()
-                stats.update(visible=visible, pairs=pairs)
-                self._update_capacity(resident, views, pairs)
-                if pairs > capacity:
-                    return self._render_counted(resident, views, into)[1]
-            return None
+                return self._render_counted(resident, views, into)[1]
 
         def profile() -> Mapping[str, float]:
             """Measure the stages by rendering again: one view into new arrays, a batch into its own."""

@@ -77,18 +77,16 @@ class ArrayPool:
             self._hosts[name] = load().empty(size, dtype=dtype, device="cpu", pinned=self.device.is_cuda)
         return self._hosts[name]
 
-    def lend(self, name: str, size: int, dtype: Any) -> Any:
-        """Lend a page-locked host array until `release`."""
-        spare = self._spare.setdefault(name, [])
-        return (
-            spare.pop()
-            if spare
-            else load().empty(size, dtype=dtype, device="cpu", pinned=self.device.is_cuda)
-        )
+    def acquire(self, name: str, size: int, dtype: Any) -> tuple[Any, np.ndarray]:
+        """A page-locked host array until `release`, and its memory as a NumPy array."""
+        if spare := self._spare.setdefault(name, []):
+            return spare.pop()
+        array = load().empty(size, dtype=dtype, device="cpu", pinned=self.device.is_cuda)
+        return array, array.numpy()
 
-    def release(self, name: str, array: Any) -> None:
-        """Return an array of `lend` to the pool."""
-        self._spare[name].append(array)
+    def release(self, name: str, acquired: tuple[Any, np.ndarray]) -> None:
+        """Return an array of `acquire` to the pool."""
+        self._spare[name].append(acquired)
 
     def allocate(self, name: str, size: int, dtype: Any) -> Any:
         """A new array outside the pool. Raises DeviceError if the device has too little memory."""
