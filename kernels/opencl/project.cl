@@ -250,16 +250,9 @@ INLINE void write_splat(
 #undef record
 #undef bounds
 #endif
-#if BATCH > 1 || defined(UNCULLED)
-// Key of a splat that is culled by its bounding sphere; 0 for others.
-#undef RETURN_CULLED
-#define RETURN_CULLED return CULLED
-INLINE uint sphere_key(
-//@@ arguments project
-    , uint i, uint view_index) {
-    view += view_index;
-//@@ splat_view
-    real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
+#if BATCH > 1 || defined(GROUP_SPLATS)
+// Key of splats that are culled by a bounding sphere; 0 for others. Their centres are at most `extent` from `mean`; infinite: not culled.
+INLINE uint frustum_key(global const View *view, real3_ mean, real extent, real max_scale) {
     real3_ p = rotate_to_camera(view, mean);
     p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
 //@@ cull_frustum
@@ -268,6 +261,21 @@ INLINE uint sphere_key(
 #endif
 //@@ project_kernels
 #if BATCH > 1
+#undef RETURN_CULLED
+#define RETURN_CULLED return CULLED
+#ifndef BOX_HERE
+#define BOX_HERE false
+#endif
+INLINE uint splat_key(
+//@@ arguments project
+    , uint i, uint view_index) {
+    view += view_index;
+//@@ splat_view
+    real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
+    real max_scale = fmax(scales[2 * i], scales[2 * i + 1]);
+//@@ max_scale
+    return frustum_key(view, mean, !BOX_HERE && opacities[i] <= 1.0f ? 0 : INFINITY, max_scale);
+}
 
 kernel void project(
 //@@ arguments project
@@ -276,7 +284,7 @@ kernel void project(
     if (first >= count) return;
     Batch batch;
     VECTORISE for (uint k = 0; k < BATCH; k++)
-        batch.keys[k] = sphere_key(
+        batch.keys[k] = splat_key(
 //@@ passed project
             , min(first + k, count - 1), view_index);
     for (uint k = 0; k < min(count - first, (uint)BATCH); k++) {

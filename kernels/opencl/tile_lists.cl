@@ -282,6 +282,11 @@ static inline void comparator(uint t, uint stride, bool mirrored, uint *i, uint 
     *j = mirrored ? *i + 2 * (stride - inside) - 1 : *i + stride;
 }
 
+//@@ pair_order
+#ifndef PAIR_BEFORE
+#define PAIR_BEFORE(a, b) ((a) < (b))
+#endif
+
 // One step of the network on `items`; `fence` names their address space.
 #define SORT_STEP(items, length, comparators, stride, mirrored, fence)                      \
     for (uint t = get_local_id(0); t < (comparators); t += SORT_ITEMS) {                    \
@@ -289,7 +294,7 @@ static inline void comparator(uint t, uint stride, bool mirrored, uint *i, uint 
         comparator(t, stride, mirrored, &i, &j);                                            \
         if (j < (length)) {                                                                 \
             ulong a = (items)[i], b = (items)[j];                                           \
-            if (a > b) {                                                                    \
+            if (PAIR_BEFORE(b, a)) {                                                        \
                 (items)[i] = b;                                                             \
                 (items)[j] = a;                                                             \
             }                                                                               \
@@ -353,11 +358,18 @@ static inline void bucket_starts(local uint *sums, local Buckets *buckets) {
 // Sorts each bucket into `list`: within its bucket, a pair's place is the number of smaller keys. `starts` are the buckets' ends.
 #define BUCKETED(position) (indexed ? pairs[((local ushort *)items)[position]] : items[position])
 static inline void sort_buckets(global const ulong *pairs, uint length, local ulong *items, local Buckets *buckets, float nearest,
-                              float scale, bool indexed, global uint *restrict list) {
+                              float scale, bool indexed, global uint *restrict list
+//@@ pair_order_parameters
+) {
     for (uint k = get_local_id(0); k < length; k += SORT_ITEMS) {
         ulong pair = BUCKETED(k);
-        uint range = bucket_of(pair, nearest, scale), position = range > 0 ? buckets->starts[range - 1] : 0;
-        for (uint other = position, end = buckets->starts[range]; other < end; other++) position += BUCKETED(other) < pair;
+        uint range = bucket_of(pair, nearest, scale), first = range > 0 ? buckets->starts[range - 1] : 0, position = first;
+//@@ equal_start
+        for (uint other = first, end = buckets->starts[range]; other < end; other++) {
+            position += BUCKETED(other) < pair;
+//@@ equal_counted
+        }
+//@@ equal_sorted
         list[position] = (uint)pair;
     }
 }
@@ -365,7 +377,9 @@ static inline void sort_buckets(global const ulong *pairs, uint length, local ul
 // Bucket sort of at most SORT_INDEXED pairs into `list`. Returns false, for all work-items, if a bucket is overfull. items: scratch of
 // SORT_LOCAL values.
 static inline bool bucket_sort(global const ulong *pairs, uint length, local ulong *items, local Buckets *buckets,
-                               global uint *restrict list) {
+                               global uint *restrict list
+//@@ pair_order_parameters
+) {
     uint item = get_local_id(0);
     if (item == 0) {
         buckets->lowest = 0xFFFFFFFFu;
@@ -386,8 +400,14 @@ static inline bool bucket_sort(global const ulong *pairs, uint length, local ulo
         else items[position] = pair;
     }
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (length > SORT_LOCAL) sort_buckets(pairs, length, items, buckets, nearest, scale, true, list);
-    else sort_buckets(pairs, length, items, buckets, nearest, scale, false, list);
+    if (length > SORT_LOCAL)
+        sort_buckets(pairs, length, items, buckets, nearest, scale, true, list
+//@@ pair_order_arguments
+        );
+    else
+        sort_buckets(pairs, length, items, buckets, nearest, scale, false, list
+//@@ pair_order_arguments
+        );
     return true;
 }
 
@@ -401,9 +421,11 @@ kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
     global ulong *list = pairs + start;
     if (clear && item == 0) {
         counters[COUNTERS + tile] = 0;
-        if (tile == 0) counters[COUNTER_BIG] = 0;
+        if (tile == 0) counters[COUNTER_BIG] = counters[COUNTER_VISIBLE] = 0;
     }
-    if (length > SHORT && length <= SORT_INDEXED && bucket_sort(list, length, items, &buckets, lists + start)) return;
+    if (length > SHORT && length <= SORT_INDEXED && bucket_sort(list, length, items, &buckets, lists + start
+//@@ pair_order_arguments
+    )) return;
     uint padded = 1;
     while (padded < length) padded *= 2;
 

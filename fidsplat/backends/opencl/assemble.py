@@ -94,7 +94,7 @@ _EFFECT_ARGUMENTS = {
             "project_step",
         )
     },
-    **{"blend_checkpoints": "blend_backward", "blend_backward": "blend_backward", "find_unculled": "project"},
+    **{"blend_checkpoints": "blend_backward", "blend_backward": "blend_backward"},
 }
 """fields of `Layout` with the arguments that effects add to these kernels"""
 
@@ -238,8 +238,11 @@ def _frustum_parts(layouts: Collection[str]) -> list[str]:
 
 
 def culls_before_projection(features: FeatureSet) -> bool:
-    """Whether splats outside of the frustum can be culled by bounding spheres."""
-    return bool(_frustum_parts(layouts_of(features)))
+    """Whether groups of splats in Morton order can be culled by bounding spheres. The k-buffer requires the
+    cloud's order; splats of a group may have different poses."""
+    layouts = layouts_of(features)
+    excluded = {"compose_pixel", "motion_groups", "shutter_rows"}
+    return excluded.isdisjoint(layouts) and bool(_frustum_parts(layouts))
 
 
 def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> KernelSource:

@@ -355,10 +355,11 @@ GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
 """Kernels with other arguments in the group schedule, where a work-group shares a tile."""
 
 UNCULLED_KERNELS: dict[str, tuple[Argument, ...]] = {
-    "project": args(KERNELS["project"], "in uint unculled  // splats that are projected"),
-    "find_unculled": args(KERNELS["project"], "in uint unculled", "out uint unculled_bits unculled_counts"),
-    "list_unculled": args(
-        "uint capacity", "in uint unculled_bits unculled_counts", "out uint unculled counters"
+    "project": args(KERNELS["project"], "in uint unculled  // groups of splats that are projected"),
+    "cull_groups": args(
+        *("uint groups capacity", "in View view", "in float4 spheres", "in float max_scales"),
+        "out uint unculled counters",
     ),
+    "sort_tiles": args(KERNELS["sort_tiles"], "in uint unculled", "in int splat_ids"),
 }
 """Kernels with frustum culling before projection."""

@@ -31,8 +31,8 @@ from fidsplat.util.errors import DeviceError
 
 MIN_BATCHED = 1 << 14
 """minimum splats of clouds whose set-up is vectorised on CPUs"""
-MIN_CULLED = 1 << 21
-"""minimum splats of clouds that are culled before projection; two more launches cost smaller ones more"""
+MIN_CULLED = 3 << 18
+"""minimum splats of clouds that are sorted, and culled before projection; smaller ones gain nothing"""
 _MAX_FRAMES = 32
 """maximum number of cached frames of a cloud"""
 _MAX_RASTERS = 4
@@ -89,7 +89,7 @@ class OpenCLPipeline(Pipeline):
                 return images
             if resident.coherent and self.shape.lists == "tiled":
                 return self._with_lists("local").render_view(resident, view)
-            if resident.count >= MIN_CULLED and not resident.streamed and self._culls:
+            if resident.count >= MIN_CULLED and resident.sortable and self._culls:
                 return self._other(self.features, replace(self.shape, culls=True)).render_view(resident, view)
             plan = self._planner.frame(resident, view)
             if plan.chunk and self.shape.lists != "ordered":

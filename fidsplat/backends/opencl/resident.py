@@ -15,6 +15,7 @@ import pyopencl as cl
 from fidsplat.backends.cloud_arrays import kernel_arrays
 from fidsplat.backends.interface import ResidentData
 from fidsplat.backends.opencl.buffers import DeviceBuffer
+from fidsplat.backends.opencl.morton_order import MortonOrder
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import color_range
@@ -34,6 +35,8 @@ class Resident(ResidentData):
     """key of clouds whose frames may share buffers"""
     coherent = False
     """whether splats with neighbouring indices are close to each other, as in stores"""
+    sortable = False
+    """whether `sorted_array` is available"""
 
     def __init__(self, count: int) -> None:
         self.count = self.capacity = count
@@ -54,6 +57,10 @@ class Resident(ResidentData):
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
         """The array of splats [first, end)."""
 
+    def sorted_array(self, name: str) -> cl.Buffer:
+        """The array of all splats in Morton order, the same for all arrays."""
+        raise NotImplementedError
+
     def _region(self, complete: cl.Buffer, first: int, end: int, width: int) -> cl.Buffer:
         """Splats [first, end) of a buffer with `width` bytes per splat."""
         if end - first == self.count:
@@ -63,15 +70,19 @@ class Resident(ResidentData):
 
 class UploadedCloud(Resident):
     """A SplatCloud on the device. A CPU reads the host's arrays. Other devices have copies; labels and
-    colours are copied on first use. A cloud of more than half of the memory budget is `streamed`."""
+    colours are copied on first use. A cloud of more than half of the memory budget is `streamed`. Once the
+    arrays are sorted, they are copied again if a frame needs the cloud's order, and stay in it."""
 
     def __init__(self, workspace: Workspace, cloud: SplatCloud) -> None:
         super().__init__(len(cloud))
         self.take_traits(cloud)
         self._workspace, self._arrays = workspace, kernel_arrays(cloud)
+        self._order: MortonOrder | None = None
         total = self.count * self._bytes_of(self._arrays)
         widest = max(array.nbytes for array in self._arrays.values())
         device = workspace.device
+        # an array exists twice while it is sorted
+        self.sortable = total + widest + 4 * self.count <= workspace.memory_budget // 2
         self._shared = workspace.info.kind == "cpu" and bool(device.host_unified_memory)
         if self._shared:
             weakref.finalize(self, _wait_unless_forked, os.getpid(), workspace.queue, workspace.replay_queue)
@@ -79,9 +90,13 @@ class UploadedCloud(Resident):
         self.streamed = total > workspace.memory_budget // 2 or widest > device.max_mem_alloc_size
         if not self.streamed:
             with workspace.failing("copying the cloud"):
-                for name in self._arrays.keys() - {"labels", "colors", "sh"}:
-                    self._buffer(name)
+                self._copy_arrays()
                 workspace.queue.finish()
+
+    def _copy_arrays(self) -> None:
+        """Copy all arrays that every frame reads."""
+        for name in self._arrays.keys() - {"labels", "colors", "sh"}:
+            self._buffer(name)
 
     def _bytes_of(self, names: Iterable[str]) -> int:
         """Bytes per splat of these arrays."""
@@ -92,7 +107,8 @@ class UploadedCloud(Resident):
             return 0, 0
         if self.streamed:
             return 0, self._bytes_of(names)
-        return self.count * self._bytes_of({*names, *self._buffers}), 0
+        order = 0 if self._order is None else 5  # bytes per splat
+        return self.count * (order + self._bytes_of({*names, *self._buffers})), 0
 
     @property
     def memory_bytes(self) -> int:
@@ -102,7 +118,22 @@ class UploadedCloud(Resident):
     def color_range(self) -> tuple[float, float]:
         return color_range(self._arrays.get("colors"), self._arrays.get("sh"))
 
+    def sorted_array(self, name: str) -> cl.Buffer:
+        if self._order is None:
+            self._copy_arrays()
+            order = MortonOrder(self._workspace, self._array("means"), self._buffer("means"))
+            for other, buffer in self._buffers.items():
+                self._buffers[other] = order.gather(other, buffer, self._bytes_of([other]))
+            order.bound(self._buffers)
+            self._order = order
+        return self._order.arrays.get(name) or self._buffer(name)
+
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
+        self.sortable = False
+        if self._order is not None:
+            self._order = None
+            self._buffers.clear()
+            self.cached_frames.clear()
         if self.streamed:
             chunk = np.ascontiguousarray(self._array(name)[first:end])
             buffer = self._workspace.pool.scratch(f"chunk of {name}", chunk.nbytes)
@@ -128,6 +159,8 @@ class UploadedCloud(Resident):
             else:
                 buffer = self._workspace.pool.allocate(f"the cloud's {name}", array.nbytes)
                 cl.enqueue_copy(self._workspace.queue, buffer, array)
+            if self._order is not None:
+                buffer = self._order.gather(name, buffer, self._bytes_of([name]))
             self._buffers[name] = buffer
         return self._buffers[name]
 

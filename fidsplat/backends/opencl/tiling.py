@@ -20,6 +20,7 @@ from fidsplat.backends.bands import split_by_cost
 from fidsplat.backends.opencl.counts import BIG, COUNTERS, PAIRS, VISIBLE, Counts, enlarged
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.memory_plan import KEY_BYTES, MIN_BIG, WINDOW_BYTES
+from fidsplat.backends.opencl.morton_order import GROUP
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.util.errors import DeviceError
 
@@ -32,8 +33,6 @@ _ITEMS = 256
 _START_TILES, _START_SHARES = 512, 32
 """tiles per work-group of the kernel `tile_starts`, and maximum number of work-groups, each of which reads
 all list lengths"""
-_UNCULLED_SPLATS = 4096
-"""splats per work-group of the kernels of part/unculled_splats.cl"""
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 
 
@@ -59,26 +58,21 @@ def allocate_counters(frame: DeviceFrame, words: int, big: int = 0) -> None:
 
 
 def cull(frame: DeviceFrame, big: int) -> None:
-    """List the splats of the cloud that are not culled by their bounding spheres, and set
-    `frame.projected`."""
-    count, pool = frame.resident.count, frame.pool
-    groups, items = -(-count // _UNCULLED_SPLATS), (_ITEMS,)
-    frame.scratch("unculled", 4 * MIN_BIG)
-    # before the first launch: a recorded launch must not bind buffers that are replaced later
-    _allocate_records(frame, min(pool.size("unculled") // 4, count))
-    frame.scratch("unculled_bits", _UNCULLED_SPLATS // 8 * groups)
-    frame.scratch("unculled_counts", 4 * groups)
-    arrays = {name: frame.resident.part(name, 0, count) for name in frame.source.cloud_arrays}
-    frame.launch("project", "find_unculled", (groups * _ITEMS,), items, frame.views, count=count, **arrays)
+    """List the groups of splats that are not culled by their bounding spheres, and set `frame.projected`."""
+    pool, groups = frame.pool, -(-frame.resident.count // GROUP)
+    frame.scratch("unculled", 4 * MIN_BIG // GROUP)
+    for name in ("spheres", "max_scales", "splat_ids"):
+        frame.bind(name, frame.resident.sorted_array(name))
     while True:
-        frame.projected = min(pool.size("unculled") // 4, count)
-        frame.launch("project", "list_unculled", (groups * _ITEMS,), items, capacity=frame.projected)
+        capacity = min(pool.size("unculled") // 4, groups)
+        frame.projected = GROUP * capacity
+        frame.launch("project", "cull_groups", (groups,), (_ITEMS,), groups=groups, capacity=capacity)
         if not frame.waits:
             break
         unculled = int(frame.read("counters", np.uint32, (COUNTERS,))[VISIBLE])
-        if unculled <= frame.projected:
+        if unculled <= capacity:
             break
-        frame.scratch("unculled", 4 * min(unculled * 17 // 16, count))
+        frame.scratch("unculled", 4 * min(unculled * 33 // 32, groups))
         allocate_counters(frame, COUNTERS + frame.tiles, big)
 
 
@@ -93,9 +87,12 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
         # the kernel writes no window for splats outside the band, so windows are first set to empty
         cl.enqueue_fill_buffer(frame.queue, windows, _NO_WINDOW, 0, WINDOW_BYTES * size)
     if count:
-        arrays = {name: frame.resident.part(name, first, end) for name in frame.source.cloud_arrays}
+        resident, names = frame.resident, frame.source.cloud_arrays
+        if frame.shape.culls:
+            arrays, count = {name: resident.sorted_array(name) for name in names}, size
+        else:
+            arrays = {name: resident.part(name, first, end) for name in names}
         batch = frame.shape.batch
-        count = size if frame.shape.culls else count
         items, group = (count, 64) if batch == 1 else (-(-count // batch), 1)
         frame.launch("project", "project", (items,), (group,), frame.views, count=count, **arrays)
 

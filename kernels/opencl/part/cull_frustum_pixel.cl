@@ -2,22 +2,17 @@
 // a margin that are larger by 1 / sqrt(1 - (R k)^2), with R the cut-off radius and k = 1/8, contain the widened disk
 // (fidsplat/streaming/frustum_culling.py has the proof). Splats outside of the band of rows are culled too.
 //@ cull_frustum
-#ifndef BOX_HERE
-#define BOX_HERE false
-#endif
-    real max_scale = fmax(scales[2 * i], scales[2 * i + 1]), most = sqrt((float)(REAL(-2.0) * view->log_cut));
+    real most = sqrt((float)(REAL(-2.0) * view->log_cut));
     real deep = REAL(0.126) * most, larger = deep < 1 ? most / sqrt(1 - deep * deep) : INFINITY;
-    real margin = REAL(0.5) * larger + 4, sphere = REAL(1.001) * larger * fmax(max_scale, (real)MIN_SCALE);    // for rounding
+    real margin = REAL(0.5) * larger + 4, sphere = extent + REAL(1.001) * larger * fmax(max_scale, (real)MIN_SCALE);    // for rounding
     real left = view->center_x + margin, right = view->center_x - view->width - margin;
     real above = view->center_y + margin, below = view->center_y - view->height - margin;
     real above_band = above - view->band, below_band = view->center_y - view->band_end - margin;
     real to_x = view->focal_x * p.x, to_y = view->focal_y * p.y;
     // |n_x| + |n_z| >= |n|; a NaN is not culled
-    if (!BOX_HERE && opacities[i] <= 1.0f) {
-        if (to_x + left * p.z < -sphere * (view->focal_x + fabs(left)) || to_x + right * p.z > sphere * (view->focal_x + fabs(right))
-            || to_y + above * p.z < -sphere * (view->focal_y + fabs(above))
-            || to_y + below * p.z > sphere * (view->focal_y + fabs(below))) return CULLED;
-        // not for a complete image, whose last row of tiles may reach below it
-        if ((view->band > 0 && to_y + above_band * p.z < -sphere * (view->focal_y + fabs(above_band)))
-            || (view->band_end < view->height && to_y + below_band * p.z > sphere * (view->focal_y + fabs(below_band)))) return OUT_OF_BAND;
-    }
+    if (to_x + left * p.z < -sphere * (view->focal_x + fabs(left)) || to_x + right * p.z > sphere * (view->focal_x + fabs(right))
+        || to_y + above * p.z < -sphere * (view->focal_y + fabs(above))
+        || to_y + below * p.z > sphere * (view->focal_y + fabs(below))) return CULLED;
+    // not for a complete image, whose last row of tiles may reach below it
+    if ((view->band > 0 && to_y + above_band * p.z < -sphere * (view->focal_y + fabs(above_band)))
+        || (view->band_end < view->height && to_y + below_band * p.z > sphere * (view->focal_y + fabs(below_band)))) return OUT_OF_BAND;

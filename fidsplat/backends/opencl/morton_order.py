@@ -1,0 +1,73 @@
+"""Morton order of large clouds on GPUs, and bounding spheres of groups of splats in this order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.opencl.assemble import kernel_text
+from fidsplat.backends.opencl.program import build
+from fidsplat.backends.opencl.workspace import Workspace
+
+GROUP = 32
+"""splats of a group: GROUP_SPLATS of part/unculled_splats.cl"""
+_SIDE = 128
+"""cells of the grid along an axis (kernels/opencl/morton_order.cl)"""
+_SAMPLE = 10_000
+"""number of splats that determine the extent of the grid"""
+
+
+class MortonOrder:
+    """A cloud's arrays sorted by position; rows of zeros complete the last group."""
+
+    def __init__(self, workspace: Workspace, means: np.ndarray, buffer: cl.Buffer) -> None:
+        """means, buffer: the positions (n, 3) on the host and on the device."""
+        self._workspace, self._count, self.groups = workspace, len(means), -(-len(means) // GROUP)
+        program = build(workspace, kernel_text("morton_order.cl"))
+        self._kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
+        queue, allocate = workspace.queue, workspace.pool.allocate
+        self.arrays = {"splat_ids": allocate("the cloud's order", 4 * self._count)}
+        """`splat_ids` (n,) int32, indices of the sorted splats in the cloud; then the arrays of `bound`"""
+        low, high = np.nanquantile(means[:: self._count // _SAMPLE + 1], (0.01, 0.99), axis=0)
+        grid = cl.cltypes.make_float4(*low, 0.0), np.float32(_SIDE / max(*(high - low), 1e-9))
+        cells, starts = allocate("cells", 4 * _SIDE**3), np.zeros(_SIDE**3, np.uint32)
+        for scatter in (0, 1):
+            cl.enqueue_copy(queue, cells, starts)
+            arguments = (
+                buffer,
+                np.uint32(self._count),
+                *grid,
+                cells,
+                np.int32(scatter),
+                self.arrays["splat_ids"],
+            )
+            self._launch("sort_by_cells", self._count, arguments)
+            cl.enqueue_copy(queue, starts, cells)
+            starts = np.cumsum(starts, dtype=np.uint32) - starts  # exclusive
+
+    def gather(self, name: str, source: cl.Buffer, row_bytes: int) -> cl.Buffer:
+        """The rows of an array in this order."""
+        words = row_bytes // 4
+        gathered = self._workspace.pool.allocate(f"the cloud's {name}", self.groups * GROUP * row_bytes)
+        size, order = np.uint64(self._count * words), self.arrays["splat_ids"]
+        self._launch(
+            "gather_splats", self.groups * GROUP * words, (source, order, size, np.uint32(words), gathered)
+        )
+        return gathered
+
+    def bound(self, arrays: Mapping[str, cl.Buffer]) -> None:
+        """Compute the bounding spheres of all groups: `spheres` (n, 4) float32 and `max_scales` (n,)."""
+        optional = ("thickness", "boxes")
+        inputs = [arrays.get(name, arrays["scales"]) for name in ("means", "scales", "opacities", *optional)]
+        sizes = *(np.int32(name in arrays) for name in optional), np.uint32(GROUP), np.uint32(self.groups)
+        for name, row_bytes in {"spheres": 16, "max_scales": 4}.items():
+            self.arrays[name] = self._workspace.pool.allocate(name, row_bytes * self.groups)
+        outputs = self.arrays["spheres"], self.arrays["max_scales"]
+        self._launch("bound_groups", self.groups, (*inputs, *sizes, *outputs))
+
+    def _launch(self, kernel: str, items: int, arguments: tuple[Any, ...]) -> None:
+        items = -(-items // GROUP) * GROUP
+        self._kernels[kernel](self._workspace.queue, (items,), (GROUP,), *arguments).wait()
