@@ -47,16 +47,16 @@ def differences_of(images, image):
     assert all(images[name].shape[:2] == size for name in image.outputs)
     pixels = sampling.chessboard(size) if size[0] * size[1] > FEW_PIXELS else None
     if pixels is not None:
-        found = _compared({name: images[name][pixels] for name in image.outputs}, image, pixels)
-        if all(difference.agrees for difference in found):
-            return found
+        actual = _compared({name: images[name][pixels] for name in image.outputs}, image, pixels)
+        if all(difference.agrees for difference in actual):
+            return actual
     return _compared(images, image)
 
 
 def _compared(images, image, pixels=None):
-    truth = reference_images(image, pixels)
-    assert all(images[name].shape == truth[name].shape for name in image.outputs)
-    return compare(images, truth, image.outputs)
+    expected = reference_images(image, pixels)
+    assert all(images[name].shape == expected[name].shape for name in image.outputs)
+    return compare(images, expected, image.outputs)
 
 
 def against_reference(renderer, image):

@@ -11,10 +11,10 @@ def ideal(cloud: fs.SplatCloud, camera: fs.Camera, quality: fs.Quality, backgrou
     n, (h, w) = quality.samples, (camera.height, camera.width)
     y, x = (np.mgrid[: h * n, : w * n] + 0.5).reshape(2, -1) / n
     rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)])
-    turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    rotation, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     means = cloud.means.astype(np.float64) + cloud.origin
-    centers = means @ turn.T + shift
-    half_rho = _half_rho(*_tangents(cloud, turn), centers, rays, camera.near)
+    centers = means @ rotation.T + shift
+    half_rho = _half_rho(*_tangents(cloud, rotation), centers, rays, camera.near)
     if quality.lowpass == "screen":
         ahead = centers[:, 2] >= camera.near
         px, py, pz = centers[ahead].T[:, :, None]

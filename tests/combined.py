@@ -185,15 +185,15 @@ def assert_renders(renderer: fs.Renderer, names: Iterable[str]) -> None:
     frame = renderer.render(requested.cloud, requested.capture)
     view = view_of(requested.capture, requested.cloud.origin)
     reference = ReferenceBackend()
-    truth = (
+    expected = (
         reference.pipeline(requested.features("alpha"))
         .render_view(reference.upload(requested.cloud), view)
         .arrays_of(0)
     )
-    differences = compare(frame, truth, frame.outputs)
+    differences = compare(frame, expected, frame.outputs)
     if any(SWITCHES[name].kind in COARSE for name in names):
         assert all(one.finite for one in differences)
-        assert np.quantile(np.abs(frame["rgb"] - truth["rgb"]), 0.95) < 0.5 / 255
+        assert np.quantile(np.abs(frame["rgb"] - expected["rgb"]), 0.95) < 0.5 / 255
         return
     wrong = [replace(one, risky=0.0) for one in differences if not (one.finite and one.excess <= 0)]
     assert not wrong, wrong

@@ -116,9 +116,9 @@ def derivatives(
     pipeline = backend.differentiate(features, **build)
     images = pipeline.forward(backend.upload(cloud), view)
     given = random_loss(features, view) if by_images is None else by_images
-    found = pipeline.backward(images, given)
+    gradients = pipeline.backward(images, given)
     # the reference's stay float64
-    return {name: one if isinstance(one, np.ndarray) else on_host(one) for name, one in found.items()}
+    return {name: one if isinstance(one, np.ndarray) else on_host(one) for name, one in gradients.items()}
 
 
 _TRUTHS: dict[bytes, dict[str, np.ndarray]] = {}
@@ -180,7 +180,7 @@ def conditioning(
     ]
 
 
-def rotation_floor(cloud: SplatCloud, truth: Mapping[str, np.ndarray]) -> dict[str, float]:
+def rotation_floor(cloud: SplatCloud, reference: Mapping[str, np.ndarray]) -> dict[str, float]:
     """Absolute error of the quaternions' derivative by rounding of moments, for `differences`.
 
     A rotation exchanges covariance between two axes: its derivative is a difference of terms as large as the
@@ -189,8 +189,8 @@ def rotation_floor(cloud: SplatCloud, truth: Mapping[str, np.ndarray]) -> dict[s
     """
     if cloud.thickness is None:
         return {}
-    third = truth["thickness"] * cloud.thickness
-    by_log = np.column_stack([truth["scales"] * cloud.scales, third])
+    third = reference["thickness"] * cloud.thickness
+    by_log = np.column_stack([reference["scales"] * cloud.scales, third])
     terms = 2 * np.linalg.norm(by_log, axis=1) / np.linalg.norm(cloud.quats, axis=1)
     return {"quats": 2.0**-24 * _ROUNDINGS * float(np.linalg.norm(terms[cloud.thickness > 0]))}
 

@@ -104,12 +104,12 @@ def _printed(placed: PlacedMarker, view: View, x: np.ndarray, y: np.ndarray) -> 
     (n,) how far along the rays; NaN where a sample has no ray."""
     rays, seen = rays_of(view, x, y)
     moved = dict(view.groups).get(placed.label, view)
-    turn = moved.rotation @ placed.pose[:3, :3]
+    rotation = moved.rotation @ placed.pose[:3, :3]
     middle = moved.rotation @ placed.pose[:3, 3] + moved.translation
     start = np.zeros_like(rays)
     if view.parallel:
         start[:, 0], start[:, 1] = (x - view.center_x) / view.focal_x, (y - view.center_y) / view.focal_y
     with np.errstate(divide="ignore", invalid="ignore"):
-        along = (middle - start) @ turn[:, 2] / (rays @ turn[:, 2])
-        place = (start + along[:, None] * rays - middle) @ turn[:, :2] / placed.marker.module
+        along = (middle - start) @ rotation[:, 2] / (rays @ rotation[:, 2])
+        place = (start + along[:, None] * rays - middle) @ rotation[:, :2] / placed.marker.module
     return place, np.where(seen, along, np.nan)

@@ -53,8 +53,8 @@ def draw(bits, size, placed, camera, quiet=1, samples=4, ground=0.5) -> tuple[np
 
 
 def _project(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    seen = np.column_stack([points, np.ones(len(points))]) @ matrix.T
-    return seen[:, :2] / seen[:, 2:]
+    homogeneous = np.column_stack([points, np.ones(len(points))]) @ matrix.T
+    return homogeneous[:, :2] / homogeneous[:, 2:]
 
 
 def photographed(image: np.ndarray, seed: int = 0, noise: float = 2.0) -> np.ndarray:

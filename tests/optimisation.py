@@ -59,20 +59,20 @@ def _memoise_overloads() -> None:
     codegen = importlib.import_module("warp._src.codegen")
     if not hasattr(codegen, "func_match_args") or hasattr(codegen.func_match_args, "cache_of_tests"):
         return
-    match, found = codegen.func_match_args, {}
+    match, results = codegen.func_match_args, {}
 
     def matches(function, types, named, *further, **options):
         try:
             stripped = map(codegen.strip_reference, types)
             key = function, (*stripped,), *named.items(), *further, *options.items()
-            known = found.get(key)
+            known = results.get(key)
         except TypeError:  # a type that cannot be a key
             return match(function, types, named, *further, **options)
         if known is None:
-            known = found[key] = match(function, types, named, *further, **options)
+            known = results[key] = match(function, types, named, *further, **options)
         return known
 
-    matches.cache_of_tests = found
+    matches.cache_of_tests = results
     codegen.func_match_args = matches
 
 
@@ -96,11 +96,11 @@ def pytest_collection_finish():
 @contextmanager
 def as_users_compile() -> Iterator[None]:
     """Within it OpenCL kernels are compiled as users have them, and in processes that it starts all are."""
-    kept = {name: os.environ.pop(name) for name in _OPENCL if name in os.environ}
+    variables = {name: os.environ.pop(name) for name in _OPENCL if name in os.environ}
     try:
         yield
     finally:
-        os.environ.update(kept)
+        os.environ.update(variables)
 
 
 @pytest.fixture
@@ -114,8 +114,8 @@ def optimised():
 def level() -> str:
     """How this process compiles kernels."""
     warp = runtime.load().config.optimization_level if runtime.installed() else None
-    found = (os.environ.get("PYOPENCL_BUILD_OPTIONS"), warp)
-    return "as users have it" if found == (None, None) else "hardly"
+    actual = (os.environ.get("PYOPENCL_BUILD_OPTIONS"), warp)
+    return "as users have it" if actual == (None, None) else "hardly"
 
 
 def _has_gpu() -> bool:

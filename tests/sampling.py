@@ -17,9 +17,11 @@ WITHOUT_KERNELS = "tests/unit/", "tests/experiments/"
 
 def sampled(cases: Sequence, count: int, seed: int) -> list:
     """All cases as parameters; all but `count` of them, chosen by chance, are marked `exhaustive`."""
-    kept = set(np.random.default_rng(seed).choice(len(cases), min(count, len(cases)), replace=False).tolist())
+    chosen = set(
+        np.random.default_rng(seed).choice(len(cases), min(count, len(cases)), replace=False).tolist()
+    )
     rest = pytest.mark.exhaustive
-    return [pytest.param(case, marks=() if k in kept else rest) for k, case in enumerate(cases)]
+    return [pytest.param(case, marks=() if k in chosen else rest) for k, case in enumerate(cases)]
 
 
 def alternate(*axes: Mapping[str, object]) -> list:
@@ -50,15 +52,15 @@ def take_turns(items: Sequence[pytest.Item], devices: Sequence[str], turn: int =
     complete file. Of `SWEEP` or more cases of a test of kernels, or with the mark `sweep`, every other one
     runs; with the mark and fewer cases the test runs in every other run.
     """
-    found: dict[str, dict[str, list[pytest.Item]]] = {}
+    results: dict[str, dict[str, list[pytest.Item]]] = {}
     for item in items:
         params = getattr(getattr(item, "callspec", None), "params", {})
         device = params.get("renderer", params.get("device"))
         marked = item.get_closest_marker("sweep")
         if (params or marked) and not item.get_closest_marker("exhaustive"):
             test = item.nodeid.partition("[")[0]
-            found.setdefault(test, {}).setdefault(device if device in devices else "", []).append(item)
-    for test, by_device in found.items():
+            results.setdefault(test, {}).setdefault(device if device in devices else "", []).append(item)
+    for test, by_device in results.items():
         # a hash of the file's name, so that its device does not depend on which other tests are collected
         own = devices[(crc32(test.partition("::")[0].encode()) + turn) % len(devices)] if devices else ""
         for device, cases in by_device.items():

@@ -18,9 +18,9 @@ NEEDED = pytest.mark.skipif(COMMAND is None, reason=REASON)
 
 def version() -> int:
     """Major version of splat-transform."""
-    found = re.search(r"splat-transform v(\d+)", _run("--version"))
-    assert found is not None
-    return int(found[1])
+    actual = re.search(r"splat-transform v(\d+)", _run("--version"))
+    assert actual is not None
+    return int(actual[1])
 
 
 def transform(*words: object) -> None:

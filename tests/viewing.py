@@ -21,15 +21,15 @@ class Client(SimpleNamespace):
     def __init__(self, number=1):
         sent: list = []
         depths: list = []
-        said = SimpleNamespace(content="")
+        message = SimpleNamespace(content="")
         camera = SimpleNamespace(
             position=(0, 0, -1), wxyz=(1, 0, 0, 0), fov=0.8, image_width=48, image_height=36,
             look_at=(0, 0, 0),
             on_update=lambda callback: setattr(self, "turned", callback),
         )  # fmt: skip
         super().__init__(
-            client_id=number, sent=sent, depths=depths, said=said, files=[], camera=camera,
-            gui=SimpleNamespace(add_folder=lambda _: _Folder(), add_markdown=lambda _: said),
+            client_id=number, sent=sent, depths=depths, said=message, files=[], camera=camera,
+            gui=SimpleNamespace(add_folder=lambda _: _Folder(), add_markdown=lambda _: message),
             scene=SimpleNamespace(
                 set_background_image=lambda image, kind, depth=None, **_: (
                     depths.append(depth), sent.append((image, kind))

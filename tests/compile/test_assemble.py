@@ -195,16 +195,16 @@ def test_arguments_and_local_memory_without_effects(renderer, schedule):
     shape = SHAPE if schedule == "lanes" else GROUP
     pipeline = renderer.backend.pipeline(select(COLORS, fs.Capture(quality=PLAIN)), shape)
     local = cl.kernel_work_group_info.LOCAL_MEM_SIZE
-    taken = {}
+    arguments = {}
     for name in pipeline.source.arguments:
         kernel = cl.Kernel(pipeline.program.compiled[name], name)
         head = re.search(rf"void {name}\(([^{{]*?)\)\s*\{{", pipeline.source.text)
         assert head, name
-        taken[name] = kernel.num_args, len(re.findall(r"\bglobal\b", head[1]))
+        arguments[name] = kernel.num_args, len(re.findall(r"\bglobal\b", head[1]))
         # drivers may pad local memory
         staged = kernel.get_work_group_info(local, renderer.backend.device)
         assert 0 <= staged - TAKEN[schedule][name][2] < 64, name
-    assert taken == {name: numbers[:2] for name, numbers in TAKEN[schedule].items()}
+    assert arguments == {name: numbers[:2] for name, numbers in TAKEN[schedule].items()}
 
 
 def test_the_readme_lists_exactly_the_hooks_of_the_kernels():

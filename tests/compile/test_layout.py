@@ -48,12 +48,12 @@ def offsets_on(backend, source: KernelSource) -> dict[str, dict[str, int]]:
     real = f"typedef {source.scalars.real} real;\n#pragma OPENCL EXTENSION cl_khr_fp64 : enable\n"
     body = f"kernel void places(global int *out) {{\n{variables}{''.join(lines)}}}\n"
     program = build(backend, real + "\n".join(structs) + "\n" + body)
-    found = np.empty(len(requested), np.int32)
-    out = cl.Buffer(backend.context, cl.mem_flags.READ_WRITE, found.nbytes)
+    actual = np.empty(len(requested), np.int32)
+    out = cl.Buffer(backend.context, cl.mem_flags.READ_WRITE, actual.nbytes)
     program.places(backend.queue, (1,), None, out)
-    cl.enqueue_copy(backend.queue, found, out)
+    cl.enqueue_copy(backend.queue, actual, out)
     places: dict[str, dict[str, int]] = {record: {} for record in source.records}
-    for (record, field), place in zip(requested, found.tolist(), strict=True):
+    for (record, field), place in zip(requested, actual.tolist(), strict=True):
         places[record][field] = place
     return places
 
@@ -87,7 +87,7 @@ def test_kernels_have_the_declared_arguments(renderer, shape):
     kernels = {kernel.function_name: kernel for program in programs for kernel in program.all_kernels()}
     assert kernels.keys() == source.arguments.keys()
     for name, kernel in kernels.items():
-        found = [
+        actual = [
             (
                 kernel.get_arg_info(k, info.TYPE_NAME),
                 kernel.get_arg_info(k, info.NAME),
@@ -99,7 +99,7 @@ def test_kernels_have_the_declared_arguments(renderer, shape):
             (source.scalars.of(one.ctype) + ("*" if one.access else ""), one.name, bool(one.access))
             for one in source.arguments[name]
         ]
-        assert found == declared, name
+        assert actual == declared, name
 
 
 def test_every_effect_has_a_layout_with_the_parts_of_its_output():
@@ -184,14 +184,14 @@ def test_an_output_and_a_step_from_outside_are_rendered(renderer, toys):
 
 
 def test_an_output_is_compared_listed_and_written_as_it_is_declared(toys, tmp_path):
-    truth = {
+    expected = {
         "nearest": np.array([[1.0, 2.0, 0.0]]),
         "nearest_may_flip": np.array([[False, True, False]]),
         "certificate": np.zeros((1, 3)),
         "rgb": np.zeros((1, 3, 3)),
     }
     within, flipped, off = (
-        compare({"nearest": np.float32([row])}, truth, ("nearest",))[0]
+        compare({"nearest": np.float32([row])}, expected, ("nearest",))[0]
         for row in ([1.0009, 2, 0], [1, 3, 0], [1.0011, 2, 0])
     )
     assert (within.error, within.agrees) == (0, True)

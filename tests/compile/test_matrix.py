@@ -35,9 +35,9 @@ def assert_well_formed(names, shapes=SHAPES):
             declared = [one.text.replace("wide", source.scalars.wide) for one in arguments]
             assert lines == declared, kernel
         # resolve may be fused into blend
-        taken = {one.name for one in source.arguments.get("resolve", source.arguments["blend"])}
-        assert {f"{output.name}_out" for output in features.images} <= taken
-        assert {one.name for one in source.samples} <= taken
+        argument_names = {one.name for one in source.arguments.get("resolve", source.arguments["blend"])}
+        assert {f"{output.name}_out" for output in features.images} <= argument_names
+        assert {one.name for one in source.samples} <= argument_names
         assert {one.name for one in source.samples} <= {one.name for one in source.arguments["blend"]}
 
 

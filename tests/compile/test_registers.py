@@ -48,14 +48,14 @@ def test_the_log_of_the_assembler_is_read():
 def test_the_log_of_this_assembler_is_read(tmp_path):
     file = tmp_path / "kernels.ptx"
     file.write_text(PTX)
-    made = subprocess.run(
+    process = subprocess.run(
         ["ptxas", "-v", "-arch=sm_90", "-o", str(tmp_path / "kernels.cubin"), str(file)],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
-    found = of_log(made.stderr)
-    assert found.keys() == {"blend", "project"}
-    assert found["project"]["stack"] == 512
-    assert all(0 < numbers["registers"] < 64 for numbers in found.values())
+    actual = of_log(process.stderr)
+    assert actual.keys() == {"blend", "project"}
+    assert actual["project"]["stack"] == 512
+    assert all(0 < numbers["registers"] < 64 for numbers in actual.values())
 
 
 def test_registers_without_effects_equal_the_record(renderer):

@@ -81,8 +81,8 @@ def test_fast_preset_is_as_accurate_as_its_constants(renderer):
     quality = fs.Quality.named("fast")
     cloud = random_splats(200, seed=0, depth=(0.5, 6.0))
     frame = renderer.render(cloud, CAMERA, quality=quality)
-    truth = reference_pixels(cloud, CAMERA, ("rgb",), quality)
-    excess = np.abs(frame["rgb"] - truth["rgb"]).max(2) - truth["certificate"]
+    expected = reference_pixels(cloud, CAMERA, ("rgb",), quality)
+    excess = np.abs(frame["rgb"] - expected["rgb"]).max(2) - expected["certificate"]
     assert np.quantile(excess, 0.999) < 0.1 / 255
     assert excess.max() < 2.0 / 255
 
@@ -106,12 +106,12 @@ def test_markers_at_five_tilts(renderer, spec, tilt):
     camera = fs.Camera.look_at(320, 240, 0.7, position, (0.0, 0.0, 0.0), up=(0.3, -1.0, 0.2))
     rows, columns = np.random.default_rng(tilt).integers((20, 60), (220, 260), (400, 2)).T
     outputs = ("rgb", "alpha", "depth", "normal")
-    truth = reference_pixels(cloud, camera, outputs, "standard", pixels=(rows, columns))
+    expected = reference_pixels(cloud, camera, outputs, "standard", pixels=(rows, columns))
     frame = renderer.render(cloud, camera, ALL_OUTPUTS)
     images = {name: frame[name][rows, columns] for name in outputs}
-    differences = compare(images, truth, outputs)
+    differences = compare(images, expected, outputs)
     assert all(difference.agrees for difference in differences), differences
-    assert truth["alpha"].mean() > 0.3
+    assert expected["alpha"].mean() > 0.3
 
 
 def test_principal_point_outside_the_image_and_odd_sizes(renderer):
@@ -153,13 +153,13 @@ def test_a_hundred_thousand_splats_at_720p(renderer):
     cloud, camera = load_scene("r100k_720p")
     generator = np.random.default_rng(1)
     pixels = generator.integers(0, camera.height, 300), generator.integers(0, camera.width, 300)
-    truth = reference_pixels(cloud, camera, ALL_OUTPUTS, "standard", pixels=pixels)
+    expected = reference_pixels(cloud, camera, ALL_OUTPUTS, "standard", pixels=pixels)
     rgb = renderer.render(cloud, camera)["rgb"][pixels]
-    error = np.abs(rgb - truth["rgb"]).max(1)
+    error = np.abs(rgb - expected["rgb"]).max(1)
     psnr = -10 * math.log10(float((error**2).mean()))
     print(f"r100k_720p: {psnr:.1f} dB, largest error {error.max():.1e}")
     assert psnr > 50
-    assert (error <= 2e-5 + truth["certificate"]).all()
+    assert (error <= 2e-5 + expected["certificate"]).all()
 
 
 def coplanar_cloud(seed, count=60, planes=2):

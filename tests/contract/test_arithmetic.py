@@ -52,15 +52,15 @@ def test_an_opacity_of_one_stays_one_and_no_exponent_runs_over(renderer):
 
 
 def test_the_bits_are_the_same_on_every_device():
-    found = []
+    results = []
     for info in fs.devices():
         if info.usable and info.name != "reference":
             renderer = fs.Renderer(info.name)
             if renderer.backend.probe().fuses:
-                found.append(functions(renderer))
-    for exponential, logarithm in found[1:]:
-        assert np.array_equal(exponential, found[0][0])
-        assert np.array_equal(logarithm, found[0][1])
+                results.append(functions(renderer))
+    for exponential, logarithm in results[1:]:
+        assert np.array_equal(exponential, results[0][0])
+        assert np.array_equal(logarithm, results[0][1])
 
 
 @pytest.mark.sweep
@@ -91,11 +91,11 @@ def test_faint_fragments_stay_faint(renderer):
 @pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
 def test_both_schedules_are_bit_identical(renderer, cloud):
     image = FrameSpec(cloud, CAMERA, FAST, ALL_OUTPUTS)
-    own, other = (
+    own_trace, other = (
         trace(renderer, image),
         trace(renderer, image, renderer.backend.shapes("schedule")["groups"]),
     )
-    assert differing(own, other, ALL_OUTPUTS) == 0
+    assert differing(own_trace, other, ALL_OUTPUTS) == 0
 
 
 def test_instructions_of_a_vendor_change_what_the_quality_allows(renderer):
@@ -105,12 +105,12 @@ def test_instructions_of_a_vendor_change_what_the_quality_allows(renderer):
         pytest.skip("the device has no dialect")
     for quality in (FAST, PRECISE, FAST.with_(order="pixel")):
         picture = FrameSpec(random_splats(3000, seed=2, scale=(1e-3, 0.8)), CAMERA, quality, ALL_OUTPUTS)
-        own, other = trace(renderer, picture), trace(renderer, picture, shape)
-        assert differing(own, other, ALL_OUTPUTS) == 0
+        own_trace, other = trace(renderer, picture), trace(renderer, picture, shape)
+        assert differing(own_trace, other, ALL_OUTPUTS) == 0
     for changes, bound in (({"arithmetic": "approximate"}, 2e-4), ({"blend_precision": "float16"}, 2.0**-7)):
         picture = FrameSpec(random_splats(3000, seed=2, scale=(1e-3, 0.8)), CAMERA, FAST.with_(**changes))
-        own, other = trace(renderer, picture), trace(renderer, picture, shape)
-        assert np.abs(own["rgb"] - other["rgb"]).max() < bound
+        own_trace, other = trace(renderer, picture), trace(renderer, picture, shape)
+        assert np.abs(own_trace["rgb"] - other["rgb"]).max() < bound
 
 
 def test_blending_in_float64_takes_the_library_s():

@@ -40,9 +40,9 @@ def moved(pose):
 
 
 def camera_at(pose):
-    turn = rigid_matrix((0, 0, 0), pose[3:])[:3, :3].T
+    rotation = rigid_matrix((0, 0, 0), pose[3:])[:3, :3].T
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = turn, -turn @ pose[:3]
+    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ pose[:3]
     return fs.Camera.pinhole(50, 40, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, matrix, position=pose[:3])
 
 
@@ -199,13 +199,13 @@ def test_a_batch_of_exposures_counts_all_its_images(renderer, cloud):
         shutter=fs.Shutter(exposure_time=0.1, sub_poses=2),
     )  # fmt: skip
     poses = np.repeat(POSES, 200, axis=0)
-    own = fs.Renderer(renderer.device.name, memory_budget=600 * 50 * 40 * 12 + 10_000)
+    separate_renderer = fs.Renderer(renderer.device.name, memory_budget=600 * 50 * 40 * 12 + 10_000)
     with pytest.raises(fs.DeviceError, match=r"memory_budget must exceed .*, got 13\.7 MiB; raise it"):
-        own.render_batch(cloud, capture, poses=poses)
+        separate_renderer.render_batch(cloud, capture, poses=poses)
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("arguments", "words"),
     [
         ({"captures": []}, "at least one view, got an empty captures"),
         ({"captures": 5}, "captures must be a list of Capture or Camera, got 5"),
@@ -241,6 +241,6 @@ def test_a_batch_of_exposures_counts_all_its_images(renderer, cloud):
         ),
     ],
 )
-def test_errors_name_what_is_not_a_batch(renderer, cloud, given, words):
+def test_errors_name_what_is_not_a_batch(renderer, cloud, arguments, words):
     with pytest.raises(fs.InputError, match=words):
-        renderer.render_batch(cloud, **{"captures": CAMERA, **given})
+        renderer.render_batch(cloud, **{"captures": CAMERA, **arguments})

@@ -29,9 +29,9 @@ def test_more_outputs_leave_rgb_as_it_was(renderer):
 
 def test_a_frame_keeps_its_images_when_the_next_is_rendered(renderer):
     first, second = random_splats(100, seed=6), random_splats(100, seed=7)
-    kept = renderer.render(first, CAMERA)
+    frame = renderer.render(first, CAMERA)
     renderer.render(second, CAMERA)
-    assert same(kept, renderer.render(first, CAMERA), ("rgb",))
+    assert same(frame, renderer.render(first, CAMERA), ("rgb",))
 
 
 def test_resident_cloud_renders_the_same(renderer):
@@ -151,7 +151,7 @@ def test_no_camera_and_no_outputs_are_named(renderer, arguments, word):
 def test_the_reference_gives_the_types_of_a_device(renderer, reference):
     cloud = random_splats(3, seed=1)
     camera = fs.Camera.pinhole(4, 3, 4.0, 4.0, 2.0, 1.5)
-    images, truth = (r.render(cloud, camera, outputs=ALL_OUTPUTS) for r in (renderer, reference))
+    images, expected = (r.render(cloud, camera, outputs=ALL_OUTPUTS) for r in (renderer, reference))
     for name in ALL_OUTPUTS:
-        assert images[name].dtype == truth[name].dtype, name
+        assert images[name].dtype == expected[name].dtype, name
         assert not images[name].flags.writeable

@@ -25,12 +25,12 @@ def overlap(edges, pixels):
     return np.maximum(np.minimum(right, edges[1:]) - np.maximum(left, edges[:-1]), 0)
 
 
-def area_sampled(made, px_per_module, center, size, background):
+def area_sampled(marker, px_per_module, center, size, background):
     """The printed marker from the front: every pixel is the exact mean of the texture over its area."""
-    h, w = made.grid.shape
+    h, w = marker.grid.shape
     across = overlap(center[0] + (np.arange(w + 1) - w / 2) * px_per_module, size[0])
     down = overlap(center[1] + (np.arange(h + 1) - h / 2) * px_per_module, size[1])
-    light = down @ (1.0 - made.grid) @ across.T
+    light = down @ (1.0 - marker.grid) @ across.T
     return light + background * (1 - down.sum(1)[:, None] * across.sum(1))
 
 
@@ -38,17 +38,20 @@ def area_sampled(made, px_per_module, center, size, background):
 @pytest.mark.parametrize("px_per_module", [0.37, 2.5, 4.571])
 def test_an_exact_marker_is_its_area_sampled_texture(renderer, px_per_module, samples):
     """QR version 22, frontal: no worse than 80 dB (rounding alone), where `fitted` has 26."""
-    made = fs.marker("qr-v22-L:" + "fidsplat" * 100, mixture="exact")
-    focal = 4 * px_per_module / made.module
-    size = math.ceil(px_per_module * made.grid.shape[1]) + 40, math.ceil(px_per_module * len(made.grid)) + 30
+    marker = fs.marker("qr-v22-L:" + "fidsplat" * 100, mixture="exact")
+    focal = 4 * px_per_module / marker.module
+    size = (
+        math.ceil(px_per_module * marker.grid.shape[1]) + 40,
+        math.ceil(px_per_module * len(marker.grid)) + 30,
+    )
     center = (size[0] / 2 + 1.3, size[1] / 2 - 0.2)
     pose = np.eye(4)
     pose[2, 3] = 4
     camera = fs.Camera.pinhole(*size, focal, focal, *center, pose)
     background = 0.3
     quality = EXACT.with_(samples=samples)
-    frame = renderer.render(made.cloud, camera, ALL_OUTPUTS, quality, background=(background,) * 3)
-    ideal = area_sampled(made, px_per_module, center, size, background)
+    frame = renderer.render(marker.cloud, camera, ALL_OUTPUTS, quality, background=(background,) * 3)
+    ideal = area_sampled(marker, px_per_module, center, size, background)
     error = np.abs(frame["rgb"] - ideal[..., None])
     psnr = -10 * math.log10(float((error**2).mean()))
     print(f"{px_per_module} px per module, {samples} x {samples}: {psnr:.1f} dB, {error.max():.1e}")
@@ -78,7 +81,7 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, tilt, spin, distance, shift):
     half = (corners[:, 2:] - corners[:, :2]) / 2
     middle = (corners[:, :2] + corners[:, 2:]) / 2 - 4.5
     sheet = boxes_of(middle / 9, half / 9)
-    whole = boxes_of(np.zeros((1, 2)), np.full((1, 2), 0.5))
+    full_sheet = boxes_of(np.zeros((1, 2)), np.full((1, 2), 0.5))
     a, b = math.radians(tilt), math.radians(spin)
     target = (0.11, 0.07, 0.0)
     position = np.add(
@@ -89,7 +92,7 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, tilt, spin, distance, shift):
         123, 97, looking.fx, looking.fy, looking.cx + shift[0], looking.cy + shift[1], looking.world_to_camera
     )
     quality = EXACT.with_(transmittance_stop=0.0)
-    parts, one = (renderer.render(cloud, camera, ALL_OUTPUTS, quality) for cloud in (sheet, whole))
+    parts, one = (renderer.render(cloud, camera, ALL_OUTPUTS, quality) for cloud in (sheet, full_sheet))
     assert one["alpha"].max() > 0.0
     assert np.abs(parts["alpha"] - one["alpha"]).max() < SEAM
     assert np.abs(parts["rgb"] - parts["alpha"][..., None]).max() < SEAM
@@ -101,10 +104,10 @@ def test_depth_over_boxes_that_are_a_small_part_of_a_pixel_is_their_planes(rende
     """As over the modules of a large code from afar, steeply aside: 0.3 x 0.06 pixels."""
     middle = (np.indices((96, 96)).reshape(2, -1).T - 47.5) / 96
     sheet = boxes_of(middle, np.full((96 * 96, 2), 0.5 / 96))
-    whole = boxes_of(np.zeros((1, 2)), np.full((1, 2), 0.5))
+    full_sheet = boxes_of(np.zeros((1, 2)), np.full((1, 2), 0.5))
     tilt, quality = math.radians(80), EXACT.with_(transmittance_stop=0.0)
     camera = fs.Camera.look_at(123, 97, 0.9, (0, -4 * math.sin(tilt), -4 * math.cos(tilt)), (0, 0, 0))
-    parts, one = (renderer.render(cloud, camera, ALL_OUTPUTS, quality) for cloud in (sheet, whole))
+    parts, one = (renderer.render(cloud, camera, ALL_OUTPUTS, quality) for cloud in (sheet, full_sheet))
     inside = one["alpha"] > 0.999
     assert inside.sum() > 50
     assert np.allclose(parts["depth"][inside], one["depth"][inside], rtol=1e-6, atol=0)
@@ -148,8 +151,8 @@ def boxes_of(middle, half):
 
 def test_light_is_conserved(renderer):
     """The opacities that a small tilted box adds to an image sum up to its projected area."""
-    turn = [math.cos(0.35), math.sin(0.35), 0.2, 0.1]
-    cloud = fs.SplatCloud([(0, 0, 4)], [turn], [(0.02, 0.07)], [1.0], colors=[(1, 1, 1)]).with_boxes()
+    rotation = [math.cos(0.35), math.sin(0.35), 0.2, 0.1]
+    cloud = fs.SplatCloud([(0, 0, 4)], [rotation], [(0.02, 0.07)], [1.0], colors=[(1, 1, 1)]).with_boxes()
     areas = []
     generator = np.random.default_rng(0)
     for _ in range(20):
@@ -191,8 +194,8 @@ def test_boxes_end_at_the_near_plane(renderer):
     cloud = random_splats(80, seed=2, depth=(-1.0, 4.0), scale=(0.1, 1.0), across=1.0).with_boxes()
     near = replace(SMALL, near=1.5)
     frame = assert_agrees(renderer, cloud, near)
-    whole = renderer.render(cloud, SMALL, ALL_OUTPUTS)
-    assert np.abs(frame["rgb"] - whole["rgb"]).max() > 0.1
+    full_frame = renderer.render(cloud, SMALL, ALL_OUTPUTS)
+    assert np.abs(frame["rgb"] - full_frame["rgb"]).max() > 0.1
 
 
 @pytest.mark.parametrize(("lowpass", "samples"), alternate({"none": "none", "screen": "screen"}, SAMPLES))

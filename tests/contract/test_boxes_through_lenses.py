@@ -37,8 +37,8 @@ def test_boxes_end_at_the_near_plane_and_the_far(renderer, camera):
     cloud = random_splats(80, 2, depth=(-3.0, 5.0), scale=(0.02, 1.0), across=1.5).with_boxes()
     cut_off = replace(camera, near=1.0, far=3.0)
     frame = assert_agrees(renderer, cloud, cut_off, quality=EXACT)
-    whole = renderer.render(cloud, camera, ALL_OUTPUTS, EXACT)
-    assert np.abs(frame["rgb"] - whole["rgb"]).max() > 0.1
+    full_frame = renderer.render(cloud, camera, ALL_OUTPUTS, EXACT)
+    assert np.abs(frame["rgb"] - full_frame["rgb"]).max() > 0.1
 
 
 @each_camera
@@ -119,11 +119,11 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, camera, tilt, distance):
     half = (corners[:, 2:] - corners[:, :2]) / 2
     middle = (corners[:, :2] + corners[:, 2:]) / 2 - 4.5
     sheet = boxes_of(middle / 9, half / 9)
-    whole = boxes_of(np.zeros((1, 2)), np.full((1, 2), 0.5))
+    full_sheet = boxes_of(np.zeros((1, 2)), np.full((1, 2), 0.5))
     # parallel rays would see the near plane cut the sheet
     looking = camera_from(camera, tilt, 0.7 if camera.lens.kind == "orthographic" else distance)
     quality = EXACT.with_(transmittance_stop=0.0)
-    parts, one = (renderer.render(cloud, looking, ALL_OUTPUTS, quality) for cloud in (sheet, whole))
+    parts, one = (renderer.render(cloud, looking, ALL_OUTPUTS, quality) for cloud in (sheet, full_sheet))
     assert one["alpha"].max() > 0.3
     even = ~widened(looking)
     assert even.mean() > 0.9
@@ -136,9 +136,9 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, camera, tilt, distance):
 def test_light_is_that_of_the_image(renderer, camera, size, shifts):
     """The opacities that a tilted box adds to an image sum up to the area of its image, below a pixel and
     above it, on average over shifts x shifts positions in a pixel."""
-    turn = [math.cos(0.35), math.sin(0.35), 0.2, 0.1]
+    quaternion = [math.cos(0.35), math.sin(0.35), 0.2, 0.1]
     box = fs.SplatCloud(
-        [(0.1, 0.1, 0.1)], [turn], [(size, 1.5 * size)], [1.0], colors=[(1, 1, 1)]
+        [(0.1, 0.1, 0.1)], [quaternion], [(size, 1.5 * size)], [1.0], colors=[(1, 1, 1)]
     ).with_boxes()
     looking = camera_from(camera, 10, 2.0)
     edge = np.linspace(-1, 1, 50)
@@ -159,6 +159,6 @@ def test_boxes_through_lenses_in_single_precision(renderer, name):
     """The set-up of devices without float64, held as Gaussians are: to a tenth of an 8-bit step."""
     cloud = random_splats(100, 0, depth=(0.5, 6.0)).with_boxes()
     frame = renderer.render(cloud, CAMERAS[name], ALL_OUTPUTS, "fast")
-    truth = reference_pixels(cloud, CAMERAS[name], ("rgb",), "fast")
-    excess = np.abs(frame["rgb"] - truth["rgb"]).max(2) - truth["certificate"]
+    expected = reference_pixels(cloud, CAMERAS[name], ("rgb",), "fast")
+    excess = np.abs(frame["rgb"] - expected["rgb"]).max(2) - expected["certificate"]
     assert np.quantile(excess, 0.995) < 0.1 / 255

@@ -27,33 +27,37 @@ SCENES = {
 def test_certificates_leave_little_open(name):
     """Nine of ten pixels have the tolerance of colours alone; at most one in forty has a decision that
     rounding may change (median depth, heaviest label)."""
-    truth = reference_images(FrameSpec(*SCENES[name], fs.Quality(), tuple(OUTPUTS)))
-    bound = truth["certificate"]
+    expected = reference_images(FrameSpec(*SCENES[name], fs.Quality(), tuple(OUTPUTS)))
+    bound = expected["certificate"]
     assert np.median(bound) < 1e-5
     assert (bound > 2e-5).mean() < 0.1
     assert (bound > 1e-3).mean() < RARE
     assert bound.max() < RISKY
-    seen = truth["depth"] != 0
-    depth = truth["certificate_depth"][seen] / np.abs(truth["depth"][seen])
+    visible = expected["depth"] != 0
+    depth = expected["certificate_depth"][visible] / np.abs(expected["depth"][visible])
     assert np.median(depth) < 2e-5
     assert (depth > 1e-3).mean() < 0.02
-    assert (truth["certificate_normal"] > 1e-3).mean() < 0.03
+    assert (expected["certificate_normal"] > 1e-3).mean() < 0.03
     for output in OUTPUTS:
-        if f"{output}_may_flip" in truth:
-            assert truth[f"{output}_may_flip"].mean() < 0.025, output
+        if f"{output}_may_flip" in expected:
+            assert expected[f"{output}_may_flip"].mean() < 0.025, output
 
 
 @pytest.mark.parametrize("output", OUTPUTS)
 def test_one_wrong_pixel_is_named(output):
     """By a thousandth of a colour, of a normal's length or of a depth; by one label, index or fragment."""
-    truth = reference_images(FrameSpec(AROUND, CAMERA, fs.Quality(), tuple(OUTPUTS)))
-    images = {name: truth[name].astype(OUTPUTS[name].dtype) for name in OUTPUTS}
-    assert all(difference.agrees for difference in compare(images, truth, OUTPUTS))
-    sure = (truth["certificate"] < 1e-5) & (truth["certificate_normal"] < 2e-4) & (truth["depth_first"] > 0)
+    expected = reference_images(FrameSpec(AROUND, CAMERA, fs.Quality(), tuple(OUTPUTS)))
+    images = {name: expected[name].astype(OUTPUTS[name].dtype) for name in OUTPUTS}
+    assert all(difference.agrees for difference in compare(images, expected, OUTPUTS))
+    sure = (
+        (expected["certificate"] < 1e-5)
+        & (expected["certificate_normal"] < 2e-4)
+        & (expected["depth_first"] > 0)
+    )
     for name in OUTPUTS:
-        sure &= ~truth.get(f"{name}_may_flip", np.zeros_like(sure))
+        sure &= ~expected.get(f"{name}_may_flip", np.zeros_like(sure))
     row, column = np.argwhere(sure)[0]
     image = images[output]
     thousandth = 1e-3 * max(1.0, float(np.abs(image[row, column]).max()))
     image[row, column] += 1 if image.dtype == np.int32 else thousandth
-    assert [one.output for one in compare(images, truth, OUTPUTS) if not one.agrees] == [output]
+    assert [one.output for one in compare(images, expected, OUTPUTS) if not one.agrees] == [output]

@@ -94,8 +94,8 @@ def test_effects_of_the_image_under_a_shutter(renderer, around, shutter):
     frame = renderer.render(cloud, capture)
     features, view = prepare(cloud, capture)
     reference = ReferenceBackend()
-    truth = reference.pipeline(features).render_view(reference.upload(cloud), view).arrays_of(0)
-    differences = compare(frame, truth, outputs)
+    expected = reference.pipeline(features).render_view(reference.upload(cloud), view).arrays_of(0)
+    differences = compare(frame, expected, outputs)
     assert all(difference.agrees for difference in differences), differences
 
 

@@ -36,11 +36,11 @@ def splat_outside(side, thick=False):
     scale = SIGMA * DEPTH / FOCAL
     arrays = {"means": [[*(way * DEPTH / FOCAL), DEPTH]], "quats": [[1, 0, 0, 0]], "scales": [[scale, scale]]}
     arrays |= {"opacities": [MAX_OPACITY], "colors": [[1, 1, 1]]} | ({"thickness": [scale]} if thick else {})
-    made = {name: np.array(value, np.float32) for name, value in arrays.items()}
+    splat = {name: np.array(value, np.float32) for name, value in arrays.items()}
     like = fs.SplatCloud(
-        made["means"], made["quats"], np.full((1, 3 if thick else 2), scale), [1.0], colors=made["colors"]
+        splat["means"], splat["quats"], np.full((1, 3 if thick else 2), scale), [1.0], colors=splat["colors"]
     )
-    return PartialCloud.of(made | {"labels": np.zeros(1, np.int32)}, like)
+    return PartialCloud.of(splat | {"labels": np.zeros(1, np.int32)}, like)
 
 
 @pytest.mark.parametrize("kind", KINDS)

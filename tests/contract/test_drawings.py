@@ -17,15 +17,15 @@ SIGN = Path(__file__).parents[2] / "examples" / "data" / "sign.svg"
 def test_a_drawing_is_as_smooth_as_its_outlines(renderer):
     """At 8 px a stroke (16 x 16 places in each pixel): 40 dB, where modules alone have 21; nothing behind it
     shows through."""
-    made = fs.marker(f"svg-64:{SIGN}")
+    marker = fs.marker(f"svg-64:{SIGN}")
     scale = 160 / 64
-    height, width = (round(side * scale) for side in made.grid.shape)
+    height, width = (round(side * scale) for side in marker.grid.shape)
     camera = fs.Camera.pinhole(width, height, 4.0 * width, 4.0 * width, width / 2, height / 2, pose_at(4.0))
     green, quality = (0.0, 1.0, 0.0), fs.Quality(lowpass="none")
-    frame = renderer.render(made.cloud, camera, ALL_OUTPUTS, quality, background=green)
+    frame = renderer.render(marker.cloud, camera, ALL_OUTPUTS, quality, background=green)
     y, x = (np.indices((height * 16, width * 16)) + 0.5) / 16 / scale
     ideal = np.zeros((height, width, 3))
-    for color, region in zip(made.palette, made.regions, strict=True):
+    for color, region in zip(marker.palette, marker.regions, strict=True):
         shapely.prepare(region)
         inside = shapely.intersects_xy(region, x, y).reshape(height, 16, width, 16).mean((1, 3))
         ideal += inside[..., None] * color

@@ -173,10 +173,10 @@ def test_random_hard_scenes(renderer, seeds):
     worst, splats, pixels, risky = {}, 0, 0, 0.0
     for seed in seeds:
         image = thick_scene_of(seed)
-        found = against_reference(renderer, image)
-        assert all(one.finite and one.excess <= 0 for one in found), (seed, found)
-        worst = {one.output: max(one.uncertified, worst.get(one.output, 0)) for one in found}
+        actual = against_reference(renderer, image)
+        assert all(one.finite and one.excess <= 0 for one in actual), (seed, actual)
+        worst = {one.output: max(one.uncertified, worst.get(one.output, 0)) for one in actual}
         size = image.camera.width * image.camera.height
-        splats, pixels, risky = splats + len(image.cloud), pixels + size, risky + found[0].risky * size
+        splats, pixels, risky = splats + len(image.cloud), pixels + size, risky + actual[0].risky * size
     print(f"{splats} splats, {pixels} pixels, {risky:.0f} with large certificates, beyond them {worst}")
     assert risky <= RARE * pixels

@@ -156,9 +156,9 @@ def test_an_image_of_nothing_has_no_error(renderer):
 
 def test_it_bounds_a_band_as_the_whole(renderer):
     cloud = haze(300, 1e-3)
-    whole = renderer.render(cloud, SMALL, OUTPUTS)["error"]
+    full_frame = renderer.render(cloud, SMALL, OUTPUTS)["error"]
     band = renderer.render_band((4, 9), cloud, SMALL, OUTPUTS)
-    assert np.array_equal(band["error"][4:9], whole[4:9])
+    assert np.array_equal(band["error"][4:9], full_frame[4:9])
     assert "error" in band.timings
 
 
@@ -274,7 +274,7 @@ def test_every_effect_without_a_bound_has_words():
     kinds = ("camera", "color", "ellipsoid", "lowpass", "compose", "footprint", "background", "shutter")
     names = {name for name in CATALOGUE if name.startswith(kinds)} | {"external_depth", "blend_double"}
     words = {name: certified_error._remedy_of(name)[0] for name in names - certified_error._BOUNDED}
-    assert {name for name, said in words.items() if said == name} == set()
+    assert {name for name, message in words.items() if message == name} == set()
 
 
 def test_lenses_have_it_on_the_reference(reference):

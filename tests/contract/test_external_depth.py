@@ -55,9 +55,9 @@ def differences(pipeline, resident, cloud, capture):
     _, view = prepare(resident, capture)
     images = pipeline.render_view(resident, view)
     reference = ReferenceBackend()
-    truth = reference.pipeline(select(cloud, capture.with_(outputs=(*capture.outputs, "alpha"))))
-    found = {name: images.read(name, 0) for name in capture.outputs}
-    return compare(found, truth.render_view(reference.upload(cloud), view).arrays_of(0), capture.outputs)
+    expected = reference.pipeline(select(cloud, capture.with_(outputs=(*capture.outputs, "alpha"))))
+    actual = {name: images.read(name, 0) for name in capture.outputs}
+    return compare(actual, expected.render_view(reference.upload(cloud), view).arrays_of(0), capture.outputs)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -174,11 +174,13 @@ def test_our_depth_is_an_external_depth_image(renderer):
     rendered = renderer.render(first, fs.Capture(CAMERA, OUTPUTS, quality))
     surface = fs.ExternalDepth(rendered["rgb"], rendered["depth"], np.maximum(rendered["label"], 0))
     both = renderer.render(rest, fs.Capture(CAMERA, OUTPUTS, quality, external_depth=surface))
-    whole = renderer.render(boxes, fs.Capture(CAMERA, OUTPUTS, quality))
-    inside = np.abs(whole["rgb"] - np.rint(whole["rgb"])).max(-1) < 1e-6  # edges cover parts of pixels
+    full_frame = renderer.render(boxes, fs.Capture(CAMERA, OUTPUTS, quality))
+    inside = (
+        np.abs(full_frame["rgb"] - np.rint(full_frame["rgb"])).max(-1) < 1e-6
+    )  # edges cover parts of pixels
     assert inside.mean() > 0.8
-    np.testing.assert_allclose(both["rgb"][inside], whole["rgb"][inside], atol=1e-6)
-    np.testing.assert_array_equal(both["label"][inside], whole["label"][inside])
+    np.testing.assert_allclose(both["rgb"][inside], full_frame["rgb"][inside], atol=1e-6)
+    np.testing.assert_array_equal(both["label"][inside], full_frame["label"][inside])
 
 
 def test_views_of_a_batch_have_their_own_surfaces(renderer):

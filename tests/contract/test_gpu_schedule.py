@@ -89,13 +89,13 @@ def draw_with_guarded_rays():
 
     compile_quickly()
     backend = fs.Renderer("warp:cpu").backend
-    kept = []
+    retained = []
 
     def before_a_guard(name, size, dtype):
         length = size * wp.types.type_size_in_bytes(dtype)
         room = -(-length // mmap.PAGESIZE) * mmap.PAGESIZE
         memory = mmap.mmap(-1, room + mmap.PAGESIZE)
-        kept.append(memory)
+        retained.append(memory)
         guard = ctypes.addressof(ctypes.c_char.from_buffer(memory)) + room
         nobody = 0
         assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(guard), mmap.PAGESIZE, nobody) == 0

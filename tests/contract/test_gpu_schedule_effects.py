@@ -63,12 +63,12 @@ def test_it_agrees_with_the_reference(renderer, name):
     groups = backend.shapes("schedule")["groups"]
     images = backend.pipeline(features, groups).render_view(backend.upload(requested.cloud), view)
     rendered = {output: images.read(output, 0) for output in requested.capture.outputs}
-    truth = (
+    expected = (
         reference.pipeline(requested.features("alpha"))
         .render_view(reference.upload(requested.cloud), view)
         .arrays_of(0)
     )
-    differences = compare(rendered, truth, requested.capture.outputs)
+    differences = compare(rendered, expected, requested.capture.outputs)
     # of so few pixels a single one that is hard is too large a share
     wrong = [one for one in differences if not (one.finite and one.excess <= 0)]
     assert not wrong, wrong
@@ -76,5 +76,5 @@ def test_it_agrees_with_the_reference(renderer, name):
 
 
 def test_nothing_is_left_out():
-    every = [made().features() for made in PICTURES.values()]
+    every = [make().features() for make in PICTURES.values()]
     assert set().union(*(features.names for features in every)) == set(CATALOGUE) - ELSEWHERE

@@ -33,17 +33,17 @@ BACKEND = ("opencl", "warp")
 
 def assert_same(backend, cloud, capture, by_images=None, **build):
     by_images = certain_loss(cloud, capture) if by_images is None else by_images
-    found = derivatives(backend, cloud, capture, by_images, **build)
+    actual = derivatives(backend, cloud, capture, by_images, **build)
     expected = reference_derivatives(cloud, capture, by_images)
-    assert found.keys() == expected.keys()
-    for name, array in found.items():
+    assert actual.keys() == expected.keys()
+    for name, array in actual.items():
         assert array.shape == expected[name].shape, name
-    off = list(differences(found, expected, rotation_floor(cloud, expected)))
+    off = list(differences(actual, expected, rotation_floor(cloud, expected)))
     if not all(one.norm <= NORM and one.turned <= COSINE for one in off):  # also for NaN
         for one, known in zip(off, conditioning(cloud, capture, by_images), strict=True):
             assert one.norm <= NORM or one.norm <= known.norm < math.inf, (one, known)
             assert one.turned <= max(COSINE, known.turned), (one, known)
-    return found
+    return actual
 
 
 CASES = {
@@ -66,8 +66,8 @@ def backend(renderer):
 
 @pytest.mark.parametrize("case", CASES)
 def test_derivatives_are_the_references(backend, case):
-    found = assert_same(backend, *random_scene(1, **CASES[case]))
-    assert all(np.abs(array).max() > 0 for array in found.values())
+    gradients = assert_same(backend, *random_scene(1, **CASES[case]))
+    assert all(np.abs(array).max() > 0 for array in gradients.values())
 
 
 @pytest.mark.parametrize("seeds", [(0, 1, 31), pytest.param(range(200), marks=pytest.mark.exhaustive)])
@@ -96,8 +96,9 @@ def test_derivatives_of_3d_gaussians_are_the_references(backend, projection, sol
     ]
     for cloud, capture in scenes:
         loss = certain_loss(cloud, capture)
-        found, again = assert_same(backend, cloud, capture, loss), derivatives(backend, cloud, capture, loss)
-        for name, array in found.items():
+        gradients = assert_same(backend, cloud, capture, loss)
+        again = derivatives(backend, cloud, capture, loss)
+        for name, array in gradients.items():
             assert array.any(), name
             assert array.tobytes() == again[name].tobytes(), name
     (shape,) = backend.shapes("schedule").values()
@@ -121,14 +122,14 @@ def test_distortions_and_their_derivatives_are_the_references(backend):
         by_distortion = {"distortion": np.random.default_rng(1).normal(size=(43, 61)).astype(np.float32)}
         assert_same(backend, cloud, capture, by_distortion)
         features, view = prepare(cloud, capture)
-        found, wanted = (
+        loaded, expected = (
             each.differentiate(with_distortion(features))
             .forward(each.upload(cloud), view)
             .read("distortion", 0)
             for each in (backend, ReferenceBackend())
         )
-        assert wanted.max() > 0
-        assert np.abs(found - wanted).max() < 1e-4 * wanted.max()
+        assert expected.max() > 0
+        assert np.abs(loaded - expected).max() < 1e-4 * expected.max()
 
 
 def test_opaque_splats_have_derivatives(backend):
@@ -137,9 +138,9 @@ def test_opaque_splats_have_derivatives(backend):
     opaque = fs.SplatCloud(
         cloud.means, cloud.quats, cloud.scales, np.ones(90), sh=cloud.sh, origin=cloud.origin
     )
-    found = assert_same(backend, opaque, capture)
-    assert np.abs(found["opacities"]).max() > 0
-    assert all(np.isfinite(array).all() for array in found.values())
+    gradients = assert_same(backend, opaque, capture)
+    assert np.abs(gradients["opacities"]).max() > 0
+    assert all(np.isfinite(array).all() for array in gradients.values())
 
 
 @pytest.mark.parametrize("solid", [0.0, 1.0], ids=["disks", "exact 3D Gaussians"])
@@ -154,8 +155,8 @@ def test_scales_below_the_smallest_have_no_derivative_and_leave_others_theirs(ba
     means, quats, _, opacities = arrays_of(cloud)
     scales = np.where(tiny, np.float32(1e-25), scales)
     thin = fs.SplatCloud(means, quats, scales, opacities, sh=cloud.sh, origin=cloud.origin)
-    found = assert_same(backend, thin, capture)
-    for axis, by in enumerate([*found["scales"].T, *([found["thickness"]] if solid else [])]):
+    gradients = assert_same(backend, thin, capture)
+    for axis, by in enumerate([*gradients["scales"].T, *([gradients["thickness"]] if solid else [])]):
         assert not by[tiny[:, axis]].any()
         assert by[~tiny[:, axis]].any()
 
@@ -172,10 +173,10 @@ def long_lists():
 
 @pytest.mark.sweep
 def test_long_lists_are_taken_back_in_chunks(backend):
-    found = assert_same(backend, *long_lists())
+    gradients = assert_same(backend, *long_lists())
     for shape in backend.shapes("tape").values():
         again = assert_same(backend, *long_lists(), shape=shape)
-        assert all(np.array_equal(again[name], found[name]) for name in found)
+        assert all(np.array_equal(again[name], gradients[name]) for name in gradients)
 
 
 def test_the_same_bits_on_every_run_and_those_of_render(backend, renderer):
@@ -195,14 +196,14 @@ def test_a_differentiable_frame_has_the_bits_of_render_and_of_the_backends_gradi
     expected = derivatives(backend, cloud, capture, distorted=False)
     weights = random_loss(*prepare(cloud, capture))
     frame = renderer.render_differentiable(cloud, capture)
-    found = frame.backward(weights)
+    gradients = frame.backward(weights)
     images, rendered = dict(frame), renderer.render(cloud, capture)
     assert all(np.array_equal(images[name], rendered[name]) for name in rendered)
-    assert all(found[name].tobytes() == array.tobytes() for name, array in expected.items())
-    assert found.keys() == expected.keys()
+    assert all(gradients[name].tobytes() == array.tobytes() for name, array in expected.items())
+    assert gradients.keys() == expected.keys()
     resident = renderer.upload(cloud)
     on_device = renderer.render_differentiable(resident, capture).backward(weights, on_device=True)
-    assert all(np.array_equal(on_host(array), found[name]) for name, array in on_device.items())
+    assert all(np.array_equal(on_host(array), gradients[name]) for name, array in on_device.items())
     with pytest.raises(fs.InputError, match="images of an earlier frame"):
         frame.backward(weights)
 
@@ -217,8 +218,8 @@ def test_frames_that_are_not_awaited_have_the_same_derivatives(backend, renderer
     def backpropagated(cloud, capture, waits):
         features, view = prepare(cloud, capture)
         images = pipeline.forward(backend.upload(cloud), view, waits)
-        found = pipeline.backward(images, random_loss(features, view))
-        return {name: on_host(array).tobytes() for name, array in found.items()}
+        gradients = pipeline.backward(images, random_loss(features, view))
+        return {name: on_host(array).tobytes() for name, array in gradients.items()}
 
     first = backpropagated(*few, waits=True)
     assert backpropagated(*few, waits=False) == first
@@ -284,8 +285,8 @@ def test_a_frame_without_a_visible_splat_has_the_backgrounds_derivative(backend)
         cloud.means - (0.0, 0.0, 40.0), cloud.quats, 0.1 * cloud.scales, cloud.opacities, sh=cloud.sh,
         origin=cloud.origin,
     )  # fmt: skip
-    found = assert_same(backend, behind, capture)
-    assert found["background"].any()
-    assert not found["means"].any()
+    gradients = assert_same(backend, behind, capture)
+    assert gradients["background"].any()
+    assert not gradients["means"].any()
     empty = fs.SplatCloud(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 2)), [], sh=np.zeros((0, 4, 3)))
     assert_same(backend, empty, capture)

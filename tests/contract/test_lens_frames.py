@@ -54,8 +54,8 @@ def test_near_and_far_planes_amid_the_splats(renderer, name):
     camera = replace(CAMERAS[name], near=1.0, far=3.0)
     cloud = random_splats(100, 2, depth=(-3.0, 6.0))
     frame = assert_agrees(renderer, cloud, camera)
-    whole = renderer.render(cloud, CAMERAS[name], ALL_OUTPUTS)
-    assert np.abs(frame["rgb"] - whole["rgb"]).max() > 0.1
+    full_frame = renderer.render(cloud, CAMERAS[name], ALL_OUTPUTS)
+    assert np.abs(frame["rgb"] - full_frame["rgb"]).max() > 0.1
 
 
 @pytest.mark.parametrize("name", ["pinhole", "distortion", "fisheye 200", "panorama", "parallel"])
@@ -63,8 +63,8 @@ def test_depths_of_a_tilted_wall_are_right_to_a_hundred_thousandth(renderer, nam
     """Without a certificate: nothing is hard here."""
     camera = CAMERAS.get(name, camera_with_lens(None))
     center = np.linalg.inv(camera.world_to_camera) @ (0.1, -0.2, 3.0, 1.0)
-    turn = (0.9, 0.25, -0.2, 0.1)
-    wall = fs.SplatCloud([center[:3]], [turn], [(1.5, 1.5)], [1.0], colors=[(1, 1, 1)])
+    quaternion = (0.9, 0.25, -0.2, 0.1)
+    wall = fs.SplatCloud([center[:3]], [quaternion], [(1.5, 1.5)], [1.0], colors=[(1, 1, 1)])
     frame = renderer.render(wall, camera, ALL_OUTPUTS)
     want = reference_pixels(wall, camera, ALL_OUTPUTS, fs.Quality())["depth"]
     inside = frame["alpha"] > 0.1
@@ -99,9 +99,9 @@ def test_rims_that_bulge_behind_a_fisheye(renderer, name):
     mean, *axes = np.array(RIMS[name])
     u, v = (axis / np.linalg.norm(axis) for axis in axes)
     v -= (u @ v) * u
-    turn = np.stack([u, v / np.linalg.norm(v), np.cross(u, v / np.linalg.norm(v))], axis=1)
+    rotation = np.stack([u, v / np.linalg.norm(v), np.cross(u, v / np.linalg.norm(v))], axis=1)
     scales = [[np.linalg.norm(axis) for axis in axes]]
-    disk = fs.SplatCloud([mean], [matrix_to_quaternion(turn)], scales, [1.0], colors=[(1, 1, 1)])
+    disk = fs.SplatCloud([mean], [matrix_to_quaternion(rotation)], scales, [1.0], colors=[(1, 1, 1)])
     camera = fs.Camera.fisheye(200, 200, math.radians(200))
     alpha = assert_agrees(renderer, disk, camera, quality=TO_THE_RIM)["alpha"]
     assert (alpha > 0.6).any()
@@ -110,8 +110,8 @@ def test_rims_that_bulge_behind_a_fisheye(renderer, name):
 def test_a_disk_whose_middle_a_fisheye_nearly_touches(renderer):
     """All of it is within its radius of the camera, so that it reaches around it: almost half of all rays
     meet it, and the arcs of its bounding polygon are short nevertheless. Found at random."""
-    turn = (0.0766, 0.5008, 0.8621, -0.0097)
-    disk = fs.SplatCloud([(0.0903, 0.0785, 0.0004)], [turn], [(1, 1)], [1.0], colors=[(1, 1, 1)])
+    quaternion = (0.0766, 0.5008, 0.8621, -0.0097)
+    disk = fs.SplatCloud([(0.0903, 0.0785, 0.0004)], [quaternion], [(1, 1)], [1.0], colors=[(1, 1, 1)])
     camera = fs.Camera.pinhole(95, 69, 35.6, 35.6, -18.6, 19.8, lens=Fisheye())
     alpha = assert_agrees(renderer, disk, camera, quality=TO_THE_RIM)["alpha"]
     assert (alpha > 0.6).any()
@@ -121,8 +121,10 @@ def test_a_disk_whose_middle_a_fisheye_nearly_touches(renderer):
 def test_a_rim_ahead_of_a_disk_that_reaches_behind_the_camera(renderer):
     """A floor, half of it behind: its far end lies between two corners of the polygon that bounds it."""
     c, s = math.cos(math.pi / 16), math.sin(math.pi / 16)
-    turn = np.array([[c, -s, 0], [0, 0, -1], [s, c, 0]])
-    floor = fs.SplatCloud([(0, 0.5, 0.3)], [matrix_to_quaternion(turn)], [(1, 1)], [1.0], colors=[(1, 1, 1)])
+    rotation = np.array([[c, -s, 0], [0, 0, -1], [s, c, 0]])
+    floor = fs.SplatCloud(
+        [(0, 0.5, 0.3)], [matrix_to_quaternion(rotation)], [(1, 1)], [1.0], colors=[(1, 1, 1)]
+    )
     camera = fs.Camera.pinhole(80, 60, 8000.0, 8000.0, 40.0, -3050.0)
     alpha = assert_agrees(renderer, floor, camera, quality=TO_THE_RIM)["alpha"]
     assert (alpha > 0.6).any()
@@ -267,7 +269,7 @@ def test_lenses_in_single_precision(renderer, name):
     """The set-up of devices without float64, held as the pinhole's is: to a tenth of an 8-bit step."""
     cloud = random_splats(200, 0, depth=(0.5, 6.0))
     frame = renderer.render(cloud, CAMERAS[name], quality="fast")
-    truth = reference_pixels(cloud, CAMERAS[name], ("rgb",), "fast")
-    excess = np.abs(frame["rgb"] - truth["rgb"]).max(2) - truth["certificate"]
+    expected = reference_pixels(cloud, CAMERAS[name], ("rgb",), "fast")
+    excess = np.abs(frame["rgb"] - expected["rgb"]).max(2) - expected["certificate"]
     assert np.quantile(excess, 0.999) < 0.1 / 255
     assert excess.max() < 2.0 / 255

@@ -12,11 +12,11 @@ import fidsplat as fs
 @pytest.mark.parametrize("device", ["opencl", "warp:cpu"])
 def test_threads_share_a_renderer_or_have_their_own(device):
     seeds = range(6)
-    truth = [load.digest_of_views(fs.Renderer(device), seed) for seed in seeds]
+    expected = [load.digest_of_views(fs.Renderer(device), seed) for seed in seeds]
     shared = fs.Renderer(device)
     with ThreadPoolExecutor(len(seeds)) as pool:
-        assert list(pool.map(lambda seed: load.digest_of_views(shared, seed), seeds)) == truth
-        assert list(pool.map(lambda seed: load.digest_of_views(fs.Renderer(device), seed), seeds)) == truth
+        assert list(pool.map(lambda seed: load.digest_of_views(shared, seed), seeds)) == expected
+        assert list(pool.map(lambda seed: load.digest_of_views(fs.Renderer(device), seed), seeds)) == expected
 
 
 @pytest.mark.sweep

@@ -136,7 +136,7 @@ def test_splats_that_are_viewed_nearly_edge_on(renderer, camera):
     tangents = np.cross(normals, generator.normal(size=(count, 3)))
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     turns = np.stack([tangents, np.cross(normals, tangents), normals], axis=2)
-    quats = np.array([matrix_to_quaternion(turn) for turn in turns])
+    quats = np.array([matrix_to_quaternion(quaternion) for quaternion in turns])
     colors, opacities = generator.uniform(0, 1, (count, 3)), generator.uniform(0.3, 1.0, count)
     scales = 10.0 ** generator.uniform(-3, -0.5, (count, 2))
     cloud = fs.SplatCloud(means, quats, scales, opacities, colors=colors)
@@ -164,13 +164,13 @@ def test_disks_far_outside_the_image_that_are_widened_into_it(renderer):
     generator, count = np.random.default_rng(4), 120
     outward = generator.uniform((-10.0, -0.2, 0.0), (10.0, 0.2, 0.0), (count, 3))
     towards = outward + np.array([0.0, 0.0, 1.0])
-    away = generator.uniform(1.0, 3.0, (count, 1)) / np.linalg.norm(towards, axis=1, keepdims=True)
+    distance = generator.uniform(1.0, 3.0, (count, 1)) / np.linalg.norm(towards, axis=1, keepdims=True)
     along = towards / np.linalg.norm(towards, axis=1, keepdims=True) + 0.01 * outward
     beside = np.cross(along, np.array([0, 1, 0]) + 0.3 * generator.normal(size=(count, 3)))
     along, beside = (axis / np.linalg.norm(axis, axis=1, keepdims=True) for axis in (along, beside))
     turns = np.stack([along, beside, np.cross(along, beside)], axis=2)
-    quats = np.array([matrix_to_quaternion(turn) for turn in turns])
-    means = away * towards
+    quats = np.array([matrix_to_quaternion(quaternion) for quaternion in turns])
+    means = distance * towards
     scales = np.linalg.norm(means, axis=1)[:, None] * generator.uniform((0.1, 0.02), (0.16, 0.08), (count, 2))
     camera, reference = (
         fs.Camera.look_at(40, 30, math.radians(4), (0, 0, 0), (0, 0, 1)),
@@ -190,10 +190,10 @@ def test_disks_far_outside_the_image_that_are_widened_into_it(renderer):
 def test_splats_that_reach_into_a_band(renderer):
     """From above, from below and from behind the camera: a band shows them as the whole image does."""
     cloud, camera = random_splats(600, 3, depth=(-1.0, 4.0), scale=(0.01, 0.5)), CAMERA
-    whole = renderer.render(cloud, camera, ALL_OUTPUTS, PIXEL)["rgb"]
+    full_frame = renderer.render(cloud, camera, ALL_OUTPUTS, PIXEL)["rgb"]
     for band in ((0, 16), (16, 40), (40, 59)):
         rows = renderer.render_band(band, cloud, camera, ALL_OUTPUTS, PIXEL)["rgb"][slice(*band)]
-        assert np.array_equal(rows, whole[slice(*band)]), band
+        assert np.array_equal(rows, full_frame[slice(*band)]), band
 
 
 def test_splats_whose_centres_lie_beyond_the_fold(renderer):
@@ -218,8 +218,10 @@ def test_the_screen_dot_of_walls_that_are_viewed_nearly_edge_on(renderer):
         for away in (0.3, 0.8, 1.5):
             half = (math.pi / 2 - away / 40.0) / 2  # of the angle by which it is tilted
             spin = generator.uniform(0, math.pi)
-            turn = (math.cos(half), math.sin(half) * math.cos(spin), math.sin(half) * math.sin(spin), 0)
-            wall = fs.SplatCloud([(0.01, 0.02, 2.0)], [turn], [(size, size)], [0.95], colors=[(1, 0.6, 0.3)])
+            quaternion = (math.cos(half), math.sin(half) * math.cos(spin), math.sin(half) * math.sin(spin), 0)
+            wall = fs.SplatCloud(
+                [(0.01, 0.02, 2.0)], [quaternion], [(size, size)], [0.95], colors=[(1, 0.6, 0.3)]
+            )
             assert_agrees(renderer, wall, camera)
 
 

@@ -30,22 +30,24 @@ def towards(tilt: float, azimuth: float) -> fs.Camera:
 @pytest.fixture(scope="module", params=["apriltag:36h11:5", "qr-v1-L:splats"])
 def pair(request, tmp_path_factory):
     """A marker and its file, read again: without coplanar groups, labels or boxes."""
-    made = fs.marker(request.param)
+    marker = fs.marker(request.param)
     path = tmp_path_factory.mktemp("files") / "marker.ply"
-    fs.save_ply(made.gaussians, path)
-    return made, fs.load_ply(path)
+    fs.save_ply(marker.gaussians, path)
+    return marker, fs.load_ply(path)
 
 
 @pytest.mark.parametrize(("tilt", "azimuth"), [(0, 0), (1, 0), (40, 30), (60, 200)])
 def test_a_marker_s_file_is_opaque_enough_and_read(renderer, pair, tilt, azimuth):
     """No splat reaches far into cells of the other colour, so that no order among them hides a cell."""
-    made, read = pair
+    marker, read = pair
     assert PRESETS["gsplat"] == PRESETS["surfel"]
     camera = towards(tilt, azimuth)
-    ideal = renderer.render(made.cloud, camera, ALL_OUTPUTS, "gsplat", background=GREY)
+    ideal = renderer.render(marker.cloud, camera, ALL_OUTPUTS, "gsplat", background=GREY)
     shown = renderer.render(read, camera, ALL_OUTPUTS, "gsplat", background=GREY)
     inside = ideal["alpha"] > 0.98
     assert shown["alpha"][inside].mean() > 0.94
     assert psnr(shown["rgb"], ideal["rgb"]) > 21
-    found = detect((np.clip(shown["rgb"], 0, 1) * 255).round().astype(np.uint8), ["36h11"])
-    assert [one.id if made.kind == "apriltag" else one.payload for one in found] == [made.id or made.payload]
+    detections = detect((np.clip(shown["rgb"], 0, 1) * 255).round().astype(np.uint8), ["36h11"])
+    assert [one.id if marker.kind == "apriltag" else one.payload for one in detections] == [
+        marker.id or marker.payload
+    ]

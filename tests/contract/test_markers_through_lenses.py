@@ -61,9 +61,9 @@ def images(renderer, placed, camera, **effects):
 
 def corners_in(image):
     """Of tag 5; None if it is not found."""
-    found = detect(image, families=("36h11",), qr=False)
-    assert [tag.id for tag in found] in ([], [5])
-    return found[0].corners if found else None
+    detections = detect(image, families=("36h11",), qr=False)
+    assert [tag.id for tag in detections] in ([], [5])
+    return detections[0].corners if detections else None
 
 
 def assert_found(renderer, name, turn, **effects):

@@ -59,12 +59,12 @@ def roomy(renderer):
 
 def as_on_a_gpu(renderer, budget=None):
     """The kernels and tables of a GPU, and a cloud that is copied, on whatever device this is."""
-    made = fs.Renderer(renderer.device.name)
-    backend = made.backend
+    limited_renderer = fs.Renderer(renderer.device.name)
+    backend = limited_renderer.backend
     backend.info = replace(backend.info, kind="gpu")
     backend.shape = gpu_shape(256, backend.shape.fast_fma)
     backend.limit_memory(budget or backend.memory_budget)
-    return made
+    return limited_renderer
 
 
 MACHINES = {"own": own_device, "gpu": as_on_a_gpu}
@@ -74,11 +74,11 @@ machines = pytest.mark.parametrize("machine", MACHINES.values(), ids=MACHINES)
 @pytest.fixture(scope="module")
 def cloud():
     """200 disks of a plane; of the others every third is a 3D Gaussian."""
-    made = random_splats(30000, 1, scale=(1e-3, 0.5), sh_degree=2)
-    number = np.arange(len(made))
+    splats = random_splats(30000, 1, scale=(1e-3, 0.5), sh_degree=2)
+    number = np.arange(len(splats))
     third = np.where((number >= 200) & (number % 3 == 0), 0.05, 0)
-    made = some_thick(made, third)
-    return made.with_coplanar_groups(np.where(number < 200, 0, -1))
+    splats = some_thick(splats, third)
+    return splats.with_coplanar_groups(np.where(number < 200, 0, -1))
 
 
 def test_one_pair_more_than_the_budget_makes_a_second_band(opencl, cloud, whole, monkeypatch):
@@ -105,13 +105,13 @@ def test_one_pair_more_than_the_budget_makes_a_second_band(opencl, cloud, whole,
 def test_nothing_is_written_beyond_the_capacity_of_lists(opencl, monkeypatch, machine, scale, views):
     """Neither where they just fit nor, on a GPU, where there are more pairs than there is room for: of splats
     that touch few tiles, and of big ones, whose pairs are written elsewhere, as those of many views are."""
-    own, some = machine(opencl), random_splats(300, seed=4, scale=scale)
+    renderer, some = machine(opencl), random_splats(300, seed=4, scale=scale)
 
     def rendered():
-        return own.render(some, CAMERA) if views == 1 else own.render_batch(some, [CAMERA] * views)
+        return renderer.render(some, CAMERA) if views == 1 else renderer.render_batch(some, [CAMERA] * views)
 
     expected = rendered()
-    pairs, pool, queue = expected.stats["pairs"], own.backend.pool, own.backend.queue
+    pairs, pool, queue = expected.stats["pairs"], renderer.backend.pool, renderer.backend.queue
     words = {"lists": pairs}
     if machine is as_on_a_gpu:
         words, capacity, bands = {"pairs": 200, "lists": 100}, tiling.pair_capacity, tiling.unsorted_bands
@@ -123,13 +123,13 @@ def test_nothing_is_written_beyond_the_capacity_of_lists(opencl, monkeypatch, ma
 
         monkeypatch.setattr(tiling, "pair_capacity", lambda workspace: 100)
         monkeypatch.setattr(tiling, "unsorted_bands", first_looked_at)
-    seen = []
+    collected = []
 
     def look():
         for name, first in words.items():
             rest = np.empty(pool.size(name) // 4 - first, np.uint32)
             cl.enqueue_copy(queue, rest, pool._buffers[name], src_offset=4 * first)
-            seen.append((rest == UNTOUCHED).all())
+            collected.append((rest == UNTOUCHED).all())
 
     for name in words:
         buffer = pool.scratch(name, max(pool.size(name), 4 * pairs + 64))
@@ -138,7 +138,7 @@ def test_nothing_is_written_beyond_the_capacity_of_lists(opencl, monkeypatch, ma
     assert np.array_equal(frame["rgb"], expected["rgb"])
     if machine is own_device:
         look()
-    assert seen == [True] * len(words)
+    assert collected == [True] * len(words)
 
 
 @pytest.fixture(scope="module")
@@ -153,27 +153,27 @@ def whole(opencl, cloud):
 def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, streamed):
     """Chunks of splats, bands of rows, and a cloud that is copied chunk by chunk or stays where it is. With a
     printed plane among them, so every fragment by its own depth."""
-    own = small(opencl, mebibytes, None if streamed else cloud)
-    resident = own.upload(cloud)
+    renderer = small(opencl, mebibytes, None if streamed else cloud)
+    resident = renderer.upload(cloud)
     resident.data._shared &= not streamed  # a CPU reads the host's arrays; make it copy them
     resident.data.streamed = streamed
     for _ in range(2):
-        frame = own.render(resident, CAMERA, ALL_OUTPUTS)
+        frame = renderer.render(resident, CAMERA, ALL_OUTPUTS)
         assert frame.stats == whole[1]
         for name in ALL_OUTPUTS:
             assert np.array_equal(frame[name], whole[0][name]), name
-    assert "packed splats" in own.backend.pool._buffers, "it was drawn in chunks"
+    assert "packed splats" in renderer.backend.pool._buffers, "it was drawn in chunks"
 
 
 def test_many_big_splats_in_chunks(opencl):
     """More splats that touch many tiles than the first guess has room for."""
     crowd = random_splats(26000, seed=2, depth=(-19.0, 9.0), scale=(0.5, 3.0))
     expected = roomy(opencl).render(crowd, CAMERA, ("rgb", "depth"))
-    own = small(opencl, 3.2)
-    resident = own.upload(crowd)
+    renderer = small(opencl, 3.2)
+    resident = renderer.upload(crowd)
     resident.data._shared, resident.data.streamed = False, True
-    frame = own.render(resident, CAMERA, ("rgb", "depth"))
-    assert "packed splats" in own.backend.pool._buffers
+    frame = renderer.render(resident, CAMERA, ("rgb", "depth"))
+    assert "packed splats" in renderer.backend.pool._buffers
     assert frame.stats == expected.stats
     assert all(np.array_equal(frame[name], expected[name]) for name in frame)
 
@@ -228,16 +228,17 @@ def test_views_are_rendered_like_single_frames(renderer):
 def test_frames_of_many_sizes_leave_no_heap_of_buffers(opencl):
     """Image buffers return to the pool when their frame is deleted; buffers of another size are released."""
     some = random_splats(50, seed=5)
-    own = fs.Renderer(opencl.device.name)
+    renderer = fs.Renderer(opencl.device.name)
     held = []
     for width in (64, 32, 48, 64, 16, 64):
         frames = [
-            own.render(some, fs.Camera.look_at(width, 32, 1.0, (0, 0, -0.1), (0, 0, 3))) for _ in range(4)
+            renderer.render(some, fs.Camera.look_at(width, 32, 1.0, (0, 0, -0.1), (0, 0, 3)))
+            for _ in range(4)
         ]
         assert frames[0]["rgb"].shape == (32, width, 3)
         del frames
-        own.render(some, fs.Camera.look_at(64, 32, 1.0, (0, 0, -0.1), (0, 0, 3)))
-        held.append(own.backend.pool.memory_bytes)
+        renderer.render(some, fs.Camera.look_at(64, 32, 1.0, (0, 0, -0.1), (0, 0, 3)))
+        held.append(renderer.backend.pool.memory_bytes)
     assert max(held) <= held[0]
 
 
@@ -246,16 +247,18 @@ def test_a_pool_keeps_to_the_budget_whatever_was_rendered_before(opencl, machine
     """Images at once and in chunks, few and many outputs: buffers of one kind do not count against the
     budget of the next."""
     budget = 8 * 2**20
-    own, opencl = machine(opencl, budget), machine(opencl)
+    renderer, opencl = machine(opencl, budget), machine(opencl)
     for count, outputs in ((35000, ("rgb",)), (200000, ALL_OUTPUTS), (50000, ("rgb",)), (200000, ("rgb",))):
         crowd = random_splats(count, seed=6, scale=(1e-4, 1e-2))
-        resident = own.upload(crowd)
+        resident = renderer.upload(crowd)
         expected = opencl.render(crowd, CAMERA, outputs)
-        frame = own.render(resident, CAMERA, outputs)
+        frame = renderer.render(resident, CAMERA, outputs)
         if count != 50000:  # of which a processor has room for all, a GPU not
-            assert ("packed splats" in own.backend.pool._buffers) == (count > 50000), "it was drawn in chunks"
+            assert ("packed splats" in renderer.backend.pool._buffers) == (count > 50000), (
+                "it was drawn in chunks"
+            )
         assert all(np.array_equal(frame[name], expected[name]) for name in outputs)
-        assert own.backend.pool.memory_bytes + resident.memory_bytes <= budget, count
+        assert renderer.backend.pool.memory_bytes + resident.memory_bytes <= budget, count
 
 
 PICTURES = {
@@ -278,17 +281,19 @@ PICTURES = {
 )
 def test_a_plan_counts_all_memory_of_a_frame(opencl, monkeypatch, machine, mebibytes, name):
     """Everything that is new on the device, the cloud and a lens's rays included."""
-    own = machine(opencl, mebibytes * 2**20)
-    pool, taken, planned = own.backend.pool, [], []
+    renderer = machine(opencl, mebibytes * 2**20)
+    pool, measured, planned = renderer.backend.pool, [], []
     fresh, trim = pool.allocate, pool.trim
-    monkeypatch.setattr(pool, "allocate", lambda what, size: taken.append((what, size)) or fresh(what, size))
+    monkeypatch.setattr(
+        pool, "allocate", lambda what, size: measured.append((what, size)) or fresh(what, size)
+    )
     monkeypatch.setattr(pool, "trim", lambda kind, *way: planned.append(way[0]) or trim(kind, *way))
     some = random_splats(60000, seed=3, depth=(1.0, 6.0), scale=(1e-3, 1e-2), sh_degree=1)
     some = some.with_boxes(np.arange(60000) < 30000) if name == "boxes before a lens" else some
     quality = fs.Quality(alpha_cutoff=1 / 255)
-    own.render(some, **{"camera": CAMERA, "quality": quality, **PICTURES[name]})["rgb"]
+    renderer.render(some, **{"camera": CAMERA, "quality": quality, **PICTURES[name]})["rgb"]
     largest = {}
-    for what, size in taken:
+    for what, size in measured:
         # a lens's rays are many buffers of one name, the others replace one another
         many = what.startswith("ray")
         largest[what] = largest.get(what, 0) + size if many else max(largest.get(what, 0), size)
@@ -301,7 +306,7 @@ def test_a_plan_counts_all_memory_of_a_frame(opencl, monkeypatch, machine, mebib
 
 def test_a_panorama_is_copied_once(opencl, monkeypatch):
     """As long as it is the one that was rendered last; images show theirs, whatever was there before."""
-    own = fs.Renderer(opencl.device.name)
+    renderer = fs.Renderer(opencl.device.name)
     rng = np.random.default_rng(0)
     one, other = (fs.Panorama(rng.random((33, 70, 3))) for _ in range(2))
     copied, copy = [], cl.enqueue_copy
@@ -312,7 +317,7 @@ def test_a_panorama_is_copied_once(opencl, monkeypatch):
 
     def draw(around, **more):
         copied.clear()
-        rgb = own.render(some, CAMERA, background=around, **more)["rgb"]
+        rgb = renderer.render(some, CAMERA, background=around, **more)["rgb"]
         return rgb, sum(array is around.image for array in copied)
 
     first, times = draw(one)
@@ -328,7 +333,7 @@ def test_a_panorama_is_copied_once(opencl, monkeypatch):
     again, times = draw(one)
     assert times == 1
     assert np.array_equal(first, again)
-    own.backend.release_scratch()
+    renderer.backend.release_scratch()
     again, times = draw(one)
     assert times == 1
     assert np.array_equal(first, again)
@@ -362,9 +367,9 @@ def test_a_leased_buffer_has_the_size_that_was_requested(opencl):
     pool = fs.Renderer(opencl.device.name).backend.pool
     pool.release([("plane", pool.allocate("plane", 64)), ("plane", pool.allocate("plane", 64))])
     assert pool.acquire("plane", 4096).size == 4096
-    kept = pool.allocate("plane", 4096)
-    pool.release([("plane", kept)])
-    assert pool.acquire("plane", 4096) is kept
+    buffer = pool.allocate("plane", 4096)
+    pool.release([("plane", buffer)])
+    assert pool.acquire("plane", 4096) is buffer
 
 
 def test_an_image_that_cannot_be_read_is_an_error_of_the_device(opencl):

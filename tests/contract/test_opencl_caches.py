@@ -23,13 +23,13 @@ def opencl(renderer):
 def test_a_part_of_a_batch_on_the_device_keeps_its_images(opencl):
     """The next batch is rendered into other buffers while a view of the last is held, though nothing else
     is."""
-    own, some = own_device(opencl), random_splats(100, seed=7)
+    renderer, some = own_device(opencl), random_splats(100, seed=7)
     poses = np.tile([0, 0, 0, 1, 0, 0, 0.0], (2, 1))
-    first = own.render_batch(some, CAMERA, poses=poses).wait()
+    first = renderer.render_batch(some, CAMERA, poses=poses).wait()
     expected = first["rgb"][1]
     view = first.device_array("rgb")[1]
     del first
-    others = [own.render_batch(some, CAMERA, poses=poses + k * np.eye(7)[2]).wait() for k in (1, 2, 3)]
+    others = [renderer.render_batch(some, CAMERA, poses=poses + k * np.eye(7)[2]).wait() for k in (1, 2, 3)]
     assert not np.array_equal(others[0]["rgb"][1], expected)
     assert np.array_equal(view.get(), expected)
     held = weakref.ref(others[-1]._images)
@@ -48,17 +48,17 @@ class LessAtOnce:
 
 
 def test_a_batch_is_cut_where_no_buffer_holds_all_its_splats(opencl):
-    own, some = as_on_a_gpu(opencl), random_splats(2000, seed=4, scale=(1e-2, 0.1))
+    renderer, some = as_on_a_gpu(opencl), random_splats(2000, seed=4, scale=(1e-2, 0.1))
     poses = np.tile([0, 0, 0, 1, 0, 0, 0.0], (8, 1))
     camera = fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
-    whole = own.render_batch(some, camera, poses=poses)["rgb"]
-    own.backend.release_scratch()
-    device = LessAtOnce(own.backend.device, 1 << 19)
-    own.backend.device = own.backend.pool._device = device
-    own.backend.limit_memory(own.backend.memory_budget)
-    assert np.array_equal(own.render_batch(some, camera, poses=poses)["rgb"], whole)
+    full_batch = renderer.render_batch(some, camera, poses=poses)["rgb"]
+    renderer.backend.release_scratch()
+    device = LessAtOnce(renderer.backend.device, 1 << 19)
+    renderer.backend.device = renderer.backend.pool._device = device
+    renderer.backend.limit_memory(renderer.backend.memory_budget)
+    assert np.array_equal(renderer.render_batch(some, camera, poses=poses)["rgb"], full_batch)
     with pytest.raises(fs.DeviceError, match=r"rgb of 40 views must be at most .* render fewer views"):
-        own.render_batch(some, camera, poses=np.tile(poses, (5, 1)))
+        renderer.render_batch(some, camera, poses=np.tile(poses, (5, 1)))
 
 
 def test_cached_views_do_not_retain_their_surroundings(opencl, monkeypatch):

@@ -137,11 +137,11 @@ def test_of_equal_splats_in_a_layer_and_equal_samples_of_a_pixel_the_first_is_na
     )
     quality = fs.Quality(samples=2, lowpass="none", alpha_cutoff=0.4, opacity_ceiling=0.5, first_hit=0.4)
     frame = renderer.render(sides, POINT, ALL, quality)
-    found = {name: frame[name][2, 2] for name in ALL}
-    assert (found["alpha"], found["label"], found["splat_id"], found["blended"]) == (0.5, 8, 1, 1)
-    assert (found["depth_first"], found["depth_median"]) == pytest.approx((2, 2), rel=1e-6)
-    assert found["depth"] == pytest.approx(2.5, rel=1e-6)
-    assert 2 < found["distance_median"] == pytest.approx(found["distance_first"], rel=1e-6)
+    actual = {name: frame[name][2, 2] for name in ALL}
+    assert (actual["alpha"], actual["label"], actual["splat_id"], actual["blended"]) == (0.5, 8, 1, 1)
+    assert (actual["depth_first"], actual["depth_median"]) == pytest.approx((2, 2), rel=1e-6)
+    assert actual["depth"] == pytest.approx(2.5, rel=1e-6)
+    assert 2 < actual["distance_median"] == pytest.approx(actual["distance_first"], rel=1e-6)
 
 
 def test_a_layer_of_a_thousand_faint_splats(renderer):
@@ -198,11 +198,11 @@ def test_an_opaque_layer_ends_the_count(renderer):
 
 def test_splat_ids_are_indices_of_the_cloud_in_chunks_too(renderer):
     cloud = random_splats(3000, 8, depth=(1.0, 6.0), scale=(1e-3, 0.3))
-    whole = renderer.render(cloud, CAMERA, ALL)
-    ids = whole["splat_id"]
+    full_frame = renderer.render(cloud, CAMERA, ALL)
+    ids = full_frame["splat_id"]
     assert ids.max() > 2000
-    seen = ids >= 0
-    assert np.array_equal(cloud.labels[ids[seen]], whole["label"][seen])
+    visible = ids >= 0
+    assert np.array_equal(cloud.labels[ids[visible]], full_frame["label"][visible])
     if not renderer.device.name.startswith("opencl"):
         return  # Warp renders no cloud in chunks (docs/backends.md)
     # a GPU's tables for drawing in chunks take more

@@ -47,24 +47,24 @@ def test_blending_in_double_has_only_the_rounding_of_the_output(opencl, cloud, s
     quality = DOUBLE.with_(samples=samples)
     outputs, background = ("rgb", "alpha", "depth", "normal"), (0.1, 0.2, 0.3)
     frame = opencl.render(cloud, CAMERA, outputs, quality, background=background)
-    truth = reference_pixels(cloud, CAMERA, outputs, quality, background)
+    expected = reference_pixels(cloud, CAMERA, outputs, quality, background)
     roundings = (2 + samples**2) * ROUNDING
     for name in outputs:
-        size = {"rgb": max(1.0, truth["rgb"].max()), "depth": 2 * truth["depth"].max()}.get(name, 1.0)
-        seen = truth["alpha"] > 1e-3
-        error = np.abs(frame[name] - truth[name])
+        size = {"rgb": max(1.0, expected["rgb"].max()), "depth": 2 * expected["depth"].max()}.get(name, 1.0)
+        visible = expected["alpha"] > 1e-3
+        error = np.abs(frame[name] - expected[name])
         if name == "normal":  # of unit length, from sums that may nearly cancel
-            assert np.quantile(error[seen], 0.99) <= 2 * roundings
+            assert np.quantile(error[visible], 0.99) <= 2 * roundings
         else:
-            assert error[seen].max() <= size * roundings, name
+            assert error[visible].max() <= size * roundings, name
 
 
 def test_double_is_nearer_to_the_truth_than_float32(opencl):
     if not opencl.device.float64:
         pytest.skip("the device has no float64")
-    truth = reference_pixels(AROUND, CAMERA, ("rgb",), DOUBLE)["rgb"]
+    expected = reference_pixels(AROUND, CAMERA, ("rgb",), DOUBLE)["rgb"]
     errors = [
-        np.abs(opencl.render(AROUND, CAMERA, ("rgb",), quality)["rgb"] - truth).max()
+        np.abs(opencl.render(AROUND, CAMERA, ("rgb",), quality)["rgb"] - expected).max()
         for quality in (DOUBLE, fs.Quality())
     ]
     assert errors[0] < 0.2 * errors[1]
@@ -140,8 +140,10 @@ def test_half_precision_changes_a_pixel_by_at_most_its_roundings(opencl, name):
     light, and transmittance and the sum of colours by up to 2^-12 each. The output `blended` counts them."""
     cloud, outputs = CLOUDS[name], ("rgb", "alpha", "blended")
     frame = opencl.render(cloud, CAMERA, outputs, HALF)
-    truth = reference_pixels(cloud, CAMERA, ("rgb", "alpha"), HALF.with_(blend_precision="float32"))
-    error = np.maximum(np.abs(frame["rgb"] - truth["rgb"]).max(-1), np.abs(frame["alpha"] - truth["alpha"]))
+    expected = reference_pixels(cloud, CAMERA, ("rgb", "alpha"), HALF.with_(blend_precision="float32"))
+    error = np.maximum(
+        np.abs(frame["rgb"] - expected["rgb"]).max(-1), np.abs(frame["alpha"] - expected["alpha"])
+    )
     assert np.all(error <= (frame["blended"] + 3) * 2.0**-11 + 2e-5)
     assert 1e-4 < error.max() < 0.01
     halves = np.stack([*np.moveaxis(frame["rgb"], -1, 0), 1 - frame["alpha"]])

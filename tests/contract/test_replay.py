@@ -33,7 +33,7 @@ def test_kernels_see_new_buffers_at_old_addresses(opencl):
 def test_a_frame_is_replayed_for_each_view(opencl):
     """The same on a GPU: other poses, groups, colours and sizes are rendered in between, and frames are
     retained."""
-    machine, own = as_on_a_gpu(opencl), as_on_a_gpu(opencl)
+    machine, renderer = as_on_a_gpu(opencl), as_on_a_gpu(opencl)
     some = (
         random_splats(300, seed=4)
         .with_labels(np.arange(300) % 2)
@@ -51,14 +51,14 @@ def test_a_frame_is_replayed_for_each_view(opencl):
         for width in (50, 60)
         for k, x in enumerate(places)
     ]
-    kept = [machine.render(resident, capture) for _ in range(3) for capture in captures]
+    first_frame = [machine.render(resident, capture) for _ in range(3) for capture in captures]
     assert [each.recorded is not None for each in resident.data.cached_frames.values()] == [True, True]
-    for frame, capture in zip(kept, captures * 3, strict=True):
-        expected = own.render(some, capture)
+    for frame, capture in zip(first_frame, captures * 3, strict=True):
+        expected = renderer.render(some, capture)
         assert all(np.array_equal(frame[name], expected[name]) for name in frame)
         assert frame.stats == expected.stats
         assert set(frame.timings) == {"project", "sort", "bin", "blend"}  # which resolves
-    assert kept[-1].wait() is kept[-1]
+    assert first_frame[-1].wait() is first_frame[-1]
 
 
 def test_counts_of_another_kind_of_frame_are_ignored(opencl):
@@ -67,11 +67,11 @@ def test_counts_of_another_kind_of_frame_are_ignored(opencl):
     machine = as_on_a_gpu(opencl)
     resident = machine.upload(random_splats(300, seed=4))
     first, *_ = (machine.render(resident, CAMERA)["rgb"] for _ in range(3))
-    (kept,) = resident.data.cached_frames.values()
-    known, state = kept.recorded, machine.backend.pool.state
+    (frame,) = resident.data.cached_frames.values()
+    known, state = frame.recorded, machine.backend.pool.state
     machine.render(resident, fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0)))
     assert np.array_equal(machine.render(resident, CAMERA)["rgb"], first)
-    assert (kept.recorded, machine.backend.pool.state) == (known, state)
+    assert (frame.recorded, machine.backend.pool.state) == (known, state)
     assert known is not None
 
 
@@ -79,7 +79,7 @@ def test_a_replay_on_a_cpu_enlarges_its_lists(opencl):
     """A camera that approaches splats: each frame is rendered once, with the pairs that it has."""
     if opencl.device.kind != "cpu":
         pytest.skip("the host waits for the counts on CPUs only")
-    machine, own = fs.Renderer(opencl.device.name), fs.Renderer(opencl.device.name)
+    machine, renderer = fs.Renderer(opencl.device.name), fs.Renderer(opencl.device.name)
     some = random_splats(2000, seed=4, scale=(1e-2, 0.1), depth=(2.0, 6.0))
     places = np.linspace(-30, 1, 9)
     cameras = [fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, z), (0.0, 0.0, 30.0)) for z in places]
@@ -90,7 +90,7 @@ def test_a_replay_on_a_cpu_enlarges_its_lists(opencl):
     assert cached.recorded.state is machine.backend.pool.state
     assert cached.recorded.capacity.pairs > 1.2 * frames[0].stats["pairs"], "lists were enlarged"
     for frame, camera in zip(frames, cameras, strict=True):
-        expected = own.render(some, camera)
+        expected = renderer.render(some, camera)
         assert np.array_equal(frame["rgb"], expected["rgb"])
         assert frame.stats == expected.stats
 
@@ -98,7 +98,7 @@ def test_a_replay_on_a_cpu_enlarges_its_lists(opencl):
 @pytest.mark.parametrize("scale", [(1e-2, 0.3), (2.0, 3.0)], ids=["pairs", "big splats"])
 def test_a_frame_that_exceeds_the_last_is_rendered_again(opencl, scale):
     """More pairs, or more splats of many tiles, than there is room for: found when the frame is read."""
-    machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
+    machine, renderer = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
     some = random_splats(6000, seed=4, scale=scale, depth=(2.0, 6.0))
     places = (-900, -800, 0, 1, -700)
     cameras = [fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, z), (0.0, 0.0, 30.0)) for z in places]
@@ -107,20 +107,20 @@ def test_a_frame_that_exceeds_the_last_is_rendered_again(opencl, scale):
     pairs = [frame.stats["pairs"] for frame in frames]
     assert max(pairs) > 1.5 * pairs[1], "it did outgrow it"
     for frame, camera in zip(frames, cameras, strict=True):
-        assert np.array_equal(frame["rgb"], own.render(some, camera)["rgb"])
+        assert np.array_equal(frame["rgb"], renderer.render(some, camera)["rgb"])
 
 
 def test_threads_share_cached_launches(opencl):
     """Sixteen draw images of two kinds with a GPU's kernels, of a cloud that outgrows its room at times,
     and read them, their times and their counts while others draw."""
-    machine, own = as_on_a_gpu(opencl), as_on_a_gpu(opencl)
+    machine, renderer = as_on_a_gpu(opencl), as_on_a_gpu(opencl)
     some = random_splats(500, seed=4, scale=(1e-2, 0.3), depth=(2.0, 6.0))
     captures = [
         fs.Capture(fs.Camera.look_at(width, 40, 1.0, (0.0, 0.0, z), (0.0, 0.0, 30.0)))
         for width in (50, 60)
         for z in (-900, 0, 1)
     ]
-    expected = [own.render(some, capture) for capture in captures]
+    expected = [renderer.render(some, capture) for capture in captures]
     resident = machine.upload(some)
 
     def draw(number):
@@ -139,18 +139,21 @@ def test_threads_share_cached_launches(opencl):
 @machines
 def test_a_batch_in_parts_has_the_bits_of_its_views(opencl, monkeypatch, machine):
     """Several views at a time, with planes, groups that move, a mask, and images of other kinds between."""
-    own, some = machine(opencl), random_splats(300, seed=4, scale=(1e-2, 2.0)).with_labels(np.arange(300) % 3)
+    renderer, some = (
+        machine(opencl),
+        random_splats(300, seed=4, scale=(1e-2, 2.0)).with_labels(np.arange(300) % 3),
+    )
     some = some.with_coplanar_groups(np.arange(300) // 250 - 1)
     capture = fs.Capture(fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0)), ("rgb", "label"))
     poses = np.random.default_rng(0).normal(0, 0.05, (2, 7, 7))
     poses[..., 3] += 1
     requested = {"poses": poses[0], "groups": {2: poses[1]}, "mask": np.arange(7) != 3}
-    resident = own.upload(some)
+    resident = renderer.upload(some)
     for most in (1 << 31, 1 << 18):
         monkeypatch.setattr(memory_plan, "PART_BYTES", {})
         monkeypatch.setattr(memory_plan, "OTHER_PART_BYTES", most)
-        rendered = own.render_batch(resident, capture, **requested)
-        alone = own.render(resident, capture)
+        rendered = renderer.render_batch(resident, capture, **requested)
+        alone = renderer.render(resident, capture)
         for number in (0, 1, 2, 4, 5, 6):
             one = {"poses": poses[0, [number]], "groups": {2: poses[1, [number]]}}
             expected = opencl.render(some, views_of([capture], **one).capture(0))
@@ -165,9 +168,9 @@ def test_a_batch_in_parts_has_the_bits_of_its_views(opencl, monkeypatch, machine
 
 
 def test_a_batch_whose_images_are_too_many_is_an_error(opencl):
-    own, poses = own_device(opencl, 2**23), np.tile([0, 0, 0, 1, 0, 0, 0.0], (400, 1))
+    renderer, poses = own_device(opencl, 2**23), np.tile([0, 0, 0, 1, 0, 0, 0.0], (400, 1))
     with pytest.raises(fs.DeviceError, match=r"images of 400 views must be .* render fewer views"):
-        own.render_batch(random_splats(10, seed=1), CAMERA, poses=poses)
+        renderer.render_batch(random_splats(10, seed=1), CAMERA, poses=poses)
 
 
 SIDES = [(40, 30), (40, 50), (60, 30), (60, 50)]

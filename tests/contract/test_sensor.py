@@ -254,10 +254,10 @@ def test_values_that_mean_nothing_select_nothing(renderer):
 def test_the_sensor_keeps_the_other_outputs(renderer):
     names = ("rgb", "alpha", "depth", "normal", "label")
     plain = renderer.render(CLOUD, CAMERA, names)
-    seen = renderer.render(CLOUD, CAMERA, names, sensor=SENSORS["all"], fog=fs.Fog(0.3), background=GREY)
+    frame = renderer.render(CLOUD, CAMERA, names, sensor=SENSORS["all"], fog=fs.Fog(0.3), background=GREY)
     for name in names[1:]:
-        assert np.array_equal(plain[name], seen[name]), name
-    assert not np.array_equal(plain["rgb"], seen["rgb"])
+        assert np.array_equal(plain[name], frame[name]), name
+    assert not np.array_equal(plain["rgb"], frame["rgb"])
 
 
 @pytest.mark.parametrize("mixture", ["fitted", "exact"])
@@ -270,11 +270,11 @@ def test_a_tag_is_found_where_it_is_in_fog_and_noise(renderer, mixture):
     pose = np.eye(4)
     pose[:3, :3] = [[0.9, 0, 0.43588989], [0, 1, 0], [-0.43588989, 0, 0.9]]
     pose[:3, 3] = (0.1, -0.05, 1.5)
-    made = fs.marker("apriltag:36h11:5", size=0.3, mixture=mixture)
+    marker = fs.marker("apriltag:36h11:5", size=0.3, mixture=mixture)
     camera = fs.Camera.pinhole(480, 360, 420.0, 420.0, 240.0, 180.0)
     sensor = fs.Sensor(0.9, (-0.4,), 3000, 10, 3, 1.0, "srgb", 8)
     around = fs.Gradient((0.3, 0.4, 0.6), (0.3, 0.25, 0.2))
-    placed = fs.scenes.PlacedMarker(made, pose)
+    placed = fs.scenes.PlacedMarker(marker, pose)
     scene = fs.Scene(markers=[placed], camera=camera, background=around, sensor=sensor)
     distance = np.linalg.norm(pose[:3, 3])
     for fog in (None, fs.Fog(0.3, (0.5, 0.5, 0.5))):
@@ -282,9 +282,9 @@ def test_a_tag_is_found_where_it_is_in_fog_and_noise(renderer, mixture):
         ideal = ideal_image(placed, camera, 2, around, sensor=sensor, fog=fog)
         errors = []
         for picture in (rgb, ideal):
-            (found,) = detect(to_uint8(picture), families=["36h11"], qr=False)
-            assert found.id == 5
-            errors.append(pose_error(marker_pose(found.corners, 0.3, camera), pose)[0])
+            (detection,) = detect(to_uint8(picture), families=["36h11"], qr=False)
+            assert detection.id == 5
+            errors.append(pose_error(marker_pose(detection.corners, 0.3, camera), pose)[0])
         assert_as_good(*errors, distance)
         assert errors[1] < 0.01 * distance
 

@@ -51,22 +51,22 @@ def test_splats_are_made_by_kernels_as_by_numpy(renderer, dataset):
     for _ in range(17):  # harmonics too have moved
         trainer.step()
     work = trainer._model
-    made = densify.densification(work.geometry(), settings, 8, dataset.extent)
-    assert 0 < made.remaining < 16 < len(made.rows)
+    densified = densify.densification(work.geometry(), settings, 8, dataset.extent)
+    assert 0 < densified.remaining < 16 < len(densified.rows)
     expected = HostModel(renderer.backend, dataset.views, settings)
     expected.load(work.read())
     for each in (work, expected):
-        each.densify(made)
+        each.densify(densified)
         each.reset_opacities()
-    assert len(work) == len(made.rows)
+    assert len(work) == len(densified.rows)
     for group in ("values", "first", "second"):
         for name, array in getattr(expected.read(), group).items():
             assert np.array_equal(getattr(work.read(), group)[name], array), (group, name)
-    found = work.read()
-    assert found.first["sh"][:, 1:].any()
-    assert found.opacities.max() <= 0.5 + 1e-6
+    actual = work.read()
+    assert actual.first["sh"][:, 1:].any()
+    assert actual.opacities.max() <= 0.5 + 1e-6
     assert all(
-        not array.any() for array in (found.first["logits"], found.gradient_sums, found.visible_counts)
+        not array.any() for array in (actual.first["logits"], actual.gradient_sums, actual.visible_counts)
     )
 
 
@@ -76,8 +76,8 @@ def test_depths_and_normals_without_distortions_have_the_references_derivatives(
     expected = derivatives(ReferenceBackend(), cloud, capture, distorted=False)
     backend = renderer.backend
     for shape in (None, *backend.shapes("schedule").values()):
-        found = derivatives(backend, cloud, capture, distorted=False, shape=shape)
-        off = list(differences(found, expected))
+        actual = derivatives(backend, cloud, capture, distorted=False, shape=shape)
+        off = list(differences(actual, expected))
         assert all(one.norm < NORM and one.turned < COSINE for one in off), (shape, off)
 
 
@@ -87,13 +87,13 @@ def test_the_loss_of_normals_does_what_it_is_for(renderer, dataset):
     for weight in (0.0, 0.2):
         losses = {"normal_weight": weight, "normal_from": 0, "densify_from": 99, "sh_degree": 0}
         trainer = Trainer(dataset, renderer, **{**QUICK, "iterations": 40, **losses})
-        cloud, found = trainer.run(), []
+        cloud, results = trainer.run(), []
         for view in dataset.views:
             camera = view.camera
             frame = renderer.render(cloud, camera, ("rgb", "alpha", "depth", "normal"), "surfel")
             lens = (camera.fx, camera.fy), (camera.cx, camera.cy)
-            found.append(normal_loss(frame["depth"], frame["normal"], frame["alpha"], *lens)[0])
-        off.append(np.mean(found))
+            results.append(normal_loss(frame["depth"], frame["normal"], frame["alpha"], *lens)[0])
+        off.append(np.mean(results))
     assert off[1] < 0.8 * off[0]
 
 
@@ -114,11 +114,11 @@ def test_the_loss_of_distortions_does_what_it_is_for(renderer, dataset):
 
 def distortion_of(trainer):
     """Mean over the views that are trained on."""
-    backend, found = trainer.renderer.backend, []
+    backend, results = trainer.renderer.backend, []
     resident = backend.upload(trainer.cloud())
     for view in trainer.dataset.views:
         capture = fs.Capture(view.camera, quality="surfel")
-        features, seen = prepare(resident, capture)
+        features, visible = prepare(resident, capture)
         pipeline = backend.differentiate(with_distortion(features))
-        found.append(pipeline.forward(resident, seen).read("distortion", 0).mean())
-    return np.mean(found)
+        results.append(pipeline.forward(resident, visible).read("distortion", 0).mean())
+    return np.mean(results)

@@ -45,13 +45,13 @@ def works(renderer, views):
 
     def make(lanes=0, **changes):
         settings = TrainSettings(iterations=5, **changes)
-        found = (
+        actual = (
             DeviceModel(training.OpenCLTraining(renderer.backend, lanes), views, settings),
             HostModel(renderer.backend, views, settings),
         )
-        for work in found:
+        for work in actual:
             work.load(splats())
-        return found
+        return actual
 
     return make
 
@@ -59,12 +59,12 @@ def works(renderer, views):
 def splats():
     random = np.random.default_rng(0)
     shapes = {"means": (3,), "log_scales": (2,), "quats": (4,), "logits": (), "sh": (16, 3)}
-    made = Splats.of({name: random.normal(size=(COUNT, *shape)) for name, shape in shapes.items()})
-    for group in (made.first, made.second):
+    cloud = Splats.of({name: random.normal(size=(COUNT, *shape)) for name, shape in shapes.items()})
+    for group in (cloud.first, cloud.second):
         for array in group.values():
             array[:] = random.uniform(0.1, 1, array.shape)
-    made.gradient_sums[:], made.visible_counts[:] = random.uniform(size=(2, COUNT))
-    return made
+    cloud.gradient_sums[:], cloud.visible_counts[:] = random.uniform(size=(2, COUNT))
+    return cloud
 
 
 def on_device(renderer, array):
@@ -94,28 +94,28 @@ def test_loss(renderer, views, works, weight, lanes):
     work, _ = works(lanes, dssim_weight=weight)
     random = np.random.default_rng(1)
     for number in (0, 1, 0, 2):
-        truth = views[number].image / 255.0
-        image = (truth + random.normal(0, 0.2, truth.shape)).astype(np.float32)
+        expected = views[number].image / 255.0
+        image = (expected + random.normal(0, 0.2, expected.shape)).astype(np.float32)
         value, slope = work.loss(rendered(renderer, image), number)
-        found = value()
-        wanted, wanted_slope = image_loss(image.astype(np.float64), truth, views[number].mask, weight)
-        assert found.value == pytest.approx(wanted.value, rel=1e-5)
-        assert found.mse == pytest.approx(wanted.mse, rel=1e-5)
+        actual = value()
+        reference, wanted_slope = image_loss(image.astype(np.float64), expected, views[number].mask, weight)
+        assert actual.value == pytest.approx(reference.value, rel=1e-5)
+        assert actual.mse == pytest.approx(reference.mse, rel=1e-5)
         np.testing.assert_allclose(slope.get(), wanted_slope, rtol=1e-3, atol=2e-7)
         again, same = work.loss(rendered(renderer, image), number)
-        assert (again(), same.get().tobytes()) == (found, slope.get().tobytes())
+        assert (again(), same.get().tobytes()) == (actual, slope.get().tobytes())
 
 
 def test_the_loss_is_summed_piece_by_piece(renderer, views, works, monkeypatch):
     """As of large images, where a work-item adds up more than one value."""
     monkeypatch.setattr(training, "_SUM_GROUPS", 2)
     work, _ = works(lanes=1)  # on CPUs it is summed strip by strip
-    truth = views[0].image / 255.0
-    image = (truth + np.random.default_rng(2).normal(0, 0.2, truth.shape)).astype(np.float32)
-    found = work.loss(rendered(renderer, image), 0)[0]()
-    wanted, _ = image_loss(image.astype(np.float64), truth, views[0].mask, TrainSettings().dssim_weight)
-    assert found.value == pytest.approx(wanted.value, rel=1e-5)
-    assert found.mse == pytest.approx(wanted.mse, rel=1e-5)
+    expected = views[0].image / 255.0
+    image = (expected + np.random.default_rng(2).normal(0, 0.2, expected.shape)).astype(np.float32)
+    actual = work.loss(rendered(renderer, image), 0)[0]()
+    reference, _ = image_loss(image.astype(np.float64), expected, views[0].mask, TrainSettings().dssim_weight)
+    assert actual.value == pytest.approx(reference.value, rel=1e-5)
+    assert actual.mse == pytest.approx(reference.mse, rel=1e-5)
 
 
 def test_masked_values_that_are_not_finite_do_not_count(renderer, views, works):
@@ -147,12 +147,12 @@ def test_loss_of_normals(renderer, views, works):
             device_array=lambda name, shown=shown: on_device(renderer, shown[name]),
             read=lambda name, view, shown=shown: shown[name],
         )
-        found, wanted = (
+        actual, expected = (
             work.normal_loss_gradients(images, number, views[number].camera, 0.3) for work in (device, host)
         )
-        for name, array in wanted.items():
+        for name, array in expected.items():
             assert np.abs(array).max() > 0
-            np.testing.assert_allclose(found[name].get(), array, rtol=1e-4, atol=1e-5 * np.abs(array).max())
+            np.testing.assert_allclose(actual[name].get(), array, rtol=1e-4, atol=1e-5 * np.abs(array).max())
 
 
 @pytest.mark.parametrize(
@@ -180,11 +180,11 @@ def test_a_step_and_its_frame(renderer, views, works, strategy, sparse, lanes):
             work.load(before_a_wall(near, 0.5 if step == 1 else -9.0, step < 4))
         shown = assert_equal_splats(renderer, device, host, degree, f"before step {step}", ORIGIN)
         by = ("depth",) if step == 2 else ("rgb",)
-        taken = backpropagated(renderer, device, view, shown, lanes, by)
-        gradients = {name: on_host(array) for name, array in taken.gradients().items()}
+        frame_gradients = backpropagated(renderer, device, view, shown, lanes, by)
+        gradients = {name: on_host(array) for name, array in frame_gradients.gradients().items()}
         capture = fs.Capture(view.camera, outputs=("rgb", "depth"), quality="surfel")
-        features, seen = prepare(shown, capture)
-        loss = random_loss(features, seen)
+        features, visible = prepare(shown, capture)
+        loss = random_loss(features, visible)
         cloud = host.read().cloud(degree, ORIGIN)
         expected = derivatives(ReferenceBackend(), cloud, capture, {name: loss[name] for name in by}, False)
         off = [one for one in differences(gradients, expected) if one.norm > NORM or one.turned > COSINE]
@@ -196,7 +196,7 @@ def test_a_step_and_its_frame(renderer, views, works, strategy, sparse, lanes):
             by = {name: bool(gradients[name][1].any()) for name in ("opacities", "colors", "means")}
             assert by == {"opacities": False, "colors": step == 1, "means": step == 2}
         before = host.read().select(np.flatnonzero(idle))
-        device.step(taken, rate, step, counted, ORIGIN)
+        device.step(frame_gradients, rate, step, counted, ORIGIN)
         host.step(gradients, rate, step, counted, ORIGIN)
         agree(device, host)
         assert_equal_splats(renderer, device, host, degree, f"after step {step}", ORIGIN)
@@ -224,26 +224,26 @@ def assert_equal_splats(renderer, device, host, degree, when, origin):
 
 def before_a_wall(camera, color=0.5, behind=True):
     """Small splats, each third behind the camera, before a solid wall that fills the image."""
-    made = splats()
-    made.values["means"][:] = np.random.default_rng(6).uniform(-0.5, 0.5, (COUNT, 3))
-    made.values["log_scales"] -= np.float32(2.5)
+    front = splats()
+    front.values["means"][:] = np.random.default_rng(6).uniform(-0.5, 0.5, (COUNT, 3))
+    front.values["log_scales"] -= np.float32(2.5)
     if behind:
-        made.values["means"][::3] = 3 * camera.position
-    made.values["means"][1] = -0.5 * camera.position
-    made.values["log_scales"][1], made.values["logits"][1] = 4, 9
-    made.values["quats"][1] = matrix_to_quaternion(camera.world_to_camera[:3, :3].T)
-    made.values["sh"][1], made.values["sh"][1, 0] = 0, color
-    return made
+        front.values["means"][::3] = 3 * camera.position
+    front.values["means"][1] = -0.5 * camera.position
+    front.values["log_scales"][1], front.values["logits"][1] = 4, 9
+    front.values["quats"][1] = matrix_to_quaternion(camera.world_to_camera[:3, :3].T)
+    front.values["sh"][1], front.values["sh"][1, 0] = 0, color
+    return front
 
 
 def backpropagated(renderer, device, view, resident, lanes, outputs=("rgb",)):
     """An image of splats on the device, taken back from a random loss of these outputs."""
     capture = fs.Capture(view.camera, outputs=("rgb", "depth"), quality="surfel")
-    features, seen = prepare(resident, capture)
+    features, visible = prepare(resident, capture)
     shape = next(iter(renderer.backend.shapes("schedule").values())) if lanes == 1 else None
     pipeline = renderer.backend.differentiate(features, shape)
-    images = pipeline.forward(resident, seen)
-    loss = random_loss(features, seen)
+    images = pipeline.forward(resident, visible)
+    loss = random_loss(features, visible)
     return device.backward_per_tile(pipeline, images, {name: loss[name] for name in outputs})
 
 
@@ -255,8 +255,8 @@ def test_a_resumed_run_renders_the_same(renderer, views, works, sparse):
     device.load(before_a_wall(view.camera))
     names = ("means", "quats", "scales", "opacities", "sh")
     for step in range(1, 6):
-        taken = backpropagated(renderer, device, view, device.resident(3, np.zeros(3)), 0)
-        device.step(taken, rate, step, None, np.zeros(3))
+        gradients = backpropagated(renderer, device, view, device.resident(3, np.zeros(3)), 0)
+        device.step(gradients, rate, step, None, np.zeros(3))
     went_on = [read(renderer, device.resident(3, np.zeros(3)), name) for name in names]
     device.load(device.read())
     for name, array in zip(names, went_on, strict=True):
@@ -268,12 +268,12 @@ def test_a_step_by_an_outdated_frame_is_refused(renderer, views, works):
     device.load(before_a_wall(views[2].camera))
     resident = device.resident(2, np.zeros(3))
     late, last = (backpropagated(renderer, device, views[2], resident, 0) for _ in range(2))
-    kept = device.read().values["means"].tobytes()
+    means_before = device.read().values["means"].tobytes()
     with pytest.raises(InputError, match="before the next frame"):
         device.step(late, learning_rates(TrainSettings(), 100, 1.5), 1, None, np.zeros(3))
     with pytest.raises(InputError, match="before the next frame"):
         late.gradients()
-    assert device.read().values["means"].tobytes() == kept
+    assert device.read().values["means"].tobytes() == means_before
     assert last.gradients()["means"].get().any()
 
 
@@ -290,14 +290,14 @@ def test_visibility_statistics(renderer, views, works):
     device, host = works()
     origin = np.array([0.2, 0.1, -0.3])
     for view in views:
-        taken = backpropagated(renderer, device, view, device.resident(0, origin), 0)
-        gradients = taken.gradients()
-        device.accumulate_statistics(taken, view.camera, origin)
+        frame_gradients = backpropagated(renderer, device, view, device.resident(0, origin), 0)
+        gradients = frame_gradients.gradients()
+        device.accumulate_statistics(frame_gradients, view.camera, origin)
         host.accumulate_statistics(gradients, view.camera, origin)
     agree(device, host)
-    kept = device.read()
-    assert kept.values["means"].tobytes() == splats().values["means"].tobytes()
-    assert (kept.gradient_sums > splats().gradient_sums).any()
+    statistics = device.read()
+    assert statistics.values["means"].tobytes() == splats().values["means"].tobytes()
+    assert (statistics.gradient_sums > splats().gradient_sums).any()
     counted = host.read().visible_counts - splats().visible_counts
     assert {0.0, 1.0, 2.0, 3.0} >= set(np.rint(counted).tolist()) > {0.0}
 
@@ -319,9 +319,9 @@ def test_shaking(renderer, works, axes):
 
 def test_what_was_loaded_is_stored(works):
     device, _ = works()
-    kept, wanted = device.read(), splats()
+    stored, expected = device.read(), splats()
     for name in NAMES:
-        np.testing.assert_array_equal(kept.values[name], wanted.values[name])
-        np.testing.assert_array_equal(kept.second[name], wanted.second[name])
+        np.testing.assert_array_equal(stored.values[name], expected.values[name])
+        np.testing.assert_array_equal(stored.second[name], expected.second[name])
     assert len(device) == COUNT
     assert on_host(np.float64(1)).dtype == np.float32

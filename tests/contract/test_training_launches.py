@@ -99,8 +99,8 @@ def test_a_replayed_frame_that_exceeds_its_capacity_is_rendered_again(on_groups,
             raise
 
     monkeypatch.setattr(OpenCLGradients, "_check_capacity", checked)
-    for kept in (True, False):
-        if not kept:
+    for keeps_capacity in (True, False):
+        if not keeps_capacity:
             never_replay(monkeypatch)
         trainer = Trainer(wide, on_groups, **STEADY)
         kernels, splats = trainer._model._kernels, trainer._model.read()
@@ -136,7 +136,7 @@ def test_a_late_loss_that_is_not_finite_has_its_iteration_and_keeps_the_checkpoi
     trainer = Trainer(dataset, renderer, checkpoint=file, **STEADY)
     trainer.step()
     trainer.save_checkpoint()
-    kept, loss, views = file.read_bytes(), trainer._model.loss, []
+    contents, loss, views = file.read_bytes(), trainer._model.loss, []
 
     def failing(images, view, exposure):
         value, slope = loss(images, view, exposure)
@@ -149,21 +149,21 @@ def test_a_late_loss_that_is_not_finite_has_its_iteration_and_keeps_the_checkpoi
     monkeypatch.setattr("fidsplat.train.trainer._READ_SECONDS", 60.0)
     with pytest.raises(
         TrainingError, match=r"the loss is nan at iteration 5, in the view (\S+); .*is complete"
-    ) as seen:
+    ) as caught:
         trainer.run()
-    assert f"in the view {views[3]}" in str(seen.value)
+    assert f"in the view {views[3]}" in str(caught.value)
     assert len(views) > 5
     for after in (trainer.step, trainer.run, trainer.cloud, trainer.save_checkpoint, lambda: trainer.history):
         with pytest.raises(TrainingError, match="at iteration 5"):
             after()
-    assert file.read_bytes() == kept
+    assert file.read_bytes() == contents
     again = Trainer(dataset, renderer, checkpoint=file, **STEADY)
     assert again.iteration == 1
 
 
 def test_an_interrupt_during_compilation_leaves_the_statistics_unchanged(renderer, dataset, monkeypatch):
-    whole, stopped = (Trainer(dataset, renderer, **STEADY) for _ in range(2))
-    whole.step()
+    uninterrupted, stopped = (Trainer(dataset, renderer, **STEADY) for _ in range(2))
+    uninterrupted.step()
 
     def interrupted(*_):
         raise KeyboardInterrupt
@@ -173,7 +173,7 @@ def test_an_interrupt_during_compilation_leaves_the_statistics_unchanged(rendere
         with pytest.raises(KeyboardInterrupt):
             stopped.step()
     stopped.step()
-    ours, theirs = (trainer._model.read() for trainer in (stopped, whole))
+    ours, theirs = (trainer._model.read() for trainer in (stopped, uninterrupted))
     assert np.array_equal(ours.visible_counts, theirs.visible_counts)
     assert np.array_equal(ours.gradient_sums, theirs.gradient_sums)
 
@@ -184,13 +184,13 @@ def test_a_failed_densification_keeps_the_checkpoint(renderer, dataset, tmp_path
     same run."""
     settings = {**QUICK, "iterations": 24, "sh_degree": 1, "strategy": strategy, "growth": 1.5}
     file, pool = tmp_path / "run.training.npz", renderer.backend.pool
-    whole = Trainer(dataset, renderer, **settings)
-    whole.run()
+    uninterrupted = Trainer(dataset, renderer, **settings)
+    uninterrupted.run()
     trainer, fresh, requested = Trainer(dataset, renderer, checkpoint=file, **settings), pool.allocate, []
     for _ in range(15):
         trainer.step()
     trainer.save_checkpoint()
-    kept = file.read_bytes()
+    contents = file.read_bytes()
 
     def full(name, size):
         requested.append(name)
@@ -205,15 +205,15 @@ def test_a_failed_densification_keeps_the_checkpoint(renderer, dataset, tmp_path
     for after in (trainer.step, trainer.run, trainer.cloud, trainer.save_checkpoint):
         with pytest.raises(TrainingError, match=r"densification was interrupted .* is complete"):
             after()
-    assert file.read_bytes() == kept
+    assert file.read_bytes() == contents
     again = Trainer(dataset, renderer, checkpoint=file, **settings)
     again.run()
-    assert splats_of(again) == splats_of(whole)
+    assert splats_of(again) == splats_of(uninterrupted)
 
 
 def test_an_interrupt_keeps_pending_losses(renderer, dataset, monkeypatch):
-    whole, stopped = (Trainer(dataset, renderer, **STEADY) for _ in range(2))
-    whole.run()
+    uninterrupted, stopped = (Trainer(dataset, renderer, **STEADY) for _ in range(2))
+    uninterrupted.run()
     monkeypatch.setattr("fidsplat.train.trainer._READ_SECONDS", 60.0)
     make, calls = stopped._model.step, []
 
@@ -228,7 +228,7 @@ def test_an_interrupt_keeps_pending_losses(renderer, dataset, monkeypatch):
         stopped.run()
     done = stopped.iteration
     assert done == 19
-    np.testing.assert_array_equal(stopped.history["losses"], whole.history["losses"][:done])
+    np.testing.assert_array_equal(stopped.history["losses"], uninterrupted.history["losses"][:done])
 
 
 @pytest.mark.parametrize("losses", [{}, {"normal_from": 24, "distortion_from": 30, "distortion_weight": 1.0}])
@@ -258,17 +258,17 @@ def test_background_compilation_returns_kernels_and_errors(renderer, dataset, mo
     cloud = fs.marker("apriltag:36h11:5", size=0.16, mixture="fitted").cloud
     features, _ = prepare(cloud, capture)
     monkeypatch.setattr(backend, "_gradients", {})
-    where, made = [], backend.pipeline
+    where, pipeline = [], backend.pipeline
 
     def seen(*given):
         where.append(threading.current_thread())
-        return made(*given)
+        return pipeline(*given)
 
     monkeypatch.setattr(backend, "pipeline", seen)
     for _ in range(2):
         backend.compile_in_background(features)
-    found = backend.differentiate(features)
-    assert backend.differentiate(features) is found
+    actual = backend.differentiate(features)
+    assert backend.differentiate(features) is actual
     assert [thread is threading.main_thread() for thread in where] == [False, True, True]
     backend.compile_in_background(features)  # it is there
     assert len(where) == 3

@@ -27,15 +27,15 @@ def settings(request):
 def test_a_run_raises_the_psnr_and_repeats_to_the_byte(renderer, dataset, settings, tmp_path):
     """By 3 dB on the training views, with noise by half of that; the second run is interrupted and
     resumes from its checkpoint."""
-    whole = Trainer(dataset, renderer, **settings)
-    before = whole.evaluate(dataset.views)
-    whole.run()
-    after = whole.evaluate(dataset.views)
+    uninterrupted = Trainer(dataset, renderer, **settings)
+    before = uninterrupted.evaluate(dataset.views)
+    uninterrupted.run()
+    after = uninterrupted.evaluate(dataset.views)
     assert np.mean([b.psnr - a.psnr for a, b in zip(before, after, strict=True)]) > (
         3 if settings["strategy"] == "default" else 1.5
     )
-    assert 16 < len(whole.cloud()) <= 30
+    assert 16 < len(uninterrupted.cloud()) <= 30
 
-    first, second = run_and_resumed(whole, renderer, settings, 21, tmp_path)
+    first, second = run_and_resumed(uninterrupted, renderer, settings, 21, tmp_path)
     assert hashlib.sha256(first).hexdigest() == hashlib.sha256(second).hexdigest()
     assert load_ply(tmp_path / "a.ply").sh_degree == 1

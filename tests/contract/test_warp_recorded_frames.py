@@ -307,14 +307,14 @@ def test_views_together_in_blocks_of_threads(renderer):
     resident, captures = backend.upload(CLOUD), [CAPTURE.with_(camera=camera) for camera in CROSSING[:3]]
     features, views = prepare_batch(resident, views_of(captures, None, None, None))
     pipeline = backend.pipeline(features, WarpShape("group", 8, 8))
-    whole = pipeline.render(resident, views).read("rgb")
+    full_frame = pipeline.render(resident, views).read("rgb")
     before, backend.pair_budget = backend.pair_budget, 4000
     try:
         banded = pipeline.render(resident, views).read("rgb")
     finally:
         backend.pair_budget = before
     for k, expected in enumerate(waiting(renderer, CROSSING[:3])):
-        assert np.array_equal(whole[k], expected["rgb"])
+        assert np.array_equal(full_frame[k], expected["rgb"])
         assert np.array_equal(banded[k], expected["rgb"])
 
 
@@ -330,8 +330,8 @@ def test_a_device_that_captures_nothing_renders_nevertheless(renderer, replayed,
         own(array)
 
     monkeypatch.setattr(wp.array, "zero_", refused)
-    with pytest.warns(UserWarning, match="captures no graphs .operation not permitted") as said:
+    with pytest.warns(UserWarning, match="captures no graphs .operation not permitted") as message:
         frames = [renderer.render(resident, CAPTURE) for _ in range(6)]
-    assert len(said) == 1
+    assert len(message) == 1
     assert not replayed
     assert_drawn(renderer, frames, [CAPTURE.camera] * 6)

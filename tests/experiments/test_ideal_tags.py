@@ -24,9 +24,9 @@ def test_a_pixel_is_the_mean_of_what_it_shows(tag):
     there = np.isfinite(image.depth)
     camera = fs.Camera.pinhole(120, 90, 110, 110, 61, 44, world_to_camera=POSE)
     for channel, value in enumerate(BEHIND[0, 0]):
-        whole = plane_image(tag.grid, tag.module, camera, background=value)
-        np.testing.assert_allclose(image.rgb[..., channel][there], whole[there], atol=1e-6)
-        assert np.abs(whole[~there] - value).max() < 1 / 256
+        full_frame = plane_image(tag.grid, tag.module, camera, background=value)
+        np.testing.assert_allclose(image.rgb[..., channel][there], full_frame[there], atol=1e-6)
+        assert np.abs(full_frame[~there] - value).max() < 1 / 256
     np.testing.assert_allclose(image.rgb[~there], BEHIND[~there], atol=1e-6)
 
 
@@ -44,16 +44,16 @@ def test_it_is_where_the_tag_is(tag):
 def test_the_window_of_a_tag_is_the_bounds_of_its_corners(spec):
     """No larger, so that a tag costs no more than its pixels; also where pixels are not square, and a board
     is higher than wide."""
-    made = fs.marker(spec, size=0.25)
+    marker = fs.marker(spec, size=0.25)
     camera = fs.Camera.pinhole(120, 90, 80, 110, 61, 44)
-    height, width = np.array(made.grid.shape) * made.module
+    height, width = np.array(marker.grid.shape) * marker.module
     corners = np.array([(x * width / 2, y * height / 2, 0) for x in (-1, 1) for y in (-1, 1)])
     for x in (0.0, 0.25, -0.45):
         pose = rigid_matrix((x, -0.02, 1.1), (1, 0.2, 0.3, 0.1))
         pixels = camera.project(corners @ pose[:3, :3].T + pose[:3, 3])
         left, top = np.maximum(np.floor(pixels.min(axis=0)), 0)
         right, bottom = np.minimum(np.ceil(pixels.max(axis=0)), (120, 90))
-        assert _window(pose, PlacedMarker(made, pose), camera) == (left, top, right, bottom)
+        assert _window(pose, PlacedMarker(marker, pose), camera) == (left, top, right, bottom)
 
 
 def test_the_nearer_of_two_tags_is_visible(tag):

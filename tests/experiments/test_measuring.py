@@ -65,7 +65,7 @@ def test_scans_of_the_ideal_texture_find_its_ceiling(pool):
     assert {len(text) for seen in result["readers"].values() for text in seen.values()} == {len(tilts)}
     for seen in result["readers"].values():
         assert all(
-            found == "1" for found, read in zip(seen["found"], seen["read"], strict=True) if read == "1"
+            actual == "1" for actual, read in zip(seen["found"], seen["read"], strict=True) if read == "1"
         )
 
 
@@ -88,13 +88,13 @@ def test_scans_do_not_hang_on_the_number_of_threads(renderer):
 )
 def test_fitted_markers_are_read_wherever_the_ideal_is(renderer, pool, category, tilts):
     """OpenCV's detectors stumble over grey in the quiet zone, which ends of long rectangles would leave."""
-    seen = []
+    collected = []
     for method in (IDEAL, "fitted/best"):
         point = scan("fixed-plane", category, method, tilts)
-        found = angles.measure_angles(point, MarkerRenderer(renderer), 0, pool, 2)["readers"]
-        seen.append({name: one["read"] for name, one in found.items()})
-    assert "0" not in seen[0]["aruco" if category == "apriltag" else "cv2"]
-    assert seen[1] == seen[0]
+        actual = angles.measure_angles(point, MarkerRenderer(renderer), 0, pool, 2)["readers"]
+        collected.append({name: one["read"] for name, one in actual.items()})
+    assert "0" not in collected[0]["aruco" if category == "apriltag" else "cv2"]
+    assert collected[1] == collected[0]
 
 
 def test_every_mixture_but_facets_is_a_row_with_both_filters():
@@ -126,10 +126,10 @@ def test_every_method_puts_the_marker_where_the_ideal_has_it(renderer):
 def test_trained_models_are_rows_where_they_are(renderer, tmp_path):
     """A model that is our own marker, saved as a trainer saves it, is rendered like our own marker."""
     spec = CATEGORIES["apriltag"].spec(2)
-    made = fs.marker(spec, 2.0 * 8 / 10)
+    sign = fs.marker(spec, 2.0 * 8 / 10)
     folder = tmp_path / "2dgs-9"
     folder.mkdir()
-    fs.save_ply(made.gaussians, folder / "apriltag-2.ply")
+    fs.save_ply(sign.gaussians, folder / "apriltag-2.ply")
     assert method_names(("fitted",), tmp_path)[-1] == "2dgs-9"
     markers = MarkerRenderer(renderer, tmp_path)
     for name in ("fixed-plane", "fixed-module"):
@@ -183,22 +183,24 @@ def test_images_are_rendered_once_for_all_truths(pool, tmp_path):
             return counted
 
     truths = [(0, "exact"), (0, "exact-linear"), (0, "exact"), (1, "exact-linear"), (1, "exact")]
-    points = [part_of(IDEAL, truth) | {"index": index, "flip": False} for index, truth in truths]
+    points = [part_of(IDEAL, expected) | {"index": index, "flip": False} for index, expected in truths]
     counting = Counting(None)
-    found = [views.measure_views(point, counting, 0, tmp_path, pool) for point in points]
+    measured = [views.measure_views(point, counting, 0, tmp_path, pool) for point in points]
     assert rendered == ["small-0", "small-0", "small-1", "small-1"]
-    assert found == [views.measure_views(point, MarkerRenderer(None), 0, tmp_path, pool) for point in points]
+    assert measured == [
+        views.measure_views(point, MarkerRenderer(None), 0, tmp_path, pool) for point in points
+    ]
 
 
 def test_views_by_the_renderer_with_every_metric(renderer, pool, tmp_path):
     point = part_of("fitted/best", "exact")
-    found = views.measure_views(
+    measured = views.measure_views(
         point, MarkerRenderer(renderer), 0, tmp_path, pool, lambda a, b: float(abs(a - b).max())
     )
-    assert all(27 < value < 40 for value in found["psnr"])
-    assert all(0.9 < value < 1 for value in found["ssim"])
-    assert all(0 < value < 0.2 for value in found["flip"])
-    assert len(found["lpips"]) == 2
+    assert all(27 < value < 40 for value in measured["psnr"])
+    assert all(0.9 < value < 1 for value in measured["ssim"])
+    assert all(0 < value < 0.2 for value in measured["flip"])
+    assert len(measured["lpips"]) == 2
 
 
 def test_blenders_images_take_part_where_a_marker_has_all_of_them(pool, tmp_path):
@@ -215,9 +217,9 @@ def test_blenders_images_take_part_where_a_marker_has_all_of_them(pool, tmp_path
         (1, "exact-linear"),
     ]
     point = points[1] | {"flip": False}
-    found = views.measure_views(point, CEILING, 0, tmp_path, pool)
-    assert found["psnr"][0] is None  # the first view is in its place, the second is another view's image
-    assert found["psnr"][1] < 20
+    measured = views.measure_views(point, CEILING, 0, tmp_path, pool)
+    assert measured["psnr"][0] is None  # the first view is in its place, the second is another view's image
+    assert measured["psnr"][1] < 20
     write_png(views.image_file(tmp_path, "raw", "small", 0, "test", 1), np.zeros((10, 10), np.uint8))
     with pytest.raises(fs.InputError, match="must have the shape"):
         views.measure_views(point, CEILING, 0, tmp_path, pool)
@@ -236,14 +238,14 @@ def test_counts_of_a_marker_that_one_can_count():
     assert result["cells"] == {"dark": dark, "light": grid.size - dark}
     rows = [[len(list(run)) for run in np.split(row, np.flatnonzero(np.diff(row)) + 1)] for row in grid]
     assert sum(result["runs"].values()) == sum(map(len, rows))
-    made = {name: fs.marker("apriltag:36h11:0", mixture=name) for name in mixtures()}
+    markers = {name: fs.marker("apriltag:36h11:0", mixture=name) for name in mixtures()}
     assert result["rectangles"] == {
-        "dark": sum(box.dark for box in made["fitted"].rectangles),
-        "light": sum(not box.dark for box in made["fitted"].rectangles),
+        "dark": sum(box.dark for box in markers["fitted"].rectangles),
+        "light": sum(not box.dark for box in markers["fitted"].rectangles),
     }
-    assert sum(result["components"].values()) == made["fitted"].components
+    assert sum(result["components"].values()) == markers["fitted"].components
     assert sum(result["rectangles"].values()) < sum(result["runs"].values()) < sum(result["cells"].values())
-    for name, one in made.items():
+    for name, one in markers.items():
         assert result["gaussians"][name]["rectangles"] == len(one.cloud)
         assert len(result["seconds"][name]) == 2
         assert min(result["seconds"][name]) > 0
@@ -255,16 +257,16 @@ def test_counts_of_a_marker_that_one_can_count():
 def test_gaussians_of_the_minimum_partition_by_the_rule_for_others():
     """The count for other partitions, applied to the minimum one, is the cloud's."""
     for name in mixtures():
-        made = fs.marker("qr-v2-L:count me", mixture=name)
-        wanted = None if name == "facets" else len(made.cloud)  # a module's, however they are cut
-        assert counts._gaussians(name, made.boxes) == wanted
+        sign = fs.marker("qr-v2-L:count me", mixture=name)
+        expected = None if name == "facets" else len(sign.cloud)  # a module's, however they are cut
+        assert counts._gaussians(name, sign.boxes) == expected
 
 
 @pytest.mark.parametrize("category", localisation.LOCATED)
 def test_localisation_on_the_ideal_texture(category, pool):
-    found = located(category, [0.6, 1.0], [0.0, 50.0], pool)
-    assert [(v["distance_m"], v["tilt_deg"]) for v in found] == [(0.6, 0), (0.6, 50), (1, 0), (1, 50)]
-    for view in found:
+    actual = located(category, [0.6, 1.0], [0.0, 50.0], pool)
+    assert [(v["distance_m"], v["tilt_deg"]) for v in actual] == [(0.6, 0), (0.6, 50), (1, 0), (1, 50)]
+    for view in actual:
         assert view["position_mm"] < 0.01 * 1000 * view["distance_m"]
         assert view["angle_deg"] < 2.0
         assert view["corners_px"] < 0.1

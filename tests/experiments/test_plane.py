@@ -39,8 +39,8 @@ def clipped_mean(camera: fs.Camera, row: int, column: int) -> float:
     for y in range(h):
         for x in range(w):
             corners = (np.array([[x, y], [x + 1, y], [x + 1, y + 1], [x, y + 1]]) - [w / 2, h / 2]) * MODULE
-            seen = camera.project(np.column_stack([corners, np.zeros(4)]))
-            area = shapely.Polygon(seen).intersection(pixel).area
+            pixels = camera.project(np.column_stack([corners, np.zeros(4)]))
+            area = shapely.Polygon(pixels).intersection(pixel).area
             total += area * (VALUES["dark"] if GRID[y, x] else VALUES["light"])
             covered += area
     return total + (1 - covered) * VALUES["background"]

@@ -58,19 +58,19 @@ def test_cameras_see_the_whole_plant(kind):
     mesh = PlantSettings().mesh(kind, 0)
     cameras = cameras_around(mesh, 12)
     for camera in cameras:
-        seen = camera.project(mesh.vertices)
-        assert (seen > 0).all()
-        assert (seen < [camera.width, camera.height]).all()
-        assert np.ptp(seen, axis=0).max() > 100
+        pixels = camera.project(mesh.vertices)
+        assert (pixels > 0).all()
+        assert (pixels < [camera.width, camera.height]).all()
+        assert np.ptp(pixels, axis=0).max() > 100
     assert len({camera.position.tobytes() for camera in (*cameras, *cameras_around(mesh, 12, 0.5))}) == 24
 
 
 def test_a_stock_of_sampled_plants_fills_a_greenhouse(tmp_path, capsys):
     words = ["experiment", "plants", "-o", str(tmp_path / "p"), "--iterations", "0", "--splats", "300"]
     assert main([*words, "--each", "2", "--kind", "tomato", "--kind", "lettuce", "--json"]) == 0
-    made = json.loads(capsys.readouterr().out)["plants"]
+    written = json.loads(capsys.readouterr().out)["plants"]
     names = ["tomato-0", "lettuce-0", "tomato-1", "lettuce-1"]
-    assert [Path(one["file"]).stem for one in made] == names
+    assert [Path(one["file"]).stem for one in written] == names
     stock = load_plants(tmp_path / "p")
     assert {kind: [len(one) for one in own] for kind, own in stock.items()} == {
         "lettuce": [300, 300], "tomato": [300, 300]
@@ -157,10 +157,10 @@ def test_images_become_a_data_set_and_the_trained_splats_a_plant(tmp_path, monke
     reported = []
     expected = PlantSettings(("lettuce",), 1, views=3, test=2, splats=200, iterations=5)
     out = tmp_path / "out"
-    made = list(
+    splats = list(
         write_plants(expected, out, tmp_path, "reference", lambda words, share: reported.append(share))
     )
-    assert made == [(out / "lettuce-0.ply", 32.0)]
+    assert splats == [(out / "lettuce-0.ply", 32.0)]
     data = requested["dataset"]
     assert (len(data.views), len(data.held_out), len(data.points)) == (3, 2, 200)
     assert data.background == plants.BACKGROUND

@@ -19,11 +19,11 @@ ALL = [("apriltag", name) for name in readers("apriltag")] + [("qr", name) for n
 
 def ideal(category: str, tilt: float, protocol: str = "fixed-module") -> tuple[np.ndarray, Target]:
     spec = CATEGORIES[category].spec(1)
-    made, setting = marker(spec), PROTOCOLS[protocol]
-    module, camera = setting.module(made.grid.shape[0]), setting.camera(tilt)
-    image = plane_image(made.grid, module, camera, background=BACKGROUND)
-    corners = camera.project(made.corners / made.module * module)
-    return to_uint8(image), Target(made.kind, made.family or "", made.id, made.payload, corners)
+    sign, setting = marker(spec), PROTOCOLS[protocol]
+    module, camera = setting.module(sign.grid.shape[0]), setting.camera(tilt)
+    image = plane_image(sign.grid, module, camera, background=BACKGROUND)
+    corners = camera.project(sign.corners / sign.module * module)
+    return to_uint8(image), Target(sign.kind, sign.family or "", sign.id, sign.payload, corners)
 
 
 def test_the_extra_detector_is_among_those_tested():

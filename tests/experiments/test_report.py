@@ -145,10 +145,10 @@ def test_the_page_can_be_regenerated_from_its_tables(reported, tmp_path):
 
 
 def test_targets_are_compared_with_what_was_found(results):
-    found = paper_targets.targets([results]).set_index("what")
+    verdicts = paper_targets.targets([results]).set_index("what")
 
     def verdict(what: str) -> list:
-        return found.loc[what, ["found", "reached"]].tolist()
+        return verdicts.loc[what, ["found", "reached"]].tolist()
 
     gap = "zxing-tall, fixed-module: behind the ideal, largest / without a miss"
     assert verdict(f"fitted/best, small, {gap}") == ["+1.0 / +83.0 deg, worst of 2", False]
@@ -237,9 +237,9 @@ def test_a_report_that_is_regenerated_has_the_same_tables(tmp_path):
     """From its results and from the tables that lie next to them."""
     results = Results(tmp_path / "counts.jsonl", run_facts(None, 0))
     part = {"dark": 3, "light": 4}
-    found = {key: part for key in ("cells", "runs", "rectangles", "components")}
-    found |= {"gaussians": {"exact": {"rectangles": 7}}, "seconds": {"exact": [0.1, 0.2]}}
-    results.append({"category": "apriltag", "index": 0, "repeats": 2}, found)
+    actual = {key: part for key in ("cells", "runs", "rectangles", "components")}
+    actual |= {"gaussians": {"exact": {"rectangles": 7}}, "seconds": {"exact": [0.1, 0.2]}}
+    results.append({"category": "apriltag", "index": 0, "repeats": 2}, actual)
     first = load([tmp_path])["counts"].write(tmp_path / "counts.csv")
     text = (tmp_path / "counts.csv").read_bytes()
     load([tmp_path])["counts"].write(tmp_path / "counts.csv")
@@ -254,16 +254,16 @@ def test_complete_inputs_of_detectors_are_not_listed(tmp_path):
 
 def test_notes_of_tables_are_on_the_page(tmp_path):
     folder = tmp_path / "kept"
-    (made, *_) = make_report([Path(__file__).parents[2] / "devlog" / "results"], folder)
+    (page, *_) = make_report([Path(__file__).parents[2] / "devlog" / "results"], folder)
     notes = read_summary(folder / "angles.csv").notes
     assert notes
-    assert all(note in made.read_text() for note in notes)
+    assert all(note in page.read_text() for note in notes)
 
 
 def test_a_table_with_words_for_numbers_is_one_line(tmp_path):
-    whole = (Path(__file__).parents[2] / "devlog" / "results" / "counts.csv").read_text().splitlines()
-    assert ",48,52," in whole[3]
-    (tmp_path / "counts.csv").write_text("\n".join([*whole[:3], whole[3].replace(",48,52,", ",x,52,")]))
+    contents = (Path(__file__).parents[2] / "devlog" / "results" / "counts.csv").read_text().splitlines()
+    assert ",48,52," in contents[3]
+    (tmp_path / "counts.csv").write_text("\n".join([*contents[:3], contents[3].replace(",48,52,", ",x,52,")]))
     with pytest.raises(fs.InputError, match=r"a result of counts .* is damaged .* measure again"):
         load([tmp_path])
 
@@ -279,8 +279,8 @@ def test_tables_that_are_joined_keep_the_runs_of_their_rows():
     one = Summary(pd.DataFrame({"name": ["a", "b"], "amount": [1, 5], "run": [0, 1]}), [{"k": 0}, {"k": 1}])
     other = Summary(pd.DataFrame({"name": ["a", "c"], "amount": [2, 1], "run": [1, 0]}), [{"k": 2}, {"k": 3}])
     joined = join([one, other], ["name"])
-    found = {row["name"]: joined.runs[row["run"]]["k"] for _, row in joined.rows.iterrows()}
-    assert found == {"a": 3, "b": 1, "c": 2}
+    actual = {row["name"]: joined.runs[row["run"]]["k"] for _, row in joined.rows.iterrows()}
+    assert actual == {"a": 3, "b": 1, "c": 2}
 
 
 def test_a_summary_is_what_its_file_says(tmp_path):

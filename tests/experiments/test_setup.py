@@ -29,12 +29,12 @@ def tilt_of(camera: fs.Camera) -> float:
 def test_markers_are_those_of_the_paper():
     assert [CATEGORIES["apriltag"].spec(i) for i in range(5)] == [f"apriltag:36h11:{i}" for i in range(5)]
     for name, version in VERSIONS.items():
-        made = marker(CATEGORIES[name].spec(3))
-        assert made.family == f"v{version}-L"
-        assert made.bits.shape[0] == 17 + 4 * version
-        assert len(made.payload) == LENGTHS[name]
+        sign = marker(CATEGORIES[name].spec(3))
+        assert sign.family == f"v{version}-L"
+        assert sign.bits.shape[0] == 17 + 4 * version
+        assert len(sign.payload) == LENGTHS[name]
         # the smallest version that holds such a text, as the paper's is
-        assert marker(f"qr:{made.payload}").family == made.family
+        assert marker(f"qr:{sign.payload}").family == sign.family
 
 
 def test_texts_are_seeded_and_differ():
@@ -48,8 +48,8 @@ def test_protocols_give_the_plane_and_the_module_that_they_promise():
         assert PROTOCOLS["fixed-plane"].module(cells) * cells == pytest.approx(PLANE)
         protocol = PROTOCOLS["fixed-module"]
         module = protocol.module(cells)
-        seen = protocol.camera(0.0).project([[0, 0, 0], [module, 0, 0]])
-        assert seen[1, 0] - seen[0, 0] == pytest.approx(8.0)
+        pixels = protocol.camera(0.0).project([[0, 0, 0], [module, 0, 0]])
+        assert pixels[1, 0] - pixels[0, 0] == pytest.approx(8.0)
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
@@ -97,9 +97,9 @@ def test_novel_views_are_seeded_random_and_see_the_whole_plane():
     assert max(tilts) - min(tilts) > 25
     corners = [[x, y, 0] for x in (-1, 1) for y in (-1, 1)]
     for camera in [*cameras, *training_cameras()]:
-        seen = camera.project(corners)
-        assert seen.min() >= 0
-        assert seen.max() <= 800
+        pixels = camera.project(corners)
+        assert pixels.min() >= 0
+        assert pixels.max() <= 800
 
 
 def test_unknown_categories_are_named():

@@ -88,8 +88,8 @@ def test_with_overlap_a_batch_is_begun_before_the_results_of_the_last_one_are_wr
 
     with thread_pool(2) as pool:
         sweep = Sweep("counts", Results(file, facts()), POINTS[:5], begin, 2, pool, overlap=True)
-        found = [record.result["value"] for record in sweep.run()]
-    assert found == [point["index"] for point in POINTS[:5]]
+        actual = [record.result["value"] for record in sweep.run()]
+    assert actual == [point["index"] for point in POINTS[:5]]
     assert written == [0, 0, 0, 0, 2]
 
 
@@ -141,13 +141,13 @@ def test_a_disk_that_is_full_is_not_reported_as_a_bug(tmp_path):
     file = tmp_path / "counts.jsonl"
     running = sweep(file)
     running.results.append(POINTS[0], {"value": 1.0})
-    kept = file.read_bytes()
+    contents = file.read_bytes()
     file.unlink()
     file.symlink_to("/dev/full")
     with pytest.raises(fs.InputError, match=r"counts.jsonl: No space left on device; .* resumes from them"):
         running.results.append(POINTS[1], {"value": 2.0})
     file.unlink()
-    file.write_bytes(kept + b'{"key": {"category":')  # as far as there was room
+    file.write_bytes(contents + b'{"key": {"category":')  # as far as there was room
     assert sweep(file).left == POINTS[1:]
 
 

@@ -119,11 +119,11 @@ def test_a_glaring_lamp_is_mirrored_within_the_code():
 def test_detectors_agree_with_the_truth_without_a_cause(view):
     key = {"scene": "greenhouse", "family": "apriltag:36h11", "cause": "none", "severity": 0.0, "views": 2}
     key["detectors"] = list(detectors_of("apriltag:36h11"))
-    found = begin_point(key, fs.Renderer("opencl"), 0)()["errors"]
+    actual = begin_point(key, fs.Renderer("opencl"), 0)()["errors"]
     limits = {"aruco": 2.0, "pupil": 0.3, "locus": 0.1, "fidsplat": 0.05}
-    assert found.keys() == limits.keys()
+    assert actual.keys() == limits.keys()
     for name, limit in limits.items():
-        assert all(errors is not None and errors[0] < limit for errors in found[name]), name
+        assert all(errors is not None and errors[0] < limit for errors in actual[name]), name
 
 
 def test_errors_of_shifted_corners(view):
@@ -231,8 +231,8 @@ def test_labels_are_scenes_of_bop_with_coco(capsys, tmp_path):
     keypoints = np.reshape(coco["annotations"][1]["keypoints"], (4, 3))[:, :2]
     assert keypoints == pytest.approx(view.camera.project(view.placed.corners), abs=1e-6)
     poses = json.loads((folder / "scene_gt.json").read_text())["1"]
-    truth = view.camera.world_to_camera @ view.placed.pose
-    assert poses[0]["cam_t_m2c"] == pytest.approx(1000 * truth[:3, 3])
+    true_pose = view.camera.world_to_camera @ view.placed.pose
+    assert poses[0]["cam_t_m2c"] == pytest.approx(1000 * true_pose[:3, 3])
     written = (folder / "rgb" / "000000.png").stat().st_mtime_ns
     assert run(capsys, *words)[0] == 0
     assert (folder / "rgb" / "000000.png").stat().st_mtime_ns == written

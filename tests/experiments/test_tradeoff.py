@@ -80,12 +80,12 @@ def test_every_quality_setting_is_varied():
 
 
 def test_the_constants_of_other_systems_are_among_the_options():
-    found = {(point.setting, point.value) for point in points(SETTINGS, False)}
+    actual = {(point.setting, point.value) for point in points(SETTINGS, False)}
     assert {
         ("alpha_cutoff", "3 sigma"), ("opacity_ceiling", "0.99"), ("stop_rule", "exclusive"),
         ("lowpass", "none"), ("preset", "gsplat"), (ABLATION, "alpha_cutoff 1/255"),
         (ABLATION, "transmittance_stop 0.0001"),
-    } <= found  # fmt: skip
+    } <= actual  # fmt: skip
     assert {point.quality.marker.mixture for point in points(SETTINGS, True)} == {"fitted", "paper", "exact"}
 
 
@@ -135,9 +135,11 @@ def test_3d_gaussians_are_compared_with_the_gaussians_themselves(monkeypatch):
     small = dataclasses.replace(SCENES["r100k_720p_3d"], count=3_000, width=160, height=90)
     monkeypatch.setitem(SCENES, "r100k_720p_3d", small)
     session = Session(fs.Renderer("opencl"))
-    truth = session.reference("r100k_720p_3d", EXACT)
+    expected = session.reference("r100k_720p_3d", EXACT)
     by_way = {
-        point.quality.ellipsoid: np.abs(session.render("r100k_720p_3d", point.quality)["rgb"] - truth).max()
+        point.quality.ellipsoid: np.abs(
+            session.render("r100k_720p_3d", point.quality)["rgb"] - expected
+        ).max()
         for point in ellipsoid_points(SETTINGS)[1:]
     }
     assert by_way["exact"] < 2e-5
@@ -197,11 +199,11 @@ def test_a_marker_is_compared_with_the_printed_texture(session):
     assert result["exact"]["corners_px"] < 0.1
     assert result["exact"]["splats"] == result["exact"]["rectangles"]
     assert result["fitted"]["splats"] > 20 * result["fitted"]["rectangles"]
-    for found in result.values():
-        assert found["repeats"] >= QUICK.minimum
-        assert found["ms"] > 0
-        assert found["base_ms"] > 0
-        assert found["ratio_quartiles"][0] <= found["ratio"] <= found["ratio_quartiles"][1]
+    for actual in result.values():
+        assert actual["repeats"] >= QUICK.minimum
+        assert actual["ms"] > 0
+        assert actual["base_ms"] > 0
+        assert actual["ratio_quartiles"][0] <= actual["ratio"] <= actual["ratio_quartiles"][1]
 
 
 def test_a_device_without_float64_is_compared_with_one_with_it(session, monkeypatch):

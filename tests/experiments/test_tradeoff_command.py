@@ -46,8 +46,8 @@ def test_an_interrupted_run_continues(capsys, tmp_path, monkeypatch):
 
     monkeypatch.setattr(run, "_begin", real)
     assert main(words) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said == {"files": [str(file)], "points": len(read_records(file)), "refused": []}
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == {"files": [str(file)], "points": len(read_records(file)), "refused": []}
     assert file.read_text().startswith(first)
     records = read_records(file)
     # an installed package has no commit
@@ -112,13 +112,13 @@ def test_ones_own_scene_is_measured_from_each_of_its_poses(capsys, tmp_path, mon
     assert main(words) == 0
     records = read_records(tmp_path / "out" / run.FILE)
     views = ("own.toml@0", "own.toml@2")  # --quick measures two
-    found = {(r.key["scene"], r.key["value"]): r.result for r in records}
-    assert {key[0] for key in found} == set(views)
+    actual = {(r.key["scene"], r.key["value"]): r.result for r in records}
+    assert {key[0] for key in actual} == set(views)
     for view in views:
-        assert 1e-4 < found[view, "base"]["maximum"] < 0.05
+        assert 1e-4 < actual[view, "base"]["maximum"] < 0.05
     # images differ, so do their errors; the ceiling lets light through
-    assert found[views[0], "base"]["rmse"] != found[views[1], "base"]["rmse"]
-    assert found[views[0], "0.99"]["maximum"] >= found[views[0], "base"]["maximum"]
+    assert actual[views[0], "base"]["rmse"] != actual[views[1], "base"]["rmse"]
+    assert actual[views[0], "0.99"]["maximum"] >= actual[views[0], "base"]["maximum"]
     capsys.readouterr()
     assert load([tmp_path / "out"])[0].scenes == list(views)
     assert main(words) == 0  # nothing is left to do
@@ -130,7 +130,7 @@ def test_ones_own_scene_is_measured_from_each_of_its_poses(capsys, tmp_path, mon
 
 
 def test_several_devices_measure_into_folders_of_their_names(capsys, tmp_path, monkeypatch):
-    found = {
+    actual = {
         "ratio": 1.0,
         "ratio_quartiles": [0.9, 1.1],
         "base_ms": 2.0,
@@ -141,7 +141,7 @@ def test_several_devices_measure_into_folders_of_their_names(capsys, tmp_path, m
 
     def begin(session, key, quick):
         begun.append(session.renderer.device.name)
-        return lambda: {**found, "read": "1" * 50}
+        return lambda: {**actual, "read": "1" * 50}
 
     monkeypatch.setattr(run, "_begin", begin)
     words = ["tradeoff", "--quick", "--scenes", "hard", "--knobs", "opacity_ceiling", "-o", str(tmp_path)]
@@ -152,10 +152,10 @@ def test_several_devices_measure_into_folders_of_their_names(capsys, tmp_path, m
     assert not begun  # a device that is not there is said first
     capsys.readouterr()
     assert main([*words, "--plot", str(tmp_path / "both.svg"), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["files"] == [str(tmp_path / name / run.FILE) for name in ("opencl-pocl", "warp-cpu")]
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["files"] == [str(tmp_path / name / run.FILE) for name in ("opencl-pocl", "warp-cpu")]
     records = [read_records(tmp_path / name / run.FILE) for name in ("opencl-pocl", "warp-cpu")]
-    assert said["points"] == len(begun) == sum(map(len, records))
+    assert printed["points"] == len(begun) == sum(map(len, records))
     assert begun == ["opencl:pocl"] * len(records[0]) + ["warp:cpu"] * len(records[1])
     titles = [device.title for device in load([tmp_path / "opencl-pocl", tmp_path / "warp-cpu"])]
     chart = (tmp_path / "both.svg").read_text()

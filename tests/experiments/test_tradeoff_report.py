@@ -68,8 +68,8 @@ NUMBERS = {
 
 
 def plain_records(scene: str, **run) -> list[Record]:
-    found = {(point.setting, point.value): point for point in points(SETTINGS, False)}
-    return [record(scene, found[key], result(*numbers), **run) for key, numbers in NUMBERS.items()]
+    actual = {(point.setting, point.value): point for point in points(SETTINGS, False)}
+    return [record(scene, actual[key], result(*numbers), **run) for key, numbers in NUMBERS.items()]
 
 
 def marker_records() -> list[Record]:
@@ -111,33 +111,33 @@ def write(folder, records: list[Record]) -> None:
     ],
 )
 def test_a_verdict_follows_from_time_and_error(setting, expected):
-    found = device(plain_records("hard"))
-    assert report.compared(found, found.at("hard", *setting), found.at("hard", "base", "base")) == expected
+    table = device(plain_records("hard"))
+    assert report.compared(table, table.at("hard", *setting), table.at("hard", "base", "base")) == expected
 
 
 def test_times_within_the_noise_of_the_base_do_not_differ():
     records = plain_records("hard")
     records[0].result["ratio_quartiles"] = [0.7, 1.1]  # the machine was not quiet
-    found = device(records)
-    assert report.noise_of(found, "hard") == pytest.approx(0.3)
-    base = found.at("hard", "base", "base")
-    assert report.compared(found, found.at("hard", "transmittance_stop", "1/512"), base) == "no difference"
+    table = device(records)
+    assert report.noise_of(table, "hard") == pytest.approx(0.3)
+    base = table.at("hard", "base", "base")
+    assert report.compared(table, table.at("hard", "transmittance_stop", "1/512"), base) == "no difference"
     # quartiles on both sides of 1 are no difference either
     wide = result(0.9, 0.02, ratio_quartiles=[0.8, 1.02])
     records = [*plain_records("hard"), record("hard", Point("samples", "2", BASE), wide)]
-    found = device(records)
-    base = found.at("hard", "base", "base")
-    assert report.compared(found, found.at("hard", "samples", "2"), base) == "no difference"
+    table = device(records)
+    base = table.at("hard", "base", "base")
+    assert report.compared(table, table.at("hard", "samples", "2"), base) == "no difference"
 
 
 def test_a_time_at_the_limit_of_the_noise_does_not_differ():
     records = plain_records("hard")
     records[0].result["ratio_quartiles"] = [0.8, 1.25]
-    found = device(records)
-    assert report.noise_of(found, "hard") == 0.25
-    base = found.at("hard", "base", "base")
-    assert report.compared(found, found.at("hard", "alpha_cutoff", "1/1024"), base) == "more accurate"
-    assert report.compared(found, found.at("hard", "alpha_cutoff", "0.0001"), base) == "slower, more accurate"
+    table = device(records)
+    assert report.noise_of(table, "hard") == 0.25
+    base = table.at("hard", "base", "base")
+    assert report.compared(table, table.at("hard", "alpha_cutoff", "1/1024"), base) == "more accurate"
+    assert report.compared(table, table.at("hard", "alpha_cutoff", "0.0001"), base) == "slower, more accurate"
 
 
 def test_what_was_measured_twice_shows_the_noise():
@@ -166,8 +166,8 @@ def test_on_a_gpu_what_delays_both_frames_makes_nothing_cheaper():
         records = plain_records("hard", kind=kind)
         slow = next(each for each in records if each.key["value"] == "1/1024")
         slow.result.update(base_ms=20.0, ratio=1.125)
-        found = device(records)
-        assert report.cost(found, found.at("hard", "alpha_cutoff", "1/1024")) == pytest.approx(expected)
+        measured = device(records)
+        assert report.cost(measured, measured.at("hard", "alpha_cutoff", "1/1024")) == pytest.approx(expected)
 
 
 @pytest.mark.sweep
@@ -254,9 +254,9 @@ def walk(node):
 
 
 def test_a_preset_is_what_it_says_today(monkeypatch):
-    found = {(point.setting, point.value): point for point in points(SETTINGS, False)}
+    actual = {(point.setting, point.value): point for point in points(SETTINGS, False)}
     records = [each for each in plain_records("hard") if each.key["value"] != "standard"]
-    records.append(record("hard", found["preset", "standard"], result(1.0, 0.02)))
+    records.append(record("hard", actual["preset", "standard"], result(1.0, 0.02)))
 
     def standard(among):
         point = device(among).at("hard", "preset", "standard")
@@ -276,9 +276,9 @@ def test_of_what_was_measured_twice_the_first_file_counts(tmp_path):
     for each in other:
         each.result["maximum"] = 7.0
     write(tmp_path / "b", other)
-    (found,) = load([tmp_path / "a", tmp_path / "b"])
-    assert found.at("hard", "base", "base")["maximum"] == 0.02
-    assert found.at("r100k_720p", "base", "base")["maximum"] == 7.0
+    (loaded,) = load([tmp_path / "a", tmp_path / "b"])
+    assert loaded.at("hard", "base", "base")["maximum"] == 0.02
+    assert loaded.at("r100k_720p", "base", "base")["maximum"] == 7.0
 
 
 def test_a_full_run_counts_before_a_quick_one(tmp_path):
@@ -286,8 +286,8 @@ def test_a_full_run_counts_before_a_quick_one(tmp_path):
     full = record("hard", Point("base", "base", BASE), result(1.0, 0.02))
     write(tmp_path / "a", [quick])
     write(tmp_path / "b", [full])
-    (found,) = load([tmp_path / "a", tmp_path / "b"])
-    assert found.at("hard", "base", "base")["maximum"] == 0.02
+    (loaded,) = load([tmp_path / "a", tmp_path / "b"])
+    assert loaded.at("hard", "base", "base")["maximum"] == 0.02
 
 
 def test_refused_settings_are_named(tmp_path):
@@ -341,8 +341,8 @@ def test_a_quality_in_words_is_the_same_for_the_same():
 
 
 def test_without_what_makes_reports_one_line_says_what_to_install(capsys, tmp_path, monkeypatch):
-    found = "fidsplat.commands.options.find_spec"
-    monkeypatch.setattr(found, lambda name: None if name == "jinja2" else True)
+    function_path = "fidsplat.commands.options.find_spec"
+    monkeypatch.setattr(function_path, lambda name: None if name == "jinja2" else True)
     assert main(["experiment", "report", str(tmp_path)]) == 2
     assert (
         "jinja2 must be installed for a report; pip install 'fidsplat[experiments]'"

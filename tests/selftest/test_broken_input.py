@@ -121,9 +121,9 @@ def test_invisible_splats_change_nothing(renderer):
     cloud = crowd()
     expected = renderer.render(without_victim(cloud), VIEW, ALL_OUTPUTS, CATALOGUED)
     for opacity in (0.0, -0.0, 1e-45, 1e-30, 0.0039):
-        kept = corrupted(cloud, {"opacities": opacity})
-        frame = renderer.render(kept, VIEW, ALL_OUTPUTS, CATALOGUED)
-        assert len(kept) == len(cloud)
+        visible = corrupted(cloud, {"opacities": opacity})
+        frame = renderer.render(visible, VIEW, ALL_OUTPUTS, CATALOGUED)
+        assert len(visible) == len(cloud)
         assert same_bits(frame, expected)
         assert frame.stats["visible"] == expected.stats["visible"]
 

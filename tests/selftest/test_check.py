@@ -49,11 +49,11 @@ class Broken:
 
 
 def test_a_good_device_passes(renderer):
-    said = []
-    result = check.run_check(renderer, [GOOD], said.append)
+    messages = []
+    result = check.run_check(renderer, [GOOD], messages.append)
     assert result.passed
     assert result.failures == []
-    assert said == ["arithmetic", "A1: a good case"]
+    assert messages == ["arithmetic", "A1: a good case"]
     (only,) = result.groups["A"]
     assert (only.frames, only.passed) == (1, True)
     assert set(only.largest) == set(only.uncertified) == {"rgb", "alpha", "depth"}
@@ -104,16 +104,16 @@ def test_a_device_that_fails_fails_its_case_only(renderer):
 def test_certificates_are_small_where_nothing_is_hard():
     """In an ordinary scene certificates are below the tolerance in every pixel, and nothing may flip."""
     cloud = random_splats(300, seed=20, depth=(1.0, 6.0), scale=(0.01, 0.3))
-    truth = check.reference_images(FrameSpec(cloud, camera(), outputs=ALL_OUTPUTS))
-    assert truth["alpha"].max() > 0.9
-    assert truth["certificate"].max() < 1e-5
-    assert np.median(truth["certificate"]) < 2e-6
+    expected = check.reference_images(FrameSpec(cloud, camera(), outputs=ALL_OUTPUTS))
+    assert expected["alpha"].max() > 0.9
+    assert expected["certificate"].max() < 1e-5
+    assert np.median(expected["certificate"]) < 2e-6
     # but where 1/255 is covered, the rim of every output but colour: a decision, which has its certificate
-    rim = np.abs(truth["alpha"] - 1 / 255) < 6e-5
+    rim = np.abs(expected["alpha"] - 1 / 255) < 6e-5
     assert rim.mean() < 1e-3
-    assert not truth["label_may_flip"][~rim].any()
+    assert not expected["label_may_flip"][~rim].any()
     # and where a fragment takes 1/255 of the light, no more or less, which the median asks
-    assert truth["depth_median_may_flip"].mean() < 5e-4
+    assert expected["depth_median_may_flip"].mean() < 5e-4
 
 
 def test_certificates_cover_decisions_within_float32_rounding():
@@ -128,15 +128,15 @@ def test_certificates_cover_decisions_within_float32_rounding():
     assert truths[0]["certificate"].max() > 1e-3
     assert 0.003 < truths[1]["certificate"].max() < 0.005
     assert truths[2]["label_may_flip"].any()
-    assert all(truth["certificate"][0, 0] < 1e-5 for truth in truths)
+    assert all(expected["certificate"][0, 0] < 1e-5 for expected in truths)
 
 
 def test_too_many_uncertain_pixels_fail(renderer, monkeypatch):
     reference_images = check.reference_images
 
     def uncertain(spec):
-        truth = reference_images(spec)
-        return truth | {"certificate": truth["certificate"] + 0.06}
+        expected = reference_images(spec)
+        return expected | {"certificate": expected["certificate"] + 0.06}
 
     monkeypatch.setattr(check, "reference_images", uncertain)
     failures = check.run_check(renderer, [GOOD]).failures

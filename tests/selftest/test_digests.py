@@ -21,9 +21,9 @@ def test_devices_render_the_digests_of_the_table(renderer, monkeypatch, kind):
     expected = {seed: row for seed, row in digests.read_table().items() if digests.kind_of(seed) == kind}
     assert len(expected) == digests.COUNT // len(digests.KINDS)
     differing = {
-        seed: found.differing(row)
+        seed: actual.differing(row)
         for seed, row in expected.items()
-        if (found := digests.digest_of(renderer, seed)) != row
+        if (actual := digests.digest_of(renderer, seed)) != row
     }
     assert not differing
 
@@ -47,8 +47,8 @@ def test_the_command_names_scenes_that_differ(renderer, monkeypatch, capsys):
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "1 of 2" in line and "disks" in line]
     assert line.split() == ["disks", "1", "of", "2", "depth", "20"]
     assert main([*command, "--json"]) == 1
-    found = json.loads(capsys.readouterr().out)
-    assert (found["passed"], list(found["sha256"])) == (False, ["0", "20"])
-    (only,) = found["differing"]
+    loaded = json.loads(capsys.readouterr().out)
+    assert (loaded["passed"], list(loaded["sha256"])) == (False, ["0", "20"])
+    (only,) = loaded["differing"]
     assert (only["seed"], only["differing"]) == (20, ["depth"])
     assert {"nu0", "keys", "samples"} <= set(only["stages"])

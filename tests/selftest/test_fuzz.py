@@ -49,9 +49,9 @@ def test_the_scenes_are_hard():
     for seed in range(150):
         spec = fuzz.scene_of(seed)
         cloud, view = spec.cloud, spec.camera
-        turn = view.world_to_camera[:3, :3]
-        p = cloud.means @ turn.T
-        axes = turn @ quaternion_to_matrix(cloud.quats)
+        rotation = view.world_to_camera[:3, :3]
+        p = cloud.means @ rotation.T
+        axes = rotation @ quaternion_to_matrix(cloud.quats)
         sine = np.einsum("nk,nk->n", axes[:, :, 2], p) / np.linalg.norm(p, axis=1)
         reach = 3.33 * np.hypot(*(axes[:, 2, :2] * cloud.scales).T)
         edge_on += (np.abs(sine) < 1.5e-6).sum()
@@ -82,14 +82,18 @@ def test_the_scenes_are_hard():
 def test_a_stopped_run_resumes(renderer, tmp_path, monkeypatch):
     monkeypatch.setattr(fuzz, "_SAVE_EVERY", 0.0)
     file = tmp_path / "fuzz.json"
-    whole = list(fuzz.fuzz_run(renderer, 300))[-1]
+    uninterrupted = list(fuzz.fuzz_run(renderer, 300))[-1]
     run = fuzz.fuzz_run(renderer, 300, file)
     first = next(run)
     run.close()
     saved = json.loads(file.read_text())
     assert (saved["scenes"], saved["splats"]) == (1, first.splats)
     *_, state = fuzz.fuzz_run(renderer, 300, file)
-    assert (state.scenes, state.pixels, state.largest) == (whole.scenes, whole.pixels, whole.largest)
+    assert (state.scenes, state.pixels, state.largest) == (
+        uninterrupted.scenes,
+        uninterrupted.pixels,
+        uninterrupted.largest,
+    )
     # more splats go on from there; the same number starts again
     *_, more = fuzz.fuzz_run(renderer, 450, file)
     assert more.scenes > state.scenes

@@ -17,11 +17,11 @@ def test_the_largest_grids_at_a_few_pixels(renderer, width, height):
     generator = np.random.default_rng(0)
     pixels = generator.integers(0, height, 200), generator.integers(0, width, 200)
     spec = FrameSpec(cloud, camera)
-    truth, frame = reference_images(spec, pixels), render(renderer, spec)
+    expected, frame = reference_images(spec, pixels), render(renderer, spec)
     for name in ("rgb", "alpha"):
-        error = np.abs(frame[name][pixels] - truth[name])
+        error = np.abs(frame[name][pixels] - expected[name])
         error = error.max(-1) if error.ndim > 1 else error
-        assert (error <= COLOR_TOLERANCE + truth["certificate"]).all(), name
+        assert (error <= COLOR_TOLERANCE + expected["certificate"]).all(), name
 
 
 def opencl(renderer):
@@ -70,11 +70,11 @@ def test_all_buffers_are_poisoned(renderer):
     from fidsplat.backends.opencl import probe
 
     backend = opencl(renderer)
-    taken = []
+    measured = []
     with backend.probe().poisoned():
         filled = backend.pool._filled
-        backend.pool._filled = lambda buffer: taken.append(buffer) or filled(buffer)
+        backend.pool._filled = lambda buffer: measured.append(buffer) or filled(buffer)
         renderer.render(random_splats(20, seed=1, depth=(1, 3)), inputs.VIEW, ("rgb", "depth"))
         again = probe.contents(backend, filled(backend.pool.scratch("splats", 64)))
-    assert len(taken) > 15
+    assert len(measured) > 15
     assert (again == 0xFF).all()

@@ -265,10 +265,10 @@ def test_a_small_pair_budget_is_bit_identical(backend, monkeypatch, budget, list
     # the shape of a CPU for its own strategy, which uses bands most often
     shape = backend.shape if lists == "ordered" else listing(backend, lists)
     pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
-    whole = pipeline.render_view(resident, view)
-    assert whole.stats["pairs"] > 1000
+    full_frame = pipeline.render_view(resident, view)
+    assert full_frame.stats["pairs"] > 1000
     monkeypatch.setattr(backend, "pair_budget", budget)
     banded = pipeline.render_view(resident, view)
-    assert banded.stats == whole.stats
+    assert banded.stats == full_frame.stats
     for name in ALL_OUTPUTS:
-        assert np.array_equal(banded.read(name), whole.read(name)), name
+        assert np.array_equal(banded.read(name), full_frame.read(name)), name

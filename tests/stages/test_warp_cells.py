@@ -74,9 +74,9 @@ def test_marked_cells_contain_all_fragments_and_few_others(renderer, cloud, qual
     features, view = prepare(resident, fs.Capture(CAMERA, quality=fs.Quality.of(quality), outputs=("rgb",)))
     frame = backend.pipeline(features).render_counted(resident, view)[0]
     visible = frame.named["keys"].numpy()[: resident.count] != 0xFFFFFFFF
-    found = marked(frame)[visible]
+    actual = marked(frame)[visible]
     lines = frame.named["lines"].numpy()[: resident.count * frame.program.layout.lines]
     records = lines.reshape(resident.count, -1)[visible]
     expected = covered(records, frame.program.layout.names, view, *frame.grid)
-    assert not (expected & ~found).any()
-    assert found.sum() < MORE[cloud] * expected.sum()
+    assert not (expected & ~actual).any()
+    assert actual.sum() < MORE[cloud] * expected.sum()

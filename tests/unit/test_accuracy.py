@@ -18,11 +18,11 @@ def test_errors_of_known_differences():
     want = np.zeros((10, 100), np.float32)
     seen = want.copy()
     seen[3, 5], seen[4, 4] = 0.25, -0.5
-    found = errors(seen, want)
-    assert found.maximum == 0.5
-    assert found.p999 == pytest.approx(np.quantile(np.abs(seen), 0.999))
-    assert found.rmse == pytest.approx(np.sqrt((0.25**2 + 0.5**2) / 1000))
-    assert found.psnr == pytest.approx(-20 * np.log10(found.rmse))
+    actual = errors(seen, want)
+    assert actual.maximum == 0.5
+    assert actual.p999 == pytest.approx(np.quantile(np.abs(seen), 0.999))
+    assert actual.rmse == pytest.approx(np.sqrt((0.25**2 + 0.5**2) / 1000))
+    assert actual.psnr == pytest.approx(-20 * np.log10(actual.rmse))
 
 
 def test_equal_images_have_no_error():

@@ -25,14 +25,14 @@ def test_codes_are_those_of_the_library(family):
 
 def test_the_library_reads_rendered_tags_at_their_poses():
     pytest.importorskip("pupil_apriltags")
-    made = [marker(f"apriltag:{family}:{len(codes(family)) - 1}", size=0.1) for family in LAYOUTS]
+    markers = [marker(f"apriltag:{family}:{len(codes(family)) - 1}", size=0.1) for family in LAYOUTS]
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, 0, 3] = 0.2 * np.arange(5) - 0.4
     camera = fs.Camera.look_at(480, 120, 1.2, position=(0.05, 0.15, -0.8), target=(0, 0, 0))
-    scene = fs.Scene(camera=camera, markers=[PlacedMarker(m, p) for m, p in zip(made, poses, strict=True)])
+    scene = fs.Scene(camera=camera, markers=[PlacedMarker(m, p) for m, p in zip(markers, poses, strict=True)])
     capture = fs.Capture(camera, outputs=("rgb",), background=(0.5, 0.5, 0.5))
     readings = read_back(fs.Renderer("opencl").render(scene, capture), scene).readings
-    assert [r.detection and r.detection.name for r in readings] == [m.spec for m in made]
+    assert [r.detection and r.detection.name for r in readings] == [m.spec for m in markers]
     for reading in readings:
         assert reading.corner_error is not None
         assert reading.corner_error < 0.05

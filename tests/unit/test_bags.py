@@ -60,9 +60,9 @@ KINDS = [
 
 @pytest.mark.parametrize(("mode", "storage"), KINDS)
 def test_bags_of_another_writer(tmp_path, mode, storage):
-    found = images(foreign_bag(tmp_path / "bag", mode, storage))
-    assert len(found) == 2
-    for image in found:
+    actual = images(foreign_bag(tmp_path / "bag", mode, storage))
+    assert len(actual) == 2
+    for image in actual:
         np.testing.assert_array_equal(image, PIXELS.reshape(2, 4, 3))
 
 
@@ -91,11 +91,11 @@ def test_a_chunk_that_expands_to_more_than_it_declares(tmp_path, monkeypatch, sm
     monkeypatch.setattr(lz4, "compress", lambda _: black)
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
-        made = writer.Writer(stream, compression=writer.CompressionType.LZ4)
-        made.start()
-        schema = made.register_schema("sensor_msgs/msg/Image", "ros2msg", b"")
-        made.add_message(made.register_channel("/a", "cdr", schema), 0, bytes(declared), 0)
-        made.finish()
+        bag = writer.Writer(stream, compression=writer.CompressionType.LZ4)
+        bag.start()
+        schema = bag.register_schema("sensor_msgs/msg/Image", "ros2msg", b"")
+        bag.add_message(bag.register_channel("/a", "cdr", schema), 0, bytes(declared), 0)
+        bag.finish()
     with pytest.raises(fs.InputError, match=r"a chunk must expand to the .* that it declares, got more"):
         images(path)
 

@@ -311,11 +311,11 @@ def test_ones_own_scene_from_ones_own_cameras(tmp_path, monkeypatch, capsys):
     (tmp_path / "poses.tum").write_text("\n".join(lines))
     words = ("--scene", "own.toml", "--device", "reference")
     assert bench(*words, "--cameras", "poses.tum", "--json", "-") == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["scenes"] == [f"own.toml@{k}" for k in (0, 2, 4)]
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["scenes"] == [f"own.toml@{k}" for k in (0, 2, 4)]
     cloud, renderer = fs.load_ply("own.ply"), fs.Renderer("reference")
     f = 12 / np.tan(np.radians(30))
-    for k, result in zip((0, 2, 4), said["results"], strict=True):
+    for k, result in zip((0, 2, 4), printed["results"], strict=True):
         pose = np.eye(4)
         pose[0, 3] = -0.1 * k
         camera = fs.Camera.pinhole(24, 18, f, f, 12, 9, pose)

@@ -69,17 +69,17 @@ def test_exponents_of_power_laws_are_found():
 
 
 def record(title: str, series: str, x: float, ms: float, **changes) -> dict:
-    made = {"title": title, "series": series, "x": x, "frame_ms": 2 * ms, "fastest_ms": ms, "error": None}
-    return made | {"stages_ms": {"blend": ms}, "fastest_stages_ms": {"blend": ms / 2}} | changes
+    row = {"title": title, "series": series, "x": x, "frame_ms": 2 * ms, "fastest_ms": ms, "error": None}
+    return row | {"stages_ms": {"blend": ms}, "fastest_stages_ms": {"blend": ms / 2}} | changes
 
 
 def test_exponents_by_device_and_series_leave_out_what_failed():
     records = [record("cpu", "splats", x, x**0.5) for x in (100.0, 10.0, 1000.0)]
     records += [record("gpu", "overdraw", f, f, layers_per_pixel=f**2) for f in (1.0, 2.0, 4.0)]
     records.append({"title": "gpu", "series": "overdraw", "x": 8.0, "error": "no memory"})
-    found = {(title, series): powers for title, series, powers in exponents(records)}
-    assert found["cpu", "splats"] == {"frame": pytest.approx(0.5), "blend": pytest.approx(0.5)}
-    assert found["gpu", "overdraw"]["frame"] == pytest.approx(0.5)  # over the layers, not the factor
+    actual = {(title, series): powers for title, series, powers in exponents(records)}
+    assert actual["cpu", "splats"] == {"frame": pytest.approx(0.5), "blend": pytest.approx(0.5)}
+    assert actual["gpu", "overdraw"]["frame"] == pytest.approx(0.5)  # over the layers, not the factor
 
 
 def test_series_cover_what_they_promise():

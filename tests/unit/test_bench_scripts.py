@@ -111,29 +111,29 @@ def rows(text: str) -> list[str]:
 
 
 def test_each_kind_of_figures_becomes_its_table(files):
-    made = tables.tables(tables.load(files))
-    assert list(made) == list(tables.TABLES)
-    assert rows(made["counts"]) == ["| tag | 640 x 480 | 691 | 690 | 202,902 |"]
-    assert rows(made["rates"]) == ["| a CPU | 45 GB/s | 250 G/s | 12.5 G/s | 50 G/s |"]
-    assert rows(made["frames"]) == ["| tag | d: a CPU | 1.23 (1.1 to 1.5) | 12.2 | 0.56 M | 1 GiB |"]
-    assert rows(made["backends"]) == [
+    pages = tables.tables(tables.load(files))
+    assert list(pages) == list(tables.TABLES)
+    assert rows(pages["counts"]) == ["| tag | 640 x 480 | 691 | 690 | 202,902 |"]
+    assert rows(pages["rates"]) == ["| a CPU | 45 GB/s | 250 G/s | 12.5 G/s | 50 G/s |"]
+    assert rows(pages["frames"]) == ["| tag | d: a CPU | 1.23 (1.1 to 1.5) | 12.2 | 0.56 M | 1 GiB |"]
+    assert rows(pages["backends"]) == [
         "| tag | 1.23 (0.5) | 1.85 (0.25) | 1.50 | 0.5 (0.25) | 0.375 (0) | 1.5 (0.75) | 2026-11-21 |"
     ]
-    assert rows(made["stages"]) == ["| tag | d: a CPU | 0.25 (-) | 0.75 (15.5) |"]
-    assert rows(made["peers"]) == [
+    assert rows(pages["stages"]) == ["| tag | d: a CPU | 0.25 (-) | 0.75 (15.5) |"]
+    assert rows(pages["peers"]) == [
         "| tag | Peer 1, 2 threads | 1234 | a CPU: 1.2 | 1e+03 | 39.7 dB | 2026-11-21 |"
     ]
-    assert rows(made["first"]) == [
+    assert rows(pages["first"]) == [
         "| tag | opencl | empty | 1.68 s (1.50 to 2.00) | 0.01 | 1.30 | 2026-11-21 |"
     ]
-    assert rows(made["batches"]) == [
+    assert rows(pages["batches"]) == [
         "| 64 of 128 x 96 | rgb, depth | 10,000 | a CPU | 900 (800 to 1000) | 5000 | 600 | 2026-11-22 |"
     ]
-    assert rows(made["peer_batches"]) == [
+    assert rows(pages["peer_batches"]) == [
         "| 64 of 128 x 96 | 10,000 | Peer 1: rgb | 1800 "
         "| rgb, depth | batches.py's | 900 | 2 | 69.6 dB | 2026-11-22 |"
     ]
-    assert rows(made["growth"]) == ["| a CPU | splats | 0.50 | 1.00 |"]
+    assert rows(pages["growth"]) == ["| a CPU | splats | 0.50 | 1.00 |"]
 
 
 def test_a_table_replaces_the_text_between_its_marks():
@@ -177,17 +177,20 @@ def test_growth_stops_where_it_takes_too_long(tmp_path, capsys):
 
 def test_images_of_two_trees_are_compared_by_their_digests(monkeypatch, capsys):
     assert len(compare_images.frames()) == 146
-    found = [{"a": "1", "b": "2", "c": "refused: so"}, {"a": "1", "b": "refused: why", "c": "refused: other"}]
+    actual = [
+        {"a": "1", "b": "2", "c": "refused: so"},
+        {"a": "1", "b": "refused: why", "c": "refused: other"},
+    ]
     monkeypatch.chdir("/")  # not the tree of this script
-    monkeypatch.setattr(compare_images, "digests_of_tree", lambda tree, *_: found[tree != Path("/")])
+    monkeypatch.setattr(compare_images, "digests_of_tree", lambda tree, *_: actual[tree != Path("/")])
     monkeypatch.setattr("sys.argv", ["compare_images.py", "."])
     assert compare_images.main() == 1
     out = capsys.readouterr().out
     assert out.startswith("differs: b\n  refused: why\n")
     assert out.endswith("3 frames on opencl: 1 identical, 1 refused by both\n")
-    found[1]["b"] = "2"
+    actual[1]["b"] = "2"
     assert compare_images.main() == 0
-    found[:] = {}, {}
+    actual[:] = {}, {}
     with pytest.raises(SystemExit):
         compare_images.main()
 
@@ -195,8 +198,8 @@ def test_images_of_two_trees_are_compared_by_their_digests(monkeypatch, capsys):
 def test_the_digest_of_a_frame_depends_on_its_outputs(monkeypatch):
     some = {name: given for name, given in compare_images.frames().items() if name.startswith("output ")}
     monkeypatch.setattr(compare_images, "frames", lambda: some)
-    found = compare_images.digests("opencl", "output depth")
-    assert set(found) == {"output depth", "output depth_first", "output depth_median"}
-    assert len(set(found.values())) == 3
+    actual = compare_images.digests("opencl", "output depth")
+    assert set(actual) == {"output depth", "output depth_first", "output depth_median"}
+    assert len(set(actual.values())) == 3
     monkeypatch.setattr(compare_images, "cloud", lambda seed: compare_images.fs.SplatCloud.empty())
-    assert not set(found.values()) & set(compare_images.digests("opencl", "output depth").values())
+    assert not set(actual.values()) & set(compare_images.digests("opencl", "output depth").values())

@@ -133,11 +133,11 @@ def test_a_renderer_that_cannot_run_has_a_reason_and_one_that_ends_is_started_ag
 
 def test_a_slow_renderer_is_measured_at_one_setting_and_a_slower_one_left_out(tmp_path, monkeypatch):
     renderers = toy(tmp_path, TOY.replace("return np.full", "time.sleep(0.02); return np.full"))
-    (found,) = run(tmp_path / "found.json", ("one",), renderers, slow=10.0)
-    assert (found["setting"], found["frames"]) == ("grey", 3)
+    (actual,) = run(tmp_path / "found.json", ("one",), renderers, slow=10.0)
+    assert (actual["setting"], actual["frames"]) == ("grey", 3)
     monkeypatch.setattr(suite, "TOO_SLOW", 15.0)
-    (found,) = run(tmp_path / "found.json", ("one",), renderers, slow=10.0, overwrite=True)
-    assert found["skipped"].startswith("a frame takes 0.0")
+    (actual,) = run(tmp_path / "found.json", ("one",), renderers, slow=10.0, overwrite=True)
+    assert actual["skipped"].startswith("a frame takes 0.0")
 
 
 @pytest.mark.parametrize(
@@ -163,8 +163,8 @@ def test_our_adapter_leaves_out_settings_that_the_device_lacks(monkeypatch):
 
 
 def test_a_definition_that_gives_the_same_image_is_rendered_once():
-    made = views()
-    references = suite.References(fs.Renderer("reference"), made, [0])
+    first_views = views()
+    references = suite.References(fs.Renderer("reference"), first_views, [0])
     claims = {"lowpass": "screen", "samples": 1, "order": "auto", "ellipsoid": "ewa"}
     assert references.image(claims) is references.image(claims | {"order": "centre", "ellipsoid": "exact"})
     assert references.image(claims) is not references.image(claims | {"order": "pixel"})
@@ -183,22 +183,22 @@ def test_scenes_by_name_regime_and_machine():
 
 
 def test_generated_scenes_are_in_view_and_of_their_kind():
-    made = {name: regimes.SUITE[name].make() for name in ("huge", "clusters_3d", "needles", "haze_3d")}
-    assert {name: one.kind for name, one in made.items()} == {
+    scenes = {name: regimes.SUITE[name].make() for name in ("huge", "clusters_3d", "needles", "haze_3d")}
+    assert {name: one.kind for name, one in scenes.items()} == {
         "huge": "disks", "clusters_3d": "ellipsoids", "needles": "disks", "haze_3d": "ellipsoids"
     }  # fmt: skip
-    assert made["haze_3d"].cloud.opacities.max() < 1 / 50
-    assert (made["needles"].cloud.scales[:, 0] > made["needles"].cloud.scales[:, 1]).mean() > 0.99
-    assert (made["huge"].cloud.scales > 0.3).mean() > 0.005
-    shown = made["clusters_3d"].camera.project(made["clusters_3d"].cloud.means)
+    assert scenes["haze_3d"].cloud.opacities.max() < 1 / 50
+    assert (scenes["needles"].cloud.scales[:, 0] > scenes["needles"].cloud.scales[:, 1]).mean() > 0.99
+    assert (scenes["huge"].cloud.scales > 0.3).mean() > 0.005
+    shown = scenes["clusters_3d"].camera.project(scenes["clusters_3d"].cloud.means)
     assert ((shown > 0) & (shown < (1280, 720))).all(1).mean() > 0.8
     flight = regimes.street(1000, 3)
     assert flight.poses.shape == (3, 4, 4)
     assert flight.kind == "disks"
     around = regimes.agents(4)
     for pose in around.poses:
-        seen = around.camera.with_pose(pose).project(np.array([[0.0, 0.0, 6.0]]))
-        np.testing.assert_allclose(seen, [[64, 64]], atol=1e-6)
+        pixels = around.camera.with_pose(pose).project(np.array([[0.0, 0.0, 6.0]]))
+        np.testing.assert_allclose(pixels, [[64, 64]], atol=1e-6)
 
 
 def test_energy_of_a_processor(tmp_path):

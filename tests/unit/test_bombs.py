@@ -163,10 +163,10 @@ def test_images_that_small_files_declare(tmp_path, kind, data):
 @pytest.mark.parametrize("kind", [b"\x42\xff\xff\xff", b"IDAT", b"tEXt", b"iCCP"])
 def test_a_png_chunk_that_is_longer_than_its_file(tmp_path, kind):
     """libpng allocates the memory of a chunk before it reads it."""
-    whole = cv2.imencode(".png", np.zeros((8, 12, 3), np.uint8))[1].tobytes()
+    contents = cv2.imencode(".png", np.zeros((8, 12, 3), np.uint8))[1].tobytes()
     path = tmp_path / "a.png"
-    for length in (0x7FFFFFFF, 0xFFFFFF7F, len(whole) + 100):
-        data = whole[:33] + struct.pack(">I", length) + kind + whole[41:]
+    for length in (0x7FFFFFFF, 0xFFFFFF7F, len(contents) + 100):
+        data = contents[:33] + struct.pack(">I", length) + kind + contents[41:]
         path.write_bytes(data)
         for read in (lambda: read_image(path), lambda: read_bits(path), lambda data=data: decode_rgb(data)):
             with pytest.raises(fs.InputError, match=rf"chunks within its \d+ bytes, got one of {length:,}"):
@@ -182,19 +182,17 @@ def test_chunks_of_logs(tmp_path, monkeypatch, indexed, compression):
     kind = writer.CompressionType[compression.upper()]
     path, zeros = tmp_path / "a.mcap", bytes(2**20)
     with path.open("wb") as stream:
-        made = writer.Writer(
+        bag = writer.Writer(
             stream, chunk_size=2**24, compression=kind, use_chunking=True, use_summary_offsets=indexed
         )
         if not indexed:
-            made = writer.Writer(
-                stream, chunk_size=2**24, compression=kind, index_types=writer.IndexType.NONE
-            )
-        made.start()
-        schema = made.register_schema("sensor_msgs/msg/Image", "ros2msg", b"")
-        channel = made.register_channel("/a", "cdr", schema)
+            bag = writer.Writer(stream, chunk_size=2**24, compression=kind, index_types=writer.IndexType.NONE)
+        bag.start()
+        schema = bag.register_schema("sensor_msgs/msg/Image", "ros2msg", b"")
+        channel = bag.register_channel("/a", "cdr", schema)
         for time in range(20):
-            made.add_message(channel, time, zeros, time)
-        made.finish()
+            bag.add_message(channel, time, zeros, time)
+        bag.finish()
     monkeypatch.setattr("fidsplat.util.limits.FLOOR", 2**22)
     monkeypatch.setattr("fidsplat.util.limits.RATIO", 1)
     with pytest.raises(fs.InputError, match=r"a\.mcap must expand to at most 4.*chunk"):

@@ -28,19 +28,19 @@ PINHOLE = fs.Camera.pinhole(640, 480, 500, 500, 320, 240)
 
 @pytest.fixture(scope="module")
 def markers():
-    made = [fs.marker(f"apriltag:36h11:{k}", size=0.12) for k in range(4)]
-    placed = [PlacedMarker(made[k], THING @ part, bundle="box") for k, part in enumerate(PARTS)]
-    return (*placed, PlacedMarker(made[3], rigid_matrix((-0.35, 0.25, 1.5)), bundle="lid"))
+    tags = [fs.marker(f"apriltag:36h11:{k}", size=0.12) for k in range(4)]
+    placed = [PlacedMarker(tags[k], THING @ part, bundle="box") for k, part in enumerate(PARTS)]
+    return (*placed, PlacedMarker(tags[3], rigid_matrix((-0.35, 0.25, 1.5)), bundle="lid"))
 
 
 def reading(placed, camera, noise=None):
     """Reading of a marker with corners that are off by an offset; None: not visible."""
-    truth = marker_truth(placed, camera)
-    found = Reading(placed, truth.truth, truth.corners, truth.visible, truth.box)
+    expected = marker_truth(placed, camera)
+    actual = Reading(placed, expected.truth, expected.corners, expected.visible, expected.box)
     code = Detection(
-        "apriltag", "36h11", placed.marker.id, None, truth.corners + (0 if noise is None else noise)
+        "apriltag", "36h11", placed.marker.id, None, expected.corners + (0 if noise is None else noise)
     )
-    return found if noise is None else replace(found, detection=code)
+    return actual if noise is None else replace(actual, detection=code)
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, fs.Camera.fisheye(640, 480, 2.0)], ids=["pinhole", "fisheye"])

@@ -33,9 +33,9 @@ def key_of_quality(monkeypatch, renderer, **changes):
         raise Asked(key)
 
     monkeypatch.setattr(quality_within, "_cached", stop)
-    given = {"error": 1e-2, "ms": None, "scene": CLOUD, "capture": fs.Capture(CAMERA), "device": renderer}
+    arguments = {"error": 1e-2, "ms": None, "scene": CLOUD, "capture": fs.Capture(CAMERA), "device": renderer}
     with pytest.raises(Asked) as requested:
-        quality_within.choose(**given | changes)
+        quality_within.choose(**arguments | changes)
     return requested.value.args[0]
 
 

@@ -17,7 +17,7 @@ NAMES = ("POCL_CACHE_DIR", "XDG_CACHE_HOME")
 @pytest.fixture
 def ensure(monkeypatch, tmp_path):
     """Calls `ensure_caches` with some folders, and returns its warnings."""
-    made = []
+    results = []
 
     def call(**places) -> str:
         for name in NAMES:
@@ -25,11 +25,11 @@ def ensure(monkeypatch, tmp_path):
         with warnings.catch_warnings(record=True) as heard:
             warnings.simplefilter("always")
             caches.ensure_caches.__wrapped__()
-        made.extend(Path(os.environ[name]) for name in places)
+        results.extend(Path(os.environ[name]) for name in places)
         return " ".join(str(one.message) for one in heard)
 
     yield call
-    for folder in made:
+    for folder in results:
         if "fidsplat-cache-" in str(folder):
             caches._remove(folder.parent, os.getpid())
             assert not folder.parent.exists()
@@ -42,25 +42,25 @@ def test_what_can_be_written_stays(ensure, tmp_path):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_cache_that_cannot_be_written_is_replaced(ensure, name):
-    said = ensure(**{name: "/dev/null/nowhere"})
-    assert said.startswith(
+    warning = ensure(**{name: "/dev/null/nowhere"})
+    assert warning.startswith(
         "kernels are compiled again in this run: cannot write into the folder /dev/null/nowhere"
     )
-    assert said.endswith(f"; set {name} to a folder of your own with free space")
+    assert warning.endswith(f"; set {name} to a folder of your own with free space")
     assert Path(os.environ[name]).parent.name.startswith("fidsplat-cache-")
 
 
 def test_a_full_disk(ensure, monkeypatch):
     monkeypatch.setattr(caches.shutil, "disk_usage", lambda _: namedtuple("Usage", "free")(2**20))
-    said = ensure(POCL_CACHE_DIR="/tmp", XDG_CACHE_HOME="/tmp")
-    assert "/tmp has only 1 MB of free space" in said
-    assert said.endswith("set POCL_CACHE_DIR and XDG_CACHE_HOME to a folder of your own with free space")
+    warning = ensure(POCL_CACHE_DIR="/tmp", XDG_CACHE_HOME="/tmp")
+    assert "/tmp has only 1 MB of free space" in warning
+    assert warning.endswith("set POCL_CACHE_DIR and XDG_CACHE_HOME to a folder of your own with free space")
 
 
 def test_folders_of_others_hold_no_kernels(ensure, tmp_path, monkeypatch):
     tmp_path.chmod(0o777)
-    said = ensure(POCL_CACHE_DIR=tmp_path)
-    assert f"{tmp_path} can be written by every user" in said
+    warning = ensure(POCL_CACHE_DIR=tmp_path)
+    assert f"{tmp_path} can be written by every user" in warning
     tmp_path.chmod(0o755)
     monkeypatch.setattr(caches.os, "geteuid", lambda: os.getuid() + 1)
     assert f"{tmp_path} belongs to another user" in ensure(POCL_CACHE_DIR=tmp_path)

@@ -35,20 +35,20 @@ def exact_views(settings: CalibrationSettings, count: int) -> list[BoardView]:
 @pytest.mark.parametrize("lens", LENSES)
 def test_exact_corners_give_the_camera_back(lens):
     settings = CalibrationSettings(lens=lens)
-    found = calibrate(exact_views(settings, 10), settings.truth)
+    calibration = calibrate(exact_views(settings, 10), settings.truth)
     true = parameters(settings.truth)
-    assert parameters(found).keys() == true.keys()
-    for name, value in parameters(found).items():
+    assert parameters(calibration).keys() == true.keys()
+    for name, value in parameters(calibration).items():
         # OpenCV accepts corners as float32: 3e-5 pixels
         assert abs(value - true[name]) < (2e-3 if name[0] in "fc" else 1e-4), name
-    assert projection_errors(found, settings.truth).max() < 2e-3
+    assert projection_errors(calibration, settings.truth).max() < 2e-3
 
 
 def test_the_projection_ignores_a_rotation_and_measures_a_scale():
-    truth = CalibrationSettings(lens="none").truth
+    expected = CalibrationSettings(lens="none").truth
     # a small shift of the principal point is almost a rotation of the camera
-    assert projection_errors(replace(truth, cx=truth.cx + 1), truth).max() < 0.6
-    assert projection_errors(replace(truth, fx=1.01 * truth.fx), truth).max() > 1
+    assert projection_errors(replace(expected, cx=expected.cx + 1), expected).max() < 0.6
+    assert projection_errors(replace(expected, fx=1.01 * expected.fx), expected).max() > 1
 
 
 def test_what_cannot_be_calibrated():
@@ -82,10 +82,10 @@ def test_the_command(tmp_path, capsys):
     pytest.importorskip("matplotlib", reason="the extra experiments is not installed")
     words = ("--board", "charuco:6x4:4x4_50", "--size", "320", "240", "--views", "6", "--lens", "none")
     assert main(["experiment", "calibrate", "-o", str(tmp_path), *words, "--device", "opencl", "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said == json.loads((tmp_path / "calibrate.json").read_text())
-    assert said["corner_rms_px"] < 0.15
-    assert said["rows"][-1]["projection_px"] < 1
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((tmp_path / "calibrate.json").read_text())
+    assert printed["corner_rms_px"] < 0.15
+    assert printed["rows"][-1]["projection_px"] < 1
     assert (tmp_path / "calibrate.svg").stat().st_size > 1000
     assert main(["experiment", "calibrate", "-o", str(tmp_path), *words]) == 2
     assert "already exists" in capsys.readouterr().err

@@ -84,14 +84,14 @@ def test_field_of_view(fov_x, width):
 
 
 def test_a_rotated_and_moved_camera():
-    turn = quaternion_to_matrix(np.array([0.9, 0.1, -0.3, 0.2]))
+    rotation = quaternion_to_matrix(np.array([0.9, 0.1, -0.3, 0.2]))
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, [1, 2, 3]
+    pose[:3, :3], pose[:3, 3] = rotation, [1, 2, 3]
     camera = fs.Camera.pinhole(640, 480, 500, 500, 320, 240, pose)
     world = np.array([[0.3, -0.2, 4.0]])
-    seen = world[0] @ turn.T + [1, 2, 3]
+    seen = world[0] @ rotation.T + [1, 2, 3]
     np.testing.assert_allclose(camera.project(world)[0], 500 * seen[:2] / seen[2] + [320, 240])
-    np.testing.assert_allclose(turn @ camera.position + [1, 2, 3], 0, atol=1e-12)
+    np.testing.assert_allclose(rotation @ camera.position + [1, 2, 3], 0, atol=1e-12)
 
 
 def test_a_position_far_from_the_origin_is_exact():

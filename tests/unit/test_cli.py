@@ -259,9 +259,9 @@ def test_warnings_are_one_line_each_and_leave_no_trace(capsys, monkeypatch):
 
 
 def test_devices(capsys):
-    found = prints_json(capsys, "devices")["devices"]
-    assert "reference" in {device["name"] for device in found}
-    assert {"platform", "version", "memory_bytes", "float64", "usable", "reason"} <= set(found[0])
+    listed_devices = prints_json(capsys, "devices")["devices"]
+    assert "reference" in {device["name"] for device in listed_devices}
+    assert {"platform", "version", "memory_bytes", "float64", "usable", "reason"} <= set(listed_devices[0])
     assert main(["devices"]) == 0
     assert "reference" in capsys.readouterr().out
 

@@ -14,14 +14,14 @@ from fidsplat.images.files import write_png
 def test_marker_says_what_it_is_made_of(capsys, tmp_path):
     file = tmp_path / "new" / "tag.ply"
     facts = prints_json(capsys, "marker", "apriltag:36h11:5", "--size", "0.16", "-o", file)
-    made = fs.marker("apriltag:36h11:5", size=0.16)
+    marker = fs.marker("apriltag:36h11:5", size=0.16)
     assert facts["shape"] == [8, 8]
-    assert facts["components"] == made.components
-    assert sum(facts["rectangles"].values()) == len(made.rectangles)
-    assert facts["splats"] == len(made.cloud) == len(made.boxes)
+    assert facts["components"] == marker.components
+    assert sum(facts["rectangles"].values()) == len(marker.rectangles)
+    assert facts["splats"] == len(marker.cloud) == len(marker.boxes)
     assert facts["mixture"] == "exact"
-    assert facts["written"] == {"mixture": "fitted", "splats": len(made.gaussians)}
-    assert len(made.gaussians) == len(fs.load_ply(file))
+    assert facts["written"] == {"mixture": "fitted", "splats": len(marker.gaussians)}
+    assert len(marker.gaussians) == len(fs.load_ply(file))
     assert facts["size_m"] == 0.16
     assert 0 < facts["seconds"] < 30
     assert main(["marker", "apriltag:36h11:5"]) == 0
@@ -93,8 +93,8 @@ def test_marker_with_the_mixture_of_the_paper(capsys):
 def test_marker_with_shape_and_wear(capsys, tmp_path):
     words = ("--shape", "cylinder,radius=0.05,axis=x", "--wear", "fading=0.3,seed=2")
     facts = prints_json(capsys, "marker", "apriltag:16h5:5", "--size", "0.16", *words)
-    made = fs.marker("apriltag:16h5:5", 0.16, shape=words[1], wear=words[3])
-    assert facts["splats"] == len(made.cloud) > len(made.boxes)
+    marker = fs.marker("apriltag:16h5:5", 0.16, shape=words[1], wear=words[3])
+    assert facts["splats"] == len(marker.cloud) > len(marker.boxes)
     assert facts["surface"] == {"kind": "cylinder", "radius": 0.05, "axis": "x"}
     assert facts["wear"] == {"fading": 0.3, "seed": 2}
     for option, value, message in (

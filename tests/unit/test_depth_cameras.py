@@ -19,9 +19,9 @@ BACKEND = "opencl"  # for the fixture `renderer`
 
 def board(z: float, grey: float = 0.9, tilt: float = 0.0, left: float = -9.0) -> fs.SplatCloud:
     """A board at a distance, from x = left to the right, rotated about the vertical by radians."""
-    turn = [math.cos(tilt / 2), 0, math.sin(tilt / 2), 0]
+    quaternion = [math.cos(tilt / 2), 0, math.sin(tilt / 2), 0]
     color = to_colors(np.full((1, 3), grey), "srgb")
-    box = fs.SplatCloud([[left + 9.0, 0, z]], [turn], [[9.0, 9.0]], [1.0], colors=color)
+    box = fs.SplatCloud([[left + 9.0, 0, z]], [quaternion], [[9.0, 9.0]], [1.0], colors=color)
     return box.with_boxes()
 
 
@@ -32,19 +32,19 @@ def pinhole(focal: float) -> fs.Camera:
 def test_noise_of_time_of_flight_is_that_of_its_light(renderer):
     device, camera = TimeOfFlight(), pinhole(500.0)
     for z in (0.8, 1.5, 3.0):  # the middle of the image is within 20 % of the published curve
-        found = device.measure(renderer, fs.Scene([board(z)]), camera)[:, 24:72]
-        assert (found - z).std() == pytest.approx(PUBLISHED["azure-kinect"](z), rel=0.2)
+        actual = device.measure(renderer, fs.Scene([board(z)]), camera)[:, 24:72]
+        assert (actual - z).std() == pytest.approx(PUBLISHED["azure-kinect"](z), rel=0.2)
     for z, grey, tilt in ((0.8, 0.9, 0.0), (2.5, 0.9, 0.0), (1.5, 0.2, 0.0), (1.5, 0.9, 1.0)):
         scene = fs.Scene([board(z, grey, tilt)])
         true = replace(device, noise=0.0, floor=0.0).measure(renderer, scene, camera)
-        found = device.measure(renderer, scene, camera)
+        actual = device.measure(renderer, scene, camera)
         light = grey * math.cos(tilt) / z**2
         expected = math.sqrt(device.floor**2 + device.noise**2 / light)
         middle = np.s_[:, 40:56]  # where the tilted board is near its distance
         assert true[32, 48] == pytest.approx(z, rel=0.01)
-        assert (found - true)[middle].std() == pytest.approx(expected, rel=0.1)
-        assert np.array_equal(found, device.measure(renderer, scene, camera))
-        assert not np.array_equal(found, device.measure(renderer, scene, camera, seed=1))
+        assert (actual - true)[middle].std() == pytest.approx(expected, rel=0.1)
+        assert np.array_equal(actual, device.measure(renderer, scene, camera))
+        assert not np.array_equal(actual, device.measure(renderer, scene, camera, seed=1))
     black = fs.Scene([board(3.0, 0.05)])
     assert not device.measure(renderer, black, camera).any()
     assert not device.measure(renderer, fs.Scene([board(4.0)]), camera).any()
@@ -67,13 +67,13 @@ def test_flying_pixels_are_the_phase_of_the_mixed_light(renderer):
 def test_structured_light_follows_the_published_error_and_casts_a_shadow(renderer):
     device, camera = StructuredLight(), pinhole(580.0)
     for z in (1.0, 2.0, 3.0):
-        found = device.measure(renderer, fs.Scene([board(z)]), camera)[:, :90]
-        assert (found - z)[found > 0].std() == pytest.approx(PUBLISHED["kinect-v1"](z), rel=0.2)
+        actual = device.measure(renderer, fs.Scene([board(z)]), camera)[:, :90]
+        assert (actual - z)[actual > 0].std() == pytest.approx(PUBLISHED["kinect-v1"](z), rel=0.2)
     calm = replace(device, noise=0.0, lateral=0.0, step=0.0)
     for tilt in (30, 50, 60):
         wall, middle = fs.Scene([board(1.5, tilt=math.radians(tilt))]), np.s_[:, 40:56]
-        found, true = (each.measure(renderer, wall, camera)[middle] for each in (device, calm))
-        assert (found - true).std() == pytest.approx(PUBLISHED["kinect-v1"](1.5, tilt), rel=0.2)
+        actual, true = (each.measure(renderer, wall, camera)[middle] for each in (device, calm))
+        assert (actual - true).std() == pytest.approx(PUBLISHED["kinect-v1"](1.5, tilt), rel=0.2)
     scene = fs.Scene([board(1.0, left=0.0), board(1.5)])
     row = calm.measure(renderer, scene, camera)[32]
     shadow = 580.0 * device.baseline * (1 / 1.0 - 1 / 1.5)
@@ -92,8 +92,8 @@ def test_the_given_camera_replaces_the_motion_of_the_scene(renderer):
     back[2, 3] = 0.5
     moving = replace(scene, camera=pinhole(580.0), camera_motion=fs.Trajectory([0.0, 1.0], [back, back]))
     for device in (TimeOfFlight(), StructuredLight(), ActiveStereo()):
-        expected, found = (device.measure(renderer, each, pinhole(580.0)) for each in (scene, moving))
-        np.testing.assert_array_equal(found, expected)
+        expected, actual = (device.measure(renderer, each, pinhole(580.0)) for each in (scene, moving))
+        np.testing.assert_array_equal(actual, expected)
 
 
 def test_disparities_of_shifted_noise_are_unbiased():
@@ -107,10 +107,10 @@ def test_disparities_of_shifted_noise_are_unbiased():
         return np.rint(np.clip(128 + 12 * light, 0, 255)).astype(np.uint8)
 
     for shift in (9.0, 9.3, 9.5, 9.8):
-        found = disparity_of(image(0.0), image(shift), 32)[8:-8, 24:-8]
-        assert (found > 0).mean() > 0.99
-        assert found[found > 0].mean() == pytest.approx(shift, abs=0.01)
-        assert found[found > 0].std() < 0.03
+        actual = disparity_of(image(0.0), image(shift), 32)[8:-8, 24:-8]
+        assert (actual > 0).mean() > 0.99
+        assert actual[actual > 0].mean() == pytest.approx(shift, abs=0.01)
+        assert actual[actual > 0].std() < 0.03
 
 
 def test_active_stereo_matches_its_pattern(renderer):
@@ -119,10 +119,10 @@ def test_active_stereo_matches_its_pattern(renderer):
     for z in (0.5, 1.0, 2.0, 3.0):  # without 0.5 % at both ends, as librealsense's depth-quality tool
         wall, spreads = fs.Scene([board(z)]), []
         for seed in range(8):
-            found = np.sort(device.measure(renderer, wall, camera, seed)[16:-16, 68:-68], axis=None)
-            assert (found > 0).mean() > 0.98
-            assert abs(np.median(found) - z) < 0.06 * z**2 / (424.0 * device.baseline)  # pixels of disparity
-            spreads.append(found[len(found) // 200 : -len(found) // 200].std())
+            actual = np.sort(device.measure(renderer, wall, camera, seed)[16:-16, 68:-68], axis=None)
+            assert (actual > 0).mean() > 0.98
+            assert abs(np.median(actual) - z) < 0.06 * z**2 / (424.0 * device.baseline)  # pixels of disparity
+            spreads.append(actual[len(actual) // 200 : -len(actual) // 200].std())
         assert np.mean(spreads) == pytest.approx(PUBLISHED["d435"](z), rel=0.2)
     # without the pattern a blank wall has nothing to match
     wall = fs.Scene([board(1.5)])

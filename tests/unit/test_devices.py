@@ -59,9 +59,9 @@ def test_devices_of_one_name_are_numbered(monkeypatch):
         )
 
     pocl = "Portable Computing Language"
-    found = [card(pocl, "a"), card("NVIDIA CUDA", "b"), card(pocl, "c"), card("NVIDIA CUDA", "d")]
-    found.append(card("NVIDIA CUDA", "e"))
-    monkeypatch.setattr(device, "_all_devices", lambda: iter(found))
+    cards = [card(pocl, "a"), card("NVIDIA CUDA", "b"), card(pocl, "c"), card("NVIDIA CUDA", "d")]
+    cards.append(card("NVIDIA CUDA", "e"))
+    monkeypatch.setattr(device, "_all_devices", lambda: iter(cards))
     monkeypatch.setattr(device, "_why_unusable", lambda one: "" if one.available else "broken")
     monkeypatch.setattr(device, "OpenCLBackend", lambda one: one.name)
     expected = {"pocl": "a", "nvidia": "b", "pocl-2": "c", "nvidia-2": "d", "NVIDIA-3 ": "e"}
@@ -69,13 +69,13 @@ def test_devices_of_one_name_are_numbered(monkeypatch):
         *("opencl:pocl", "opencl:nvidia", "opencl:pocl-2", "opencl:nvidia-2", "opencl:nvidia-3")
     ]
     assert {name: device.open_device(name) for name in expected} == expected
-    assert [device._name_of(each) for each in found] == list(device._named_devices())
+    assert [device._name_of(each) for each in cards] == list(device._named_devices())
     with pytest.raises(UnknownDeviceError, match="opencl:nvidia-3: e"):
         device.open_device("nvidia-4")
     # without a number the first that works; with one just that
-    found[0] = card(pocl, "a", available=False)
+    cards[0] = card(pocl, "a", available=False)
     assert device.open_device("pocl") == "c"
-    found[0], found[2] = card(pocl, "a"), card(pocl, "c", available=False)
+    cards[0], cards[2] = card(pocl, "a"), card(pocl, "c", available=False)
     with pytest.raises(fs.DeviceError, match="broken"):
         device.open_device("pocl-2")
 
@@ -92,16 +92,16 @@ def test_platforms_are_matched_before_devices_and_processors_never(monkeypatch):
     pocl = card("Portable Computing Language", "cpu-Intel(R) Xeon(R)", cpu, "GenuineIntel")
     other = card("Clover", "Intel Arc by Clover", gpu)
     intel = card("Intel(R) OpenCL", "Intel(R) Xeon(R)", cpu)
-    found = [pocl, other, intel]
-    monkeypatch.setattr(device, "_all_devices", lambda: iter(found))
+    platforms = [pocl, other, intel]
+    monkeypatch.setattr(device, "_all_devices", lambda: iter(platforms))
     monkeypatch.setattr(device, "_why_unusable", lambda one: "")
     monkeypatch.setattr(device, "OpenCLBackend", lambda one: one)
     assert device.open_device("intel") is intel
     assert device.open_device("arc") is other
     assert device.open_device("cpu") is pocl
-    found.pop()
+    platforms.pop()
     assert device.open_device("Intel") is other
-    found.pop()
+    platforms.pop()
     with pytest.raises(UnknownDeviceError, match="no OpenCL device matches 'intel'; there are: opencl:pocl"):
         device.open_device("intel")
 
@@ -190,10 +190,10 @@ def record(monkeypatch):
     """Device record of a PoCL that does not recognise the processor; its attribute keeps the strings
     alive."""
     words = [ctypes.create_string_buffer(text) for text in (b"x86_64-unknown-linux-gnu", b"generic")]
-    made = (ctypes.c_uint64 * 512)(*map(ctypes.addressof, words))
-    made.kept = words
+    addresses = (ctypes.c_uint64 * 512)(*map(ctypes.addressof, words))
+    addresses.kept = words
     monkeypatch.setattr(target_patch, "_corrected", {})  # of records that had its address before
-    return made
+    return addresses
 
 
 def test_what_needs_no_patch_is_preferred(monkeypatch, record):

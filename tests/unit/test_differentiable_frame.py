@@ -47,9 +47,9 @@ def test_derivatives_by_a_pose_are_those_of_central_differences(pose):
     """Gradient by a pose offset that is applied after a motion, compared with central differences."""
     by_motion, step = np.array([0.3, -1.2, 0.7, 2.0, 0.5, -0.9]), 1e-6
     back = np.linalg.inv(motion(pose))
-    for k, found in enumerate(offset_gradient(by_motion, pose)):
+    for k, actual in enumerate(offset_gradient(by_motion, pose)):
         ends = [screw(motion(pose + sign * step * np.eye(6)[k]) @ back) for sign in (1, -1)]
-        assert found == pytest.approx(by_motion @ (ends[0] - ends[1]) / (2 * step), rel=1e-6, abs=1e-8)
+        assert actual == pytest.approx(by_motion @ (ends[0] - ends[1]) / (2 * step), rel=1e-6, abs=1e-8)
 
 
 def test_a_rotation_vector_rotates_by_its_length():
@@ -66,10 +66,10 @@ def test_gradients_of_a_frame_reach_a_pose_that_is_not_0():
 
     frame = rendered(pose)
     weights = np.random.default_rng(1).normal(size=frame["rgb"].shape)
-    found = offset_gradient(frame.backward({"rgb": weights})["pose"], pose)
+    actual = offset_gradient(frame.backward({"rgb": weights})["pose"], pose)
     for k in range(6):
         ends = [(weights * rendered(pose + sign * 1e-3 * np.eye(6)[k])["rgb"]).sum() for sign in (1, -1)]
-        assert found[k] == pytest.approx((ends[0] - ends[1]) / 2e-3, abs=5e-3 * np.abs(found).max())
+        assert actual[k] == pytest.approx((ends[0] - ends[1]) / 2e-3, abs=5e-3 * np.abs(actual).max())
 
 
 def test_an_effect_without_a_gradient_is_an_error_before_rendering():
@@ -86,14 +86,14 @@ def test_gradients_are_named_arrays_in_the_shapes_of_the_cloud():
     assert isinstance(frame, fs.Frame)
     assert list(frame) == [*OUTPUTS, "distortion"]
     np.testing.assert_array_equal(frame["depth"], renderer.render(cloud, CAMERA, OUTPUTS)["depth"])
-    found = frame.backward({"rgb": ONES, "distortion": ONES[..., 0]})
+    gradients = frame.backward({"rgb": ONES, "distortion": ONES[..., 0]})
     shapes = {"means": (6, 3), "quats": (6, 4), "scales": (6, 2), "opacities": (6,), "sh": (6, 4, 3)}
     shapes |= {"background": (3,), "pose": (6,), "intrinsics": (4,), "screen": (6,)}
-    assert {name: (array.shape, array.dtype) for name, array in found.items()} == {
+    assert {name: (array.shape, array.dtype) for name, array in gradients.items()} == {
         name: (shape, np.float32) for name, shape in shapes.items()
     }
     precise = frame.backward({"rgb": ONES, "distortion": ONES[..., 0]}, on_device=True)
-    assert all(np.array_equal(array.astype(np.float32), found[name]) for name, array in precise.items())
+    assert all(np.array_equal(array.astype(np.float32), gradients[name]) for name, array in precise.items())
     assert not any(array.any() for array in frame.backward({}).values())
     with pytest.raises(fs.InputError, match="the output 'normal' was not rendered"):
         frame.backward({"normal": ONES})
@@ -103,9 +103,9 @@ def test_3d_gaussians_have_gradients_by_their_thickness():
     given, renderer = arrays(), fs.Renderer("reference")
     given["scales"] = np.column_stack([given["scales"], [0.1, 0, 0.2, 0.3, 0, 0.1]])
     cloud = fs.SplatCloud(**given)
-    found = renderer.render_differentiable(cloud, CAMERA).backward({"rgb": ONES})
-    assert found["scales"].shape == (6, 2)
-    np.testing.assert_array_equal(found["thickness"] != 0, cloud.thickness > 0)
+    actual = renderer.render_differentiable(cloud, CAMERA).backward({"rgb": ONES})
+    assert actual["scales"].shape == (6, 2)
+    np.testing.assert_array_equal(actual["thickness"] != 0, cloud.thickness > 0)
 
 
 def test_a_store_has_no_gradients(tmp_path):
@@ -196,8 +196,8 @@ def test_the_bridge_without_torch_itself(monkeypatch):
     )  # one that cannot be rendered
     with pytest.warns(UserWarning, match="1 of 6 splats left out"):
         bridge.render(renderer, fs.Capture(CAMERA, OUTPUTS), **tensors)
-    kept = {name: array[[0, 2, 3, 4, 5]] for name, array in given.items()}
-    frame = renderer.render_differentiable(fs.SplatCloud(**kept), offset_camera(CAMERA, pose), OUTPUTS)
+    remaining = {name: array[[0, 2, 3, 4, 5]] for name, array in given.items()}
+    frame = renderer.render_differentiable(fs.SplatCloud(**remaining), offset_camera(CAMERA, pose), OUTPUTS)
     expected = frame.backward({"rgb": ONES})
     back = bridge._Rendered.backward(bridge._Rendered.context, Tensor(ONES), None, None)
     for place, name in ((2, "means"), (4, "scales"), (5, "opacities"), (6, "colors")):
@@ -242,13 +242,13 @@ def test_tensors_are_fitted_to_an_image():
     from fidsplat.train.torch_bridge import render
 
     renderer, given, capture = fs.Renderer("reference"), arrays(), fs.Capture(CAMERA)
-    truth = torch.tensor(renderer.render(fs.SplatCloud(**given), capture)["rgb"])
+    expected = torch.tensor(renderer.render(fs.SplatCloud(**given), capture)["rgb"])
     tensors = {name: torch.tensor(array, dtype=torch.float32) for name, array in given.items()}
     tensors["colors"] = torch.full((6, 3), 0.5, requires_grad=True)
     optimiser, losses = torch.optim.Adam([tensors["colors"]], lr=0.1), []
     for _ in range(15):
         optimiser.zero_grad()
-        loss = ((render(renderer, capture, **tensors)["rgb"] - truth) ** 2).mean()
+        loss = ((render(renderer, capture, **tensors)["rgb"] - expected) ** 2).mean()
         loss.backward()
         optimiser.step()
         losses.append(loss.item())

@@ -128,8 +128,8 @@ def run_command(words: list[str], line: str, page: str) -> None:
         for word in words:
             if word in READERS_FILES and not glob(word):
                 READERS_FILES[word]()
-        given = [name for word in words for name in (sorted(glob(word)) if "*" in word else [word])]
-        assert main([*given, *SMALLER.get(verb, [])]) == 0, line
+        arguments = [name for word in words for name in (sorted(glob(word)) if "*" in word else [word])]
+        assert main([*arguments, *SMALLER.get(verb, [])]) == 0, line
 
 
 def save_city(name: str):
@@ -266,6 +266,6 @@ def test_the_files_of_the_examples_are_made_by_their_script(tmp_path, monkeypatc
         <= 1
     )
     for name in ("globe", "corner"):
-        made, stored = (fs.load_ply(folder / f"{name}.ply") for folder in (tmp_path, EXAMPLES / "data"))
-        assert np.allclose(made.sh, stored.sh, atol=1e-6)
-        assert np.allclose(made.means, stored.means, atol=1e-6)
+        written, stored = (fs.load_ply(folder / f"{name}.ply") for folder in (tmp_path, EXAMPLES / "data"))
+        assert np.allclose(written.sh, stored.sh, atol=1e-6)
+        assert np.allclose(written.means, stored.means, atol=1e-6)

@@ -77,14 +77,14 @@ def test_exact_under_parallel_rays(renderer, seed):
 @pytest.mark.parametrize("way", ["exact", "ewa", "ewa_antialiased"])
 def test_the_normal_is_that_of_the_surface_of_largest_values_at_the_centre(renderer, way):
     """Sigma^-1 p, turned towards the camera: -p of a ball, the disk's own of a flat one."""
-    for thickness, wanted in ((0.3, (0.6, 0, 0.8)), (1e-4, None)):
+    for thickness, reference in ((0.3, (0.6, 0, 0.8)), (1e-4, None)):
         cloud = fs.SplatCloud(
             [[1.2, 0, 1.6]], [[1, 0.3, -0.2, 0.4]], [[0.3, 0.3, thickness]], [1.0], colors=[[1, 1, 1]]
         )
         normal = renderer.render(cloud, PINHOLE, ("normal",), fs.Quality(ellipsoid=way))["normal"]
         middle = normal[HEIGHT // 2, WIDTH // 2 + 30 - 1]
         own = quaternion_to_matrix(cloud.quats)[0, :, 2]
-        expected = -np.array(wanted) if wanted else -own * np.sign(own @ cloud.means[0])
+        expected = -np.array(reference) if reference else -own * np.sign(own @ cloud.means[0])
         np.testing.assert_allclose(middle, expected, atol=1e-5)
 
 

@@ -97,8 +97,8 @@ def test_tables_in_a_hundred_thousand_tables_are_no_data_set(tmp_path):
 def test_a_damaged_header_is_a_damaged_array(tmp_path):
     """Whatever NumPy makes of it: its Python may end within a bracket."""
     np.save(tmp_path / "a.npy", np.zeros(3))
-    whole = (tmp_path / "a.npy").read_bytes()
-    (tmp_path / "a.npy").write_bytes(whole.replace(b"(3,)", b"(3, "))
+    contents = (tmp_path / "a.npy").read_bytes()
+    (tmp_path / "a.npy").write_bytes(contents.replace(b"(3,)", b"(3, "))
     with pytest.raises(ValueError, match="header"):
         load_npy(tmp_path / "a.npy")
 

@@ -76,8 +76,8 @@ def test_each_image_has_its_pose(here):
     assert len(list((here / "out" / "depth").iterdir())) == 9
     poses = fs.load_trajectory("out/trajectory.tum")
     np.testing.assert_allclose(poses.poses[:, 0, 3], [0, 0.15, 0.3], atol=1e-12)
-    said = json.loads((here / "out" / "transforms.json").read_text())
-    assert [frame["file_path"] for frame in said["frames"]] == [f"rgb/{k:06d}.png" for k in range(3)]
+    printed = json.loads((here / "out" / "transforms.json").read_text())
+    assert [frame["file_path"] for frame in printed["frames"]] == [f"rgb/{k:06d}.png" for k in range(3)]
     assert (here / "out" / "contact-sheet.png").exists()
 
 
@@ -88,10 +88,10 @@ def test_a_flights_images_are_read_from_where_its_camera_was(here, capsys, monke
     capsys.readouterr()
     for folder in ("out", "out/rgb"):
         assert main(["detect", folder, "--scene", "scene.toml", "--json"]) == 0
-        said = json.loads(capsys.readouterr().out)
-        assert [one["image"] for one in said["pictures"]] == [f"out/rgb/{k:06d}.png" for k in range(3)]
-        assert said["means"]["found"] == 3
-        assert said["means"]["position_error_mm"] < 2  # by the scene's own camera it would be 70
+        printed = json.loads(capsys.readouterr().out)
+        assert [one["image"] for one in printed["pictures"]] == [f"out/rgb/{k:06d}.png" for k in range(3)]
+        assert printed["means"]["found"] == 3
+        assert printed["means"]["position_error_mm"] < 2  # by the scene's own camera it would be 70
     assert main(["detect", "out", "--scene", "scene.toml"]) == 0
     errors = capsys.readouterr().out.partition("Distances and errors")[2]
     assert all(f"{k:06d}" in errors for k in range(3))  # the image of each row
@@ -149,9 +149,9 @@ def test_poses_of_a_log_are_those_of_frames_in_the_world(here):
     with logs.RobotLog("run.mcap") as log:
         log.transform(0.5, "robot", pose)
         log.transform(0.5, "camera", pose, "robot")
-    found = logs.log_poses("run.mcap")
-    assert list(found) == [("robot", 500_000_000), ("camera", 500_000_000)]
-    for moved, expected in zip(found.values(), (pose, pose @ pose), strict=True):
+    actual = logs.log_poses("run.mcap")
+    assert list(actual) == [("robot", 500_000_000), ("camera", 500_000_000)]
+    for moved, expected in zip(actual.values(), (pose, pose @ pose), strict=True):
         np.testing.assert_allclose(moved, expected, atol=1e-12)
 
 
@@ -180,8 +180,8 @@ def test_a_flight_goes_on_where_it_was(here, capsys):
         (here / "out" / "rgb" / name).unlink()
     capsys.readouterr()
     assert fly("--rate", "4", "--json") == 0
-    said = json.loads(capsys.readouterr().out)
-    assert (said["frames"], said["drawn"]) == (5, 2)
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["frames"], printed["drawn"]) == (5, 2)
     again = {file.name: file.stat().st_mtime_ns for file in (here / "out" / "rgb").iterdir()}
     assert sorted(again) == sorted(first)
     assert sorted(name for name in first if first[name] != again[name]) == ["000001.png", "000004.png"]
@@ -289,12 +289,12 @@ def test_a_log_and_the_truth_next_to_the_images(here):
     pictures = list(logs.log_images("run.mcap"))
     assert [one.name for one in pictures] == [f"/camera/image_raw {t:.3f} s" for t in (0, 0.5, 1)]
     np.testing.assert_array_equal(pictures[1].image, read_image("out/rgb/000001.png"))
-    truth = json.loads((here / "truth.json").read_text())
-    assert [image["file_name"] for image in truth["images"]] == [f"rgb/00000{k}.png" for k in range(3)]
-    moved = [annotation["camera_from_marker"][0][3] for annotation in truth["annotations"]]
+    expected = json.loads((here / "truth.json").read_text())
+    assert [image["file_name"] for image in expected["images"]] == [f"rgb/00000{k}.png" for k in range(3)]
+    moved = [annotation["camera_from_marker"][0][3] for annotation in expected["annotations"]]
     np.testing.assert_allclose(moved, [0, -0.15, -0.3], atol=1e-9)
     own = np.load("out/label/000001.npy") == 1
-    assert truth["annotations"][1]["area"] == own.sum() > 50
+    assert expected["annotations"][1]["area"] == own.sum() > 50
 
 
 def test_a_log_named_as_the_output_has_its_images_next_to_it(here):

@@ -48,26 +48,26 @@ def test_a_coplanar_group_has_one_footprint():
 
 
 def test_an_exact_marker_is_its_partition():
-    made = fs.marker("apriltag:36h11:5", size=0.16, mixture="exact")
-    assert len(made.cloud) == len(made.rectangles)
-    assert made.cloud.footprint == "box"
+    marker = fs.marker("apriltag:36h11:5", size=0.16, mixture="exact")
+    assert len(marker.cloud) == len(marker.rectangles)
+    assert marker.cloud.footprint == "box"
     for rectangle, mean, scale, color in zip(
-        made.rectangles, made.cloud.means, made.cloud.scales, made.cloud.colors, strict=True
+        marker.rectangles, marker.cloud.means, marker.cloud.scales, marker.cloud.colors, strict=True
     ):
         x0, x1 = (mean[0] + sign * scale[0] for sign in (-1, 1))
         y0, y1 = (mean[1] + sign * scale[1] for sign in (-1, 1))
-        edges = np.array([x0, y0, x1, y1]) / made.module + made.grid.shape[0] / 2
+        edges = np.array([x0, y0, x1, y1]) / marker.module + marker.grid.shape[0] / 2
         assert edges == pytest.approx(rectangle[:4], abs=1e-4)
         assert color.tolist() == [0.0 if rectangle.dark else 1.0] * 3
-    assert (4 * made.cloud.scales.prod(1)).sum() == pytest.approx((10 * 0.02) ** 2)
+    assert (4 * marker.cloud.scales.prod(1)).sum() == pytest.approx((10 * 0.02) ** 2)
 
 
 def test_an_exact_marker_has_gaussians_for_others():
-    made = fs.marker("qr:hello", mixture="exact")
+    marker = fs.marker("qr:hello", mixture="exact")
     fitted = fs.marker("qr:hello", mixture="fitted")
-    assert made.gaussians.boxes is None
-    assert np.array_equal(made.gaussians.means, fitted.cloud.means)
-    assert np.array_equal(made.gaussians.opacities, fitted.cloud.opacities)
+    assert marker.gaussians.boxes is None
+    assert np.array_equal(marker.gaussians.means, fitted.cloud.means)
+    assert np.array_equal(marker.gaussians.opacities, fitted.cloud.opacities)
     assert fitted.gaussians is fitted.cloud
 
 
@@ -78,9 +78,9 @@ def test_options_of_other_mixtures_are_refused(option):
 
 
 def test_a_ply_file_has_no_boxes(tmp_path):
-    made = fs.marker("apriltag:36h11:5", mixture="exact")
+    marker = fs.marker("apriltag:36h11:5", mixture="exact")
     with pytest.raises(fs.InputError, match=r"splats in a PLY file must be Gaussians, got \d+ boxes"):
-        fs.save_ply(made.cloud, tmp_path / "tag.ply")
+        fs.save_ply(marker.cloud, tmp_path / "tag.ply")
     assert not list(tmp_path.iterdir())
 
 
@@ -96,9 +96,9 @@ def test_the_command_writes_gaussians_and_says_so(tmp_path, capsys):
 
 
 def test_a_scene_keeps_exact_markers(tmp_path):
-    made = fs.marker("apriltag:36h11:5", size=0.2, mixture="exact")
-    scene = fs.Scene(markers=[fs.scenes.PlacedMarker(made)])
+    marker = fs.marker("apriltag:36h11:5", size=0.2, mixture="exact")
+    scene = fs.Scene(markers=[fs.scenes.PlacedMarker(marker)])
     scene.save(tmp_path / "scene.toml")
     read = fs.Scene.load(tmp_path / "scene.toml")
     assert read.markers[0].marker.mixture == "exact"
-    assert np.array_equal(read.cloud().boxes, made.cloud.boxes)
+    assert np.array_equal(read.cloud().boxes, marker.cloud.boxes)

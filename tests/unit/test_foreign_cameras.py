@@ -84,8 +84,8 @@ def test_cameras_of_nerfstudio(tmp_path):
     # OpenCV's pixel coordinates are smaller by 0.5
     k = np.array([[500, 0, 320.5], [0, 510, 238.5], [0, 0, 1]])
     rotation = cv2.Rodrigues(POSE[:3, :3])[0]
-    seen, _ = cv2.projectPoints(POINTS, rotation, POSE[:3, 3], k, np.array([0.05, 0, 0.001, 0, 0]))
-    np.testing.assert_allclose(camera.project(POINTS), seen[:, 0] + 0.5, atol=1e-6)
+    pixels, _ = cv2.projectPoints(POINTS, rotation, POSE[:3, 3], k, np.array([0.05, 0, 0.001, 0, 0]))
+    np.testing.assert_allclose(camera.project(POINTS), pixels[:, 0] + 0.5, atol=1e-6)
     np.testing.assert_array_equal(fs.Camera.from_nerfstudio(transforms, 1).world_to_camera, np.eye(4))
     (tmp_path / "transforms.json").write_text(json.dumps(transforms))
     loaded = fs.load_cameras(tmp_path / "transforms.json")
@@ -145,10 +145,10 @@ def test_cameras_of_ros_project_as_opencv_does(model, factors):
     camera = fs.Camera.from_ros_camera_info(info, PAIR)
     rotation, move, k = cv2.Rodrigues(POSE[:3, :3])[0], POSE[:3, 3], info.k.reshape(3, 3)
     if model == "equidistant":
-        seen = cv2.fisheye.projectPoints(POINTS[:, None], rotation, move, k, np.array(factors))[0][:, 0]
+        pixels = cv2.fisheye.projectPoints(POINTS[:, None], rotation, move, k, np.array(factors))[0][:, 0]
     else:
-        seen = cv2.projectPoints(POINTS, rotation, move, k, np.array(factors))[0][:, 0]
-    np.testing.assert_allclose(camera.project(POINTS), seen + 0.5, atol=1e-6)
+        pixels = cv2.projectPoints(POINTS, rotation, move, k, np.array(factors))[0][:, 0]
+    np.testing.assert_allclose(camera.project(POINTS), pixels + 0.5, atol=1e-6)
     rectified = fs.Camera.from_ros_camera_info(info, rectified=True)
     assert (rectified.fx, rectified.cy, rectified.lens) == (480.0, 241.0, None)
 

@@ -30,10 +30,10 @@ def assert_placed(cloud, turn, move, scale, atol=2e-6):
     np.testing.assert_allclose(cloud.world_means(), scale * MEANS @ turn.T + move, atol=atol)
     ours = quaternion_to_matrix(cloud.quats)
     three = np.column_stack([cloud.scales, cloud.thickness])
-    found = ours * (three**2)[:, None, :] @ ours.swapaxes(1, 2)
+    actual = ours * (three**2)[:, None, :] @ ours.swapaxes(1, 2)
     theirs = turn @ quaternion_to_matrix(QUATS)
     expected = theirs * ((scale * SCALES) ** 2)[:, None, :] @ theirs.swapaxes(1, 2)
-    np.testing.assert_allclose(found, expected, atol=atol)
+    np.testing.assert_allclose(actual, expected, atol=atol)
     np.testing.assert_allclose(cloud.opacities, OPACITIES, atol=1e-6)
     np.testing.assert_allclose(cloud.sh[:, 0], COLORS, atol=1e-6)
 
@@ -51,8 +51,8 @@ def test_a_gltf_of_pygltflib_with_a_matrix_and_rows_that_interleave(tmp_path, su
     accessors, at = [], 0
     for part in parts[:-1]:
         kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[part.shape[1]]
-        made = {"bufferView": 0, "byteOffset": at, "componentType": 5126, "count": COUNT, "type": kind}
-        accessors.append(gltf.Accessor(**made))
+        accessor = {"bufferView": 0, "byteOffset": at, "componentType": 5126, "count": COUNT, "type": kind}
+        accessors.append(gltf.Accessor(**accessor))
         at += 4 * part.shape[1]
     matrix = rigid_matrix(MOVE, TURN, 2.5).T.ravel().tolist()  # by columns
     primitive = gltf.Primitive(
@@ -134,10 +134,10 @@ def test_encodings_of_images_in_a_bag_of_rosbags(tmp_path, encoding, order):
     with rosbag2.Writer(tmp_path / "bag", version=9) as bag:
         connection = bag.add_connection("/eye", message.__msgtype__, typestore=store)
         bag.write(connection, 10, store.serialize_cdr(message, message.__msgtype__))
-    (found,) = log_images(tmp_path / "bag")
+    (actual,) = log_images(tmp_path / "bag")
     expected = PIXELS[..., [0, 0, 0]] if encoding == "mono8" else PIXELS[..., :3]
-    np.testing.assert_array_equal(found.image, expected)
-    assert (found.frame, found.stamp) == ("eye", 3_000_000_007)
+    np.testing.assert_array_equal(actual.image, expected)
+    assert (actual.frame, actual.stamp) == ("eye", 3_000_000_007)
 
 
 @pytest.mark.parametrize("time", [1.009, 2.01, 4.012])
@@ -149,9 +149,9 @@ def test_stamps_are_the_nearest_nanosecond(tmp_path, time):
     with RobotLog(tmp_path / "a.mcap") as log:
         log.image(time, "eye", np.zeros((2, 2, 3)))
         log.transform(time, "eye", np.eye(4))
-    (found,) = log_images(tmp_path / "a.mcap")
+    (actual,) = log_images(tmp_path / "a.mcap")
     milliseconds = round(time * 1000)
-    assert found.stamp == milliseconds * 10**6
+    assert actual.stamp == milliseconds * 10**6
     assert list(log_poses(tmp_path / "a.mcap")) == [("eye", milliseconds * 10**6)]
 
 
@@ -234,8 +234,8 @@ def test_the_angle_of_a_camera_is_that_of_the_width(tmp_path, size):
         write_png(tmp_path / f"{k}.png", np.full((height, width), 50 * k))
         matrix = rigid_matrix((k, 0.2, 0.5), TURN).tolist()
         frames.append({"file_path": f"{k}.png", "transform_matrix": matrix})
-    found = {"camera_angle_x": 0.8, "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(found))
+    actual = {"camera_angle_x": 0.8, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(actual))
     for view in load_dataset(tmp_path, hold_out=0, random_points=5).views:
         focal = width / 2 / np.tan(0.4)
         np.testing.assert_allclose([view.camera.fx, view.camera.fy], focal)

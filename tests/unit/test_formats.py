@@ -312,10 +312,10 @@ def test_files_that_are_cut_short_or_something_else(tmp_path, suffix):
     need(suffix)
     path = tmp_path / f"a{suffix}"
     fs.save_splats(some(count=9, degree=1), path)
-    whole = path.read_bytes()
-    last = len(whole.rstrip()) - 1  # text may do without its line's end
-    for cut in sorted({0, 1, 5, 13, 25, len(whole) // 2, last, len(whole) - 7}):
-        path.write_bytes(whole[:cut])
+    contents = path.read_bytes()
+    last = len(contents.rstrip()) - 1  # text may do without its line's end
+    for cut in sorted({0, 1, 5, 13, 25, len(contents) // 2, last, len(contents) - 7}):
+        path.write_bytes(contents[:cut])
         with pytest.raises(fs.InputError, match=str(path)):
             fs.load_splats(path)
     path.write_bytes(b"\x89PNG" + bytes(100))
@@ -476,9 +476,9 @@ def test_convert_says_what_it_costs(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("fidsplat.scenes.sources.HEIGHT", 36)
     fs.save_splats(some(labels=2), "a.ply")
     assert main(["convert", "a.ply", "a.glb", "--device", "reference", "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert (said["splats"], said["lost"], said["format"]) == (40, [], "glTF KHR_gaussian_splatting")
-    assert said["error"]["largest"] < 1e-5
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["splats"], printed["lost"], printed["format"]) == (40, [], "glTF KHR_gaussian_splatting")
+    assert printed["error"]["largest"] < 1e-5
     assert main(["convert", "a.ply", "a.splat", "--device", "reference"]) == 0
     out = capsys.readouterr().out
     assert "lost: labels (1 different)" in out

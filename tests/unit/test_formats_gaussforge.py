@@ -15,21 +15,21 @@ TURN = np.diag([1.0, -1.0, -1.0, 1.0])
 def converted(file, to: str, **more):
     """The file next to it in another format, written by GaussForge."""
     kind = "".join(file.suffixes)[1:]
-    found = gaussforge.GaussForge().convert(file.read_bytes(), kind, to, **more)
-    assert "error" not in found, found
+    actual = gaussforge.GaussForge().convert(file.read_bytes(), kind, to, **more)
+    assert "error" not in actual, actual
     written = file.with_name(f"theirs.{to}")
-    written.write_bytes(found["data"])
+    written.write_bytes(actual["data"])
     return written
 
 
 def gaussforge_splats(file) -> fs.SplatCloud:
     """Splats read by GaussForge, from its own arrays: logarithms of scales, logits of opacities. Its
     Python module returns no cloud without higher SH."""
-    found = gaussforge.GaussForge().read(file.read_bytes(), file.suffix[1:])
-    assert "error" not in found, found
-    found = found["data"]
-    count, degree = found["numPoints"], found["meta"]["shDegree"]
-    part = {name: np.frombuffer(value, "<f4") for name, value in found.items() if isinstance(value, bytes)}
+    model = gaussforge.GaussForge().read(file.read_bytes(), file.suffix[1:])
+    assert "error" not in model, model
+    model = model["data"]
+    count, degree = model["numPoints"], model["meta"]["shDegree"]
+    part = {name: np.frombuffer(value, "<f4") for name, value in model.items() if isinstance(value, bytes)}
     sh = np.concatenate(
         [part["colors"].reshape(count, 1, 3), part["sh"].reshape(count, (degree + 1) ** 2 - 1, 3)], axis=1
     )

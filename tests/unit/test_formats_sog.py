@@ -195,10 +195,10 @@ def test_images_may_have_twice_the_pixels_that_are_meant(tmp_path, monkeypatch, 
     sog(tmp_path / "a.sog")
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
-    said = json.loads(parts.pop("meta.json"))
-    del said["shN"]  # its palette has another size
+    printed = json.loads(parts.pop("meta.json"))
+    del printed["shN"]  # its palette has another size
     with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
-        archive.writestr("meta.json", json.dumps(said))
+        archive.writestr("meta.json", json.dumps(printed))
         for name, data in parts.items():
             archive.writestr(name, data)
     if fits:

@@ -111,7 +111,7 @@ def test_derivatives_are_those_of_central_differences(name):
         images = frozen.images(parameters)
         return sum((weights[output] * images[output]).sum() for output in OUTPUTS)
 
-    found = frozen.backward(weights)
+    gradients = frozen.backward(weights)
     for parameter in at.names:
         values = getattr(at, parameter)
         expected = np.zeros_like(values)
@@ -125,38 +125,38 @@ def test_derivatives_are_those_of_central_differences(name):
                 moved[place] += sign * step
                 ends.append(loss(replace(at, **{parameter: moved})))
             expected[place] = (ends[0] - ends[1]) / (2 * step)
-        off = np.abs(found[parameter] - expected).max()
+        off = np.abs(gradients[parameter] - expected).max()
         assert off <= 2e-6 * max(1.0, np.abs(expected).max()), (parameter, off)
         assert np.abs(expected).max() > 0, parameter
 
 
 def test_every_decision_occurs():
-    made = {}
+    images = {}
     for name in SCENES:
         cloud, features, view = rendered_scene(name)
-        ((_, _, made[name]),) = FrozenFrame(cloud, view, features)._blocks
-    assert made["dots"].by_disc[made["dots"].contributes].all()
-    both = made["dots and disks"]
+        ((_, _, images[name]),) = FrozenFrame(cloud, view, features)._blocks
+    assert images["dots"].by_disc[images["dots"].contributes].all()
+    both = images["dots and disks"]
     assert {*both.by_disc[both.contributes].tolist()} == {True, False}
-    assert made["ceiling"].clamped[made["ceiling"].contributes].any()
-    assert (made["edge-on"].missed & made["edge-on"].contributes).any()
+    assert images["ceiling"].clamped[images["ceiling"].contributes].any()
+    assert (images["edge-on"].missed & images["edge-on"].contributes).any()
     # depths between the centre's and the plane's
     assert {*both.mirrored[both.contributes & ~both.missed].tolist()} == {True, False}
-    assert {*made["edge-on"].wide[made["edge-on"].mirrored & made["edge-on"].contributes].tolist()} == {
+    assert {*images["edge-on"].wide[images["edge-on"].mirrored & images["edge-on"].contributes].tolist()} == {
         True,
         False,
     }
-    assert not made["opaque"].contributes.all()
+    assert not images["opaque"].contributes.all()
 
 
 def test_the_screen_statistic_is_the_derivative_by_the_centres_place():
     """dL_dmean2D of the 2DGS authors: gradient with respect to the position of the centre in the image,
     in half images."""
     cloud, features, view = rendered_scene("dots")
-    found = FrozenFrame(cloud, view, features).backward({"rgb": np.ones((view.height, view.width, 3))})
-    z, (x, y, _) = cloud.means[:, 2].astype(float), found["means"].T
+    gradients = FrozenFrame(cloud, view, features).backward({"rgb": np.ones((view.height, view.width, 3))})
+    z, (x, y, _) = cloud.means[:, 2].astype(float), gradients["means"].T
     across = 0.5 * z * np.hypot(view.width * x / view.focal_x, view.height * y / view.focal_y)
-    assert np.allclose(found["screen"], across)
+    assert np.allclose(gradients["screen"], across)
     assert across.max() > 0
 
 

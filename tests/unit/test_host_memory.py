@@ -61,10 +61,12 @@ def test_no_more_is_locked_than_allowed(renderer, monkeypatch):
     monkeypatch.setattr(host_memory, "_MAXIMUM", 900)
     first = memory.empty(shape, np.float32)
     assert first.base is None  # the first of a size is in ordinary memory
-    kept = [memory.empty(shape, np.float32) for _ in range(4)]
-    assert [array.base is not None for array in kept] == [True, True, False, False]
-    assert all(array.shape == shape and array.dtype == np.float32 and array.flags.writeable for array in kept)
-    del kept
+    arrays = [memory.empty(shape, np.float32) for _ in range(4)]
+    assert [array.base is not None for array in arrays] == [True, True, False, False]
+    assert all(
+        array.shape == shape and array.dtype == np.float32 and array.flags.writeable for array in arrays
+    )
+    del arrays
     assert memory.empty((9, 9), np.int32).base is None
     other = memory.empty((9, 9), np.int32)  # what lies idle makes room
     assert other.base is not None

@@ -97,10 +97,10 @@ def gltf(folder):
     data = (folder / "a.glb").read_bytes()
     (folder / "a.glb").unlink()
     size = int.from_bytes(data[12:16], "little")
-    said = json.loads(data[20 : 20 + size])
-    said["buffers"][0]["uri"] = "a.bin"
+    printed = json.loads(data[20 : 20 + size])
+    printed["buffers"][0]["uri"] = "a.bin"
     (folder / "a.bin").write_bytes(data[28 + size :])
-    (folder / "a.gltf").write_text(json.dumps(said))
+    (folder / "a.gltf").write_text(json.dumps(printed))
 
 
 def packed_sog(folder):
@@ -300,11 +300,11 @@ def use_splats(file):
 
 
 def use_scene(file):
-    made = fs.Scene.load(file)
-    camera = made.camera
-    if camera is not None and camera.width * camera.height < 10_000 and len(made.cloud()) < 10_000:
-        RENDERER.render(made)
-    made.save(file.with_name("again.toml"))
+    written_scene = fs.Scene.load(file)
+    camera = written_scene.camera
+    if camera is not None and camera.width * camera.height < 10_000 and len(written_scene.cloud()) < 10_000:
+        RENDERER.render(written_scene)
+    written_scene.save(file.with_name("again.toml"))
     fs.Scene.load(file.with_name("again.toml"))
 
 
@@ -353,8 +353,8 @@ def use_views(path):
 
 
 def use_path(file):
-    made = fs.load_trajectory(file)
-    made(made.times[0])
+    trajectory = fs.load_trajectory(file)
+    trajectory(trajectory.times[0])
 
 
 def use_results(file):
@@ -417,10 +417,10 @@ INPUTS = {
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
     """Folder of good files of a kind, which must be used."""
-    made = {}
+    arguments = {}
 
     def of(kind):
-        if kind not in made:
+        if kind not in arguments:
             make, use, name, _ = INPUTS[kind]
             folder = tmp_path_factory.mktemp("good")
             make(folder)
@@ -430,8 +430,8 @@ def good(tmp_path_factory):
                     copy = tmp_path_factory.mktemp("used") / "copy"
                     shutil.copytree(folder, copy)
                     use(copy if name == "." else copy / path.name)
-            made[kind] = folder
-        return made[kind]
+            arguments[kind] = folder
+        return arguments[kind]
 
     return of
 
@@ -463,10 +463,10 @@ def test_damaged_files_are_used_or_refused(kind, good, tmp_path):
 
 def test_a_gltf_buffer_view_of_more_bytes_than_there_are(tmp_path):
     gltf(tmp_path)
-    said = json.loads((tmp_path / "a.gltf").read_text())
+    printed = json.loads((tmp_path / "a.gltf").read_text())
     for length in (2**53, 2**62, 10**300):
-        said["bufferViews"][0]["byteLength"] = length
-        (tmp_path / "a.gltf").write_text(json.dumps(said))
+        printed["bufferViews"][0]["byteLength"] = length
+        (tmp_path / "a.gltf").write_text(json.dumps(printed))
         with limits():
             fs.load_splats(tmp_path / "a.gltf")
 
@@ -518,8 +518,8 @@ def test_numbers_of_sog_beyond_float32(tmp_path, part, key, value):
 @pytest.mark.parametrize("value", [[], {}, 5, None])
 def test_a_camera_model_that_is_no_text(tmp_path, value):
     views(tmp_path)
-    said = json.loads((tmp_path / "transforms.json").read_text())
-    (tmp_path / "transforms.json").write_text(json.dumps(said | {"camera_model": value}))
+    printed = json.loads((tmp_path / "transforms.json").read_text())
+    (tmp_path / "transforms.json").write_text(json.dumps(printed | {"camera_model": value}))
     with limits(), pytest.raises(fs.InputError, match="camera_model must be one of"):
         use_views(tmp_path)
 
@@ -579,9 +579,9 @@ def test_every_argument_is_validated(name, tmp_path, monkeypatch):
         for odd in (*ODD[:3], ODD[3 + number % 4]):
             function, good, use = CALLS[name](tmp_path)
             with contextlib.suppress(fs.FidsplatError):
-                made = function(**good | {key: odd})
+                value = function(**good | {key: odd})
                 if use is not None:
-                    use(made)
+                    use(value)
 
 
 MISSING = {"read_description": "world.sdf", "load_trajectory": "a.tum", "Scene.load": "a.toml"}
@@ -599,9 +599,9 @@ def test_good_arguments_are_used(name, tmp_path, monkeypatch):
     function, good, use = CALLS[name](tmp_path)
     if name in MISSING:
         good = good | {"path": tmp_path / MISSING[name]}
-    made = function(**good)
+    arguments = function(**good)
     if use is not None:
-        use(made)
+        use(arguments)
 
 
 @examples(40)
@@ -613,9 +613,9 @@ def test_unexpected_arguments(tmp_path, data):
     keys = st.lists(st.sampled_from(sorted(arguments)), min_size=1, max_size=2, unique=True)
     odd = {key: data.draw(st.sampled_from(JUNK)) for key in data.draw(keys)}
     with limits(), contextlib.chdir(tmp_path):
-        made = function(**arguments | odd)
+        value = function(**arguments | odd)
         if use is not None:
-            use(made)
+            use(value)
 
 
 # --- command lines
@@ -732,7 +732,7 @@ def test_command_lines(tmp_path, capsys, words):
         if status:
             assert status in (1, 2)
             last = errors.rstrip("\n").rpartition("\n")[2]
-            said = [line for line in errors.splitlines() if line.startswith("fidsplat: ")]
-            assert [line for line in said if not line.startswith("fidsplat: warning: ")] == [last], errors
+            lines = [line for line in errors.splitlines() if line.startswith("fidsplat: ")]
+            assert [line for line in lines if not line.startswith("fidsplat: warning: ")] == [last], errors
             assert "a fault of fidsplat" not in last
             assert "Traceback" not in errors

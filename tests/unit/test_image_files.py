@@ -26,9 +26,9 @@ def test_a_large_image_is_converted_as_its_rows_are():
     random = np.random.default_rng(3)
     large = random.uniform(-0.1, 1.1, (900, 857, 3)).astype(np.float32)
     large[-1, -1] = (np.nan, np.inf, -np.inf)
-    made = to_uint8(large)
-    assert np.array_equal(made, np.stack([to_uint8(row) for row in large]))
-    assert made[-1, -1].tolist() == [0, 255, 0]
+    converted = to_uint8(large)
+    assert np.array_equal(converted, np.stack([to_uint8(row) for row in large]))
+    assert converted[-1, -1].tolist() == [0, 255, 0]
 
 
 def test_sixteen_bits_are_preserved(tmp_path):

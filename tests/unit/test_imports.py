@@ -114,16 +114,16 @@ def statements(path: Path) -> list[ast.Import | ast.ImportFrom]:
 
 def imported(path: Path) -> set[str]:
     """Every module that a file names in an import statement."""
-    found = set()
+    modules = set()
     for node in statements(path):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            modules |= {alias.name for alias in node.names}
         else:
             assert node.level == 0, f"{path}: imports are absolute"
-            found.add(node.module or "")
+            modules.add(node.module or "")
             if node.module == "fidsplat" or (node.module or "").startswith("fidsplat."):
-                found |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return found
+                modules |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return modules
 
 
 def within(name: str, places) -> bool:
@@ -148,14 +148,14 @@ def test_imports_point_downwards(module):
 def needed(path: Path, modules) -> set[str]:
     """The modules that a file's import statements need: `from fidsplat.a import b` needs fidsplat.a.b if that
     is a module, else fidsplat.a. That a.b.c brings the `__init__` of a.b with it does not count."""
-    found = set()
+    packages = set()
     for node in statements(path):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            packages |= {alias.name for alias in node.names}
         else:
             named = {f"{node.module}.{alias.name}" for alias in node.names}
-            found |= {name if name in modules else name.rpartition(".")[0] for name in named}
-    return found & set(modules)
+            packages |= {name if name in modules else name.rpartition(".")[0] for name in named}
+    return packages & set(modules)
 
 
 def test_no_module_imports_itself_by_way_of_others():

@@ -117,11 +117,11 @@ def test_clouds_and_scenes_say_what_they_hold():
         [[0, 0, 0], [1, 2, 3]], [[1, 0, 0, 0]] * 2, [[0.1, 0.1, 0.0], [0.1, 0.1, 0.2]], [1, 1],
         sh=np.zeros((2, 4, 3)), labels=[0, 5],
     )  # fmt: skip
-    said = cloud.summary()
-    assert said["splats"] == "2, 2D and 3D"
-    assert said["colours"] == "SH of degree 1"
-    assert said["labels"] == "2 different"
-    assert said["bounds"].endswith(" m")
+    summary = cloud.summary()
+    assert summary["splats"] == "2, 2D and 3D"
+    assert summary["colours"] == "SH of degree 1"
+    assert summary["labels"] == "2 different"
+    assert summary["bounds"].endswith(" m")
     assert "<td style='text-align:left'>2, 2D and 3D</td>" in cloud._repr_html_()
     assert fs.SplatCloud.empty().summary() == {"splats": "0, 2D", "colours": "plain"}
     scene = fs.Scene([cloud], camera=CAMERA, markers=[PlacedMarker(fs.marker("qr:<b>", size=0.1))])

@@ -70,35 +70,35 @@ def trial(tmp_path_factory):
 
 @pytest.mark.sweep
 def test_an_interrupted_command_loses_nothing(trial):
-    found = [interrupt.disturb(trial, how, how, 0.8) for how in interrupt.SIGNALS]
-    assert [row["lost"] for row in found] == [[]] * 3
-    assert any(row["stopped"] for row in found)
+    outcomes = [interrupt.disturb(trial, how, how, 0.8) for how in interrupt.SIGNALS]
+    assert [row["lost"] for row in outcomes] == [[]] * 3
+    assert any(row["stopped"] for row in outcomes)
 
 
 @pytest.mark.parametrize(
-    ("name", "status", "said"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")]
+    ("name", "status", "message"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")]
 )
-def test_a_library_that_is_being_loaded_is_not_interrupted(name, status, said):
+def test_a_library_that_is_being_loaded_is_not_interrupted(name, status, message):
     """PyOpenCL aborted the process then."""
     ended = subprocess.run(
         [sys.executable, "-c", IN_A_LIBRARY.format(name=name)], capture_output=True, text=True, check=False
     )
-    assert (ended.returncode, ended.stderr) == (status, f"fidsplat: {said}\n")
+    assert (ended.returncode, ended.stderr) == (status, f"fidsplat: {message}\n")
 
 
 @pytest.mark.parametrize(
-    ("name", "then", "status", "said"),
+    ("name", "then", "status", "message"),
     [
         ("SIGINT", "interrupts.check()", 130, "interrupted"),
         ("SIGTERM", "raise OSError('interrupted system call')", 143, "terminated"),
     ],
 )
-def test_a_signal_in_a_finalizer_is_not_lost(name, then, status, said):
+def test_a_signal_in_a_finalizer_is_not_lost(name, then, status, message):
     """Python discards exceptions of a finalizer: the command continued, with status 0. A later error is a
     consequence of the signal."""
     code = WHERE_EXCEPTIONS_ARE_DROPPED.format(name=name, then=then)
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stderr) == (status, f"fidsplat: {said}\n")
+    assert (ended.returncode, ended.stderr) == (status, f"fidsplat: {message}\n")
 
 
 @pytest.mark.parametrize("module", ["fidsplat.cli", "tyro"])
@@ -146,8 +146,8 @@ def test_an_awaited_result_is_returned():
     assert (done.returncode, done.stdout) == (4, "out\n")
     with subprocess.Popen(
         [sys.executable, "-c", r"print('one\ntwo'); print('rest', end='')"], stdout=subprocess.PIPE
-    ) as said:
-        assert list(interrupts.lines_of(said.stdout)) == ["one", "two"]
+    ) as message:
+        assert list(interrupts.lines_of(message.stdout)) == ["one", "two"]
 
 
 def test_the_second_signal_does_not_wait(monkeypatch):
@@ -168,8 +168,8 @@ def test_a_full_disk_loses_nothing(trial, tmp_path):
             pass
     except subprocess.CalledProcessError:
         pytest.skip("no file system can be mounted here")
-    found = interrupt.disturb(trial, "full", interrupt.DISK, 0.6)
-    assert (found["stopped"], found["lost"]) == (True, [])
+    outcomes = interrupt.disturb(trial, "full", interrupt.DISK, 0.6)
+    assert (outcomes["stopped"], outcomes["lost"]) == (True, [])
 
 
 def test_damage_is_found(trial):

@@ -80,17 +80,17 @@ PATTERNS = (IDEAL.pattern, Rosette(math.radians(35), (700.0, -430.0), 400))
 @pytest.mark.parametrize("pattern", PATTERNS, ids=("spinning", "rosette"))
 def test_ranges_are_those_of_the_reference(renderer, room, pattern):
     lidar = replace(IDEAL, pattern=pattern)
-    found = fs.scan(room, lidar, MOUNT, renderer=renderer, label=True)
-    truth = fs.scan(room, lidar, MOUNT, renderer=fs.Renderer("reference"), label=True)
-    same = (found.range > 0) == (truth.range > 0)
+    actual = fs.scan(room, lidar, MOUNT, renderer=renderer, label=True)
+    expected = fs.scan(room, lidar, MOUNT, renderer=fs.Renderer("reference"), label=True)
+    same = (actual.range > 0) == (expected.range > 0)
     assert same.mean() > 0.99
-    assert (truth.range > 0).mean() > 0.3
-    both = (found.range > 0) & (truth.range > 0)
-    error = np.abs(found.range[both] / truth.range[both] - 1)
+    assert (expected.range > 0).mean() > 0.3
+    both = (actual.range > 0) & (expected.range > 0)
+    error = np.abs(actual.range[both] / expected.range[both] - 1)
     # a ray that passes a surface at an opacity of 0.5 ends at the next one
     assert np.quantile(error, 0.99) < 1e-5
-    assert np.abs(found.intensity - truth.intensity)[both][error < 1e-5].max() < 1e-4
-    assert (found.label == truth.label)[both][error < 1e-5].mean() > 0.99
+    assert np.abs(actual.intensity - expected.intensity)[both][error < 1e-5].max() < 1e-4
+    assert (actual.label == expected.label)[both][error < 1e-5].mean() > 0.99
 
 
 @pytest.fixture(scope="module")
@@ -102,30 +102,30 @@ def device() -> fs.Renderer:
 def test_a_wall_is_where_its_equation_says(device, pattern):
     normal = np.array([0.9, -0.2, 0.3]) / np.linalg.norm([0.9, -0.2, 0.3])
     pose = turned(0.2, 0.1, -0.3, (-0.5, 0.4, 0.1))
-    found = fs.scan(plane(normal, 3.0, 12.0, 30), replace(IDEAL, pattern=pattern), pose, renderer=device)
-    rays = found.directions @ pose[:3, :3].T
+    actual = fs.scan(plane(normal, 3.0, 12.0, 30), replace(IDEAL, pattern=pattern), pose, renderer=device)
+    rays = actual.directions @ pose[:3, :3].T
     ranges = (3.0 - normal @ pose[:3, 3]) / (rays @ normal)
-    hit = found.range[0] > 0
+    hit = actual.range[0] > 0
     assert hit.sum() > 80
-    np.testing.assert_allclose(found.range[0][hit], ranges[hit], rtol=1e-5)
-    points = found.world_points[0][hit]
+    np.testing.assert_allclose(actual.range[0][hit], ranges[hit], rtol=1e-5)
+    points = actual.world_points[0][hit]
     np.testing.assert_allclose(points @ normal, 3.0, atol=1e-4)
     # Lambert: sRGB 0.6 reflects 31.9 %
     expected = ((0.6 + 0.055) / 1.055) ** 2.4 * np.abs(rays @ normal)[hit]
     middle = np.linalg.norm(points - 3.0 * normal, axis=1) < 3
-    np.testing.assert_allclose(found.intensity[0][hit][middle], expected[middle], rtol=2e-2)
+    np.testing.assert_allclose(actual.intensity[0][hit][middle], expected[middle], rtol=2e-2)
 
 
 def test_the_intensity_is_that_of_the_surface_however_opaque(device):
     """A wall of faint disks in front of a black one; the rays end at the first."""
     faint, black = plane((1, 0, 0), 5.0, 18.0, 32, opacity=0.12), plane((1, 0, 0), 9.0, 18.0, color=0.0)
-    full, found = (
+    full, actual = (
         fs.scan(joined(*walls), IDEAL, np.eye(4), renderer=device).intensity[0]
         for walls in ((plane((1, 0, 0), 5.0, 18.0, 32),), (faint, black))
     )
     ahead = (full > 0) & (np.abs(np.arctan2(*IDEAL.directions().T[1::-1])) < 0.3)
     assert ahead.sum() > 20
-    np.testing.assert_allclose(found[ahead], full[ahead], rtol=0.01)
+    np.testing.assert_allclose(actual[ahead], full[ahead], rtol=0.01)
 
 
 def test_a_moving_lidar_sees_a_wall_from_its_pose_at_the_time_of_the_beam(device):
@@ -136,28 +136,28 @@ def test_a_moving_lidar_sees_a_wall_from_its_pose_at_the_time_of_the_beam(device
         return turned(1.0 * (time - 0.05), 0.1, 0.0, (4 * time, 1 * time, 0.2))
 
     motion = fs.Motion(camera=lambda time: np.linalg.inv(world_from_lidar(time)))
-    found = fs.scan(plane((1, 0, 0), 5.0, 30.0, 40), lidar, motion=motion, renderer=device)
-    hit = found.range[0] > 0
+    actual = fs.scan(plane((1, 0, 0), 5.0, 30.0, 40), lidar, motion=motion, renderer=device)
+    hit = actual.range[0] > 0
     assert hit.sum() > 100
     for beam in np.flatnonzero(hit)[::7]:
-        pose = world_from_lidar(found.time[beam])
-        expected = (5.0 - pose[0, 3]) / (pose[:3, :3] @ found.directions[beam])[0]
-        assert found.range[0, beam] == pytest.approx(expected, rel=1e-5)
-    np.testing.assert_allclose(found.world_points[0][hit][:, 0], 5.0, atol=1e-4)
+        pose = world_from_lidar(actual.time[beam])
+        expected = (5.0 - pose[0, 3]) / (pose[:3, :3] @ actual.directions[beam])[0]
+        assert actual.range[0, beam] == pytest.approx(expected, rel=1e-5)
+    np.testing.assert_allclose(actual.world_points[0][hit][:, 0], 5.0, atol=1e-4)
     still = fs.scan(plane((1, 0, 0), 5.0, 30.0, 40), lidar, world_from_lidar(0.05), renderer=device)
-    assert np.abs(still.range - found.range)[0][hit & (still.range[0] > 0)].max() > 0.1
+    assert np.abs(still.range - actual.range)[0][hit & (still.range[0] > 0)].max() > 0.1
 
 
 def test_a_moving_rosette_has_fewer_poses_than_beams(device):
     pattern = Rosette(math.radians(20), (700.0, -430.0), 300)
     lidar = replace(IDEAL, pattern=pattern, bands=10)
     motion = fs.Motion(camera=lambda t: np.linalg.inv(turned(0, 0, 0, (3 * t, 0, 0))))
-    found = fs.scan(plane((1, 0, 0), 5.0, 12.0, 30), lidar, motion=motion, start=0.2, renderer=device)
-    hit = found.range[0] > 0
+    actual = fs.scan(plane((1, 0, 0), 5.0, 12.0, 30), lidar, motion=motion, start=0.2, renderer=device)
+    hit = actual.range[0] > 0
     assert hit.mean() > 0.9
-    assert len(found.poses) == 10
-    np.testing.assert_allclose(found.world_points[0][hit][:, 0], 5.0, atol=1e-4)
-    late = np.abs(found.poses[found.pose_index][:, 0, 3] - 3 * (0.2 + found.time))
+    assert len(actual.poses) == 10
+    np.testing.assert_allclose(actual.world_points[0][hit][:, 0], 5.0, atol=1e-4)
+    late = np.abs(actual.poses[actual.pose_index][:, 0, 3] - 3 * (0.2 + actual.time))
     assert late.max() <= 3 * 0.1 / (2 * 10) + 1e-9
 
 
@@ -166,8 +166,8 @@ def test_a_scan_without_a_pose_is_at_the_moving_camera_at_its_start(device):
     motion = fs.Trajectory([0.0, 1.0], [np.eye(4), turned(0, 0, 0, (0, 0, -1.0))])  # camera_from_world
     scene = fs.Scene([plane((0, 0, 1), 4.0, 6.0)], camera=camera, camera_motion=motion)
     for time, distance in ((0.0, 4.0), (1.0, 3.0)):
-        found = fs.scan(scene, IDEAL, renderer=device, start=time)
-        assert np.nanmedian(found.points[..., 0]) == pytest.approx(distance, rel=1e-5)
+        actual = fs.scan(scene, IDEAL, renderer=device, start=time)
+        assert np.nanmedian(actual.points[..., 0]) == pytest.approx(distance, rel=1e-5)
 
 
 def test_a_batch_equals_single_scans(renderer, room):
@@ -186,9 +186,9 @@ def test_against_ray_casting_of_the_mesh(device):
     mesh = trimesh.creation.box(extents=2 * np.array(half))
     faces = [plane(sign * np.eye(3)[axis], half[axis], 7.0, 32) for axis in range(3) for sign in (1, -1)]
     pose = turned(0.7, 0.05, -0.1, (0.4, -0.3, 0.1))
-    found = fs.scan(joined(*faces), IDEAL, pose, renderer=device)
-    rays = found.directions @ pose[:3, :3].T
-    truth = np.full(len(rays), np.inf)
+    actual = fs.scan(joined(*faces), IDEAL, pose, renderer=device)
+    rays = actual.directions @ pose[:3, :3].T
+    expected = np.full(len(rays), np.inf)
     for triangle, normal in zip(mesh.triangles, mesh.face_normals, strict=True):
         places, valid = trimesh.intersections.planes_lines(
             plane_origins=np.tile(triangle[0], (len(rays), 1)),
@@ -200,9 +200,9 @@ def test_against_ray_casting_of_the_mesh(device):
         away = ((places - pose[:3, 3]) * rays[valid]).sum(1)
         inside = (weights >= -1e-12).all(1) & (away > 0)
         beams = np.flatnonzero(valid)[inside]
-        truth[beams] = np.minimum(truth[beams], away[inside])
-    assert (found.range[0] > 0).all()
-    error = np.abs(found.range[0] - truth)
+        expected[beams] = np.minimum(expected[beams], away[inside])
+    assert (actual.range[0] > 0).all()
+    error = np.abs(actual.range[0] - expected)
     # splats of one face reach over its edge by their radius, so that beams near an edge end early
     assert np.median(error) < 1e-5
     assert (error < 1e-4).mean() > 0.9
@@ -213,12 +213,12 @@ def test_dual_returns_at_an_edge(device):
     scene = joined(plane((1, 0, 0), 2.0, 4.0, 32, left=0.04), plane((1, 0, 0), 6.0, 20.0, 40, color=0.9))
     pattern = Spinning((0.0,), 720)
     lidar = Lidar(pattern, divergence=0.3, rays=64, returns=("first", "last"), near=0.1)
-    found = fs.scan(scene, lidar, np.eye(4), renderer=device)
+    actual = fs.scan(scene, lidar, np.eye(4), renderer=device)
     ahead = np.arange(340, 380)
-    both = (found.range > 0).all(0)[ahead]
+    both = (actual.range > 0).all(0)[ahead]
     assert 0 < both.sum() < len(ahead)
-    assert np.allclose(found.range[0, ahead][both], 2.0, atol=0.05)
-    assert np.allclose(found.range[1, ahead][both], 6.0, atol=0.2)
+    assert np.allclose(actual.range[0, ahead][both], 2.0, atol=0.05)
+    assert np.allclose(actual.range[1, ahead][both], 6.0, atol=0.2)
     strongest = fs.scan(scene, replace(lidar, returns="strongest"), np.eye(4), renderer=device)
     assert set(np.round(strongest.range[0, ahead])) <= {2.0, 6.0}
     # a plane that fills the beam is one return
@@ -289,13 +289,13 @@ def test_directions_of_a_spinning_lidar_turn_clockwise_from_behind():
 
 @pytest.mark.parametrize("ending", ["pcd", "ply", "npy"])
 def test_files_of_points(device, tmp_path, ending):
-    found = fs.scan(plane((1, 0, 0), 3.0, 6.0, label=4), IDEAL, np.eye(4), label=True, renderer=device)
-    cloud = found.cloud()
+    actual = fs.scan(plane((1, 0, 0), 3.0, 6.0, label=4), IDEAL, np.eye(4), label=True, renderer=device)
+    cloud = actual.cloud()
     xyz = np.stack([cloud[axis] for axis in "xyz"], 1)
     elevations = np.arcsin(xyz[:, 2] / np.linalg.norm(xyz, axis=1))
     np.testing.assert_allclose(elevations, np.array(UNEVEN)[cloud["ring"]], atol=1e-5)
     file = tmp_path / f"scan.{ending}"
-    found.save(file)
+    actual.save(file)
     if ending == "npy":
         read = np.load(file)
     elif ending == "pcd":
@@ -311,7 +311,7 @@ def test_files_of_points(device, tmp_path, ending):
         np.testing.assert_allclose(vertices, xyz, atol=1e-6)
         return
     assert read.dtype.names == cloud.dtype.names
-    assert len(cloud) == (found.range > 0).sum() > 10
+    assert len(cloud) == (actual.range > 0).sum() > 10
     np.testing.assert_array_equal(read, cloud)
     assert (set(read["label"]), read["ring"].max()) == ({4}, 8)
 
@@ -323,8 +323,8 @@ def test_messages_have_the_points(device, tmp_path):
 
     from fidsplat.logs import RobotLog
 
-    found = fs.scan(plane((1, 0, 0), 3.0, 6.0), IDEAL, np.eye(4), renderer=device)
-    cloud, path = found.cloud(), tmp_path / "run.mcap"
+    actual = fs.scan(plane((1, 0, 0), 3.0, 6.0), IDEAL, np.eye(4), renderer=device)
+    cloud, path = actual.cloud(), tmp_path / "run.mcap"
     with RobotLog(path) as log:
         log.points(12.25, "lidar", cloud)
     with path.open("rb") as stream:

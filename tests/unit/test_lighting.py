@@ -67,8 +67,8 @@ def test_half_of_a_panorama_returns_the_cosine_integral(degrees):
     assert angles.sum() == pytest.approx(4 * math.pi)
     angle = math.radians(degrees)
     bright = directions @ [math.sin(angle), 0, math.cos(angle)] > 0
-    found = cosine_weights(UP, directions, angles)[bright].sum()
-    assert found == pytest.approx(math.pi * (1 + math.cos(angle)) / 2, rel=0.02)
+    weight_sum = cosine_weights(UP, directions, angles)[bright].sum()
+    assert weight_sum == pytest.approx(math.pi * (1 + math.cos(angle)) / 2, rel=0.02)
 
 
 def test_light_is_measured_where_the_marker_is():
@@ -81,9 +81,9 @@ def test_light_is_measured_where_the_marker_is():
              for p in (lying, pose)]  # fmt: skip
     direction, angles = panorama_directions(64)
     radiance = to_light((1 - direction[:, 1]) / 2, "srgb")
-    for found, normal in zip(light, ([0, -1, 0], [0, 0, -1]), strict=True):
+    for actual, normal in zip(light, ([0, -1, 0], [0, 0, -1]), strict=True):
         expected = 0.85 / math.pi * cosine_weights(np.array(normal), direction, angles) @ radiance
-        assert np.allclose(found, expected, rtol=0.01)
+        assert np.allclose(actual, expected, rtol=0.01)
 
 
 @pytest.mark.parametrize("degrees", [0, 40, 80, 100])
@@ -257,7 +257,7 @@ def test_reflections_by_sampling_equal_the_integral(roughness):
     incoming = field.incoming_radiance(directions[0], np.zeros((len(views), 2)))[..., 0]
     sampled = (incoming * weights[0]).sum(-1)
     count = len(field.directions)
-    for view, found in zip(views, sampled, strict=True):
+    for view, actual in zip(views, sampled, strict=True):
         reflected = glossy_reflection(
             np.full((count, 1), view @ UP),
             np.broadcast_to(view, (count, 1, 3)),
@@ -265,7 +265,7 @@ def test_reflections_by_sampling_equal_the_integral(roughness):
             np.broadcast_to(UP, (count, 3)),
             surface,
         )[:, 0]
-        assert found == pytest.approx(reflected @ (field.angles * light), abs=0.0025)
+        assert actual == pytest.approx(reflected @ (field.angles * light), abs=0.0025)
 
 
 def test_fresnel_by_polarisation():
@@ -302,14 +302,14 @@ def test_harmonics_of_a_glossy_marker_are_those_of_the_world():
     pose = rigid_matrix((0.1, 0.2, 3.0), (0.9, 0.2, -0.3, 0.1))
     sky = fs.Gradient(top=(1.0, 0.9, 0.8), bottom=(0.1, 0.1, 0.3), up=(1.0, -0.5, 0.0))
     camera = fs.Camera.look_at(64, 48, 1.0, (0.5, 0.4, 2.0), (0.1, 0.2, 3.0))
-    found = []
+    results = []
     for view in ("any", "camera"):
         light = fs.Lighting(roughness=0.6, view=view)
         scene = fs.Scene(camera=camera, markers=[PlacedMarker(TAG, pose, light=light)], background=sky)
         placed = renderer().lit(scene).markers[0]
-        found.append(renderer().render(fs.Scene([placed.cloud()], camera))["rgb"])
-    assert np.abs(found[0] - found[1]).max() < 0.02
-    assert found[0].max() > 0.3
+        results.append(renderer().render(fs.Scene([placed.cloud()], camera))["rgb"])
+    assert np.abs(results[0] - results[1]).max() < 0.02
+    assert results[0].max() > 0.3
 
 
 def test_the_error_of_harmonics_of_degree_3():

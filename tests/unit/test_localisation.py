@@ -51,9 +51,9 @@ def room(renderer):
     return scene, renderer.upload(scene), renderer.render(scene)["rgb"]
 
 
-def off(found, camera):
+def pose_difference(estimate, camera):
     """Millimetres and degrees between two cameras."""
-    position, angle = pose_error(found.camera_to_world, camera.camera_to_world)
+    position, angle = pose_error(estimate.camera_to_world, camera.camera_to_world)
     return 1e3 * position, math.degrees(angle)
 
 
@@ -61,33 +61,35 @@ def test_the_pose_of_a_noisy_image_is_recovered(renderer, room):
     scene, resident, image = room
     noisy = image + np.random.default_rng(0).normal(0, 0.01, image.shape)
     start = offset_camera(scene.camera, START)
-    found = fs.localise(noisy, scene, start, renderer=renderer, resident=resident)
-    assert found.found
-    assert found.start == "start"
-    millimetres, degrees = off(found.camera, scene.camera)
+    localisation = fs.localise(noisy, scene, start, renderer=renderer, resident=resident)
+    assert localisation.found
+    assert localisation.start == "start"
+    millimetres, degrees = pose_difference(localisation.camera, scene.camera)
     assert millimetres < 2
     assert degrees < 0.15
-    assert off(start, scene.camera)[0] > 30
-    assert found.inliers > 0.95
-    assert found.noise == pytest.approx(0.01, rel=0.2)
-    assert found.camera.fx == 62.0
+    assert pose_difference(start, scene.camera)[0] > 30
+    assert localisation.inliers > 0.95
+    assert localisation.noise == pytest.approx(0.01, rel=0.2)
+    assert localisation.camera.fx == 62.0
 
 
 def test_small_splats_are_aligned_to_a_fraction_of_a_pixel(renderer):
     """Edges that Tukey's loss ignores after the stages at lower resolution."""
     scene = scene_with(2000)
     start = offset_camera(scene.camera, START / 2)
-    found = fs.localise(renderer.render(scene)["rgb"], scene, start, renderer=renderer)
-    assert off(found.camera, scene.camera)[0] < 0.2
+    localisation = fs.localise(renderer.render(scene)["rgb"], scene, start, renderer=renderer)
+    assert pose_difference(localisation.camera, scene.camera)[0] < 0.2
 
 
 def test_exposure_and_white_balance_do_not_matter(renderer, room):
     scene, resident, image = room
     start = offset_camera(scene.camera, START)
     changed = image * np.float32([0.6, 0.8, 1.1]) + np.float32([0.05, -0.02, 0.01])
-    found = [fs.localise(one, scene, start, renderer=renderer, resident=resident) for one in (image, changed)]
-    assert off(found[1].camera, found[0].camera)[0] < 0.05
-    assert off(found[1].camera, scene.camera)[0] < 0.3
+    actual = [
+        fs.localise(one, scene, start, renderer=renderer, resident=resident) for one in (image, changed)
+    ]
+    assert pose_difference(actual[1].camera, actual[0].camera)[0] < 0.05
+    assert pose_difference(actual[1].camera, scene.camera)[0] < 0.3
 
 
 def test_an_occluder_is_an_outlier_and_a_mask_ignores_it(renderer, room):
@@ -98,17 +100,17 @@ def test_an_occluder_is_an_outlier_and_a_mask_ignores_it(renderer, room):
     start = offset_camera(scene.camera, START / 3)
     free = fs.localise(occluded, scene, start, renderer=renderer, resident=resident)
     masked = fs.localise(occluded, scene, start, mask=mask, renderer=renderer, resident=resident)
-    assert off(free.camera, scene.camera)[0] < 3
-    assert off(masked.camera, scene.camera)[0] < 0.3
+    assert pose_difference(free.camera, scene.camera)[0] < 3
+    assert pose_difference(masked.camera, scene.camera)[0] < 0.3
     assert free.inliers < 0.9 < masked.inliers
 
 
-def normalised(found, camera):
+def normalised(localisation, camera):
     """Squared error of a pose, normalised by its covariance."""
-    moved = camera.world_to_camera @ found.camera.camera_to_world
-    turn = (moved[:3, :3] - moved[:3, :3].T) / 2
-    error = np.array([turn[2, 1], turn[0, 2], turn[1, 0], *moved[:3, 3]])
-    return error @ np.linalg.solve(found.covariance, error)
+    moved = camera.world_to_camera @ localisation.camera.camera_to_world
+    rotation = (moved[:3, :3] - moved[:3, :3].T) / 2
+    error = np.array([rotation[2, 1], rotation[0, 2], rotation[1, 0], *moved[:3, 3]])
+    return error @ np.linalg.solve(localisation.covariance, error)
 
 
 def test_the_covariance_has_the_scale_of_the_errors(renderer, room):
@@ -117,8 +119,8 @@ def test_the_covariance_has_the_scale_of_the_errors(renderer, room):
     random, squares = np.random.default_rng(5), []
     for _ in range(30):
         noisy = image + random.normal(0, 0.02, image.shape)
-        found = fs.localise(noisy, scene, scene.camera, renderer=renderer, resident=resident)
-        squares.append(normalised(found, scene.camera))
+        localisation = fs.localise(noisy, scene, scene.camera, renderer=renderer, resident=resident)
+        squares.append(normalised(localisation, scene.camera))
     assert 4 < np.mean(squares) < 8.5
 
 
@@ -130,8 +132,8 @@ def test_the_covariance_includes_errors_of_the_scene(renderer, room):
         means = cloud.world_means() + np.random.default_rng(seed).normal(0, 0.005, (len(cloud), 3))
         off = fs.SplatCloud(means, cloud.quats, cloud.scales, cloud.opacities, colors=cloud.colors)
         other = fs.Scene([off], scene.camera, background=scene.background)
-        found = fs.localise(image, other, scene.camera, renderer=renderer)
-        squares.append(normalised(found, scene.camera))
+        localisation = fs.localise(image, other, scene.camera, renderer=renderer)
+        squares.append(normalised(localisation, scene.camera))
     assert np.mean(squares) < 100
 
 
@@ -142,20 +144,20 @@ def test_a_large_image_is_reduced(renderer, room):
     image = np.array(renderer.render(resident, camera)["rgb"])
     mask = np.ones((96, 128), bool)
     mask[20:40, 60:90] = False
-    given = {"renderer": renderer, "resident": resident}
+    arguments = {"renderer": renderer, "resident": resident}
     reduced, half = image.reshape(48, 2, 64, 2, 3).mean(axis=(1, 3)), mask[::2, ::2]
-    expected = fs.localise(reduced, scene, start, mask=half, **given)
-    found = fs.localise(
+    expected = fs.localise(reduced, scene, start, mask=half, **arguments)
+    localisation = fs.localise(
         np.where(mask[..., None], image, 0.5),
         scene,
         camera.with_pose(start.world_to_camera),
         mask=mask,
         max_side=64,
-        **given,
+        **arguments,
     )
-    assert (found.camera.width, found.camera.height) == (128, 96)
-    assert found.pose == pytest.approx(expected.pose, abs=1e-6)
-    assert found.covariance == pytest.approx(expected.covariance, rel=1e-3, abs=1e-12)
+    assert (localisation.camera.width, localisation.camera.height) == (128, 96)
+    assert localisation.pose == pytest.approx(expected.pose, abs=1e-6)
+    assert localisation.covariance == pytest.approx(expected.covariance, rel=1e-3, abs=1e-12)
     with pytest.raises(fs.InputError, match="max_side must be"):
         fs.localise(image, scene, camera, max_side=8, renderer=renderer)
 
@@ -170,9 +172,9 @@ def test_a_wrong_pose_is_not_found(renderer, room, wrong):
     if wrong == "outside the basin":
         start = offset_camera(scene.camera, np.array([0.5, -0.3, 0.2, 0.1, 0.2, -0.1]))
     given = 1 - image if wrong == "negated" else image
-    found = fs.localise(given, scene, start, renderer=renderer, resident=resident)
-    assert not found.found
-    assert found.inliers < 0.4
+    localisation = fs.localise(given, scene, start, renderer=renderer, resident=resident)
+    assert not localisation.found
+    assert localisation.inliers < 0.4
 
 
 def test_a_tag_alone_is_aligned_or_has_a_large_covariance(renderer):
@@ -186,10 +188,10 @@ def test_a_tag_alone_is_aligned_or_has_a_large_covariance(renderer):
         camera = fs.Camera.look_at(160, 120, 0.5, (*random.normal(0, 0.1, 2), 0), (0, 0, 1))
         noisy = renderer.render(resident, camera)["rgb"] + random.normal(0, 0.01, (120, 160, 3))
         start = offset_camera(camera, random.normal(size=6) * 0.006)
-        found = fs.localise(np.clip(noisy, 0, 1), resident, start, renderer=renderer)
-        assert found.found
-        errors.append(off(found.camera, camera)[0])
-        squares.append(normalised(found, camera))
+        localisation = fs.localise(np.clip(noisy, 0, 1), resident, start, renderer=renderer)
+        assert localisation.found
+        errors.append(pose_difference(localisation.camera, camera)[0])
+        squares.append(normalised(localisation, camera))
     assert np.median(errors) < 2
     assert np.median(squares) < 40
 
@@ -205,10 +207,10 @@ def test_a_lens_and_a_grey_image(renderer, name):
     scene, (lens, fx, fy) = scene_with(), LENSES[name]
     camera = fs.Camera.pinhole(64, 48, fx, fy, 33.0, 23.0, scene.camera.world_to_camera, lens=lens)
     image = renderer.render(scene, camera)["rgb"].mean(axis=2)
-    found = fs.localise(image, scene, offset_camera(camera, START / 2), renderer=renderer)
-    assert off(found.camera, camera)[0] < 0.5
-    assert off(found.camera, camera)[0] < 4e3 * found.position_deviation
-    assert found.camera.lens == camera.lens
+    localisation = fs.localise(image, scene, offset_camera(camera, START / 2), renderer=renderer)
+    assert pose_difference(localisation.camera, camera)[0] < 0.5
+    assert pose_difference(localisation.camera, camera)[0] < 4e3 * localisation.position_deviation
+    assert localisation.camera.lens == camera.lens
 
 
 @pytest.mark.parametrize("lens", [None, fs.BrownConrady(k1=-0.1)], ids=["pinhole", "lens"])
@@ -245,22 +247,22 @@ def test_a_store_is_localised_in(renderer, room, tmp_path):
     fs.save_ply(scene.clouds[0], str(tmp_path / "room.ply"))
     store = fs.Store(fs.build_store([str(tmp_path / "room.ply")], str(tmp_path / "room.fss")))
     image = renderer.render(store, scene.camera)["rgb"]
-    found = fs.localise(image, store, offset_camera(scene.camera, START), renderer=renderer)
-    assert found.found
-    assert off(found.camera, scene.camera)[0] < 0.1
+    localisation = fs.localise(image, store, offset_camera(scene.camera, START), renderer=renderer)
+    assert localisation.found
+    assert pose_difference(localisation.camera, scene.camera)[0] < 0.1
 
 
 def test_a_tag_gives_the_initial_pose(renderer, tmp_path, capsys):
-    made = fs.marker("apriltag:36h11:5", size=0.5)
+    marker = fs.marker("apriltag:36h11:5", size=0.5)
     pose = np.eye(4)
     pose[:3, 3] = 3.0, -2.0, 5.75
-    placed = fs.scenes.PlacedMarker(made, pose)
+    placed = fs.scenes.PlacedMarker(marker, pose)
     scene = scene_with(count=40, marker=placed)
     image = renderer.render(scene)["rgb"]
-    found = fs.localise(image, scene, renderer=renderer)
-    assert found.found
-    assert found.start == made.spec
-    assert off(found.camera, scene.camera)[0] < 3
+    localisation = fs.localise(image, scene, renderer=renderer)
+    assert localisation.found
+    assert localisation.start == marker.spec
+    assert pose_difference(localisation.camera, scene.camera)[0] < 3
     scene.save(tmp_path / "scene.toml")
     write_png(tmp_path / "photo.png", image)
     write_png(tmp_path / "blank.png", 0 * image)  # without a tag: the other photograph is found all the same
@@ -283,9 +285,9 @@ def test_the_most_similar_candidate_is_the_start(renderer, room):
         for k in (0.5, 1.5, 2.5, 4.0, 5.0)
     ]
     candidates = [*others[:3], offset_camera(scene.camera, START), *others[3:]]
-    found = fs.localise(image, scene, candidates=candidates, renderer=renderer, resident=resident)
-    assert found.start == "candidates"
-    assert off(found.camera, scene.camera)[0] < 3
+    localisation = fs.localise(image, scene, candidates=candidates, renderer=renderer, resident=resident)
+    assert localisation.start == "candidates"
+    assert pose_difference(localisation.camera, scene.camera)[0] < 3
 
 
 def test_an_image_without_contrast_is_not_found(renderer, room):
@@ -293,9 +295,9 @@ def test_an_image_without_contrast_is_not_found(renderer, room):
     scene, resident, image = room
     away = scene.camera.with_pose(position=(3.0, -2.0, -500.0), target=(3.0, -2.0, -600.0))
     for value, start in ((0, scene.camera), (1, scene.camera), (0, away)):
-        found = fs.localise(0 * image + value, scene, start, renderer=renderer, resident=resident)
-        assert not found.found
-    assert found.position_deviation == math.inf  # no splat is visible
+        localisation = fs.localise(0 * image + value, scene, start, renderer=renderer, resident=resident)
+        assert not localisation.found
+    assert localisation.position_deviation == math.inf  # no splat is visible
 
 
 def test_few_pixels_do_not_determine_a_covariance(renderer, room):
@@ -303,9 +305,9 @@ def test_few_pixels_do_not_determine_a_covariance(renderer, room):
     scene, resident, image = room
     mask = np.zeros((48, 64), bool)
     mask[20:32, 28:40] = True
-    found = fs.localise(image, scene, scene.camera, mask=mask, renderer=renderer, resident=resident)
-    assert found.position_deviation == math.inf
-    assert not found.found
+    localisation = fs.localise(image, scene, scene.camera, mask=mask, renderer=renderer, resident=resident)
+    assert localisation.position_deviation == math.inf
+    assert not localisation.found
 
 
 def test_errors_of_localisation(renderer, room, tmp_path, capsys):

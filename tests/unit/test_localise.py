@@ -86,8 +86,8 @@ def test_a_wheel_slips_by_the_metre_whatever_the_step():
     for steps, step in ((4000, 0.01), (4000, 0.25)):
         rolled = step * np.arange(steps)[:, None] * np.array([1.0, -1.0])  # the right wheel rolls back
         times, poses = np.arange(steps) * CONTROL, np.tile(np.eye(4), (steps, 1, 1))
-        made = _measured(times, poses, rolled, np.zeros(steps), replace(EXACT, slip=slip))
-        off = made.wheels - np.diff(rolled, axis=0, prepend=rolled[:1])
+        odometry = _measured(times, poses, rolled, np.zeros(steps), replace(EXACT, slip=slip))
+        off = odometry.wheels - np.diff(rolled, axis=0, prepend=rolled[:1])
         assert off[0].tolist() == [0.0, 0.0]  # what has not rolled does not slip
         assert off[1:].std(axis=0) == pytest.approx([slip * math.sqrt(step)] * 2, rel=0.05)
         assert off.sum(axis=0) == pytest.approx([0, 0], abs=4 * slip * math.sqrt(steps * step))
@@ -248,24 +248,24 @@ def test_scans_of_a_room_give_the_motion():
 
 def test_errors_are_those_of_evo():
     times = np.linspace(0, 10, 400)
-    truth = np.array([headed(0.1 * t, 0.5 * t, math.sin(t)) for t in times])
+    expected = np.array([headed(0.1 * t, 0.5 * t, math.sin(t)) for t in times])
     rng = np.random.default_rng(0)
-    guess = truth @ np.array(
+    guess = expected @ np.array(
         [headed(a, *b) for a, b in zip(rng.normal(0, 0.02, 400), rng.normal(0, 0.05, (400, 2)), strict=True)]
     )
-    found = errors_of(Run(times, truth, np.zeros((400, 2)), np.zeros(400)), guess)
-    assert found["heading_deg"] == pytest.approx(math.degrees(0.02), rel=0.15)
+    actual = errors_of(Run(times, expected, np.zeros((400, 2)), np.zeros(400)), guess)
+    assert actual["heading_deg"] == pytest.approx(math.degrees(0.02), rel=0.15)
     metrics = pytest.importorskip("evo.core.metrics", reason="pip install evo")
     from evo.core.trajectory import PoseTrajectory3D
 
-    pair = [PoseTrajectory3D(poses_se3=list(poses), timestamps=times) for poses in (truth, guess)]
+    pair = [PoseTrajectory3D(poses_se3=list(poses), timestamps=times) for poses in (expected, guess)]
     ape = metrics.APE(metrics.PoseRelation.translation_part)
     ape.process_data(pair)
-    assert found["ate_m"] == pytest.approx(ape.get_statistic(metrics.StatisticsType.rmse))
-    assert found["worst_m"] == pytest.approx(ape.get_statistic(metrics.StatisticsType.max))
+    assert actual["ate_m"] == pytest.approx(ape.get_statistic(metrics.StatisticsType.rmse))
+    assert actual["worst_m"] == pytest.approx(ape.get_statistic(metrics.StatisticsType.max))
     rpe = metrics.RPE(metrics.PoseRelation.translation_part, 1.0, metrics.Unit.meters, all_pairs=True)
     rpe.process_data(pair)
-    assert found["rpe_m"] == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse), rel=0.2)
+    assert actual["rpe_m"] == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse), rel=0.2)
 
 
 def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
@@ -276,9 +276,9 @@ def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
     first = json.loads(capsys.readouterr().out)
     assert first["variants"]["odometry"]["ate_m"] > 0.02
     assert 9 < first["variants"]["odometry"]["length_m"] < 10
-    truth = fs.load_trajectory(tmp_path / "out/truth.tum")
+    expected = fs.load_trajectory(tmp_path / "out/truth.tum")
     guess = fs.load_trajectory(tmp_path / "out/odometry.tum")
-    off = np.linalg.norm(truth.poses[:, :2, 3] - guess.poses[:, :2, 3], axis=1)
+    off = np.linalg.norm(expected.poses[:, :2, 3] - guess.poses[:, :2, 3], axis=1)
     ate = first["variants"]["odometry"]["ate_m"]  # to six digits
     assert np.sqrt((off**2).mean()) == pytest.approx(
         ate, rel=1e-6, abs=0.5e-6 * 10 ** math.ceil(math.log10(ate))
@@ -294,9 +294,9 @@ def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
     assert main([*whole, "--rows", "1", "--plants", "3"]) == 2
     assert "localise.jsonl must be of the same scene" in capsys.readouterr().err
     assert main([*words[:-1], "odometri"]) == 2
-    said = capsys.readouterr().err
-    assert "unknown variant 'odometri' (did you mean 'odometry'?)" in said
-    assert ", all of these, '0.25 m/s, blur', '1 m/s, blur', up to 1 m, " in said
+    error_output = capsys.readouterr().err
+    assert "unknown variant 'odometri' (did you mean 'odometry'?)" in error_output
+    assert ", all of these, '0.25 m/s, blur', '1 m/s, blur', up to 1 m, " in error_output
     file = tmp_path / "out/localise.jsonl"
     file.write_text(file.read_text().replace(first["run"]["code"], "yesterday's"))
     assert main(words) == 2
@@ -322,8 +322,8 @@ def test_the_drive_as_a_log(tmp_path, monkeypatch):
     counts = {topics[k]: count for k, count in counts.items()}
     ros2 = pytest.importorskip("mcap_ros2.decoder", reason="pip install mcap-ros2-support")
     with (tmp_path / "run.mcap").open("rb") as stream:
-        made = reader.make_reader(stream, decoder_factories=[ros2.DecoderFactory()])
-        turned = next(made.iter_decoded_messages(topics=["/imu/data_raw"]))[-1]
+        log = reader.make_reader(stream, decoder_factories=[ros2.DecoderFactory()])
+        turned = next(log.iter_decoded_messages(topics=["/imu/data_raw"]))[-1]
     assert turned.linear_acceleration_covariance[0] == -1  # no accelerometer
     assert (
         counts["/eye/image_raw/compressed"] == counts["/tf"] == counts["/eye/detections"] == len(images) > 3

@@ -85,15 +85,15 @@ def test_lenses_have_the_coefficients_of_opencv_in_their_order(tmp_path, kind, o
 
 @pytest.mark.parametrize(("name", "read"), [("run.mcap", by_mcap), ("bag", by_rosbags)])
 def test_their_own_readers_read_what_we_write(tmp_path, name, read):
-    found = {}
+    results = {}
     for topic, time, message in read(written(tmp_path / name)):
-        found.setdefault(topic, []).append((time, message))
-    assert set(found) == {
+        results.setdefault(topic, []).append((time, message))
+    assert set(results) == {
         *(f"/front/{part}" for part in ("image_raw", "depth/image_raw", "label/image_raw", "camera_info")),
         *("/front/image_raw/compressed", "/front/detections", "/tf", "/odom", "/imu/data_raw"),
     }
-    assert [[time for time, _ in each] for each in found.values()] == [[500_000_000, 1_250_000_000]] * 9
-    first = {topic: each[0][1] for topic, each in found.items()}
+    assert [[time for time, _ in each] for each in results.values()] == [[500_000_000, 1_250_000_000]] * 9
+    first = {topic: each[0][1] for topic, each in results.items()}
     image, depth, label = (first[f"/front/{part}image_raw"] for part in ("", "depth/", "label/"))
     assert (image.encoding, image.height, image.width, image.step) == ("rgb8", 24, 32, 96)
     assert (image.header.frame_id, image.header.stamp.nanosec) == ("front", 500_000_000)
@@ -107,15 +107,17 @@ def test_their_own_readers_read_what_we_write(tmp_path, name, read):
     assert list(info.p) == [30, 0, 15.5, 0, 0, 31, 11.5, 0, 0, 0, 1, 0]
     (moved,) = first["/tf"].transforms
     assert (moved.header.frame_id, moved.child_frame_id) == ("map", "front")
-    turn = moved.transform.rotation
-    np.testing.assert_allclose(rigid_matrix((1, 2, 3), (turn.w, turn.x, turn.y, turn.z)), POSE, atol=1e-12)
+    rotation = moved.transform.rotation
+    np.testing.assert_allclose(
+        rigid_matrix((1, 2, 3), (rotation.w, rotation.x, rotation.y, rotation.z)), POSE, atol=1e-12
+    )
     odometry = first["/odom"]
     assert (odometry.pose.pose.position.z, odometry.twist.twist.angular.z) == (3, 0.5)
     assert (
         first["/imu/data_raw"].linear_acceleration.z,
         first["/imu/data_raw"].orientation_covariance[0],
     ) == (9.81, -1)
-    not_measured = [each.linear_acceleration_covariance[0] for _, each in found["/imu/data_raw"]]
+    not_measured = [each.linear_acceleration_covariance[0] for _, each in results["/imu/data_raw"]]
     assert not_measured == [0, -1]
     (tag,) = first["/front/detections"].detections
     assert (tag.family, tag.id, tag.corners[2].x, tag.centre.y) == ("36h11", 5, 2.5, 2.5)
@@ -222,9 +224,9 @@ def test_frames_follow_rep_103_and_105(tmp_path, up):
         assert messages[f"/front/depth/{topic}"].header.frame_id == "front_optical_frame"
     tree = {}
     for one in messages["/tf"].transforms:
-        at, turn = one.transform.translation, one.transform.rotation
+        at, rotation = one.transform.translation, one.transform.rotation
         pose = RigidTransform.from_components(
-            [at.x, at.y, at.z], Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
+            [at.x, at.y, at.z], Rotation.from_quat([rotation.x, rotation.y, rotation.z, rotation.w])
         )
         tree[one.header.frame_id, one.child_frame_id] = pose
     map_from_scene, map_from_link = tree["map", "scene"], tree["map", "front_link"]
@@ -250,10 +252,10 @@ def test_damaged_logs(tmp_path, name):
 
     path = written(tmp_path / name)
     file = path if path.is_file() else next(path.glob("*.db3"))
-    whole = file.read_bytes()
+    contents = file.read_bytes()
     random = np.random.default_rng(0)
     for k in range(40):
-        data = bytearray(whole[: random.integers(1, len(whole))] if k % 2 else whole)
+        data = bytearray(contents[: random.integers(1, len(contents))] if k % 2 else contents)
         for place in random.integers(0, len(data), 30):
             data[place] = random.integers(256)
         file.write_bytes(data)

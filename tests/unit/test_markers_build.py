@@ -18,12 +18,12 @@ def text_of(length: int) -> str:
     return "".join(random.Random(1).choices(string.ascii_letters + string.digits, k=length))
 
 
-def coverage(made: Marker, per_module: int = 12) -> tuple[np.ndarray, np.ndarray]:
+def coverage(sign: Marker, per_module: int = 12) -> tuple[np.ndarray, np.ndarray]:
     """The marker over grey as coplanar splats are rendered, in NumPy, and the marker as it is printed."""
-    cloud = made.gaussians
-    h, w = made.grid.shape
-    x = ((np.arange(w * per_module) + 0.5) / per_module - w / 2) * made.module
-    y = ((np.arange(h * per_module) + 0.5) / per_module - h / 2) * made.module
+    cloud = sign.gaussians
+    h, w = sign.grid.shape
+    x = ((np.arange(w * per_module) + 0.5) / per_module - w / 2) * sign.module
+    y = ((np.arange(h * per_module) + 0.5) / per_module - h / 2) * sign.module
     means, scales = cloud.means.astype(float), cloud.scales.astype(float)
     reach = np.sqrt(2 * np.log(255 * cloud.opacities))
     x0, x1 = (np.searchsorted(x, means[:, 0] + side * reach * scales[:, 0]) for side in (-1, 1))
@@ -39,21 +39,21 @@ def coverage(made: Marker, per_module: int = 12) -> tuple[np.ndarray, np.ndarray
         shone[at] += tau * cloud.colors[i, 0]
     left = np.exp(-depth)
     shown = (1 - left) * shone / depth + left * 0.5
-    return shown, np.kron(1.0 - made.grid, np.ones((per_module, per_module)))
+    return shown, np.kron(1.0 - sign.grid, np.ones((per_module, per_module)))
 
 
-def psnr(made: Marker) -> float:
-    shown, printed = coverage(made)
+def psnr(sign: Marker) -> float:
+    shown, printed = coverage(sign)
     return float(-10 * np.log10(np.mean((shown - printed) ** 2)))
 
 
 def test_frame_size_and_corners():
-    made = fs.marker("apriltag:36h11:5", size=0.16)
-    assert isinstance(made, Marker)
-    assert made.module == pytest.approx(0.02)
-    assert made.quiet_zone == 1
-    assert np.allclose(made.corners, [[-0.08, -0.08, 0], [0.08, -0.08, 0], [0.08, 0.08, 0], [-0.08, 0.08, 0]])
-    cloud = made.cloud
+    sign = fs.marker("apriltag:36h11:5", size=0.16)
+    assert isinstance(sign, Marker)
+    assert sign.module == pytest.approx(0.02)
+    assert sign.quiet_zone == 1
+    assert np.allclose(sign.corners, [[-0.08, -0.08, 0], [0.08, -0.08, 0], [0.08, 0.08, 0], [-0.08, 0.08, 0]])
+    cloud = sign.cloud
     assert (cloud.means[:, 2] == 0).all()
     assert np.array_equal(cloud.quats, np.tile(np.float32([1, 0, 0, 0]), (len(cloud), 1)))
     assert np.abs(cloud.means).max() < 0.1
@@ -61,14 +61,14 @@ def test_frame_size_and_corners():
     assert (cloud.coplanar_groups == 0).all()
     assert not cloud.dropped
     assert (cloud.labels == 0).all()
-    assert made.seconds > 0
-    assert "apriltag:36h11:5" in repr(made)
+    assert sign.seconds > 0
+    assert "apriltag:36h11:5" in repr(sign)
 
 
 def test_upright_as_printed():
     """x right and y down: the image is the grid, neither turned nor mirrored; it fits best as it is."""
-    made = marker("aruco:4x4_50:7")
-    shown, printed = coverage(made, 6)
+    sign = marker("aruco:4x4_50:7")
+    shown, printed = coverage(sign, 6)
     error = np.mean((shown - printed) ** 2)
     for turned in (np.rot90(printed), printed.T, printed[::-1], printed[:, ::-1]):
         assert error < 0.1 * np.mean((shown - turned) ** 2)
@@ -81,25 +81,25 @@ def test_size_scales_everything():
 
 
 def test_rectangles_components_and_polygons():
-    made = marker("apriltag:36h11:0")
-    assert made.components == len(made.polygons)
-    assert sum(polygon.area for polygon in made.polygons) == made.grid.size
-    assert all(isinstance(rectangle, Rectangle) for rectangle in made.rectangles)
-    for x0, y0, x1, y1, dark in made.rectangles:
-        assert (made.grid[y0:y1, x0:x1] == dark).all()
-    assert sum((r.x1 - r.x0) * (r.y1 - r.y0) for r in made.rectangles) == made.grid.size
-    assert type(made.rectangles[0].x0) is int
+    sign = marker("apriltag:36h11:0")
+    assert sign.components == len(sign.polygons)
+    assert sum(polygon.area for polygon in sign.polygons) == sign.grid.size
+    assert all(isinstance(rectangle, Rectangle) for rectangle in sign.rectangles)
+    for x0, y0, x1, y1, dark in sign.rectangles:
+        assert (sign.grid[y0:y1, x0:x1] == dark).all()
+    assert sum((r.x1 - r.x0) * (r.y1 - r.y0) for r in sign.rectangles) == sign.grid.size
+    assert type(sign.rectangles[0].x0) is int
 
 
 def test_the_paper_s_mixture_has_its_options():
-    made = marker("apriltag:36h11:0", mixture="paper")
-    n = len(made.boxes)
-    assert len(made.cloud) == 107 * n
+    sign = marker("apriltag:36h11:0", mixture="paper")
+    n = len(sign.boxes)
+    assert len(sign.cloud) == 107 * n
     assert len(marker("apriltag:36h11:0", mixture="paper", duplicates=True).cloud) == 135 * n
     assert len(marker("apriltag:36h11:0", mixture="paper", levels=2, density=1).cloud) == 9 * n
     grown = marker("apriltag:36h11:0", mixture="paper", growth=0.3)
     assert len(grown.cloud) == 107 * n
-    assert psnr(grown) > psnr(made) + 1
+    assert psnr(grown) > psnr(sign) + 1
 
 
 @pytest.mark.parametrize("spec", ["apriltag:36h11:0", "apriltag:25h9:3", "aruco:4x4_50:7"])
@@ -112,14 +112,14 @@ def test_fitted_is_nearer_to_the_print_with_a_quarter_of_the_splats(spec):
     assert psnr(fitted) > psnr(marker(spec, mixture="fitted", growth=0.0))
 
 
-def in_order(made: Marker, angle: float, per_module: int = 24) -> tuple[np.ndarray, np.ndarray]:
+def in_order(sign: Marker, angle: float, per_module: int = 24) -> tuple[np.ndarray, np.ndarray]:
     """Light over grey, and alpha, as other renderers composite: one splat after the other by their centres'
     depth, here along a direction of the plane; alphas at most 0.99, cut off at 1/255.
     """
-    cloud = made.gaussians
-    h, w = made.grid.shape
-    x = ((np.arange(w * per_module) + 0.37) / per_module - w / 2) * made.module
-    y = ((np.arange(h * per_module) + 0.37) / per_module - h / 2) * made.module
+    cloud = sign.gaussians
+    h, w = sign.grid.shape
+    x = ((np.arange(w * per_module) + 0.37) / per_module - w / 2) * sign.module
+    y = ((np.arange(h * per_module) + 0.37) / per_module - h / 2) * sign.module
     means, scales = cloud.means.astype(float), cloud.scales.astype(float)
     reach = np.sqrt(2 * np.log(255))
     x0, x1 = (np.searchsorted(x, means[:, 0] + side * reach * scales[:, 0]) for side in (-1, 1))
@@ -138,9 +138,9 @@ def in_order(made: Marker, angle: float, per_module: int = 24) -> tuple[np.ndarr
 
 @pytest.mark.parametrize("angle", [0.3, 3.8])
 def test_the_nested_template_is_opaque_and_clean_in_any_order(angle):
-    made = marker("aruco:4x4_50:7", mixture="fitted", template=NESTED)
-    shown, alpha = in_order(made, angle)
-    error = shown - np.kron(1.0 - made.grid, np.ones((24, 24)))
+    sign = marker("aruco:4x4_50:7", mixture="fitted", template=NESTED)
+    shown, alpha = in_order(sign, angle)
+    error = shown - np.kron(1.0 - sign.grid, np.ones((24, 24)))
     assert alpha[1:-1, 1:-1].min() > 0.999  # but for 2 % of a module, less than a sample
     assert -10 * np.log10(np.mean(error**2)) > 35
     inside = np.tile(np.arange(24) % 23 > 0, len(error) // 24)  # cells less a sample on each side
@@ -149,9 +149,9 @@ def test_the_nested_template_is_opaque_and_clean_in_any_order(angle):
 
 def test_no_hairs_stand_out_of_the_paper():
     """A line that is much longer than its rectangle gains a few tenths of a decibel and shows as a hair."""
-    made = marker("apriltag:36h11:5", mixture="fitted")
-    edge = made.grid.shape[1] * made.module / 2
-    low, high = made.cloud.bounds()
+    sign = marker("apriltag:36h11:5", mixture="fitted")
+    edge = sign.grid.shape[1] * sign.module / 2
+    low, high = sign.cloud.bounds()
     assert np.all(np.abs([low[:2], high[:2]]) < 1.4 * edge)
 
 
@@ -228,22 +228,22 @@ def test_too_many_splats_are_refused_by_their_number(noise):
 
 
 def test_an_exact_marker_may_have_more_boxes_than_gaussians(noise):
-    made = marker(noise, mixture="exact", max_splats=100_000)
-    assert len(made.cloud) == len(made.boxes)
+    sign = marker(noise, mixture="exact", max_splats=100_000)
+    assert len(sign.cloud) == len(sign.boxes)
     with pytest.raises(fs.InputError, match=r"as Gaussians image:.* at most 100,000 splats"):
-        _ = made.gaussians
+        _ = sign.gaussians
 
 
 def test_clouds_are_filled_part_by_part_bit_identically(noise, monkeypatch):
     for mixture in ("fitted", "exact"):
-        whole, said = marker(noise, mixture=mixture).cloud, []
+        whole, messages = marker(noise, mixture=mixture).cloud, []
         with monkeypatch.context() as patched:
             patched.setattr("fidsplat.markers.printing.CHUNK", 4321)
-            parts = marker(noise, mixture=mixture, progress=lambda *now, to=said: to.append(now)).cloud
+            parts = marker(noise, mixture=mixture, progress=lambda *now, to=messages: to.append(now)).cloud
         for name in ("means", "scales", "opacities", "colors", "quats"):
             assert np.array_equal(getattr(whole, name), getattr(parts, name))
-        assert [words for words, _ in said[:2]] == ["components", "rectangles"]
-        shares = [share for words, share in said if words == "splats"]
+        assert [words for words, _ in messages[:2]] == ["components", "rectangles"]
+        shares = [share for words, share in messages if words == "splats"]
         assert shares == sorted(shares)
         assert 0 == shares[0] < shares[-1] < 1
 
@@ -252,8 +252,8 @@ def test_a_large_checkerboard(tmp_path):
     """Every module becomes a rectangle: an algorithm of more than linear time would not end."""
     bits = np.indices((1000, 1000)).sum(0) % 2 == 1
     spec = f"image:{write_png(tmp_path / 'board.png', bits)}"
-    made = marker(spec, mixture="exact")
-    assert len(made.cloud) == made.components == 1_000_000
+    sign = marker(spec, mixture="exact")
+    assert len(sign.cloud) == sign.components == 1_000_000
     with pytest.raises(fs.InputError, match="at least 25,000,000"):
         marker(spec, mixture="fitted")
 
@@ -270,8 +270,8 @@ def test_the_quiet_zone():
 
 
 def test_a_marker_is_frozen():
-    made = marker("aruco:4x4_50:0")
-    for array in (made.bits, made.grid, made.boxes, made.labels, made.cloud.means):
+    sign = marker("aruco:4x4_50:0")
+    for array in (sign.bits, sign.grid, sign.boxes, sign.labels, sign.cloud.means):
         assert not array.flags.writeable
 
 
@@ -283,7 +283,7 @@ def test_importing_markers_is_light():
 
 
 def test_corners_of_a_marker_that_is_not_square():
-    made = fs.marker("gridboard:2x1:4x4_50", size=0.7, mixture="exact")
-    half = 0.35, 0.35 * made.bits.shape[0] / made.bits.shape[1]
-    np.testing.assert_allclose(made.corners[:, :2], half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
+    sign = fs.marker("gridboard:2x1:4x4_50", size=0.7, mixture="exact")
+    half = 0.35, 0.35 * sign.bits.shape[0] / sign.bits.shape[1]
+    np.testing.assert_allclose(sign.corners[:, :2], half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
     assert half[1] < half[0]

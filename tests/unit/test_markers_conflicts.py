@@ -89,8 +89,8 @@ def test_trees_need_no_search(monkeypatch):
 def test_threads_keep_the_limit():
     limit = sys.getrecursionlimit()
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda n: maximum_independent_set(n, n, *path(n)), [3000, 2000, 1500, 2500]))
-    assert [a.sum() + b.sum() for a, b in found] == [3000, 2000, 1500, 2500]
+        actual = list(pool.map(lambda n: maximum_independent_set(n, n, *path(n)), [3000, 2000, 1500, 2500]))
+    assert [a.sum() + b.sum() for a, b in actual] == [3000, 2000, 1500, 2500]
     assert sys.getrecursionlimit() == limit
 
 

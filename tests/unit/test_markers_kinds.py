@@ -13,53 +13,53 @@ from fidsplat.scenes import PlacedMarker
 PIXELS = 10
 
 
-def printed(made: fs.markers.Marker) -> np.ndarray:
+def printed(sign: fs.markers.Marker) -> np.ndarray:
     """An image of the grid, quiet zone included."""
-    return np.kron(255 * (1 - made.grid), np.ones((PIXELS, PIXELS))).astype(np.uint8)
+    return np.kron(255 * (1 - sign.grid), np.ones((PIXELS, PIXELS))).astype(np.uint8)
 
 
-def place(made, corners: np.ndarray) -> np.ndarray:
+def place(sign, corners: np.ndarray) -> np.ndarray:
     """Pixels in modules of the code: as rendered, pixel centres lie at halves."""
-    return (corners + 0.5) / PIXELS - made.quiet_zone
+    return (corners + 0.5) / PIXELS - sign.quiet_zone
 
 
 @pytest.mark.parametrize(
     ("columns", "rows", "family"), [(7, 5, "4x4_50"), (4, 6, "5x5_100"), (2, 2, "6x6_250")]
 )
 def test_charuco_boards(columns, rows, family):
-    made = marker(f"charuco:{columns}x{rows}:{family}")
-    square = made.bits.shape[1] // columns
-    assert made.bits.shape == (rows * square, columns * square)
+    sign = marker(f"charuco:{columns}x{rows}:{family}")
+    square = sign.bits.shape[1] // columns
+    assert sign.bits.shape == (rows * square, columns * square)
     dictionary = predefined("aruco", family)
     board = cv2.aruco.CharucoBoard((columns, rows), square, square - 2, dictionary)
-    rendered = board.generateImage(made.bits.shape[::-1], marginSize=0, borderBits=1)
-    assert np.array_equal(made.bits, rendered < 128)
-    corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(printed(made))
+    rendered = board.generateImage(sign.bits.shape[::-1], marginSize=0, borderBits=1)
+    assert np.array_equal(sign.bits, rendered < 128)
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(printed(sign))
     assert sorted(ids.ravel().tolist()) == list(range((columns - 1) * (rows - 1)))
     expected = board.getChessboardCorners()[ids.ravel(), :2]
-    assert np.allclose(place(made, corners.reshape(-1, 2)), expected, atol=0.05)
+    assert np.allclose(place(sign, corners.reshape(-1, 2)), expected, atol=0.05)
 
 
 def test_grid_boards():
-    made = marker("gridboard:5x3:4x4_50")
+    sign = marker("gridboard:5x3:4x4_50")
     board = cv2.aruco.GridBoard((5, 3), 6, 2, predefined("aruco", "4x4_50"))
-    rendered = board.generateImage(made.bits.shape[::-1], marginSize=0, borderBits=1)
-    assert np.array_equal(made.bits, rendered < 128)
-    found, ids, _ = cv2.aruco.ArucoDetector(board.getDictionary()).detectMarkers(printed(made))
-    at, image = board.matchImagePoints(found, ids)
+    rendered = board.generateImage(sign.bits.shape[::-1], marginSize=0, borderBits=1)
+    assert np.array_equal(sign.bits, rendered < 128)
+    detected_corners, ids, _ = cv2.aruco.ArucoDetector(board.getDictionary()).detectMarkers(printed(sign))
+    at, image = board.matchImagePoints(detected_corners, ids)
     assert len(at) == 4 * 15
-    assert np.allclose(place(made, image.reshape(-1, 2)), at.reshape(-1, 3)[:, :2], atol=0.15)
+    assert np.allclose(place(sign, image.reshape(-1, 2)), at.reshape(-1, 3)[:, :2], atol=0.15)
 
 
 def test_april_grids():
-    made = marker("aprilgrid:6x4:36h11")
-    assert made.bits.shape == (4 * 10 + 2, 6 * 10 + 2)
+    sign = marker("aprilgrid:6x4:36h11")
+    assert sign.bits.shape == (4 * 10 + 2, 6 * 10 + 2)
     options = cv2.aruco.DetectorParameters()
     # dark squares touch the tags' corners, where contours run on from one to the other
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
     detector = cv2.aruco.ArucoDetector(predefined("apriltag", "36h11"), options)
-    found, ids, _ = detector.detectMarkers(printed(made))
-    places = {int(i): place(made, c.reshape(4, 2)) for i, c in zip(ids.ravel(), found, strict=True)}
+    detected, ids, _ = detector.detectMarkers(printed(sign))
+    places = {int(i): place(sign, c.reshape(4, 2)) for i, c in zip(ids.ravel(), detected, strict=True)}
     assert sorted(places) == list(range(24))
     for number, corners in places.items():
         row, column = divmod(number, 6)  # from the bottom left, as Kalibr counts
@@ -107,14 +107,14 @@ def toy(monkeypatch):
 
 
 def test_a_kind_from_outside_is_a_marker_like_any_other(toy, tmp_path):
-    made = marker("stripes:5", size=0.5)
-    assert (made.kind, made.quiet_zone, made.module) == ("stripes", 3, 0.1)
-    assert made.bits.tolist() == [[0, 1, 0, 1, 0]]
-    assert len(made.cloud) > 0
-    scene = fs.Scene(markers=[PlacedMarker(made)])
+    sign = marker("stripes:5", size=0.5)
+    assert (sign.kind, sign.quiet_zone, sign.module) == ("stripes", 3, 0.1)
+    assert sign.bits.tolist() == [[0, 1, 0, 1, 0]]
+    assert len(sign.cloud) > 0
+    scene = fs.Scene(markers=[PlacedMarker(sign)])
     scene.save(tmp_path / "a.toml")
     again = fs.Scene.load(tmp_path / "a.toml").markers[0].marker
-    assert np.array_equal(again.cloud.means, made.cloud.means)
+    assert np.array_equal(again.cloud.means, sign.cloud.means)
     with pytest.raises(fs.InputError, match="or stripes:N"):
         marker("squares:5")
 

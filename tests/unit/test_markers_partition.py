@@ -89,14 +89,14 @@ def naive_counts(cells: frozenset) -> tuple[int, int]:
 def check_formula(grid: np.ndarray, boxes: np.ndarray) -> None:
     """Per component: rectangles = concave vertices - independent chords - holes + 1, counted from scratch."""
     labels, count = label_components(grid)
-    found = np.bincount(labels[boxes[:, 1], boxes[:, 0]], minlength=count)
+    actual = np.bincount(labels[boxes[:, 1], boxes[:, 0]], minlength=count)
     holes = count_holes(labels, count)
     order = np.argsort(labels.ravel(), kind="stable")
     parts = np.split(order, np.searchsorted(labels.ravel()[order], np.arange(1, count)))
     for i, part in enumerate(parts):
         cells = frozenset(divmod(int(cell), grid.shape[1]) for cell in part)
         concave, independent = naive_counts(cells)
-        assert found[i] == concave - independent - holes[i] + 1
+        assert actual[i] == concave - independent - holes[i] + 1
 
 
 def fewest_rectangles(cells: frozenset) -> int:
@@ -144,10 +144,10 @@ def test_small_grids_are_exact_and_match_the_formula(grid):
 @example(SHARED)
 def test_no_partition_has_fewer_rectangles(grid):
     labels, count = label_components(grid)
-    found = np.bincount(labels[tuple(partition(grid)[:, [1, 0]].T)], minlength=count)
+    actual = np.bincount(labels[tuple(partition(grid)[:, [1, 0]].T)], minlength=count)
     for i in range(count):
         cells = frozenset((int(y), int(x)) for y, x in np.argwhere(labels == i))
-        assert found[i] == fewest_rectangles(cells)
+        assert actual[i] == fewest_rectangles(cells)
 
 
 @settings(max_examples=200)
@@ -184,10 +184,10 @@ def test_every_tag_of_36h11():
 @pytest.mark.parametrize(("length", "version"), [(20, 2), (100, 5), (250, 10), (1000, 22)])
 def test_qr_codes(length, version):
     text = "".join(random.Random(length).choices(string.ascii_letters + string.digits, k=length))
-    made = marker(f"qr:{text}")
-    assert made.family == f"v{version}-L"
-    check_exact(made.grid, made.boxes)
-    check_formula(made.grid, made.boxes)
+    sign = marker(f"qr:{text}")
+    assert sign.family == f"v{version}-L"
+    check_exact(sign.grid, sign.boxes)
+    check_formula(sign.grid, sign.boxes)
 
 
 def test_shapes_known_by_hand():
@@ -214,8 +214,8 @@ def test_chords_are_between_neighbours_with_an_interior_between():
     # a comb with teeth up and down: on each line concave vertices see each other, or a gap lies between
     grid = np.array([[0, 1, 0, 1, 0], [1, 1, 1, 1, 1], [0, 1, 0, 1, 0]], np.uint8)
     concave = concave_vertices(grid)
-    found = {tuple(chord) for chord in chords(grid, concave).tolist()}
-    assert found == {(1, 1, 2), (1, 3, 4), (2, 1, 2), (2, 3, 4)}
+    actual = {tuple(chord) for chord in chords(grid, concave).tolist()}
+    assert actual == {(1, 1, 2), (1, 3, 4), (2, 1, 2), (2, 3, 4)}
     across, down = independent_chords(grid, concave)
     assert len(across) + len(down) == 4
 

@@ -13,7 +13,7 @@ EIGHT = (*FOUR, (1, 1), (1, -1), (-1, 1), (-1, -1))
 
 def flood(mask: np.ndarray, steps) -> list[set[tuple[int, int]]]:
     """Components of the True cells, in raster order."""
-    left, found = set(zip(*np.nonzero(mask), strict=True)), []
+    left, results = set(zip(*np.nonzero(mask), strict=True)), []
     for cell in sorted(left):
         if cell not in left:
             continue
@@ -27,8 +27,8 @@ def flood(mask: np.ndarray, steps) -> list[set[tuple[int, int]]]:
                     left.discard(other)
                     part.add(other)
                     stack.append(other)
-        found.append(part)
-    return found
+        results.append(part)
+    return results
 
 
 def holes(cells: set[tuple[int, int]], shape: tuple[int, int]) -> int:

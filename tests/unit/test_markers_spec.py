@@ -70,11 +70,11 @@ def test_a_spec_is_text():
 @pytest.mark.parametrize("kind", ["apriltag", "aruco"])
 def test_every_dictionary(kind):
     for family, (size, count) in families(kind).items():
-        made = marker(f"{kind}:{family}:{count - 1}")
-        assert made.bits.shape == (size, size)
-        assert np.array_equal(made.bits, dictionary_bits(kind, family, count - 1))
-        assert made.grid.shape == (size + 2 * made.quiet_zone,) * 2
-        assert made.quiet_zone == (0 if family.startswith("circle") else 1)
+        sign = marker(f"{kind}:{family}:{count - 1}")
+        assert sign.bits.shape == (size, size)
+        assert np.array_equal(sign.bits, dictionary_bits(kind, family, count - 1))
+        assert sign.grid.shape == (size + 2 * sign.quiet_zone,) * 2
+        assert sign.quiet_zone == (0 if family.startswith("circle") else 1)
         with pytest.raises(InputError, match=f"0 to {count - 1}"):
             marker(f"{kind}:{family}:{count}")
 
@@ -107,18 +107,18 @@ def test_a_version_higher_than_needed_is_used():
 @pytest.mark.parametrize("text", ["hello", "123456", "HELLO", "café: 5 µm", "10 € für 日本語", "a:b:c"])
 def test_qr_codes_read_back_as_written(text):
     bits = bits_of(parse_spec(f"qr:{text}"))[1]
-    assert [found.payload for found in detect(printed(bits), families=())] == [text]
+    assert [detection.payload for detection in detect(printed(bits), families=())] == [text]
 
 
 def test_image_files(tmp_path):
     bits = np.array([[1, 0, 1], [0, 0, 1]], np.uint8)
     file = tmp_path / "a picture.png"
     cv2.imwrite(str(file), 255 * (1 - bits))
-    made = marker(f"image:{file}", size=0.3)
-    assert np.array_equal(made.bits, bits)
-    assert np.array_equal(made.grid, bits)
-    assert (made.kind, made.family, made.id, made.payload) == ("image", None, None, str(file))
-    assert made.module == pytest.approx(0.1)
+    sign = marker(f"image:{file}", size=0.3)
+    assert np.array_equal(sign.bits, bits)
+    assert np.array_equal(sign.grid, bits)
+    assert (sign.kind, sign.family, sign.id, sign.payload) == ("image", None, None, str(file))
+    assert sign.module == pytest.approx(0.1)
     assert marker(f"image:{file}", quiet_zone=2).grid.shape == (6, 7)
     cv2.imwrite(str(file), np.arange(12, dtype=np.uint8).reshape(3, 4))
     with pytest.raises(InputError, match=r"a picture\.png"):

@@ -36,16 +36,16 @@ def sheet_points(count: int) -> np.ndarray:
 
 def corners_of(cloud: fs.SplatCloud) -> np.ndarray:
     """Corners (n, 4, 3) of boxes."""
-    turn, scales = quaternion_to_matrix(cloud.quats), cloud.scales.astype(float)
+    rotation, scales = quaternion_to_matrix(cloud.quats), cloud.scales.astype(float)
     sides = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * scales[:, None]
-    return cloud.world_means()[:, None] + sides @ turn[:, :, :2].transpose(0, 2, 1)
+    return cloud.world_means()[:, None] + sides @ rotation[:, :, :2].transpose(0, 2, 1)
 
 
 @on_each
 def test_splats_are_near_the_surface_with_its_normals(shape):
     """Random points of the boxes, against the nearest of a dense grid of points of the surface."""
-    made, cells = fs.marker(SPEC, SIZE, shape=shape), 300
-    corners, rng = corners_of(made.cloud), np.random.default_rng(0)
+    marker, cells = fs.marker(SPEC, SIZE, shape=shape), 300
+    corners, rng = corners_of(marker.cloud), np.random.default_rng(0)
     some = rng.integers(0, len(corners), 400)
     a, b = rng.random((2, 400, 1))
     corner = corners[some]
@@ -61,10 +61,10 @@ def test_splats_are_near_the_surface_with_its_normals(shape):
     assert along_normal.max() > SIZE / 25000
     assert distance.max() < SIZE / 2500 + step
 
-    near = grid.query(made.cloud.means)[1]
-    cosine = (quaternion_to_matrix(made.cloud.quats)[:, :, 2] * frames.normals[near]).sum(1)
+    near = grid.query(marker.cloud.means)[1]
+    cosine = (quaternion_to_matrix(marker.cloud.quats)[:, :, 2] * frames.normals[near]).sum(1)
     assert np.arccos(np.minimum(cosine, 1)).max() < 0.71 * step / sharpest + 1e-3
-    area = (made.cloud.scales.prod(1) * 4).sum()
+    area = (marker.cloud.scales.prod(1) * 4).sum()
     assert area > SHEET**2
 
 
@@ -105,13 +105,13 @@ def test_rectangles_keep_their_area_and_tangents(shape):
 
 def test_a_cylinder_in_closed_form():
     radius = 0.07
-    made = fs.marker(SPEC, SIZE, shape=Cylinder(radius))
+    marker = fs.marker(SPEC, SIZE, shape=Cylinder(radius))
     angle = SIZE / 2 / radius
     x, z = radius * math.sin(angle), radius * (1 - math.cos(angle))
     y = SIZE / 2
-    assert np.allclose(made.corners, [[-x, -y, z], [x, -y, z], [x, y, z], [-x, y, z]], atol=1e-15)
+    assert np.allclose(marker.corners, [[-x, -y, z], [x, -y, z], [x, y, z], [-x, y, z]], atol=1e-15)
     # the arc between the outer edges of the splats is the width of the flat sheet
-    corners = corners_of(made.cloud)
+    corners = corners_of(marker.cloud)
     angles = np.arctan2(corners[..., 0], radius - corners[..., 2])
     assert radius * (angles.max() - angles.min()) == pytest.approx(SHEET, abs=4 * SIZE / 2500)
     inside = fs.marker(SPEC, SIZE, shape=Cylinder(-radius, axis="x"))
@@ -151,32 +151,32 @@ def test_other_shapes_in_closed_form():
 def test_no_light_passes_between_the_pieces(renderer):
     camera = fs.Camera.look_at(64, 48, 0.25, (0.02, -0.05, -0.2), (0, 0, 0))
     for shape in SHAPES[:1] + SHAPES[2:]:
-        made = fs.marker(SPEC, SIZE, shape=shape)
-        frame = renderer.render(made.cloud, fs.Capture(camera, ("rgb", "alpha")))
+        marker = fs.marker(SPEC, SIZE, shape=shape)
+        frame = renderer.render(marker.cloud, fs.Capture(camera, ("rgb", "alpha")))
         assert frame["alpha"].min() > 0.99, shape
 
 
 def test_a_detector_reads_wide_cylinders_and_its_truth_follows_the_shape(renderer):
     camera = fs.Camera.look_at(200, 200, 0.7, (0, 0, -0.35), (0, 0, 0))
-    found = {}
+    results = {}
     for radius in (2.0, 0.04):
         placed = PlacedMarker(fs.marker(SPEC, SIZE, shape=Cylinder(radius)))
         scene = fs.Scene(markers=[placed], camera=camera, background=(0.5, 0.5, 0.5))
         frame = renderer.render(scene, outputs=("rgb", "label", "depth"))
-        truth = truth_of(frame, scene).markers[0]
-        found[radius] = read_back(frame, scene).readings[0]
-        assert np.allclose(truth.corners, camera.project(placed.corners))
+        expected = truth_of(frame, scene).markers[0]
+        results[radius] = read_back(frame, scene).readings[0]
+        assert np.allclose(expected.corners, camera.project(placed.corners))
         # depth at the centre is that of the flat marker, and grows with the distance from the axis
         depth = frame["depth"]
         assert depth[100, 100] == pytest.approx(0.35, abs=2e-4)
         mask = frame["label"] == 1
-        assert truth.box is not None
-        x0, _, x1, _ = truth.box
+        assert expected.box is not None
+        x0, _, x1, _ = expected.box
         assert np.flatnonzero(mask.any(0))[[0, -1]] == pytest.approx([x0, x1 - 1], abs=1.5)
-    assert found[2.0].corner_error is not None
-    assert found[2.0].corner_error < 0.4
-    assert found[0.04].detection is None
-    assert 0 < found[0.04].visible < 1.0001
+    assert results[2.0].corner_error is not None
+    assert results[2.0].corner_error < 0.4
+    assert results[0.04].detection is None
+    assert 0 < results[0.04].visible < 1.0001
 
 
 def test_shapes_in_scene_files(tmp_path):
@@ -218,11 +218,11 @@ def test_a_flat_marker_has_the_same_splats_as_ever():
 
 def test_gaussians_of_a_bent_marker(renderer):
     """As Gaussians the marker has the same surface, and the facets of its mixture are refused."""
-    made = fs.marker("apriltag:16h5:3", SIZE, "fitted", template=5, shape=Cylinder(0.1))
-    radii = np.hypot(made.cloud.means[:, 0], 0.1 - made.cloud.means[:, 2])
+    marker = fs.marker("apriltag:16h5:3", SIZE, "fitted", template=5, shape=Cylinder(0.1))
+    radii = np.hypot(marker.cloud.means[:, 0], 0.1 - marker.cloud.means[:, 2])
     assert np.abs(radii - 0.1).max() < SIZE / 2500
     camera = fs.Camera.look_at(160, 160, 0.7, (0, 0, -0.35), (0, 0, 0))
-    image = renderer.render(made.cloud, camera, background=(0.5, 0.5, 0.5))["rgb"]
+    image = renderer.render(marker.cloud, camera, background=(0.5, 0.5, 0.5))["rgb"]
     assert [code.name for code in detect(to_uint8(image), ["apriltag:16h5"])] == ["apriltag:16h5:3"]
     with pytest.raises(fs.InputError, match="mixture facets"):
         fs.marker(SPEC, SIZE, "facets", shape=Cylinder(0.1))
@@ -231,12 +231,12 @@ def test_gaussians_of_a_bent_marker(renderer):
 def test_light_of_a_worn_tag_on_a_cylinder_follows_its_normals(renderer):
     """Paper under a sun: 0.85 / pi times the irradiance times the cosine to the normal of the cylinder."""
     radius = 0.06
-    made = fs.marker(SPEC, SIZE, shape=Cylinder(radius), wear="dirt=0.1,seed=1")
+    marker = fs.marker(SPEC, SIZE, shape=Cylinder(radius), wear="dirt=0.1,seed=1")
     sun = fs.Sun(direction=(0.8, 0.0, 0.6), intensity=3.0)
-    scene = fs.Scene(markers=[PlacedMarker(made, light="lights")], lights=[sun])
+    scene = fs.Scene(markers=[PlacedMarker(marker, light="lights")], lights=[sun])
     cloud = renderer.lit(scene).cloud()
-    paper = (made.cloud.colors == 1).all(1)
-    assert len(cloud) == len(made.cloud)
+    paper = (marker.cloud.colors == 1).all(1)
+    assert len(cloud) == len(marker.cloud)
     turn = np.arctan2(cloud.means[paper, 0], radius - cloud.means[paper, 2])
     cosine = np.maximum(-(0.8 * np.sin(turn) - 0.6 * np.cos(turn)), 0)
     light = to_light(cloud.plain_colors[paper, 0], "srgb")

@@ -29,7 +29,7 @@ def rendered(folder, body: str, modules: int = 40, view: str = "0 0 40 20", **op
 
 
 def test_shapes_are_painted_one_over_the_other(tmp_path):
-    made = rendered(
+    drawing = rendered(
         tmp_path,
         '<rect x="2" y="3" width="10" height="8" fill="#ff0000"/>'
         '<g fill="blue" transform="translate(20 2)"><rect width="5" height="4"/><g transform="scale(2)">'
@@ -41,15 +41,15 @@ def test_shapes_are_painted_one_over_the_other(tmp_path):
     expected[2:6, 20:25] = 2
     expected[4:8, 26:30] = 1
     expected[5:9, 4:8] = 0
-    assert np.array_equal(made.bits, expected)
-    assert made.palette.tolist() == [[1, 1, 1], [1, 0, 0], [0, 0, 1]]
-    assert (made.kind, made.quiet_zone, made.module) == ("svg", 0, 1 / 40)
+    assert np.array_equal(drawing.bits, expected)
+    assert drawing.palette.tolist() == [[1, 1, 1], [1, 0, 0], [0, 0, 1]]
+    assert (drawing.kind, drawing.quiet_zone, drawing.module) == ("svg", 0, 1 / 40)
 
 
 def test_rectangles_of_whole_modules_are_as_few_as_can_be(tmp_path):
-    made = rendered(tmp_path, '<path d="M10 5h20v10h-20z" fill="red"/>', quiet_zone=2)
-    assert (made.regions, made.angles, made.boxes.dtype) == (None, None, np.int64)
-    assert len(made.boxes) == 5
+    drawing = rendered(tmp_path, '<path d="M10 5h20v10h-20z" fill="red"/>', quiet_zone=2)
+    assert (drawing.regions, drawing.angles, drawing.boxes.dtype) == (None, None, np.int64)
+    assert len(drawing.boxes) == 5
 
 
 CURVED = (
@@ -60,30 +60,32 @@ CURVED = (
 
 def test_rectangles_cover_exactly_the_drawing(tmp_path):
     """Circles, obtuse and acute corners, a sliver thinner than a module, of either colour at an edge."""
-    made = rendered(tmp_path, CURVED, quiet_zone=2)
-    rectangles = np.array(shapely.polygons(rotated(made.boxes, made.boxes, made.angles)))
-    assert made.palette.tolist()[0] == [1, 1, 1]
-    assert len(made.regions) == len(made.palette) == 5
-    assert sum(region.area for region in made.regions) == pytest.approx(made.grid.size, abs=1e-4)
-    for value, region in enumerate(made.regions):
-        union = shapely.union_all(rectangles[made.values == value])
+    drawing = rendered(tmp_path, CURVED, quiet_zone=2)
+    rectangles = np.array(shapely.polygons(rotated(drawing.boxes, drawing.boxes, drawing.angles)))
+    assert drawing.palette.tolist()[0] == [1, 1, 1]
+    assert len(drawing.regions) == len(drawing.palette) == 5
+    assert sum(region.area for region in drawing.regions) == pytest.approx(drawing.grid.size, abs=1e-4)
+    for value, region in enumerate(drawing.regions):
+        union = shapely.union_all(rectangles[drawing.values == value])
         assert (region - union).area < 1e-6
         assert (union - region).area < 1e-3
-        assert sum(shapely.area(rectangles[made.values == value])) < 1.5 * region.area + 1
-    assert np.array_equal(made.cloud.colors, made.palette[made.values])
-    assert made.components == len(made.polygons)
-    y, x = np.indices(made.grid.shape) + 0.5
-    for value, region in enumerate(made.regions):
+        assert sum(shapely.area(rectangles[drawing.values == value])) < 1.5 * region.area + 1
+    assert np.array_equal(drawing.cloud.colors, drawing.palette[drawing.values])
+    assert drawing.components == len(drawing.polygons)
+    y, x = np.indices(drawing.grid.shape) + 0.5
+    for value, region in enumerate(drawing.regions):
         sure = shapely.distance(region.boundary, shapely.points(x, y)) > 1e-3
-        assert np.array_equal((made.grid == value)[sure], shapely.contains_xy(region, x, y)[sure])
+        assert np.array_equal((drawing.grid == value)[sure], shapely.contains_xy(region, x, y)[sure])
 
 
 def test_gaussians_stay_within_their_colour(tmp_path):
-    made = rendered(tmp_path, CURVED)
-    fitted = made.gaussians
-    x, y = (fitted.means[:, :2] / made.module + np.array(made.grid.shape[::-1]) / 2).T.astype(np.float64)
-    for value, region in enumerate(made.regions):
-        own = (fitted.colors == made.palette[value]).all(1)
+    drawing = rendered(tmp_path, CURVED)
+    fitted = drawing.gaussians
+    x, y = (fitted.means[:, :2] / drawing.module + np.array(drawing.grid.shape[::-1]) / 2).T.astype(
+        np.float64
+    )
+    for value, region in enumerate(drawing.regions):
+        own = (fitted.colors == drawing.palette[value]).all(1)
         assert shapely.distance(region, shapely.points(x[own], y[own])).max() < 0.05
 
 
@@ -92,7 +94,7 @@ def test_gaussians_stay_within_their_colour(tmp_path):
 def test_what_rings_enclose(points, evenodd):
     """Against the winding number as the sum over triangles from one corner to each edge."""
     ring = np.array(points)
-    found = filled([ring], "evenodd" if evenodd else "nonzero")
+    actual = filled([ring], "evenodd" if evenodd else "nonzero")
     y, x = np.indices((12, 12)) + 0.5
     winding = np.zeros((12, 12), int)
     near = np.zeros((12, 12), bool)
@@ -104,7 +106,7 @@ def test_what_rings_enclose(points, evenodd):
         turn = np.sign(np.cross(np.append(b - a, 0), np.append(c - a, 0))[2])
         winding += (turn * shapely.contains_xy(triangle, x, y)).astype(int)
     expected = winding % 2 == 1 if evenodd else winding != 0
-    assert np.array_equal(shapely.contains_xy(found, x, y)[~near], expected[~near])
+    assert np.array_equal(shapely.contains_xy(actual, x, y)[~near], expected[~near])
 
 
 def test_fill_rules():
@@ -246,22 +248,24 @@ def test_files_that_are_no_drawings(tmp_path):
 
 
 def test_a_drawing_in_a_scene_file_is_next_to_it(tmp_path):
-    made = rendered(tmp_path, '<rect width="20" height="20" fill="red"/>')
-    fs.Scene(markers=[PlacedMarker(made)]).save(tmp_path / "scene.toml")
+    drawing = rendered(tmp_path, '<rect width="20" height="20" fill="red"/>')
+    fs.Scene(markers=[PlacedMarker(drawing)]).save(tmp_path / "scene.toml")
     assert 'spec = "svg-40:sign.svg"' in (tmp_path / "scene.toml").read_text()
     again = fs.Scene.load(tmp_path / "scene.toml").markers[0].marker
-    assert np.array_equal(again.cloud.colors, made.cloud.colors)
+    assert np.array_equal(again.cloud.colors, drawing.cloud.colors)
 
 
 def test_shapes_that_touch_the_sheet_leave_no_lines(tmp_path):
     """The first shape is outside of the sheet and shares an edge with it."""
-    made = rendered(tmp_path, '<rect x="-5" width="5" height="9" fill="red"/><circle cx="9" cy="9" r="5"/>')
-    assert set(map(tuple, made.cloud.colors[:, :3])) == {(0, 0, 0), (1, 1, 1)}
+    drawing = rendered(
+        tmp_path, '<rect x="-5" width="5" height="9" fill="red"/><circle cx="9" cy="9" r="5"/>'
+    )
+    assert set(map(tuple, drawing.cloud.colors[:, :3])) == {(0, 0, 0), (1, 1, 1)}
 
 
 def test_what_a_style_sheet_says(tmp_path):
     """Of equals the later; attributes, tags, classes, ids, an element's own: each over those before."""
-    made = rendered(
+    drawing = rendered(
         tmp_path,
         "<style>/* as it comes */ .a, .b { fill: #ff0000; } rect { fill: lime } .c.b { fill: navy }"
         " #it { visibility: hidden } .d { fill-rule: evenodd }</style>"
@@ -275,7 +279,7 @@ def test_what_a_style_sheet_says(tmp_path):
     expected |= {(5, 0): (0, 128 / 255, 128 / 255), (0, 10): (220 / 255, 20 / 255, 60 / 255)}
     expected |= {(4, 14): names[""]}
     for (x, y), color in expected.items():
-        assert np.allclose(made.palette[made.bits[y, x]], color), (x, y)
+        assert np.allclose(drawing.palette[drawing.bits[y, x]], color), (x, y)
 
 
 def test_colours_have_the_names_of_css():
@@ -287,34 +291,34 @@ def test_colours_have_the_names_of_css():
 
 
 def test_invisible_shapes_are_not_rendered(tmp_path):
-    made = rendered(
+    drawing = rendered(
         tmp_path,
         '<g visibility="hidden"><rect width="5" height="5"/><rect x="9" width="5" height="5" '
         'visibility="visible"/></g><rect y="9" width="5" height="5" fill="transparent"/>'
         '<switch><desc/><rect x="20" width="5" height="5" requiredExtensions="x"/>'
         '<rect x="25" width="5" height="5"/><rect x="30" width="5" height="5"/></switch>',
     )
-    assert np.flatnonzero(made.bits.any(0)).tolist() == [*range(9, 14), *range(25, 30)]
-    assert not made.bits[5:].any()
+    assert np.flatnonzero(drawing.bits.any(0)).tolist() == [*range(9, 14), *range(25, 30)]
+    assert not drawing.bits[5:].any()
 
 
 def test_round_corners(tmp_path):
-    made = rendered(tmp_path, '<rect x="1px" y="2" width="30" height="16" rx="4" fill="red"/>')
-    assert made.regions[1].area == pytest.approx(30 * 16 - (4 - np.pi) * 16, rel=1e-3)
-    made = rendered(tmp_path, '<rect width="30" height="16" rx="99" ry="99" fill="red"/>')
-    assert made.regions[1].area == pytest.approx(np.pi * 15 * 8, rel=1e-3)
-    made = rendered(tmp_path, '<path d="M10 0h10v10h-10z" transform="skewX(45)" fill="red"/>')
-    assert made.regions[1].bounds == pytest.approx((10, 0, 30, 10))
+    drawing = rendered(tmp_path, '<rect x="1px" y="2" width="30" height="16" rx="4" fill="red"/>')
+    assert drawing.regions[1].area == pytest.approx(30 * 16 - (4 - np.pi) * 16, rel=1e-3)
+    drawing = rendered(tmp_path, '<rect width="30" height="16" rx="99" ry="99" fill="red"/>')
+    assert drawing.regions[1].area == pytest.approx(np.pi * 15 * 8, rel=1e-3)
+    drawing = rendered(tmp_path, '<path d="M10 0h10v10h-10z" transform="skewX(45)" fill="red"/>')
+    assert drawing.regions[1].bounds == pytest.approx((10, 0, 30, 10))
 
 
 def test_curves_that_touch_make_no_heaps_of_gaussians(tmp_path):
     """Between them lie slivers of paper ten thousand times as long as wide."""
     body = '<rect width="40" height="20" rx="6" fill="red"/>'
-    made = rendered(tmp_path, body)
-    thin = (made.boxes[:, 2:] - made.boxes[:, :2]).min(1) < 1 / 64
+    drawing = rendered(tmp_path, body)
+    thin = (drawing.boxes[:, 2:] - drawing.boxes[:, :2]).min(1) < 1 / 64
     assert thin.sum() > 20
-    assert len(made.gaussians) < 20_000
-    assert np.array_equal(rendered(tmp_path, body, mixture="fitted").cloud.means, made.gaussians.means)
+    assert len(drawing.gaussians) < 20_000
+    assert np.array_equal(rendered(tmp_path, body, mixture="fitted").cloud.means, drawing.gaussians.means)
 
 
 def test_scribbles_are_refused(tmp_path):
@@ -338,8 +342,8 @@ def test_one_outline_many_times_over_is_refused_soon(tmp_path):
 def test_crossing_segments_are_those_of_geos():
     ends = np.random.default_rng(8).integers(0, 7, (2, 20_000, 2, 2)).astype(float)
     one, other = ends[:, (ends[:, :, 0] != ends[:, :, 1]).any(axis=2).all(axis=0)]
-    wanted = shapely.crosses(shapely.linestrings(one), shapely.linestrings(other))
-    np.testing.assert_array_equal(_crosses(one, other), wanted)
+    expected = shapely.crosses(shapely.linestrings(one), shapely.linestrings(other))
+    np.testing.assert_array_equal(_crosses(one, other), expected)
 
 
 def test_which_modules_a_region_meets():

@@ -18,10 +18,10 @@ SHEET = 0.2**2
 """m^2 of the marker with its quiet zone"""
 
 
-def areas(made: fs.Marker) -> dict[tuple[float, ...], float]:
+def areas(marker: fs.Marker) -> dict[tuple[float, ...], float]:
     """Area of the boxes of each colour, in m^2."""
-    own = 4 * made.cloud.scales.astype(float).prod(1)
-    colors, index = np.unique(made.cloud.colors.astype(float).round(3), axis=0, return_inverse=True)
+    own = 4 * marker.cloud.scales.astype(float).prod(1)
+    colors, index = np.unique(marker.cloud.colors.astype(float).round(3), axis=0, return_inverse=True)
     totals = np.bincount(index.ravel(), own)
     return {tuple(color.tolist()): total for color, total in zip(colors, totals, strict=True)}
 
@@ -45,15 +45,15 @@ def test_severity_0_is_the_new_marker_and_seeds_are_reproducible(effect):
         assert np.array_equal(getattr(one.cloud, name), getattr(again.cloud, name))
     if effect != "fading":
         assert not (len(one.cloud) == len(other.cloud) and np.array_equal(one.cloud.means, other.cloud.means))
-    for made in (one, worn(1.0, effect)):
-        assert np.array_equal(made.corners, plain.corners)
-        assert np.array_equal(made.boxes, plain.boxes)
+    for marker in (one, worn(1.0, effect)):
+        assert np.array_equal(marker.corners, plain.corners)
+        assert np.array_equal(marker.boxes, plain.boxes)
 
 
 def test_fading_loses_contrast_and_no_area():
-    made = fs.marker(SPEC, SIZE, black=(0.1, 0.1, 0.1), white=(0.9, 0.9, 0.9), wear=Wear(fading=0.25))
-    found = areas(made)
-    assert found == {(0.3, 0.3, 0.3): pytest.approx(INK), (0.9, 0.9, 0.9): pytest.approx(SHEET - INK)}
+    marker = fs.marker(SPEC, SIZE, black=(0.1, 0.1, 0.1), white=(0.9, 0.9, 0.9), wear=Wear(fading=0.25))
+    dark_areas = areas(marker)
+    assert dark_areas == {(0.3, 0.3, 0.3): pytest.approx(INK), (0.9, 0.9, 0.9): pytest.approx(SHEET - INK)}
 
 
 @pytest.mark.parametrize("severity", [0.1, 0.5, 1.0])
@@ -81,13 +81,13 @@ def test_areas_are_those_of_the_severity(severity):
 def test_ink_bleeds_by_a_distance_on_average(tmp_path):
     """A square of ink grows by a rounded rim: 4 a r + pi r^2."""
     file = write_png(tmp_path / "square.png", np.pad(np.zeros((4, 4), np.uint8), 1, constant_values=255))
-    made = fs.marker(f"image:{file}", SIZE, quiet_zone=2, wear=Wear(bleed=0.6, seed=3))
-    module = made.module
+    marker = fs.marker(f"image:{file}", SIZE, quiet_zone=2, wear=Wear(bleed=0.6, seed=3))
+    module = marker.module
     side, reach = 4 * module, 0.5 * 0.6 * module
-    grown = areas(made)[0.0, 0.0, 0.0] - side**2
+    grown = areas(marker)[0.0, 0.0, 0.0] - side**2
     ideal = 4 * side * reach + np.pi * reach**2
     assert grown == pytest.approx(ideal, rel=0.25)
-    dark = made.cloud.means[made.cloud.colors[:, 0] == 0]
+    dark = marker.cloud.means[marker.cloud.colors[:, 0] == 0]
     assert np.abs(dark[:, :2]).max() < side / 2 + 1.3 * reach + module / 16
 
 
@@ -95,8 +95,8 @@ def test_a_detector_reads_light_wear_and_fails_at_the_end(renderer):
     camera = fs.Camera.look_at(160, 160, 0.75, (0.0, -0.03, -0.3), (0, 0, 0))
 
     def read(wear: Wear, shape=None) -> bool:
-        made = fs.marker(SPEC, SIZE, wear=wear, shape=shape)
-        image = renderer.render(made.cloud, camera, background=(0.4, 0.5, 0.6))["rgb"]
+        marker = fs.marker(SPEC, SIZE, wear=wear, shape=shape)
+        image = renderer.render(marker.cloud, camera, background=(0.4, 0.5, 0.6))["rgb"]
         return SPEC in [code.name for code in detect(to_uint8(image), ["apriltag:36h11"])]
 
     for effect in EFFECTS:
@@ -110,10 +110,10 @@ def test_a_detector_reads_light_wear_and_fails_at_the_end(renderer):
 
 def test_wear_of_each_kind_of_marker_and_mixture(tmp_path):
     for spec in ("qr:hello", "charuco:3x3:4x4_50", "apriltag:circle21h7:3"):
-        made = fs.marker(spec, SIZE, wear="dirt=0.2,scratches=0.1,seed=4")
-        assert made.wear == Wear(dirt=0.2, scratches=0.1, seed=4)
-        assert sum(areas(made).values()) == pytest.approx(sum(areas(fs.marker(spec, SIZE)).values()))
-        assert set(made.cloud.coplanar_groups.tolist()) == {0}
+        marker = fs.marker(spec, SIZE, wear="dirt=0.2,scratches=0.1,seed=4")
+        assert marker.wear == Wear(dirt=0.2, scratches=0.1, seed=4)
+        assert sum(areas(marker).values()) == pytest.approx(sum(areas(fs.marker(spec, SIZE)).values()))
+        assert set(marker.cloud.coplanar_groups.tolist()) == {0}
     bent = fs.marker("apriltag:16h5:3", SIZE, "fitted", template=5, wear=Wear(tear=0.2), shape=Cylinder(0.1))
     assert np.abs(np.hypot(bent.cloud.means[:, 0], 0.1 - bent.cloud.means[:, 2]) - 0.1).max() < SIZE / 1500
     assert len(fs.marker(SPEC, SIZE, wear=Wear(fold=0.3)).gaussians) > 25

@@ -43,9 +43,9 @@ def ball():
 
 
 def test_area_and_volume_of_a_sphere_are_the_closed_forms(ball):
-    away = np.linalg.norm(ball.vertices - AT, axis=1) - RADIUS
-    assert np.abs(away).max() < VOXEL / 2
-    assert math.sqrt(np.mean(away**2)) < VOXEL / 10
+    distance = np.linalg.norm(ball.vertices - AT, axis=1) - RADIUS
+    assert np.abs(distance).max() < VOXEL / 2
+    assert math.sqrt(np.mean(distance**2)) < VOXEL / 10
     assert ball.area == pytest.approx(4 * math.pi * RADIUS**2, rel=0.03)
     assert ball.volume == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=0.03)
     assert foreign(ball).is_watertight
@@ -103,8 +103,10 @@ def test_files_are_read_by_trimesh(ball, tmp_path, ending):
     again = trimesh.load(file, force="mesh")
     assert again.volume == pytest.approx(ball.volume, rel=1e-4)
     assert len(again.faces) == len(ball.faces)
-    turn = np.array([-1, -1, 1]) if ending == "glb" else np.ones(3)  # y up
-    np.testing.assert_allclose(np.sort(again.bounds, 0), np.sort(foreign(ball).bounds * turn, 0), atol=1e-5)
+    rotation = np.array([-1, -1, 1]) if ending == "glb" else np.ones(3)  # y up
+    np.testing.assert_allclose(
+        np.sort(again.bounds, 0), np.sort(foreign(ball).bounds * rotation, 0), atol=1e-5
+    )
     if ending == "ply":
         np.testing.assert_allclose(again.visual.vertex_colors[:, :3] / 255, ball.colors, atol=0.003)
 
@@ -119,10 +121,12 @@ def test_area_and_volume_are_those_of_a_box():
 
 def test_fewer_faces(ball):
     pytest.importorskip("fast_simplification", reason="the extra mesh is not installed")
-    made = ball.simplified(300)
-    assert len(made.faces) <= 300
-    assert made.volume == pytest.approx(ball.volume, rel=0.03)
-    assert made.colors[made.vertices[:, 0] > AT[0] + 0.3].mean(0) == pytest.approx((0.9, 0.1, 0.1), abs=0.05)
+    simplified = ball.simplified(300)
+    assert len(simplified.faces) <= 300
+    assert simplified.volume == pytest.approx(ball.volume, rel=0.03)
+    assert simplified.colors[simplified.vertices[:, 0] > AT[0] + 0.3].mean(0) == pytest.approx(
+        (0.9, 0.1, 0.1), abs=0.05
+    )
     assert ball.simplified(10**6) is ball
     with pytest.raises(fs.InputError, match="--faces must be at least 4, got 3"):
         ball.simplified(3)
@@ -162,7 +166,7 @@ def test_the_command_writes_a_mesh(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["a.glb", "--voxel", "0.1"], "must be given with --mesh"),
         (["a.spz", "--mesh"], "the suffix of a mesh must be .glb"),
@@ -172,7 +176,7 @@ def test_the_command_writes_a_mesh(tmp_path, capsys):
         (["a.glb", "--mesh", "--parts", "0"], "--parts must be at least 1"),
     ],
 )
-def test_invalid_options_are_reported(tmp_path, monkeypatch, capsys, words, said):
+def test_invalid_options_are_reported(tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
     fs.save_ply(plane((0.0, 0.0, 2.0), (0.0, 0.0, -1.0), 0.5), "wall.ply")
-    assert said in fails(capsys, "convert", "wall.ply", *words)[1]
+    assert message in fails(capsys, "convert", "wall.ply", *words)[1]

@@ -30,12 +30,12 @@ def test_bands_of_several_devices_are_bit_identical(store, two):
         for share in (0.5, 0.2, 0.97):
             two._borders = np.array([0.0, share, 1.0])
             ours = two.render(given, look(turn=TURNED), outputs)
-            whole = alone.render(cloud, look(turn=TURNED), outputs)
+            full_frame = alone.render(cloud, look(turn=TURNED), outputs)
             assert np.array_equal(ours.capture.camera.world_to_camera, look(turn=TURNED).world_to_camera)
             for output in outputs:
-                assert np.array_equal(ours[output], whole[output]), (output, share)
-    assert ours.stats["visible"] >= whole.stats["visible"]
-    assert set(ours.timings) == set(whole.timings)
+                assert np.array_equal(ours[output], full_frame[output]), (output, share)
+    assert ours.stats["visible"] >= full_frame.stats["visible"]
+    assert set(ours.timings) == set(full_frame.timings)
 
 
 def _around():
@@ -57,12 +57,12 @@ def _moving():
 def test_bands_of_effects_that_depend_on_the_row(two, capture):
     """Rays of a panorama and poses of a shutter are those of the complete frame."""
     cloud = splats(1).with_labels(np.arange(len(splats(1))) % 2)
-    whole = fs.Renderer("opencl").render(cloud, capture)["rgb"]
+    full_frame = fs.Renderer("opencl").render(cloud, capture)["rgb"]
     given = two.upload(cloud)
     for share in (0.3, 0.6):
         two._borders = np.array([0.0, share, 1.0])
-        assert np.array_equal(two.render(given, capture)["rgb"], whole), share
-    assert len(np.unique(whole.reshape(-1, 3), axis=0)) > 100
+        assert np.array_equal(two.render(given, capture)["rgb"], full_frame), share
+    assert len(np.unique(full_frame.reshape(-1, 3), axis=0)) > 100
 
 
 def test_splats_outside_a_band_are_not_big():
@@ -73,8 +73,8 @@ def test_splats_outside_a_band_are_not_big():
     renderer = fs.Renderer("opencl")
     renderer.render(cloud, lower).wait()
     for band in ((0, 20), (220, 240)):
-        whole, rows = fs.Renderer("opencl").render(cloud, camera)["rgb"], slice(*band)
-        assert np.array_equal(renderer.render_band(band, cloud, camera)["rgb"][rows], whole[rows])
+        full_frame, rows = fs.Renderer("opencl").render(cloud, camera)["rgb"], slice(*band)
+        assert np.array_equal(renderer.render_band(band, cloud, camera)["rgb"][rows], full_frame[rows])
 
 
 def test_a_device_caches_the_visible_chunks_of_its_band(store, two):
@@ -140,17 +140,17 @@ def test_frames_precede_a_failure_of_the_captures(store, two):
 
     alone = fs.Renderer("opencl")
     for count in (0, 1, 3, 12):
-        frames, made = two.render_views(two.upload(store), failing(count)), []
+        frames, results = two.render_views(two.upload(store), failing(count)), []
         with pytest.raises(OSError, match="ends here"):
-            made.extend(frames)  # keeps those that came
-        assert len(made) == count
-        for x, frame in enumerate(made):
+            results.extend(frames)  # keeps those that came
+        assert len(results) == count
+        for x, frame in enumerate(results):
             expected = alone.render(store.cloud(), look(at=(0.1 * x, 0, 0)))["rgb"]
             assert np.array_equal(frame["rgb"], expected)
-    frames, made = two.render_views(store, [look(), look(), fs.Capture(), look()]), []
+    frames, results = two.render_views(store, [look(), look(), fs.Capture(), look()]), []
     with pytest.raises(fs.InputError, match="no camera"):
-        made.extend(frames)
-    assert len(made) == 2
+        results.extend(frames)
+    assert len(results) == 2
     with pytest.raises(fs.InputError, match="must be a list of Capture or Camera"):
         list(two.render_views(store, 3))
     frames = two.render_views(store, [look(), None, look()])  # type: ignore[list-item]

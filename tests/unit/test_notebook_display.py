@@ -24,9 +24,9 @@ def test_cameras_and_devices_are_tables():
     shown = fs.Camera.fisheye(64, 48, 2.0, coefficients=(0.1, 0, 0, 0))._repr_html_()
     assert "64 x 48 pixels" in shown
     assert "fisheye k1 = 0.1" in shown
-    found = fs.devices()
-    assert found._repr_html_().count("<tr>") == 1 + len(found)
-    assert "<td>reference</td>" in found._repr_html_()
+    actual = fs.devices()
+    assert actual._repr_html_().count("<tr>") == 1 + len(actual)
+    assert "<td>reference</td>" in actual._repr_html_()
 
 
 def test_ink_and_paper_are_rendered_saved_and_read(tmp_path):

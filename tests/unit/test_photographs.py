@@ -53,12 +53,12 @@ def photographed(seed, scale, noise=0.1, count=8, tags=3, shaken=0.0):
 
 def test_exact_corners_give_scale_and_poses():
     cameras, views, sizes, poses = photographed(0, scale=0.37, noise=0.0)
-    found = adjust(cameras, views, sizes)
-    assert found.scale == pytest.approx(0.37, rel=1e-9)
-    assert found.rms < 1e-6
+    adjusted = adjust(cameras, views, sizes)
+    assert adjusted.scale == pytest.approx(0.37, rel=1e-9)
+    assert adjusted.rms < 1e-6
     for tag, pose in poses.items():
-        np.testing.assert_allclose(found.poses[tag][:3, :3], pose[:3, :3], atol=1e-8)
-        np.testing.assert_allclose(found.poses[tag][:3, 3], pose[:3, 3] / 0.37, atol=1e-8)
+        np.testing.assert_allclose(adjusted.poses[tag][:3, :3], pose[:3, :3], atol=1e-8)
+        np.testing.assert_allclose(adjusted.poses[tag][:3, 3], pose[:3, 3] / 0.37, atol=1e-8)
 
 
 @pytest.mark.parametrize("shaken", [0.0, 3e-4])
@@ -66,25 +66,25 @@ def test_the_standard_error_is_that_of_repeated_captures(shaken):
     """Also with errors of the cameras' directions, which all corners of a photograph share."""
     normalised = []
     for seed in range(12):
-        found = adjust(*photographed(seed, scale=2.5, tags=2, shaken=shaken)[:3])
-        normalised.append(math.log(found.scale / 2.5) / found.scale_error)
+        adjusted = adjust(*photographed(seed, scale=2.5, tags=2, shaken=shaken)[:3])
+        normalised.append(math.log(adjusted.scale / 2.5) / adjusted.scale_error)
     assert 0.3 < np.mean(np.square(normalised)) < 2.2  # chi squared with 12 degrees of freedom: 98 %
 
 
 def test_a_tag_of_one_photograph_is_placed_by_the_scale_of_the_others():
     cameras, views, sizes, poses = photographed(1, scale=2.0, noise=0.02)
     views = [view for view in views if view.tag != "tag 2" or view.image == 3]
-    found = adjust(cameras, views, sizes)
-    assert "tag 2" not in found.scales
-    assert np.linalg.norm(2.0 * found.poses["tag 2"][:3, 3] - poses["tag 2"][:3, 3]) < 0.005
+    adjusted = adjust(cameras, views, sizes)
+    assert "tag 2" not in adjusted.scales
+    assert np.linalg.norm(2.0 * adjusted.poses["tag 2"][:3, 3] - poses["tag 2"][:3, 3]) < 0.005
 
 
 def test_a_wrong_detection_is_rejected():
     cameras, views, sizes, _ = photographed(2, scale=2.0)
     views[4] = TagView(views[4].tag, views[4].image, views[4].corners + 60)
-    found = adjust(cameras, views, sizes)
-    assert found.rejected == (views[4],)
-    assert found.scale == pytest.approx(2.0, rel=0.005)
+    adjusted = adjust(cameras, views, sizes)
+    assert adjusted.rejected == (views[4],)
+    assert adjusted.scale == pytest.approx(2.0, rel=0.005)
 
 
 def test_tags_that_contradict_are_errors():
@@ -194,7 +194,7 @@ def test_two_picked_features_give_the_scale():
 def test_a_rolling_shutter_of_moving_cameras_is_found(speed):
     """Cameras at the middle of the readout, each with its own motion; 0.3 pixels of noise."""
     rng = np.random.default_rng(0)
-    points, cameras, seen = rng.uniform((-1, -1, -0.5), (1, 1, 0.5), (300, 3)), [], []
+    points, cameras, collected = rng.uniform((-1, -1, -0.5), (1, 1, 0.5), (300, 3)), [], []
     for _ in range(6):
         position = rng.uniform((-1, -0.6, -3.2), (1, 0.6, -2.8))
         cameras.append(fs.Camera.look_at(640, 480, 1.0, position, (0, 0, 0)))
@@ -203,9 +203,11 @@ def test_a_rolling_shutter_of_moving_cameras_is_found(speed):
             times = pixels[:, 1] / 480 - 0.5
             late = (points[:, None] - motion * times[:, None, None]).reshape(-1, 3)
             pixels = cameras[-1].project(late)
-        seen.append(pixels + rng.normal(0, 0.3, pixels.shape))
+        collected.append(pixels + rng.normal(0, 0.3, pixels.shape))
     tracks = tuple(np.arange(300) for _ in cameras)
-    model = Model(tuple("abcdef"), tuple(cameras), points, np.zeros((300, 3), np.uint8), tuple(seen), tracks)
+    model = Model(
+        tuple("abcdef"), tuple(cameras), points, np.zeros((300, 3), np.uint8), tuple(collected), tracks
+    )
     share, displaced = readout_motion(model)
     assert (share > MIN_SHARE and displaced > MIN_DISPLACEMENT) == (speed > 0)
     if speed:
@@ -243,11 +245,11 @@ def test_exif_is_kept_with_upright_pixels(order, tmp_path):
     image[:8] = 255
     jpeg = cv2.imencode(".jpg", image)[1].tobytes()
     rotated = jpeg[:2] + exif(order, 6) + jpeg[2:]
-    found = read_exif(rotated)
-    assert (found.orientation, found.focal_length) == (6, (4.3,))
+    actual = read_exif(rotated)
+    assert (actual.orientation, actual.focal_length) == (6, (4.3,))
     (tmp_path / "a.jpg").write_bytes(rotated)
     assert read_image(tmp_path / "a.jpg").shape == (32, 16, 3)  # OpenCV reads the orientation too
-    upright = with_exif(jpeg, found)
+    upright = with_exif(jpeg, actual)
     again = read_exif(upright)
     assert (again.orientation, again.focal_length) == (1, (4.3,))
     (tmp_path / "b.jpg").write_bytes(upright)
@@ -280,10 +282,10 @@ def test_copies_are_upright_for_colmap_too(suffix, orientation, tmp_path):
     folder.mkdir()
     copy_photos([source], folder, lambda words, share: None)
     (copy,) = folder.iterdir()
-    with images.open(source) as given, images.open(copy) as made:
+    with images.open(source) as given, images.open(copy) as image:
         upright = importlib.import_module("PIL.ImageOps").exif_transpose(given)
-        assert made.size == upright.size
-        assert np.abs(np.asarray(made, int) - np.asarray(upright, int)).mean() < 12
+        assert image.size == upright.size
+        assert np.abs(np.asarray(image, int) - np.asarray(upright, int)).mean() < 12
 
 
 def test_sharp_frames_at_equal_steps_are_chosen():

@@ -86,12 +86,12 @@ def test_photographs_become_a_metric_data_set(captured, capsys):
     assert (facts["registered"], facts["missing"]) == (5, {})
     assert facts["corner_rms_px"] < 0.4
     known = {f"view_{i}.png": camera for i, camera in enumerate(cameras())}
-    found = fs.load_cameras(out / "sparse" / "0")
-    assert found.keys() == known.keys()
+    loaded = fs.load_cameras(out / "sparse" / "0")
+    assert loaded.keys() == known.keys()
     # distances between cameras, in metres
     lengths = [
         [np.linalg.norm(each["view_0.png"].position - each[f"view_{i}.png"].position) for i in (2, 3, 4)]
-        for each in (found, known)
+        for each in (loaded, known)
     ]
     np.testing.assert_allclose(*lengths, rtol=0.01)
     markers = fs.Scene.load(without_splats(out)).markers

@@ -242,18 +242,18 @@ def test_memory_grows_with_valid_splats(tmp_path, content, good, monkeypatch):
 def test_arrays_that_grow_while_a_file_is_read(tmp_path, content, monkeypatch):
     path = tmp_path / "good.ply"
     path.write_bytes(content)
-    whole = fs.load_ply(path)
+    splats = fs.load_ply(path)
     for room in (16, 64, 299):
         monkeypatch.setattr(collect, "_INITIAL_CAPACITY", room)
         monkeypatch.setattr(collect, "WINDOW", 16)
         read = fs.load_ply(path)
         for name in ("means", "quats", "scales", "opacities", "sh"):
-            assert np.array_equal(getattr(read, name), getattr(whole, name)), name
+            assert np.array_equal(getattr(read, name), getattr(splats, name)), name
 
 
 def test_progress_is_reported(tmp_path, content, monkeypatch):
     monkeypatch.setattr(collect, "WINDOW", 128)
-    path, said = tmp_path / "good.ply", []
+    path, messages = tmp_path / "good.ply", []
     path.write_bytes(content)
-    fs.load_ply(path, progress=lambda *done: said.append(done))
-    assert said == [("reading good.ply", share) for share in (128 / N, 256 / N, 1.0)]
+    fs.load_ply(path, progress=lambda *done: messages.append(done))
+    assert messages == [("reading good.ply", share) for share in (128 / N, 256 / N, 1.0)]

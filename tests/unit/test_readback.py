@@ -57,15 +57,15 @@ def test_detections_are_matched_by_what_they_say_and_then_by_nearness(scene):
     def seen(placed, kind="apriltag", family="36h11", tag_id: int | None = 5, payload=None):
         return Detection(kind, family, tag_id, payload, camera.project(placed.corners))
 
-    found = [
+    actual = [
         seen(twice[1]),
         seen(twice[0]),
         seen(twice[0], tag_id=6),
         seen(qr, "qr", "v2-L", None, "something else"),
     ]
-    codes, others = match(found, twice, camera)
-    assert [code and code[0] for code in codes] == [found[1], found[0], None]
-    assert others == found[2:]
+    codes, others = match(actual, twice, camera)
+    assert [code and code[0] for code in codes] == [actual[1], actual[0], None]
+    assert others == actual[2:]
     for code, placed in zip(codes[:2], twice, strict=False):
         assert code is not None
         assert np.allclose(code[1], camera.world_to_camera @ placed.pose, atol=1e-5)
@@ -128,8 +128,8 @@ def test_what_the_images_edge_cuts_off():
     assert 0 < shapely.area(part) < shapely.area(whole)
     # the pixels whose rays meet the printed sheet: the code with a module of quiet zone
     rays = camera.rays(np.stack(np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5), 2).reshape(-1, 2))
-    turn, place = camera.world_to_camera[:3, :3], camera.position
-    rays = rays @ turn
+    rotation, place = camera.world_to_camera[:3, :3], camera.position
+    rays = rays @ rotation
     at = place + np.where(rays[:, 2] > 0, -place[2] / rays[:, 2], np.nan)[:, None] * rays
     hit = (np.abs(at[:, :2]) < 0.125).all(1)
     assert shapely.area(part) == pytest.approx(hit.sum(), rel=0.02)
@@ -184,8 +184,8 @@ def test_the_truth_is_where_the_frames_own_capture_had_camera_and_markers(render
     batch = renderer.render_batch(
         scene, own, poses=[pose, pose], groups={1: [[0, 0, 0, 1, 0, 0, 0], [0.1, 0, 0, 1, 0, 0, 0]]}
     )
-    for made in (batch, pickle.loads(pickle.dumps(batch))):
-        frames += [(scene, made.frame(i), None) for i in range(2)]
+    for copies in (batch, pickle.loads(pickle.dumps(batch))):
+        frames += [(scene, copies.frame(i), None) for i in range(2)]
     for case, (made_of, frame, time) in enumerate(frames):
         (reading,), others = read_back(frame, made_of)
         assert others == []
@@ -225,8 +225,8 @@ def test_markers_that_face_away_or_lie_outside_are_not_missed(tmp_path, monkeypa
     ]
     scene = fs.Scene(markers=[PlacedMarker(tag, pose) for pose in places], camera=outlined()[1])
     blank = np.full((240, 320, 3), 128, np.uint8)
-    found = means(read_back(blank, scene).readings)
-    assert (found["markers"], found["found"], found["not_visible"]) == (1, 0, 2)
+    actual = means(read_back(blank, scene).readings)
+    assert (actual["markers"], actual["found"], actual["not_visible"]) == (1, 0, 2)
     monkeypatch.chdir(tmp_path)
     scene.save("scene.toml")
     write_png("blank.png", blank)

@@ -69,12 +69,12 @@ def test_pixels_that_are_far_apart_are_those_of_the_whole_image(monkeypatch):
     )
     camera = fs.Camera.look_at(200, 150, 1.0, (0, 0, -2), (0, 0, 0))
     picture = FrameSpec(random_splats(100, 3, depth=(-0.5, 1.0)), camera, outputs=("rgb", "depth"))
-    whole = reference_images(picture)
+    full_frame = reference_images(picture)
     rows, columns = np.random.default_rng(1).integers(0, (150, 200), (50, 2)).T
     tiles = len(np.unique(rows // 16 * 200 + columns // 16))
     chosen.clear()
     for name, values in reference_images(picture, (rows, columns)).items():
-        assert np.allclose(values, whole[name][rows, columns], rtol=1e-11, atol=1e-11), name
+        assert np.allclose(values, full_frame[name][rows, columns], rtol=1e-11, atol=1e-11), name
     assert 1 < len(chosen) < tiles / 3
     assert np.mean(chosen) < 0.9
 
@@ -91,10 +91,10 @@ def test_every_third_pixel_is_that_of_the_whole_image(monkeypatch, exposed):
         **({"motion": motion, "shutter": shutter} if exposed else {}),
     )
     renderer, cloud, shares = fs.Renderer("reference"), random_splats(40, 3), []
-    whole = renderer.render(cloud, capture)
+    full_frame = renderer.render(cloud, capture)
     some = renderer.render_subsampled(3, cloud, capture, progress=shares.append)
     for name in some.outputs:
-        np.testing.assert_array_equal(some[name], whole[name][::3, ::3])
+        np.testing.assert_array_equal(some[name], full_frame[name][::3, ::3])
     assert some["rgb"].shape == (6, 7, 3)
     assert shares == sorted(shares)
     assert len(shares) > 3

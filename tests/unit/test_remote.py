@@ -49,9 +49,9 @@ def test_every_item_is_done_and_none_twice_though_workers_die():
         return 10 * item
 
     engine = Here(work, dies=[(1, 1), (2, 3), (4, 2)])
-    found = list(drain(engine, range(20), workers=3))
+    actual = list(drain(engine, range(20), workers=3))
     assert set(done.values()) == {1}
-    assert sorted(found) == [(k, 10 * k) for k in range(20)]
+    assert sorted(actual) == [(k, 10 * k) for k in range(20)]
     assert engine.started == 3 + 3  # another for each that died
 
 

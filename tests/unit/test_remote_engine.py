@@ -82,11 +82,11 @@ def cluster(monkeypatch):
 
 def work(do, titles=("a device",)):
     """Results of workers: the n-th worker has the n-th title, all further ones the last."""
-    made = []
+    results = []
 
     def make():
-        title = titles[min(len(made), len(titles) - 1)]
-        made.append(SimpleNamespace(title=title))
+        title = titles[min(len(results), len(titles) - 1)]
+        results.append(SimpleNamespace(title=title))
         doer = do
 
         class Doer:

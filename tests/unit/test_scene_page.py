@@ -108,9 +108,9 @@ def test_a_browser_shows_the_scene(scene, tmp_path):
             assert time.monotonic() < end, page.evaluate("document.getElementById('note')?.textContent")
             time.sleep(0.1)
         shown = page.screenshot()
-        (found,) = detect(shown)
-        assert found.payload == detect(rendered)[0].payload
-        np.testing.assert_allclose(found.corners, detect(rendered)[0].corners, atol=1.0)
+        (detection,) = detect(shown)
+        assert detection.payload == detect(rendered)[0].payload
+        np.testing.assert_allclose(detection.corners, detect(rendered)[0].corners, atol=1.0)
         part = slice(0, 210)  # above the text
         assert np.abs(shown[part].astype(int) - rendered[part]).mean() < 4
         red = lambda image: np.argwhere(image[:, :, 0] > image[:, :, 2].astype(int) + 100).mean(0)  # noqa: E731

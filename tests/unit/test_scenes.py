@@ -270,7 +270,7 @@ def test_a_quality_other_than_presets_is_saved(tmp_path, quality):
 
 @pytest.mark.parametrize("quality", [None, BETWEEN])
 @pytest.mark.parametrize(
-    "made",
+    "marker",
     [
         fs.MarkerQuality(),
         fs.MarkerQuality("fitted"),
@@ -278,16 +278,16 @@ def test_a_quality_other_than_presets_is_saved(tmp_path, quality):
         fs.MarkerQuality("paper", 2, 1, 0.5),
     ],
 )
-def test_markers_are_saved_as_they_were_made(tmp_path, made, quality):
-    placed = PlacedMarker(fake_marker("qr:a", quality=made))
+def test_markers_are_saved_as_they_were_made(tmp_path, marker, quality):
+    placed = PlacedMarker(fake_marker("qr:a", quality=marker))
     fs.Scene(markers=[placed], quality=quality).save(tmp_path / "a.toml")
     again = fs.Scene.load(tmp_path / "a.toml").markers[0].marker.quality
-    if made.mixture == "paper":
-        assert replace(again, template=made.template) == made
+    if marker.mixture == "paper":
+        assert replace(again, template=marker.template) == marker
     else:
-        assert (again.mixture, again.template) == (made.mixture, made.template)
-    if made.mixture == "fitted":
-        assert again.growth in (made.growth, 0.4)  # which the fitted templates were made with
+        assert (again.mixture, again.template) == (marker.mixture, marker.template)
+    if marker.mixture == "fitted":
+        assert again.growth in (marker.growth, 0.4)  # which the fitted templates were made with
 
 
 def test_the_splat_limit_of_a_marker_is_saved(tmp_path):

@@ -49,24 +49,24 @@ background = [0.2, 0.5, 0.8]
 
 def subscribed(port: int, wanted: set[str]) -> list[tuple[str, str, int, bytes]]:
     """(topic, type, nanoseconds, CDR) of messages, until every topic has one."""
-    found = []
+    results = []
     with websockets.connect(
         f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=2**24
     ) as server:
         channels: dict[int, dict] = {}
-        while {topic for topic, *_ in found} != wanted and len(found) < 200:
+        while {topic for topic, *_ in results} != wanted and len(results) < 200:
             message = server.recv(timeout=60)
             if isinstance(message, str):
-                said = json.loads(message)
-                for channel in said.get("channels", ()):
+                printed = json.loads(message)
+                for channel in printed.get("channels", ()):
                     if channel["topic"] in wanted:
                         assert (channel["encoding"], channel["schemaEncoding"]) == ("cdr", "ros2msg")
                         channels[channel["id"]] = channel
-                news = {channel["id"] for channel in said.get("channels", ())}
-                if said["op"] == "status":
+                news = {channel["id"] for channel in printed.get("channels", ())}
+                if printed["op"] == "status":
                     # the server may refuse a channel that it has just announced; then it is requested again
                     time.sleep(0.2)
-                    heard = {topic for topic, *_ in found}
+                    heard = {topic for topic, *_ in results}
                     news = {number for number, one in channels.items() if one["topic"] not in heard}
                 for number in news & set(channels):
                     one = {"id": number, "channelId": number}
@@ -74,8 +74,8 @@ def subscribed(port: int, wanted: set[str]) -> list[tuple[str, str, int, bytes]]
             elif message[0] == 1:
                 number, stamp = struct.unpack_from("<IQ", message, 1)
                 channel = channels[number]
-                found.append((channel["topic"], channel["schemaName"], stamp, message[13:]))
-    return found
+                results.append((channel["topic"], channel["schemaName"], stamp, message[13:]))
+    return results
 
 
 @pytest.fixture(scope="module")
@@ -252,9 +252,9 @@ def test_a_ros2_node_receives_and_drives(served):
             "scene": "map", "base_link": "map", "camera_link": "base_link",
             "camera_optical_frame": "camera_link",
         }  # fmt: skip
-        at, turn = by_frame["base_link"].transform.translation, by_frame["base_link"].transform.rotation
+        at, rotation = by_frame["base_link"].transform.translation, by_frame["base_link"].transform.rotation
         matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+        matrix[:3, :3] = Rotation.from_quat([rotation.x, rotation.y, rotation.z, rotation.w]).as_matrix()
         matrix[:3, 3] = at.x, at.y, at.z
         return matrix
 
@@ -272,8 +272,8 @@ def test_a_ros2_node_receives_and_drives(served):
 
     here = stands.copy()
     here[:3, 3] += 0.5 * stands[:3, 0]  # half a metre forward
-    turn = Rotation.from_matrix(here[:3, :3]).as_quat()
-    stamped = PoseStamped(Header(Time(0, 0), "map"), Pose(Point(*here[:3, 3]), Quaternion(*turn)))
+    quaternion = Rotation.from_matrix(here[:3, :3]).as_quat()
+    stamped = PoseStamped(Header(Time(0, 0), "map"), Pose(Point(*here[:3, 3]), Quaternion(*quaternion)))
     place.write(stamped)
     moved = next_of(transforms, lambda m: (b := base(m)) is not None and not np.allclose(b, stands))
     np.testing.assert_allclose(base(moved), here, atol=1e-9)
@@ -289,7 +289,7 @@ def test_a_ros2_node_receives_and_drives(served):
     np.testing.assert_allclose(pixels / 255, np.clip(expected, 0, 1), atol=0.5 / 255 + 1e-5)
 
     for frame, x in (("map", np.nan), ("map", 1e30), ("lidar", 9.0)):  # ignored
-        place.write(PoseStamped(Header(Time(0, 0), frame), Pose(Point(x, 0.0, 0.0), Quaternion(*turn))))
+        place.write(PoseStamped(Header(Time(0, 0), frame), Pose(Point(x, 0.0, 0.0), Quaternion(*quaternion))))
     # a step of 0.1 m forward from where it stands
     place.write(PoseStamped(Header(Time(0, 0), "base_link"), Pose(Point(0.1, 0, 0), Quaternion(0, 0, 0, 1))))
     here[:3, 3] += 0.1 * here[:3, 0]
@@ -324,12 +324,12 @@ def test_a_node_of_ros_itself_receives_and_drives(tmp_path, publisher):
     with subprocess.Popen(command, env=environment | {"PYTHONPATH": str(root)}) as server:
         try:
             node = [RCLPY, str(root / "examples" / "ros2_node.py")]
-            said = subprocess.run(node, env=environment, capture_output=True, text=True, check=True).stdout
+            output = subprocess.run(node, env=environment, capture_output=True, text=True, check=True).stdout
         finally:
             server.terminate()
-    assert "/camera/image_raw: 5 messages, 64 x 48, frame camera_optical_frame" in said
-    assert "/lidar/points: 5 messages" in said
-    assert "the image changes as the robot drives" in said
+    assert "/camera/image_raw: 5 messages, 64 x 48, frame camera_optical_frame" in output
+    assert "/lidar/points: 5 messages" in output
+    assert "the image changes as the robot drives" in output
 
 
 def test_late_steps_are_dropped_and_counted(monkeypatch):

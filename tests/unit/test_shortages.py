@@ -49,8 +49,8 @@ def test_a_zeroed_buffer_that_grows_is_large_enough_and_zeroed():
     ],
 )
 def test_output_that_goes_nowhere(line, status, says, tmp_path):
-    found, out, err = shell(line, tmp_path)
-    assert (found, err) == (status, says)
+    actual, out, err = shell(line, tmp_path)
+    assert (actual, err) == (status, says)
     assert out == ""
 
 

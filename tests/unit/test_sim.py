@@ -92,13 +92,13 @@ def test_cameras_off_the_origin_have_the_images_of_a_scene_put_together_by_hand(
     cloud = fs.SplatCloud(
         around, rng.normal(size=(200, 4)), sizes, rng.random(200), sh=0.3 * rng.normal(size=(200, 9, 3))
     )
-    made = fs.Scene([cloud], markers=scene.markers)
+    composed = fs.Scene([cloud], markers=scene.markers)
 
     def seen_from(eye):
         return fs.Camera.pinhole(*SIZE, 150, 190, 70, 66, np.linalg.inv(eye))
 
     cameras = {"fixed": seen_from(base), "mounted": RigCamera(seen_from(mount), body="robot")}
-    own = Rig(made, {1: "box"}, cameras, renderer=renderer, outputs=("rgb", "depth"))
+    own = Rig(composed, {1: "box"}, cameras, renderer=renderer, outputs=("rgb", "depth"))
     poses = {"box": np.stack([a_pose() for _ in range(2)])}
     poses["robot"] = np.stack([compose(pose_of(base), a_pose(0.1, 0.05)) for _ in range(2)])
     images = own.render(poses)

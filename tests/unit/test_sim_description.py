@@ -54,19 +54,19 @@ def world(tmp_path):
     return tmp_path / "world.sdf"
 
 
-def in_the_world(found, name):
+def in_the_world(description, name):
     """The camera of the description at the pose of its link."""
-    camera = found.cameras[name]
-    pose = compose(found.bodies[camera.body], camera.mount)
+    camera = description.cameras[name]
+    pose = compose(description.bodies[camera.body], camera.mount)
     return replace(camera.camera, world_to_camera=matrix_of(inverse(pose)), position=None)
 
 
 def test_links_and_cameras_of_a_world(world):
-    found = read_description(world, [world.parent / "models"])
-    assert set(found.bodies) == {"first::base", "mast::pole", "mast::head"}
-    np.testing.assert_allclose(found.bodies["first::base"][:3], [1, 2, 0.3], atol=1e-12)
-    np.testing.assert_allclose(found.bodies["mast::head"][:3], [0, 0, 3 + 0.5 + 1 + 0.25], atol=1e-12)
-    front, depth = found.cameras["front"], found.cameras["depth"]
+    description = read_description(world, [world.parent / "models"])
+    assert set(description.bodies) == {"first::base", "mast::pole", "mast::head"}
+    np.testing.assert_allclose(description.bodies["first::base"][:3], [1, 2, 0.3], atol=1e-12)
+    np.testing.assert_allclose(description.bodies["mast::head"][:3], [0, 0, 3 + 0.5 + 1 + 0.25], atol=1e-12)
+    front, depth = description.cameras["front"], description.cameras["depth"]
     assert (front.body, depth.body) == ("first::base", "mast::head")
     assert (front.outputs, depth.outputs) == (("rgb",), ("depth",))
     assert (front.rate, depth.rate) == (15.0, None)
@@ -78,9 +78,9 @@ def test_links_and_cameras_of_a_world(world):
 
 
 def test_a_sensor_looks_along_its_x_with_z_up(world):
-    found = read_description(world, [world.parent / "models"])
+    description = read_description(world, [world.parent / "models"])
     # the head is pitched by 90 degrees about y: its x is the world's -z, its z the world's x
-    camera = in_the_world(found, "depth")
+    camera = in_the_world(description, "depth")
     below = [0, 0, 1.0]
     np.testing.assert_allclose(camera.project([below]), [[32, 24]], atol=1e-6)
     ((x, y),) = camera.project([[0.1, 0, 1.0]])
@@ -90,7 +90,7 @@ def test_a_sensor_looks_along_its_x_with_z_up(world):
 
 
 def test_roll_pitch_and_yaw_rotate_about_the_fixed_axes(world):
-    found = read_description(world, [world.parent / "models"])
+    description = read_description(world, [world.parent / "models"])
     r, p, y = 0.1, 0.2, 0.3
     turns = [
         np.array([[1, 0, 0], [0, math.cos(r), -math.sin(r)], [0, math.sin(r), math.cos(r)]]),
@@ -98,16 +98,16 @@ def test_roll_pitch_and_yaw_rotate_about_the_fixed_axes(world):
         np.array([[math.cos(y), -math.sin(y), 0], [math.sin(y), math.cos(y), 0], [0, 0, 1]]),
     ]
     optical = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0.0]])
-    mount = matrix_of(found.cameras["front"].mount)
+    mount = matrix_of(description.cameras["front"].mount)
     np.testing.assert_allclose(mount[:3, :3], turns[2] @ turns[1] @ turns[0] @ optical, atol=1e-12)
     np.testing.assert_allclose(mount[:3, 3], [0.2, 0, 0.1], atol=1e-12)
 
 
 def test_a_robot(tmp_path):
     (tmp_path / "robot.urdf").write_text(URDF)
-    found = read_description(tmp_path / "robot.urdf")
-    np.testing.assert_allclose(found.bodies["wrist"][:3], [0, 2, 1], atol=1e-6)
-    eye, own = found.cameras["eye"], found.cameras["own"]
+    description = read_description(tmp_path / "robot.urdf")
+    np.testing.assert_allclose(description.bodies["wrist"][:3], [0, 2, 1], atol=1e-6)
+    eye, own = description.cameras["eye"], description.cameras["own"]
     assert (eye.body, eye.outputs, eye.camera.lens) == ("wrist", ("rgb", "depth"), fs.Fisheye())
     assert eye.camera.fx == pytest.approx(50 / 0.75)
     assert (own.body, own.rate, own.camera.near, own.camera.far) == ("base", 20.0, 0.05, 50)

@@ -66,8 +66,8 @@ def moved(model, seed):
     rng = np.random.default_rng(seed)
     data = mujoco.MjData(model)
     data.qpos[:3] += rng.uniform(-0.1, 0.1, 3)
-    turn = np.array([1, *rng.uniform(-0.2, 0.2, 3)])
-    data.qpos[3:7] = turn / np.linalg.norm(turn)
+    rotation = np.array([1, *rng.uniform(-0.2, 0.2, 3)])
+    data.qpos[3:7] = rotation / np.linalg.norm(rotation)
     data.qpos[7:] = rng.uniform(-0.1, 0.1, 2)
     mujoco.mj_forward(model, data)
     return data
@@ -86,10 +86,10 @@ def test_a_tag_is_read_where_mujoco_says_it_is(model, rig):
             eye = np.eye(4)
             eye[:3, :3] = data.camera(camera).xmat.reshape(3, 3) @ np.diag([1.0, -1.0, -1.0])
             eye[:3, 3] = data.camera(camera).xpos
-            truth = np.linalg.inv(eye) @ box @ FACE
+            expected = np.linalg.inv(eye) @ box @ FACE
             (reading,) = read_back(images.of(camera).frame(i), rig.scene).readings
-            np.testing.assert_allclose(reading.truth, truth, atol=1e-9)
-            assert np.linalg.norm(reading.pose[:3, 3] - truth[:3, 3]) < 0.01, (camera, i)
+            np.testing.assert_allclose(reading.truth, expected, atol=1e-9)
+            assert np.linalg.norm(reading.pose[:3, 3] - expected[:3, 3]) < 0.01, (camera, i)
 
 
 @pytest.mark.parametrize("name", ["front", "lens", "plain", "above"])

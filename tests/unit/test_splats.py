@@ -30,14 +30,14 @@ def sh_parts(n=6, degree=3, seed=0, **changes):
 
 
 def test_keeps_float32_bits_and_normalises_quaternions():
-    given = parts()
-    cloud = fs.SplatCloud(**given)
+    arrays = parts()
+    cloud = fs.SplatCloud(**arrays)
     for name in ("means", "scales", "opacities", "colors"):
         array = getattr(cloud, name)
         assert array.dtype == F32
-        assert np.array_equal(array, given[name])
-    norms = np.linalg.norm(given["quats"].astype(float), axis=1, keepdims=True)
-    np.testing.assert_allclose(cloud.quats, given["quats"] / norms, atol=1e-7)
+        assert np.array_equal(array, arrays[name])
+    norms = np.linalg.norm(arrays["quats"].astype(float), axis=1, keepdims=True)
+    np.testing.assert_allclose(cloud.quats, arrays["quats"] / norms, atol=1e-7)
     assert (len(cloud), cloud.sh, cloud.sh_degree, cloud.dropped) == (6, None, -1, {})
     assert cloud.labels.dtype == np.int32
     assert not cloud.labels.any()
@@ -58,25 +58,25 @@ def test_sh_degree(degree):
 
 
 def test_arrays_are_read_only_and_independent_of_the_input():
-    given = parts()
-    cloud = fs.SplatCloud(**given, labels=3)
-    given["means"][:] = 0
+    arrays = parts()
+    cloud = fs.SplatCloud(**arrays, labels=3)
+    arrays["means"][:] = 0
     assert cloud.means.any()
     for name in ("means", "quats", "scales", "opacities", "colors", "labels", "origin"):
         with pytest.raises(ValueError, match="read-only"):
             getattr(cloud, name)[...] = 0
     with pytest.raises(AttributeError):
-        cloud.means = given["means"]
+        cloud.means = arrays["means"]
 
 
 def test_read_only_float32_is_shared_but_a_view_of_writable_memory_is_copied():
-    given = parts()
-    view = given["scales"][:]
-    for array in (given["means"], view):
+    arrays = parts()
+    view = arrays["scales"][:]
+    for array in (arrays["means"], view):
         array.flags.writeable = False
-    cloud = fs.SplatCloud(**{**given, "scales": view})
-    assert np.shares_memory(cloud.means, given["means"])
-    assert not np.shares_memory(cloud.scales, given["scales"])
+    cloud = fs.SplatCloud(**{**arrays, "scales": view})
+    assert np.shares_memory(cloud.means, arrays["means"])
+    assert not np.shares_memory(cloud.scales, arrays["scales"])
 
 
 @pytest.mark.parametrize(
@@ -128,14 +128,14 @@ DEFECTS = [
 
 @pytest.mark.parametrize(("name", "column", "value", "reason"), DEFECTS)
 def test_a_bad_splat_is_left_out_counted_and_reported(name, column, value, reason):
-    given = parts(labels=np.arange(6, dtype=np.int32))
-    given[name][(2, *column) if isinstance(column, tuple) else (2, column)] = value
+    arrays = parts(labels=np.arange(6, dtype=np.int32))
+    arrays[name][(2, *column) if isinstance(column, tuple) else (2, column)] = value
     with pytest.warns(UserWarning, match="1 of 6 splats left out") as caught:
-        cloud = fs.SplatCloud(**given)
+        cloud = fs.SplatCloud(**arrays)
     assert reason in str(caught[0].message)
     assert cloud.dropped == {reason: 1}
     assert cloud.labels.tolist() == [0, 1, 3, 4, 5]
-    assert np.array_equal(cloud.means, given["means"][[0, 1, 3, 4, 5]])
+    assert np.array_equal(cloud.means, arrays["means"][[0, 1, 3, 4, 5]])
 
 
 @pytest.mark.parametrize(
@@ -146,61 +146,61 @@ def test_a_bad_splat_is_left_out_counted_and_reported(name, column, value, reaso
     ],
 )
 def test_what_files_hold_instead_is_hinted_at(name, value, hint):
-    given = parts()
-    given[name][:2] = value
+    arrays = parts()
+    arrays[name][:2] = value
     with pytest.warns(UserWarning, match="2 of 6 splats left out") as caught:
-        fs.SplatCloud(**given)
+        fs.SplatCloud(**arrays)
     assert str(caught[0].message).endswith(f"; {hint}")
-    given[name][0] = given[name][2]  # one of six is a stray
+    arrays[name][0] = arrays[name][2]  # one of six is a stray
     with pytest.warns(UserWarning, match=r"1 of 6 splats left out \([^()]*: 1\)$"):
-        fs.SplatCloud(**given)
+        fs.SplatCloud(**arrays)
 
 
 def test_bytes_are_no_colours():
-    given = parts()
-    given["colors"] = np.full((6, 3), 255, np.uint8)
+    arrays = parts()
+    arrays["colors"] = np.full((6, 3), 255, np.uint8)
     with pytest.raises(fs.InputError, match=r"got bytes up to 255; give colors / 255"):
-        fs.SplatCloud(**given)
-    given["colors"] = np.ones((6, 3), np.uint8)
-    assert fs.SplatCloud(**given).colors.max() == 1
+        fs.SplatCloud(**arrays)
+    arrays["colors"] = np.ones((6, 3), np.uint8)
+    assert fs.SplatCloud(**arrays).colors.max() == 1
 
 
 def test_float64_that_float32_cannot_hold_is_left_out():
-    given = parts()
-    given["scales"] = given["scales"].astype(float)
-    given["scales"][0, 0], given["scales"][1, 0] = 1e300, 1e-300
+    arrays = parts()
+    arrays["scales"] = arrays["scales"].astype(float)
+    arrays["scales"][0, 0], arrays["scales"][1, 0] = 1e300, 1e-300
     with pytest.warns(UserWarning, match="2 of 6"):
-        assert fs.SplatCloud(**given).dropped == {"scales not finite": 1, "scale not above 0": 1}
+        assert fs.SplatCloud(**arrays).dropped == {"scales not finite": 1, "scale not above 0": 1}
 
 
 def test_a_splat_with_two_defects_counts_once():
-    given = parts()
-    given["means"][0] = np.nan
-    given["opacities"][0] = 7
-    given["opacities"][1] = 7
+    arrays = parts()
+    arrays["means"][0] = np.nan
+    arrays["opacities"][0] = 7
+    arrays["opacities"][1] = 7
     with pytest.warns(UserWarning, match="2 of 6"):
-        assert fs.SplatCloud(**given).dropped == {"means not finite": 1, "opacity outside [0, 1]": 1}
+        assert fs.SplatCloud(**arrays).dropped == {"means not finite": 1, "opacity outside [0, 1]": 1}
 
 
 @pytest.mark.parametrize("value", [1.1e15, -1e38])
 @pytest.mark.parametrize("name", ["means", "colors"])
 def test_values_that_would_overflow_on_devices_are_left_out(name, value):
-    given = parts()
-    given[name][2, 1] = value
+    arrays = parts()
+    arrays[name][2, 1] = value
     with pytest.warns(UserWarning, match="1 of 6"):
-        assert fs.SplatCloud(**given).dropped == {f"{name} beyond 1e+15": 1}
+        assert fs.SplatCloud(**arrays).dropped == {f"{name} beyond 1e+15": 1}
 
 
 def test_large_values_are_not_defects():
-    given = parts(means=np.full((6, 3), 1e15, F32), quats=np.full((6, 4), 3e38, F32))
+    arrays = parts(means=np.full((6, 3), 1e15, F32), quats=np.full((6, 4), 3e38, F32))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert len(fs.SplatCloud(**given)) == 6
+        assert len(fs.SplatCloud(**arrays)) == 6
 
 
 def test_extreme_opacities_and_tiny_quaternions_stay():
-    given = parts(opacities=[0, 1, 0, 1, 0, 1], quats=np.full((6, 4), 1e-14))
-    cloud = fs.SplatCloud(**given)
+    arrays = parts(opacities=[0, 1, 0, 1, 0, 1], quats=np.full((6, 4), 1e-14))
+    cloud = fs.SplatCloud(**arrays)
     assert cloud.opacities.tolist() == [0, 1, 0, 1, 0, 1]
     np.testing.assert_allclose(cloud.quats, 0.5)
 
@@ -226,20 +226,20 @@ def test_near_or_float32_means_have_no_origin():
 
 def test_a_splat_that_is_left_out_has_no_say_in_the_origin():
     means = np.random.default_rng(1).normal(size=(6, 3)) + 1e6
-    given = parts(means=means)
+    arrays = parts(means=means)
     origin = fs.SplatCloud(**parts(5, means=means[:5])).origin
-    given["means"][5] = 0
-    given["opacities"][5] = 2
+    arrays["means"][5] = 0
+    arrays["opacities"][5] = 2
     with pytest.warns(UserWarning, match="1 of 6"):
-        assert np.allclose(fs.SplatCloud(**given).origin, origin, atol=10)
+        assert np.allclose(fs.SplatCloud(**arrays).origin, origin, atol=10)
 
 
 def test_given_origin_is_used_and_means_are_relative_to_it():
-    given = parts()
-    cloud = fs.SplatCloud(**given, origin=[5e5, 4.5e6, 300])
-    assert np.array_equal(cloud.means, given["means"])
+    arrays = parts()
+    cloud = fs.SplatCloud(**arrays, origin=[5e5, 4.5e6, 300])
+    assert np.array_equal(cloud.means, arrays["means"])
     assert np.array_equal(cloud.origin, [5e5, 4.5e6, 300])
-    assert np.array_equal(cloud.world_means(), given["means"] + np.array([5e5, 4.5e6, 300]))
+    assert np.array_equal(cloud.world_means(), arrays["means"] + np.array([5e5, 4.5e6, 300]))
 
 
 def test_empty():
@@ -324,10 +324,10 @@ def test_concatenate_near_clouds_keeps_their_bits():
 
 
 def test_dropped_adds_up_and_survives():
-    given = parts()
-    given["opacities"][0] = 2
+    arrays = parts()
+    arrays["opacities"][0] = 2
     with pytest.warns(UserWarning, match="1 of 6"):
-        cloud = fs.SplatCloud(**given)
+        cloud = fs.SplatCloud(**arrays)
     assert cloud.with_labels(1).transformed(np.eye(4)).dropped == {"opacity outside [0, 1]": 1}
     assert fs.SplatCloud.concatenate([cloud, cloud]).dropped == {"opacity outside [0, 1]": 2}
 

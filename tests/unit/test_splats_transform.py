@@ -60,8 +60,8 @@ def test_quaternions_and_matrices_agree(a, b):
 
 @pytest.mark.parametrize("axis", np.eye(3))
 def test_rotations_by_180_degrees_have_quaternions(axis):
-    turn = 2 * np.outer(axis, axis) - np.eye(3)
-    np.testing.assert_allclose(quaternion_to_matrix(matrix_to_quaternion(turn)), turn, atol=1e-15)
+    rotation = 2 * np.outer(axis, axis) - np.eye(3)
+    np.testing.assert_allclose(quaternion_to_matrix(matrix_to_quaternion(rotation)), rotation, atol=1e-15)
 
 
 def test_an_origin_is_scaled_rotated_and_moved():
@@ -198,13 +198,13 @@ def test_bounds_of_boxes_are_those_of_their_corners():
     apart = fs.SplatCloud.concatenate([cloud]).half_extents(3.0)
     np.testing.assert_allclose((corners.max(1) - cloud.means)[mixed], apart[mixed], atol=1e-6)
     np.testing.assert_array_equal(apart[~mixed], cloud_of().half_extents(3.0)[~mixed])
-    made = fs.marker("qr:hello", size=0.21, mixture="exact")
+    marker = fs.marker("qr:hello", size=0.21, mixture="exact")
     pose = rigid_matrix((1, 2, 3), (1, 0.3, -0.5, 0.2))
-    rows, columns = made.grid.shape
-    half = np.array([columns, rows]) * made.module / 2
+    rows, columns = marker.grid.shape
+    half = np.array([columns, rows]) * marker.module / 2
     sheet = np.array([[x, y, 0.0] for x in (-half[0], half[0]) for y in (-half[1], half[1])])
     sheet = sheet @ pose[:3, :3].T + pose[:3, 3]
-    low, high = made.cloud.transformed(pose).bounds()
+    low, high = marker.cloud.transformed(pose).bounds()
     np.testing.assert_allclose([low, high], [sheet.min(0), sheet.max(0)], atol=1e-6)
 
 
@@ -267,8 +267,8 @@ def test_rotating_coefficients_keeps_bands_apart_and_lengths(turn):
 def test_quaternions_of_many_rotations_are_those_of_each():
     quats = np.random.default_rng(0).normal(size=(4, 50, 4))
     rotations = quaternion_to_matrix(quats)
-    found = matrices_to_quaternions(rotations)
-    np.testing.assert_allclose(quaternion_to_matrix(found), rotations, atol=1e-14)
-    for one, rotation in zip(found.reshape(-1, 4), rotations.reshape(-1, 3, 3), strict=True):
+    quaternions = matrices_to_quaternions(rotations)
+    np.testing.assert_allclose(quaternion_to_matrix(quaternions), rotations, atol=1e-14)
+    for one, rotation in zip(quaternions.reshape(-1, 4), rotations.reshape(-1, 3, 3), strict=True):
         assert np.array_equal(matrices_to_quaternions(rotation), one)
         assert np.abs(np.abs(one @ matrix_to_quaternion(rotation)) - 1) < 1e-14

@@ -15,8 +15,8 @@ from fidsplat.vision.readback import read_back
 def test_a_marker_is_read_at_its_pose():
     pytest.importorskip("stag")
     camera = fs.Camera.look_at(320, 240, 1.0, position=(0.1, -0.05, -0.35), target=(0, 0, 0))
-    made = marker("stag:hd21:3", size=0.16)
-    scene = Scene((), markers=(PlacedMarker(made, np.eye(4)),), camera=camera, background=(1.0, 1.0, 1.0))
+    sign = marker("stag:hd21:3", size=0.16)
+    scene = Scene((), markers=(PlacedMarker(sign, np.eye(4)),), camera=camera, background=(1.0, 1.0, 1.0))
     image = fs.Renderer("opencl").render(scene)["rgb"]
     (reading,), others = read_back(np.clip(image, 0, 1), scene, camera)
     assert reading.corner_error < 0.3

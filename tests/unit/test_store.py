@@ -24,17 +24,17 @@ def sorted_by_position(cloud):
 
 
 def test_a_store_contains_exactly_the_splats_of_its_files(files, store):
-    made, given = store.cloud(), fs.SplatCloud.concatenate([fs.load_ply(file) for file in files])
+    stored, given = store.cloud(), fs.SplatCloud.concatenate([fs.load_ply(file) for file in files])
     assert len(store) == len(given) == 2 * COUNT
     assert store.ellipsoids == "some"
     assert store.sh_degree == 1
-    ours, theirs = sorted_by_position(made), sorted_by_position(given)
+    ours, theirs = sorted_by_position(stored), sorted_by_position(given)
     for name, array in theirs.items():
         assert np.array_equal(ours[name], array), name
     # coplanar groups of both files stay distinct, and are last
-    assert np.array_equal(np.unique(made.coplanar_groups), np.unique(given.coplanar_groups))
-    assert (made.coplanar_groups[store.header.pinned :] >= 0).all()
-    assert (made.coplanar_groups[: store.header.pinned] < 0).all()
+    assert np.array_equal(np.unique(stored.coplanar_groups), np.unique(given.coplanar_groups))
+    assert (stored.coplanar_groups[store.header.pinned :] >= 0).all()
+    assert (stored.coplanar_groups[: store.header.pinned] < 0).all()
 
 
 def test_neighbours_in_space_are_near_in_order(store):
@@ -123,14 +123,14 @@ def test_an_incomplete_store_is_refused(store, tmp_path):
     folder = tmp_path / "none.fss"
     refused("must be the folder of a store, got nothing")
     folder = copied(store, tmp_path)
-    whole = contents(folder)
-    for name in whole:
+    original = contents(folder)
+    for name in original:
         (folder / name).unlink()
         refused("no store.json|cannot read")
-        (folder / name).write_bytes(whole[name][: len(whole[name]) * 2 // 3])
+        (folder / name).write_bytes(original[name][: len(original[name]) * 2 // 3])
         refused("damaged|truncated")
-        (folder / name).write_bytes(whole[name])
-    header = json.loads(whole["store.json"])
+        (folder / name).write_bytes(original[name])
+    header = json.loads(original["store.json"])
     for change, match in [
         ({"version": 2}, "a store of version 2, and this fidsplat reads version 1"),
         ({"format": "zip"}, "another format"),
@@ -141,12 +141,12 @@ def test_an_incomplete_store_is_refused(store, tmp_path):
         ({"nodes_crc": 1}, "checksum"),
         ({"origin": [0, 0]}, "origin"),
     ]:
-        said = header | change
-        (folder / "store.json").write_text(json.dumps(said | {"crc": header_crc(said)}))
+        changed_header = header | change
+        (folder / "store.json").write_text(json.dumps(changed_header | {"crc": header_crc(changed_header)}))
         refused(match)
     (folder / "store.json").write_text(json.dumps(header | {"pinned": header["pinned"] - 1}))
     refused(r"store.json is damaged \(its checksum differs\)")
-    (folder / "store.json").write_bytes(whole["store.json"])
+    (folder / "store.json").write_bytes(original["store.json"])
     nodes = np.load(folder / "nodes.npy")
     assert nodes.dtype == NODE
     nodes["count"][0] += 1
@@ -218,12 +218,12 @@ def test_a_header_that_contradicts_its_index_is_refused(store, tmp_path):
         ({"identity": 5}, "is not text"),
         ({"dropped": {"nan": "<b>"}}, "not whole numbers"),
     ]:
-        said = (store.path / "store.json").read_bytes()
-        (folder / "store.json").write_bytes(said)
+        header = (store.path / "store.json").read_bytes()
+        (folder / "store.json").write_bytes(header)
         crafted(folder, **changes)
         with pytest.raises(fs.InputError, match=match):
             fs.Store(folder)
-    (folder / "store.json").write_bytes(said)
+    (folder / "store.json").write_bytes(header)
     assert len(fs.Store(folder)) == len(store)
 
 
@@ -268,8 +268,8 @@ def test_colours_are_stored_in_the_requested_type(files, store, tmp_path):
     plain = fs.Store(fs.build_store(files, tmp_path / "plain.fss", sh_degree=0, levels=False, **SMALL))
     assert plain.sh_degree == -1
     assert (plain.nodes["level"] == 0).all()
-    kept = C0 * store.cloud().sh[:, 0] + 0.5
-    assert plain.cloud().colors == pytest.approx(np.maximum(kept, 0), abs=1e-6)
+    colors = C0 * store.cloud().sh[:, 0] + 0.5
+    assert plain.cloud().colors == pytest.approx(np.maximum(colors, 0), abs=1e-6)
 
 
 def test_an_instanced_store_repeats_the_splats(store, files, tmp_path):

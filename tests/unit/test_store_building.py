@@ -94,7 +94,7 @@ def test_a_build_restarts_if_files_were_lost(files, store, tmp_path, words):
 
 def test_chunks_too_large_for_the_memory_are_refused(files, tmp_path, monkeypatch):
     """The suggested chunk size works, and nodes are merged one by one if memory allows only one."""
-    under_way, most, lock, made = 0, 0, Lock(), build.merged
+    under_way, most, lock, original = 0, 0, Lock(), build.merged
 
     def merged(*given):
         nonlocal under_way, most
@@ -103,7 +103,7 @@ def test_chunks_too_large_for_the_memory_are_refused(files, tmp_path, monkeypatc
             most = max(most, under_way)
         time.sleep(0.002)
         try:
-            return made(*given)
+            return original(*given)
         finally:
             with lock:
                 under_way -= 1

@@ -107,32 +107,34 @@ def test_cells_of_a_distorted_lens_have_the_sizes_of_a_pinhole(store):
     """0.05 m on the axis at 5 m, and a box next to the camera's plane."""
     corners = np.array([[-0.1, -0.1, 5.0], [3.0, -0.1, 4.0]])
     high = corners + np.array([[0.2, 0.2, 1.0], [1.0, 0.2, 1.0]])
-    found = []
+    results = []
     for own in (None, fs.BrownConrady(k1=-0.1)):
         camera = fs.Camera.pinhole(80, 60, 50.0, 50.0, 40.0, 30.0, lens=own)
         _, view = prepare(store, fs.Capture(camera))
-        found.append(projected_sizes(view, lambda sigmas: (corners, high), np.full(2, 0.05)))
-    assert 0.5 <= found[0][0] < 0.5001
-    assert np.array_equal(*found)
+        results.append(projected_sizes(view, lambda sigmas: (corners, high), np.full(2, 0.05)))
+    assert 0.5 <= results[0][0] < 0.5001
+    assert np.array_equal(*results)
 
 
 def test_fewer_splats_are_selected_further_away(store):
     counts = [
-        sum(store.counts(np.array(selected_nodes(store, camera_at(away), 0.5)[0])))
-        for away in (60, 600, 6000)
+        sum(store.counts(np.array(selected_nodes(store, camera_at(distance), 0.5)[0])))
+        for distance in (60, 600, 6000)
     ]
     assert len(store) >= counts[0] > counts[1] > counts[2]
 
 
 def test_errors_grow_with_cell_size_and_are_saved(store, renderer):
-    made, *coarser = measure_detail(store, renderer, views=4 * store.levels)
-    assert [one.level for one in (made, *coarser)] == list(range(1, store.levels + 1))
-    met = [(size, error) for size, error in zip(made.sizes, made.errors, strict=True) if error is not None]
-    assert made.sizes == SIZES
+    errors, *coarser = measure_detail(store, renderer, views=4 * store.levels)
+    assert [one.level for one in (errors, *coarser)] == list(range(1, store.levels + 1))
+    met = [
+        (size, error) for size, error in zip(errors.sizes, errors.errors, strict=True) if error is not None
+    ]
+    assert errors.sizes == SIZES
     assert len(met) >= 4
     assert met[-1][1] > 0.02 > 1.5 * met[0][1]
     again = fs.Store(store.path)
-    assert again.detail_errors == [made, *coarser]
+    assert again.detail_errors == [errors, *coarser]
     allowed = MARGIN * met[0][1] + 1e-9
     limits = again.cell_sizes(QUALITY.with_(detail_error=allowed))
     assert limits[0] == 0.0
@@ -150,13 +152,13 @@ def test_frames_keep_the_allowed_error(store, renderer, device):
     measure_detail(store, renderer, views=4 * store.levels)
     renderer = fs.Renderer(device)
     resident = renderer.upload(fs.Store(store.path))
-    for away in (300.0, 1500.0):
-        camera = camera_at(away)
+    for distance in (300.0, 1500.0):
+        camera = camera_at(distance)
         exact = renderer.render(resident, camera, quality=QUALITY)
         for error in (0.01, 0.05):
             frame = renderer.render(resident, camera, quality=QUALITY.with_(detail_error=error))
             assert np.abs(frame["rgb"] - exact["rgb"]).max() <= error
-        assert away < 1000 or frame.stats["splats"] < exact.stats["splats"]
+        assert distance < 1000 or frame.stats["splats"] < exact.stats["splats"]
         ids = renderer.render(resident, camera, ("splat_id",), QUALITY.with_(detail_error=0.05))["splat_id"]
         assert ids.max() < len(store)
 
@@ -224,15 +226,15 @@ def test_errors_of_other_content_are_ignored(tmp_path):
     details = [DetailErrors(name, 1, (0.1,), (0.2,), 1, "here", "today") for name in ("pixel", "screen")]
     save_detail_errors(tmp_path, "a", details)
     save_detail_errors(tmp_path, "a", [DetailErrors("pixel", 1, (0.3,), (None,), 1, "here", "today")])
-    kept = load_detail_errors(tmp_path, "a")
-    assert [(one.lowpass, one.sizes) for one in kept] == [("pixel", (0.3,)), ("screen", (0.1,))]
+    loaded = load_detail_errors(tmp_path, "a")
+    assert [(one.lowpass, one.sizes) for one in loaded] == [("pixel", (0.3,)), ("screen", (0.1,))]
     assert load_detail_errors(tmp_path, "b") == []
-    whole = (tmp_path / "detail.json").read_bytes()
+    contents = (tmp_path / "detail.json").read_bytes()
     for damage in (
         b"{",
         b"[]",
         json.dumps({"identity": "a", "details": [{"sizes": 1, "errors": 2}]}).encode(),
-        whole.replace(b"0.3", b"0.4"),
+        contents.replace(b"0.3", b"0.4"),
     ):
         (tmp_path / "detail.json").write_bytes(damage)
         with pytest.raises(fs.InputError, match="store measure"):
@@ -262,9 +264,9 @@ def test_measured_views_contain_all_sizes(store):
         np.median(nodes["size"][nodes["level"] == level]) for level in range(1, nodes["level"].max() + 1)
     ]
     middle = sum(store.bounds(0.0)) / 2
-    away = [np.linalg.norm(camera.position - middle) for camera in cameras_around(store, 5 * len(edges))]
+    distances = [np.linalg.norm(camera.position - middle) for camera in cameras_around(store, 5 * len(edges))]
     for first, edge in enumerate(edges):
-        sizes = [edge * focal / distance for distance in away[first :: len(edges)]]
+        sizes = [edge * focal / distance for distance in distances[first :: len(edges)]]
         assert min(sizes) < 0.15
         assert max(sizes) > 0.4
     errors = errors_of(store, fs.Renderer("reference"), fs.Capture(camera_at(50.0, (8, 6))), [1e-6, 1e-5], 1)

@@ -48,9 +48,9 @@ def test_gathered_parts_can_begin_within_a_chunk(stores):
     device_chunks = DeviceChunks(scene)
     gathered = backend.chunk_cache(device_chunks).gather(device_chunks.of(scene.all_chunks(), True))
     gathered.streamed = True
-    found = np.empty(130, np.float32)
-    cl.enqueue_copy(backend.queue, found, gathered.part("opacities", 70, 200))
-    assert np.array_equal(found, stores["disks"].cloud().opacities[70:200])
+    actual = np.empty(130, np.float32)
+    cl.enqueue_copy(backend.queue, actual, gathered.part("opacities", 70, 200))
+    assert np.array_equal(actual, stores["disks"].cloud().opacities[70:200])
 
 
 def test_cache_content_survives_a_failed_growth(stores, monkeypatch):
@@ -68,9 +68,9 @@ def test_cache_content_survives_a_failed_growth(stores, monkeypatch):
         return fresh(name, size)
 
     def contents_of(name):
-        found = np.empty(before[name].size, np.uint8)
-        cl.enqueue_copy(renderer.backend.queue, found, cache._arrays[name])
-        return found
+        actual = np.empty(before[name].size, np.uint8)
+        cl.enqueue_copy(renderer.backend.queue, actual, cache._arrays[name])
+        return actual
 
     before = dict(cache._arrays)
     expected = {name: contents_of(name) for name in before}
@@ -92,9 +92,9 @@ def test_a_cache_smaller_than_a_view(stores, monkeypatch):
     monkeypatch.setattr(chunk_cache, "_CLOUD_DIVISOR", renderer.backend.memory_budget // 10000)
     resident, outputs = renderer.upload(store), ("rgb", "splat_id")
     for camera in (look(), look(turn=TURNED)):
-        ours, whole = (renderer.render(each, camera, outputs) for each in (resident, store.cloud()))
+        ours, full_frame = (renderer.render(each, camera, outputs) for each in (resident, store.cloud()))
         for output in outputs:
-            assert np.array_equal(ours[output], whole[output]), output
+            assert np.array_equal(ours[output], full_frame[output]), output
     cache, scene, device_chunks = resident.data._cache, resident.data.scene, resident.data.chunks
     held = set(cache._slots)
     assert 0 < len(held) <= 2
@@ -135,12 +135,12 @@ def test_views_that_do_not_fit_are_rendered_in_bands(stores, monkeypatch):
     widened = fs.Capture(facing_the_wall(), outputs=outputs, quality="lowpass=pixel,alpha_cutoff=1e-8")
     for capture in (fs.Capture(facing_the_wall(), outputs=outputs), sampled, by_pixel, widened, moved):
         rendered.clear()
-        ours, whole = limited.render(resident, capture), plain.render(cloud, capture)
+        ours, full_frame = limited.render(resident, capture), plain.render(cloud, capture)
         for output in capture.outputs:
-            assert np.array_equal(ours[output], whole[output]), output
+            assert np.array_equal(ours[output], full_frame[output]), output
         assert sum(count < most for count in rendered) >= 2
-        assert ours.stats["visible"] >= whole.stats["visible"]
-        assert set(ours.timings) == set(whole.timings)
+        assert ours.stats["visible"] >= full_frame.stats["visible"]
+        assert set(ours.timings) == set(full_frame.timings)
     # the next view begins with the bands of the previous one
     rendered.clear()
     limited.render(resident, moved)
@@ -197,29 +197,29 @@ def test_smaller_frames_reuse_buffers():
     pool = fs.Renderer("opencl").backend.pool
     pool.clear()
     pool.trim("stores", 1 << 30, 100)
-    for splats, kept in ((90, True), (100, True), (101, False)):
+    for splats, reused in ((90, True), (100, True), (101, False)):
         pool.scratch("records", 1 << 20)
         pool.trim("stores", 0, splats)
-        assert bool(pool.memory_bytes) == kept
+        assert bool(pool.memory_bytes) == reused
     pool.scratch("records", 1 << 20)
     pool.trim("others", 0, 1)
     assert not pool.memory_bytes
 
 
 def test_bands_that_fit_together_are_merged():
-    made = bands.BandSplitter()
+    splitter = bands.BandSplitter()
     whole = SimpleNamespace(rows=(0, 64), count=64)
     whole.with_rows = lambda first, end: SimpleNamespace(
         rows=(first, end), count=end - first, with_rows=whole.with_rows,
         halves=[] if end - first < 2 else [whole.with_rows(first, (first + end) // 2),
                                            whole.with_rows((first + end) // 2, end)],
     )  # fmt: skip
-    assert [band.rows for band in made.split(whole, lambda band: band.count <= 20)] == [
+    assert [band.rows for band in splitter.split(whole, lambda band: band.count <= 20)] == [
         (0, 16), (16, 32), (32, 48), (48, 64)
     ]  # fmt: skip
-    assert len(list(made.split(whole, lambda band: band.count <= 20))) == 4
-    assert len(list(made.split(whole, lambda band: band.count <= 8))) == 8
-    assert len(list(made.split(whole, lambda band: True))) == 8
-    made._capacity = 33
-    list(made.split(whole, lambda band: True))
-    assert made._borders == {(0, 64): [0, 32, 64]}
+    assert len(list(splitter.split(whole, lambda band: band.count <= 20))) == 4
+    assert len(list(splitter.split(whole, lambda band: band.count <= 8))) == 8
+    assert len(list(splitter.split(whole, lambda band: True))) == 8
+    splitter._capacity = 33
+    list(splitter.split(whole, lambda band: True))
+    assert splitter._borders == {(0, 64): [0, 32, 64]}

@@ -18,19 +18,23 @@ def test_merging_preserves_opacity_times_area_and_position():
     splats = {"means": means.astype(np.float32), "quats": turns, "scales": scales}
     splats |= {"opacities": np.full(400, 0.1, np.float32)}
     splats["colors"] = 0.5 + 0.1 * generator.random((400, 3), np.float32)
-    made, size = merged(splats, Grid((-4.0, -4.0, -4.0), 8.0))
-    assert 1 < len(made["means"]) <= 100
+    merged_splats, size = merged(splats, Grid((-4.0, -4.0, -4.0), 8.0))
+    assert 1 < len(merged_splats["means"]) <= 100
     assert size > 0
-    light = (made["opacities"] * made["scales"].prod(axis=1)).astype(np.float64)
+    light = (merged_splats["opacities"] * merged_splats["scales"].prod(axis=1)).astype(np.float64)
     assert light.sum() == pytest.approx(400 * 0.1 * 1e-4, rel=1e-5)
-    assert np.average(made["means"], axis=0, weights=light) == pytest.approx(means.mean(axis=0), abs=1e-6)
-    assert np.average(made["colors"], axis=0, weights=light) == pytest.approx(splats["colors"].mean(axis=0))
+    assert np.average(merged_splats["means"], axis=0, weights=light) == pytest.approx(
+        means.mean(axis=0), abs=1e-6
+    )
+    assert np.average(merged_splats["colors"], axis=0, weights=light) == pytest.approx(
+        splats["colors"].mean(axis=0)
+    )
     # as flat and as wide: equal mean square distance from the centre
-    square = (made["scales"] ** 2).sum(axis=1) + (made["means"][:, :2] ** 2).sum(axis=1)
+    square = (merged_splats["scales"] ** 2).sum(axis=1) + (merged_splats["means"][:, :2] ** 2).sum(axis=1)
     given = 2 * 0.01**2 + (means[:, :2] ** 2).sum(axis=1)
     assert np.average(square, weights=light) == pytest.approx(given.mean(), rel=1e-5)
-    spread = made["scales"].max(axis=1) ** 2
-    assert (np.abs(fs.SplatCloud(**made).half_extents(1.0)[:, 2]) < 1e-6).all()
+    spread = merged_splats["scales"].max(axis=1) ** 2
+    assert (np.abs(fs.SplatCloud(**merged_splats).half_extents(1.0)[:, 2]) < 1e-6).all()
     assert spread.max() < size**2
 
 
@@ -56,9 +60,9 @@ def test_merging_preserves_moments(thick):
         second = np.einsum("nij,nj,nkj->nik", frames, axes**2, frames) + means[:, :, None] * means[:, None]
         return weights.sum(), *(np.tensordot(weights, each, 1) / weights.sum() for each in (means, second))
 
-    made, _ = merged(splats, Grid((0.0, -4.0, 0.0), 8.0))
-    assert 1 < len(made["means"]) <= count / 4
-    (mass, mean, second), (mass_made, mean_made, second_made) = moments(splats), moments(made)
+    merged_splats, _ = merged(splats, Grid((0.0, -4.0, 0.0), 8.0))
+    assert 1 < len(merged_splats["means"]) <= count / 4
+    (mass, mean, second), (mass_made, mean_made, second_made) = moments(splats), moments(merged_splats)
     assert mass_made == pytest.approx(mass, rel=1e-5)
     assert mean_made == pytest.approx(mean, abs=1e-5)
     lost = np.linalg.eigvalsh(second - second_made)
@@ -76,12 +80,12 @@ def test_overlapping_splats_are_merged_into_copies():
     splats = {"means": means, "quats": np.tile(np.float32([1, 0, 0, 0]), (count, 1))}
     splats |= {"scales": np.full((count, 2), 0.02, np.float32), "opacities": np.full(count, 0.9, np.float32)}
     splats["colors"] = np.ones((count, 3), np.float32)
-    made, _ = merged(splats, Grid((-1.0, -1.0, -1.0), 2.0))
-    light = made["opacities"] * made["scales"].prod(axis=1)
+    merged_splats, _ = merged(splats, Grid((-1.0, -1.0, -1.0), 2.0))
+    light = merged_splats["opacities"] * merged_splats["scales"].prod(axis=1)
     assert light.sum() == pytest.approx(count * 0.9 * 4e-4, rel=1e-5)
     assert 0.9 * count / MAX_OPACITY - 1 < len(light) < 0.9 * count
-    assert 1 < made["opacities"].max() <= MAX_OPACITY
-    assert made["scales"].max() < 0.02 * 1.4
+    assert 1 < merged_splats["opacities"].max() <= MAX_OPACITY
+    assert merged_splats["scales"].max() < 0.02 * 1.4
 
 
 def test_bright_and_dark_splats_are_merged_separately():
@@ -93,12 +97,12 @@ def test_bright_and_dark_splats_are_merged_separately():
     plain, _ = merged(splats | {"colors": np.full((40, 3), 0.2, np.float32)}, Grid((-1.0, -1.0, -1.0), 2.0))
     harmonics = ((light - np.float32(0.5)) / np.float32(C0))[:, None] * np.ones((1, 1, 3), np.float32)
     for colors in ({"colors": light * np.ones((1, 3), np.float32)}, {"sh": harmonics}):
-        made, _ = merged(splats | colors, Grid((-1.0, -1.0, -1.0), 2.0))
-        assert len(made["means"]) > len(plain["means"])
+        merged_splats, _ = merged(splats | colors, Grid((-1.0, -1.0, -1.0), 2.0))
+        assert len(merged_splats["means"]) > len(plain["means"])
         name, values = next(iter(colors.items()))
         known = {float(value) for value in values.ravel()}
-        assert {min(known, key=lambda k, v=v: abs(k - v)) for v in made[name].ravel()} == known
-        assert np.abs(made[name].ravel()[:, None] - sorted(known)).min(axis=1).max() < 1e-6
+        assert {min(known, key=lambda k, v=v: abs(k - v)) for v in merged_splats[name].ravel()} == known
+        assert np.abs(merged_splats[name].ravel()[:, None] - sorted(known)).min(axis=1).max() < 1e-6
 
 
 def test_codes_follow_the_bits_of_the_cells():

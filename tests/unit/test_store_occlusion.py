@@ -59,9 +59,9 @@ def culling(monkeypatch):
     monkeypatch.setattr(subchunks, "ROWS", 24)
 
     def noted(self, whole, *given):
-        made = rendered(self, whole, *given)
-        counts.append((whole.count if made is None else made[0][0].count, whole.count))
-        return made
+        images = rendered(self, whole, *given)
+        counts.append((whole.count if images is None else images[0][0].count, whole.count))
+        return images
 
     monkeypatch.setattr(occlusion_culling.OcclusionCulling, "render", noted)
     return counts
@@ -104,9 +104,9 @@ def test_frames_are_bit_identical_to_those_of_all_splats(town, culling, name, sc
     if schedule == "groups":
         asking["outputs"], path = ("rgb", "splat_id"), [view(size=(64, 36))]
     for number, frame in enumerate(renderer.render_views(resident, path, **asking)):
-        whole = renderer.render(cloud, path[number], **asking)
-        for output in whole:
-            assert np.array_equal(frame[output], whole[output]), (output, number)
+        full_frame = renderer.render(cloud, path[number], **asking)
+        for output in full_frame:
+            assert np.array_equal(frame[output], full_frame[output]), (output, number)
     assert len(culling) == len(path)
     if name in ("centres", "pixels", "samples"):
         assert culling[0][0] < 0.95 * culling[0][1]
@@ -147,7 +147,7 @@ def test_missing_chunks_are_rendered_in_their_tiles(town, culling, monkeypatch, 
     monkeypatch.setattr(occlusion_culling, "_PATCH_RATIO", 1)
     size = {"odd samples": (48, 27), "groups": SMALL, "pixels": (128, 72)}.get(name, (192, 108))
     path = [view(*place, size) for place in ((0.0, 0.0), (0.02, 0.1), (0.03, 0.5))]
-    renderer, taken = fs.Renderer("opencl"), []
+    renderer, measured = fs.Renderer("opencl"), []
     backend = type(renderer.backend)
     take, outputs = backend.copy_tiles, ALL_OUTPUTS if name != "groups" else ("rgb", "splat_id")
 
@@ -155,7 +155,7 @@ def test_missing_chunks_are_rendered_in_their_tiles(town, culling, monkeypatch, 
         own, others = (dict(each.stats) for each in (images, other))
         take(self, images, other, tiles)
         assert images.stats == {name: own[name] + others[name] for name in own}
-        taken.append(tiles.mean())
+        measured.append(tiles.mean())
 
     monkeypatch.setattr(backend, "copy_tiles", noted)
     if name == "groups":
@@ -165,12 +165,12 @@ def test_missing_chunks_are_rendered_in_their_tiles(town, culling, monkeypatch, 
     resident, cloud = drawing.upload(town), town.cloud()
     for camera in path:
         frame = drawing.render(resident, camera, quality=quality, outputs=outputs)
-        whole = renderer.render(cloud, camera, quality=quality, outputs=outputs)
-        for output in whole:
-            assert np.array_equal(frame[output], whole[output]), output
+        full_frame = renderer.render(cloud, camera, quality=quality, outputs=outputs)
+        for output in full_frame:
+            assert np.array_equal(frame[output], full_frame[output]), output
     # pixels with samples in two tiles need a complete pass
-    assert bool(taken) == (name != "odd samples")
-    assert not taken or min(taken) < 0.4
+    assert bool(measured) == (name != "odd samples")
+    assert not measured or min(measured) < 0.4
 
 
 def test_views_of_similar_size_reuse_memory(town, culling, monkeypatch):
@@ -185,7 +185,7 @@ def test_views_of_similar_size_reuse_memory(town, culling, monkeypatch):
         counts.append((frame.stats["splats"], len(fresh) - before))
     # buffers grow with the first views
     assert counts[2][0] > counts[1][0] > counts[0][0]
-    assert [taken for _, taken in counts[2:]] == [0, 0]
+    assert [memory for _, memory in counts[2:]] == [0, 0]
 
 
 def test_transparent_splats_occlude_nothing(tmp_path, culling, monkeypatch):
@@ -231,16 +231,16 @@ def test_bands_of_several_devices_are_culled_separately(town, culling):
     devices, renderer = fs.SeveralDevices(["opencl", "opencl"]), fs.Renderer("opencl")
     there = devices.upload(town)
     for camera in PATH[:3]:
-        whole = renderer.render(town.cloud(), camera)["rgb"]
-        assert np.array_equal(devices.render(there, camera)["rgb"], whole)
+        full_frame = renderer.render(town.cloud(), camera)["rgb"]
+        assert np.array_equal(devices.render(there, camera)["rgb"], full_frame)
     assert any(count < of for count, of in culling)
 
 
 def test_too_little_memory_for_visible_chunks(town, culling):
     renderer = fs.Renderer("opencl", memory_budget=4 * 2**20)
     resident = renderer.upload(town)
-    whole = fs.Renderer("opencl").render(town.cloud(), view())["rgb"]
-    assert np.array_equal(renderer.render(resident, view())["rgb"], whole)
+    full_frame = fs.Renderer("opencl").render(town.cloud(), view())["rgb"]
+    assert np.array_equal(renderer.render(resident, view())["rgb"], full_frame)
 
 
 CAPTURES = {
@@ -305,9 +305,9 @@ def test_tiles_terminate_where_all_pixels_are_opaque(order, schedule):
     capture = fs.Capture(camera, outputs=("alpha", "depth"), quality=f"lowpass=none,order={order}")
     features, shot = prepare(cloud, capture)
     images = backend.pipeline(with_termination_depths(features)).render_view(backend.upload(cloud), shot)
-    found = backend.termination_depths(images)
-    height, width = found.tile
-    rows, columns = found.depths.shape
+    depths = backend.termination_depths(images)
+    height, width = depths.tile
+    rows, columns = depths.depths.shape
     tiles = [(row, column) for row in range(rows) for column in range(columns)]
     alpha, depth = (images.read(name, 0).reshape(64, 96) for name in ("alpha", "depth"))
     finished = np.zeros((rows, columns), bool)
@@ -315,9 +315,9 @@ def test_tiles_terminate_where_all_pixels_are_opaque(order, schedule):
         own = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
         finished[row, column] = (alpha[own] >= 1 - 1e-4).all()
         if finished[row, column]:
-            assert found.depths[row, column] >= depth[own].max()
+            assert depths.depths[row, column] >= depth[own].max()
     assert 3 < finished.sum() < len(tiles) - 3
-    ends_known = np.isfinite(found.depths)
+    ends_known = np.isfinite(depths.depths)
     assert not (ends_known & ~finished).any()
     # work-groups test batches of a list by centres, and these lists are shorter than one
     assert np.array_equal(ends_known, finished) or (order, schedule) == ("centre", "groups")
@@ -340,9 +340,9 @@ def test_range_maximum():
     values = generator.normal(size=(13, 21))
     tops, lefts = generator.integers(0, 13, 300), generator.integers(0, 21, 300)
     bottoms, rights = generator.integers(0, 14, 300), generator.integers(0, 22, 300)
-    found = occlusion_test._RangeMaximum(values).within(tops, bottoms, lefts, rights)
+    actual = occlusion_test._RangeMaximum(values).within(tops, bottoms, lefts, rights)
     for k, (top, bottom, left, right) in enumerate(zip(tops, bottoms, lefts, rights, strict=True)):
-        assert found[k] == values[top:bottom, left:right].max(initial=-np.inf)
+        assert actual[k] == values[top:bottom, left:right].max(initial=-np.inf)
 
 
 def test_a_needle_that_ewa_widens_is_not_occluded():

@@ -70,10 +70,10 @@ def test_views_read_visible_chunks_only(stores, reference, name):
     for kind in ["disks", *kinds]:
         store, capture = stores[kind], CAPTURES[name].with_(outputs=("rgb", "splat_id", "label"))
         resident = reference.upload(store)
-        ours, whole = reference.render(resident, capture), reference.render(store.cloud(), capture)
+        ours, full_frame = reference.render(resident, capture), reference.render(store.cloud(), capture)
         for output in ours:
-            assert np.array_equal(ours[output], whole[output]), output
-        assert whole["rgb"].any()
+            assert np.array_equal(ours[output], full_frame[output]), output
+        assert full_frame["rgb"].any()
         read, every = resident.data.node_count, store.chunks
         assert 0 < read <= every
         if name in ("pinhole", "distorted", "pixel", "aside"):
@@ -120,7 +120,7 @@ def test_splats_that_the_low_pass_pixel_widens_are_in_the_frustum(reference, nam
     beside = np.cross(along, np.array([0, 1, 0]) + 0.3 * generator.normal(size=(count, 3)))
     along, beside = (axis / np.linalg.norm(axis, axis=1, keepdims=True) for axis in (along, beside))
     turns = np.stack([along, beside, np.cross(along, beside)], axis=2)
-    quats = [matrix_to_quaternion(turn) for turn in turns]
+    quats = [matrix_to_quaternion(quaternion) for quaternion in turns]
     sizes = np.linalg.norm(means, axis=1)[:, None] * generator.uniform((0, 0), most, (count, 2))
     cloud = fs.SplatCloud(means, quats, sizes, np.full(count, 0.99), colors=np.ones((count, 3)))
     quality = fs.Quality(lowpass="pixel", alpha_cutoff=1e-8)
@@ -170,8 +170,8 @@ def test_walls_next_to_the_camera_under_the_low_pass_pixel(tmp_path, lens):
             generator.uniform(-9, 9),
         )
         half = generator.uniform(-math.pi, math.pi) if number % 2 else generator.normal(0, 0.01)
-        turn = (math.cos(half), 0.0, math.sin(half), 0.0)
-        camera = look(turn=turn, at=at, lens=lens) if lens else look(turn=turn, at=at)
+        quaternion = (math.cos(half), 0.0, math.sin(half), 0.0)
+        camera = look(turn=quaternion, at=at, lens=lens) if lens else look(turn=quaternion, at=at)
         ours, expected = (renderer.render(each, camera, quality=quality) for each in (resident, whole))
         assert np.array_equal(ours["rgb"], expected["rgb"])
         read.append(ours.stats["splats"])
@@ -201,9 +201,9 @@ def test_moving_groups_are_culled_at_their_poses(tmp_path, reference):
     store = build_small_store(tmp_path, behind, "behind")
     half_turn = rigid_matrix((0, 0, 0), (0, 0, 1, 0))
     capture = fs.Capture(look(), motion=fs.Motion(groups={3: lambda t: half_turn}))
-    ours, whole = (reference.render(each, capture)["rgb"] for each in (store, store.cloud()))
+    ours, full_frame = (reference.render(each, capture)["rgb"] for each in (store, store.cloud()))
     assert ours.any()
-    assert np.array_equal(ours, whole)
+    assert np.array_equal(ours, full_frame)
     assert not reference.render(store, look())["rgb"].any()
 
 
@@ -245,8 +245,8 @@ def test_stores_with_splats_in_memory_are_bit_identical(stores):
     scene = fs.Scene([beside], look(), stores=(stores["disks"],))
     resident = renderer.upload(scene)
     for camera in (look(), look(turn=TURNED)):
-        ours, whole = (renderer.render(each, camera)["rgb"] for each in (resident, scene.cloud()))
-        assert np.array_equal(ours, whole)
+        ours, full_frame = (renderer.render(each, camera)["rgb"] for each in (resident, scene.cloud()))
+        assert np.array_equal(ours, full_frame)
     # split into chunks of the size of the store's
     assert resident.data._cache._rows < 200
 
@@ -286,9 +286,9 @@ def test_scenes_with_stores_markers_and_clouds(stores, reference, tmp_path):
     )
     scene = fs.Scene([far], look(), (placed,), stores=(stores["sh"],))
     ours = reference.render(scene, outputs=("rgb", "label", "splat_id"))
-    whole = reference.render(scene.cloud(), scene.camera, outputs=("rgb", "label", "splat_id"))
+    full_frame = reference.render(scene.cloud(), scene.camera, outputs=("rgb", "label", "splat_id"))
     for output in ours:
-        assert np.array_equal(ours[output], whole[output]), output
+        assert np.array_equal(ours[output], full_frame[output]), output
     assert (ours["label"] == 1).any()
     # away from the scene only pinned chunks are read
     away = look(at=(0, 0, 50))
@@ -306,15 +306,15 @@ def test_scenes_with_stores_markers_and_clouds(stores, reference, tmp_path):
 
 def test_stores_with_different_origins(tmp_path, reference):
     ahead = [random_splats(300, seed, depth=(1, 4), scale=(0.01, 0.1), across=0.8) for seed in (11, 12)]
-    given = {name: getattr(ahead[1], name) for name in ("quats", "scales", "opacities", "colors")}
-    moved = fs.SplatCloud(ahead[1].means - np.float32([8, 0, 0]), origin=(8.0, 0, 0), **given)
+    arguments = {name: getattr(ahead[1], name) for name in ("quats", "scales", "opacities", "colors")}
+    moved = fs.SplatCloud(ahead[1].means - np.float32([8, 0, 0]), origin=(8.0, 0, 0), **arguments)
     stores = (build_small_store(tmp_path, ahead[0], "here"), build_small_store(tmp_path, moved, "there"))
     assert stores[1].origin.tolist() == [8, 0, 0]
     scene = fs.Scene(stores=stores, camera=look())
     ours = reference.render(scene, outputs=("rgb", "splat_id"))
-    whole = reference.render(scene.cloud(), scene.camera, outputs=("rgb", "splat_id"))
+    full_frame = reference.render(scene.cloud(), scene.camera, outputs=("rgb", "splat_id"))
     for output in ours:
-        assert np.array_equal(ours[output], whole[output]), output
+        assert np.array_equal(ours[output], full_frame[output]), output
     assert ours["splat_id"].max() >= len(stores[0])
     apart = reference.render(fs.Scene([ahead[0], moved], look()), outputs=("rgb",))
     assert ours["rgb"] == pytest.approx(apart["rgb"], abs=1e-4)
@@ -336,8 +336,8 @@ def test_coplanar_groups_of_stores_are_part_of_every_frame(tmp_path, reference):
     cloud = fs.SplatCloud.concatenate([marker, random_splats(500, 4, depth=(1.5, 4), scale=(0.01, 0.05))])
     store = build_small_store(tmp_path, cloud, "tag")
     near = look(5, at=(0.19, 0.19, 1.0))
-    ours, whole = (reference.render(each, near)["rgb"] for each in (store, store.cloud()))
-    assert np.array_equal(ours, whole)
+    ours, full_frame = (reference.render(each, near)["rgb"] for each in (store, store.cloud()))
+    assert np.array_equal(ours, full_frame)
     selection = select(
         ChunkedSplats([store]),
         [prepare(store, fs.Capture(look(at=(0, 0, 90))))[1]],

@@ -38,12 +38,12 @@ def folder(tmp_path_factory):
     scales = np.column_stack([cloud.scales, third])
     cloud = fs.SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, sh=cloud.sh, labels=3)
     cloud = cloud.with_coplanar_groups(np.where(np.arange(COUNT) < PLANAR, np.arange(COUNT) // 3, -1))
-    made = tmp_path_factory.mktemp("values")
-    fs.save_ply(cloud, made / "a.ply")
+    path = tmp_path_factory.mktemp("values")
+    fs.save_ply(cloud, path / "a.ply")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(build_plan, "_MIN_MEMORY", 0)
         patch.setattr(build_plan, "_MERGE_BYTES", (0, 0.01))
-        return fs.build_store([made / "a.ply"], made / "a.fss", chunk=100, memory=1 << 20)
+        return fs.build_store([path / "a.ply"], path / "a.fss", chunk=100, memory=1 << 20)
 
 
 def crafted(folder, target, column, rows, value):
@@ -151,8 +151,8 @@ def test_sparse_columns_are_refused(folder, tmp_path, monkeypatch):
         with (path / f"{name}.npy").open("r+b") as stream:
             stream.write(npy_header(kind, shape))
             stream.truncate(NPY_HEADER + row_bytes(kind, shape))
-    said = {"nodes_crc": zlib.crc32(nodes.tobytes()), "splats": count, "rows": count, "pinned": count}
-    header_of(path, **said, chunk=count)
+    header = {"nodes_crc": zlib.crc32(nodes.tobytes()), "splats": count, "rows": count, "pinned": count}
+    header_of(path, **header, chunk=count)
     monkeypatch.setattr(limits, "FLOOR", 2**23)
     with pytest.raises(fs.InputError, match=r"must have at most 8 MiB, as it has .*FIDSPLAT_INPUT_LIMIT="):
         fs.Store(path)
@@ -207,7 +207,7 @@ def test_an_error_beyond_floats_is_a_damaged_file(folder, tmp_path):
     path = tmp_path / "a.fss"
     shutil.copytree(folder, path)
     one = {"lowpass": "screen", "level": 0, "sizes": [10**400], "errors": [0.1], "views": 1}
-    said = {"identity": fs.Store(path).identity, "details": [one | {"device": "", "date": ""}]}
-    (path / "detail.json").write_text(json.dumps(said | {"crc": header_crc(said)}))
+    header = {"identity": fs.Store(path).identity, "details": [one | {"device": "", "date": ""}]}
+    (path / "detail.json").write_text(json.dumps(header | {"crc": header_crc(header)}))
     with pytest.raises(fs.InputError, match=r"detail\.json is damaged"):
         _ = fs.Store(path).detail_errors

@@ -21,8 +21,8 @@ POSE = fs.Camera.look_at(8, 8, 1.0, AT + np.array((0.3, -0.2, -2.0)), AT).world_
 
 def camera(lens=None, **changes) -> fs.Camera:
     """Off the origin, of unequal focal lengths, its principal point off the middle."""
-    given = {"fx": 150.0, "fy": 110.0, "cx": 70.0, "cy": 63.0} | changes
-    return fs.Camera.pinhole(160, 120, **given, world_to_camera=POSE, lens=lens)
+    arguments = {"fx": 150.0, "fy": 110.0, "cx": 70.0, "cy": 63.0} | changes
+    return fs.Camera.pinhole(160, 120, **arguments, world_to_camera=POSE, lens=lens)
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +54,8 @@ def test_unproject_inverts_project(lens):
     points = view.unproject(pixels, depths)
     np.testing.assert_allclose(view.project(points), pixels, atol=1e-8)
     local = (points - view.position) @ view.world_to_camera[:3, :3].T
-    found = np.linalg.norm(local, axis=1) if lens == "fisheye" else local[:, 2]
-    np.testing.assert_allclose(found, depths, rtol=1e-12)
+    actual = np.linalg.norm(local, axis=1) if lens == "fisheye" else local[:, 2]
+    np.testing.assert_allclose(actual, depths, rtol=1e-12)
 
 
 @pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
@@ -65,14 +65,14 @@ def test_a_wall_behind_leaves(wall, renderer, lens, radius):
     view = camera(**LENSES[lens])
     centre = view.project(AT[None])[0]
     for pixel in (centre, centre + np.array((18.0, -13.0))):
-        found = wall.surface_at(view, pixel, radius=radius, renderer=renderer)
-        assert abs((found.position - AT) @ NORMAL) < 1e-5
-        assert angle(found.normal, NORMAL) < 0.02
-        np.testing.assert_allclose(view.project(found.position[None])[0], pixel, atol=1e-6)
-        assert 0.5 <= found.inlier_share <= 1
-        assert found.roughness < 1e-5
+        surface = wall.surface_at(view, pixel, radius=radius, renderer=renderer)
+        assert abs((surface.position - AT) @ NORMAL) < 1e-5
+        assert angle(surface.normal, NORMAL) < 0.02
+        np.testing.assert_allclose(view.project(surface.position[None])[0], pixel, atol=1e-6)
+        assert 0.5 <= surface.inlier_share <= 1
+        assert surface.roughness < 1e-5
         if radius is not None:
-            assert found.radius == pytest.approx(radius, rel=0.15)
+            assert surface.radius == pytest.approx(radius, rel=0.15)
 
 
 def test_shares_count_the_leaves(wall, renderer):
@@ -80,25 +80,25 @@ def test_shares_count_the_leaves(wall, renderer):
     view = camera()
     pixel = tuple(view.project(AT[None])[0])
     depth = renderer.render(wall, outputs=("depth_first",), quality="first_hit=0.5")["depth_first"]
-    found = surface_of(depth, view, pixel, 20.0)
+    surface = surface_of(depth, view, pixel, 20.0)
     y, x = np.mgrid[:120, :160] + 0.5
     rays = np.stack([(x - 70.0) / 150.0, (y - 63.0) / 110.0, np.ones_like(x)], 2) @ POSE[:3, :3]
     plane_depth = ((AT - view.position) @ NORMAL) / (rays @ NORMAL)
     of_wall = np.abs(depth - plane_depth) < 0.01
     inside = (x - pixel[0]) ** 2 + (y - pixel[1]) ** 2 <= 20.0**2
     assert 0.55 < of_wall[inside].mean() < 0.95
-    assert found.inlier_share == pytest.approx(of_wall[inside].mean(), abs=0.01)
-    assert angle(found.normal, NORMAL) < 0.02
+    assert surface.inlier_share == pytest.approx(of_wall[inside].mean(), abs=0.01)
+    assert angle(surface.normal, NORMAL) < 0.02
 
 
 def test_a_sphere(renderer):
     """The plane of a patch of radius a is within a^2 / R of the sphere, and parallel to it at the middle."""
     scene, view = fs.Scene([sphere(AT, 0.5, 4000)], camera=camera()), camera()
     for x, y in ((70.0, 60.0), (55.0, 50.0), (85.0, 66.0)):
-        found = scene.surface_at(view, (x, y), radius=0.05, renderer=renderer)
-        outwards = found.position - AT
+        surface = scene.surface_at(view, (x, y), radius=0.05, renderer=renderer)
+        outwards = surface.position - AT
         assert np.linalg.norm(outwards) == pytest.approx(0.5, abs=0.005)
-        assert angle(found.normal, outwards / np.linalg.norm(outwards)) < 1.5
+        assert angle(surface.normal, outwards / np.linalg.norm(outwards)) < 1.5
 
 
 def test_a_ray_and_a_pixel_agree(wall, renderer):
@@ -117,32 +117,32 @@ def test_the_scenes_camera_is_at_the_time_of_the_shutter(renderer):
     moving = fs.Scene(
         [plane(AT, NORMAL)], camera=camera(), camera_motion=motion, shutter=fs.Shutter(time=1.0)
     )
-    found = moving.surface_at(pixel=(60.0, 60.0), renderer=renderer)
+    surface = moving.surface_at(pixel=(60.0, 60.0), renderer=renderer)
     there = camera().with_pose(np.linalg.inv(later))
-    np.testing.assert_allclose(there.project(found.position[None])[0], (60.0, 60.0), atol=1e-6)
-    assert abs((found.position - AT) @ NORMAL) < 1e-5
+    np.testing.assert_allclose(there.project(surface.position[None])[0], (60.0, 60.0), atol=1e-6)
+    assert abs((surface.position - AT) @ NORMAL) < 1e-5
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("arguments", "words"),
     [
         ({"pixel": (159.0, 1.0)}, "the surface must .*got"),
         ({"pixel": (161.0, 1.0)}, r"pixel must be \(x, y\) in the image, 0 to 160"),
         (
             {"pixel": (80.0, 60.0), "ray": (AT, NORMAL)},
-            "exactly one of pixel and ray must be given, got both",
+            "exactly one of pixel and ray must be arguments, got both",
         ),
-        ({}, "exactly one of pixel and ray must be given, got neither"),
+        ({}, "exactly one of pixel and ray must be arguments, got neither"),
         ({"pixel": (80.0, 60.0), "radius": -1.0}, "radius must be a positive length"),
         ({"pixel": (80.0, 60.0), "radius": "1"}, "radius must be a positive length"),
         ({"ray": (AT, (0.0, 0.0, 0.0))}, r"direction \(3,\), not 0"),
         ({"ray": 3}, "ray must be an origin"),
     ],
 )
-def test_what_has_no_surface_is_refused(renderer, given, words):
+def test_what_has_no_surface_is_refused(renderer, arguments, words):
     scene = fs.Scene([plane(AT, NORMAL, 0.3)], camera=camera())
     with pytest.raises(fs.InputError, match=words):
-        scene.surface_at(renderer=renderer, **given)
+        scene.surface_at(renderer=renderer, **arguments)
 
 
 def test_haze_is_no_surface(renderer):
@@ -183,19 +183,21 @@ def test_a_marker_on_a_floor_has_its_top_away_from_the_camera(renderer, how):
     """y is vertical and down; the camera looks along z, and down."""
     floor = fs.Scene([plane(np.array([0.0, 1.0, 3.0]), (0.0, -1.0, 0.0), 2.0)])
     view = fs.Camera.look_at(160, 120, 1.0, (0.0, -0.5, 0.0), (0.0, 1.0, 3.0))
-    given = {"camera": view, "pixel": (80, 60)} if how == "pixel" else {"ray": ((0, -0.5, 0), (0, 1.5, 3))}
+    arguments = (
+        {"camera": view, "pixel": (80, 60)} if how == "pixel" else {"ray": ((0, -0.5, 0), (0, 1.5, 3))}
+    )
     tag = fs.marker("apriltag:36h11:5", size=0.3)
-    pose = floor.place(tag, up=(0.0, -1.0, 0.0), renderer=renderer, **given).markers[0].pose
+    pose = floor.place(tag, up=(0.0, -1.0, 0.0), renderer=renderer, **arguments).markers[0].pose
     expected = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     np.testing.assert_allclose(pose[:3, :3], expected, atol=1e-4)
     np.testing.assert_allclose(pose[:3, 3], (0.0, 0.999, 3.0), atol=1e-3)
 
 
-@pytest.mark.parametrize("given", [{"up": (0, 0, 0)}, {"up": (1, 2)}, {"lift": math.nan}])
-def test_a_pose_of_invalid_numbers_is_refused(wall, renderer, given):
+@pytest.mark.parametrize("arguments", [{"up": (0, 0, 0)}, {"up": (1, 2)}, {"lift": math.nan}])
+def test_a_pose_of_invalid_numbers_is_refused(wall, renderer, arguments):
     tag = fs.marker("apriltag:36h11:5", size=0.1)
-    with pytest.raises(fs.InputError, match=rf"{next(iter(given))} must be"):
-        wall.place(tag, pixel=(70.0, 60.0), renderer=renderer, **given)
+    with pytest.raises(fs.InputError, match=rf"{next(iter(arguments))} must be"):
+        wall.place(tag, pixel=(70.0, 60.0), renderer=renderer, **arguments)
 
 
 def test_the_command_places_a_marker(wall, tmp_path, capsys):
@@ -233,9 +235,9 @@ def test_the_command_places_a_marker(wall, tmp_path, capsys):
     ],
 )
 def test_options_of_a_place_need_each_other(words, capsys):
-    status, said = fails(capsys, "marker", "apriltag:36h11:5", *words)
+    status, output = fails(capsys, "marker", "apriltag:36h11:5", *words)
     assert status == 2
-    assert "--scene" in said or "--append must" in said
+    assert "--scene" in output or "--append must" in output
 
 
 def test_a_click_places_a_marker(tmp_path):

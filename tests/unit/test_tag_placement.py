@@ -65,10 +65,10 @@ def test_the_jacobian_is_that_of_finite_differences(lens):
     points = view.unproject(
         np.array([[40.0, 60.0], [200.0, 30.0], [160.0, 200.0]]), np.array([2.0, 1.0, 3.0])
     )
-    found, step = pose_jacobian(view, points), 1e-6
+    actual, step = pose_jacobian(view, points), 1e-6
     for axis in range(6):
         ahead, behind = (moved(view, axis, s).project(points) for s in (step, -step))
-        np.testing.assert_allclose(found[:, :, axis], (ahead - behind) / (2 * step), rtol=1e-6, atol=1e-4)
+        np.testing.assert_allclose(actual[:, :, axis], (ahead - behind) / (2 * step), rtol=1e-6, atol=1e-4)
 
 
 def test_the_variance_of_a_corner_is_that_of_fitted_edges():
@@ -80,8 +80,8 @@ def test_the_variance_of_a_corner_is_that_of_fitted_edges():
     rows = np.stack([np.ones(4000), (np.arange(4000) + 0.5) / 4000], 1)
     at_end = np.linalg.inv(rows.T @ rows)[0, 0] * 4000 / side * offset
     square = np.array([[[10.0, 10.0], [50.0, 10.0], [50.0, 50.0], [10.0, 50.0]]])
-    found = corner_covariances(square, np.zeros_like(square), noise)
-    np.testing.assert_allclose(found, np.tile(at_end * np.eye(2), (1, 4, 1, 1)), rtol=2e-3, atol=1e-9)
+    actual = corner_covariances(square, np.zeros_like(square), noise)
+    np.testing.assert_allclose(actual, np.tile(at_end * np.eye(2), (1, 4, 1, 1)), rtol=2e-3, atol=1e-9)
 
 
 def test_motion_blurs_the_edges_across_it():
@@ -120,12 +120,12 @@ def test_odometry_drifts_as_in_the_closed_form():
     count, metres, radians = 6, 0.02, 0.01
     poses = np.tile(np.eye(4), (count + 1, 1, 1))
     poses[:, 2, 3] = np.arange(count + 1)
-    found = odometry_covariance(poses, metres, radians, (0.0, 0.0))[-6:, -6:]
+    actual = odometry_covariance(poses, metres, radians, (0.0, 0.0))[-6:, -6:]
     aside = count * metres**2 + radians**2 * sum(m * m for m in range(count))
     np.testing.assert_allclose(
-        np.diag(found), [aside, aside, count * metres**2, *[count * radians**2] * 3], rtol=1e-5
+        np.diag(actual), [aside, aside, count * metres**2, *[count * radians**2] * 3], rtol=1e-5
     )
-    assert position_error(found) == pytest.approx(math.sqrt(2 * aside + count * metres**2), rel=1e-5)
+    assert position_error(actual) == pytest.approx(math.sqrt(2 * aside + count * metres**2), rel=1e-5)
 
 
 def test_a_camera_on_a_floor_drifts_in_the_plane():
@@ -143,8 +143,8 @@ def test_errors_of_height_and_tilt_are_marginalised():
     roots = rng.normal(size=(2, 6, 6)) * 300
     information = roots @ roots.transpose(0, 2, 1)
     up = np.array([0.3, -1.0, 0.2])
-    found = planar_information(information, poses, up)
-    for own, pose, result in zip(information, poses, found, strict=True):
+    actual = planar_information(information, poses, up)
+    for own, pose, result in zip(information, poses, actual, strict=True):
         vertical = pose[:3, :3].T @ up / np.linalg.norm(up)
         along = np.outer(vertical, vertical)
         errors = block_diag(0.003**2 * along, 0.005**2 * (np.eye(3) - along))
@@ -193,15 +193,15 @@ def test_updates_are_those_of_dense_matrices():
 def test_selections_against_brute_force(seed):
     covariance, candidates = problem(seed)
     best = max(value_of(covariance, candidates, some) for some in itertools.combinations(range(8), 3))
-    found = greedy(covariance, candidates, 3)
-    assert found.value == pytest.approx(value_of(covariance, candidates, found.chosen))
-    assert (1 - 1 / math.e) * best <= found.value <= best * (1 + 1e-9)
-    assert found.bound >= best * (1 - 1e-9)
-    searched = local_search(covariance, candidates, found)
+    selection = greedy(covariance, candidates, 3)
+    assert selection.value == pytest.approx(value_of(covariance, candidates, selection.chosen))
+    assert (1 - 1 / math.e) * best <= selection.value <= best * (1 + 1e-9)
+    assert selection.bound >= best * (1 - 1e-9)
+    searched = local_search(covariance, candidates, selection)
     assert searched.value == pytest.approx(value_of(covariance, candidates, searched.chosen))
     assert searched.value == pytest.approx(best)
     worst = min(itertools.combinations(range(8), 3), key=lambda some: value_of(covariance, candidates, some))
-    start = found.__class__(worst, value_of(covariance, candidates, worst), math.inf)
+    start = selection.__class__(worst, value_of(covariance, candidates, worst), math.inf)
     assert local_search(covariance, candidates, start).value == pytest.approx(best)
 
 
@@ -217,12 +217,12 @@ def test_the_predicted_error_can_be_minimised():
     for seed in range(6):
         covariance, candidates = problem(seed)
         best = min(error_of(covariance, candidates, some) for some in itertools.combinations(range(8), 3))
-        found = greedy(covariance, candidates, 3, objective=error_gain)
-        decrease = position_error(covariance) ** 2 - error_of(covariance, candidates, found.chosen) ** 2
-        assert found.value == pytest.approx(decrease)
-        assert math.isinf(found.bound)
-        short += error_of(covariance, candidates, found.chosen) > best * (1 + 1e-9)
-        searched = local_search(covariance, candidates, found, objective=error_gain)
+        selection = greedy(covariance, candidates, 3, objective=error_gain)
+        decrease = position_error(covariance) ** 2 - error_of(covariance, candidates, selection.chosen) ** 2
+        assert selection.value == pytest.approx(decrease)
+        assert math.isinf(selection.bound)
+        short += error_of(covariance, candidates, selection.chosen) > best * (1 + 1e-9)
+        searched = local_search(covariance, candidates, selection, objective=error_gain)
         assert error_of(covariance, candidates, searched.chosen) == pytest.approx(best)
     assert short < 6
 
@@ -236,11 +236,11 @@ def test_exchanges_of_precise_tags_lose_no_digits():
         roots = 1e4 * rng.normal(size=(5, 6, 8))
         seen = np.sort(rng.choice(30, 5, replace=False))
         candidates.append(Sightings(seen, roots @ roots.transpose(0, 2, 1)))
-    found = greedy(covariance, candidates, 6, objective=error_gain)
-    searched = local_search(covariance, candidates, found, objective=error_gain)
+    selection = greedy(covariance, candidates, 6, objective=error_gain)
+    searched = local_search(covariance, candidates, selection, objective=error_gain)
     left = error_of(covariance, candidates, searched.chosen)
     assert position_error(covariance) ** 2 - searched.value == pytest.approx(left**2, rel=1e-3)
-    assert left <= error_of(covariance, candidates, found.chosen)
+    assert left <= error_of(covariance, candidates, selection.chosen)
 
 
 def test_conflicts_and_targets_are_respected():
@@ -248,9 +248,9 @@ def test_conflicts_and_targets_are_respected():
     free = greedy(covariance, candidates, 3).chosen
     conflicts = np.zeros((8, 8), bool)
     conflicts[free[0], free[1]] = conflicts[free[1], free[0]] = True
-    found = greedy(covariance, candidates, 3, conflicts)
-    assert not {free[0], free[1]} <= set(found.chosen)
-    assert not {free[0], free[1]} <= set(local_search(covariance, candidates, found, conflicts).chosen)
+    selection = greedy(covariance, candidates, 3, conflicts)
+    assert not {free[0], free[1]} <= set(selection.chosen)
+    assert not {free[0], free[1]} <= set(local_search(covariance, candidates, selection, conflicts).chosen)
     target = position_error(updated(covariance, candidates[free[0]])) * 1.0001
     assert (
         greedy(covariance, candidates, 8, None, lambda now: position_error(now) <= target).chosen == free[:1]
@@ -272,10 +272,10 @@ def test_tags_are_seen_where_they_are_readable():
     }
     depth = np.zeros((240, 320), np.float32)
     depth[:, 200:240] = 1.0
-    found = sightings_of([PlacedMarker(tag, pose) for pose in poses.values()], [view], [depth], NOISE)
-    assert {name for name, one in zip(poses, found, strict=True) if len(one.poses)} == {"in front"}
+    actual = sightings_of([PlacedMarker(tag, pose) for pose in poses.values()], [view], [depth], NOISE)
+    assert {name for name, one in zip(poses, actual, strict=True) if len(one.poses)} == {"in front"}
     placed = PlacedMarker(tag, poses["in front"])
-    np.testing.assert_allclose(found[0].information, tag_information(view, placed.corners[None], NOISE))
+    np.testing.assert_allclose(actual[0].information, tag_information(view, placed.corners[None], NOISE))
 
 
 @pytest.fixture
@@ -329,8 +329,8 @@ def test_the_command_writes_a_scene_and_a_map(hall, few_candidates, tmp_path, ca
     words = ["plan-tags", hall / "scene.toml", "--trajectory", hall / "path.tum", "--size", "0.4"]
     words += ["--poses", "5", "--views", "3", "--count", "2", "-o", tmp_path / "plan"]
     facts = prints_json(capsys, *words)
-    made = fs.Scene.load(tmp_path / "plan/scene.toml")
-    assert [tag.marker.spec for tag in made.markers] == [tag["spec"] for tag in facts["tags"]]
+    scene = fs.Scene.load(tmp_path / "plan/scene.toml")
+    assert [tag.marker.spec for tag in scene.markers] == [tag["spec"] for tag in facts["tags"]]
     assert 0 < facts["objective"] <= facts["bound"]
     assert (tmp_path / "plan/map.svg").read_text().count("<svg") == 1
     assert "already exists" in fails(capsys, *words)[1]
@@ -339,8 +339,8 @@ def test_the_command_writes_a_scene_and_a_map(hall, few_candidates, tmp_path, ca
 def test_the_example_plans_tags_in_an_aisle(few_candidates, tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib", reason="the extra experiments is not installed")
     example = Path(__file__).resolve().parents[2] / "examples" / "plan_tags.py"
-    given = ["--count", "2", "--poses", "9", "-o", str(tmp_path / "plan")]
-    monkeypatch.setattr(sys, "argv", [str(example), *given])
+    arguments = ["--count", "2", "--poses", "9", "-o", str(tmp_path / "plan")]
+    monkeypatch.setattr(sys, "argv", [str(example), *arguments])
     runpy.run_path(str(example), run_name="__main__")
     facts = json.loads((tmp_path / "plan/plan.json").read_text())
     assert len(facts["tags"]) == 2
@@ -349,7 +349,7 @@ def test_the_example_plans_tags_in_an_aisle(few_candidates, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["--count", "0"], "--count must be at least 1"),
         (["--size", "0.01"], "give larger tags, --size 0."),
@@ -359,19 +359,19 @@ def test_the_example_plans_tags_in_an_aisle(few_candidates, tmp_path, monkeypatc
         (["--size", "9"], "got none; give smaller tags"),
     ],
 )
-def test_impossible_plans_are_reported(hall, few_candidates, tmp_path, capsys, words, said):
-    given = ["plan-tags", hall / "scene.toml", "--trajectory", hall / "path.tum", "-o", tmp_path / "p"]
-    assert said in fails(capsys, *given, "--poses", "5", *words)[1]
+def test_impossible_plans_are_reported(hall, few_candidates, tmp_path, capsys, words, message):
+    arguments = ["plan-tags", hall / "scene.toml", "--trajectory", hall / "path.tum", "-o", tmp_path / "p"]
+    assert message in fails(capsys, *arguments, "--poses", "5", *words)[1]
 
 
 def test_a_folder_that_cannot_be_written_is_reported_before_the_search(hall, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("fidsplat.experiments.plan_tags.plan_tags", None)  # not called
     (tmp_path / "file").touch()
-    given = ["plan-tags", hall / "scene.toml", "--trajectory", hall / "path.tum"]
-    assert "cannot write into the folder" in fails(capsys, *given, "-o", tmp_path / "file" / "p")[1]
+    arguments = ["plan-tags", hall / "scene.toml", "--trajectory", hall / "path.tum"]
+    assert "cannot write into the folder" in fails(capsys, *arguments, "-o", tmp_path / "file" / "p")[1]
 
 
 def test_a_missing_trajectory_leaves_no_folder(hall, tmp_path, capsys):
-    given = ["plan-tags", hall / "scene.toml", "--trajectory", tmp_path / "no.tum", "-o", tmp_path / "p"]
-    assert "no.tum" in fails(capsys, *given)[1]
+    arguments = ["plan-tags", hall / "scene.toml", "--trajectory", tmp_path / "no.tum", "-o", tmp_path / "p"]
+    assert "no.tum" in fails(capsys, *arguments)[1]
     assert not (tmp_path / "p").exists()

@@ -36,13 +36,13 @@ CAMERAS = {"eye": RigCamera(PINHOLE, "eye")}
 @pytest.fixture(scope="module")
 def states():
     """The model, and MuJoCo's state of each world."""
-    model, found = mujoco.MjModel.from_xml_string(MODEL), []
+    model, results = mujoco.MjModel.from_xml_string(MODEL), []
     for height in HEIGHTS:
         data = mujoco.MjData(model)
         data.qpos[0] = height
         mujoco.mj_forward(model, data)
-        found.append(data)
-    return model, found
+        results.append(data)
+    return model, results
 
 
 @pytest.fixture(scope="module")
@@ -103,9 +103,9 @@ def test_the_example_reads_the_tag_of_each_world(monkeypatch, capsys):
     example = Path(__file__).resolve().parents[2] / "examples" / "tiled_cameras.py"
     monkeypatch.setattr(sys, "argv", [str(example), "--worlds", "2"])
     runpy.run_path(str(example), run_name="__main__")
-    said = capsys.readouterr().out
-    assert "rgb (2, 240, 320, 3)" in said
-    errors = re.findall(r"world (\d): apriltag:36h11:5, ([\d.]+) mm off", said)
+    error_output = capsys.readouterr().out
+    assert "rgb (2, 240, 320, 3)" in error_output
+    errors = re.findall(r"world (\d): apriltag:36h11:5, ([\d.]+) mm off", error_output)
     assert [world for world, _ in errors] == ["0", "1"]
     assert max(float(error) for _, error in errors) < 5
 
@@ -127,14 +127,14 @@ def test_newtons_shapes_are_composited_in_all_worlds(states, scene):
     poses = state.body_q.numpy()
     poses[2::3, 2] += HEIGHTS
     state.body_q.assign(poses)
-    given = {"renderer": fs.Renderer("reference"), "outputs": OUTPUTS}
-    rig = NewtonRig(model, scene, {1: "box"}, CAMERAS, **given)
+    arguments = {"renderer": fs.Renderer("reference"), "outputs": OUTPUTS}
+    rig = NewtonRig(model, scene, {1: "box"}, CAMERAS, **arguments)
     check(rig.render(state, meshes=True), states, lambda label: (-2 - label) % 2)
     with pytest.raises(fs.InputError, match=r"unknown body 'bx' \(did you mean 'box'\?\)"):
-        NewtonRig(model, scene, {1: "bx"}, CAMERAS, **given)
+        NewtonRig(model, scene, {1: "bx"}, CAMERAS, **arguments)
     builder.add_world(newton.ModelBuilder())
     with pytest.raises(fs.InputError, match="the worlds of a model must have the same bodies"):
-        NewtonRig(builder.finalize(device="cpu"), scene, {1: "box"}, CAMERAS, **given)
+        NewtonRig(builder.finalize(device="cpu"), scene, {1: "box"}, CAMERAS, **arguments)
 
 
 # `supported_output_types` of Isaac Lab's renderers, `Camera` and `CameraData` of isaac-sim/IsaacLab, 00b36b75
@@ -188,8 +188,8 @@ def test_the_interface_is_that_of_isaac_labs_source(scene):
             assert value.shape == (2, *np.atleast_1d(shape))
             assert (value.dtype, value.device.type) == (torch.float32, place)
         assert data.output["rgba"][..., :3].equal(data.output["rgb"])
-        seen = data.output["semantic_segmentation"][..., 0] == 1
-        assert (data.output["rgba"][..., 3][seen] > 127).all()
+        visible = data.output["semantic_segmentation"][..., 0] == 1
+        assert (data.output["rgba"][..., 3][visible] > 127).all()
         assert data.output["rgba"][0, 0, 0, 3] == 0
 
 

@@ -16,11 +16,11 @@ def timers(order, *seconds):
     def work(number, left):
         def once():
             order.append(number)
-            taken = next(left)
-            if isinstance(taken, Exception):
-                raise taken
-            clock.seconds += taken
-            return {"half": 500 * taken}
+            ms = next(left)
+            if isinstance(ms, Exception):
+                raise ms
+            clock.seconds += ms
+            return {"half": 500 * ms}
 
         return once
 

@@ -54,7 +54,7 @@ def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
     assert main([*solid, str(tmp_path / "a.ply"), "--iterations", "2"]) == 0
     assert main([*solid, str(tmp_path / "a.ply")]) == 0  # goes on
     assert (tmp_path / "e.ply").read_bytes() == (tmp_path / "d.ply").read_bytes()
-    for wrong, said in (
+    for wrong, message in (
         (["-o", "a.png"], "-o must be a .ply file, got a.png"),
         (["--random-points", "-1"], "--random-points must be"),
         (["--random-points", "99999999999"], "--random-points must be"),
@@ -62,7 +62,7 @@ def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
         (["--within-memory", "1e-6"], "must be more than the 0.0001 GiB of the images"),
     ):
         assert main([*words, *wrong]) == 2
-        assert said in capsys.readouterr().err
+        assert message in capsys.readouterr().err
     shutil.rmtree(folder / "test")
     words[3] = str(tmp_path / "c.ply")
     assert main(words) == 0
@@ -85,8 +85,8 @@ def test_a_run_that_is_interrupted_keeps_what_it_has_done(folder, tmp_path, caps
     monkeypatch.setattr(Trainer, "_advance", interrupted)
     file = tmp_path / "a.ply"
     assert main([*words, str(file)]) == 130
-    said = capsys.readouterr().err
-    assert "the same command resumes after iteration 4" in said
+    error_output = capsys.readouterr().err
+    assert "the same command resumes after iteration 4" in error_output
     assert not file.exists()
     assert main([*words, str(file)]) == 0
     assert file.read_bytes() == (tmp_path / "whole.ply").read_bytes()

@@ -89,21 +89,21 @@ def test_what_lenses_took_is_flat(folder, tmp_path, model):
     for file in images.iterdir():
         write_png(file, picture)
         write_png(folder / "masks" / f"{file.name}.png", mask)
-    found = load_dataset(folder)
-    for view in found.views:
+    dataset = load_dataset(folder)
+    for view in dataset.views:
         flat_as_wanted(view, lens, mask)
     if model in ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"):
         return
-    given = {field: value for field, value in vars(lens).items() if value and field != "fold"}
+    arguments = {field: value for field, value in vars(lens).items() if value and field != "fold"}
     frames = [
         {"file_path": f"images/{view.name}", "mask_path": f"masks/{view.name}.png", "transform_matrix": pose}
-        for view in found.views
+        for view in dataset.views
         for pose in [(np.linalg.inv(view.camera.world_to_camera) @ np.diag([1, -1, -1, 1])).tolist()]
     ]
     names = dict(zip(("fl_x", "fl_y", "cx", "cy"), pinhole[2:], strict=True))
-    table = {"camera_model": model, "frames": frames, **names, **given}
+    table = {"camera_model": model, "frames": frames, **names, **arguments}
     (folder / "transforms.json").write_text(json.dumps(table))
-    for ours, theirs in zip(load_dataset(folder, random_points=9).views, found.views, strict=True):
+    for ours, theirs in zip(load_dataset(folder, random_points=9).views, dataset.views, strict=True):
         np.testing.assert_array_equal(ours.image, theirs.image)
         np.testing.assert_array_equal(ours.mask, theirs.mask)
 

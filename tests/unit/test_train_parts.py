@@ -22,19 +22,19 @@ def images(seed=0, size=(9, 12)):
 def splats_of(count, seed=0, degree=1):
     random = np.random.default_rng(seed)
     shapes = {"means": (3,), "log_scales": (2,), "quats": (4,), "logits": (), "sh": ((degree + 1) ** 2, 3)}
-    made = Splats.of({name: random.normal(size=(count, *shape)) for name, shape in shapes.items()})
-    for group in (made.first, made.second):
+    splats = Splats.of({name: random.normal(size=(count, *shape)) for name, shape in shapes.items()})
+    for group in (splats.first, splats.second):
         for array in group.values():
             array[:] = random.uniform(0.1, 1, array.shape)
-    return made
+    return splats
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("masked", [False, True])
 def test_the_gradient_of_the_loss_is_that_of_central_differences(weight, masked):
-    image, truth = images()
+    image, expected = images()
     mask = np.random.default_rng(1).uniform(size=image.shape[:2]) < 0.6 if masked else None
-    _, gradient = image_loss(image, truth, mask, weight)
+    _, gradient = image_loss(image, expected, mask, weight)
     random = np.random.default_rng(2)
     for _ in range(40):
         place = tuple(random.integers(image.shape))
@@ -42,7 +42,7 @@ def test_the_gradient_of_the_loss_is_that_of_central_differences(weight, masked)
         for change in (1e-5, -1e-5):
             moved = image.copy()
             moved[place] += change
-            values.append(image_loss(moved, truth, mask, weight)[0].value)
+            values.append(image_loss(moved, expected, mask, weight)[0].value)
         assert gradient[place] == pytest.approx((values[0] - values[1]) / 2e-5, abs=1e-9)
         if masked and not mask[place[:2]]:
             assert gradient[place] == 0
@@ -62,18 +62,18 @@ def test_the_gradient_of_the_loss_of_normals_is_that_of_central_differences():
     depth, normals, alpha = solid()
     lens = (6.0, 7.0), (4.2, 3.1)
     _, by_depth, by_normal = normal_loss(depth, normals, alpha, *lens)
-    for array, found in ((depth, by_depth), (normals, by_normal)):
+    for array, actual in ((depth, by_depth), (normals, by_normal)):
         for place in np.ndindex(array.shape):
             if array is depth and depth[place] == 0:
-                assert found[place] == 0
+                assert actual[place] == 0
                 continue
             ends = []
             for change in (1e-6, -1e-6):
-                kept, array[place] = array[place], array[place] + change
+                old_value, array[place] = array[place], array[place] + change
                 ends.append(normal_loss(depth, normals, alpha, *lens)[0])
-                array[place] = kept
-            assert found[place] == pytest.approx((ends[0] - ends[1]) / 2e-6, abs=1e-9)
-        assert np.abs(found).max() > 1e-3
+                array[place] = old_value
+            assert actual[place] == pytest.approx((ends[0] - ends[1]) / 2e-6, abs=1e-9)
+        assert np.abs(actual).max() > 1e-3
 
 
 def test_a_plane_has_the_normals_of_its_depths():
@@ -91,11 +91,11 @@ def test_a_plane_has_the_normals_of_its_depths():
 
 def test_the_loss_is_what_its_definition_says():
     """SSIM written out pixel by pixel: a window of 11 that sees zeros beyond the image."""
-    image, truth = images(size=(5, 7))
+    image, expected = images(size=(5, 7))
     weights = np.outer(window(), window())
     similar = []
     for c in range(3):
-        a, b = (np.pad(picture[:, :, c], 5) for picture in (image, truth))
+        a, b = (np.pad(picture[:, :, c], 5) for picture in (image, expected))
         for y in range(5):
             for x in range(7):
                 p, q = (each[y : y + 11, x : x + 11] for each in (a, b))
@@ -105,21 +105,21 @@ def test_the_loss_is_what_its_definition_says():
                 shared = (weights * p * q).sum() - mean_p * mean_q
                 top = (2 * mean_p * mean_q + C1) * (2 * shared + C2)
                 similar.append(top / ((mean_p**2 + mean_q**2 + C1) * (var_p + var_q + C2)))
-    loss, _ = image_loss(image, truth, None, 0.2)
-    l1 = np.abs(image - truth).mean()
+    loss, _ = image_loss(image, expected, None, 0.2)
+    l1 = np.abs(image - expected).mean()
     assert loss.value == pytest.approx(0.8 * l1 + 0.2 * (1 - np.mean(similar)), rel=1e-12)
-    assert loss.psnr == pytest.approx(-10 * np.log10(np.mean((image - truth) ** 2)))
-    assert image_loss(truth, truth, None, 0.2)[0].psnr == np.inf
+    assert loss.psnr == pytest.approx(-10 * np.log10(np.mean((image - expected) ** 2)))
+    assert image_loss(expected, expected, None, 0.2)[0].psnr == np.inf
     np.testing.assert_allclose(blurred(np.ones((30, 30, 1)))[15, 15], 1)
 
 
 def test_a_value_that_is_not_finite_is_detected_unless_it_is_masked():
-    image, truth = images()
+    image, expected = images()
     image[3, 4, 1] = np.nan
-    assert np.isnan(image_loss(image, truth, None, 0.2)[0].value)
+    assert np.isnan(image_loss(image, expected, None, 0.2)[0].value)
     mask = np.ones(image.shape[:2], bool)
     mask[3, 4] = False
-    assert np.isfinite(image_loss(image, truth, mask, 0.2)[0].value)
+    assert np.isfinite(image_loss(image, expected, mask, 0.2)[0].value)
 
 
 def test_adam_takes_the_step_that_is_written_out():
@@ -162,10 +162,10 @@ def test_gradients_by_inner_values_are_those_of_central_differences(strategy, pl
 
     def shown(values):
         quats = values["quats"] / np.linalg.norm(values["quats"], axis=1, keepdims=True)
-        found = {"means": values["means"], "quats": quats, "scales": np.exp(values["log_scales"])}
-        found["opacities"] = sigmoid(values["logits"])
+        actual = {"means": values["means"], "quats": quats, "scales": np.exp(values["log_scales"])}
+        actual["opacities"] = sigmoid(values["logits"])
         color = np.maximum(values["sh"][:, 0] * 0.28209479177387814 + 0.5, 0)
-        return found | ({"colors": color} if plain else {"sh": values["sh"]})
+        return actual | ({"colors": color} if plain else {"sh": values["sh"]})
 
     start = {name: array.astype(np.float64) for name, array in splats.values.items()}
     weights = {name: random.normal(size=shown(start)[name].shape) for name in names}
@@ -173,13 +173,13 @@ def test_gradients_by_inner_values_are_those_of_central_differences(strategy, pl
         np.testing.assert_allclose(getattr(cloud, name), shown(start)[name], rtol=1e-5, atol=1e-6)
 
     def loss(values):
-        found = shown(values)
-        total = sum((found[name] * weights[name]).sum() for name in names)
+        actual = shown(values)
+        total = sum((actual[name] * weights[name]).sum() for name in names)
         if strategy == "mcmc":
-            total += 0.01 * found["opacities"].mean() + 0.01 * found["scales"].mean()
+            total += 0.01 * actual["opacities"].mean() + 0.01 * actual["scales"].mean()
         return total
 
-    found = parameter_gradients(splats, weights, settings)
+    result = parameter_gradients(splats, weights, settings)
     for name, array in start.items():
         for place in np.ndindex(array.shape):
             values = []
@@ -187,7 +187,7 @@ def test_gradients_by_inner_values_are_those_of_central_differences(strategy, pl
                 moved = {**start, name: array.copy()}
                 moved[name][place] += change
                 values.append(loss(moved))
-            assert found[name][place] == pytest.approx((values[0] - values[1]) / 2e-6, rel=1e-4, abs=1e-6)
+            assert result[name][place] == pytest.approx((values[0] - values[1]) / 2e-6, rel=1e-4, abs=1e-6)
 
 
 def test_philox_gives_what_its_authors_print():
@@ -271,24 +271,24 @@ def test_densification_keeps_the_order_and_puts_new_splats_behind():
     splats.values["log_scales"][[2, 5]] = np.log(0.03)  # larger than a hundredth of the extent
     splats.values["logits"][7] = logit(0.04)
     old = splats.select(slice(None))
-    made = densify.densification(splats, settings, 600, extent=2.0).apply(splats)
-    assert ids(made) == [0, 1, 3, 4, 6, 1, 2, 5, 2, 5]
-    kept = old.select(np.array([0, 1, 3, 4, 6]))
-    for name in kept.values:
-        np.testing.assert_array_equal(made.values[name][:5], kept.values[name])
-        np.testing.assert_array_equal(made.first[name][:5], kept.first[name])
-        assert not made.first[name][5:].any()
-        assert not made.second[name][5:].any()
-    np.testing.assert_array_equal(made.values["means"][5], old.values["means"][1])  # a clone
-    np.testing.assert_allclose(made.scales[6:], 0.03 / 1.6, rtol=1e-5)
-    np.testing.assert_array_equal(made.values["quats"][6:], old.values["quats"][[2, 5, 2, 5]])
-    away = made.values["means"][6:] - old.values["means"][[2, 5, 2, 5]]
+    densified = densify.densification(splats, settings, 600, extent=2.0).apply(splats)
+    assert ids(densified) == [0, 1, 3, 4, 6, 1, 2, 5, 2, 5]
+    survivors = old.select(np.array([0, 1, 3, 4, 6]))
+    for name in survivors.values:
+        np.testing.assert_array_equal(densified.values[name][:5], survivors.values[name])
+        np.testing.assert_array_equal(densified.first[name][:5], survivors.first[name])
+        assert not densified.first[name][5:].any()
+        assert not densified.second[name][5:].any()
+    np.testing.assert_array_equal(densified.values["means"][5], old.values["means"][1])  # a clone
+    np.testing.assert_allclose(densified.scales[6:], 0.03 / 1.6, rtol=1e-5)
+    np.testing.assert_array_equal(densified.values["quats"][6:], old.values["quats"][[2, 5, 2, 5]])
+    away = densified.values["means"][6:] - old.values["means"][[2, 5, 2, 5]]
     assert (np.abs(away[:2] - away[2:]).max(axis=1) > 1e-4).all()  # the parts of a splat are apart
     assert (np.abs(away).max(axis=1) > 0).all()
     turns = quaternion_to_matrix(old.values["quats"][[2, 5, 2, 5]])
     assert np.abs(np.einsum("ni,ni->n", away, turns[:, :, 2])).max() < 1e-6  # within their disks
-    assert not made.gradient_sums.any()
-    assert not made.visible_counts.any()
+    assert not densified.gradient_sums.any()
+    assert not densified.visible_counts.any()
 
 
 def test_a_faint_splat_goes_though_it_would_be_split():
@@ -296,8 +296,8 @@ def test_a_faint_splat_goes_though_it_would_be_split():
     splats.gradient_sums[[1, 2]] = 4 * settings.gradient_threshold
     splats.values["log_scales"][[1, 2]] = np.log(0.03)
     splats.values["logits"][1] = logit(0.04)
-    made = densify.densification(splats, settings, 600, extent=2.0).apply(splats)
-    assert ids(made) == [0, 3, 4, 5, 6, 7, 2, 2]
+    densified = densify.densification(splats, settings, 600, extent=2.0).apply(splats)
+    assert ids(densified) == [0, 3, 4, 5, 6, 7, 2, 2]
 
 
 def test_no_more_splats_are_made_than_allowed():
@@ -321,18 +321,18 @@ def test_mcmc_moves_the_dead_and_grows_up_to_its_limit():
     settings = TrainSettings(strategy="mcmc", max_splats=41)
     splats = ready(40)
     splats.values["logits"][[3, 9]] = logit(0.004)
-    made = mcmc.relocate_and_grow(splats, settings, 600)
-    assert len(made) == 41
-    assert [i for i, new in enumerate(ids(made)[:40]) if i != new] == [3, 9]
+    densified = mcmc.relocate_and_grow(splats, settings, 600)
+    assert len(densified) == 41
+    assert [i for i, new in enumerate(ids(densified)[:40]) if i != new] == [3, 9]
     # two that stand for one let through what the one did
-    sources = [ids(made)[3], ids(made)[9], ids(made)[40]]
+    sources = [ids(densified)[3], ids(densified)[9], ids(densified)[40]]
     for source in sources:
-        copies = ids(made).count(source)
-        together = 1 - (1 - made.opacities[source]) ** copies
+        copies = ids(densified).count(source)
+        together = 1 - (1 - densified.opacities[source]) ** copies
         assert together == pytest.approx(0.5, rel=1e-4)
-    assert not made.first["means"][sources[:2]].any()
+    assert not densified.first["means"][sources[:2]].any()
     for place, source in zip((3, 9, 40), sources, strict=True):
-        assert_looks_like(made, [source, place], ids(made).count(source))
+        assert_looks_like(densified, [source, place], ids(densified).count(source))
     splats.values["logits"][:] = logit(0.004)
     with pytest.raises(TrainingError, match=r"all splats are dead"):
         mcmc.relocate_and_grow(splats, settings, 600)

@@ -166,29 +166,29 @@ def test_opacities_are_reset_at_multiples_of_an_interval_that_densification_foll
     trainer = Trainer(
         dataset, fs.Renderer("reference"), iterations=ITERATIONS, **QUICK | {"reset_every": every}
     )
-    found, limit = [], QUICK["reset_opacity"] + 1e-6
+    results, limit = [], QUICK["reset_opacity"] + 1e-6
     reset = type(trainer._model).reset_opacities
 
     def counted(model):
         reset(model)
-        found.append(trainer.iteration)
+        results.append(trainer.iteration)
         assert model.read().opacities.max() <= limit
 
     monkeypatch.setattr(type(trainer._model), "reset_opacities", counted)
     trainer.run()
-    assert found == expected
+    assert results == expected
 
 
 def test_a_run_that_restarts_keeps_the_old_checkpoint_until_it_has_its_own(dataset, tmp_path):
     file, renderer = tmp_path / "scene.training.npz", fs.Renderer("reference")
     Trainer(dataset, renderer, iterations=2, checkpoint=file, **QUICK).run()
-    kept = sha(file)
+    digest = sha(file)
     again = Trainer(dataset, renderer, iterations=2, checkpoint=file, restart=True, seed=1, **QUICK)
     assert again.iteration == 0
     again.step()
-    assert sha(file) == kept
+    assert sha(file) == digest
     again.run()
-    assert sha(file) != kept
+    assert sha(file) != digest
     with pytest.raises(fs.InputError, match="must be a regular file"):  # before any work
         Trainer(dataset, renderer, checkpoint=tmp_path, **QUICK)
 
@@ -235,9 +235,9 @@ def test_a_run_says_that_a_checkpoint_is_of_another_device_or_other_sources(data
         warnings.simplefilter("error")
         assert Trainer(dataset, renderer, **settings).done
     monkeypatch.setattr("fidsplat.train.checkpoint.code_hash", lambda: "f00d")
-    with pytest.warns(UserWarning, match=r"another fidsplat \(.*, not .*f00d\); the run resumes") as seen:
+    with pytest.warns(UserWarning, match=r"another fidsplat \(.*, not .*f00d\); the run resumes") as caught:
         assert Trainer(dataset, renderer, **settings).done
-    assert "another device" not in str(seen[0].message)
+    assert "another device" not in str(caught[0].message)
     file.unlink()
     Trainer(dataset, renderer, **settings).run()
     monkeypatch.setattr(renderer.backend, "info", replace(renderer.device, title="abacus"))
@@ -259,12 +259,12 @@ def test_a_checkpoint_of_another_run_is_refused(dataset, tmp_path):
             Trainer(dataset, renderer, checkpoint=file, **{"iterations": 3, **QUICK, **change})
     with pytest.raises(fs.InputError, match="another data set"):
         Trainer(scene(views=3), renderer, checkpoint=file, iterations=3, **QUICK)
-    whole = file.read_bytes()
-    flag = whole.index(b"PK\1\2") + 8
+    contents = file.read_bytes()
+    flag = contents.index(b"PK\1\2") + 8
     np.save(tmp_path / "array.npy", np.zeros(3))
     for damaged in (
-        whole[:200],
-        whole[:flag] + b"\1" + whole[flag + 1 :],  # says that it is encrypted
+        contents[:200],
+        contents[:flag] + b"\1" + contents[flag + 1 :],  # says that it is encrypted
         (tmp_path / "array.npy").read_bytes(),
     ):
         file.write_bytes(damaged)
@@ -376,14 +376,14 @@ def test_what_is_not_finite_ends_the_run_and_leaves_the_checkpoint(dataset, tmp_
     monkeypatch.setattr(os, "fsync", synced.append)
     trainer.save_checkpoint()
     assert len(synced) == 2  # the file and its folder: a power cut loses neither
-    kept = sha(file)
+    digest = sha(file)
     splats = trainer._model.read()
     splats.values["sh"][:] = np.nan
     with pytest.raises(TrainingError, match=r"the loss is nan at iteration 2.*is complete"):
         trainer.run()
     with pytest.raises(TrainingError, match=r"sh of 16 splats .* are not finite after iteration 1"):
         trainer.save_checkpoint()
-    assert sha(file) == kept
+    assert sha(file) == digest
     alone = Trainer(dataset, renderer, iterations=9, **QUICK)
     alone._model.read().values["means"][3] = np.nan
     with pytest.raises(TrainingError, match=r"means of 1 splats \(the first is 3\).*there is no checkpoint"):
@@ -395,7 +395,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(dataset, tmp_path, monkeypatch):
     file = tmp_path / "scene.training.npz"
     trainer = Trainer(dataset, fs.Renderer("reference"), iterations=9, checkpoint=file, **QUICK)
     trainer.save_checkpoint()
-    kept = sha(file)
+    digest = sha(file)
 
     def full(*_, **__):
         raise OSError(28, "No space left on device")
@@ -403,7 +403,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(np, "savez", full)
     with pytest.raises(fs.InputError, match="No space left on device"):
         trainer.save_checkpoint()
-    assert sha(file) == kept
+    assert sha(file) == digest
     assert [each.name for each in tmp_path.iterdir()] == [file.name]
 
 

@@ -82,9 +82,9 @@ def test_a_smooth_circle_stays_round():
     angles = np.array([0.0, 0.5, 1.5, 2.0])
     poses = []
     for angle in angles:
-        turn = quaternion_to_matrix(np.array([math.cos(angle / 2), 0, math.sin(angle / 2), 0]))
+        rotation = quaternion_to_matrix(np.array([math.cos(angle / 2), 0, math.sin(angle / 2), 0]))
         poses.append(np.eye(4))
-        poses[-1][:3, :3], poses[-1][:3, 3] = turn, turn @ [0, 0, -2]
+        poses[-1][:3, :3], poses[-1][:3, 3] = rotation, rotation @ [0, 0, -2]
     path = fs.Trajectory(angles, poses, smooth=True)
     for time in np.linspace(0, 2, 9):
         assert np.linalg.norm(path(time)[:3, 3]) == pytest.approx(2, abs=1e-12)
@@ -145,9 +145,9 @@ def test_what_a_file_of_each_format_says(tmp_path):
     row = [float(w) for w in (tmp_path / "a.kitti").read_text().split()]
     np.testing.assert_allclose(row, [0, 0, 1, 1, 0, 1, 0, 2, -1, 0, 0, 3], atol=1e-15)
     fs.save_trajectory(path, tmp_path / "a.json", CAMERA, ["images/x.png"])
-    said = json.loads((tmp_path / "a.json").read_text())
-    assert (said["w"], said["h"], said["fl_x"], said["fl_y"]) == (640, 480, 500.0, 510.0)
-    frame = said["frames"][0]
+    printed = json.loads((tmp_path / "a.json").read_text())
+    assert (printed["w"], printed["h"], printed["fl_x"], printed["fl_y"]) == (640, 480, 500.0, 510.0)
+    frame = printed["frames"][0]
     assert (frame["file_path"], frame["time"]) == ("images/x.png", 1.5)
     # OpenGL: the camera looks along its own -z, so the third column is backwards, the second up
     expected = [[0, 0, -1, 1], [0, -1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]]
@@ -160,8 +160,8 @@ def test_colmap_reads_what_is_written(tmp_path):
     fs.save_trajectory(path, tmp_path / "model", CAMERA)
     model = pycolmap.Reconstruction(str(tmp_path / "model"))
     images = sorted(model.images.values(), key=lambda image: image.name)
-    found = [image.cam_from_world().inverse().matrix() for image in images]
-    np.testing.assert_allclose(found, path.poses[:, :3], atol=1e-12)
+    actual = [image.cam_from_world().inverse().matrix() for image in images]
+    np.testing.assert_allclose(actual, path.poses[:, :3], atol=1e-12)
 
 
 def test_colmaps_images_come_in_the_order_of_their_names(tmp_path):
@@ -257,12 +257,14 @@ def test_lenses_of_transforms_json_are_those_of_opencv(tmp_path):
     brown = fs.Camera.pinhole(64, 48, 50.0, 52.0, 31.0, 25.0, lens=fs.BrownConrady(k1=-0.1, p2=0.01, k4=0.02))
     for camera in (fs.Camera.fisheye(64, 48, 2.0, coefficients=(0.1, -0.02, 0.003, 0.001)), brown):
         fs.save_trajectory(some(), tmp_path / "a.json", camera)
-        said = json.loads((tmp_path / "a.json").read_text())
-        fisheye = said["camera_model"] == "OPENCV_FISHEYE"
+        printed = json.loads((tmp_path / "a.json").read_text())
+        fisheye = printed["camera_model"] == "OPENCV_FISHEYE"
         names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        matrix = np.array([[said["fl_x"], 0, said["cx"]], [0, said["fl_y"], said["cy"]], [0, 0, 1]])
+        matrix = np.array(
+            [[printed["fl_x"], 0, printed["cx"]], [0, printed["fl_y"], printed["cy"]], [0, 0, 1]]
+        )
         project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
-        values = np.array([said.get(name, 0.0) for name in names])
+        values = np.array([printed.get(name, 0.0) for name in names])
         theirs, _ = project(points[:, None], still, still, matrix, values)
         np.testing.assert_allclose(theirs[:, 0], camera.project(points), atol=1e-9)
 

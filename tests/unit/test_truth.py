@@ -89,11 +89,11 @@ def test_flow_follows_a_point_that_moves_before_a_camera_that_moves(lens, scene,
     before = a_camera(lens=lens)
     after = a_camera(rigid_matrix((0.05, -0.02, 0.1), (1, 0.01, 0.02, -0.03)), lens)
     motion = rigid_matrix((0.1, 0.05, -0.1), (1, 0.1, 0, 0.05))
-    seen = renderer.render(scene, before, outputs=("depth_first", "label"))
-    flow = optical_flow(seen["depth_first"], before, after, seen["label"], {BOX: motion})
-    points = points_of(seen["depth_first"], before)
+    images = renderer.render(scene, before, outputs=("depth_first", "label"))
+    flow = optical_flow(images["depth_first"], before, after, images["label"], {BOX: motion})
+    points = points_of(images["depth_first"], before)
     for label in (0, 1, BOX):
-        rows, columns = np.nonzero((seen["label"] == label) & np.isfinite(flow[..., 0]))
+        rows, columns = np.nonzero((images["label"] == label) & np.isfinite(flow[..., 0]))
         picked = slice(None, None, max(1, len(rows) // 50))
         world = points[rows[picked], columns[picked]]
         assert len(world) > 10
@@ -169,11 +169,11 @@ def test_a_camera_of_bop_is_where_ours_is(tmp_path, scene, renderer):
         json.loads((tmp_path / f"set/train/000000/scene_{name}.json").read_text())["0"]
         for name in ("camera", "gt")
     )
-    turn, move = np.reshape(camera["cam_R_w2c"], (3, 3)), np.array(camera["cam_t_w2c"])
+    rotation, move = np.reshape(camera["cam_R_w2c"], (3, 3)), np.array(camera["cam_t_w2c"])
     np.testing.assert_allclose(move, 1000 * moved.camera.world_to_camera[:3, 3], rtol=1e-12)
     tag = moved.markers[0]
     by_marker = 1000 * tag.marker.corners @ np.reshape(gt[0]["cam_R_m2c"], (3, 3)).T + gt[0]["cam_t_m2c"]
-    np.testing.assert_allclose(1000 * tag.corners @ turn.T + move, by_marker, atol=1e-9)
+    np.testing.assert_allclose(1000 * tag.corners @ rotation.T + move, by_marker, atol=1e-9)
 
 
 def test_bop_follows_its_format(tmp_path, truth, frame, scene):
@@ -184,8 +184,8 @@ def test_bop_follows_its_format(tmp_path, truth, frame, scene):
         json.loads((folder / f"scene_{name}.json").read_text())["0"] for name in ("gt", "gt_info", "camera")
     )
     corners = np.array(truth.markers[0].placed.marker.corners)
-    turn, move = np.reshape(gt[0]["cam_R_m2c"], (3, 3)), np.array(gt[0]["cam_t_m2c"])
-    seen = (1000 * corners @ turn.T + move) @ np.reshape(camera["cam_K"], (3, 3)).T
+    rotation, move = np.reshape(gt[0]["cam_R_m2c"], (3, 3)), np.array(gt[0]["cam_t_m2c"])
+    seen = (1000 * corners @ rotation.T + move) @ np.reshape(camera["cam_K"], (3, 3)).T
     # BOP counts pixels from the centre of the first
     np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], truth.markers[0].corners - 0.5, atol=1e-9)
     np.testing.assert_allclose(np.array(camera["cam_t_w2c"]), 0, atol=1e-9)

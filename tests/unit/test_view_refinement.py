@@ -45,7 +45,7 @@ def cloud():
 
 
 @pytest.fixture(scope="module")
-def given(renderer, cloud):
+def original(renderer, cloud):
     """Views from an arc away from the origin, with fx other than fy."""
     views = []
     for k, angle in enumerate(np.linspace(-1, 1, 4)):
@@ -59,11 +59,11 @@ def given(renderer, cloud):
 
 
 @pytest.fixture(scope="module")
-def disturbed(given):
+def disturbed(original):
     random = np.random.default_rng(1)
     motions = random.normal(size=(4, 6)) * np.repeat([0.01, 0.02], 3)
-    pairs = zip(given.views, motions, strict=True)
-    return replace(given, views=tuple(replace(v, camera=offset_camera(v.camera, m)) for v, m in pairs))
+    pairs = zip(original.views, motions, strict=True)
+    return replace(original, views=tuple(replace(v, camera=offset_camera(v.camera, m)) for v, m in pairs))
 
 
 def errors(views, truth):
@@ -72,18 +72,18 @@ def errors(views, truth):
     return np.max([pose_error(a.camera.camera_to_world, b.camera.camera_to_world) for a, b in pairs], axis=0)
 
 
-def test_poses_return_to_the_truth(renderer, cloud, given, disturbed):
+def test_poses_return_to_the_truth(renderer, cloud, original, disturbed):
     rates = RATES | {"pose_rate_end": 1e-4}
     trainer = Trainer(disturbed, renderer, start=cloud, iterations=400, refine_poses=True, **rates, **FIXED)
     trained = trainer.run()
     # aligned with the disturbed poses, the cameras and splats are moved by one similarity
-    matrix = alignment([view.camera for view in given.views], [view.camera for view in trainer.views])
+    matrix = alignment([view.camera for view in original.views], [view.camera for view in trainer.views])
     expected = cloud.world_means() @ matrix[:3, :3].T + matrix[:3, 3]
     assert np.abs(trained.world_means() - expected).max() < 0.003
-    truth = replace(
-        given, views=tuple(replace(view, camera=moved(view.camera, matrix)) for view in given.views)
+    reference = replace(
+        original, views=tuple(replace(view, camera=moved(view.camera, matrix)) for view in original.views)
     )
-    before, after = errors(disturbed.views, given), errors(trainer.views, truth)
+    before, after = errors(disturbed.views, original), errors(trainer.views, reference)
     assert (before > (0.02, 0.008)).all()
     assert (after < (0.002, 0.001)).all()
     changes = trainer.pose_changes()
@@ -101,13 +101,13 @@ def wrong_intrinsics(dataset, held_out=0):
     return replace(dataset, views=views[held_out:], held_out=views[:held_out])
 
 
-def test_intrinsics_return_to_the_truth(renderer, cloud, given):
-    wrong = wrong_intrinsics(given, held_out=1)
+def test_intrinsics_return_to_the_truth(renderer, cloud, original):
+    wrong = wrong_intrinsics(original, held_out=1)
     trainer = Trainer(wrong, renderer, start=cloud, iterations=400, refine_intrinsics=True, **RATES, **FIXED)
     before = trainer.evaluate()[0].psnr
     trainer.run()
-    for found, view in zip(trainer.views, given.views[1:], strict=True):
-        camera, true = found.camera, view.camera
+    for actual, view in zip(trainer.views, original.views[1:], strict=True):
+        camera, true = actual.camera, view.camera
         assert abs(camera.fx - true.fx) < 0.1
         assert abs(camera.fy - true.fy) < 0.1
         assert abs(camera.cx - true.cx) < 0.05
@@ -117,44 +117,44 @@ def test_intrinsics_return_to_the_truth(renderer, cloud, given):
     assert trainer.evaluate()[0].psnr > 35
 
 
-def test_a_held_out_view_with_too_sparse_a_mask_is_evaluated(renderer, cloud, given):
+def test_a_held_out_view_with_too_sparse_a_mask_is_evaluated(renderer, cloud, original):
     """Localisation has no pixel whose neighbours are not ignored."""
     mask = np.indices((24, 32)).sum(axis=0) % 2 == 0
-    dataset = replace(given, views=given.views[1:], held_out=(replace(given.views[0], mask=mask),))
+    dataset = replace(original, views=original.views[1:], held_out=(replace(original.views[0], mask=mask),))
     trainer = Trainer(dataset, renderer, start=cloud, iterations=1, refine_poses=True, **FIXED)
     assert trainer.evaluate()[0].psnr > 40
 
 
-def test_a_localisation_that_matches_worse_is_not_used(renderer, cloud, given, monkeypatch):
+def test_a_localisation_that_matches_worse_is_not_used(renderer, cloud, original, monkeypatch):
     """Scores are those at the held-out view's own pose."""
     from fidsplat.localisation import direct_alignment
 
-    dataset = replace(given, views=given.views[1:], held_out=given.views[:1])
+    dataset = replace(original, views=original.views[1:], held_out=original.views[:1])
     trainer = Trainer(dataset, renderer, start=cloud, iterations=1, refine_poses=True, **FIXED)
     expected = trainer.evaluate()[0].psnr
-    wrong = replace(given.views[0].camera, cx=given.views[0].camera.cx + 4)
-    found = SimpleNamespace(camera=wrong, inliers=0.9)
-    monkeypatch.setattr(direct_alignment, "align", lambda *given: found)
+    wrong = replace(original.views[0].camera, cx=original.views[0].camera.cx + 4)
+    localisation = SimpleNamespace(camera=wrong, inliers=0.9)
+    monkeypatch.setattr(direct_alignment, "align", lambda *arguments: localisation)
     assert trainer.evaluate()[0].psnr == pytest.approx(expected, abs=0.5)
     assert expected > 40
 
 
-def test_refinement_does_not_drift_by_a_similarity(given):
+def test_refinement_does_not_drift_by_a_similarity(original):
     """Cameras that are rotated, moved and scaled together are aligned with the original ones."""
-    refinement = ViewRefinement(given, TrainSettings(refine_poses=True))
+    refinement = ViewRefinement(original, TrainSettings(refine_poses=True))
     drift = 1.03 * rigid_matrix((0.2, -0.1, 0.4), (0.98, 0.1, -0.1, 0.15))
     drift[3, 3] = 1.0
-    refinement.cameras = [moved(view.camera, drift) for view in given.views]
+    refinement.cameras = [moved(view.camera, drift) for view in original.views]
     np.testing.assert_allclose(refinement.to_dataset() @ drift, np.eye(4), atol=1e-12)
     assert refinement.pose_changes().max() < 1e-10
 
 
-def test_exposures_return_to_the_truth(renderer, cloud, given):
+def test_exposures_return_to_the_truth(renderer, cloud, original):
     gains = np.exp(np.random.default_rng(2).normal(0, 0.1, (4, 3)))
     gains /= np.exp(np.log(gains).mean(axis=0))
-    pairs = zip(given.views, gains, strict=True)
+    pairs = zip(original.views, gains, strict=True)
     exposed = replace(
-        given, views=tuple(replace(v, image=to_uint8(v.image / 255 * gain)) for v, gain in pairs)
+        original, views=tuple(replace(v, image=to_uint8(v.image / 255 * gain)) for v, gain in pairs)
     )
     trainer = Trainer(exposed, renderer, start=cloud, iterations=240, fit_exposures=True, **FIXED)
     trainer.run()
@@ -168,19 +168,19 @@ def test_exposures_return_to_the_truth(renderer, cloud, given):
 def test_devices_agree_on_refinement(renderer, cloud, disturbed, monkeypatch):
     """Kernels of the derivatives by camera and exposure against the float64 reference."""
     monkeypatch.setattr("fidsplat.train.trainer.INTRINSICS_EVERY", 2)
-    found = []
+    results = []
     for device in (renderer, fs.Renderer("reference")):
         settings = {"iterations": 5, "sh_degree": 0} | RATES | ALL
         trainer = Trainer(disturbed, device, start=cloud, **settings)
         trainer.run()
         (intrinsics,) = {camera_intrinsics(view.camera)[2:] for view in trainer.views}
         poses = np.array([view.camera.world_to_camera for view in trainer.views])
-        found.append((poses, trainer.exposures, np.array(intrinsics)))
-    assert np.abs(found[0][0] - [view.camera.world_to_camera for view in disturbed.views]).max() > 5e-4
-    np.testing.assert_allclose(found[0][0], found[1][0], atol=2e-6)
-    np.testing.assert_allclose(found[0][1], found[1][1], atol=2e-6)
-    np.testing.assert_allclose(found[0][2], found[1][2], atol=1e-5)
-    assert np.abs(found[0][2] - (33, 36, 16.5, 11.5)).min() > 0.005
+        results.append((poses, trainer.exposures, np.array(intrinsics)))
+    assert np.abs(results[0][0] - [view.camera.world_to_camera for view in disturbed.views]).max() > 5e-4
+    np.testing.assert_allclose(results[0][0], results[1][0], atol=2e-6)
+    np.testing.assert_allclose(results[0][1], results[1][1], atol=2e-6)
+    np.testing.assert_allclose(results[0][2], results[1][2], atol=1e-5)
+    assert np.abs(results[0][2] - (33, 36, 16.5, 11.5)).min() > 0.005
 
 
 def test_a_resumed_run_is_bit_identical(renderer, cloud, disturbed, tmp_path, monkeypatch):
@@ -202,18 +202,18 @@ def test_a_resumed_run_is_bit_identical(renderer, cloud, disturbed, tmp_path, mo
     np.testing.assert_array_equal(resumed.cloud().means, complete.cloud().means)
 
 
-def test_masks_of_a_folder_and_of_alpha(given, tmp_path):
+def test_masks_of_a_folder_and_of_alpha(original, tmp_path):
     import cv2
 
     from fidsplat.formats.colmap import save_colmap
 
-    cameras = [view.camera for view in given.views]
-    names = [view.name for view in given.views]
-    save_colmap(tmp_path / "set" / "sparse" / "0", names, cameras, given.points, given.colors)
+    cameras = [view.camera for view in original.views]
+    names = [view.name for view in original.views]
+    save_colmap(tmp_path / "set" / "sparse" / "0", names, cameras, original.points, original.colors)
     (tmp_path / "set" / "images").mkdir()
     alpha = np.full((24, 32), 255, np.uint8)
     alpha[:5] = 0
-    for view in given.views:
+    for view in original.views:
         cv2.imwrite(str(tmp_path / "set" / "images" / view.name), np.dstack([view.image[:, :, ::-1], alpha]))
     (tmp_path / "masks").mkdir()
     mask = np.ones((24, 32), bool)
@@ -222,16 +222,16 @@ def test_masks_of_a_folder_and_of_alpha(given, tmp_path):
     plain = load_dataset(tmp_path / "set")
     assert all(view.mask is None for view in plain.views)
     assert (plain.views[0].image[:5] == 0).all()
-    found = load_dataset(tmp_path / "set", masks=tmp_path / "masks", alpha_masks=True)
-    np.testing.assert_array_equal(found.views[0].mask, mask & (alpha > 0))
-    np.testing.assert_array_equal(found.views[1].mask, alpha > 0)
+    dataset = load_dataset(tmp_path / "set", masks=tmp_path / "masks", alpha_masks=True)
+    np.testing.assert_array_equal(dataset.views[0].mask, mask & (alpha > 0))
+    np.testing.assert_array_equal(dataset.views[1].mask, alpha > 0)
     with pytest.raises(fs.InputError, match=r"--masks must be a folder of masks NAME.png, got .*missing"):
         load_dataset(tmp_path / "set", masks=tmp_path / "missing")
     (tmp_path / "empty").mkdir()
     with pytest.raises(fs.InputError, match=r"must have masks of the images, e\.g\. 0\.png\.png, got none"):
         load_dataset(tmp_path / "set", masks=tmp_path / "empty", alpha_masks=True)
     with pytest.raises(fs.InputError, match="refine_poses must be True or False, got 'yes'"):
-        Trainer(given, refine_poses="yes")
+        Trainer(original, refine_poses="yes")
 
 
 def test_rates_need_their_switches():

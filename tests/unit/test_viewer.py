@@ -18,9 +18,9 @@ from fidsplat.viewer.settings import AT_REST, Settings
 
 @pytest.fixture
 def session():
-    made = Session(scene(), "reference")
-    yield made
-    made.close()
+    viewer_session = Session(scene(), "reference")
+    yield viewer_session
+    viewer_session.close()
 
 
 def test_a_viewpoints_camera_sees_what_the_page_does():
@@ -127,12 +127,12 @@ def test_invalid_frames_change_nothing(session):
 def test_a_switch_never_blocks(session, monkeypatch):
     """The old renderer renders while the new one is opened."""
     compiling, go_on = threading.Event(), threading.Event()
-    made = session_module.Renderer
+    make_renderer = session_module.Renderer
 
     def slow(*words):
         compiling.set()
         assert go_on.wait(20)
-        return made(*words)
+        return make_renderer(*words)
 
     monkeypatch.setattr(session_module, "Renderer", slow)
     changed = []

@@ -18,8 +18,8 @@ CANVAS = "document.querySelector('canvas').getBoundingClientRect()"
 def until(condition, seconds=120.0):
     end = time.monotonic() + seconds
     while time.monotonic() < end:
-        if found := condition():
-            return found
+        if actual := condition():
+            return actual
         time.sleep(0.1)
     raise AssertionError("it did not happen in time")
 
@@ -73,8 +73,8 @@ def test_a_browser_sees_drags_asks_and_changes(tmp_path):
 
             for kind in ("mousePressed", "mouseReleased"):
                 page.mouse(kind, *middle)
-            (said,) = viewer._messages.values()
-            until(lambda: "label" in said.content)
+            (message,) = viewer._messages.values()
+            until(lambda: "label" in message.content)
         until(lambda: not viewer._streams)  # the browser has left, and is forgotten
     finally:
         viewer.close()

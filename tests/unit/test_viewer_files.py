@@ -34,12 +34,12 @@ POSE = rigid_matrix((0.25, -0.5, 1 / 3), (math.cos(0.3), 0, math.sin(0.3), 0))
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_moved_marker_goes_back_into_its_file(number):
     new = with_pose(FILE, number, POSE, "scene.toml")
-    said, before = tomllib.loads(new), tomllib.loads(FILE)
-    marker = said["markers"][number]
+    written, before = tomllib.loads(new), tomllib.loads(FILE)
+    marker = written["markers"][number]
     np.testing.assert_allclose(rigid_matrix(marker["position"], marker["quaternion"]), POSE, atol=1e-8)
     for key in ("position", "quaternion"):
         marker.pop(key), before["markers"][number].pop(key, None)
-    assert said == before
+    assert written == before
     for words in ("# a scene, with words", "# the first", "# the second", "# where from"):
         assert words in new
     assert with_pose(new, number, POSE, "") == new

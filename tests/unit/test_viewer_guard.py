@@ -33,9 +33,9 @@ from fidsplat.viewer.guard import guarded, refusal
     ],
 )
 def test_pages_of_others_are_refused(origin, host, listens, words):
-    found = refusal(origin, host, listens)
-    assert words in found
-    assert bool(words) == bool(found)
+    refused = refusal(origin, host, listens)
+    assert words in refused
+    assert bool(words) == bool(refused)
 
 
 def test_a_server_that_is_not_guarded_is_stopped():

@@ -45,9 +45,9 @@ def viewer(tmp_path, monkeypatch):
     monkeypatch.setattr(server, "POLL_INTERVAL", 0.1)
     path = tmp_path / "scene.toml"
     path.write_text(SCENE)
-    made = server.Viewer(fs.Scene.load(path), path, "reference", port=0)
-    yield made
-    made.close()
+    running_viewer = server.Viewer(fs.Scene.load(path), path, "reference", port=0)
+    yield running_viewer
+    running_viewer.close()
 
 
 def put(client, pose, width=64, height=40, fov=0.9):
@@ -83,10 +83,10 @@ def shows(client, image):
 
 @pytest.fixture
 def client(viewer):
-    made = Client()
-    viewer._enter(made)
-    put(made, ASIDE)
-    return made
+    page_client = Client()
+    viewer._enter(page_client)
+    put(page_client, ASIDE)
+    return page_client
 
 
 def test_a_moved_camera_shows_the_scene_from_there(viewer, client):
@@ -180,11 +180,11 @@ def test_clicks_name_what_is_at_their_pixel(viewer, client):
         assert abs(x - 32) > 3
         assert abs(y - 20) > 2
         viewer._click(SimpleNamespace(client_id=1, screen_pos=(x / 64, y / 40)))
-        said = client.said.content
-        assert f"marker {placed.marker.spec}" in said
-        assert f"label {placed.label}" in said
-        assert f"pixel ({int(x)}, {int(y)})" in said
-        depth = float(said.partition("depth ")[2].split()[0])
+        message = client.said.content
+        assert f"marker {placed.marker.spec}" in message
+        assert f"label {placed.label}" in message
+        assert f"pixel ({int(x)}, {int(y)})" in message
+        depth = float(message.partition("depth ")[2].split()[0])
         assert depth == pytest.approx((np.linalg.inv(ASIDE) @ placed.pose)[2, 3], abs=0.03)
     for corner in ((0.0, 0.0), (0.999, 0.999)):
         viewer._click(SimpleNamespace(client_id=1, screen_pos=corner))
@@ -244,8 +244,8 @@ def test_outlines_are_where_the_image_has_the_markers(tmp_path):
     Nodes(page).show(scene, True)
     for placed in scene.markers:
         node = page.added[f"/markers/{placed.label}"]
-        turn = rigid_matrix(node.position, node.wxyz)
-        edges = node.values[0] @ turn[:3, :3].T + turn[:3, 3]
+        rotation = rigid_matrix(node.position, node.wxyz)
+        edges = node.values[0] @ rotation[:3, :3].T + rotation[:3, 3]
         np.testing.assert_allclose(edges[:, 0], placed.corners, atol=1e-12)
         np.testing.assert_allclose(edges[:, 1], np.roll(placed.corners, -1, axis=0), atol=1e-12)
 

@@ -32,9 +32,9 @@ def viewer(tmp_path, monkeypatch):
         '[[markers]]\nspec = "aruco:4x4_50:7"\nsize = 0.4\n[render]\nbackground = [0.2, 0.3, 0.4]\n'
     )
     path = tmp_path / "scene.toml"
-    made = Viewer(fs.Scene.load(path), path, "reference", port=0)
-    yield made
-    made.close()
+    running_viewer = Viewer(fs.Scene.load(path), path, "reference", port=0)
+    yield running_viewer
+    running_viewer.close()
 
 
 def test_what_a_browser_gets_and_asks(viewer):
@@ -255,10 +255,10 @@ def test_large_splat_files_move_once_they_are_let_go(monkeypatch):
     from fidsplat.viewer import nodes
 
     cloud = fs.SplatCloud([[0, 0, 0]], [[1, 0, 0, 0]], [[0.1, 0.1]], [1], colors=[[1, 0, 0]])
-    taken = nodes.find_target(fs.Scene([cloud]), [SplatFile(0, "a.ply", np.eye(4))], "file 1: a.ply")
-    assert taken.live
+    target = nodes.find_target(fs.Scene([cloud]), [SplatFile(0, "a.ply", np.eye(4))], "file 1: a.ply")
+    assert target.live
     monkeypatch.setattr(nodes, "LIVE_LIMIT", 0)
-    assert not taken.live
+    assert not target.live
 
 
 def test_a_file_that_is_edited_is_shown(viewer, tmp_path):
@@ -408,9 +408,9 @@ def test_a_page_of_another_site_gets_no_socket(viewer):
         host = words.pop("host", "127.0.0.1")
         with (
             socket.create_connection(("127.0.0.1", port)) as line,
-            pytest.raises(InvalidStatus, match="403") as found,
+            pytest.raises(InvalidStatus, match="403") as error,
         ):
             connect(f"ws://{host}:{port}", sock=line, **words)
-        assert b"this" in found.value.response.body
+        assert b"this" in error.value.response.body
     assert not viewer._streams
     connect(f"ws://127.0.0.1:{port}", origin=f"http://127.0.0.1:{port}").close()

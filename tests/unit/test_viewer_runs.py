@@ -56,12 +56,12 @@ def test_a_scene_file_that_is_edited_keeps_the_quality_that_was_given(flight, mo
     pytest.importorskip("viser", reason="the extra viewer is not installed")
     from fidsplat.viewer import server
 
-    made = []
+    results = []
 
     class Page(server.Viewer):
         def __init__(self, *words, **more):
             super().__init__(*words, **more)
-            made.append(self.session)
+            results.append(self.session)
             file = self._file.path
             file.write_text(file.read_text().replace("0.4", "0.2"))
             for _ in range(100):
@@ -74,7 +74,7 @@ def test_a_scene_file_that_is_edited_keeps_the_quality_that_was_given(flight, mo
     monkeypatch.setattr(server, "Viewer", Page)
     words = ["--quality", "samples=2", "--device", "reference", "--port", "0"]
     assert main(["view", str(flight.parents[1] / "scene.toml"), *words]) == 2
-    scene = made[0].state.scene
+    scene = results[0].state.scene
     assert (scene.markers[0].marker.size, scene.capture.quality.samples) == (0.2, 2)
 
 
@@ -97,10 +97,10 @@ def trainer(tmp_path_factory):
     """A run of one step."""
     dataset = scene(views=2, held_out=0, size=(12, 9))
     file = tmp_path_factory.mktemp("run") / "yard.training.npz"
-    made = Trainer(dataset, fs.Renderer("reference"), iterations=9, checkpoint=file, **QUICK)
-    made.step()
-    made.save_checkpoint()
-    return made
+    short_trainer = Trainer(dataset, fs.Renderer("reference"), iterations=9, checkpoint=file, **QUICK)
+    short_trainer.step()
+    short_trainer.save_checkpoint()
+    return short_trainer
 
 
 def test_a_checkpoint_holds_what_is_rendered(trainer):

@@ -24,8 +24,8 @@ def seen(bits, pixels, tilt=0.0, spin=0.0, quiet=1, camera=CAMERA, aside=(0.007,
     return photographed(picture), corners, placed
 
 
-def corner_error(found, corners):
-    return float(np.linalg.norm(found - corners, axis=1).max())
+def corner_error(detection, corners):
+    return float(np.linalg.norm(detection - corners, axis=1).max())
 
 
 @pytest.mark.sweep
@@ -40,10 +40,10 @@ def test_every_family_is_found_and_its_corners_are_those_of_the_print(family):
         inner, size = outside(family) / len(bits), np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
         frame = cv2.getPerspectiveTransform(size, corners.astype(np.float32))
         corners = cv2.perspectiveTransform((inner + size * (1 - 2 * inner))[None], frame)[0]
-    found = detect(picture, families=[family], qr=False)
-    assert [(d.kind, d.family, d.id, d.payload) for d in found] == [(kind, family, tag_id, None)]
-    assert corner_error(found[0].corners, corners) < 0.1
-    assert found[0].name == f"{kind}:{family}:{tag_id}"
+    detections = detect(picture, families=[family], qr=False)
+    assert [(d.kind, d.family, d.id, d.payload) for d in detections] == [(kind, family, tag_id, None)]
+    assert corner_error(detections[0].corners, corners) < 0.1
+    assert detections[0].name == f"{kind}:{family}:{tag_id}"
 
 
 @pytest.mark.parametrize(
@@ -136,19 +136,24 @@ def test_an_image_with_several_codes():
     left, _, _ = seen(dictionary_bits("apriltag", "36h11", 300), 150)
     right, _, _ = seen(dictionary_bits("aruco", "4x4_50", 7), 150, tilt=30)
     below, _, _ = seen(qr_bits("two words"), 150, quiet=4)
-    found = detect(
+    detections = detect(
         np.repeat(np.vstack([np.hstack([left, right]), np.hstack([below, below])])[:, :, None], 3, 2)
     )
-    assert [d.name for d in found] == ["apriltag:36h11:300", "aruco:4x4_50:7", "qr:two words", "qr:two words"]
-    assert found[0].corners[:, 0].max() < 480 < found[1].corners[:, 0].min()
+    assert [d.name for d in detections] == [
+        "apriltag:36h11:300",
+        "aruco:4x4_50:7",
+        "qr:two words",
+        "qr:two words",
+    ]
+    assert detections[0].corners[:, 0].max() < 480 < detections[1].corners[:, 0].min()
 
 
 def test_neighbours_are_two_tags():
     """Their middles are 1.3 sides apart."""
     left, _, _ = seen(dictionary_bits("apriltag", "36h11", 7), 150, aside=(0, 0))
     right, _, _ = seen(dictionary_bits("apriltag", "36h11", 8), 150, aside=(0, 0))
-    found = detect(np.hstack([left[:, 140:340], right[:, 140:340]]), ["36h11"], qr=False)
-    assert [tag.name for tag in found] == ["apriltag:36h11:7", "apriltag:36h11:8"]
+    detections = detect(np.hstack([left[:, 140:340], right[:, 140:340]]), ["36h11"], qr=False)
+    assert [tag.name for tag in detections] == ["apriltag:36h11:7", "apriltag:36h11:8"]
 
 
 @pytest.mark.parametrize("fails", [cv2.aruco.CORNER_REFINE_SUBPIX, cv2.aruco.CORNER_REFINE_APRILTAG])
@@ -188,9 +193,9 @@ def test_what_detect_cannot_use():
         detect([[1], [2, 3]])
     with pytest.raises(InputError, match="qr must be True or False"):
         detect(np.zeros((60, 60), np.uint8), qr=np.eye(4))
-    for wanted in (5, "36h11"):
+    for expected in (5, "36h11"):
         with pytest.raises(InputError, match="families must be several names"):
-            detect(np.zeros((60, 60), np.uint8), wanted)
+            detect(np.zeros((60, 60), np.uint8), expected)
 
 
 @pytest.mark.parametrize("spin", [0.0, 90.0])
@@ -198,15 +203,15 @@ def test_what_is_viewed_frontally_has_a_pose(spin):
     """Where OpenCV's IPPE divides by next to nothing: squares, and boards of many points."""
     points = np.stack(np.meshgrid([-0.12, -0.04, 0.04, 0.12], [-0.08, 0, 0.08]), -1).reshape(-1, 2)
     square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * SIZE / 2
-    for away in np.linspace(0.5, 3, 250):
-        placed = pose(turned(0, spin), [0, 0, away])
+    for distance in np.linspace(0.5, 3, 250):
+        placed = pose(turned(0, spin), [0, 0, distance])
         for flat in (square, points):
-            seen = CAMERA.project(np.pad(flat, ((0, 0), (0, 1))) @ placed[:3, :3].T + placed[:3, 3])
+            pixels = CAMERA.project(np.pad(flat, ((0, 0), (0, 1))) @ placed[:3, :3].T + placed[:3, 3])
             # as detectors give them
-            seen = seen.astype(np.float32).astype(np.float64)
-            found = marker_pose(seen, SIZE, CAMERA) if flat is square else plane_pose(flat, seen, CAMERA)
-            apart, angle = pose_error(found, placed)
-            assert apart < 1e-4 * away
+            pixels = pixels.astype(np.float32).astype(np.float64)
+            actual = marker_pose(pixels, SIZE, CAMERA) if flat is square else plane_pose(flat, pixels, CAMERA)
+            apart, angle = pose_error(actual, placed)
+            assert apart < 1e-4 * distance
             assert angle < 0.01
 
 
@@ -282,9 +287,9 @@ def test_align_looks_past_something_in_front():
 
 
 def test_pose_error_is_the_distance_and_the_angle():
-    truth = pose(turned(10), [0.1, 0.2, 1.0])
+    true_pose = pose(turned(10), [0.1, 0.2, 1.0])
     moved = pose(turned(10 + 1e-4), [0.1, 0.2, 1.003])
-    apart, angle = pose_error(moved, truth)
+    apart, angle = pose_error(moved, true_pose)
     assert apart == pytest.approx(0.003)
     assert np.degrees(angle) == pytest.approx(1e-4)
     for degrees in (60, 90, 180):

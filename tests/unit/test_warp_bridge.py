@@ -65,10 +65,10 @@ def test_a_tape_differentiates_frames_and_kernels(renderer, render):
     tape.backward(loss)
     rgb = images["rgb"].numpy()
     assert np.array_equal(rgb, renderer.render(cloud, capture)["rgb"])
-    truth = derivatives(renderer.backend, cloud, capture, {"rgb": 2 * rgb})
+    reference_images = derivatives(renderer.backend, cloud, capture, {"rgb": 2 * rgb})
     for name, array in arrays.items():
-        assert np.abs(truth[name]).max() > 0
-        np.testing.assert_array_equal(array.grad.numpy(), truth[name], err_msg=name)
+        assert np.abs(reference_images[name]).max() > 0
+        np.testing.assert_array_equal(array.grad.numpy(), reference_images[name], err_msg=name)
 
 
 def test_a_tape_differentiates_3d_gaussians(renderer, render):
@@ -79,10 +79,10 @@ def test_a_tape_differentiates_3d_gaussians(renderer, render):
     images = render(tape, renderer, capture, **arrays)
     for _ in range(2):
         tape.backward(grads={images["rgb"]: ones})
-    truth = derivatives(renderer.backend, cloud, capture, {"rgb": ones.numpy()})
-    truth["scales"] = np.column_stack([truth["scales"], truth["thickness"]])
+    expected = derivatives(renderer.backend, cloud, capture, {"rgb": ones.numpy()})
+    expected["scales"] = np.column_stack([expected["scales"], expected["thickness"]])
     for name, array in arrays.items():
-        np.testing.assert_array_equal(array.grad.numpy(), 2 * truth[name], err_msg=name)
+        np.testing.assert_array_equal(array.grad.numpy(), 2 * expected[name], err_msg=name)
 
 
 def test_a_tape_has_the_gradients_of_pose_and_background(renderer, render):
@@ -97,11 +97,13 @@ def test_a_tape_has_the_gradients_of_pose_and_background(renderer, render):
     at = pose.numpy().astype(np.float64)
     assert capture.camera
     there = capture.with_(camera=offset_camera(capture.camera, at), background=tuple(behind.numpy().tolist()))
-    truth = renderer.render_differentiable(cloud, there).backward({"rgb": weights})
-    np.testing.assert_array_equal(behind.grad.numpy(), truth["background"])
-    np.testing.assert_allclose(pose.grad.numpy(), offset_gradient(truth["pose"].astype(float), at), rtol=1e-6)
-    assert np.abs(truth["pose"]).min() > 0
-    np.testing.assert_array_equal(arrays["colors"].grad.numpy(), truth["colors"])
+    expected = renderer.render_differentiable(cloud, there).backward({"rgb": weights})
+    np.testing.assert_array_equal(behind.grad.numpy(), expected["background"])
+    np.testing.assert_allclose(
+        pose.grad.numpy(), offset_gradient(expected["pose"].astype(float), at), rtol=1e-6
+    )
+    assert np.abs(expected["pose"]).min() > 0
+    np.testing.assert_array_equal(arrays["colors"].grad.numpy(), expected["colors"])
     assert arrays["means"].grad is None
 
 
@@ -150,11 +152,11 @@ def test_other_libraries_share_the_memory(renderer, name):
     frame = renderer.render_differentiable(cloud, capture)
     rgb, shared = frame["rgb"], library.read(frame)
     assert library.address(shared) == frame.device_array("rgb").ptr
-    truth = frame.backward({"rgb": weights})
-    found = frame.backward({"rgb": library.make(weights)}, on_device=True)
-    by_means = library.read(found["means"])
-    assert library.address(by_means) == found["means"].ptr
-    np.testing.assert_array_equal(np.from_dlpack(by_means), truth["means"])
+    expected = frame.backward({"rgb": weights})
+    gradients = frame.backward({"rgb": library.make(weights)}, on_device=True)
+    by_means = library.read(gradients["means"])
+    assert library.address(by_means) == gradients["means"].ptr
+    np.testing.assert_array_equal(np.from_dlpack(by_means), expected["means"])
     del frame
     batch = renderer.render_batch(cloud, [capture.with_(background=(1.0, 1.0, 1.0)), capture])
     np.testing.assert_array_equal(np.from_dlpack(shared), rgb)  # its memory is not used again
@@ -175,8 +177,8 @@ def test_on_other_devices_arrays_of_the_host_are_read():
     cloud, capture = picture()
     frame = fs.Renderer("reference").render_differentiable(cloud, capture)
     weights = np.random.default_rng(2).normal(size=(43, 61, 3)).astype(np.float32)
-    truth, found = (frame.backward({"rgb": by}) for by in (weights, wp.array(weights, device="cpu")))
-    np.testing.assert_array_equal(found["means"], truth["means"])
+    expected, actual = (frame.backward({"rgb": by}) for by in (weights, wp.array(weights, device="cpu")))
+    np.testing.assert_array_equal(actual["means"], expected["means"])
 
     class Elsewhere:
         shape = (43, 61, 3)
@@ -215,9 +217,9 @@ def test_training_on_warp_repeats_to_the_byte_and_after_a_stop(renderer, tmp_pat
     """3D Gaussians, trained by the step in NumPy, since Warp has no kernels for them."""
     settings = {**QUICK, "iterations": 20, "sh_degree": 0, "growth": 1.2, "primitive": "3d"}
     dataset = scene()
-    whole = Trainer(dataset, renderer, **settings)
-    before = np.mean([each.psnr for each in whole.evaluate(dataset.views)])
-    whole.run()
-    assert np.mean([each.psnr for each in whole.evaluate(dataset.views)]) > before + 1
-    first, second = run_and_resumed(whole, renderer, settings, 11, tmp_path)
+    uninterrupted = Trainer(dataset, renderer, **settings)
+    before = np.mean([each.psnr for each in uninterrupted.evaluate(dataset.views)])
+    uninterrupted.run()
+    assert np.mean([each.psnr for each in uninterrupted.evaluate(dataset.views)]) > before + 1
+    first, second = run_and_resumed(uninterrupted, renderer, settings, 11, tmp_path)
     assert first == second

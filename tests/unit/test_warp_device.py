@@ -153,10 +153,10 @@ def test_what_is_done_to_a_shared_image_is_not_done_to_what_was_read(renderer):
 
 
 def test_a_frame_keeps_its_arrays_when_the_next_is_rendered(renderer):
-    kept = renderer.render(CLOUD, CAMERA).device_array("rgb")
-    before = kept.numpy().copy()
+    frame = renderer.render(CLOUD, CAMERA).device_array("rgb")
+    before = frame.numpy().copy()
     renderer.render(random_splats(50, seed=2, depth=(1, 3)), CAMERA)
-    assert np.array_equal(kept.numpy(), before)
+    assert np.array_equal(frame.numpy(), before)
 
 
 def test_other_backends_say_that_they_share_nothing(reference):
@@ -354,9 +354,11 @@ def test_a_memory_budget_renders_in_bands_bit_identically():
     cloud = random_splats(300, seed=5, depth=(0.5, 4.0), scale=(0.05, 1.0))
     view = fs.Camera.look_at(320, 240, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
     expected = fs.Renderer("warp:cpu").render(cloud, view, ALL_OUTPUTS)
-    own = fs.Renderer("warp:cpu", memory_budget=6_894_400)
-    frame = own.render(cloud, view, ALL_OUTPUTS)
-    assert own.backend.pool._arrays["lists", wp.int32].size < expected.stats["pairs"], "rendered in bands"
+    separate_renderer = fs.Renderer("warp:cpu", memory_budget=6_894_400)
+    frame = separate_renderer.render(cloud, view, ALL_OUTPUTS)
+    assert separate_renderer.backend.pool._arrays["lists", wp.int32].size < expected.stats["pairs"], (
+        "rendered in bands"
+    )
     assert frame.stats == expected.stats
     assert all(np.array_equal(frame[name], expected[name]) for name in ALL_OUTPUTS)
     with pytest.raises(fs.DeviceError, match=r"memory_budget must exceed .*, got 1 MiB; raise it"):
@@ -371,9 +373,11 @@ def test_a_memory_budget_counts_rays_and_the_planes_of_all_poses():
     poses = fs.Trajectory([-1.0, 1.0], np.stack([start, end]))
     exposed = {"motion": fs.Motion(poses), "shutter": fs.Shutter(exposure_time=0.3, sub_poses=2)}
     expected = fs.Renderer("warp:cpu").render(cloud, view, ("rgb", "depth"), **exposed)
-    own = fs.Renderer("warp:cpu", memory_budget=6_170_000)
-    frame = own.render(cloud, view, ("rgb", "depth"), **exposed)
-    assert own.backend.pool._arrays["lists", wp.int32].size < expected.stats["pairs"], "rendered in bands"
+    separate_renderer = fs.Renderer("warp:cpu", memory_budget=6_170_000)
+    frame = separate_renderer.render(cloud, view, ("rgb", "depth"), **exposed)
+    assert separate_renderer.backend.pool._arrays["lists", wp.int32].size < expected.stats["pairs"], (
+        "rendered in bands"
+    )
     assert all(np.array_equal(frame[name], expected[name]) for name in ("rgb", "depth"))
     small = fs.Renderer("warp:cpu", memory_budget=5_500_000)
     small.render(cloud, view, ("rgb", "depth"))
@@ -385,12 +389,12 @@ def test_poison_reaches_every_array(renderer, monkeypatch):
     """Hard case E5 would prove nothing if the arrays were clean."""
     from fidsplat.backends.warp import probe
 
-    taken, poison = [], probe.poison
-    monkeypatch.setattr(probe, "poison", lambda array: taken.append(poison(array)) or taken[-1])
+    measured, poison = [], probe.poison
+    monkeypatch.setattr(probe, "poison", lambda array: measured.append(poison(array)) or measured[-1])
     with renderer.backend.probe().poisoned():
         renderer.render(CLOUD, CAMERA, ("rgb", "depth"))
         again = renderer.backend.pool.scratch("lines", 4, wp.vec4)
-    assert len(taken) > 15
+    assert len(measured) > 15
     assert (again.numpy().view(np.uint8) == 0xFF).all()
 
 

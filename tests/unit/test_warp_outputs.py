@@ -107,11 +107,11 @@ def rendered(outputs, post_steps):
 
 def make_anew(stage, monkeypatch):
     """Kernels of a stage are rebuilt until the test ends; existing pipelines keep theirs."""
-    made = getattr(runtime.kernels(stage), f"make_{stage}")
-    fresh = cache(made.__wrapped__)
+    make = getattr(runtime.kernels(stage), f"make_{stage}")
+    fresh = cache(make.__wrapped__)
     for module in list(sys.modules.values()):
-        if vars(module).get(made.__name__) is made:
-            monkeypatch.setattr(module, made.__name__, fresh)
+        if vars(module).get(make.__name__) is make:
+            monkeypatch.setattr(module, make.__name__, fresh)
 
 
 def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch, tmp_path):
@@ -133,11 +133,11 @@ def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch, tmp_path):
     # files and the comparison with the reference follow from the declaration
     files = save_output("strongest", toys["strongest"], lambda name, suffix: tmp_path / f"{name}{suffix}")
     assert [file.name for file in files] == ["strongest.png"]
-    truth = {name: toys[name].astype(float) for name in ("rgb", "strongest")}
-    truth |= {"certificate": np.zeros(toys["strongest"].shape)}
-    truth |= {"certificate_strongest": np.zeros(toys["strongest"].shape)}
+    expected = {name: toys[name].astype(float) for name in ("rgb", "strongest")}
+    expected |= {"certificate": np.zeros(toys["strongest"].shape)}
+    expected |= {"certificate_strongest": np.zeros(toys["strongest"].shape)}
     for error, agrees in ((0.9e-3, True), (1.1e-3, False)):
-        [difference] = compare({"strongest": toys["strongest"] + error}, truth, ("strongest",))
+        [difference] = compare({"strongest": toys["strongest"] + error}, expected, ("strongest",))
         assert difference.agrees == agrees
 
     # an output whose file has changed, which Warp's cache would not read_attributes, is compiled again
