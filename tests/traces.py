@@ -18,7 +18,7 @@ def traced(backend, cloud, quality, shape=None):
 
 def listing(backend, lists):
     """The shape with one of the two ways of listing."""
-    shapes = backend.shapes("listing")
+    shapes = backend.configs("binning")
     if lists not in shapes:
         pytest.skip("lists in one way")
     return shapes[lists]

@@ -57,7 +57,7 @@ def main() -> None:
     if options.no_fma:
         if not isinstance(backend, OpenCLBackend):
             parser.error("--no-fma must be used with an OpenCL device")
-        backend.shape = replace(backend.shape, fast_fma=False)
+        backend.config = replace(backend.config, fast_fma=False)
     most = dict.fromkeys(NAMES, 0.0)
     pairs = zip_longest(every(*EXPONENTS), every(*SHARES), fillvalue=np.ones(AT_ONCE))
     for x, share in track(pairs, "every float32", total=len(range(*_bits(*EXPONENTS), AT_ONCE))):

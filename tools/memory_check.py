@@ -137,10 +137,12 @@ def frames(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
     from fidsplat.selftest.clouds import camera, splats
 
     backend = renderer.backend
-    lanes = replace(backend.shape, schedule="lanes", lanes=4, tile_width=4, tile_height=8, scan_items=1)
-    group = replace(backend.shape, schedule="group", lists="tiled", lanes=1, tile_width=8, tile_height=8)
+    lanes = replace(backend.config, schedule="lanes", lanes=4, tile_width=4, tile_height=8, scan_items=1)
+    group = replace(
+        backend.config, schedule="group", binning="bin_first", lanes=1, tile_width=8, tile_height=8
+    )
     shapes = {
-        "lanes": replace(lanes, chunks=3, radix_bits=5),
+        "lanes": replace(lanes, sort_blocks=3, radix_bits=5),
         "group": replace(group, scan_items=8),
     }
 

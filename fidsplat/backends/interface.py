@@ -298,7 +298,7 @@ class Backend(ABC):
     """An open device."""
 
     info: DeviceInfo
-    shape: Any = None
+    config: Any = None
     """build constants of the kernels, such as the tile size"""
     renders_subsampled: bool = False
     """whether pipelines implement `Pipeline.render_subsampled`"""
@@ -320,12 +320,12 @@ class Backend(ABC):
         """Copy a cloud to the device."""
 
     @abstractmethod
-    def pipeline(self, features: FeatureSet, shape: Any = None) -> Pipeline:
-        """The pipeline for these features, compiled on first use. shape: build constants, one of `shapes`;
+    def pipeline(self, features: FeatureSet, config: Any = None) -> Pipeline:
+        """The pipeline for these features, compiled on first use. config: build constants, one of `configs`;
         None: those of the device. Raises DeviceError if the device lacks a feature or the compiler fails."""
 
-    def frame_shape(self, view: View, count: int = 1) -> Any:
-        """The `shape` for which `pipeline` renders `count` views of this size fastest."""
+    def frame_config(self, view: View, count: int = 1) -> Any:
+        """The `config` for which `pipeline` renders `count` views of this size fastest."""
         return None
 
     def unsupported(self, features: FeatureSet) -> str:
@@ -354,7 +354,7 @@ class Backend(ABC):
         add its counts. A pixel must not span two tiles."""
         raise DeviceError(self.lacks("copy tiles", "render without occlusion culling"))
 
-    def differentiate(self, features: FeatureSet, shape: Any = None) -> GradientPipeline:
+    def differentiate(self, features: FeatureSet, config: Any = None) -> GradientPipeline:
         """The pipeline with gradients. Raises InputError for an effect without a gradient."""
         raise DeviceError(self.lacks("have gradients", "use device='opencl', 'warp' or 'reference'"))
 
@@ -380,11 +380,11 @@ class Backend(ABC):
     def probe(self) -> Probe:
         raise DeviceError(self.lacks("have a probe", "use an OpenCL or Warp device"))
 
-    def shapes(self, kind: str) -> dict[str, Any]:
+    def configs(self, kind: str) -> dict[str, Any]:
         """Alternative build constants by name, with which tests compile the same features.
 
         kind: `tiles` or `k_buffer`: another tile or k-buffer size, with bit-identical images; `tape`: fewer
-        fragments are stored for the backward pass; `listing`, `sorting`: another method of tile binning or
+        fragments are stored for the backward pass; `binning`, `sorting`: another method of tile binning or
         sorting; `schedule`: work is assigned to threads as on a GPU; `arithmetic`: without fused
         multiply-adds or vectors.
         """

@@ -39,14 +39,14 @@ class Source(SceneInput):
 
     def run(self) -> int:
         from fidsplat.backends.opencl.assemble import assemble
-        from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape, shape_for
+        from fidsplat.backends.opencl.kernel_config import config_for, cpu_config, gpu_config
         from fidsplat.effects import select
 
         scene = self.load()
         features = select(scene.splats, scene.capture.with_(outputs=self.outputs, quality=self.quality))
         if self.device is None:
-            shape = cpu_shape() if self.schedule == "lanes" else gpu_shape()
-            source = assemble(features, shape_for(features, shape))
+            shape = cpu_config() if self.schedule == "lanes" else gpu_config()
+            source = assemble(features, config_for(features, shape))
         else:
             source = self._backend().source(features)
         sys.stdout.write(source.listing)

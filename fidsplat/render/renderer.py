@@ -376,8 +376,8 @@ class Renderer:
             data, scene_indices = resident.gather(
                 rendered, features, (capture.quality for capture in views.captures)
             )
-            shape = self.backend.frame_shape(batch.view, len(batch))
-            images = self.backend.pipeline(features, shape).render(data, batch)
+            config = self.backend.frame_config(batch.view, len(batch))
+            images = self.backend.pipeline(features, config).render(data, batch)
         return FrameBatch(images, views, scene_indices)
 
     def _resident(self, scene: Scene | SplatCloud | Store | ResidentCloud) -> ResidentCloud:
@@ -417,14 +417,14 @@ class Renderer:
         bounded = "error" in capture.outputs
         reference = error_reference(resident.data, capture, self.backend) if bounded else None
         with self._lock:  # scratch buffers and kernel arguments belong to one frame at a time
-            shape, data = self.backend.frame_shape(view), resident.data
-            pipeline = self.backend.pipeline(features, shape)
+            config, data = self.backend.frame_config(view), resident.data
+            pipeline = self.backend.pipeline(features, config)
             if not isinstance(data, Residency):
                 images = _images_of(pipeline, data, view, subsampling)
                 if reference is None:
                     return Frame(images, capture)
                 view = reference.view if band is None else _restricted(reference.view, band)
-                pipeline = self.backend.pipeline(reference.features, shape)
+                pipeline = self.backend.pipeline(reference.features, config)
                 reference_images = _images_of(pipeline, data, view, subsampling)
                 return Frame(images, capture, error=ErrorImage(images, reference_images, reference))
 

@@ -185,7 +185,7 @@ def f5(renderer: Renderer) -> Found:
     features, view = prepare(cloud, Capture(VIEW, ALL_OUTPUTS, background=(0.1, 0.2, 0.3)))
     resident = backend.upload(cloud)
     base = backend.pipeline(features).render_view(resident, view)
-    (schedule,) = backend.shapes("schedule").values()
+    (schedule,) = backend.configs("schedule").values()
     other = backend.pipeline(features, schedule).render_view(resident, view)
     for name in ("rgb", "alpha", "depth"):
         error = np.abs(other.read(name) - base.read(name)).max()
@@ -214,7 +214,7 @@ def f6(renderer: Renderer) -> Found:
     generator = np.random.default_rng(67)
     features, view = prepare(in_a_row([1.0]), Capture(VIEW))
     unsorted = unlisted = tried = 0
-    for shape in backend.shapes("sorting").values():
+    for shape in backend.configs("sorting").values():
         pipeline = backend.pipeline(features, shape)
         c = shape.chunks
         for n in sorted({1, 2, 3, c - 1, c, c + 1, 2 * c + 1, 255, 256, 257, 1000, 4097} - {0}):

@@ -99,7 +99,7 @@ def a4(renderer: Renderer) -> Found:
     if not renderer.backend.has("probe"):
         return
     base = trace(renderer, spec)
-    for name, shape in renderer.backend.shapes("tiles").items():
+    for name, shape in renderer.backend.configs("tiles").items():
         changed = differing(base, trace(renderer, spec, shape), ALL_OUTPUTS)
         yield Finding(f"pixels that change with tiles of {name}", changed, 0)
 

@@ -309,7 +309,7 @@ def c3(renderer: Renderer) -> Found:
     changed = max(differing(copies, render(renderer, spec), ALL_OUTPUTS) for _ in range(3))
     yield Finding("pixels that change when rendered again", changed, 0)
     if renderer.backend.has("probe"):
-        tiles = next(iter(renderer.backend.shapes("tiles").values()))
+        tiles = next(iter(renderer.backend.configs("tiles").values()))
         changed = differing(copies, trace(renderer, spec, tiles), ALL_OUTPUTS)
         yield Finding("pixels that change with another tile size", changed, 0)
     plain = FrameSpec(subset_of(spec.cloud, np.arange(300)), spec.camera, outputs=("rgb",))

@@ -13,13 +13,13 @@ import fidsplat as fs
 from fidsplat.backends.opencl import assemble as assembly
 from fidsplat.backends.opencl.assemble import assemble
 from fidsplat.backends.opencl.effect_layouts import LAYOUTS
-from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
+from fidsplat.backends.opencl.kernel_config import cpu_config, gpu_config
 from fidsplat.capture.quality import ELLIPSOID
 from fidsplat.effects import OUTPUTS, select
 
 BACKEND = "opencl"
 
-SHAPE, GROUP = cpu_shape(lanes=16, cores=2), gpu_shape()
+SHAPE, GROUP = cpu_config(lanes=16, cores=2), gpu_config()
 FURTHER = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
 SHARED_FILES = {
@@ -274,7 +274,7 @@ def test_pipelines_are_compiled_once(renderer):
 
 
 def test_half_precision_and_approximate_arithmetic_add_their_instructions_of_a_dialect_only():
-    ptx = gpu_shape(dialect="ptx")
+    ptx = gpu_config(dialect="ptx")
     for quality, added in (
         ({}, set()),
         ({"arithmetic": "approximate"}, {"ex2.approx"}),

@@ -15,8 +15,8 @@ import fidsplat as fs
 from fidsplat.backends.opencl.assemble import KernelSource, assemble, layouts_of
 from fidsplat.backends.opencl.declare import Layout, SampleBuffer, member, uniforms
 from fidsplat.backends.opencl.effect_layouts import LAYOUTS
+from fidsplat.backends.opencl.kernel_config import cpu_config, gpu_config
 from fidsplat.backends.opencl.program import build
-from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
 from fidsplat.cli import main
 from fidsplat.effects import CATALOGUE, OUTPUTS, Effect, Output, declared_output, select
 from fidsplat.effects.catalogue import DERIVED_OUTPUTS
@@ -67,14 +67,14 @@ def test_records_have_equal_layouts_on_host_and_device(renderer, name):
     if name == "double":
         quality = requested.capture.quality.with_(blend_precision="float64")
         features = select(requested.cloud, requested.capture.with_(quality=quality))
-    source = assemble(features, gpu_shape())
+    source = assemble(features, gpu_config())
     places = offsets_on(renderer.backend, source)
     for record, dtype in source.records.items():
         fields = dtype.fields or {}
         assert places[record] == {"": dtype.itemsize, **{name: fields[name][1] for name in dtype.names or ()}}
 
 
-@pytest.mark.parametrize("shape", [cpu_shape(), gpu_shape(256)], ids=["lanes", "group"])
+@pytest.mark.parametrize("shape", [cpu_config(), gpu_config(256)], ids=["lanes", "group"])
 def test_kernels_have_the_declared_arguments(renderer, shape):
     """Names, types and address spaces of all arguments, as reported by the compiler."""
     requested = combination(all_effects("fisheye") if shape.schedule == "lanes" else all_effects(None))
@@ -216,9 +216,9 @@ def test_help_of_render_lists_all_outputs(capsys):
 
 def test_effects_from_outside_do_not_change_other_texts(request):
     requested = [select(random_splats(3, seed=1), fs.Capture(outputs=(name,))) for name in OUTPUTS]
-    before = [assemble(features, cpu_shape()).digest for features in requested]
+    before = [assemble(features, cpu_config()).digest for features in requested]
     request.getfixturevalue("toys")
-    assert [assemble(features, cpu_shape()).digest for features in requested] == before
+    assert [assemble(features, cpu_config()).digest for features in requested] == before
     assert "nearest" not in layouts_of(requested[0])
 
 
@@ -235,7 +235,7 @@ def test_compiler_errors_name_the_kernel_file_and_line(renderer, toys):
 def test_line_directives_match_the_lines_of_the_files():
     from fidsplat.util.files import kernels_folder
 
-    source = assemble(combination(all_effects("distortion")).features(), cpu_shape())
+    source = assemble(combination(all_effects("distortion")).features(), cpu_config())
     assert source.listing.count("\n") == source.text.count("\n")
     compared = 0
     for program in source.programs.values():
@@ -257,10 +257,10 @@ def test_assembling_needs_no_opencl():
         "import sys; sys.modules['pyopencl'] = None\n"
         "import fidsplat as fs\n"
         "from fidsplat.backends.opencl.assemble import assemble\n"
-        "from fidsplat.backends.opencl.shapes import cpu_shape\n"
+        "from fidsplat.backends.opencl.kernel_config import cpu_config\n"
         "from fidsplat.effects import select\n"
         "features = select(fs.SplatCloud.empty(), fs.Capture(outputs=('rgb', 'depth')))\n"
-        "print(assemble(features, cpu_shape()).digest)"
+        "print(assemble(features, cpu_config()).digest)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -11,11 +11,11 @@ from combined import LENSES, SWITCHES, all_effects, assert_renders, combination,
 from sampling import sampled
 
 from fidsplat.backends.opencl.assemble import assemble
-from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
+from fidsplat.backends.opencl.kernel_config import cpu_config, gpu_config
 
 BACKEND = "opencl"
 
-SHAPES = (cpu_shape(), gpu_shape())
+SHAPES = (cpu_config(), gpu_config())
 PAIRS = [pair for pair in combinations(SWITCHES, 2) if is_compatible(pair)]
 
 

@@ -36,8 +36,8 @@ def functions(renderer, exponents=EXPONENTS, shares=SHARES):
 def test_short_functions_keep_their_bounds_on_every_device(renderer, monkeypatch):
     """Compiled as the device compiles kernels; if we choose the mode, also one value at a time and
     without fused operations."""
-    for shape in renderer.backend.shapes("arithmetic").values():
-        monkeypatch.setattr(renderer.backend, "shape", shape)
+    for shape in renderer.backend.configs("arithmetic").values():
+        monkeypatch.setattr(renderer.backend, "config", shape)
         exponential, logarithm = functions(renderer)
         assert 0.5 < worst(exponential, np.exp(EXPONENTS)) <= BOUNDS["fast_exp"]
         assert 0.5 < worst(logarithm, np.log(SHARES)) <= BOUNDS["fast_log"]
@@ -93,14 +93,14 @@ def test_both_schedules_are_bit_identical(renderer, cloud):
     image = FrameSpec(cloud, CAMERA, FAST, ALL_OUTPUTS)
     own_trace, other = (
         trace(renderer, image),
-        trace(renderer, image, renderer.backend.shapes("schedule")["groups"]),
+        trace(renderer, image, renderer.backend.configs("schedule")["groups"]),
     )
     assert differing(own_trace, other, ALL_OUTPUTS) == 0
 
 
 def test_instructions_of_a_vendor_change_what_the_quality_allows(renderer):
     """Kernels with and without the file of kernels/opencl/dialect/ that the device selects."""
-    shape = getattr(renderer.backend.shape, "dialect", "") and replace(renderer.backend.shape, dialect="")
+    shape = getattr(renderer.backend.config, "dialect", "") and replace(renderer.backend.config, dialect="")
     if not shape:
         pytest.skip("the device has no dialect")
     for quality in (FAST, PRECISE, FAST.with_(order="pixel")):

@@ -142,7 +142,7 @@ def test_the_schedule_of_gpus_bounds_the_same(renderer):
     plan = error_reference(data, capture, backend)
     own, groups = (
         backend.pipeline(plan.features, shape).render_view(data, plan.view)
-        for shape in (backend.shape, backend.shapes("schedule")["groups"])
+        for shape in (backend.config, backend.configs("schedule")["groups"])
     )
     assert groups.read("rgb") == pytest.approx(own.read("rgb"), rel=1e-5, abs=1e-5)
     assert groups.read("rounding") == pytest.approx(own.read("rounding"), rel=1e-3, abs=1e-9)

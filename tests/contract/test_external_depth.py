@@ -8,7 +8,7 @@ from agreement import compare, random_splats
 
 import fidsplat as fs
 from fidsplat.backends.opencl.assemble import assemble
-from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
+from fidsplat.backends.opencl.kernel_config import cpu_config, gpu_config
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.capture.environment import DeviceExternalDepth
@@ -79,7 +79,7 @@ def test_both_schedules_agree(renderer):
     cloud, requested = CASES["planes, fog, 2 x 2 samples"]
     capture = fs.Capture(CAMERA, OUTPUTS, external_depth=a_surface()).with_(**requested)
     resident = renderer.upload(cloud).data
-    for shape in renderer.backend.shapes("schedule").values():
+    for shape in renderer.backend.configs("schedule").values():
         pipeline = renderer.backend.pipeline(prepare(resident, capture)[0], shape)
         wrong = [one for one in differences(pipeline, resident, cloud, capture) if not one.agrees]
         assert not wrong, wrong
@@ -194,7 +194,7 @@ def test_views_of_a_batch_have_their_own_surfaces(renderer):
                 assert batch[name][i].tobytes() == alone[name].tobytes()
 
 
-@pytest.mark.parametrize("shape", [cpu_shape(), gpu_shape()], ids=["lanes", "group"])
+@pytest.mark.parametrize("shape", [cpu_config(), gpu_config()], ids=["lanes", "group"])
 def test_a_scene_without_a_surface_has_none_of_its_kernel_text(shape):
     plain = fs.Capture(CAMERA, OUTPUTS)
     text = assemble(select(a_cloud(), plain), shape).text

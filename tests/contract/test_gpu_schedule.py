@@ -65,7 +65,7 @@ def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
     image = PICTURES[name]()
     backend, cloud = renderer.backend, image.cloud
     features, view = prepare(cloud, image.capture)
-    images = backend.pipeline(features, backend.shapes("schedule")["groups"]).render_view(
+    images = backend.pipeline(features, backend.configs("schedule")["groups"]).render_view(
         backend.upload(cloud), view
     )
     rendered = {output: images.read(output, 0) for output in image.outputs}
@@ -104,5 +104,5 @@ def draw_with_guarded_rays():
     backend.pool.allocate = before_a_guard
     image = PICTURES["distortion"]()
     features, view = prepare(image.cloud, image.capture)
-    pipeline = backend.pipeline(features, backend.shapes("schedule")["groups"])
+    pipeline = backend.pipeline(features, backend.configs("schedule")["groups"])
     pipeline.render_view(backend.upload(image.cloud), view).read("rgb", 0)

@@ -60,7 +60,7 @@ def test_it_agrees_with_the_reference(renderer, name):
     requested = PICTURES[name]()
     backend, reference = renderer.backend, ReferenceBackend()
     features, view = prepare(requested.cloud, requested.capture)
-    groups = backend.shapes("schedule")["groups"]
+    groups = backend.configs("schedule")["groups"]
     images = backend.pipeline(features, groups).render_view(backend.upload(requested.cloud), view)
     rendered = {output: images.read(output, 0) for output in requested.capture.outputs}
     expected = (

@@ -101,13 +101,13 @@ def test_derivatives_of_3d_gaussians_are_the_references(backend, projection, sol
         for name, array in gradients.items():
             assert array.any(), name
             assert array.tobytes() == again[name].tobytes(), name
-    (shape,) = backend.shapes("schedule").values()
+    (shape,) = backend.configs("schedule").values()
     if projection == "exact":
         assert_same(backend, *scenes[2], shape=shape)
 
 
 def test_the_schedule_of_gpus_has_the_references_derivatives(backend):
-    for shape in backend.shapes("schedule").values():
+    for shape in backend.configs("schedule").values():
         assert_same(backend, *random_scene(2), shape=shape)
         assert_same(backend, *long_lists(), shape=shape)
 
@@ -174,7 +174,7 @@ def long_lists():
 @pytest.mark.sweep
 def test_long_lists_are_taken_back_in_chunks(backend):
     gradients = assert_same(backend, *long_lists())
-    for shape in backend.shapes("tape").values():
+    for shape in backend.configs("tape").values():
         again = assert_same(backend, *long_lists(), shape=shape)
         assert all(np.array_equal(again[name], gradients[name]) for name in gradients)
 
@@ -211,9 +211,9 @@ def test_a_differentiable_frame_has_the_bits_of_render_and_of_the_backends_gradi
 def test_frames_that_are_not_awaited_have_the_same_derivatives(backend, renderer):
     """Where lists are made before their length is known, one that had too little room says so when it is
     taken back, and the next has enough."""
-    (shape,) = backend.shapes("schedule").values()
+    (shape,) = backend.configs("schedule").values()
     few, crowd = random_scene(2), random_scene(2, count=3000, scale=(0.2, 1.0))
-    pipeline = backend.differentiate(with_distortion(prepare(*few)[0]), shape=shape)
+    pipeline = backend.differentiate(with_distortion(prepare(*few)[0]), config=shape)
 
     def backpropagated(cloud, capture, waits):
         features, view = prepare(cloud, capture)

@@ -13,8 +13,8 @@ from sampling import alternate
 import fidsplat as fs
 from fidsplat.backends.bands import split_by_cost
 from fidsplat.backends.opencl import tiling
+from fidsplat.backends.opencl.kernel_config import gpu_config
 from fidsplat.backends.opencl.memory_plan import plan_of
-from fidsplat.backends.opencl.shapes import gpu_shape
 
 UNTOUCHED = 0xFFFFFFFF
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
@@ -62,7 +62,7 @@ def as_on_a_gpu(renderer, budget=None):
     limited_renderer = fs.Renderer(renderer.device.name)
     backend = limited_renderer.backend
     backend.info = replace(backend.info, kind="gpu")
-    backend.shape = gpu_shape(256, backend.shape.fast_fma)
+    backend.config = gpu_config(256, backend.config.fast_fma)
     backend.limit_memory(budget or backend.memory_budget)
     return limited_renderer
 
@@ -205,7 +205,7 @@ def test_plans_hold_to_the_budget():
     for count in (10**5, 2 * 10**7, 10**8):
         for budget in (2**28, 2**30, 2**34):
             for upload in (0, 52):
-                plan = plan_of(count, 80, upload, 2**27, "ordered", budget, budget // 4)
+                plan = plan_of(count, 80, upload, 2**27, "sort_first", budget, budget // 4)
                 held = plan.capacity * (80 + 12 + 16) + plan.chunk * (80 + 12 + upload) + budget // 8 + 2**27
                 assert held == plan.total or not plan.chunk
                 assert plan.total <= budget, (count, budget, upload, plan)

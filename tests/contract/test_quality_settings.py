@@ -160,7 +160,7 @@ def test_half_precision_has_the_same_bits_in_both_schedules_and_words(opencl, mo
     for cloud in (DENSE, CLOUDS["layers"]):
         features, view = prepare(cloud, capture)
         own, groups = (
-            replace(shape, dialect="") for shape in (backend.shape, backend.shapes("schedule")["groups"])
+            replace(shape, dialect="") for shape in (backend.config, backend.configs("schedule")["groups"])
         )
         expected = backend.pipeline(features, own).trace(backend.upload(cloud), view)
         plain = backend.pipeline(features, groups).trace(backend.upload(cloud), view)

@@ -75,7 +75,7 @@ def test_depths_and_normals_without_distortions_have_the_references_derivatives(
     cloud, capture = random_scene(8, degree=None, quality="surfel")
     expected = derivatives(ReferenceBackend(), cloud, capture, distorted=False)
     backend = renderer.backend
-    for shape in (None, *backend.shapes("schedule").values()):
+    for shape in (None, *backend.configs("schedule").values()):
         actual = derivatives(backend, cloud, capture, distorted=False, shape=shape)
         off = list(differences(actual, expected))
         assert all(one.norm < NORM and one.turned < COSINE for one in off), (shape, off)

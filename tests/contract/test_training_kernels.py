@@ -240,7 +240,7 @@ def backpropagated(renderer, device, view, resident, lanes, outputs=("rgb",)):
     """An image of splats on the device, taken back from a random loss of these outputs."""
     capture = fs.Capture(view.camera, outputs=("rgb", "depth"), quality="surfel")
     features, visible = prepare(resident, capture)
-    shape = next(iter(renderer.backend.shapes("schedule").values())) if lanes == 1 else None
+    shape = next(iter(renderer.backend.configs("schedule").values())) if lanes == 1 else None
     pipeline = renderer.backend.differentiate(features, shape)
     images = pipeline.forward(resident, visible)
     loss = random_loss(features, visible)

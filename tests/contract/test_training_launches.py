@@ -25,7 +25,7 @@ STEADY = {**QUICK, "iterations": 40, "densify_from": 99, "sh_degree": 1}
 def on_groups(renderer, monkeypatch):
     """The device with the schedule of GPUs, whose images no one waits for."""
     backend = renderer.backend
-    monkeypatch.setattr(backend, "shape", next(iter(backend.shapes("schedule").values())))
+    monkeypatch.setattr(backend, "config", next(iter(backend.configs("schedule").values())))
     backend.limit_memory(backend.memory_budget)
     yield renderer
     monkeypatch.undo()

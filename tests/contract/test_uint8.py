@@ -7,7 +7,7 @@ import pytest
 from agreement import random_splats
 
 import fidsplat as fs
-from fidsplat.backends.opencl.shapes import gpu_shape
+from fidsplat.backends.opencl.kernel_config import gpu_config
 from fidsplat.images.files import to_uint8
 from fidsplat.util.errors import MissingOutputError
 
@@ -66,7 +66,7 @@ def test_every_kind_of_value_by_a_gpus_work_items(renderer):
     if not renderer.device.name.startswith("opencl"):
         pytest.skip("the OpenCL backend")
     frame = rendered(fs.Renderer(renderer.device.name), 37, 23)
-    frame.wait()._images._workspace.shape = gpu_shape()
+    frame.wait()._images._workspace.config = gpu_config()
     values = np.resize(KINDS, (23, 37, 3))
     put(frame, values)
     assert np.array_equal(frame.to_uint8(), to_uint8(values))

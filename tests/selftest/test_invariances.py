@@ -38,7 +38,7 @@ def test_tile_sizes(renderer, spec):
     if not renderer.backend.has("probe"):
         pytest.skip("renders without tiles")
     own = render(renderer, spec)
-    for shape in renderer.backend.shapes("tiles").values():
+    for shape in renderer.backend.configs("tiles").values():
         assert differing(own, trace(renderer, spec, shape), ALL_OUTPUTS) == 0, shape
 
 
@@ -46,14 +46,14 @@ def test_one_tile_for_the_complete_image(renderer):
     """Cases A4 and A5: an image of one tile has every fragment that a tile could lack."""
     if not renderer.backend.has("probe"):
         pytest.skip("renders without tiles")
-    own = renderer.backend.shape
+    own = renderer.backend.config
     width, height = (own.lanes, 32) if own.schedule == "lanes" else (32, 32)
     whole = replace(own, tile_width=width, tile_height=height)
     for cloud in CLOUDS.values():
         spec = FrameSpec(cloud, camera(width, height, 20.0), outputs=ALL_OUTPUTS)
         traced = trace(renderer, spec, whole)
         assert len(traced["starts"]) == 2
-        for shape in renderer.backend.shapes("tiles").values():
+        for shape in renderer.backend.configs("tiles").values():
             assert differing(traced, trace(renderer, spec, shape), ALL_OUTPUTS) == 0, shape
 
 

@@ -72,7 +72,7 @@ def test_intersecting_splats_equal_their_composited_images(renderer, cloud):
 def test_images_do_not_depend_on_the_size_of_the_k_buffer(renderer, cloud):
     """A k-buffer of one or few fragments needs several passes and is bit-identical."""
     spec = FrameSpec(cloud, clouds.camera(50, 40, 40.0), fs.Quality(order="pixel"), ALL_OUTPUTS)
-    shapes = renderer.backend.shapes("k_buffer")
+    shapes = renderer.backend.configs("k_buffer")
     expected = trace(renderer, spec)
     for name, shape in shapes.items():
         assert differing(trace(renderer, spec, shape), expected, spec.outputs) == 0, name
@@ -130,7 +130,7 @@ def test_deferral_and_lookahead_are_bit_identical(renderer, name):
     }
     view = views.get(name, clouds.camera(34, 20, 30.0))
     spec = FrameSpec(NEAR_ELSEWHERE[name], view, fs.Quality(order="pixel"), ("rgb", "depth", "normal"))
-    groups = renderer.backend.shapes("schedule")["groups"]
+    groups = renderer.backend.configs("schedule")["groups"]
     assert differing(trace(renderer, spec, groups), trace(renderer, spec), spec.outputs) == 0
 
 

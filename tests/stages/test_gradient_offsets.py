@@ -24,11 +24,11 @@ WIDE = fs.SplatCloud(
 def test_splats_have_an_offset_for_each_tile_that_lists_them(renderer):
     backend = renderer.backend
     random = random_splats(300, 0, scale=(0.02, 0.6), depth=(1.5, 4.0), sh_degree=None)
-    for shape in (None, *backend.shapes("schedule").values()):
+    for shape in (None, *backend.configs("schedule").values()):
         for cloud, side in ((WIDE, 800), (random, 300)):
             camera = fs.Camera.look_at(side, side, 1.0, (0, 0, 0), (0, 0, 3.0))
             features, view = prepare(cloud, fs.Capture(camera))
-            pipeline = backend.differentiate(features, shape=shape)
+            pipeline = backend.differentiate(features, config=shape)
             images = pipeline.forward(backend.upload(cloud), view)
             pipeline.backward(images, {"rgb": np.ones((side, side, 3), np.float32)})
             frame, words = images.frame, np.empty(1, np.uint32)

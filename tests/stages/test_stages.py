@@ -48,7 +48,7 @@ def footprint(cloud, view, index, dot=True):
     return np.nonzero(inside)
 
 
-@pytest.mark.parametrize("lists", ["ordered", "tiled"])
+@pytest.mark.parametrize("lists", ["sort_first", "bin_first"])
 @pytest.mark.parametrize(("seed", "scale"), [(1, (1e-3, 2.0)), (7, (0.1, 50.0)), (3, (1e-5, 0.05))])
 def test_lists_have_all_overlapped_tiles_and_few_others(backend, seed, scale, lists):
     """Cases A1, A3 to A5: no tile is missing for any pose; bounds in front of the camera are tight."""
@@ -150,7 +150,7 @@ def test_culled_splats_change_nothing(backend):
     assert np.array_equal(traced(backend, fewer, fs.Quality())[0]["rgb"], trace["rgb"])
 
 
-@pytest.mark.parametrize("lists", ["ordered", "tiled"])
+@pytest.mark.parametrize("lists", ["sort_first", "bin_first"])
 def test_splats_between_the_samples_are_culled(backend, lists):
     """Without a low-pass a splat smaller than a sample mostly intersects no ray and is not listed."""
     cloud = random_splats(20000, seed=3, scale=(1e-5, 3e-4))
@@ -170,7 +170,7 @@ def test_tile_sizes_are_bit_identical(backend):
     cloud = random_splats(300, seed=3)
     quality = fs.Quality()
     base, _ = traced(backend, cloud, quality)
-    for size, other in backend.shapes("tiles").items():
+    for size, other in backend.configs("tiles").items():
         trace, _ = traced(backend, cloud, quality, shape=other)
         for name in ALL_OUTPUTS:
             assert np.array_equal(trace[name], base[name]), f"{name} differs with {size}"
@@ -215,10 +215,10 @@ def test_layers_do_not_depend_on_tile_size_or_schedule(backend, renderer):
     planes = np.random.default_rng(9).choice([-1, -1, -1, 0, 1, 2, 3], 300)
     cloud = random_splats(300, seed=9, scale=(0.05, 0.5)).with_coplanar_groups(planes)
     base, _ = traced(backend, cloud, fs.Quality())
-    other, _ = traced(backend, cloud, fs.Quality(), shape=backend.shapes("schedule")["groups"])
+    other, _ = traced(backend, cloud, fs.Quality(), shape=backend.configs("schedule")["groups"])
     for name in ("rgb", "alpha", "normal", "depth"):
         assert np.abs(other[name] - base[name]).max() < 2e-5, name
-    *_, (size, shape) = backend.shapes("tiles").items()
+    *_, (size, shape) = backend.configs("tiles").items()
     tiled, _ = traced(backend, cloud, fs.Quality(), shape=shape)
     for name in ALL_OUTPUTS:
         assert np.array_equal(tiled[name], base[name]), f"{name} differs with {size}"
@@ -238,7 +238,7 @@ def test_splats_of_coplanar_groups_are_first_in_each_list(backend, order):
 def test_schedules_agree(backend, renderer):
     cloud = random_splats(300, seed=9)
     base, _ = traced(backend, cloud, fs.Quality())
-    other, _ = traced(backend, cloud, fs.Quality(), shape=backend.shapes("schedule")["groups"])
+    other, _ = traced(backend, cloud, fs.Quality(), shape=backend.configs("schedule")["groups"])
     for name in ("rgb", "alpha", "normal", "depth"):
         assert np.allclose(other[name], base[name], rtol=1e-5, atol=2e-6), name
     assert np.array_equal(other["label"], base["label"])

@@ -24,7 +24,7 @@ def test_binning_strategies_make_equal_lists(backend, scale):
     cloud = random_splats(2500, seed=5, scale=scale)
     tiled, ordered = (
         traced(backend, cloud, fs.Quality(lowpass="none"), shape=listing(backend, lists))[0]
-        for lists in ("tiled", "ordered")
+        for lists in ("bin_first", "sort_first")
     )
     assert max(np.diff(tiled["starts"].astype(int))) > 20
     # both list every tile that a splat overlaps (test_stages.py), and few others
@@ -42,12 +42,14 @@ def test_no_splat_of_a_complete_image_is_outside_of_its_band(backend):
     cloud = random_splats(3000, seed=7, depth=(-4, 4), scale=(0.1, 0.5), across=3.0)
     camera = fs.Camera.pinhole(33, 17, 30.0, 30.0, 5.0, 3.0)
     features, view = prepare(cloud, fs.Capture(camera, quality=fs.Quality(lowpass="pixel")))
-    assert view.height % backend.shape.tile_height
+    assert view.height % backend.config.tile_height
     trace = backend.pipeline(features).trace(backend.upload(cloud), view)
     assert not (trace["keys"] == CULLED - 1).any()
 
 
-@pytest.mark.parametrize(("lists", "budget"), [("ordered", 0), ("tiled", 0), ("local", 0), ("local", 5000)])
+@pytest.mark.parametrize(
+    ("lists", "budget"), [("sort_first", 0), ("bin_first", 0), ("bin_local", 0), ("bin_local", 5000)]
+)
 def test_views_of_a_batch_have_separate_lists(backend, monkeypatch, lists, budget):
     """local: few tiles, counted in local memory by groups of 4096 splats; a pair budget makes bands."""
     cloud = random_splats(5000, seed=5, scale=(1e-3, 0.5))
@@ -57,7 +59,7 @@ def test_views_of_a_batch_have_separate_lists(backend, monkeypatch, lists, budge
         for x in (-1.0, 0.5)
     ]
     features, batch = prepare_batch(cloud, views_of(captures))
-    shape = listing(backend, "tiled" if lists == "local" else lists)
+    shape = listing(backend, "bin_first" if lists == "bin_local" else lists)
     pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
     alone = [pipeline.render_view(resident, prepare(cloud, capture)[1]) for capture in captures]
     original = tiling.launch_local
@@ -68,11 +70,11 @@ def test_views_of_a_batch_have_separate_lists(backend, monkeypatch, lists, budge
         original(self, kernel, **given)
 
     monkeypatch.setattr(tiling, "launch_local", launch)
-    if lists == "tiled":
+    if lists == "bin_first":
         monkeypatch.setattr(tiling, "LOCAL_TILES", 0)
     monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
     batch_images = pipeline.render(resident, batch)
-    assert (launched.count("emit_local") > (2 if budget else 0)) == (lists == "local")
+    assert (launched.count("emit_local") > (2 if budget else 0)) == (lists == "bin_local")
     for name in ("visible", "pairs"):
         assert batch_images.stats[name] == sum(images.stats[name] for images in alone)
     for images, own in zip(batch_images.read("rgb"), alone, strict=True):
@@ -92,7 +94,7 @@ def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
     camera = fs.Camera.look_at(641, 549, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
     capture = fs.Capture(camera, ("rgb",), fs.Quality(lowpass="none"))
     features, view = prepare(cloud, capture)
-    pipeline, resident = backend.pipeline(features, listing(backend, "tiled")), backend.upload(cloud)
+    pipeline, resident = backend.pipeline(features, listing(backend, "bin_first")), backend.upload(cloud)
     expected = pipeline.render_view(resident, view)
     assert 1000 < expected.stats["visible"] < 2.2 * 4096
     original, launched = tiling.launch_local, []
@@ -137,7 +139,7 @@ def test_splats_culled_before_projection(backend, monkeypatch):
     for least in (pipeline_module.MIN_CULLED, 1):
         monkeypatch.setattr(pipeline_module, "MIN_CULLED", least)
         own = type(backend)(backend.device)  # with new buffers
-        pipeline, resident = own.pipeline(features, listing(own, "tiled")), own.upload(cloud)
+        pipeline, resident = own.pipeline(features, listing(own, "bin_first")), own.upload(cloud)
         rendered.append([pipeline.render_view(resident, view) for view in (*views, *views)])
         own.pool.clear()  # recorded again, with the buffers of a smaller cloud
         pipeline.render_view(own.upload(few), views[2])
@@ -155,7 +157,7 @@ def test_splats_culled_before_projection(backend, monkeypatch):
 
 def test_lists_that_overflow_are_made_again(backend):
     """A frame with many more pairs and big splats than the previous one."""
-    groups = listing(backend, "tiled")
+    groups = listing(backend, "bin_first")
     few, many = random_splats(30, seed=2, scale=(1e-3, 0.05)), random_splats(9000, seed=2, scale=(0.5, 5.0))
     features, quality = select(few, fs.Capture(outputs=ALL_OUTPUTS)), fs.Quality()
     camera = fs.Camera.look_at(81, 59, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
@@ -178,7 +180,7 @@ def test_lists_that_overflow_are_made_again(backend):
 def test_a_capacity_of_exactly_the_pairs_of_a_frame(backend, spare):
     """Lists are made again if and only if they overflow."""
     cloud, quality = random_splats(3000, seed=5, scale=(1e-3, 0.5)), fs.Quality()
-    groups = listing(backend, "tiled")
+    groups = listing(backend, "bin_first")
     features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS, quality))
     rendered = []
     for extra in (None, spare):
@@ -200,7 +202,7 @@ def test_a_list_longer_than_local_memory_is_sorted(backend):
     """tile_lists.cl sorts 2048 pairs or the indices of 8192 at once in local memory, longer lists in global
     memory as well."""
     cloud = random_splats(11000, seed=8, depth=(1.0, 9.0), scale=(0.2, 0.3), across=0.1)
-    trace, _ = traced(backend, cloud, fs.Quality(), shape=backend.shapes("schedule")["groups"])
+    trace, _ = traced(backend, cloud, fs.Quality(), shape=backend.configs("schedule")["groups"])
     visible = np.flatnonzero(trace["keys"] != CULLED)
     lengths = np.diff(trace["starts"].astype(int))
     assert max(lengths) > 8192
@@ -247,7 +249,7 @@ def test_lists_of_all_depth_distributions_are_sorted(backend, depths):
     )
     camera = fs.Camera.pinhole(CAMERA.width, CAMERA.height, 150.0, 150.0, 80.0, 58.0)
     features, view = prepare(cloud, fs.Capture(camera, ALL_OUTPUTS))
-    trace = backend.pipeline(features, backend.shapes("schedule")["groups"]).trace(
+    trace = backend.pipeline(features, backend.configs("schedule")["groups"]).trace(
         backend.upload(cloud), view
     )
     visible = np.flatnonzero(trace["keys"] != CULLED)
@@ -256,14 +258,14 @@ def test_lists_of_all_depth_distributions_are_sorted(backend, depths):
     assert out_of_order(trace, visible[np.argsort(trace["keys"][visible], kind="stable")]) == 0
 
 
-@pytest.mark.parametrize("lists", ["ordered", "tiled"])
+@pytest.mark.parametrize("lists", ["sort_first", "bin_first"])
 @pytest.mark.parametrize("budget", [1, 50, 1000])
 def test_a_small_pair_budget_is_bit_identical(backend, monkeypatch, budget, lists):
     """Case E3: a frame with more pairs than the budget is rendered in bands of tiles."""
     cloud = random_splats(300, seed=12)
     features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS))
     # the shape of a CPU for its own strategy, which uses bands most often
-    shape = backend.shape if lists == "ordered" else listing(backend, lists)
+    shape = backend.config if lists == "sort_first" else listing(backend, lists)
     pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
     full_frame = pipeline.render_view(resident, view)
     assert full_frame.stats["pairs"] > 1000

@@ -96,7 +96,7 @@ QUALITIES = {
 def test_frames_are_bit_identical_to_those_of_all_splats(town, culling, name, schedule):
     renderer = fs.Renderer("opencl")
     if schedule == "groups":
-        renderer.backend.shape = renderer.backend.shapes("schedule")["groups"]
+        renderer.backend.config = renderer.backend.configs("schedule")["groups"]
     cloud, resident = town.cloud(), renderer.upload(town)
     asking, path = {"quality": QUALITIES[name], "outputs": ALL_OUTPUTS}, PATH
     if "pixels" in name:
@@ -159,7 +159,7 @@ def test_missing_chunks_are_rendered_in_their_tiles(town, culling, monkeypatch, 
 
     monkeypatch.setattr(backend, "copy_tiles", noted)
     if name == "groups":
-        renderer.backend.shape = renderer.backend.shapes("schedule")["groups"]
+        renderer.backend.config = renderer.backend.configs("schedule")["groups"]
     quality = {**QUALITIES, "odd samples": "samples=3", "groups": "", "bands": ""}[name] or None
     drawing = fs.SeveralDevices(["opencl", "opencl"]) if name == "bands" else renderer
     resident, cloud = drawing.upload(town), town.cloud()
@@ -296,7 +296,7 @@ def test_tiles_terminate_where_all_pixels_are_opaque(order, schedule):
     """Opaque boxes over parts of tiles."""
     generator, backend = np.random.default_rng(3), fs.Renderer("opencl").backend
     if schedule == "groups":
-        backend.shape = backend.shapes("schedule")["groups"]
+        backend.config = backend.configs("schedule")["groups"]
     means = np.column_stack([generator.uniform(-1.5, 1.5, (60, 2)), generator.uniform(2.0, 4.0, 60)])
     sizes = generator.uniform(0.03, 0.6, (60, 2))
     upright, opaque = np.tile([1.0, 0, 0, 0], (60, 1)), np.ones(60)

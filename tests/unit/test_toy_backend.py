@@ -44,7 +44,7 @@ class Backend(interface.Backend):
         lacking = {*features.outputs, *features.post_steps, *features.effects[8:]} - {"alpha"}
         return f"toy has no {', '.join(sorted(lacking))}" if lacking else ""
 
-    def pipeline(self, features, shape=None):
+    def pipeline(self, features, config=None):
         if why := self.unsupported(features):
             raise DeviceError(why)
         return Pipeline()

@@ -34,7 +34,7 @@ class OpenCLAlignment(AlignmentKernels):
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()
         self._workspace = workspace
-        self._items = 1 if workspace.shape.schedule == "lanes" else 32
+        self._items = 1 if workspace.config.schedule == "lanes" else 32
         self._program = Program(workspace, assemble_alignment(self._items))
         self._commands = CommandList(self._program)
         self._stages: list[dict[str, Any]] = []

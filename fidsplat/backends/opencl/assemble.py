@@ -1,4 +1,4 @@
-"""Kernel source assembly: flat program texts from a FeatureSet and a DeviceShape. Needs no OpenCL.
+"""Kernel source assembly: flat program texts from a FeatureSet and a KernelConfig. Needs no OpenCL.
 
 A frame needs two programs, `lists` and `frame`: drivers cache compiled programs by their text, and most
 feature sets have the same `lists`. Gradients (`gradients`, `step`) and `training` are separate programs.
@@ -31,6 +31,7 @@ from fidsplat.backends.opencl.declare import (
     output_argument,
 )
 from fidsplat.backends.opencl.effect_layouts import LAYOUTS, extension_layout
+from fidsplat.backends.opencl.kernel_config import KernelConfig
 from fidsplat.backends.opencl.layout import (
     BOUNDS,
     GROUP_KERNELS,
@@ -40,16 +41,15 @@ from fidsplat.backends.opencl.layout import (
     UNCULLED_KERNELS,
     VIEW,
 )
-from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.effects import FeatureSet, Output
 from fidsplat.effects.extensions import EXTENSIONS
 from fidsplat.util.errors import DeviceError
 from fidsplat.util.files import kernels_folder
 
 _LISTS = {
-    "ordered": ("scan", "sort", "bin"),
-    "tiled": ("tile_lists",),
-    "local": ("tile_lists", "tile_lists_local"),
+    "sort_first": ("scan", "sort", "bin"),
+    "bin_first": ("tile_lists",),
+    "bin_local": ("tile_lists", "tile_lists_local"),
 }
 """stages of the program `lists`, by tile-binning strategy"""
 _FRAME = (
@@ -64,7 +64,7 @@ _FRAME = (
     "schedule/{}",
     "resolve",
 )
-"""stages of the program `frame`; `{}` is the schedule; `pack` is used by the strategy `ordered` only"""
+"""stages of the program `frame`; `{}` is the schedule; `pack` is used by the strategy `sort_first` only"""
 _GRADIENTS = (
     *("prelude", "math", "splat", "bounds", "record_gradients", "blend_backward"),
     *("schedule/{}_cells", "schedule/{}_backward", "set_up_backward", "project_backward"),
@@ -176,53 +176,59 @@ def layouts_of(features: FeatureSet) -> dict[str, Layout]:
     return {name: LAYOUTS[name] for name in names}
 
 
-def assemble(features: FeatureSet, shape: DeviceShape) -> KernelSource:
+def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
     """Assemble the source of a feature set. Raises DeviceError if a file fills an unknown hook."""
     layouts = layouts_of(features)
     # blend and resolve are fused if a pixel has one sample and one pose, and no other pass adds to it
     separate = {"rays", "shutter_exposure", "shutter_rows"}
     fused = features.samples == 1 and "background_constant" in layouts and separate.isdisjoint(layouts)
     files = [layout.file for layout in layouts.values() if layout.file]
-    files += [*_dialect(shape, _scalars(features), features.effects), "part/resolve_pixel.cl"]
+    files += [*_dialect(config, _scalars(features), features.effects), "part/resolve_pixel.cl"]
     if "blend_half" not in layouts:
         files.append("part/blend_float.cl")
-    if shape.batch > 1 or shape.culls:
+    if config.batch > 1 or config.culls_first:
         files += _frustum_parts(layouts)
-    if shape.culls:
+    if config.culls_first:
         files.append("part/unculled_splats.cl")
     if fused:
         files.append("part/resolve_fused.cl")
-    if shape.lists == "tiled":
+    if config.binning == "bin_first":
         files.append("list/tiled.cl")
     # bounds of the depth in a tile exist for the pinhole only
-    keys_by_tile = {"compose_pixel", "camera_pinhole"} <= layouts.keys() and shape.lists != "ordered"
+    keys_by_tile = {"compose_pixel", "camera_pinhole"} <= layouts.keys() and config.binning != "sort_first"
     if keys_by_tile:
         layouts["tile_keys"] = LAYOUTS["tile_keys"]
         files.append("part/tile_keys.cl")
     if "compose_pixel" in layouts:
-        files.append(f"part/k_buffer_{shape.schedule}.cl")
-    elif shape.schedule == "lanes":
+        files.append(f"part/k_buffer_{config.schedule}.cl")
+    elif config.schedule == "lanes":
         files.append("part/tile_loop_lanes.cl")
     if not layouts.keys().isdisjoint({"compose_pixel", "coplanar_layers"}):
-        files += ["part/passes.cl", f"part/passes_{shape.schedule}.cl"]
-        files.append("part/blocks_nearest.cl" if shape.schedule == "lanes" else "part/tile_nearest.cl")
+        files += ["part/passes.cl", f"part/passes_{config.schedule}.cl"]
+        files.append("part/blocks_nearest.cl" if config.schedule == "lanes" else "part/tile_nearest.cl")
     if "termination_depths" in layouts:  # after all passes through a list
         order = "_pixel" if "compose_pixel" in layouts else ""
         files += ["part/termination_depth_pixel.cl"] if order else []
-        files.append(f"part/termination_depth{order}_{shape.schedule}.cl")
+        files.append(f"part/termination_depth{order}_{config.schedule}.cl")
     if "external_depth" in layouts:  # after all passes
         files.append("part/external_depth_end.cl")
     stages = {
-        "lists": ("prelude", "math", *(("splat",) if keys_by_tile else ()), "bounds", *_LISTS[shape.lists]),
+        "lists": (
+            "prelude",
+            "math",
+            *(("splat",) if keys_by_tile else ()),
+            "bounds",
+            *_LISTS[config.binning],
+        ),
         "frame": [
-            stage.format(shape.schedule)
+            stage.format(config.schedule)
             for stage in _FRAME
-            if not (stage == "pack" and shape.lists != "ordered") and not (stage == "resolve" and fused)
+            if not (stage == "pack" and config.binning != "sort_first") and not (stage == "resolve" and fused)
         ],
     }
     _refuse_unknown_hooks(files)
-    declared = Declarations(_scalars(features), layouts, features.images, fused, kernels_of(shape))
-    return Assembler(files, declared, numbers_of(features, shape)).source(stages)
+    declared = Declarations(_scalars(features), layouts, features.images, fused, kernels_of(config))
+    return Assembler(files, declared, numbers_of(features, config)).source(stages)
 
 
 def _frustum_parts(layouts: Collection[str]) -> list[str]:
@@ -245,50 +251,50 @@ def culls_before_projection(features: FeatureSet) -> bool:
     return excluded.isdisjoint(layouts) and bool(_frustum_parts(layouts))
 
 
-def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> KernelSource:
-    return _assemble_backward("gradients", _GRADIENTS, features, shape)
+def assemble_gradients(features: FeatureSet, config: KernelConfig) -> KernelSource:
+    return _assemble_backward("gradients", _GRADIENTS, features, config)
 
 
-def assemble_step(features: FeatureSet, shape: DeviceShape, camera: bool = False) -> KernelSource:
+def assemble_step(features: FeatureSet, config: KernelConfig, camera: bool = False) -> KernelSource:
     """Assemble a training step: the last stage of the backward pass, fused with Adam. camera: also sum the
     gradient with respect to the camera."""
-    return _assemble_backward("step", _STEP, features, shape, ("step_camera",) if camera else ())
+    return _assemble_backward("step", _STEP, features, config, ("step_camera",) if camera else ())
 
 
 def _assemble_backward(
-    name: str, stages: Sequence[str], features: FeatureSet, shape: DeviceShape, parts: Sequence[str] = ()
+    name: str, stages: Sequence[str], features: FeatureSet, config: KernelConfig, parts: Sequence[str] = ()
 ) -> KernelSource:
     layouts = layouts_of(features) | {part: LAYOUTS[part] for part in parts}
     # the backward pass needs the forward text of effects, but only the derivatives of outputs
     files = [layout.file for layout in layouts_of(replace(features, outputs=(), post_steps=())).values()]
-    files += _dialect(shape, _scalars(features), features.effects)
+    files += _dialect(config, _scalars(features), features.effects)
     files += [layout.backward_file for layout in layouts.values()]
     files += [LAYOUTS[part].file for part in parts]
-    kernels = kernels_of(shape)
+    kernels = kernels_of(config)
     declared = Declarations(_scalars(features), layouts, kernels=kernels)
-    backward = {"BACK_ITEMS": backward_items(features, shape), "CHUNK": backward_chunk(features, shape)}
+    backward = {"BACK_ITEMS": backward_items(features, config), "CHUNK": backward_chunk(features, config)}
     if stages is _STEP:
         backward["AXES"] = 3 if "thickness" in layouts else 2
-    assembler = Assembler(files, declared, numbers_of(features, shape) | backward)
-    return assembler.source({name: [stage.format(shape.schedule) for stage in stages]})
+    assembler = Assembler(files, declared, numbers_of(features, config) | backward)
+    return assembler.source({name: [stage.format(config.schedule) for stage in stages]})
 
 
-def _dialect(shape: DeviceShape, scalars: Scalars, effects: Iterable[str] = ()) -> list[str]:
+def _dialect(config: KernelConfig, scalars: Scalars, effects: Iterable[str] = ()) -> list[str]:
     """Files with a vendor's instructions for float32 fragments: one for all frames, then the files of
     effects."""
-    if not shape.dialect or scalars.wide != "float":
+    if not config.dialect or scalars.wide != "float":
         return []
     suffixes = {"arithmetic_approximate": "_exp", "blend_half": "_half"}
     return [
-        f"dialect/{shape.dialect}{suffix}.cl"
+        f"dialect/{config.dialect}{suffix}.cl"
         for suffix in ("", *(suffixes[n] for n in effects if n in suffixes))
     ]
 
 
-def kernels_of(shape: DeviceShape) -> Mapping[str, tuple[Argument, ...]]:
-    """The arguments of each kernel in the schedule of a shape."""
-    kernels = KERNELS | GROUP_KERNELS if shape.schedule == "group" else KERNELS
-    return kernels | UNCULLED_KERNELS if shape.culls else kernels
+def kernels_of(config: KernelConfig) -> Mapping[str, tuple[Argument, ...]]:
+    """The arguments of each kernel in the schedule of a config."""
+    kernels = KERNELS | GROUP_KERNELS if config.schedule == "group" else KERNELS
+    return kernels | UNCULLED_KERNELS if config.culls_first else kernels
 
 
 @cache
@@ -311,29 +317,29 @@ def assemble_alignment(items: int) -> KernelSource:
     return Assembler((), declared, numbers).source({"alignment": ("alignment",)})
 
 
-def assemble_check(file: str, shape: DeviceShape, float64: bool, effects: Iterable[str] = ()) -> str:
+def assemble_check(file: str, config: KernelConfig, float64: bool, effects: Iterable[str] = ()) -> str:
     """Text of prelude.cl, math.cl and a file of test kernels below kernels/opencl/ (empty: no file). effects:
     files whose sections fill the hooks."""
-    numbers = {"LANES": shape.lanes, "FAST_FMA": int(shape.fast_fma), "SETUP_FP64": int(float64)}
+    numbers = {"LANES": config.lanes, "FAST_FMA": int(config.fast_fma), "SETUP_FP64": int(float64)}
     scalars = Scalars("double" if float64 else "float", "float")
     stages = ("prelude", "math", *([file.removesuffix(".cl")] if file else ()))
-    files = [*effects, *_dialect(shape, scalars)]
+    files = [*effects, *_dialect(config, scalars)]
     return Assembler(files, Declarations(scalars), numbers).source({"check": stages}).text
 
 
-def backward_items(features: FeatureSet, shape: DeviceShape) -> int:
+def backward_items(features: FeatureSet, config: KernelConfig) -> int:
     """Work-group size of the backward pass over a chunk of a tile's list; half for outputs other than rgb,
     which would otherwise exceed NVIDIA's 48 KiB of local memory."""
-    if shape.schedule == "lanes":
+    if config.schedule == "lanes":
         return 1
-    return min(shape.tile_width * shape.tile_height, 128 if features.outputs else 256)
+    return min(config.tile_width * config.tile_height, 128 if features.outputs else 256)
 
 
-def backward_chunk(features: FeatureSet, shape: DeviceShape) -> int:
+def backward_chunk(features: FeatureSet, config: KernelConfig) -> int:
     """Number of splats of a tile's list that the backward pass evaluates at once."""
-    if shape.schedule == "lanes":
-        return shape.tape
-    return backward_items(features, shape) // shape.tile_width
+    if config.schedule == "lanes":
+        return config.tape
+    return backward_items(features, config) // config.tile_width
 
 
 def _scalars(features: FeatureSet) -> Scalars:
@@ -341,24 +347,24 @@ def _scalars(features: FeatureSet) -> Scalars:
     return Scalars(real, "double" if "blend_double" in features.effects else "float")
 
 
-def numbers_of(features: FeatureSet, shape: DeviceShape) -> dict[str, int]:
+def numbers_of(features: FeatureSet, config: KernelConfig) -> dict[str, int]:
     """The build constants, by their names in the kernels."""
     numbers = {
-        "BATCH": shape.batch,
-        "SORT_BLOCKS": shape.chunks,
-        "FAST_FMA": int(shape.fast_fma),
-        "LANES": shape.lanes,
-        "RADIX_BITS": shape.radix_bits,
+        "BATCH": config.batch,
+        "SORT_BLOCKS": config.sort_blocks,
+        "FAST_FMA": int(config.fast_fma),
+        "LANES": config.lanes,
+        "RADIX_BITS": config.radix_bits,
         "SAMPLES": features.samples,
-        "SCAN_ITEMS": shape.scan_items,
+        "SCAN_ITEMS": config.scan_items,
         "SETUP_FP64": int(features.setup_precision == "float64"),
         "SH_DEGREE": features.sh_degree,
-        "TILE_H": shape.tile_height,
-        "TILE_W": shape.tile_width,
-        "K_BUFFER_SIZE": shape.k_buffer_size,
+        "TILE_H": config.tile_height,
+        "TILE_W": config.tile_width,
+        "K_BUFFER_SIZE": config.k_buffer_size,
     }
-    if shape.schedule == "group":
-        numbers["ROWS"] = shape.rows
+    if config.schedule == "group":
+        numbers["ROWS"] = config.rows
     return numbers
 
 

@@ -17,20 +17,20 @@ from fidsplat.backends.opencl.assemble import KernelSource, assemble
 from fidsplat.backends.opencl.chunk_cache import OpenCLChunkCache
 from fidsplat.backends.opencl.gradients import OpenCLGradients
 from fidsplat.backends.opencl.images import OpenCLImages
+from fidsplat.backends.opencl.kernel_config import (
+    KernelConfig,
+    config_for,
+    cpu_config,
+    gpu_config,
+    other_configs,
+    small_frame_config,
+)
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.pocl_workarounds import is_pocl, kernel_cache, linker, target_patch
 from fidsplat.backends.opencl.probe import OpenCLProbe
 from fidsplat.backends.opencl.program import BackgroundCompiler, build_options
 from fidsplat.backends.opencl.resident import UploadedCloud
 from fidsplat.backends.opencl.roofline import measure_rates
-from fidsplat.backends.opencl.shapes import (
-    DeviceShape,
-    cpu_shape,
-    gpu_shape,
-    other_shapes,
-    shape_for,
-    small_frame_shape,
-)
 from fidsplat.backends.opencl.training import OpenCLTraining
 from fidsplat.backends.opencl.vendors import intel_registered, processor_flags
 from fidsplat.backends.opencl.workspace import Workspace
@@ -96,17 +96,17 @@ class OpenCLBackend(Workspace, Backend):
             check_once(pocl_folder(), kernel_cache.is_loaded, kernel_cache.is_complete)
         else:  # pyopencl caches programs for drivers without a cache of their own
             check_once(user_cache() / "pyopencl", _PYOPENCL_FILES.__contains__, lambda _: True)
-        super().__init__(device, _describe(device, _name_of(device)), _shape(device))
+        super().__init__(device, _describe(device, _name_of(device)), _config(device))
         self.compiler_options = build_options(device)
-        self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
+        self._pipelines: dict[tuple[FeatureSet, KernelConfig], OpenCLPipeline] = {}
         self._gradients: dict[OpenCLPipeline, OpenCLGradients] = {}
         self._alignment: OpenCLAlignment | None = None
         self._background = BackgroundCompiler()
-        self._requested: tuple[DeviceShape, dict[tuple[FeatureSet, DeviceShape | None], OpenCLPipeline]] = (
-            self.shape,
+        self._requested: tuple[KernelConfig, dict[tuple[FeatureSet, KernelConfig | None], OpenCLPipeline]] = (
+            self.config,
             {},
         )
-        """the device's own shape, and pipelines by the arguments of `pipeline`"""
+        """the device's own config, and pipelines by the arguments of `pipeline`"""
 
     def upload(self, cloud: SplatCloud) -> UploadedCloud:
         return UploadedCloud(self, cloud)
@@ -128,15 +128,15 @@ class OpenCLBackend(Workspace, Backend):
             "blend_precision='float32', or another device"
         )
 
-    def pipeline(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLPipeline:
-        if self._requested[0] is not self.shape:
-            self._requested = self.shape, {}
-        cached = self._requested[1].get((features, shape))
+    def pipeline(self, features: FeatureSet, config: KernelConfig | None = None) -> OpenCLPipeline:
+        if self._requested[0] is not self.config:
+            self._requested = self.config, {}
+        cached = self._requested[1].get((features, config))
         if cached is not None:
             return cached
         if why := self.unsupported(features):
             raise DeviceError(why)
-        key = self._key(features, shape)
+        key = self._key(features, config)
         if key[1].blend_items > self.device.max_work_group_size:
             raise DeviceError(
                 f"tiles must need at most {self.device.max_work_group_size} work-items on "
@@ -145,22 +145,22 @@ class OpenCLBackend(Workspace, Backend):
             )
         if key not in self._pipelines:
             self._pipelines[key] = OpenCLPipeline(self, assemble(*key), *key, self.pipeline)
-        self._requested[1][features, shape] = self._pipelines[key]
+        self._requested[1][features, config] = self._pipelines[key]
         return self._pipelines[key]
 
-    def frame_shape(self, view: View, count: int = 1) -> DeviceShape | None:
+    def frame_config(self, view: View, count: int = 1) -> KernelConfig | None:
         """Smaller tiles for frames with too few tiles to occupy a GPU (devlog/tuning.md), except with a small
         memory budget, as smaller tiles have more pairs."""
-        if self.shape.schedule != "group" or self.memory_budget < self.info.memory_bytes // 2:
+        if self.config.schedule != "group" or self.memory_budget < self.info.memory_bytes // 2:
             return None
         samples = count * view.width * view.height
         few = samples <= _FEW_SAMPLES * self.info.compute_units
-        return small_frame_shape(self.shape) if few else None
+        return small_frame_config(self.config) if few else None
 
-    def differentiate(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLGradients:
+    def differentiate(self, features: FeatureSet, config: KernelConfig | None = None) -> OpenCLGradients:
         check_differentiable(features)
         self._background.wait(features)
-        pipeline = self.pipeline(features, shape)
+        pipeline = self.pipeline(features, config)
         if pipeline not in self._gradients:
             self._gradients[pipeline] = OpenCLGradients(pipeline)
         return self._gradients[pipeline]
@@ -179,10 +179,10 @@ class OpenCLBackend(Workspace, Backend):
                 self._alignment = OpenCLAlignment(self)
             return self._alignment
 
-    def _key(self, features: FeatureSet, shape: DeviceShape | None) -> tuple[FeatureSet, DeviceShape]:
+    def _key(self, features: FeatureSet, config: KernelConfig | None) -> tuple[FeatureSet, KernelConfig]:
         if not self.info.float64 and features.setup_precision != "float32":
             features = replace(features, setup_precision="float32")
-        return features, shape or shape_for(features, self.shape)
+        return features, config or config_for(features, self.config)
 
     def source(self, features: FeatureSet) -> KernelSource:
         """Kernel source of these features for this device."""
@@ -202,8 +202,8 @@ class OpenCLBackend(Workspace, Backend):
     def probe(self) -> OpenCLProbe:
         return OpenCLProbe(self)
 
-    def shapes(self, kind: str) -> dict[str, DeviceShape]:
-        return other_shapes(self.shape, kind)
+    def configs(self, kind: str) -> dict[str, KernelConfig]:
+        return other_configs(self.config, kind)
 
 
 def _all_devices() -> Iterator[cl.Device]:
@@ -291,11 +291,11 @@ def _describe(device: cl.Device, name: str) -> DeviceInfo:
     )
 
 
-def _shape(device: cl.Device) -> DeviceShape:
+def _config(device: cl.Device) -> KernelConfig:
     fast_fma = bool(device.single_fp_config & cl.device_fp_config.FMA)
     if device.type & cl.device_type.CPU:
         fast_fma |= "fma" in processor_flags()  # Intel's runtime does not report it
         lanes = 16 if device.native_vector_width_float >= 16 else 8
-        return cpu_shape(lanes, device.max_compute_units, fast_fma)
+        return cpu_config(lanes, device.max_compute_units, fast_fma)
     dialect = "ptx" if device.platform.name == "NVIDIA CUDA" else ""
-    return gpu_shape(min(1024, device.max_work_group_size), fast_fma, dialect)
+    return gpu_config(min(1024, device.max_work_group_size), fast_fma, dialect)

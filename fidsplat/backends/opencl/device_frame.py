@@ -13,10 +13,10 @@ from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.counts import Capacity, Counts
 from fidsplat.backends.opencl.declare import Argument
+from fidsplat.backends.opencl.kernel_config import KernelConfig
 from fidsplat.backends.opencl.layout import RAW
 from fidsplat.backends.opencl.memory_plan import MemoryPlan
 from fidsplat.backends.opencl.resident import Resident
-from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.opencl.uniforms import numbers_of, projection_arrays
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
@@ -96,7 +96,7 @@ class DeviceFrame:
         self,
         workspace: Workspace,
         commands: CommandList,
-        shape: DeviceShape,
+        config: KernelConfig,
         resident: Resident,
         views: ViewBatch,
         plan: MemoryPlan,
@@ -106,30 +106,30 @@ class DeviceFrame:
         """commands: records the launches. replay_queue: queue of frames that are recorded for replay; on a
         GPU the host does not wait for their counts. pair_limit: largest capacity of the lists of a recorded
         frame; 0: no limit."""
-        self.workspace, self.commands, self.shape = workspace, commands, shape
+        self.workspace, self.commands, self.config = workspace, commands, config
         self.resident, self.plan = resident, plan
         self.projected = resident.count
         """number of splats of each view that have records; with `culls_first` a capacity"""
         self.batch, self.views = views, len(views)
         self.view = view = views.view
-        self.waits = replay_queue is None or shape.lists == "ordered"
+        self.waits = replay_queue is None or config.binning == "sort_first"
         """whether the host waits for the counts"""
         self.pair_limit, self.pool = pair_limit, workspace.pool
         self.queue = workspace.switch_to(workspace.queue) if replay_queue is None else replay_queue
         self.source = commands.program.source
         """arguments of the program whose kernels are launched"""
         workspace.frames += 1
-        self.tiles_x = -(-view.width // shape.tile_width)
-        self.tiles_y = -(-view.height // shape.tile_height)
+        self.tiles_x = -(-view.width // config.tile_width)
+        self.tiles_y = -(-view.height // config.tile_height)
         self.tiles = self.views * self.tiles_x * self.tiles_y
         """number of tiles of all views; the tiles of a view are consecutive"""
-        self.stride = self.tiles_x * shape.tile_width
-        self.rows = self.tiles_y * shape.tile_height
+        self.stride = self.tiles_x * config.tile_width
+        self.rows = self.tiles_y * config.tile_height
         self.first_tile, self.end_tile = 0, self.tiles
         """tiles of the requested rows"""
-        if view.band is not None and shape.lists == "ordered" and self.views == 1:
-            self.first_tile = view.band[0] // shape.tile_height * self.tiles_x
-            self.end_tile = -(-view.band[1] // shape.tile_height) * self.tiles_x
+        if view.band is not None and config.binning == "sort_first" and self.views == 1:
+            self.first_tile = view.band[0] // config.tile_height * self.tiles_x
+            self.end_tile = -(-view.band[1] // config.tile_height) * self.tiles_x
         self.buffers = FrameBuffers()
         self.named: dict[str, cl.Buffer] = vars(self.buffers)
         """all buffers, including those of effects and outputs, by the names of the kernel arguments"""
@@ -162,7 +162,7 @@ class DeviceFrame:
     def sub_frame(self, view: View) -> DeviceFrame:
         """The frame of `view`, one of the camera poses that a shutter averages."""
         views = ViewBatch.single(view)
-        frame = DeviceFrame(self.workspace, self.commands, self.shape, self.resident, views, self.plan)
+        frame = DeviceFrame(self.workspace, self.commands, self.config, self.resident, views, self.plan)
         frame.is_sub_frame = True
         return frame
 

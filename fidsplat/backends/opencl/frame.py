@@ -35,7 +35,7 @@ def render(frame: DeviceFrame) -> None:
     allocate_samples(frame)
     if frame.plan.chunk:
         render_in_chunks(frame)
-    elif frame.shape.lists == "ordered":
+    elif frame.config.binning == "sort_first":
         render_sorted(frame)
     else:
         render_tiled(frame)
@@ -141,10 +141,10 @@ def render_in_chunks(frame: DeviceFrame) -> None:
 
 def blend(frame: DeviceFrame, band: TileBand) -> None:
     """Submit the blend kernel for a band of tiles; GPUs start with the longest lists."""
-    group = frame.shape.blend_items
+    group = frame.config.blend_items
     arguments: dict[str, Any] = {"band_first": band.first}
-    if frame.shape.schedule == "group":
-        ordered = frame.shape.lists != "ordered" and band.end - band.first == frame.tiles
+    if frame.config.schedule == "group":
+        ordered = frame.config.binning != "sort_first" and band.end - band.first == frame.tiles
         arguments["tile_order"] = frame.named["tile_order"] if ordered else frame.buffers.starts
         arguments["longest_first"] = ordered
     frame.launch("blend", "blend", ((band.end - band.first) * group,), (group,), **arguments)

@@ -67,7 +67,7 @@ class OpenCLGradients(GradientPipeline):
 
     def __init__(self, pipeline: OpenCLPipeline) -> None:
         self._pipeline, self.features = pipeline, pipeline.features
-        self.source = assemble_gradients(pipeline.features, pipeline.shape)
+        self.source = assemble_gradients(pipeline.features, pipeline.config)
         self.program = Program(pipeline.workspace, self.source)
         arguments = self.source.arguments
         self._output_gradients = [
@@ -144,12 +144,12 @@ class OpenCLGradients(GradientPipeline):
         return frame.pool.state, count, frame.capacity, size
 
     def _record_blend_backward(self, frame: DeviceFrame, log_ceiling: float) -> None:
-        features, shape = self.features, self._pipeline.shape
-        in_groups, tile = shape.schedule == "group", shape.tile_width * shape.tile_height
-        chunks = frame.pairs // backward_chunk(features, shape) + frame.tiles
-        frame.scratch("checkpoints", (8 * tile if in_groups else 4 * (tile + shape.lanes)) * chunks)
+        features, config = self.features, self._pipeline.config
+        in_groups, tile = config.schedule == "group", config.tile_width * config.tile_height
+        chunks = frame.pairs // backward_chunk(features, config) + frame.tiles
+        frame.scratch("checkpoints", (8 * tile if in_groups else 4 * (tile + config.lanes)) * chunks)
         if not in_groups:
-            rows = -(-frame.view.height // shape.tile_height)
+            rows = -(-frame.view.height // config.tile_height)
             frame.scratch("big_rows", 4 * frame.numbers["big_capacity"] * rows)
         if count := frame.resident.count:
             frame.launch("reserve", "reserve_gradients", (count,), (_GROUP,), count=count)
@@ -157,28 +157,28 @@ class OpenCLGradients(GradientPipeline):
         if in_groups:
             frame.scratch("reached_chunks", 4 * frame.tiles)
             frame.scratch("chunk_tiles", 4 * chunks)
-            size = frame.tiles * shape.blend_items
+            size = frame.tiles * config.blend_items
             frame.launch(
-                "blend backward", "blend_checkpoints", (size,), (shape.blend_items,), log_ceiling=log_ceiling
+                "blend backward", "blend_checkpoints", (size,), (config.blend_items,), log_ceiling=log_ceiling
             )
         else:
             frame.scratch("tapes", self._tape_bytes() * groups)
-        items = backward_items(features, shape)
+        items = backward_items(features, config)
         frame.launch("blend backward", "blend_backward", (groups * items,), (items,), log_ceiling=log_ceiling)
 
     def _tape_bytes(self) -> int:
         """Bytes of the struct `Tape` (schedule/lanes_backward.cl): transmittance and opacity of each pixel
         for a chunk of splats, two words for each splat of eight chunks, and one more word, rounded up to
         vectors."""
-        shape = self._pipeline.shape
-        chunk, vector = backward_chunk(self.features, shape), 4 * shape.lanes
+        config = self._pipeline.config
+        chunk, vector = backward_chunk(self.features, config), 4 * config.lanes
         words = 2 * 8 * chunk + 1
-        return 8 * chunk * shape.tile_width * shape.tile_height + -(-4 * words // vector) * vector
+        return 8 * chunk * config.tile_width * config.tile_height + -(-4 * words // vector) * vector
 
     def compile_step(self, with_camera: bool = False) -> None:
         """Compile the kernel of `step`, which gradients do not need."""
         if with_camera not in self.step_commands:
-            source = assemble_step(self.features, self._pipeline.shape, with_camera)
+            source = assemble_step(self.features, self._pipeline.config, with_camera)
             self.step_commands[with_camera] = CommandList(Program(self._pipeline.workspace, source))
 
     def _check_capacity(self, frame: DeviceFrame) -> None:

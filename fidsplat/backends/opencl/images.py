@@ -74,7 +74,7 @@ class OpenCLImages(Images):
             self.views = views.total
         self._size = view.height // view.samples, view.width // view.samples
         self._rendered, self._replay = rendered, replay
-        self._tile = pipeline.shape.tile_height, pipeline.shape.tile_width
+        self._tile = pipeline.config.tile_height, pipeline.config.tile_width
         self._batch = None if acquired is None else dict(zip(self._outputs, acquired, strict=True))
         self._timings: dict[str, float] = {}
         self._copied: list[Rendered] = []
@@ -228,7 +228,7 @@ class OpenCLImages(Images):
 def _uint8_kernel(workspace: Workspace) -> tuple[cl.Kernel, int]:
     if workspace not in _KERNELS:
         load_invoker()
-        values = 16 if workspace.shape.schedule == "lanes" else 4
+        values = 16 if workspace.config.schedule == "lanes" else 4
         program = build(workspace, kernel_text("uint8.cl"), f"-DVALUES={values}")
         _KERNELS[workspace] = program.to_uint8, values
     return _KERNELS[workspace]

@@ -15,9 +15,9 @@ from fidsplat.backends.bands import even_parts
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.assemble import KernelSource
 from fidsplat.backends.opencl.buffers import RayBuffers
+from fidsplat.backends.opencl.kernel_config import KernelConfig
 from fidsplat.backends.opencl.layout import RAW
 from fidsplat.backends.opencl.resident import Resident
-from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
@@ -65,9 +65,9 @@ class Part(NamedTuple):
 
 class MemoryPlanner:
     def __init__(
-        self, device: Workspace, source: KernelSource, features: FeatureSet, shape: DeviceShape
+        self, device: Workspace, source: KernelSource, features: FeatureSet, config: KernelConfig
     ) -> None:
-        self._device, self._source, self._shape = device, source, shape
+        self._device, self._source, self._config = device, source, config
         self._has_ray_slopes = source.has_argument("blend", "ray_slopes")
         self._has_camera_uniforms = not _CAMERA_UNIFORMS.isdisjoint(source.uniform_groups)
         self._channels = RAW.channels
@@ -83,11 +83,11 @@ class MemoryPlanner:
             self._image_channels += output.channels
 
     def tiles(self, view: View) -> int:
-        return -(-view.width // self._shape.tile_width) * -(-view.height // self._shape.tile_height)
+        return -(-view.width // self._config.tile_width) * -(-view.height // self._config.tile_height)
 
     def frame(self, resident: Resident, view: View, reserved: int = 0) -> MemoryPlan:
         """Plan one view. reserved: bytes of other buffers. Raises DeviceError if it does not fit."""
-        shape = self._shape
+        config = self._config
         resident_bytes, upload_bytes = resident.bytes_for(self._source.cloud_arrays)
         samples, tables = self._samples_and_tables(view)
         fixed = reserved + resident_bytes + UNIFORM_BYTES + tables
@@ -102,11 +102,11 @@ class MemoryPlanner:
                 view.raster,
                 *(sub_frame.view.raster for sub_frame in view.sub_frames if sub_frame.view.raster),
             }
-            columns = -(-view.width // shape.tile_width) * shape.tile_width
-            fixed += RayBuffers.bytes_of(rasters, shape.tile_height, columns, self._has_ray_slopes)
+            columns = -(-view.width // config.tile_width) * config.tile_width
+            fixed += RayBuffers.bytes_of(rasters, config.tile_height, columns, self._has_ray_slopes)
         record = self._source.records["Splat"].itemsize
         budget, largest = self._device.memory_budget, self._device.largest_buffer
-        return plan_of(resident.capacity, record, upload_bytes, fixed, shape.lists, budget, largest)
+        return plan_of(resident.capacity, record, upload_bytes, fixed, config.binning, budget, largest)
 
     def parts(self, resident: Resident, views: ViewBatch) -> Iterator[Part]:
         """Divide a batch into parts that are rendered together."""
@@ -123,7 +123,7 @@ class MemoryPlanner:
             return
         samples, tables = self._samples_and_tables(views.view)
         splat_bytes = self._source.records["Splat"].itemsize + KEY_BYTES + WINDOW_BYTES
-        splat_bytes += SORT_BYTES if self._shape.lists == "ordered" else 0
+        splat_bytes += SORT_BYTES if self._config.binning == "sort_first" else 0
         view_bytes = resident.capacity * splat_bytes + tables + 4 * self._channels * samples
         free = min(self._device.memory_budget - plan.total + view_bytes, self._device.largest_buffer)
         max_views = min(free, PART_BYTES.get(self._device.info.kind, OTHER_PART_BYTES)) // view_bytes
@@ -135,16 +135,16 @@ class MemoryPlanner:
 
     def _samples_and_tables(self, view: View) -> tuple[int, int]:
         """Number of samples in complete tiles, and bytes of the tables of tile binning."""
-        shape, tiles = self._shape, self.tiles(view)
-        samples = tiles * shape.tile_width * shape.tile_height
-        if shape.lists != "ordered":
+        config, tiles = self._config, self.tiles(view)
+        samples = tiles * config.tile_width * config.tile_height
+        if config.binning != "sort_first":
             return samples, 4 * 3 * tiles
-        bins = 1 << shape.radix_bits
-        return samples, 4 * ((tiles + bins) * (shape.chunks + 2) + 3 * shape.chunks)
+        bins = 1 << config.radix_bits
+        return samples, 4 * ((tiles + bins) * (config.sort_blocks + 2) + 3 * config.sort_blocks)
 
 
 def plan_of(
-    count: int, record_bytes: int, upload_bytes: int, fixed_bytes: int, lists: str, budget: int, largest: int
+    count: int, record_bytes: int, upload_bytes: int, fixed_bytes: int, binning: str, budget: int, limit: int
 ) -> MemoryPlan:
     """Plan a frame of `count` splats.
 
@@ -152,15 +152,15 @@ def plan_of(
         record_bytes: bytes of the struct `Splat`.
         upload_bytes: bytes per splat that each frame copies to the device; 0 for a resident cloud.
         fixed_bytes: bytes of sample buffers, outputs, tables, and the cloud if it is resident.
-        lists: tile-binning strategy.
+        binning: tile-binning strategy.
         budget: maximum total bytes.
-        largest: maximum bytes of one buffer.
+        limit: maximum bytes of one buffer.
     """
     projected_bytes = record_bytes + KEY_BYTES + WINDOW_BYTES
-    splat_bytes = count * (projected_bytes + (SORT_BYTES if lists == "ordered" else 0))
+    splat_bytes = count * (projected_bytes + (SORT_BYTES if binning == "sort_first" else 0))
     pair_bytes = budget // 8
     fits = not upload_bytes and fixed_bytes + splat_bytes + pair_bytes <= budget
-    if fits and count * record_bytes <= largest:
+    if fits and count * record_bytes <= limit:
         return MemoryPlan(0, count, fixed_bytes + splat_bytes + pair_bytes)
     free = budget - fixed_bytes - pair_bytes
     chunk, chunked_bytes = DEFAULT_CHUNK, projected_bytes + upload_bytes
@@ -169,7 +169,7 @@ def plan_of(
     while chunk > _MIN_CHUNK and (chunk * chunked_bytes > free // 8 or chunk > 2 * count):
         chunk //= 2
     capacity = (free - chunk * chunked_bytes) // (projected_bytes + SORT_BYTES)
-    capacity = min(capacity, largest // record_bytes, count)
+    capacity = min(capacity, limit // record_bytes, count)
     if capacity < min(_MIN_CHUNK, count):
         raise DeviceError(
             f"memory_budget must exceed the {bytes_words(fixed_bytes)} of the frame and the cloud without "

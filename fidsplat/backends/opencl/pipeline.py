@@ -18,11 +18,11 @@ from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.device_frame import DeviceFrame, Rendered
 from fidsplat.backends.opencl.frame import render
 from fidsplat.backends.opencl.images import OpenCLImages, acquire_images
+from fidsplat.backends.opencl.kernel_config import KernelConfig
 from fidsplat.backends.opencl.memory_plan import MemoryPlan, MemoryPlanner
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.recorded_frame import RecordedFrame, Replay
 from fidsplat.backends.opencl.resident import Resident
-from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
 from fidsplat.cameras.raster import RayRaster
@@ -59,13 +59,13 @@ class OpenCLPipeline(Pipeline):
         workspace: Workspace,
         source: KernelSource,
         features: FeatureSet,
-        shape: DeviceShape,
-        other: Callable[[FeatureSet, DeviceShape], OpenCLPipeline],
+        config: KernelConfig,
+        other: Callable[[FeatureSet, KernelConfig], OpenCLPipeline],
     ) -> None:
-        """other: function that returns the pipeline with another shape."""
-        self.workspace, self.source, self.features, self.shape = workspace, source, features, shape
+        """other: function that returns the pipeline with another config."""
+        self.workspace, self.source, self.features, self.config = workspace, source, features, config
         self.outputs = {output.name: output for output in features.images}
-        self._planner = MemoryPlanner(workspace, source, features, shape)
+        self._planner = MemoryPlanner(workspace, source, features, config)
         self._other = other
 
     @cached_property
@@ -87,14 +87,15 @@ class OpenCLPipeline(Pipeline):
             cached = resident.cached_frames.get(key) if view.band is None else None
             if cached is not None and (images := self._replay(resident, view, cached)) is not None:
                 return images
-            if resident.coherent and self.shape.lists == "tiled":
-                return self._with_lists("local").render_view(resident, view)
+            if resident.coherent and self.config.binning == "bin_first":
+                return self._with_binning("bin_local").render_view(resident, view)
             if resident.count >= MIN_CULLED and resident.sortable and self._culls:
-                return self._other(self.features, replace(self.shape, culls=True)).render_view(resident, view)
+                culling = self._other(self.features, replace(self.config, culls_first=True))
+                return culling.render_view(resident, view)
             plan = self._planner.frame(resident, view)
-            if plan.chunk and self.shape.lists != "ordered":
+            if plan.chunk and self.config.binning != "sort_first":
                 # frames in chunks use only this strategy; it is the fastest with little memory
-                return self._with_lists("ordered").render_view(resident, view)
+                return self._with_binning("sort_first").render_view(resident, view)
             frame = self._render_planned(resident, view, plan)
             complete = not (plan.chunk or frame.in_bands or view.sub_frames or view.band)
             if complete and resident.count and not resident.streamed:
@@ -116,7 +117,7 @@ class OpenCLPipeline(Pipeline):
                 pipeline = self._for_part(resident, plan, part)
                 buffers = pipeline, "views", resident.capacity, plan
                 workspace.pool.trim(buffers, workspace.memory_budget - plan.total)
-                frame = DeviceFrame(workspace, pipeline._commands, pipeline.shape, resident, part, plan)
+                frame = DeviceFrame(workspace, pipeline._commands, pipeline.config, resident, part, plan)
                 frame.bind_images(images)
                 render(frame)
                 rendered.append(frame.rendered())
@@ -147,7 +148,7 @@ class OpenCLPipeline(Pipeline):
     def replay_complete(self, resident: Resident, view: View, pair_limit: int) -> DeviceFrame:
         """Render one frame like `render_complete` without waiting for its counts (`DeviceFrame.count_pairs`
         does), by a replay if possible. pair_limit: maximum capacity of the lists."""
-        if self.shape.lists == "ordered" or not resident.count:
+        if self.config.binning == "sort_first" or not resident.count:
             return self.render_complete(resident, view)
         workspace, key = self.workspace, (*self._key(view), pair_limit)
         with workspace.rendering():
@@ -155,7 +156,7 @@ class OpenCLPipeline(Pipeline):
             recorded = None if cached is None else cached.recorded
             if cached is not None and recorded is not None and recorded.set_view(view, queue):
                 frame = DeviceFrame(
-                    *(workspace, recorded.commands, self.shape, resident),
+                    *(workspace, recorded.commands, self.config, resident),
                     *(ViewBatch.single(view), cached.plan, queue, pair_limit),
                 )
                 recorded.render(frame)
@@ -181,7 +182,7 @@ class OpenCLPipeline(Pipeline):
 
     def _replay(self, resident: Resident, view: View, cached: CachedFrame) -> OpenCLImages | None:
         """Replay a cached frame for another view; None if its buffers are too small or were replaced."""
-        workspace, recorded, waits = self.workspace, cached.recorded, self.shape.lists == "ordered"
+        workspace, recorded, waits = self.workspace, cached.recorded, self.config.binning == "sort_first"
         workspace.pool.trim(cached.buffer_key, workspace.memory_budget - cached.plan.total, resident.capacity)
         if not waits and not tiling.pair_capacity(workspace):
             return None
@@ -217,7 +218,7 @@ class OpenCLPipeline(Pipeline):
         pair_limit: int = 0,
     ) -> DeviceFrame:
         frame = DeviceFrame(
-            *(self.workspace, commands or self._commands, self.shape),
+            *(self.workspace, commands or self._commands, self.config),
             *(resident, ViewBatch.single(view), plan, replay_queue, pair_limit),
         )
         frame.acquire_images(self.features.images)
@@ -252,34 +253,34 @@ class OpenCLPipeline(Pipeline):
         labels, budgets = tuple(dict(view.groups)), (self.workspace.memory_budget, self.workspace.pair_budget)
         return self, view.width, view.height, view.raster, labels, budgets
 
-    def _with_lists(self, lists: str) -> OpenCLPipeline:
+    def _with_binning(self, binning: str) -> OpenCLPipeline:
         """The pipeline with another tile-binning strategy."""
-        return self._other(self.features, replace(self.shape, lists=lists, culls=False))
+        return self._other(self.features, replace(self.config, binning=binning, culls_first=False))
 
     def _is_too_small_to_batch(self, resident: Resident) -> bool:
         """Whether compiling the vectorised set-up would take longer than it saves, for a small cloud."""
-        return self.shape.batch > 1 and resident.count < MIN_BATCHED
+        return self.config.batch > 1 and resident.count < MIN_BATCHED
 
     @cached_property
     def _culls(self) -> bool:
         """Whether large clouds are rendered by the pipeline with frustum culling before projection."""
-        tiled = self.shape.lists == "tiled" and not self.shape.culls
+        tiled = self.config.binning == "bin_first" and not self.config.culls_first
         return tiled and culls_before_projection(self.features)
 
     @cached_property
     def _unbatched(self) -> OpenCLPipeline:
         """The pipeline whose projection is not vectorised, for small clouds: compiling the vectorised
         projection takes longer than it saves."""
-        return self._other(self.features, replace(self.shape, batch=1))
+        return self._other(self.features, replace(self.config, batch=1))
 
     def _for_part(self, resident: Resident, plan: MemoryPlan, views: ViewBatch) -> OpenCLPipeline:
         """The pipeline with the fastest tile-binning strategy for a part of a batch."""
-        if self.shape.lists != "tiled":
+        if self.config.binning != "bin_first":
             return self
         if plan.chunk:
-            return self._with_lists("ordered")  # the only strategy of frames in chunks
+            return self._with_binning("sort_first")  # the only strategy of frames in chunks
         few = len(views) > 1 and self._planner.tiles(views.view) <= tiling.LOCAL_TILES
-        return self._with_lists("local") if few or resident.coherent else self
+        return self._with_binning("bin_local") if few or resident.coherent else self
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Render one view, and return the data between the stages: keys (n,) uint32; starts (tiles + 1,)

@@ -93,7 +93,7 @@ class OpenCLProbe(Probe):
     @property
     def fuses(self) -> bool:
         """Whether the device fuses multiply-adds where requested."""
-        return self._workspace.shape.fast_fma
+        return self._workspace.config.fast_fma
 
     def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
         real = np.float64 if self._workspace.info.float64 else np.float32
@@ -118,7 +118,7 @@ class OpenCLProbe(Probe):
 
         single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
         names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log", "reciprocal")
-        made, count, items = np.empty((8, n), np.float32), np.uint32(n), n // workspace.shape.lanes
+        made, count, items = np.empty((8, n), np.float32), np.uint32(n), n // workspace.config.lanes
         try:
             parts = run("arithmetic_float", items, made, count, *single)
             results: dict[str, np.ndarray] = dict(zip(names, parts, strict=True))
@@ -136,11 +136,11 @@ class OpenCLProbe(Probe):
         return self._workspace.compiler_options
 
     def scan(self, pipeline: OpenCLPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
-        workspace, items = pipeline.workspace, (pipeline.shape.scan_items,)
+        workspace, items = pipeline.workspace, (pipeline.config.scan_items,)
         starts = buffer_of(workspace, np.empty(len(lengths) + 1, np.uint32))
         sums = buffer_of(workspace, np.zeros(8, np.uint32))
         given = {"starts": starts}
-        if pipeline.shape.lists != "ordered":
+        if pipeline.config.binning != "sort_first":
             kernel, place, size = "tile_starts", 1, (3 * items[0],)
             given |= {"tiles": len(lengths), "capacity": 2**32 - 1, "counts": sums}
             counters = buffer_of(workspace, np.concatenate([np.zeros(8, np.uint32), lengths]))

@@ -114,8 +114,8 @@ def check_kernels(
 ) -> dict[str, cl.Kernel]:
     """Compile a file below kernels/opencl/ or a text after prelude.cl and math.cl, like the stages. lanes:
     SIMD width; 0 for the device's. effects: files that fill hooks."""
-    shape = replace(workspace.shape, lanes=lanes) if lanes else workspace.shape
-    built = build(workspace, assemble_check(file, shape, workspace.info.float64, effects) + text)
+    config = replace(workspace.config, lanes=lanes) if lanes else workspace.config
+    built = build(workspace, assemble_check(file, config, workspace.info.float64, effects) + text)
     load_invoker()
     return {kernel.function_name: kernel for kernel in built.all_kernels()}
 

@@ -48,7 +48,7 @@ def _operation_rate(workspace: Workspace, kernel: cl.Kernel, a: float, b: float)
     # a GPU needs many work-items to hide its latencies; on a CPU a few groups per core are plenty
     groups = workspace.info.compute_units * (32 if workspace.info.kind == "gpu" else 4)
     items = groups * _GROUP
-    out = workspace.pool.allocate("sums", 4 * items * workspace.shape.lanes)
+    out = workspace.pool.allocate("sums", 4 * items * workspace.config.lanes)
 
     def launch(rounds: int) -> cl.Event:
         return kernel(
@@ -59,7 +59,7 @@ def _operation_rate(workspace: Workspace, kernel: cl.Kernel, a: float, b: float)
     while _seconds(launch(rounds)) < _SHORTEST and rounds < 2**24:
         rounds *= 2
     best = _best(lambda: launch(rounds))
-    return items * workspace.shape.lanes * _CHAINS * rounds / best
+    return items * workspace.config.lanes * _CHAINS * rounds / best
 
 
 def _best(launch: Callable[[], cl.Event]) -> float:

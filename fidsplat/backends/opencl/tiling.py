@@ -1,10 +1,10 @@
 """Tile binning: the splats of each tile, in depth order.
 
-`ordered` (CPU): all visible splats are sorted by depth, then appended to tile lists in that order, by
-counting sorts over a few contiguous blocks: long sequential loops, no atomics. `tiled` (GPU): the projection
-counts the splats of each tile, (splat, tile) pairs are written in any order, and each tile's list is sorted
-in local memory. `local`: like `tiled`, with counters in local memory, for many small views and for stores,
-where atomics of neighbouring splats on one tile's counter would serialise.
+`sort_first` (CPU): all visible splats are sorted by depth, then appended to tile lists in that order, by
+counting sorts over a few contiguous blocks: long sequential loops, no atomics. `bin_first` (GPU): the
+projection counts the splats of each tile, (splat, tile) pairs are written in any order, and each tile's list
+is sorted in local memory. `bin_local`: like `bin_first`, with counters in local memory, for many small views
+and for stores, where atomics of neighbouring splats on one tile's counter would serialise.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from fidsplat.util.errors import DeviceError
 LOCAL_TILES = 4096
 """maximum tiles of a view that are counted in local memory (as in tile_lists_local.cl)"""
 _GROUP_SPLATS = 4096
-"""splats per work-group of the strategy `local`"""
+"""splats per work-group of the strategy `bin_local`"""
 _ITEMS = 256
 """work-group size: BIN_ITEMS and SORT_ITEMS of the kernels"""
 _START_TILES, _START_SHARES = 512, 32
@@ -80,7 +80,7 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
     """Project splats [first, end), or only those that passed `cull`: write their records, sort keys and tile
     windows."""
     count, size = end - first, _splat_capacity(frame, end - first)
-    if frame.shape.culls:
+    if frame.config.culls_first:
         size = frame.projected
     windows = _allocate_records(frame, size)
     if frame.view.band is not None and size:
@@ -88,11 +88,11 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
         cl.enqueue_fill_buffer(frame.queue, windows, _NO_WINDOW, 0, WINDOW_BYTES * size)
     if count:
         resident, names = frame.resident, frame.source.cloud_arrays
-        if frame.shape.culls:
+        if frame.config.culls_first:
             arrays, count = {name: resident.sorted_array(name) for name in names}, size
         else:
             arrays = {name: resident.part(name, first, end) for name in names}
-        batch = frame.shape.batch
+        batch = frame.config.batch
         items, group = (count, 64) if batch == 1 else (-(-count // batch), 1)
         frame.launch("project", "project", (items,), (group,), frame.views, count=count, **arrays)
 
@@ -115,11 +115,11 @@ def _splat_capacity(frame: DeviceFrame, count: int) -> int:
 
 def sort_by_depth(frame: DeviceFrame, count: int) -> None:
     """Radix sort of the visible splats by depth, ties by index."""
-    views, chunks, bins = frame.views, frame.shape.chunks, 1 << frame.shape.radix_bits
+    views, chunks, bins = frame.views, frame.config.sort_blocks, 1 << frame.config.radix_bits
     table = frame.scratch("sort table", 4 * bins * chunks * views)
     size = 4 * _splat_capacity(frame, count)
     keys, order = frame.buffers.keys, frame.scratch("order 0", size)
-    for number, shift in enumerate(range(0, 32, frame.shape.radix_bits)):
+    for number, shift in enumerate(range(0, 32, frame.config.radix_bits)):
         keys_out = frame.scratch(f"sorted keys {number % 2}", size)
         order_out = frame.scratch(f"order {(number + 1) % 2}", size)
         digit = {"keys": keys, "count": count, "first": number == 0, "shift": shift, "table": table}
@@ -134,8 +134,8 @@ def sort_by_depth(frame: DeviceFrame, count: int) -> None:
 def count_pairs(frame: DeviceFrame, count: int) -> Counts:
     """Count the length of each tile's list; waits for the totals."""
     views = frame.views
-    table = frame.scratch("bin table", 4 * frame.tiles * frame.shape.chunks)
-    frame.launch("bin", "bin_count", (frame.shape.chunks,), (1,), views, table=table, count=count)
+    table = frame.scratch("bin table", 4 * frame.tiles * frame.config.sort_blocks)
+    frame.launch("bin", "bin_count", (frame.config.sort_blocks,), (1,), views, table=table, count=count)
     # tiles of all views are numbered consecutively, view after view
     frame.buffers.starts = _prefix_sums(frame, "bin", table, frame.tiles // views, PAIRS, 1)
     frame.counted_launches = len(frame.events)
@@ -161,7 +161,7 @@ def list_sorted(frame: DeviceFrame, band: TileBand, count: int) -> None:
     frame.scratch("lists", 4 * size)
     arguments = {"band_first": band.first, "band_end": band.end, "count": count}
     table = frame.named["bin table"]
-    frame.launch("bin", "bin_emit", (frame.shape.chunks,), (1,), frame.views, table=table, **arguments)
+    frame.launch("bin", "bin_emit", (frame.config.sort_blocks,), (1,), frame.views, table=table, **arguments)
 
 
 def _prefix_sums(
@@ -169,7 +169,7 @@ def _prefix_sums(
 ) -> cl.Buffer:
     """Prefix sums over tables of counts: the start of each bin (lists, bins of a list + 1). lists: 1 for a
     single list of all views, or the number of views. counter: index of the sum in the buffer `counters`."""
-    views, items = frame.views, frame.shape.scan_items
+    views, items = frame.views, frame.config.scan_items
     totals = frame.scratch(f"{stage} totals", 4 * bins * views)
     list_bins = bins * views // lists
     starts = frame.scratch(f"{stage} starts", 4 * (list_bins + 1) * lists)
@@ -193,7 +193,7 @@ class PackedCounts(NamedTuple):
 
 def pack_visible(frame: DeviceFrame, top: int, end: int) -> PackedCounts:
     """Project in chunks, and pack the visible splats of tile rows [top, end)."""
-    height, plan = frame.shape.tile_height, frame.plan
+    height, plan = frame.config.tile_height, frame.plan
     frame.upload_view(top * height, end * height)
     big = 0
     while True:
@@ -213,7 +213,7 @@ def pack_visible(frame: DeviceFrame, top: int, end: int) -> PackedCounts:
 def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[PackedCounts, int]:
     """Project and pack chunks until a capacity is exceeded. Returns the packed splats, and the number of big
     splats if it exceeded the capacity, else 0."""
-    count, chunk, chunks = frame.resident.count, frame.plan.chunk, frame.shape.chunks
+    count, chunk, chunks = frame.resident.count, frame.plan.chunk, frame.config.sort_blocks
     out: dict[str, Any] = {f"{name}_out": buffer for name, buffer in packed.items()}
     total = visible = 0
     for start in range(0, count, chunk):
@@ -259,18 +259,18 @@ def pair_capacity(workspace: Workspace) -> int:
 def project_and_count(frame: DeviceFrame, big: int = 0) -> None:
     """Project the cloud and count the pairs of each tile, with buffers for at least `big` big splats."""
     allocate_counters(frame, COUNTERS + frame.tiles, big)
-    if frame.shape.culls:
+    if frame.config.culls_first:
         cull(frame, big)
     project(frame, 0, frame.resident.count)
     count = frame.projected
     frame.launch("bin", "count_big", (_big_groups(frame) * _ITEMS,), (_ITEMS,), count=count)
-    if frame.shape.lists == "local":
+    if frame.config.binning == "bin_local":
         launch_local(frame, "count_local")
 
 
 def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
     """Compute the start of each tile's list; all lists are empty if there are more pairs than `capacity`."""
-    items = frame.shape.scan_items
+    items = frame.config.scan_items
     frame.scratch("starts", 4 * (frame.tiles + 1))
     frame.scratch("cursors", 4 * frame.tiles)
     frame.scratch("tile_order", 4 * frame.tiles)
@@ -289,7 +289,7 @@ def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band:
         "capacity": capacity,
         "first_band": first_band,
     }
-    if frame.shape.lists == "local":  # big splats, then all others
+    if frame.config.binning == "bin_local":  # big splats, then all others
         frame.launch(
             "bin", "emit", (groups * _ITEMS,), (_ITEMS,), views, count=count, splat_groups=0, **arguments
         )
@@ -316,7 +316,7 @@ def unsorted_bands(frame: DeviceFrame, pairs: int) -> list[TileBand]:
 
 def launch_local(frame: DeviceFrame, kernel: str, **arguments: Any) -> None:
     """Submit a kernel of tile_lists_local.cl."""
-    count, items = frame.resident.count, frame.shape.scan_items
+    count, items = frame.resident.count, frame.config.scan_items
     if count:
         groups = -(-count // _GROUP_SPLATS)
         frame.launch("bin", kernel, (groups * items,), (items,), frame.views, count=count, **arguments)

@@ -127,9 +127,9 @@ class OpenCLTraining:
     def __init__(self, workspace: Workspace, lanes: int = 0) -> None:
         """lanes: vector width; 0 for the device's own."""
         self._workspace = workspace
-        lanes = lanes or (workspace.shape.lanes if workspace.shape.schedule == "lanes" else 1)
+        lanes = lanes or (workspace.config.lanes if workspace.config.schedule == "lanes" else 1)
         self._lanes = lanes
-        source = assemble_training(lanes, workspace.info.float64, workspace.shape.fast_fma)
+        source = assemble_training(lanes, workspace.info.float64, workspace.config.fast_fma)
         self._program = Program(workspace, source)
         self._commands = CommandList(self._program)
         """command list of kernels that are not replayed"""

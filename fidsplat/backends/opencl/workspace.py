@@ -11,8 +11,8 @@ import pyopencl as cl
 from fidsplat.backends.interface import DeviceInfo
 from fidsplat.backends.opencl.buffers import BufferPool, RayBuffers
 from fidsplat.backends.opencl.host_memory import HostMemory
+from fidsplat.backends.opencl.kernel_config import KernelConfig
 from fidsplat.backends.opencl.pocl_workarounds import is_pocl, shared_context
-from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.util.errors import DeviceError
 
 
@@ -22,8 +22,8 @@ class Workspace:
     compiler_options: list[str]
     """of all programs"""
 
-    def __init__(self, device: cl.Device, info: DeviceInfo, shape: DeviceShape) -> None:
-        self.device, self.info, self.shape = device, info, shape
+    def __init__(self, device: cl.Device, info: DeviceInfo, config: KernelConfig) -> None:
+        self.device, self.info, self.config = device, info, config
         self.context = shared_context(device) if is_pocl(device) else cl.Context([device])
         self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
         self.side_queue = cl.CommandQueue(self.context)
@@ -90,5 +90,5 @@ class Workspace:
         self.memory_budget, self.largest_buffer = budget, self.device.max_mem_alloc_size
         """maximum bytes of a frame with its cloud, and of one buffer"""
         largest = self.largest_buffer // 8
-        self.pair_budget = max(1, min(largest, budget // 8 // self.shape.pair_bytes, 2**32 - 1))
+        self.pair_budget = max(1, min(largest, budget // 8 // self.config.pair_bytes, 2**32 - 1))
         """maximum number of pairs of a splat and a tile in the lists at once"""

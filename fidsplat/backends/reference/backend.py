@@ -75,12 +75,12 @@ class ReferenceBackend(Backend):
         lacking = ", ".join(sorted(EXTENSIONS.keys() & features.names))
         return f"reference has no {lacking}; use an OpenCL device for it" if lacking else ""
 
-    def pipeline(self, features: FeatureSet, shape: None = None) -> ReferencePipeline:
+    def pipeline(self, features: FeatureSet, config: None = None) -> ReferencePipeline:
         if why := self.unsupported(features):
             raise DeviceError(why)
         return ReferencePipeline(features)
 
-    def differentiate(self, features: FeatureSet, shape: None = None) -> ReferenceGradients:
+    def differentiate(self, features: FeatureSet, config: None = None) -> ReferenceGradients:
         check_differentiable(features)
         return ReferenceGradients(self.pipeline(features), features)
 

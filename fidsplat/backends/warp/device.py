@@ -57,7 +57,7 @@ class WarpBackend(Workspace, Backend):
     def __init__(self, device: Any) -> None:
         self.info = _describe(device)
         super().__init__(device, self.info.name, self.info.memory_bytes // 10 * 9)
-        self.shape = shape_for(device)
+        self.config = shape_for(device)
         # debug builds of Warp's CPU kernels share a pointer among threads, and crash (warp/native/tile.h)
         single = device.is_cuda or runtime.load().config.mode == "debug"
         self._launches = LaunchCache(device, 1 if single else self.info.compute_units)
@@ -78,16 +78,16 @@ class WarpBackend(Workspace, Backend):
     def unsupported(self, features: FeatureSet) -> str:
         return unsupported(features, self.info.name)
 
-    def pipeline(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpPipeline:
-        key = (features, shape or self.shape)
+    def pipeline(self, features: FeatureSet, config: WarpShape | None = None) -> WarpPipeline:
+        key = (features, config or self.config)
         if key not in self._pipelines:
             program = Program(self.device, self.info.name, *key)
             self._pipelines[key] = WarpPipeline(program, self, self._launches)
         return self._pipelines[key]
 
-    def differentiate(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpGradients:
+    def differentiate(self, features: FeatureSet, config: WarpShape | None = None) -> WarpGradients:
         check_differentiable(features)
-        key = (features, shape or self.shape)
+        key = (features, config or self.config)
         if key not in self._gradients:
             self._gradients[key] = WarpGradients(self.pipeline(*key))
         return self._gradients[key]
@@ -95,8 +95,8 @@ class WarpBackend(Workspace, Backend):
     def probe(self) -> WarpProbe:
         return WarpProbe(self)
 
-    def shapes(self, kind: str) -> dict[str, WarpShape]:
-        return other_shapes(self.shape, kind)
+    def configs(self, kind: str) -> dict[str, WarpShape]:
+        return other_shapes(self.config, kind)
 
 
 def _describe(device: Any) -> DeviceInfo:

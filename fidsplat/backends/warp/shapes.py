@@ -27,8 +27,8 @@ def other_shapes(own: WarpShape, kind: str) -> dict[str, WarpShape]:
     """Alternative build constants by name, for tests (`Backend.shapes`)."""
     if kind == "schedule":
         return {"groups": WarpShape("group", 8, 8)}
-    if kind == "listing":
-        return {"ordered": own}
+    if kind == "binning":
+        return {"sort_first": own}
     if kind in ("sorting", "arithmetic"):
         return {"own": own}
     if kind == "tape":

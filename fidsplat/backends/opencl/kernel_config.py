@@ -9,20 +9,20 @@ from fidsplat.effects import FeatureSet
 
 
 @dataclass(frozen=True)
-class DeviceShape:
+class KernelConfig:
     """Build constants that follow from the kind of device, not from the scene."""
 
     schedule: str
     """`lanes` (CPU: a work-item renders a tile) or `group` (GPU: a work-group renders a tile)"""
-    lists: str
-    """tile-binning strategy (tiling.py): `ordered`, `tiled` or `local`"""
+    binning: str
+    """tile-binning strategy (tiling.py): `sort_first`, `bin_first` or `bin_local`"""
     lanes: int
     tile_width: int
     tile_height: int
-    chunks: int
-    """number of blocks into which the counting sorts divide their input (`ordered`)"""
+    sort_blocks: int
+    """number of blocks into which the counting sorts divide their input (`sort_first`)"""
     radix_bits: int
-    """bits per pass of the depth sort (`ordered`)"""
+    """bits per pass of the depth sort (`sort_first`)"""
     scan_items: int
     fast_fma: bool
     k_buffer_size: int
@@ -34,15 +34,15 @@ class DeviceShape:
     fragments are computed twice"""
     batch: int = 1
     """splats that a work-item of the project stage sets up, vectorised if more than 1 (`lanes`)"""
-    culls: bool = False
-    """whether splats outside the frustum are culled before projection (part/unculled_splats.cl, `tiled`)"""
+    culls_first: bool = False
+    """whether splats outside the frustum are culled before projection (part/unculled_splats.cl)"""
     dialect: str = ""
     """file of kernels/opencl/dialect/ with a vendor's instructions; empty: portable, bit-identical kernels"""
 
     @property
     def pair_bytes(self) -> int:
         """Bytes of a pair of a splat and a tile while it is listed."""
-        return 4 if self.lists == "ordered" else 12
+        return 4 if self.binning == "sort_first" else 12
 
     @property
     def blend_items(self) -> int:
@@ -50,39 +50,39 @@ class DeviceShape:
         return 1 if self.schedule == "lanes" else self.tile_width * self.tile_height // self.rows
 
 
-def cpu_shape(lanes: int = 16, cores: int = 8, fast_fma: bool = True) -> DeviceShape:
-    """The shape for CPUs: a tile per work-item, in the widest vectors."""
-    return DeviceShape(
-        "lanes", "ordered", lanes, lanes, 16, min(max(4 * cores, 8), 256), 11, 1, fast_fma, 32, batch=64
+def cpu_config(lanes: int = 16, cores: int = 8, fast_fma: bool = True) -> KernelConfig:
+    """The config for CPUs: a tile per work-item, in the widest vectors."""
+    return KernelConfig(
+        "lanes", "sort_first", lanes, lanes, 16, min(max(4 * cores, 8), 256), 11, 1, fast_fma, 32, batch=64
     )
 
 
-def gpu_shape(scan_items: int = 1024, fast_fma: bool = True, dialect: str = "") -> DeviceShape:
-    """The shape for GPUs: a work-group per tile of 16 x 16 pixels."""
-    return DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, scan_items, fast_fma, 8, dialect=dialect)
+def gpu_config(scan_items: int = 1024, fast_fma: bool = True, dialect: str = "") -> KernelConfig:
+    """The config for GPUs: a work-group per tile of 16 x 16 pixels."""
+    return KernelConfig("group", "bin_first", 1, 16, 16, 1024, 8, scan_items, fast_fma, 8, dialect=dialect)
 
 
 @cache
-def small_frame_shape(own: DeviceShape) -> DeviceShape:
-    """The shape of a GPU for frames with too few tiles to occupy it: more work-groups and work-items."""
+def small_frame_config(own: KernelConfig) -> KernelConfig:
+    """The config of a GPU for frames with too few tiles to occupy it: more work-groups and work-items."""
     return replace(own, tile_width=8, tile_height=8, rows=1)
 
 
-def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:
-    """`shape` with the tiles and the schedule that these features require."""
-    if "blend_double" in features.effects and shape.schedule == "lanes":
+def config_for(features: FeatureSet, config: KernelConfig) -> KernelConfig:
+    """`config` with the tiles and the schedule that these features require."""
+    if "blend_double" in features.effects and config.schedule == "lanes":
         # float64 kernels are not vectorised
-        shape = replace(shape, schedule="group", lanes=1, tile_width=16, tile_height=16, k_buffer_size=8)
-    if shape.schedule == "group" or "camera_pinhole" not in features.effects:
+        config = replace(config, schedule="group", lanes=1, tile_width=16, tile_height=16, k_buffer_size=8)
+    if config.schedule == "group" or "camera_pinhole" not in features.effects:
         # the set-up of lenses has loops and branches that compilers do not vectorise
-        shape = replace(shape, batch=1)
+        config = replace(config, batch=1)
     if not {"compose_pixel", "compose_coplanar_pixel"}.isdisjoint(features.effects):
         # the k-buffer needs the registers of a second pixel
-        shape = replace(shape, rows=1)
-    return shape
+        config = replace(config, rows=1)
+    return config
 
 
-def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
+def other_configs(own: KernelConfig, kind: str) -> dict[str, KernelConfig]:
     """Alternative build constants by name, for tests (`Backend.shapes`)."""
     if kind == "schedule":
         return {"groups": _groups(own, 16 if own.schedule == "lanes" else 8)}
@@ -91,21 +91,21 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
         few = replace(_groups(own, 8), k_buffer_size=1), replace(_groups(own, 8), k_buffer_size=4)
         return {
             **{f"own, k-buffer of {size}": replace(own, k_buffer_size=size) for size in (1, 3)},
-            **{f"groups, k-buffer of {shape.k_buffer_size}": shape for shape in few},
+            **{f"groups, k-buffer of {config.k_buffer_size}": config for config in few},
         }
     if kind == "tape":
         return {"a short tape": replace(own, tape=40)} if own.schedule == "lanes" else {}
-    if kind == "listing":
-        return {lists: replace(_groups(own, 8), lists=lists) for lists in ("ordered", "tiled")}
+    if kind == "binning":
+        return {binning: replace(_groups(own, 8), binning=binning) for binning in ("sort_first", "bin_first")}
     if kind == "arithmetic":
         plain = replace(own, fast_fma=False)
         scalar = {"one by one": replace(own, lanes=1), "not fused, one by one": replace(plain, lanes=1)}
         return {"own": own, "not fused": plain, **scalar}
     if kind == "sorting":
-        return {"own": own, "in 7 pieces": replace(own, chunks=7, radix_bits=5), "groups": _groups(own, 16)}
+        return {"own": own, "7 blocks": replace(own, sort_blocks=7, radix_bits=5), "groups": _groups(own, 16)}
     if own.schedule == "group":
         return {
-            "small frames": small_frame_shape(own),
+            "small frames": small_frame_config(own),
             "32 x 32": replace(own, tile_width=32, tile_height=32),
         }
     # a tile is as wide as the vector
@@ -115,9 +115,11 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
     }
 
 
-def _groups(own: DeviceShape, side: int) -> DeviceShape:
-    """Shape with the schedule of a GPU and tiles of side x side pixels; side 8 as for small frames."""
-    groups = replace(own, schedule="group", lists="tiled", lanes=1, scan_items=64, k_buffer_size=8, batch=1)
+def _groups(own: KernelConfig, side: int) -> KernelConfig:
+    """Constants with the schedule of a GPU and tiles of side x side pixels; side 8 as for small frames."""
+    groups = replace(
+        own, schedule="group", binning="bin_first", lanes=1, scan_items=64, k_buffer_size=8, batch=1
+    )
     if side == 8:
-        return small_frame_shape(groups)
+        return small_frame_config(groups)
     return replace(groups, tile_width=side, tile_height=side)
