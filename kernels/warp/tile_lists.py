@@ -26,14 +26,9 @@ number of visible splats, so that not all warps add to one address"""
 SHARED_SPLATS = wp.constant(32)
 """maximum number of big splats that a block shares at once"""
 _NUMBERS = {"BLOCK": BLOCK, "COUNTERS": 128, "VISIBLE": 64}
-_SORT = {
-    **{"BLOCK": BLOCK, "LOCAL": 2048, "INDEXED": 8192},  # pairs in shared memory; their 16-bit indices there
-    **{
-        "BUCKETS": 1024,
-        "LIMIT": 128,
-        "DEPTHS": 0x01000000,
-    },  # lowest key of a depth: below are coplanar groups
-}
+_SORT = {"BLOCK": BLOCK, "BUCKETS": 1024, "LIMIT": 128, "LOCAL": 2048, "INDEXED": 8192, "DEPTHS": 0x01000000}
+"""LIMIT: maximum pairs of a bucket. LOCAL, INDEXED: pairs, and 16-bit indices of pairs, that fit shared
+memory. DEPTHS: lowest key of a depth; those of coplanar groups are below"""
 
 _SHARES = """
 #if defined(__CUDA_ARCH__)
@@ -378,7 +373,9 @@ def start(
     cursors: wp.array(dtype=wp.int32),
     starts: wp.array(dtype=wp.int32),
     tile_order: wp.array(dtype=wp.int32),
-): ...
+):
+    """See `start_lists`."""
+    ...
 
 
 @wp.func_native(with_numbers(_SORT_LIST, _SORT))
