@@ -1,7 +1,8 @@
 """Boxes around the markers of a data set: training leaves no splats in them and none in front of them.
 
-In the training images, the background colour replaces visible markers. The views have different background
-colours, so that only transparent splats match all images.
+Densification prunes splats in boxes and near the front of markers. In the training images, the background
+colour replaces visible markers. The views have different background colours, so that only transparent splats
+match all images.
 """
 
 from __future__ import annotations
@@ -21,6 +22,10 @@ GREYS = (0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0)
 """background display values, cycled through by view index: black and white, without a period of two views"""
 EDGE = 1.5
 """width [px] of the marker's rim that stays in the image, so that no gap remains around the marker"""
+
+
+FRONT = 6.0
+"""distance in front of a marker, in half thicknesses of its box, within which splats are removed"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +59,11 @@ def read_boxes(file: Path, given: Any) -> tuple[MarkerBox, ...]:
 
 
 def outside_boxes(points: np.ndarray, matrices: Sequence[np.ndarray]) -> np.ndarray:
-    """Mask (n,) of the points (n, 3) that are outside all boxes."""
+    """Mask (n,) of the points (n, 3) that are neither in a box nor up to `FRONT` in front of it."""
     outside = np.ones(len(points), bool)
     for box in matrices:
         local = np.linalg.solve(box[:3, :3], (points - box[:3, 3]).T)
-        outside &= (np.abs(local) > 1).any(0)
+        outside &= (np.abs(local[:2]) > 1).any(0) | (local[2] > 1) | (local[2] < -FRONT)
     return outside
 
 

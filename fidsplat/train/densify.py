@@ -47,12 +47,15 @@ class Densification(NamedTuple):
         return with_statistics_reset(densified)
 
 
-def densification(splats: Splats, settings: TrainSettings, iteration: int, extent: float) -> Densification:
+def densification(
+    splats: Splats, settings: TrainSettings, iteration: int, extent: float, free: np.ndarray | bool = True
+) -> Densification:
     """Choose the splats to clone, split and prune.
 
     Args:
         splats: the splats; harmonics and moments may be missing.
         extent: scene extent [m], the unit of size thresholds.
+        free: mask (n,) of the splats to keep if they are visible, False for those in front of markers.
 
     Raises:
         TrainingError: no splat would remain.
@@ -71,7 +74,7 @@ def densification(splats: Splats, settings: TrainSettings, iteration: int, exten
     unsplit[splits] = False
     means, log_scales = _split_values(splats, splits, settings, iteration)
     copies = np.concatenate([splits] * COPIES)
-    unpruned = sigmoid(splats.values["logits"]) >= settings.prune_opacity
+    unpruned = (sigmoid(splats.values["logits"]) >= settings.prune_opacity) & free
     unpruned_copies = unpruned[copies]
     if iteration > settings.reset_every:
         limit = settings.prune_scale * extent

@@ -528,7 +528,9 @@ class Trainer:
         if settings.strategy == "mcmc" or not settings.densifies_after(iteration):
             return
         self._read_losses()
-        change = densify.densification(self._model.geometry(), settings, iteration, self.dataset.extent)
+        splats = self._model.geometry()
+        free = outside_boxes(splats.values["means"] + self.dataset.origin, self.dataset.boxes)
+        change = densify.densification(splats, settings, iteration, self.dataset.extent, free)
         with self._all_or_failed():
             self._model.densify(change)
             if iteration % settings.reset_every == 0:

@@ -298,6 +298,10 @@ def test_a_faint_splat_goes_though_it_would_be_split():
     splats.values["logits"][1] = logit(0.04)
     densified = densify.densification(splats, settings, 600, extent=2.0).apply(splats)
     assert ids(densified) == [0, 3, 4, 5, 6, 7, 2, 2]
+    splats.values["logits"][1] = logit(0.5)
+    occluding = np.isin(np.arange(8), [1, 5])  # in front of a marker
+    densified = densify.densification(splats, settings, 600, 2.0, ~occluding).apply(splats)
+    assert ids(densified) == [0, 3, 4, 6, 7, 2, 2]
 
 
 def test_no_more_splats_are_made_than_allowed():
