@@ -33,6 +33,8 @@ FEATURE_SIDE, FEATURES = 2000, 4096
 """maximum side in pixels of the photographs in which features are detected; maximum number of features of
 each"""
 FEW_FEATURES = 200
+HUBER = 0.25
+"""pixels: threshold of Huber's loss of the last bundle adjustment"""
 MIN_MATCHES = 15
 """matches that COLMAP's mapper needs of a pair"""
 
@@ -168,11 +170,25 @@ def map_incrementally(database: Path, photos: Path, folder: Path, progress: Prog
             f"photographs must overlap to find their cameras, got {total} of which fewer than 3 fit together "
             f"({why}); take photographs of one scene from positions a small step apart"
         )
+    _adjust_robustly(largest)
     shutil.rmtree(parts)
     parts.mkdir()
     largest.write(parts)
     parts.rename(folder)
     return read_model(folder)
+
+
+def _adjust_robustly(model: Any) -> None:
+    """Minimise Huber's loss of the reprojection errors, after COLMAP's mapper with squared errors."""
+    pycolmap = require_pycolmap()
+    options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.HUBER
+    options.ceres.loss_function_scale = HUBER
+    for image in model.reg_image_ids():
+        config.add_image(image)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
 def read_model(folder: Path) -> Model:
