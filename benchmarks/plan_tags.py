@@ -6,6 +6,7 @@ python benchmarks/plan_tags.py --rows 5 --plants 12 --counts 25 12
 import argparse
 import json
 from dataclasses import dataclass, replace
+from unittest import mock
 
 import numpy as np
 
@@ -32,12 +33,25 @@ class PlannedDrive(Drive):
         return replace(house, markers=(*others, *self.placed))
 
 
+class IndependentSurvey(Survey):
+    """Survey of poses with independent errors: the objective of OMP (Huang et al., arXiv 2211.01513), the sum
+    over poses of the information of the tags that each one sees."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        poses = len(self.path)
+        blocks = np.einsum("aiaj->aij", self.covariance.reshape(poses, 6, poses, 6))
+        self.covariance = np.kron(np.eye(poses), blocks.mean(0))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rows", type=int, default=5)
     parser.add_argument("--plants", type=int, default=12)
     parser.add_argument("--counts", type=int, nargs="*", default=[25])
-    parser.add_argument("--objectives", nargs="*", default=["information"])
+    parser.add_argument(
+        "--objectives", nargs="*", default=["information"], help="information, error, omp (independent poses)"
+    )
     parser.add_argument("--walls", action="store_true")
     parser.add_argument(
         "--seeds", type=int, default=1, help="drives with other errors of wheels and gyroscope"
@@ -59,8 +73,11 @@ def main() -> None:
     layouts = {f"greenhouse's {len(own)}": own}
     for count in given.counts:
         for objective in given.objectives:
-            wanted = replace(settings, count=count, objective=objective)
-            plan = plan_tags(bare, run.camera, wanted, renderer)
+            known = "information" if objective == "omp" else objective
+            wanted = replace(settings, count=count, objective=known)
+            kind = IndependentSurvey if objective == "omp" else Survey
+            with mock.patch("fidsplat.experiments.plan_tags.Survey", kind):
+                plan = plan_tags(bare, run.camera, wanted, renderer)
             layouts[f"{count}, {objective}"] = plan.tags
         some = np.linspace(0, len(own) - 1, count).round().astype(int)
         layouts[f"every {len(own) / count:.2g}th"] = tuple(own[k] for k in some)
