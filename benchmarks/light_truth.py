@@ -15,7 +15,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import count, islice
+from itertools import compress, count, islice
 from pathlib import Path
 from typing import Any
 
@@ -340,6 +340,7 @@ def main() -> int:
     parser.add_argument("-o", "--out", default="light-truth", help="folder for images and figures")
     parser.add_argument("--samples", type=int, default=256, help="of Cycles")
     parser.add_argument("--poses", type=int, default=200, help="views for detection rates")
+    parser.add_argument("--existing", action="store_true", help="compare only existing images of Blender")
     parser.add_argument("--case", action="append", default=None, help="name of a case (default: all)")
     parser.add_argument("--device", default=None)
     parser.add_argument("--threads", type=int, default=None)
@@ -353,6 +354,10 @@ def main() -> int:
             continue
         job = {"samples": arguments.samples, "denoise": False}
         one = job_of(case, folder)
+        if arguments.existing:
+            found = [Path(image["file"]).is_file() for image in one["images"]]
+            one["images"] = list(compress(one["images"], found))
+            case = replace(case, cameras=tuple(compress(case.cameras, found)))
         list(run_worker(python, WORKER, [one], job, arguments.threads))
         truth = [np.load(image["file"]) for image in one["images"]]
         own = list(ours(case, renderer))
