@@ -23,8 +23,7 @@ MAX_COEFFICIENT = 1e12
 """largest magnitude of a lens coefficient: more than any invertible lens has; products stay finite"""
 _TABLE_SIZE = 4096  # entries of the table of initial values of Newton's method
 _MAX_ITERATIONS = 12  # of Newton's method
-# minimum angle between a ray and -z, which the stereographic projection maps to infinity
-_MIN_ANGLE_COSINE = math.cos(math.radians(1))
+_MIN_ANGLE_COSINE = math.cos(math.radians(1))  # to -z, which the stereographic projection maps to infinity
 _NEGLIGIBLE = 1e-200  # smaller leading coefficients are dropped: roots would overflow
 
 
@@ -78,8 +77,7 @@ class BrownConrady:
 
     @cached_property
     def max_tangent(self) -> float:
-        """Tangent of the angle from the axis at which the radial polynomial stops increasing; inf if it never
-        does."""
+        """Tangent of the angle from the axis up to which the radial polynomial increases, or inf."""
         numerator = np.polynomial.Polynomial([1, self.k1, self.k2, self.k3])
         denominator = np.polynomial.Polynomial([1, self.k4, self.k5, self.k6])
         q = np.polynomial.Polynomial([0, 2])
@@ -110,9 +108,8 @@ class BrownConrady:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
             a, b = self._distorted(x, y)[:2]
-            visible = (
-                (points[:, 2] > 0) & (np.hypot(x, y) < self.max_tangent) & np.isfinite(a) & np.isfinite(b)
-            )
+            inside = (points[:, 2] > 0) & (np.hypot(x, y) < self.max_tangent)
+            visible = inside & np.isfinite(a) & np.isfinite(b)
         return np.where(visible[:, None], np.stack([a, b], 1), np.nan)
 
     def derivative(self, points: np.ndarray) -> np.ndarray:

@@ -160,16 +160,15 @@ class Camera(PickledByFields, Summarised):
             raise InputError(f"a fisheye must have 4 coefficients, k1 to k4, got {len(factors)}")
         lens, width, height = Fisheye(*factors), _size("width", width), _size("height", height)
         f = fisheye_focal_length(width, fov_x, lens)
-        rest = width / 2, height / 2, world_to_camera, near, far
-        return Camera.pinhole(width, height, f, f, *rest, lens=lens)
+        intrinsics = f, f, width / 2, height / 2
+        return Camera.pinhole(width, height, *intrinsics, world_to_camera, near, far, lens=lens)
 
     @staticmethod
     def equirectangular(width, height, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
         """A panorama of the sphere: z in the centre, -z at the left and right edges, -y at the top."""
         width, height = _size("width", width), _size("height", height)
-        fx, fy = width / (2 * math.pi), height / math.pi
-        rest = width / 2, height / 2, world_to_camera, near, far
-        return Camera.pinhole(width, height, fx, fy, *rest, lens=Equirectangular())
+        intrinsics = width / (2 * math.pi), height / math.pi, width / 2, height / 2
+        return Camera.pinhole(width, height, *intrinsics, world_to_camera, near, far, lens=Equirectangular())
 
     @staticmethod
     def orthographic(width, height, metres_wide, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
@@ -179,8 +178,8 @@ class Camera(PickledByFields, Summarised):
         if not 0 < metres < math.inf:
             raise InputError(f"camera metres_wide must be above 0 and finite, got {metres_wide!r}")
         f = width / metres
-        rest = width / 2, height / 2, world_to_camera, near, far
-        return Camera.pinhole(width, height, f, f, *rest, lens=Orthographic())
+        intrinsics = f, f, width / 2, height / 2
+        return Camera.pinhole(width, height, *intrinsics, world_to_camera, near, far, lens=Orthographic())
 
     @staticmethod
     def look_at(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields, replace
 from numbers import Real
 from typing import Any
@@ -159,24 +158,17 @@ class Quality:
 
     def __post_init__(self) -> None:
         python_scalars(self)
-
-        def within(name: str, low: float, high: float, excludes_low: bool, excludes_high: bool) -> None:
-            value = getattr(self, name)
-            number = as_float(value)
-            valid = (
-                math.isfinite(number)
-                and (number > low if excludes_low else number >= low)
-                and (number < high if excludes_high else number <= high)
-            )
-            if not valid:
-                interval = f"{'[('[excludes_low]}{low:g}, {high:g}{'])'[excludes_high]}"
-                raise InputError(f"quality: {name} must be in {interval}, got {value!r}")
-
-        within("alpha_cutoff", 0.0, 1.0, True, True)
-        within("transmittance_stop", 0.0, 1.0, False, True)
-        within("opacity_ceiling", 0.0, 1.0, True, False)
-        within("first_hit", 0.0, 1.0, True, True)
-        within("detail_error", 0.0, 1.0, False, True)
+        for name, interval in (
+            ("alpha_cutoff", "(0, 1)"),
+            ("transmittance_stop", "[0, 1)"),
+            ("opacity_ceiling", "(0, 1]"),
+            ("first_hit", "(0, 1)"),
+            ("detail_error", "[0, 1)"),
+        ):
+            value = as_float(getattr(self, name))
+            excluded = (value == 0 and interval[0] == "(") or (value == 1 and interval[-1] == ")")
+            if excluded or not 0 <= value <= 1:
+                raise InputError(f"quality: {name} must be in {interval}, got {getattr(self, name)!r}")
         for name, choices in (
             ("stop_rule", STOP_RULES),
             ("lowpass", LOWPASS),

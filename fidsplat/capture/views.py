@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -29,15 +30,7 @@ class Views:
     """(v,) bool: views to render; None: all"""
 
     def __post_init__(self) -> None:
-        counts = {"captures": len(self.captures)} if len(self.captures) != 1 else {}
-        counts |= {} if self.poses is None else {"poses": len(self.poses)}
-        counts |= {f"groups[{label}]": len(poses) for label, poses in (self.groups or {}).items()}
-        for external in (capture.external_depth for capture in self.captures):
-            if external and external.stacked:
-                counts["external_depth"] = len(external.depth)
-        if not counts:
-            counts = {"captures": 1}
-        counts |= {} if self.mask is None else {"mask": len(self.mask)}
+        counts = self._counts | ({} if self.mask is None else {"mask": len(self.mask)})
         if len(set(counts.values())) > 1:
             listed = ", ".join(f"{name} has {count}" for name, count in counts.items())
             raise InputError(f"all arguments of a batch must have the same number of views, got {listed}")
@@ -45,6 +38,17 @@ class Views:
             raise InputError(f"a batch must have at least one view, got an empty {next(iter(counts))}")
         for number, capture in enumerate(self.captures):
             self._check_motion(number, capture.motion)
+
+    @cached_property
+    def _counts(self) -> dict[str, int]:
+        """Number of views by the name of each argument that determines it."""
+        counts = {"captures": len(self.captures)} if len(self.captures) != 1 else {}
+        counts |= {} if self.poses is None else {"poses": len(self.poses)}
+        counts |= {f"groups[{label}]": len(poses) for label, poses in (self.groups or {}).items()}
+        for external in (capture.external_depth for capture in self.captures):
+            if external and external.stacked:
+                counts["external_depth"] = len(external.depth)
+        return counts or {"captures": 1}
 
     def _check_motion(self, number: int, motion: Motion) -> None:
         if self.poses is not None and motion.camera is not None:
@@ -60,13 +64,7 @@ class Views:
 
     def __len__(self) -> int:
         """Number of views, including masked views."""
-        if len(self.captures) > 1:
-            return len(self.captures)
-        external = self.captures[0].external_depth if self.captures else None
-        arrays = [] if self.poses is None else [self.poses]
-        arrays += [*(self.groups or {}).values()]
-        arrays += [external.depth] if external and external.stacked else []
-        return len(arrays[0]) if arrays else len(self.captures)
+        return next(iter(self._counts.values()))
 
     @property
     def active(self) -> list[int]:

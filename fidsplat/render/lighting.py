@@ -14,14 +14,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.cameras.lenses import Orthographic
 from fidsplat.render.irradiance import LightField
-from fidsplat.render.reflection import (
-    GlossyBrdf,
-    fit_harmonics,
-    fresnel,
-    glossy_reflection,
-    sample_lobe,
-    view_directions,
-)
+from fidsplat.render.reflection import GlossyBrdf, fit_harmonics, fresnel, view_directions
 from fidsplat.render.shadows import LightPoint, ReceiverPoints, light_points, shadow_casters, visibility
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.lights import GRIDS, Light, Lighting, PointLight
@@ -370,7 +363,7 @@ def _reflection_to_camera(
     reflected = _highlights(surface.points, surface.normals, viewers[:, None], brdf, incoming.points)[:, 0]
     for start in range(0, len(viewers) if incoming.field.radiance.any() else 0, _CHUNK):
         rows = slice(start, start + _CHUNK)
-        directions, weights = sample_lobe(viewers[rows, None], surface.normals[rows], brdf)
+        directions, weights = brdf.sample(viewers[rows, None], surface.normals[rows])
         radiance = incoming.field.incoming_radiance(directions[:, 0], points.local[rows, :2])
         reflected[rows] += np.einsum("nk,nkc->nc", weights[:, 0], radiance)
     cosine = np.einsum("mc,mc->m", viewers, surface.normals)
@@ -389,7 +382,7 @@ def _highlights(
     cosine = np.einsum("nvc,nc->nv", viewers, normals)
     for point, visible in lights:
         directions, irradiance = point.irradiance(positions)
-        reflected = glossy_reflection(cosine, viewers, directions, normals, brdf)
+        reflected = brdf.reflected(cosine, viewers, directions, normals)
         total += reflected[..., None] * (irradiance * visible[:, None])[:, None]
     return total
 
@@ -412,7 +405,7 @@ def _harmonics_of_parts(
     for members in _by_normal(normals, _MAX_NORMAL_ANGLE):
         normal = normals[members[0]]
         views = view_directions(normal)
-        directions, weights = sample_lobe(views[None], normal[None], brdf)
+        directions, weights = brdf.sample(views[None], normal[None])
         transmitted = 1 - fresnel(views @ normal, brdf.reflectance)
         reflected = incoming.field.reflected(directions[0], weights[0])
         for start in range(0, len(members), _CHUNK):

@@ -33,6 +33,54 @@ class GlossyBrdf(NamedTuple):
         """GGX width of the distribution of microfacet normals."""
         return self.roughness**2
 
+    def reflected(
+        self, cosine: np.ndarray, to_viewer: np.ndarray, to_light: np.ndarray, normal: np.ndarray
+    ) -> np.ndarray:
+        """BRDF times the cosine of the light (n, v): radiance towards viewers (n, v, 3) per irradiance of a
+        surface that faces the light. cosine: (n, v) of viewer and normal (n, 3); to_light: (n, 3)."""
+        square = self.alpha**2
+        light = np.einsum("nc,nc->n", to_light, normal)[:, None]
+        above = (cosine > _MIN_COSINE) & (light > _MIN_COSINE)
+        view, light = np.maximum(cosine, _MIN_COSINE), np.maximum(light, _MIN_COSINE)
+        cosine_between = np.einsum("nvc,nc->nv", to_viewer, to_light)
+        length = np.sqrt(np.maximum(2 + 2 * cosine_between, 1e-12))
+        half = (view + light) / length
+        distribution = square / (np.pi * (half**2 * (square - 1) + 1) ** 2)
+        masking = 0.5 / (light * _smith_root(view, square) + view * _smith_root(light, square))
+        # the cosine is between viewer and half vector
+        factor = fresnel((1 + cosine_between) / length, self.reflectance)
+        return np.where(above, distribution * masking * factor * light, 0.0)
+
+    def sample(self, to_viewer: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Importance samples of visible normals (Heitz 2018): directions (n, v, k, 3) to incoming light, and
+        weights (n, v, k). The sum of weights times radiance is the radiance towards viewers (n, v, 3)."""
+        square, i = self.alpha**2, np.arange(_LOBE_SAMPLES)
+        radius, phi = np.sqrt((i + 0.5) / _LOBE_SAMPLES), 2 * np.pi * _van_der_corput(_LOBE_SAMPLES)
+        axes = np.concatenate([perpendicular(normal), normal[:, None]], 1)
+        local = np.einsum("nvd,ncd->nvc", to_viewer, axes)
+        stretched = local * (self.alpha, self.alpha, 1.0)
+        stretched = (stretched / np.linalg.norm(stretched, axis=-1, keepdims=True))[..., None, :]
+        tangent = np.cross((0.0, 0.0, 1.0), stretched)
+        length = np.linalg.norm(tangent, axis=-1, keepdims=True)
+        tangent = np.where(length > 1e-9, tangent / np.maximum(length, 1e-9), (1.0, 0.0, 0.0))
+        bitangent = np.cross(stretched, tangent)
+        t1, s = radius * np.cos(phi), (1 + stretched[..., 2]) / 2
+        t2 = (1 - s) * np.sqrt(1 - t1**2) + s * (radius * np.sin(phi))
+        t3 = np.sqrt(np.maximum(1 - t1**2 - t2**2, 0))
+        half = t1[:, None] * tangent + t2[..., None] * bitangent + t3[..., None] * stretched
+        half *= (self.alpha, self.alpha, 1.0)
+        half[..., 2] = np.maximum(half[..., 2], 1e-9)
+        half /= np.linalg.norm(half, axis=-1, keepdims=True)
+        local = local[..., None, :]
+        cosine = np.sum(local * half, axis=-1, keepdims=True)
+        reflected = 2 * cosine * half - local
+        light, view = reflected[..., 2], np.maximum(local[..., 2], _MIN_COSINE)
+        above = light > _MIN_COSINE
+        masking = light * (view + _smith_root(view, square))
+        masking = masking / (light * _smith_root(view, square) + view * _smith_root(light, square))
+        weights = np.where(above, fresnel(cosine[..., 0], self.reflectance) * masking / _LOBE_SAMPLES, 0.0)
+        return np.einsum("nvkc,ncd->nvkd", reflected, axes), weights
+
 
 def fresnel(cosine: np.ndarray, reflectance: float) -> np.ndarray:
     """Fresnel factor of unpolarised light on a dielectric. reflectance: at normal incidence."""
@@ -41,57 +89,6 @@ def fresnel(cosine: np.ndarray, reflectance: float) -> np.ndarray:
     g = np.sqrt(index**2 - 1 + c**2)  # the symbols c and g of Cook and Torrance
     difference, total = g - c, np.maximum(g + c, 1e-12)
     return 0.5 * (difference / total) ** 2 * (1 + ((c * total - 1) / (1 + c * difference)) ** 2)
-
-
-def glossy_reflection(
-    cosine: np.ndarray, to_viewer: np.ndarray, to_light: np.ndarray, normal: np.ndarray, brdf: GlossyBrdf
-) -> np.ndarray:
-    """Reflected radiance (n, v) towards viewers (n, v, 3) per irradiance of a surface that faces the light:
-    the BRDF times the cosine of the light. cosine: (n, v) of viewer and normal (n, 3); to_light: (n, 3)."""
-    square = brdf.alpha**2
-    light = np.einsum("nc,nc->n", to_light, normal)[:, None]
-    above = (cosine > _MIN_COSINE) & (light > _MIN_COSINE)
-    view, light = np.maximum(cosine, _MIN_COSINE), np.maximum(light, _MIN_COSINE)
-    cosine_between = np.einsum("nvc,nc->nv", to_viewer, to_light)
-    length = np.sqrt(np.maximum(2 + 2 * cosine_between, 1e-12))
-    half = (view + light) / length
-    distribution = square / (np.pi * (half**2 * (square - 1) + 1) ** 2)
-    masking = 0.5 / (light * _smith_root(view, square) + view * _smith_root(light, square))
-    # the cosine is between viewer and half vector
-    factor = fresnel((1 + cosine_between) / length, brdf.reflectance)
-    return np.where(above, distribution * masking * factor * light, 0.0)
-
-
-def sample_lobe(to_viewer: np.ndarray, normal: np.ndarray, brdf: GlossyBrdf) -> tuple[np.ndarray, np.ndarray]:
-    """Importance samples of the reflection: directions (n, v, k, 3) towards incoming light, and weights (n,
-    v, k). The sum of weights times radiance is the radiance towards viewers (n, v, 3). Visible normals are
-    sampled (Heitz 2018)."""
-    square, i = brdf.alpha**2, np.arange(_LOBE_SAMPLES)
-    radius, phi = np.sqrt((i + 0.5) / _LOBE_SAMPLES), 2 * np.pi * _van_der_corput(_LOBE_SAMPLES)
-    axes = np.concatenate([perpendicular(normal), normal[:, None]], 1)
-    local = np.einsum("nvd,ncd->nvc", to_viewer, axes)
-    stretched = local * (brdf.alpha, brdf.alpha, 1.0)
-    stretched = (stretched / np.linalg.norm(stretched, axis=-1, keepdims=True))[..., None, :]
-    tangent = np.cross((0.0, 0.0, 1.0), stretched)
-    length = np.linalg.norm(tangent, axis=-1, keepdims=True)
-    tangent = np.where(length > 1e-9, tangent / np.maximum(length, 1e-9), (1.0, 0.0, 0.0))
-    bitangent = np.cross(stretched, tangent)
-    t1, s = radius * np.cos(phi), (1 + stretched[..., 2]) / 2
-    t2 = (1 - s) * np.sqrt(1 - t1**2) + s * (radius * np.sin(phi))
-    t3 = np.sqrt(np.maximum(1 - t1**2 - t2**2, 0))
-    half = t1[:, None] * tangent + t2[..., None] * bitangent + t3[..., None] * stretched
-    half *= (brdf.alpha, brdf.alpha, 1.0)
-    half[..., 2] = np.maximum(half[..., 2], 1e-9)
-    half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    local = local[..., None, :]
-    cosine = np.sum(local * half, axis=-1, keepdims=True)
-    reflected = 2 * cosine * half - local
-    light, view = reflected[..., 2], np.maximum(local[..., 2], _MIN_COSINE)
-    above = light > _MIN_COSINE
-    masking = light * (view + _smith_root(view, square))
-    masking = masking / (light * _smith_root(view, square) + view * _smith_root(light, square))
-    weights = np.where(above, fresnel(cosine[..., 0], brdf.reflectance) * masking / _LOBE_SAMPLES, 0.0)
-    return np.einsum("nvkc,ncd->nvkd", reflected, axes), weights
 
 
 def _smith_root(cosine: np.ndarray, square: float) -> np.ndarray:

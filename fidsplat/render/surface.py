@@ -101,16 +101,15 @@ def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = 
     left, top = max(x - half_side, 0), max(y - half_side, 0)
     patch = depth[top : y + half_side + 1 : step, left : x + half_side + 1 : step]
     metres = _metres_of(camera, pixel, pixels, _median_of(patch))
-    window = replace(  # centres of the pixels in every step-th row and column
-        camera,
-        width=patch.shape[1],
-        height=patch.shape[0],
-        fx=camera.fx / step,
-        fy=camera.fy / step,
-        cx=(camera.cx - left - 0.5) / step + 0.5,
-        cy=(camera.cy - top - 0.5) / step + 0.5,
-    )
-    patch_pixel = ((pixel[0] - left - 0.5) / step + 0.5, (pixel[1] - top - 0.5) / step + 0.5)
+
+    def in_patch(coordinate: float, first: int) -> float:
+        return (coordinate - first - 0.5) / step + 0.5
+
+    height, width = patch.shape
+    focal = {"fx": camera.fx / step, "fy": camera.fy / step}
+    center = {"cx": in_patch(camera.cx, left), "cy": in_patch(camera.cy, top)}
+    window = replace(camera, width=width, height=height, **focal, **center)
+    patch_pixel = in_patch(pixel[0], left), in_patch(pixel[1], top)
     return _fit_patch(patch, window, patch_pixel, pixels / step, metres)
 
 

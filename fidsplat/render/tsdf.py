@@ -79,13 +79,7 @@ class DistanceField:
             measured, slant = depth[y, x].astype(np.float64), cosine[y, x]
             distance = (measured - distances) / (TRUNCATION * self.voxel)
             used = (measured > 0) & (distance > -1) & (slant >= MIN_COSINE)
-            rows, x, y, distance, slant = (
-                rows[used],
-                x[used],
-                y[used],
-                distance[used],
-                slant[used],
-            )
+            rows, x, y, distance, slant = (array[used] for array in (rows, x, y, distance, slant))
             near_surface = distance < 1
             distance = np.minimum(distance, 1.0)
             weight = np.where(near_surface, slant, FREE_SPACE_WEIGHT)
@@ -118,9 +112,8 @@ class DistanceField:
         quad_keys = np.concatenate(quads)
         corners = np.minimum(np.searchsorted(cell_keys, quad_keys), len(cell_keys) - 1)
         corners = corners[(cell_keys[corners] == quad_keys).all(1)]
-        shorter = np.linalg.norm(points[corners[:, 0]] - points[corners[:, 2]], axis=1) <= np.linalg.norm(
-            points[corners[:, 1]] - points[corners[:, 3]], axis=1
-        )
+        diagonals = points[corners[:, :2]] - points[corners[:, 2:]]
+        shorter = np.less_equal(*np.linalg.norm(diagonals, axis=2).T)
         first = np.where(shorter[:, None], corners[:, [0, 1, 2]], corners[:, [0, 1, 3]])
         second = np.where(shorter[:, None], corners[:, [0, 2, 3]], corners[:, [1, 2, 3]])
         faces = np.concatenate([first, second]).astype(np.int32)

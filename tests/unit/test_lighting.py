@@ -13,8 +13,6 @@ from fidsplat.render.reflection import (
     GlossyBrdf,
     fit_harmonics,
     fresnel,
-    glossy_reflection,
-    sample_lobe,
     view_directions,
 )
 from fidsplat.scenes import PlacedMarker
@@ -253,17 +251,16 @@ def test_reflections_by_sampling_equal_the_integral(roughness):
     light = 0.1 + 1.0 * (field.directions @ toward > math.cos(math.radians(25)))
     field.radiance = np.repeat(light[:, None], 3, 1)[None, None]
     views = view_directions(UP)[::16]
-    directions, weights = sample_lobe(views[None], UP[None], surface)
+    directions, weights = surface.sample(views[None], UP[None])
     incoming = field.incoming_radiance(directions[0], np.zeros((len(views), 2)))[..., 0]
     sampled = (incoming * weights[0]).sum(-1)
     count = len(field.directions)
     for view, actual in zip(views, sampled, strict=True):
-        reflected = glossy_reflection(
+        reflected = surface.reflected(
             np.full((count, 1), view @ UP),
             np.broadcast_to(view, (count, 1, 3)),
             field.directions,
             np.broadcast_to(UP, (count, 3)),
-            surface,
         )[:, 0]
         assert actual == pytest.approx(reflected @ (field.angles * light), abs=0.0025)
 
@@ -278,7 +275,7 @@ def test_fresnel_by_polarisation():
     assert (fresnel(np.array([0.0, 0.3]), 0.0) == 0).all()
     assert fresnel(np.array([0.0, 0.5]), 1.0) == pytest.approx(1)
     views = np.array([[0, 0, 1.0], [math.sin(1.2), 0, math.cos(1.2)]])
-    _, weights = sample_lobe(views[None], UP[None], GlossyBrdf(0.1, 0.04))
+    _, weights = GlossyBrdf(0.1, 0.04).sample(views[None], UP[None])
     assert np.allclose(weights[0].sum(-1), expected, rtol=0.03)
 
 
@@ -321,7 +318,7 @@ def test_the_error_of_harmonics_of_degree_3():
     views = view_directions(UP)
     errors = []
     for roughness in (0.25, 0.5):
-        weights = sample_lobe(views[None], UP[None], GlossyBrdf(roughness, 0.04))
+        weights = GlossyBrdf(roughness, 0.04).sample(views[None], UP[None])
         light = field.reflected(weights[0][0], weights[1][0])[0, 0] + 0.05
         colors = to_colors(light, "srgb")
         fitted = 0.5 + np.einsum("vk,kc->vc", sh_basis(3, -views), fit_harmonics(views, colors[None])[0])
