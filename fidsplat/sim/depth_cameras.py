@@ -190,7 +190,7 @@ class TimeOfFlight(DepthCamera):
     def _measured(
         self, renderer: Renderer, scene: Scene, camera: Camera, rng: np.random.Generator
     ) -> np.ndarray:
-        fine = _finer(camera, self.samples)
+        fine = camera.resampled(camera.width * self.samples, camera.height * self.samples)
         view = _view(renderer, scene, fine)
         stretch = _stretch(fine)
         distance = view.depth * stretch
@@ -320,12 +320,6 @@ def _projector(camera: Camera, right: float, near: float) -> Camera:
     moved = _shifted(camera, right)
     margin = math.ceil(camera.fx * abs(right) / near)
     return replace(moved, width=moved.width + 2 * margin, cx=moved.cx + margin)
-
-
-def _finer(camera: Camera, samples: int) -> Camera:
-    """The same view with more pixels."""
-    names = ("width", "height", "fx", "fy", "cx", "cy")
-    return replace(camera, **{name: getattr(camera, name) * samples for name in names})
 
 
 def _stretch(camera: Camera) -> np.ndarray:
