@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from fidsplat.commands.options import Json, Overwrite, log_is_complete, parse_numbers
+from fidsplat.commands.options import Json, Overwrite, check_compressed, log_is_complete, parse_numbers
 from fidsplat.commands.output import console, report, show_progress
 from fidsplat.commands.scenes import RenderInput, Size
 from fidsplat.util.errors import InputError
@@ -100,6 +100,10 @@ class Fly(RenderInput):
         if self.trajectory is not None:
             path = load_trajectory(self.trajectory, self.file_rate, self.smooth)
         scene = self.load(size=self.size)
+        if self.compress is not None:
+            if self.log is None:
+                raise InputError(f"--compress must be given with a log, got {self.compress}; add --log FILE")
+            check_compressed(self.outputs or scene.outputs)
         path = path or _camera_motion(self.source, scene, self.smooth)
         times = (
             path.sampled(self.rate).times

@@ -79,6 +79,15 @@ def require_packages(
         )
 
 
+def check_compressed(outputs: tuple[str, ...]) -> None:
+    """Raise InputError if --compress would have no effect on these outputs."""
+    if "rgb" not in outputs:
+        listed = ",".join(outputs)
+        raise InputError(
+            f"--compress must have rgb among the outputs, got {listed}; add rgb, or leave it out"
+        )
+
+
 def check_plot(name: str, *packages: str) -> None:
     """Raise InputError for a chart that cannot be written, before measuring.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from fidsplat.cameras.foreign import LINK_FROM_OPTICAL
 from fidsplat.cameras.screw import exponential
-from fidsplat.commands.options import Json, require_packages
+from fidsplat.commands.options import Json, check_compressed, require_packages
 from fidsplat.commands.output import console, report
 from fidsplat.commands.scenes import RenderInput, Size
 from fidsplat.splats.rotations import rigid_matrix
@@ -97,11 +97,8 @@ class Serve(RenderInput):
             path = load_trajectory(self.trajectory, self.file_rate).inverse()
         scene = self.load(size=self.size)
         outputs = self.outputs or scene.outputs
-        if self.compress and "rgb" not in outputs:
-            raise InputError(
-                f"--compress must have rgb among the outputs, got {','.join(outputs)}; leave out --compress, "
-                "or add rgb"
-            )
+        if self.compress:
+            check_compressed(outputs)
         with console(self.json).status("opening the device"):
             renderer = fs.Renderer(self.device or scene.device, self.memory_budget)
             resident = renderer.upload(scene)

@@ -341,6 +341,8 @@ def test_a_video_has_every_image(here):
         ),
         (["--log", "poses.tum"], "poses.tum already exists"),
         (["--coco", "."], "got the folder ."),
+        (["--compress", "png"], "--compress must be given with a log, got png; add --log FILE"),
+        (["--compress", "jpeg", "--log", "a.mcap", "--outputs", "depth"], "--compress must have rgb among"),
     ],
 )
 def test_words_that_cannot_be_flown(here, capsys, words, message):

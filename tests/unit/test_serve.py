@@ -363,7 +363,7 @@ def test_a_port_in_use_and_wrong_options_are_one_line(tmp_path, capsys, monkeypa
         (["--rate", "0"], "--rate must be a number of frames per second, 0.001 to 1000, got 0.0"),
         (
             ["--compress", "--outputs", "depth"],
-            "--compress must have rgb among the outputs, got depth; leave",
+            "--compress must have rgb among the outputs, got depth; add",
         ),
     ):
         assert main(["serve", str(file), *options]) == 2
