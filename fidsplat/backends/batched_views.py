@@ -14,9 +14,9 @@ _SHARED = (
     *("width", "height", "samples", "log_cut", "ceiling", "stop", "background", "first_light", "sensor"),
     *("fog_density", "environment_map", "external_depth", "along_ray", "parallel"),
 )
-_OWN = ("focal_x", "focal_y", "center_x", "center_y", "near", "far", "slopes")
-_FIRST = np.zeros(1, np.uint32)
-_FIRST.flags.writeable = False
+_PER_VIEW = ("focal_x", "focal_y", "center_x", "center_y", "near", "far", "slopes")
+_INDEX_0 = np.zeros(1, np.uint32)
+_INDEX_0.flags.writeable = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class ViewBatch:
     """(g + 1, v, 3) float64 metres"""
     numbers: Mapping[str, np.ndarray] = field(default_factory=dict)
     """(v,) or (v, k) float64: camera parameters that differ between views, by their names in View"""
-    batch_indices: np.ndarray = field(default_factory=lambda: _FIRST)
+    batch_indices: np.ndarray = field(default_factory=lambda: _INDEX_0)
     """(v,) uint32: position of each view in the batch"""
     total: int = 1
     views: tuple[View, ...] = ()
@@ -61,18 +61,18 @@ class ViewBatch:
     @staticmethod
     def single(view: View) -> ViewBatch:
         if view.groups:
-            return _stacked((view,), {}, _FIRST, 1)
+            return _stacked((view,), {}, _INDEX_0, 1)
         poses = view.rotation[None, None], view.translation[None, None], view.eye[None, None]
-        return ViewBatch(view, *poses, batch_indices=_FIRST, views=(view,))
+        return ViewBatch(view, *poses, batch_indices=_INDEX_0, views=(view,))
 
     @staticmethod
     def of(views: Sequence[View], batch_indices: np.ndarray, total: int) -> ViewBatch:
         first = views[0]
         labels = [label for label, _ in first.groups]
         for view in views:
-            alike = all(getattr(view, name) == getattr(first, name) for name in _SHARED)
-            alike = alike and view.raster is first.raster and not view.sub_frames
-            if not alike or [label for label, _ in view.groups] != labels:
+            same = all(getattr(view, name) == getattr(first, name) for name in _SHARED)
+            same = same and view.raster is first.raster and not view.sub_frames
+            if not same or [label for label, _ in view.groups] != labels:
                 return replace(
                     ViewBatch.single(first),
                     batch_indices=batch_indices,
@@ -80,8 +80,8 @@ class ViewBatch:
                     views=tuple(views),
                     stacked=False,
                 )
-        numbers = {name: np.array([getattr(view, name) for view in views], np.float64) for name in _OWN}
-        numbers = {name: each for name, each in numbers.items() if (each != each[0]).any()}
+        numbers = {name: np.array([getattr(view, name) for view in views], np.float64) for name in _PER_VIEW}
+        numbers = {name: values for name, values in numbers.items() if (values != values[0]).any()}
         return _stacked(views, numbers, batch_indices, total)
 
     @staticmethod
@@ -110,14 +110,14 @@ class ViewBatch:
             eye = centre - FAR_EYE * rotation[:, 2] if view.parallel else centre
         rotations, translations, eyes = [rotation], [translation], [eye]
         for motion in groups.values():
-            turn, move = motion[:, :3, :3], motion[:, :3, 3]
-            turned = rotation @ turn
-            away = rotated(turn, np.broadcast_to(origin, (count, 3))) + move - origin
-            moved = translation + rotated(rotation, away)
-            own = rotated(-np.swapaxes(turned, 1, 2), moved)
-            rotations.append(turned)
+            group_rotation, group_translation = motion[:, :3, :3], motion[:, :3, 3]
+            moved_rotation = rotation @ group_rotation
+            shift = rotated(group_rotation, np.broadcast_to(origin, (count, 3))) + group_translation - origin
+            moved = translation + rotated(rotation, shift)
+            moved_eye = rotated(-np.swapaxes(moved_rotation, 1, 2), moved)
+            rotations.append(moved_rotation)
             translations.append(moved)
-            eyes.append(own - FAR_EYE * turned[:, 2] if view.parallel else own)
+            eyes.append(moved_eye - FAR_EYE * moved_rotation[:, 2] if view.parallel else moved_eye)
         arrays = np.stack(rotations), np.stack(translations), np.stack(eyes)
         return ViewBatch(view, *arrays, batch_indices=batch_indices, total=total)
 
@@ -125,7 +125,7 @@ class ViewBatch:
         """Sub-batch of the rendered views [first, end)."""
         indices = self.batch_indices[first:end].copy()
         if end - first == 1:
-            return replace(ViewBatch.single(self.one(first)), batch_indices=indices, total=self.total)
+            return replace(ViewBatch.single(self.view_at(first)), batch_indices=indices, total=self.total)
         external = self.view.external_depth
         return ViewBatch(
             replace(self.view, external_depth=external.of_views(slice(first, end)))
@@ -134,17 +134,17 @@ class ViewBatch:
             self.rotation[:, first:end],
             self.translation[:, first:end],
             self.eye[:, first:end],
-            {name: each[first:end] for name, each in self.numbers.items()},
+            {name: values[first:end] for name, values in self.numbers.items()},
             indices,
             self.total,
             self.views[first:end],
         )
 
-    def one(self, number: int) -> View:
+    def view_at(self, number: int) -> View:
         """One of the rendered views, by its number."""
         if self.views:
             return self.views[number]
-        own: dict[str, Any] = {name: _plain(each[number]) for name, each in self.numbers.items()}
+        own: dict[str, Any] = {name: _plain(values[number]) for name, values in self.numbers.items()}
         external = self.view.external_depth
         if external and external.stacked:
             own["external_depth"] = external.of_views(number)

@@ -69,7 +69,7 @@ class ResidentData(ABC):
     footprint: str
     ellipsoids: str
 
-    def take_traits(self, cloud: PlacedTraits) -> None:
+    def copy_traits(self, cloud: PlacedTraits) -> None:
         """Copy the origin and the properties that select kernels from another cloud."""
         for name in ("origin", "sh_degree", "has_coplanar_groups", "footprint", "ellipsoids"):
             setattr(self, name, getattr(cloud, name))
@@ -231,7 +231,7 @@ class Pipeline(ABC):
     def render(self, resident: Any, views: ViewBatch) -> Images:
         """Render several views, each bit-identical to rendering it alone. By default one after another."""
         each = enumerate(views.batch_indices.tolist())
-        rendered = {index: self.render_view(resident, views.one(number)) for number, index in each}
+        rendered = {index: self.render_view(resident, views.view_at(number)) for number, index in each}
         return SeparateImages(rendered, views, resident.count)
 
     def render_subsampled(

@@ -77,23 +77,24 @@ def view_of(capture: Capture, origin: np.ndarray) -> View:
         groups = tuple((k, _moved(view, m, origin)) for k, m in motion.groups_at(time))
         return replace(view, groups=groups) if groups else view
 
-    whole = at(shutter.time)
+    full_view = at(shutter.time)
     if not capture.has_sub_frames:
-        return whole
+        return full_view
     sub_frames, samples = [], capture.quality.samples
-    for top, end, middle in shutter.bands(whole.height // samples):
+    for top, end, middle in shutter.bands(full_view.height // samples):
         times = shutter.times(middle)
         for k, time in enumerate(times):
             view = at(time).rows(top * samples, end * samples)
             sub_frames.append(SubFrame(view, top * samples, 1 / len(times), k == 0, k == len(times) // 2))
-    return replace(whole, sub_frames=tuple(sub_frames))
+    return replace(full_view, sub_frames=tuple(sub_frames))
 
 
 def _moved(view: View, motion: np.ndarray, origin: np.ndarray) -> View:
     """The view for splats that are moved by a rigid motion (4, 4) in world coordinates."""
-    turn, move = motion[:3, :3], motion[:3, 3]
-    rotation = view.rotation @ turn
-    translation = view.translation + rotated(view.rotation, rotated(turn, origin) + move - origin)
+    group_rotation, group_translation = motion[:3, :3], motion[:3, 3]
+    rotation = view.rotation @ group_rotation
+    shift = rotated(group_rotation, origin) + group_translation - origin
+    translation = view.translation + rotated(view.rotation, shift)
     eye = rotated(-rotation.T, translation)
     return replace(
         view,

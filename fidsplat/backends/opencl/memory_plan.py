@@ -113,13 +113,13 @@ class MemoryPlanner:
         count, other_images = len(views), (views.total - 1) * self._image_bytes(views.view)
         if not count:
             return
-        plan = self.frame(resident, views.one(0), other_images)
+        plan = self.frame(resident, views.view_at(0), other_images)
         external = views.view.external_depth
         batched = views.stacked and not (resident.streamed or self._one_by_one)
         batched = batched and not (external and external.stacked)
         if plan.chunk or not batched or (views.numbers and self._has_camera_uniforms):
             for k in range(count):
-                yield Part(k, k + 1, self.frame(resident, views.one(k), other_images))
+                yield Part(k, k + 1, self.frame(resident, views.view_at(k), other_images))
             return
         samples, tables = self._samples_and_tables(views.view)
         splat_bytes = self._source.records["Splat"].itemsize + KEY_BYTES + WINDOW_BYTES

@@ -104,7 +104,7 @@ class OpenCLPipeline(Pipeline):
 
     def render(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
         if views.is_single:
-            return self.render_view(resident, views.one(0))
+            return self.render_view(resident, views.view_at(0))
         if self._is_too_small_to_batch(resident):
             return self._unbatched.render(resident, views)
         workspace, rendered = self.workspace, []

@@ -89,7 +89,7 @@ class ReferenceCloud(ResidentData):
     def __init__(self, cloud: SplatCloud) -> None:
         self.cloud, self.count = cloud, len(cloud)
         self.memory_bytes = 0  # nothing is copied to a device
-        self.take_traits(cloud)
+        self.copy_traits(cloud)
 
     def color_range(self) -> tuple[float, float]:
         return color_range(self.cloud.plain_colors, self.cloud.sh)
@@ -156,17 +156,17 @@ class ReferencePipeline(Pipeline):
         splats = Setup(resident.cloud, view, self.features)
         if len(x) * len(splats.order) <= _BLOCK:
             return composite(splats, view, self.features, x, y)
-        places, starts = _by_tile(view, x, y, widest)
+        order, starts = _by_tile(view, x, y, widest)
         parts = []
-        for mine in np.split(places, starts):
-            near = splats.subset(may_contribute(splats, view, x[mine], y[mine]))
-            step = max(1, _BLOCK // max(1, len(near.order)))
-            for k in range(0, len(mine), step):
-                block = mine[k : k + step]
-                parts.append(composite(near, view, self.features, x[block], y[block]))
+        for members in np.split(order, starts):
+            candidates = splats.subset(may_contribute(splats, view, x[members], y[members]))
+            step = max(1, _BLOCK // max(1, len(candidates.order)))
+            for k in range(0, len(members), step):
+                block = members[k : k + step]
+                parts.append(composite(candidates, view, self.features, x[block], y[block]))
                 self._progress.add(len(block))
-        back = np.argsort(places)
-        return {name: np.concatenate([part[name] for part in parts])[back] for name in parts[0]}
+        inverse = np.argsort(order)
+        return {name: np.concatenate([part[name] for part in parts])[inverse] for name in parts[0]}
 
     def _exposed(
         self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray, widest: int
@@ -177,16 +177,16 @@ class ReferencePipeline(Pipeline):
         rows_of = [
             (y > sub_frame.top) & (y < sub_frame.top + sub_frame.view.height) for sub_frame in view.sub_frames
         ]
-        self._progress.total = sum(int(mine.sum()) for mine in rows_of)
-        for sub_frame, mine in zip(view.sub_frames, rows_of, strict=True):
-            samples = self._samples(resident, sub_frame.view, x[mine], y[mine] - sub_frame.top, widest)
+        self._progress.total = sum(int(members.sum()) for members in rows_of)
+        for sub_frame, members in zip(view.sub_frames, rows_of, strict=True):
+            samples = self._samples(resident, sub_frame.view, x[members], y[members] - sub_frame.top, widest)
             samples["certificate_middle"] = samples["certificate"]
             for name, values in samples.items():
                 plane = out.setdefault(name, np.zeros((len(x), *values.shape[1:]), values.dtype))
                 if name in ("rgb", "t", "fogged", "certificate", "behind_bound"):
-                    plane[mine] += sub_frame.weight * values
+                    plane[members] += sub_frame.weight * values
                 elif sub_frame.middle:
-                    plane[mine] = values
+                    plane[members] = values
         return out
 
 
@@ -196,10 +196,10 @@ def _by_tile(view: View, x: np.ndarray, y: np.ndarray, widest: int) -> tuple[np.
     side = _TILE
     while True:
         tile = y // side * view.width + x // side
-        places = np.argsort(tile, kind="stable")
-        starts = np.flatnonzero(np.diff(tile[places])) + 1
+        order = np.argsort(tile, kind="stable")
+        starts = np.flatnonzero(np.diff(tile[order])) + 1
         if side >= widest or len(x) >= _FEW * len(starts):
-            return places, starts
+            return order, starts
         side *= 2
 
 

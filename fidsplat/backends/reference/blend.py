@@ -86,7 +86,7 @@ def composite(
         )
     if "normal" in features.names:
         out["normal"] = _sum(weight, ordered.normal)
-        out["normal_moved"] = (f.alpha * s.turned).sum(1)
+        out["normal_moved"] = (f.alpha * s.normal_error).sum(1)
     ids = {"label": ordered.labels, "splat_id": ordered.ids}
     flips = {"label": ordered.label_may_flip, "splat_id": ordered.id_may_flip}
     for name in sorted(ids.keys() & features.names):

@@ -36,9 +36,9 @@ class Axes:
     """semi-axis of the ellipsoid conjugate to a and b; 0 for disks"""
     inverse_m2: np.ndarray
     """1 / |W p|^2; 0 for disks"""
-    faint: np.ndarray
+    opacity_term: np.ndarray
     """term added to the logarithm of the opacity"""
-    turned: np.ndarray
+    normal_error: np.ndarray
     """error bound of the normal [rad], large for flat ellipsoids near edge-on"""
 
 
@@ -63,11 +63,11 @@ def exact(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View) -> Ax
         e2 = np.where((length > 0)[:, None], e2 / length[:, None], np.roll(e3, 1, axis=1))
         e1 = np.cross(e2, e3)
         a, b = (np.einsum("nk,nkc->nc", e * scales, axes) for e in (e1, e2))
-        normal, turned = _surface_normals(axes, scales, towards)
+        normal, normal_error = _surface_normals(axes, scales, towards)
         area = scales.prod(axis=1) * m / np.einsum("nc,nc->n", normal, towards)
         none = np.zeros(len(p))
         inverse_m2 = none if view.parallel else 1 / m**2
-        return Axes(a, b, normal, normal, area, towards / m[:, None], inverse_m2, none, turned)
+        return Axes(a, b, normal, normal, area, towards / m[:, None], inverse_m2, none, normal_error)
 
 
 def _surface_normals(
@@ -104,7 +104,7 @@ def ewa(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View, antiali
     b = np.stack([none, np.sqrt(after) / l11 / per_y, none], 1)
     normal = np.stack([none, none, one], 1)
     with np.errstate(divide="ignore"):
-        faint = 0.5 * np.log(before / after) if antialiased else none
+        opacity_term = 0.5 * np.log(before / after) if antialiased else none
     towards = np.broadcast_to([0.0, 0.0, 1.0], p.shape) if view.parallel else p
-    surface, turned = _surface_normals(axes, scales, towards)
-    return Axes(a, b, normal, surface, a[:, 0] * b[:, 1], np.zeros_like(a), none, faint, turned)
+    surface, normal_error = _surface_normals(axes, scales, towards)
+    return Axes(a, b, normal, surface, a[:, 0] * b[:, 1], np.zeros_like(a), none, opacity_term, normal_error)

@@ -168,15 +168,15 @@ def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.nda
     return bound + (span.front_high * moved).sum(1)
 
 
-def of_layer_color(thin: np.ndarray, thick: np.ndarray) -> np.ndarray:
+def of_layer_color(min_tau: np.ndarray, max_tau: np.ndarray) -> np.ndarray:
     """Error bound (k, 1) of the colour of a layer of n splats, per unit of transmittance in front of it. The
-    splats have optical depths (k, n) between `thin` and `thick`."""
-    lowest = thin.sum(1, keepdims=True)
-    others = thick.sum(1, keepdims=True) - thick
+    splats have optical depths (k, n) between `min_tau` and `max_tau`."""
+    lowest = min_tau.sum(1, keepdims=True)
+    others = max_tau.sum(1, keepdims=True) - max_tau
     # maximum derivative of the layer's colour with respect to one splat's optical depth
     slope = np.exp(-lowest) + np.minimum(1.0, others / np.maximum(lowest, 1e-9)) / np.maximum(lowest, 1.0)
-    moved = np.minimum(1.0, slope * (thick - thin)).sum(1, keepdims=True)
-    return np.where((thick > 0).sum(1, keepdims=True) > 1, moved, 0.0)
+    moved = np.minimum(1.0, slope * (max_tau - min_tau)).sum(1, keepdims=True)
+    return np.where((max_tau > 0).sum(1, keepdims=True) > 1, moved, 0.0)
 
 
 def of_box_color(low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -186,18 +186,18 @@ def of_box_color(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 
 def of_layer_depth(
-    z_low: np.ndarray, z_high: np.ndarray, share: np.ndarray, thin: np.ndarray, thick: np.ndarray
+    z_low: np.ndarray, z_high: np.ndarray, share: np.ndarray, min_tau: np.ndarray, max_tau: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Interval of the mean (k, 1) of the depths of n fragments (k, n), weighted by optical depth."""
-    may = thick > 0
+    may = max_tau > 0
     count = may.sum(1, keepdims=True)
     none = count == 0
     nearest = np.where(may, z_low, np.inf).min(1, keepdims=True, initial=np.inf)
     furthest = np.where(may, z_high, -np.inf).max(1, keepdims=True, initial=-np.inf)
     nearest, furthest = np.where(none, 0.0, nearest), np.where(none, 0.0, furthest)
-    lowest = thin.sum(1, keepdims=True)
+    lowest = min_tau.sum(1, keepdims=True)
     spread = furthest - nearest
-    moved = spread * np.minimum(1.0, 2 * (thick - thin).sum(1, keepdims=True) / np.maximum(lowest, 1e-9))
+    moved = spread * np.minimum(1.0, 2 * (max_tau - min_tau).sum(1, keepdims=True) / np.maximum(lowest, 1e-9))
     low = np.where(share > 0, share * z_low, 0.0).sum(1, keepdims=True) - moved
     high = np.where(share > 0, share * z_high, 0.0).sum(1, keepdims=True) + moved
     blended = share.any(1, keepdims=True)
@@ -214,16 +214,16 @@ def first_column(mask: np.ndarray, start: int) -> np.ndarray:
     return start + np.where(mask.any(1), np.argmax(mask, axis=1), m) if m else np.full(k, start)
 
 
-def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
+def of_order(span: Span, depth_bias: np.ndarray) -> tuple[Span, np.ndarray]:
     """Bounds over all depth orders that rounding allows, for fragments or layers (k, m) sorted by depth.
 
     Returns the span with bounds of the transmittance in front of each fragment, and (k,) the largest change
-    of a pixel's colour, for colours in [0, 1]. lift (k, m): length subtracted from each depth before sorting.
-    Swapping two neighbours changes a colour by at most the product of their opacities and the transmittance
-    in front of them, and every possible order results from swaps of pairs with overlapping depth intervals.
-    Exactly equal depths keep their order.
+    of a pixel's colour, for colours in [0, 1]. depth_bias (k, m): length subtracted from each depth before
+    sorting. Swapping two neighbours changes a colour by at most the product of their opacities and the
+    transmittance in front of them, and every possible order results from swaps of pairs with overlapping
+    depth intervals. Exactly equal depths keep their order.
     """
-    near, far = _sort_depths(span, lift)
+    near, far = _sort_depths(span, depth_bias)
     may, exact = span.high > 0, span.z_low == span.z_high
     furthest = np.maximum.accumulate(far, axis=1)
     nearest = np.minimum.accumulate(near[:, ::-1], axis=1)[:, ::-1]
@@ -232,20 +232,20 @@ def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
         first, second = np.s_[:, :-apart], np.s_[:, apart:]
         if not (furthest[first] >= nearest[second]).any():
             break
-        meet = may[first] & may[second] & (far[first] >= near[second])
-        meet &= ~(exact[first] & exact[second] & (near[first] == near[second]))
-        pairs.append((first, second, meet))
+        may_swap = may[first] & may[second] & (far[first] >= near[second])
+        may_swap &= ~(exact[first] & exact[second] & (near[first] == near[second]))
+        pairs.append((first, second, may_swap))
     return _of_swaps(span, pairs)
 
 
-def of_layers(span: Span, lift: np.ndarray, place: np.ndarray) -> tuple[Span, np.ndarray]:
+def of_layers(span: Span, depth_bias: np.ndarray, position: np.ndarray) -> tuple[Span, np.ndarray]:
     """Bounds as in `of_order`, for fragments in the order of the splats' centres and layers sorted by depth.
 
-    Two fragments may also swap if rounding decides whether a layer is between them. place (k, m): position in
-    the order of centres; negative for layers.
+    Two fragments may also swap if rounding decides whether a layer is between them. position (k, m): index
+    in the order of centres; negative for layers.
     """
-    near, far = _sort_depths(span, lift)
-    may, layered = span.high > 0, place < 0
+    near, far = _sort_depths(span, depth_bias)
+    may, layered = span.high > 0, position < 0
     bound, lowest, highest = np.zeros(len(may)), span.front_low.copy(), span.front_high.copy()
     layers = layered.sum(1).max(initial=0)
     # for each layer: whether it may exist, whether it surely exists, and its interval
@@ -258,7 +258,7 @@ def of_layers(span: Span, lift: np.ndarray, place: np.ndarray) -> tuple[Span, np
     rows = np.flatnonzero(unsure)
     if len(rows) == 0:
         return span, bound
-    near, far, may, layered, place = (each[rows] for each in (near, far, may, layered, place))
+    near, far, may, layered, position = (each[rows] for each in (near, far, may, layered, position))
     own = [each[rows].T[:, :, None] for each in own]
     pairs = []
     for apart in range(1, near.shape[1]):
@@ -267,36 +267,36 @@ def of_layers(span: Span, lift: np.ndarray, place: np.ndarray) -> tuple[Span, np
         for exists, surely, low, high in zip(*own, strict=True):
             between |= exists & (far[first] >= low) & (near[second] <= high)
             divided |= exists & surely & (far[first] < low) & (near[second] > high)
-        swapped = np.where(place[first] < place[second], between, ~divided)
-        meet = np.where(layered[first] | layered[second], far[first] >= near[second], swapped)
-        pairs.append((first, second, meet & may[first] & may[second]))
+        swapped = np.where(position[first] < position[second], between, ~divided)
+        may_swap = np.where(layered[first] | layered[second], far[first] >= near[second], swapped)
+        pairs.append((first, second, may_swap & may[first] & may[second]))
     part = Span(*(getattr(span, field.name)[rows] for field in fields(Span)))
     part, bound[rows] = _of_swaps(part, pairs)
     lowest[rows], highest[rows] = part.front_low, part.front_high
     return replace(span, front_low=lowest, front_high=highest), bound
 
 
-def _sort_depths(span: Span, lift: np.ndarray) -> _Pair:
+def _sort_depths(span: Span, depth_bias: np.ndarray) -> _Pair:
     """Nearest and furthest depths (k, m) at which rounding may sort fragments and layers."""
     may = span.high > 0
-    near = np.where(may, span.z_low - lift - _DEPTH * np.abs(span.z_low), np.inf)
-    return near, np.where(may, span.z_high - lift + _DEPTH * np.abs(span.z_high), -np.inf)
+    near = np.where(may, span.z_low - depth_bias - _DEPTH * np.abs(span.z_low), np.inf)
+    return near, np.where(may, span.z_high - depth_bias + _DEPTH * np.abs(span.z_high), -np.inf)
 
 
 def _of_swaps(span: Span, pairs: list[tuple]) -> tuple[Span, np.ndarray]:
     """Bounds over all orders in which pairs may be swapped. pairs: two slices of columns, and a mask of
     samples."""
-    dimmed = np.log1p(-np.minimum(span.low, 1 - 2.0**-53))
-    light = np.cumsum(dimmed, axis=1) - dimmed
+    log_passed = np.log1p(-np.minimum(span.low, 1 - 2.0**-53))
+    log_transmittance = np.cumsum(log_passed, axis=1) - log_passed
     lowest = span.front_low.copy()
-    for first, second, meet in pairs:
-        light[second] -= np.where(meet, dimmed[first], 0.0)
-        lowest[first] *= np.where(meet, 1 - span.high[second], 1.0)
-    highest = np.exp(light) if pairs else span.front_high
-    bound = np.zeros(len(light))
-    for first, second, meet in pairs:
+    for first, second, may_swap in pairs:
+        log_transmittance[second] -= np.where(may_swap, log_passed[first], 0.0)
+        lowest[first] *= np.where(may_swap, 1 - span.high[second], 1.0)
+    highest = np.exp(log_transmittance) if pairs else span.front_high
+    bound = np.zeros(len(log_transmittance))
+    for first, second, may_swap in pairs:
         front = np.minimum(highest[first], highest[second])
-        bound += np.where(meet, front * span.high[first] * span.high[second], 0.0).sum(1)
+        bound += np.where(may_swap, front * span.high[first] * span.high[second], 0.0).sum(1)
     return replace(span, front_low=lowest, front_high=highest), bound
 
 
@@ -310,12 +310,12 @@ def of_depth(span: Span, weight: np.ndarray, z: np.ndarray) -> dict[str, np.ndar
     }
 
 
-def of_first(span: Span, light: float) -> np.ndarray:
+def of_first(span: Span, threshold: float) -> np.ndarray:
     """(k,) bool: whether rounding may change the first fragment behind which transmittance is below
-    `light`."""
+    `threshold`."""
     high, low = span.high, span.low
-    may = (high > 0) & (span.front_low * (1 - high) * (1 - STOP) <= light)
-    sure = (low > 0) & (span.front_high * (1 - low) * (1 + STOP) <= light)
+    may = (high > 0) & (span.front_low * (1 - high) * (1 - STOP) <= threshold)
+    sure = (low > 0) & (span.front_high * (1 - low) * (1 + STOP) <= threshold)
     return first_column(may, 0) != first_column(sure, 0)
 
 

@@ -42,7 +42,7 @@ class OrderedFragments:
     reordered: np.ndarray
     """(k,) error bound of colour due to possible changes of the order"""
 
-    def take(self, rank: np.ndarray) -> OrderedFragments:
+    def reordered_by(self, rank: np.ndarray) -> OrderedFragments:
         """Reorder by rank (k, m)."""
 
         def of(array: np.ndarray) -> np.ndarray:
@@ -79,31 +79,31 @@ def by_center(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
 def by_depth(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
     """Fragments, and a layer for each coplanar group, sorted by their depths at each sample. Ties: layers
     first, then the splats' order. Fragments that do not contribute are left out."""
-    columns, lift, arrival = _with_layers(s, f, span)
+    columns, depth_bias, tie_order = _with_layers(s, f, span)
     may = columns.span.high > 0
-    depth = np.where(may, columns.z - lift, np.inf)
-    rank = _rank(may, arrival, depth)
-    ordered, lift = columns.take(rank), np.take_along_axis(lift, rank, 1)
-    ordered.span, ordered.reordered = error_bounds.of_order(ordered.span, lift)
+    depth = np.where(may, columns.z - depth_bias, np.inf)
+    rank = _rank(may, tie_order, depth)
+    ordered, depth_bias = columns.reordered_by(rank), np.take_along_axis(depth_bias, rank, 1)
+    ordered.span, ordered.reordered = error_bounds.of_order(ordered.span, depth_bias)
     return ordered
 
 
 def by_layers(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
     """Fragments in the order of the splats' centres, and layers of coplanar groups by depth at each sample,
     behind nearer fragments and in front of the others. Fragments that do not contribute are left out."""
-    columns, lift, arrival = _with_layers(s, f, span)
-    may, layered = columns.span.high > 0, arrival < 0
-    depth, exists = columns.z - lift, columns.alpha > 0
+    columns, depth_bias, tie_order = _with_layers(s, f, span)
+    may, layered = columns.span.high > 0, tie_order < 0
+    depth, exists = columns.z - depth_bias, columns.alpha > 0
     # number of layers in front of each fragment, and of each layer by its rank among layers
     in_front = np.zeros(depth.shape, int)
     for layer in np.flatnonzero(layered):
-        first = np.where(layered, arrival > arrival[layer], True)
+        first = np.where(layered, tie_order > tie_order[layer], True)
         nearer = (depth[:, [layer]] < depth) | ((depth[:, [layer]] == depth) & first)
         in_front += 2 * (nearer & exists[:, [layer]])
-    rank = _rank(may, arrival, in_front + layered)
-    ordered, lift = columns.take(rank), np.take_along_axis(lift, rank, 1)
-    place = arrival[rank]
-    ordered.span, ordered.reordered = error_bounds.of_layers(ordered.span, lift, place)
+    rank = _rank(may, tie_order, in_front + layered)
+    ordered, depth_bias = columns.reordered_by(rank), np.take_along_axis(depth_bias, rank, 1)
+    position = tie_order[rank]
+    ordered.span, ordered.reordered = error_bounds.of_layers(ordered.span, depth_bias, position)
     return ordered
 
 
@@ -114,14 +114,14 @@ def _with_layers(s: Setup, f: Fragments, span: Span) -> tuple[OrderedFragments, 
     plain = np.flatnonzero(groups < 0)
     members = [np.flatnonzero(groups == group) for group in np.unique(groups[groups >= 0])]
     columns = _concatenated([_plain(s, f, span, plain), *(_layer(s, f, span, splats) for splats in members)])
-    arrival = np.concatenate([plain, np.arange(len(members)) - len(members)])
+    tie_order = np.concatenate([plain, np.arange(len(members)) - len(members)])
     # a coplanar layer is composited in front of other splats in its plane
-    return columns, np.where(arrival < 0, COPLANAR_BIAS * np.abs(columns.z), 0.0), arrival
+    return columns, np.where(tie_order < 0, COPLANAR_BIAS * np.abs(columns.z), 0.0), tie_order
 
 
-def _rank(may: np.ndarray, arrival: np.ndarray, key: np.ndarray) -> np.ndarray:
-    """Columns (k, m) of the fragments that may contribute, sorted by `key` (k, n), then by `arrival` (n,)."""
-    rank = np.lexsort((np.broadcast_to(arrival, key.shape), key, ~may), axis=1)
+def _rank(may: np.ndarray, tie_order: np.ndarray, key: np.ndarray) -> np.ndarray:
+    """Columns (k, m) of the fragments that may contribute, sorted by `key` (k, n), then `tie_order` (n,)."""
+    rank = np.lexsort((np.broadcast_to(tie_order, key.shape), key, ~may), axis=1)
     return rank[:, : may.sum(1).max(initial=0)]
 
 
@@ -157,15 +157,15 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> OrderedFra
     total = tau.sum(1, keepdims=True)
     share = tau / np.where(total > 0, total, 1)
     # 1 - opacity is rounded too
-    thin, thick = optical_depth(low - 2.0**-23), np.where(high > 0, optical_depth(high + 2.0**-23), 0.0)
+    min_tau, max_tau = optical_depth(low - 2.0**-23), np.where(high > 0, optical_depth(high + 2.0**-23), 0.0)
     if boxes:
-        thin, thick = low, high
+        min_tau, max_tau = low, high
     heaviest = np.argmax(tau, axis=1)[:, None]
     labels = s.labels[splats]
     label = labels[heaviest]
-    as_heavy = (high > 0) & (thick >= np.take_along_axis(thin, heaviest, 1))
+    as_heavy = (high > 0) & (max_tau >= np.take_along_axis(min_tau, heaviest, 1))
     contributes = alpha > 0
-    z_low, z_high = error_bounds.of_layer_depth(z_low, z_high, share, thin, thick)
+    z_low, z_high = error_bounds.of_layer_depth(z_low, z_high, share, min_tau, max_tau)
     depth = np.where(total > 0, (share * z).sum(1, keepdims=True), (z_low + z_high) / 2)
     covered = (_coverage(each, boxes) for each in (alpha, low, high))
     opacity, low, high = covered
@@ -179,7 +179,9 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> OrderedFra
         ids=splats[heaviest],
         count=contributes.sum(1, keepdims=True),
         count_bound=((low > 0) != (high > 0)).sum(1, keepdims=True),
-        moved=error_bounds.of_box_color(low, high) if boxes else error_bounds.of_layer_color(thin, thick),
+        moved=error_bounds.of_box_color(low, high)
+        if boxes
+        else error_bounds.of_layer_color(min_tau, max_tau),
         label_may_flip=(as_heavy & (labels != label)).any(1, keepdims=True),
         id_may_flip=as_heavy.sum(1, keepdims=True) > 1,
         reordered=np.zeros(len(alpha)),

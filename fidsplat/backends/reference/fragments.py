@@ -50,32 +50,32 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
     dz = s.z_numerator
     if s.depth_forms is not None:
         dz = c0 * s.depth_forms[0] + c1 * s.depth_forms[1] + c2 * s.depth_forms[2]
-    d_bulged, q = bulged(s.inverse_m2, d, n_u * n_u + n_v * n_v)
-    inside = (q <= 2 * s.half_r2 * d_bulged * d_bulged) & (d_bulged > 0) & (d_bulged * view.near <= dz)
+    d_solid, q = ellipsoid_forms(s.inverse_m2, d, n_u * n_u + n_v * n_v)
+    inside = (q <= 2 * s.half_r2 * d_solid * d_solid) & (d_solid > 0) & (d_solid * view.near <= dz)
     offset = ((x - s.center_x) ** 2 + (y - s.center_y) ** 2) / view.samples**2
     offset = np.where(samples.valid, offset, np.inf)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        half_rho = np.where(inside, q / (2 * d_bulged * d_bulged), np.inf)
-        z = dz / d_bulged
+        half_rho = np.where(inside, q / (2 * d_solid * d_solid), np.inf)
+        z = dz / d_solid
         if s.screen:
             # depths beyond the disc's circle are mirrored at it
             circle = np.maximum(offset, HALF_RHO_OF_RANGE)
-            mirrored = s.pz + circle * (dz - s.pz * d_bulged) * (2 * d_bulged / q)
-            z = np.where((q <= 2 * circle * d_bulged**2) | s.coplanar, z, mirrored)
+            mirrored = s.pz + circle * (dz - s.pz * d_solid) * (2 * d_solid / q)
+            z = np.where((q <= 2 * circle * d_solid**2) | s.coplanar, z, mirrored)
     if s.screen:
         half_rho = np.minimum(half_rho, np.where(offset <= s.half_r2, offset, np.inf))
     alpha = np.minimum(np.exp(s.log_opacity - half_rho), view.ceiling)
     if s.box.any():
         visible = (d > 0) & (d * view.near <= dz)
-        whole = np.minimum(np.exp(s.log_opacity), view.ceiling)
-        alpha = np.where(s.box, np.where(visible, whole * cover(edges, n_u, n_v, d, 0.0), 0.0), alpha)
-    hit = (d_bulged > 0) & (d_bulged * view.near <= dz)
-    z = np.where(hit, np.clip(z, s.z_low, s.z_high), s.pz)
+        full_opacity = np.minimum(np.exp(s.log_opacity), view.ceiling)
+        alpha = np.where(s.box, np.where(visible, full_opacity * cover(edges, n_u, n_v, d, 0.0), 0.0), alpha)
+    meets_plane = (d_solid > 0) & (d_solid * view.near <= dz)
+    z = np.where(meets_plane, np.clip(z, s.z_low, s.z_high), s.pz)
     dx, dy, away = np.abs(x - s.anchor_x), np.abs(y - s.anchor_y), away_of(view, samples, s.anchors)
     return Fragments(dx, dy, away, n_u, n_v, d, dz, offset, alpha, z, edges, edge_terms)
 
 
-def bulged(inverse_m2: np.ndarray, d: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def ellipsoid_forms(inverse_m2: np.ndarray, d: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Convert D and q = n_u^2 + n_v^2 (k, n) of equivalent disks to D and q of 3D Gaussians: rho = q / D^2 is
     divided by 1 + rho / m^2. inverse_m2 (n,): 0 for disks."""
     if not inverse_m2.any():

@@ -10,7 +10,12 @@ import numpy as np
 from fidsplat.backends.gradients import NOT_LATEST_FRAME, check_shape, gradient_shape
 from fidsplat.backends.interface import GradientPipeline, Images, Pipeline
 from fidsplat.backends.reference.gradients_blend import Blend, Decisions, Samples, decide
-from fidsplat.backends.reference.gradients_scene import Parameters, Placed, place, place_backward
+from fidsplat.backends.reference.gradients_scene import (
+    CameraSplats,
+    Parameters,
+    to_camera,
+    to_camera_backward,
+)
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
@@ -55,7 +60,9 @@ class FrozenFrame:
 
     def images(self, parameters: Parameters) -> dict[str, np.ndarray]:
         """Render output images (float64) with other parameters, under the frozen decisions."""
-        parts = [_images(blend.samples, made, parameters) for blend, made in self._blend(parameters)]
+        parts = [
+            _images(blend.samples, decisions, parameters) for blend, decisions in self._blend(parameters)
+        ]
         height, width = self._view.height, self._view.width
         whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         return {name: image.reshape(height, width, *image.shape[1:]) for name, image in whole.items()}
@@ -69,45 +76,47 @@ class FrozenFrame:
             given = gradients[name] if name in gradients else np.zeros(gradient_shape(name, view))
             check_shape(name, given.shape, view)
             flat[name] = given.reshape(view.height * view.width, *given.shape[2:])
-        slopes, by_background, start = Placed.zeros(len(parameters.means)), np.zeros(3), 0
-        for blend, made in self._blend(parameters):
-            rows = slice(start, start + len(made.covered))
+        splat_grads, grad_background, start = CameraSplats.zeros(len(parameters.means)), np.zeros(3), 0
+        for blend, decisions in self._blend(parameters):
+            rows = slice(start, start + len(decisions.covered))
             start = rows.stop
             samples = blend.samples
-            here = {name: array[rows] for name, array in flat.items()}
-            by_background += samples.t @ here["rgb"]
-            found = blend.backward(_images_backward(here, samples, made, parameters))
-            for name, values in vars(found).items():
-                getattr(slopes, name)[...] += values
-        placed = place(parameters, view)
+            pixel_grads = {name: array[rows] for name, array in flat.items()}
+            grad_background += samples.t @ pixel_grads["rgb"]
+            results = blend.backward(_images_backward(pixel_grads, samples, decisions, parameters))
+            for name, values in vars(results).items():
+                getattr(splat_grads, name)[...] += values
+        splats = to_camera(parameters, view)
         # gradient with respect to the projected centre in units of half images, as in 2DGS; for EWA at a
         # constant projected covariance, as in 3DGS
-        z = placed.p[:, 2]
-        across = z[:, None] * slopes.p[:, :2] / (view.focal_x, view.focal_y)
+        z = splats.p[:, 2]
+        across = z[:, None] * splat_grads.p[:, :2] / (view.focal_x, view.focal_y)
         if "ellipsoid_exact" not in self._features.effects:
-            across = np.where(placed.scales[:, 2:] > 0, 0.0, across)
-        by_center = slopes.center + across
-        screen = 0.5 * np.sign(z) * np.hypot(view.width * by_center[:, 0], view.height * by_center[:, 1])
+            across = np.where(splats.scales[:, 2:] > 0, 0.0, across)
+        grad_center = splat_grads.center + across
+        screen = 0.5 * np.sign(z) * np.hypot(view.width * grad_center[:, 0], view.height * grad_center[:, 1])
         return {
-            **place_backward(parameters, view, placed, slopes),
-            **{"background": by_background, "screen": screen},
+            **to_camera_backward(parameters, view, splats, splat_grads),
+            **{"background": grad_background, "screen": screen},
         }
 
     def _blend(self, parameters: Parameters) -> Iterator[tuple[Blend, Decisions]]:
         view = parameters.view(self._view)
-        placed = place(parameters, view)
-        for x, y, made in self._blocks:
-            yield Blend(placed, view, self._features, made, x, y), made
+        splats = to_camera(parameters, view)
+        for x, y, decisions in self._blocks:
+            yield Blend(splats, view, self._features, decisions, x, y), decisions
 
 
-def _images(samples: Samples, made: Decisions, parameters: Parameters) -> dict[str, np.ndarray]:
+def _images(samples: Samples, decisions: Decisions, parameters: Parameters) -> dict[str, np.ndarray]:
     """Pixels (k,) or (k, 3) from their samples."""
     length = np.linalg.norm(samples.normal, axis=1)
-    has_normal = made.covered & (length > 0)
+    has_normal = decisions.covered & (length > 0)
     return {
         "rgb": samples.rgb + samples.t[:, None] * parameters.background,
         "alpha": 1 - samples.t,
-        "depth": np.where(made.covered, samples.depth / np.where(made.covered, samples.weight, 1), 0.0),
+        "depth": np.where(
+            decisions.covered, samples.depth / np.where(decisions.covered, samples.weight, 1), 0.0
+        ),
         "distortion": samples.weight * samples.squares - samples.inverse**2,
         "normal": np.where(
             has_normal[:, None], samples.normal / np.where(has_normal, length, 1)[:, None], 0.0
@@ -116,20 +125,20 @@ def _images(samples: Samples, made: Decisions, parameters: Parameters) -> dict[s
 
 
 def _images_backward(
-    by: Mapping[str, np.ndarray], samples: Samples, made: Decisions, parameters: Parameters
+    grads: Mapping[str, np.ndarray], samples: Samples, decisions: Decisions, parameters: Parameters
 ) -> Samples:
     """Gradients with respect to samples, from gradients with respect to pixels."""
-    weight = np.where(made.covered, samples.weight, np.inf)
-    depth = np.where(made.covered, samples.depth / weight, 0.0)
+    weight = np.where(decisions.covered, samples.weight, np.inf)
+    depth = np.where(decisions.covered, samples.depth / weight, 0.0)
     length = np.linalg.norm(samples.normal, axis=1)
-    length = np.where(made.covered & (length > 0), length, np.inf)[:, None]
+    length = np.where(decisions.covered & (length > 0), length, np.inf)[:, None]
     normal = samples.normal / length
     return Samples(
-        rgb=by["rgb"],
-        t=by["rgb"] @ parameters.background - by["alpha"],
-        depth=by["depth"] / weight,
-        weight=by["distortion"] * samples.squares - by["depth"] * depth / weight,
-        inverse=-2 * by["distortion"] * samples.inverse,
-        squares=by["distortion"] * samples.weight,
-        normal=(by["normal"] - normal * (normal * by["normal"]).sum(1, keepdims=True)) / length,
+        rgb=grads["rgb"],
+        t=grads["rgb"] @ parameters.background - grads["alpha"],
+        depth=grads["depth"] / weight,
+        weight=grads["distortion"] * samples.squares - grads["depth"] * depth / weight,
+        inverse=-2 * grads["distortion"] * samples.inverse,
+        squares=grads["distortion"] * samples.weight,
+        normal=(grads["normal"] - normal * (normal * grads["normal"]).sum(1, keepdims=True)) / length,
     )

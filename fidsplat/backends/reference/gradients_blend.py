@@ -14,8 +14,8 @@ from fidsplat.backends.reference.blend import (
     inverse_depth,
     transmittance,
 )
-from fidsplat.backends.reference.fragments import HALF_RHO_OF_RANGE, bulged, fragments_of
-from fidsplat.backends.reference.gradients_scene import Placed
+from fidsplat.backends.reference.fragments import HALF_RHO_OF_RANGE, ellipsoid_forms, fragments_of
+from fidsplat.backends.reference.gradients_scene import CameraSplats
 from fidsplat.backends.reference.gradients_shapes import shapes_of
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
@@ -50,7 +50,7 @@ def decide(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
     """The decisions of the forward pass at samples (k,) at grid positions x, y."""
     f = fragments_of(s, view, x, y)
     _, live, final = transmittance(f.alpha, view.stop, s.exclusive)
-    d, q = bulged(s.inverse_m2, f.d, f.n_u**2 + f.n_v**2)
+    d, q = ellipsoid_forms(s.inverse_m2, f.d, f.n_u**2 + f.n_v**2)
     inside = (q <= 2 * s.half_r2 * d**2) & (d > 0) & (d * view.near <= f.dz)
     with np.errstate(divide="ignore", invalid="ignore"):
         plane = np.where(inside, q / (2 * d**2), np.inf)
@@ -85,13 +85,19 @@ class Samples:
 
 
 class Blend:
-    """Differentiable blending of m placed splats at k samples under frozen decisions."""
+    """Differentiable blending of m splats at k samples under frozen decisions."""
 
     def __init__(
-        self, placed: Placed, view: View, features: FeatureSet, made: Decisions, x: np.ndarray, y: np.ndarray
+        self,
+        splats: CameraSplats,
+        view: View,
+        features: FeatureSet,
+        decisions: Decisions,
+        x: np.ndarray,
+        y: np.ndarray,
     ) -> None:
-        self._count, self._made = len(placed.p), made
-        chosen = placed.select(made.order)
+        self._count, self._decisions = len(splats.p), decisions
+        chosen = splats.select(decisions.order)
         self._rgb, log_opacity = chosen.rgb, chosen.log_opacity.copy()
         self._shapes = shapes_of(chosen, view, features, x, y)
         self._pz = chosen.p[:, 2]
@@ -100,20 +106,20 @@ class Blend:
         for rows, shape in self._shapes:
             self._plane[:, rows], self._z_plane[:, rows] = shape.half_rho, shape.z
             self._facing[rows] = shape.facing
-            log_opacity[rows] += shape.faint
+            log_opacity[rows] += shape.opacity_term
         self._disc_x, self._disc_y = (at[:, None] - c for at, c in zip((x, y), chosen.center.T, strict=True))
         plane, z_plane = self._plane, self._z_plane
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             disc = self._disc_x**2 + self._disc_y**2
-            half_rho = np.where(made.by_disc, disc, plane)
+            half_rho = np.where(decisions.by_disc, disc, plane)
             # interpolation factor from the centre's depth to the depth on the plane
-            circle = np.where(made.wide, disc, HALF_RHO_OF_RANGE)
-            self._share = np.where(made.mirrored, circle / plane, 1.0)
+            circle = np.where(decisions.wide, disc, HALF_RHO_OF_RANGE)
+            self._share = np.where(decisions.mirrored, circle / plane, 1.0)
             z = self._pz + self._share * (z_plane - self._pz)
-            opacity = np.where(made.clamped, view.ceiling, np.exp(log_opacity - half_rho))
-        self._z = np.where(made.contributes, np.where(made.missed, self._pz, z), 0.0)
-        self._inverse = np.where(made.contributes, inverse_depth(self._z), 0.0)
-        self._alpha = np.where(made.contributes, opacity, 0.0)
+            opacity = np.where(decisions.clamped, view.ceiling, np.exp(log_opacity - half_rho))
+        self._z = np.where(decisions.contributes, np.where(decisions.missed, self._pz, z), 0.0)
+        self._inverse = np.where(decisions.contributes, inverse_depth(self._z), 0.0)
+        self._alpha = np.where(decisions.contributes, opacity, 0.0)
         after = np.cumprod(1 - self._alpha, axis=1)
         self._before = np.concatenate([np.ones((len(x), 1)), after], axis=1)
         self._weight = self._before[:, :-1] * self._alpha
@@ -130,51 +136,51 @@ class Blend:
             (self._weight * self._inverse**2).sum(1),
         )
 
-    def backward(self, by: Samples) -> Placed:
+    def backward(self, grads: Samples) -> CameraSplats:
         """Derivatives of a loss with respect to the splats, from derivatives with respect to the samples."""
-        made = self._made
-        by_inverse = by.inverse[:, None] + 2 * by.squares[:, None] * self._inverse
-        by_inverse = np.where(self._z > SPREAD_NEAR, by_inverse, 0.0)
-        by_z = self._weight * (by.depth[:, None] - by_inverse * self._inverse**2 / INVERSE_DEPTH)
-        by_alpha = np.where(made.contributes, self._by_opacity(by), 0.0)
-        by_log = np.where(made.clamped, 0.0, by_alpha * self._alpha)
+        decisions = self._decisions
+        grad_inverse = grads.inverse[:, None] + 2 * grads.squares[:, None] * self._inverse
+        grad_inverse = np.where(self._z > SPREAD_NEAR, grad_inverse, 0.0)
+        grad_z = self._weight * (grads.depth[:, None] - grad_inverse * self._inverse**2 / INVERSE_DEPTH)
+        grad_alpha = np.where(decisions.contributes, self._opacity_gradients(grads), 0.0)
+        grad_log = np.where(decisions.clamped, 0.0, grad_alpha * self._alpha)
 
-        met = made.contributes & ~made.missed
-        on_plane, mirrored = made.contributes & ~made.by_disc, met & made.mirrored
+        met = decisions.contributes & ~decisions.missed
+        on_plane, mirrored = decisions.contributes & ~decisions.by_disc, met & decisions.mirrored
         share = np.where(met, self._share, 0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            by_share = np.where(mirrored, by_z * (self._z_plane - self._pz), 0.0)
+            grad_share = np.where(mirrored, grad_z * (self._z_plane - self._pz), 0.0)
             # derivative with respect to rho / 2 of the ray-plane intersection
-            by_plane = np.where(mirrored, -by_share * share / self._plane, 0.0)
-            by_plane -= np.where(on_plane, by_log, 0.0)
-            by_disc = np.where(made.contributes & made.by_disc, by_log, 0.0)
-            by_disc -= np.where(mirrored & made.wide, by_share / self._plane, 0.0)
-        by_facing, by_log_opacity = self._weight.T @ by.normal, by_log.sum(0)
-        slopes = Placed.zeros(len(self._pz))
+            grad_plane = np.where(mirrored, -grad_share * share / self._plane, 0.0)
+            grad_plane -= np.where(on_plane, grad_log, 0.0)
+            grad_disc = np.where(decisions.contributes & decisions.by_disc, grad_log, 0.0)
+            grad_disc -= np.where(mirrored & decisions.wide, grad_share / self._plane, 0.0)
+        grad_facing, grad_log_opacity = self._weight.T @ grads.normal, grad_log.sum(0)
+        splat_grads = CameraSplats.zeros(len(self._pz))
         for rows, shape in self._shapes:
-            found = Placed.zeros(len(rows))
-            by_rays = (by_plane[:, rows], by_z[:, rows] * share[:, rows], (on_plane | met)[:, rows])
-            shape.backward(found, *by_rays, by_facing[rows], by_log_opacity[rows])
-            for name, array in vars(found).items():
-                getattr(slopes, name)[rows] = array
+            results = CameraSplats.zeros(len(rows))
+            grad_rays = (grad_plane[:, rows], grad_z[:, rows] * share[:, rows], (on_plane | met)[:, rows])
+            shape.backward(results, *grad_rays, grad_facing[rows], grad_log_opacity[rows])
+            for name, array in vars(results).items():
+                getattr(splat_grads, name)[rows] = array
         for axis, distance in enumerate((self._disc_x, self._disc_y)):
-            slopes.center[:, axis] += 2 * np.where(by_disc != 0, by_disc * distance, 0.0).sum(0)
-        slopes.p[:, 2] += (by_z * (1 - share)).sum(0)
-        slopes.log_opacity, slopes.rgb = by_log_opacity, self._weight.T @ by.rgb
-        out = Placed.zeros(self._count)
-        for name, array in vars(slopes).items():
-            getattr(out, name)[made.order] = array
+            splat_grads.center[:, axis] += 2 * np.where(grad_disc != 0, grad_disc * distance, 0.0).sum(0)
+        splat_grads.p[:, 2] += (grad_z * (1 - share)).sum(0)
+        splat_grads.log_opacity, splat_grads.rgb = grad_log_opacity, self._weight.T @ grads.rgb
+        out = CameraSplats.zeros(self._count)
+        for name, array in vars(splat_grads).items():
+            getattr(out, name)[decisions.order] = array
         return out
 
-    def _by_opacity(self, by: Samples) -> np.ndarray:
+    def _opacity_gradients(self, grads: Samples) -> np.ndarray:
         """Derivatives (k, m) with respect to the fragments' opacities: the term of a fragment's own colour
         minus the term of the colour behind it, from back to front."""
-        worth = by.rgb @ self._rgb.T + by.normal @ self._facing.T + by.depth[:, None] * self._z
-        worth = worth + by.weight[:, None] + by.inverse[:, None] * self._inverse
-        worth = worth + by.squares[:, None] * self._inverse**2
-        hidden, slopes = by.t.copy(), np.zeros_like(worth)
-        for k in range(worth.shape[1] - 1, -1, -1):
-            gain = worth[:, k] - hidden
-            slopes[:, k] = self._before[:, k] * gain
-            hidden = hidden + self._alpha[:, k] * gain
-        return slopes
+        own_term = grads.rgb @ self._rgb.T + grads.normal @ self._facing.T + grads.depth[:, None] * self._z
+        own_term = own_term + grads.weight[:, None] + grads.inverse[:, None] * self._inverse
+        own_term = own_term + grads.squares[:, None] * self._inverse**2
+        term_behind, alpha_grads = grads.t.copy(), np.zeros_like(own_term)
+        for k in range(own_term.shape[1] - 1, -1, -1):
+            difference = own_term[:, k] - term_behind
+            alpha_grads[:, k] = self._before[:, k] * difference
+            term_behind = term_behind + self._alpha[:, k] * difference
+        return alpha_grads

@@ -58,7 +58,7 @@ class Parameters:
 
 
 @dataclass
-class Placed:
+class CameraSplats:
     """Splats in the camera's frame; also used for the derivatives of a loss with respect to each array."""
 
     unit_a: np.ndarray
@@ -76,13 +76,13 @@ class Placed:
     """(n, 4), only for derivatives: with respect to fx, fy, cx, cy by splat, except through `center`"""
 
     @classmethod
-    def zeros(cls, n: int) -> Placed:
+    def zeros(cls, n: int) -> CameraSplats:
         """Zero derivatives of n splats."""
         a, b, p, scales, rgb = np.zeros((5, n, 3))
         return cls(a, b, p, np.zeros((n, 2)), scales, np.zeros(n), rgb, np.zeros((n, 4)))
 
-    def select(self, rows: np.ndarray) -> Placed:
-        return Placed(*(array[rows] for array in vars(self).values()))
+    def select(self, rows: np.ndarray) -> CameraSplats:
+        return CameraSplats(*(array[rows] for array in vars(self).values()))
 
 
 def motion_of(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -95,7 +95,7 @@ def motion_of(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross, pose[3:]
 
 
-def place(parameters: Parameters, view: View) -> Placed:
+def to_camera(parameters: Parameters, view: View) -> CameraSplats:
     """Transform splats to the camera frame."""
     rotation_offset, translation_offset = motion_of(parameters.pose)
     rotation, translation = (
@@ -110,7 +110,7 @@ def place(parameters: Parameters, view: View) -> Placed:
         log_opacity = np.log(parameters.opacities)
         focal, middle = (view.focal_x, view.focal_y), (view.center_x, view.center_y)
         center = p[:, :2] * focal / p[:, 2:] + middle
-    return Placed(
+    return CameraSplats(
         tangent_u @ rotation.T,
         tangent_v @ rotation.T,
         p,
@@ -122,41 +122,41 @@ def place(parameters: Parameters, view: View) -> Placed:
     )
 
 
-def place_backward(parameters: Parameters, view: View, placed: Placed, slopes: Placed) -> dict:
+def to_camera_backward(parameters: Parameters, view: View, splats: CameraSplats, grads: CameraSplats) -> dict:
     """Derivatives with respect to the parameters, from derivatives with respect to the transformed splats."""
     rotation = view.rotation
-    by_color, by_ray = _rgb_backward(parameters, _eye(parameters, view), slopes.rgb)
-    by_p = slopes.p + center_backward(view, placed.p, slopes.center)
-    pairs = [(slopes.unit_a, placed.unit_a), (slopes.unit_b, placed.unit_b), (by_p, placed.p)]
-    turned = sum(np.cross(at, slope).sum(0) for slope, at in pairs)
+    grad_color, grad_ray = _rgb_backward(parameters, _eye(parameters, view), grads.rgb)
+    grad_p = grads.p + center_backward(view, splats.p, grads.center)
+    pairs = [(grads.unit_a, splats.unit_a), (grads.unit_b, splats.unit_b), (grad_p, splats.p)]
+    rotation_grad = sum(np.cross(vector, grad).sum(0) for grad, vector in pairs)
     # a translation by t moves the camera centre by -t; the rotation is about the centre
-    moved = by_p.sum(0) + by_ray.sum(0) @ rotation.T
+    translation_grad = grad_p.sum(0) + grad_ray.sum(0) @ rotation.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        by_opacity = slopes.log_opacity / parameters.opacities
-        tangents = np.where(slopes.center != 0, placed.p[:, :2] / placed.p[:, 2:], 0.0)
-    by_focal = (slopes.center * tangents).sum(0)
-    rendered = slopes.scales[:, :2]
-    found = {
-        "means": by_p @ rotation + by_ray,
-        "quats": _tangents_backward(parameters.quats, slopes.unit_a @ rotation, slopes.unit_b @ rotation),
+        grad_opacity = grads.log_opacity / parameters.opacities
+        tangents = np.where(grads.center != 0, splats.p[:, :2] / splats.p[:, 2:], 0.0)
+    grad_focal = (grads.center * tangents).sum(0)
+    rendered = grads.scales[:, :2]
+    results = {
+        "means": grad_p @ rotation + grad_ray,
+        "quats": _tangents_backward(parameters.quats, grads.unit_a @ rotation, grads.unit_b @ rotation),
         "scales": np.where(parameters.scales >= _SMALLEST, rendered, 0.0),
-        "opacities": np.where(slopes.log_opacity != 0, by_opacity, 0.0),
-        "sh" if parameters.colors is None else "colors": by_color,
-        "pose": np.concatenate([turned, moved]),
-        "intrinsics": slopes.intrinsics.sum(0) + np.concatenate([by_focal, slopes.center.sum(0)]),
+        "opacities": np.where(grads.log_opacity != 0, grad_opacity, 0.0),
+        "sh" if parameters.colors is None else "colors": grad_color,
+        "pose": np.concatenate([rotation_grad, translation_grad]),
+        "intrinsics": grads.intrinsics.sum(0) + np.concatenate([grad_focal, grads.center.sum(0)]),
     }
     if parameters.thickness is not None:
-        found["thickness"] = np.where(parameters.thickness >= _SMALLEST, slopes.scales[:, 2], 0.0)
-    return found
+        results["thickness"] = np.where(parameters.thickness >= _SMALLEST, grads.scales[:, 2], 0.0)
+    return results
 
 
-def center_backward(view: View, p: np.ndarray, by_center: np.ndarray) -> np.ndarray:
+def center_backward(view: View, p: np.ndarray, grad_center: np.ndarray) -> np.ndarray:
     """Derivatives (n, 3) with respect to centres, from derivatives (n, 2) with respect to their
     projections."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        across = by_center * (view.focal_x, view.focal_y) / p[:, 2:]
-        by_p = np.column_stack([across, -(across * p[:, :2]).sum(1) / p[:, 2]])
-    return np.where((by_center != 0).any(axis=1, keepdims=True), by_p, 0.0)
+        across = grad_center * (view.focal_x, view.focal_y) / p[:, 2:]
+        grad_p = np.column_stack([across, -(across * p[:, :2]).sum(1) / p[:, 2]])
+    return np.where((grad_center != 0).any(axis=1, keepdims=True), grad_p, 0.0)
 
 
 def _tangents(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -168,10 +168,10 @@ def _tangents(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _tangents_backward(quats: np.ndarray, by_u: np.ndarray, by_v: np.ndarray) -> np.ndarray:
+def _tangents_backward(quats: np.ndarray, grad_u: np.ndarray, grad_v: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     w, x, y, z = unit = (quats / length).T
-    (ux, uy, uz), (vx, vy, vz) = by_u.T, by_v.T
+    (ux, uy, uz), (vx, vy, vz) = grad_u.T, grad_v.T
     slopes = 2 * np.stack(
         [
             uy * z - uz * y - vx * z + vz * x,
@@ -211,21 +211,21 @@ def _unclamped(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
 
 
 def _rgb_backward(
-    parameters: Parameters, eye: np.ndarray, by_rgb: np.ndarray
+    parameters: Parameters, eye: np.ndarray, grad_rgb: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gradients of the loss with respect to SH coefficients or colours, and to the vectors from the camera
-    centre to the means (n, 3). by_rgb: (n, 3) gradient with respect to the rendered colours."""
+    centre to the means (n, 3). grad_rgb: (n, 3) gradient with respect to the rendered colours."""
     if parameters.sh is None:
-        return by_rgb, np.zeros_like(by_rgb)
+        return grad_rgb, np.zeros_like(grad_rgb)
     directions, length = _directions(parameters.means - eye)
-    by_rgb = np.where(_unclamped(parameters.sh, directions) > 0, by_rgb, 0.0)
+    grad_rgb = np.where(_unclamped(parameters.sh, directions) > 0, grad_rgb, 0.0)
     degree = _degree(parameters.sh)
-    by_basis = np.einsum("nc,nkc->nk", by_rgb, parameters.sh)
+    grad_basis = np.einsum("nc,nkc->nk", grad_rgb, parameters.sh)
     slopes = np.stack(
-        [np.einsum("nk,nk->n", by_basis, _basis_slope(degree, directions, axis)) for axis in range(3)], 1
+        [np.einsum("nk,nk->n", grad_basis, _basis_slope(degree, directions, axis)) for axis in range(3)], 1
     )
     across = slopes - directions * (directions * slopes).sum(1, keepdims=True)
-    return np.einsum("nk,nc->nkc", sh_basis(degree, directions), by_rgb), across / length
+    return np.einsum("nk,nc->nkc", sh_basis(degree, directions), grad_rgb), across / length
 
 
 def _basis_slope(degree: int, directions: np.ndarray, axis: int) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from fidsplat.backends.reference.ellipsoids import EWA_SPREAD
-from fidsplat.backends.reference.gradients_scene import Placed
+from fidsplat.backends.reference.gradients_scene import CameraSplats
 from fidsplat.backends.reference.optics import rays_of
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
@@ -26,17 +26,17 @@ class Shapes(Protocol):
     """(k, n) depths [m]"""
     facing: np.ndarray
     """(n, 3) unit normals towards the camera"""
-    faint: np.ndarray
+    opacity_term: np.ndarray
     """(n,) term that is added to the logarithm of the opacity"""
 
     def backward(
         self,
-        out: Placed,
-        by_half_rho: np.ndarray,
-        by_z: np.ndarray,
+        out: CameraSplats,
+        grad_half_rho: np.ndarray,
+        grad_z: np.ndarray,
         used: np.ndarray,
-        by_facing: np.ndarray,
-        by_faint: np.ndarray,
+        grad_facing: np.ndarray,
+        grad_opacity_term: np.ndarray,
     ) -> None:
         """Add derivatives of a loss with respect to the splats to `out`, from derivatives with respect to the
         attributes. used: (k, n) where half_rho or z counts; elsewhere they may be infinite."""
@@ -44,89 +44,89 @@ class Shapes(Protocol):
 
 
 def shapes_of(
-    placed: Placed, view: View, features: FeatureSet, x: np.ndarray, y: np.ndarray
+    splats: CameraSplats, view: View, features: FeatureSet, x: np.ndarray, y: np.ndarray
 ) -> list[tuple[np.ndarray, Shapes]]:
     """Indices of the splats of each primitive, and their shapes."""
-    thick = placed.scales[:, 2] > 0
+    thick = splats.scales[:, 2] > 0
     flat, solid = np.flatnonzero(~thick), np.flatnonzero(thick)
     rays = rays_of(view, x, y)[0][:, None, :]
-    found: list[tuple[np.ndarray, Shapes]] = [(flat, _Disks(placed.select(flat), rays, view))]
+    shapes: list[tuple[np.ndarray, Shapes]] = [(flat, _Disks(splats.select(flat), rays, view))]
     if len(solid) and "ellipsoid_exact" in features.effects:
-        found.append((solid, _Ellipsoids(placed.select(solid), rays, view)))
+        shapes.append((solid, _Ellipsoids(splats.select(solid), rays, view)))
     elif len(solid):
         antialiased = "ellipsoid_ewa_antialiased" in features.effects
-        found.append((solid, _Projected(placed.select(solid), view, antialiased, x, y)))
-    return found
+        shapes.append((solid, _Projected(splats.select(solid), view, antialiased, x, y)))
+    return shapes
 
 
-def _by_intrinsics(by_rays: np.ndarray, rays: np.ndarray, view: View) -> np.ndarray:
+def _intrinsics_gradients(grad_rays: np.ndarray, rays: np.ndarray, view: View) -> np.ndarray:
     """Derivatives (n, 4) with respect to fx, fy, cx, cy, from derivatives (k, n, 3) with respect to rays."""
-    across = -by_rays[..., :2] / (view.focal_x, view.focal_y)
+    across = -grad_rays[..., :2] / (view.focal_x, view.focal_y)
     return np.concatenate([(across * rays[..., :2]).sum(0), across.sum(0)], axis=1)
 
 
 class _Disks:
-    def __init__(self, placed: Placed, rays: np.ndarray, view: View) -> None:
-        self._placed, self._rays, self._view = placed, rays, view
-        self._su, self._sv = placed.scales[:, :2].T
-        self._normal = np.cross(placed.unit_a, placed.unit_b)
-        height = (self._normal * placed.p).sum(1)
+    def __init__(self, splats: CameraSplats, rays: np.ndarray, view: View) -> None:
+        self._splats, self._rays, self._view = splats, rays, view
+        self._su, self._sv = splats.scales[:, :2].T
+        self._normal = np.cross(splats.unit_a, splats.unit_b)
+        height = (self._normal * splats.p).sum(1)
         self._towards = np.where(height > 0, -1.0, 1.0)[:, None]
-        self.facing, self.faint = self._normal * self._towards, np.zeros(len(placed.p))
+        self.facing, self.opacity_term = self._normal * self._towards, np.zeros(len(splats.p))
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             self._slant = (rays * self._normal).sum(2)
             self.z = height / self._slant
-            self._off = self.z[..., None] * rays - placed.p
-            self._u = (self._off * placed.unit_a).sum(2) / self._su
-            self._v = (self._off * placed.unit_b).sum(2) / self._sv
+            self._off = self.z[..., None] * rays - splats.p
+            self._u = (self._off * splats.unit_a).sum(2) / self._su
+            self._v = (self._off * splats.unit_b).sum(2) / self._sv
             self.half_rho = (self._u**2 + self._v**2) / 2
 
-    def backward(self, out, by_half_rho, by_z, used, by_facing, by_faint) -> None:
-        unit_a, unit_b = self._placed.unit_a, self._placed.unit_b
+    def backward(self, out, grad_half_rho, grad_z, used, grad_facing, grad_opacity_term) -> None:
+        unit_a, unit_b = self._splats.unit_a, self._splats.unit_b
         with np.errstate(invalid="ignore", divide="ignore"):
-            by_u = np.where(used, by_half_rho * self._u / self._su, 0.0)
-            by_v = np.where(used, by_half_rho * self._v / self._sv, 0.0)
+            grad_u = np.where(used, grad_half_rho * self._u / self._su, 0.0)
+            grad_v = np.where(used, grad_half_rho * self._v / self._sv, 0.0)
             off = np.where(used[..., None], self._off, 0.0)
-            by_off = by_u[..., None] * unit_a + by_v[..., None] * unit_b
-            by_plane_z = np.where(used, ((by_off * self._rays).sum(2) + by_z) / self._slant, 0.0)
-            out.scales[:, 0] = -np.where(used, by_u * self._u, 0.0).sum(0)
-            out.scales[:, 1] = -np.where(used, by_v * self._v, 0.0).sum(0)
-        by_normal = -(by_plane_z[..., None] * off).sum(0) + self._towards * by_facing
-        out.unit_a[:] = np.einsum("kn,knc->nc", by_u, off) + np.cross(unit_b, by_normal)
-        out.unit_b[:] = np.einsum("kn,knc->nc", by_v, off) + np.cross(by_normal, unit_a)
-        out.p[:] = by_plane_z.sum(0)[:, None] * self._normal - by_off.sum(0)
-        by_rays = by_off - by_plane_z[..., None] * self._normal
-        by_rays *= np.where(used, self.z, 0.0)[..., None]
-        out.intrinsics[:] = _by_intrinsics(by_rays, self._rays, self._view)
+            grad_off = grad_u[..., None] * unit_a + grad_v[..., None] * unit_b
+            grad_plane_z = np.where(used, ((grad_off * self._rays).sum(2) + grad_z) / self._slant, 0.0)
+            out.scales[:, 0] = -np.where(used, grad_u * self._u, 0.0).sum(0)
+            out.scales[:, 1] = -np.where(used, grad_v * self._v, 0.0).sum(0)
+        grad_normal = -(grad_plane_z[..., None] * off).sum(0) + self._towards * grad_facing
+        out.unit_a[:] = np.einsum("kn,knc->nc", grad_u, off) + np.cross(unit_b, grad_normal)
+        out.unit_b[:] = np.einsum("kn,knc->nc", grad_v, off) + np.cross(grad_normal, unit_a)
+        out.p[:] = grad_plane_z.sum(0)[:, None] * self._normal - grad_off.sum(0)
+        grad_rays = grad_off - grad_plane_z[..., None] * self._normal
+        grad_rays *= np.where(used, self.z, 0.0)[..., None]
+        out.intrinsics[:] = _intrinsics_gradients(grad_rays, self._rays, self._view)
 
 
 class _Solid:
     """3D Gaussians: their axes, and the normal along the inverse covariance times the ray to the centre."""
 
-    def __init__(self, placed: Placed) -> None:
-        self._p, self._scales = placed.p, placed.scales
-        third = np.cross(placed.unit_a, placed.unit_b)
-        self._axes = np.stack([placed.unit_a, placed.unit_b, third], axis=1)
+    def __init__(self, splats: CameraSplats) -> None:
+        self._p, self._scales = splats.p, splats.scales
+        third = np.cross(splats.unit_a, splats.unit_b)
+        self._axes = np.stack([splats.unit_a, splats.unit_b, third], axis=1)
         """(n, 3, 3), in rows"""
         # relative to the shortest axis, which does not change the direction
-        self._shares = (placed.scales.min(axis=1)[:, None] / placed.scales) ** 2
-        self._along = np.einsum("nkc,nc->nk", self._axes, placed.p)
+        self._shares = (splats.scales.min(axis=1)[:, None] / splats.scales) ** 2
+        self._along = np.einsum("nkc,nc->nk", self._axes, splats.p)
         normal = np.einsum("nk,nkc->nc", self._along * self._shares, self._axes)
         self._length = np.linalg.norm(normal, axis=1, keepdims=True)
         self.facing = -normal / self._length
 
-    def _finish(self, out: Placed, by_axes: np.ndarray, by_facing: np.ndarray) -> None:
+    def _finish(self, out: CameraSplats, grad_axes: np.ndarray, grad_facing: np.ndarray) -> None:
         """Add the derivatives with respect to the normals and to all axes (n, 3, 3)."""
-        across = by_facing - self.facing * (self.facing * by_facing).sum(1, keepdims=True)
-        by_normal = -across / self._length
-        by_share = np.einsum("nkc,nc->nk", self._axes, by_normal)
-        by_along = by_share * self._shares
-        by_axes = by_axes + (self._along * self._shares)[..., None] * by_normal[:, None]
-        by_axes += by_along[..., None] * self._p[:, None]
-        out.p += np.einsum("nk,nkc->nc", by_along, self._axes)
+        across = grad_facing - self.facing * (self.facing * grad_facing).sum(1, keepdims=True)
+        grad_normal = -across / self._length
+        grad_share = np.einsum("nkc,nc->nk", self._axes, grad_normal)
+        grad_along = grad_share * self._shares
+        grad_axes = grad_axes + (self._along * self._shares)[..., None] * grad_normal[:, None]
+        grad_axes += grad_along[..., None] * self._p[:, None]
+        out.p += np.einsum("nk,nkc->nc", grad_along, self._axes)
         # the length of the normal has no derivative, so that the shortest axis is a constant
-        out.scales += -2 * by_along * self._along / self._scales
-        a, b, c = by_axes.transpose(1, 0, 2)
+        out.scales += -2 * grad_along * self._along / self._scales
+        a, b, c = grad_axes.transpose(1, 0, 2)
         out.unit_a += a + np.cross(self._axes[:, 1], c)
         out.unit_b += b + np.cross(c, self._axes[:, 0])
 
@@ -135,10 +135,10 @@ class _Ellipsoids(_Solid):
     """3D Gaussians by their maximum along each ray: after whitening, at distance |y x r| / |r| from the ray r
     to the centre y."""
 
-    def __init__(self, placed: Placed, rays: np.ndarray, view: View) -> None:
-        super().__init__(placed)
-        self.faint = np.zeros(len(placed.p))
-        self._rays, self._view, scales = rays[:, 0], view, placed.scales
+    def __init__(self, splats: CameraSplats, rays: np.ndarray, view: View) -> None:
+        super().__init__(splats)
+        self.opacity_term = np.zeros(len(splats.p))
+        self._rays, self._view, scales = rays[:, 0], view, splats.scales
         self._y = self._along / scales
         self._r = np.einsum("nkc,sc->snk", self._axes, self._rays) / scales
         self._square = (self._r**2).sum(2)
@@ -146,33 +146,39 @@ class _Ellipsoids(_Solid):
         self.half_rho = (self._cross**2).sum(2) / (2 * self._square)
         self.z = (self._y * self._r).sum(2) / self._square
 
-    def backward(self, out, by_half_rho, by_z, used, by_facing, by_faint) -> None:
-        by_cross = (by_half_rho / self._square)[..., None] * self._cross
-        by_dot = by_z / self._square
-        by_square = -(by_half_rho * self.half_rho + by_z * self.z) / self._square
-        by_r = 2 * by_square[..., None] * self._r + by_dot[..., None] * self._y + np.cross(by_cross, self._y)
-        by_y = (by_dot[..., None] * self._r + np.cross(self._r, by_cross)).sum(0)
+    def backward(self, out, grad_half_rho, grad_z, used, grad_facing, grad_opacity_term) -> None:
+        grad_cross = (grad_half_rho / self._square)[..., None] * self._cross
+        grad_dot = grad_z / self._square
+        grad_square = -(grad_half_rho * self.half_rho + grad_z * self.z) / self._square
+        grad_r = (
+            2 * grad_square[..., None] * self._r
+            + grad_dot[..., None] * self._y
+            + np.cross(grad_cross, self._y)
+        )
+        grad_y = (grad_dot[..., None] * self._r + np.cross(self._r, grad_cross)).sum(0)
         scales = self._scales
-        by_axes = np.einsum("snk,sc->nkc", by_r, self._rays) + by_y[..., None] * self._p[:, None]
-        out.p += np.einsum("nk,nkc->nc", by_y / scales, self._axes)
-        out.scales -= (by_y * self._y + (by_r * self._r).sum(0)) / scales
-        by_rays = np.einsum("snk,nkc->snc", by_r / scales, self._axes)
-        out.intrinsics[:] = _by_intrinsics(by_rays, self._rays[:, None], self._view)
-        self._finish(out, by_axes / scales[..., None], by_facing)
+        grad_axes = np.einsum("snk,sc->nkc", grad_r, self._rays) + grad_y[..., None] * self._p[:, None]
+        out.p += np.einsum("nk,nkc->nc", grad_y / scales, self._axes)
+        out.scales -= (grad_y * self._y + (grad_r * self._r).sum(0)) / scales
+        grad_rays = np.einsum("snk,nkc->snc", grad_r / scales, self._axes)
+        out.intrinsics[:] = _intrinsics_gradients(grad_rays, self._rays[:, None], self._view)
+        self._finish(out, grad_axes / scales[..., None], grad_facing)
 
 
 class _Projected(_Solid):
     """3D Gaussians by EWA: image covariance by the Jacobian at the centre, plus 0.3 square pixels."""
 
-    def __init__(self, placed: Placed, view: View, antialiased: bool, x: np.ndarray, y: np.ndarray) -> None:
-        super().__init__(placed)
+    def __init__(
+        self, splats: CameraSplats, view: View, antialiased: bool, x: np.ndarray, y: np.ndarray
+    ) -> None:
+        super().__init__(splats)
         self._antialiased, self._focal = antialiased, np.array([view.focal_x, view.focal_y])
-        self._per = self._focal / placed.p[:, 2:]
+        self._per = self._focal / splats.p[:, 2:]
         left, right, up, down = view.slopes
-        slopes = placed.p[:, :2] / placed.p[:, 2:]
+        slopes = splats.p[:, :2] / splats.p[:, 2:]
         self._slopes = np.clip(slopes, (-left, -up), (right, down))
         self._inside = self._slopes == slopes
-        scaled = self._axes * placed.scales[..., None]
+        scaled = self._axes * splats.scales[..., None]
         self._flat = scaled[..., :2] - scaled[..., 2:] * self._slopes[:, None]
         self._images = self._flat * self._per[:, None]
         """(n, 3, 2) projections of the scaled axes [samples]"""
@@ -183,34 +189,36 @@ class _Projected(_Solid):
         grown = self._own + EWA_SPREAD * (np.einsum("nii->n", covariance) - EWA_SPREAD)
         xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
         self._conic = np.array([[yy, -xy], [-xy, xx]]).transpose(2, 0, 1) / grown[:, None, None]
-        self._away = np.stack([x[:, None] - placed.center[:, 0], y[:, None] - placed.center[:, 1]], 2)
+        self._away = np.stack([x[:, None] - splats.center[:, 0], y[:, None] - splats.center[:, 1]], 2)
         self._pull = np.einsum("nij,knj->kni", self._conic, self._away)
         self.half_rho = (self._pull * self._away).sum(2) / 2
-        self.z = np.broadcast_to(placed.p[:, 2], self.half_rho.shape)
+        self.z = np.broadcast_to(splats.p[:, 2], self.half_rho.shape)
         with np.errstate(divide="ignore"):
-            self.faint = 0.5 * np.log(self._own / grown) if antialiased else np.zeros(len(grown))
+            self.opacity_term = 0.5 * np.log(self._own / grown) if antialiased else np.zeros(len(grown))
 
-    def backward(self, out, by_half_rho, by_z, used, by_facing, by_faint) -> None:
+    def backward(self, out, grad_half_rho, grad_z, used, grad_facing, grad_opacity_term) -> None:
         pz, per, scales = self._p[:, 2:], self._per, self._scales
-        out.center -= np.einsum("kn,kni->ni", by_half_rho, self._pull)
+        out.center -= np.einsum("kn,kni->ni", grad_half_rho, self._pull)
         # with respect to the covariance C: half_rho has -(C^-1 d)(C^-1 d)^T / 2
-        by_covariance = -0.5 * np.einsum("kn,kni,knj->nij", by_half_rho, self._pull, self._pull)
-        by_images = np.zeros_like(self._images)
+        grad_covariance = -0.5 * np.einsum("kn,kni,knj->nij", grad_half_rho, self._pull, self._pull)
+        grad_images = np.zeros_like(self._images)
         if self._antialiased:
-            by_covariance -= 0.5 * by_faint[:, None, None] * self._conic
-            by_crossed = (by_faint / self._own)[:, None] * self._crossed
-            by_images[..., 0] += np.cross(self._images[..., 1], by_crossed)
-            by_images[..., 1] += np.cross(by_crossed, self._images[..., 0])
-        by_images += 2 * np.einsum("nij,nkj->nki", by_covariance, self._images)
-        by_per = (by_images * self._flat).sum(1)
-        by_flat = by_images * per[:, None]
-        by_scaled = np.concatenate([by_flat, -(by_flat * self._slopes[:, None]).sum(2, keepdims=True)], 2)
+            grad_covariance -= 0.5 * grad_opacity_term[:, None, None] * self._conic
+            grad_crossed = (grad_opacity_term / self._own)[:, None] * self._crossed
+            grad_images[..., 0] += np.cross(self._images[..., 1], grad_crossed)
+            grad_images[..., 1] += np.cross(grad_crossed, self._images[..., 0])
+        grad_images += 2 * np.einsum("nij,nkj->nki", grad_covariance, self._images)
+        grad_per = (grad_images * self._flat).sum(1)
+        grad_flat = grad_images * per[:, None]
+        grad_scaled = np.concatenate(
+            [grad_flat, -(grad_flat * self._slopes[:, None]).sum(2, keepdims=True)], 2
+        )
         scaled_z = self._axes[:, :, 2] * scales
-        by_slopes = -np.einsum("nki,nk->ni", by_flat, scaled_z)
-        by_limits = -by_slopes * ~self._inside / self._focal
-        out.intrinsics[:] = np.concatenate([by_per / pz + by_limits * self._slopes, by_limits], axis=1)
-        by_slopes *= self._inside
-        out.p[:, :2] += by_slopes / pz
-        out.p[:, 2] += by_z.sum(0) - ((by_slopes * self._slopes + by_per * per) / pz).sum(1)
-        out.scales += (by_scaled * self._axes).sum(2)
-        self._finish(out, by_scaled * scales[..., None], by_facing)
+        grad_slopes = -np.einsum("nki,nk->ni", grad_flat, scaled_z)
+        grad_limits = -grad_slopes * ~self._inside / self._focal
+        out.intrinsics[:] = np.concatenate([grad_per / pz + grad_limits * self._slopes, grad_limits], axis=1)
+        grad_slopes *= self._inside
+        out.p[:, :2] += grad_slopes / pz
+        out.p[:, 2] += grad_z.sum(0) - ((grad_slopes * self._slopes + grad_per * per) / pz).sum(1)
+        out.scales += (grad_scaled * self._axes).sum(2)
+        self._finish(out, grad_scaled * scales[..., None], grad_facing)
