@@ -285,6 +285,7 @@ static inline void comparator(uint t, uint stride, bool mirrored, uint *i, uint 
 //@@ pair_order
 #ifndef PAIR_BEFORE
 #define PAIR_BEFORE(a, b) ((a) < (b))
+#define COUNT_BEFORE(position, other, pair) position += (other) < (pair)
 #endif
 
 // One step of the network on `items`; `fence` names their address space.
@@ -365,10 +366,7 @@ static inline void sort_buckets(global const ulong *pairs, uint length, local ul
         ulong pair = BUCKETED(k);
         uint range = bucket_of(pair, nearest, scale), first = range > 0 ? buckets->starts[range - 1] : 0, position = first;
 //@@ equal_start
-        for (uint other = first, end = buckets->starts[range]; other < end; other++) {
-            position += BUCKETED(other) < pair;
-//@@ equal_counted
-        }
+        for (uint other = first, end = buckets->starts[range]; other < end; other++) COUNT_BEFORE(position, BUCKETED(other), pair);
 //@@ equal_sorted
         list[position] = (uint)pair;
     }

@@ -20,13 +20,17 @@ static inline bool pair_before(ulong a, ulong b
     return a >> 32 == b >> 32 ? CLOUD_INDEX(a) < CLOUD_INDEX(b) : a < b;
 }
 #define PAIR_BEFORE(a, b) pair_before(a, b, unculled, splat_ids)
+// By depth; pairs of equal depth are counted, and sorted after the loop.
+#define COUNT_BEFORE(position, other, pair) do { \
+        uint other_key = (uint)((other) >> 32); \
+        position += other_key < (uint)((pair) >> 32); \
+        equal += other_key == (uint)((pair) >> 32); \
+    } while (0)
 //@ equal_start
-        uint equal = 0;         // pairs of equal depth
-//@ equal_counted
-            equal += BUCKETED(other) >> 32 == pair >> 32;
+        uint equal = 0;
 //@ equal_sorted
         for (uint other = first; equal > 1 && other < buckets->starts[range]; other++)
-            position += PAIR_BEFORE(BUCKETED(other), pair) - (BUCKETED(other) < pair);
+            position += BUCKETED(other) >> 32 == pair >> 32 && PAIR_BEFORE(BUCKETED(other), pair);
 //@ project_kernels
 // Index space: one work-item per group of splats, in work-groups of CULL_ITEMS.
 // Reads: view, spheres, max_scales. Writes: unculled, at most `capacity` groups; adds to counters' number of visible splats. If more groups
