@@ -41,7 +41,7 @@ def measure_detail(
 
     Args:
         settings: None: `DetailSettings()`. `changes` are settings by name: views, lowpass, seed.
-        progress: called with the current step and its completed share, 0 to 1.
+        progress: called with the current step and its completed fraction, 0 to 1.
 
     Raises:
         InputError: the store is instanced or has no splats or levels of detail, or an option is invalid.

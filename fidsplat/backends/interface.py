@@ -238,8 +238,8 @@ class Pipeline(ABC):
         self, resident: Any, view: View, step: int, progress: Callable[[float], object] | None = None
     ) -> Images:
         """Render every step-th pixel in both directions, from the first: (ceil(h / step), ceil(w / step))
-        images, bit-identical to those pixels of a complete frame. progress: called with the completed share,
-        0 to 1."""
+        images, bit-identical to those pixels of a complete frame. progress: called with the completed
+        fraction, 0 to 1."""
         raise NotImplementedError
 
     def fits(self, resident: Any, view: View) -> bool:

@@ -51,22 +51,22 @@ class Capture:
         return report(self.json, facts, *_words(captured, facts, self.out, self.settings.lens))
 
 
-def _facts(made: Captured) -> dict[str, Any]:
-    adjusted = made.adjustment
+def _facts(captured: Captured) -> dict[str, Any]:
+    adjusted = captured.adjustment
     facts: dict[str, Any] = {
-        "scene": str(made.scene),
-        "photographs": made.photographs,
-        "registered": len(made.model.names),
-        "missing": dict(made.missing),
-        "points": len(made.model.points),
-        "reprojection_px": made.model.reprojection,
-        "metric": made.metric,
-        "readout_px": made.readout,
+        "scene": str(captured.scene),
+        "photographs": captured.photographs,
+        "registered": len(captured.model.names),
+        "missing": dict(captured.missing),
+        "points": len(captured.model.points),
+        "reprojection_px": captured.model.reprojection,
+        "metric": captured.metric,
+        "readout_px": captured.readout,
     }
     if adjusted is None:
         return facts
     tags = {}
-    for spec, pose in zip(adjusted.poses, made.tags, strict=True):
+    for spec, pose in zip(adjusted.poses, captured.tags, strict=True):
         views = sum(view.tag == spec for view in adjusted.used)
         scale = adjusted.scales.get(spec)
         tags[spec] = {
@@ -83,13 +83,13 @@ def _facts(made: Captured) -> dict[str, Any]:
     }
 
 
-def _words(made: Captured, facts: dict[str, Any], out: str, lens: str) -> list[str]:
+def _words(captured: Captured, facts: dict[str, Any], out: str, lens: str) -> list[str]:
     lines = [
         f"{facts['registered']} of {facts['photographs']} photographs, {facts['points']:,} points, "
         f"reprojection error {facts['reprojection_px']:.2f} px"
     ]
-    lines += [f"no camera for {name}: {reason}" for name, reason in made.missing]
-    if made.adjustment is not None:
+    lines += [f"no camera for {name}: {reason}" for name, reason in captured.missing]
+    if captured.adjustment is not None:
         lines.append(
             f"scale {facts['metres_per_unit']:.6g} m per unit with a standard error of "
             f"{100 * facts['scale_standard_error']:.2g} %; corners of tags {facts['corner_rms_px']:.2f} px"
@@ -102,19 +102,19 @@ def _words(made: Captured, facts: dict[str, Any], out: str, lens: str) -> list[s
             )
             others = f", {tag['rejected']} rejected" if tag["rejected"] else ""
             lines.append(f"{spec}: {tag['views']} photographs{others}{alone}")
-    elif not made.metric:
+    elif not captured.metric:
         lines.append("lengths are not in metres; give --tag SPEC=METRES, or --scale A,B=METRES")
-    if made.readout:
+    if captured.readout:
         lines.append(
             f"rows are displaced by motion during the readout (rolling shutter), or the lens is not {lens}: "
-            f"{made.readout:.2f} px remain in the errors, and lengths may be wrong by some percent; take "
+            f"{captured.readout:.2f} px remain in the errors, and lengths may be wrong by some percent; take "
             "photographs with the camera held still, or give --lens"
         )
-    lines += [f"{spec} was not detected" for spec in made.undetected]
+    lines += [f"{spec} was not detected" for spec in captured.undetected]
     splats = Path(out) / "splats.ply"
     again = " again if tags, --up or --scale changed" if splats.exists() else ""
     lines.append(
         f"train it{again}: fidsplat train {out} -o {splats}{' --overwrite' if again else ''}; then view it: "
-        f"fidsplat view {made.scene}"
+        f"fidsplat view {captured.scene}"
     )
     return lines

@@ -88,7 +88,7 @@ class Demo:
             rows = (_row(s, result) for s in result.sightings)
             print_table(where, f"fidsplat demo on {result.device}", heads, rows)
             where.print(
-                "visible: share of the marker in view. Errors: position in mm and in % of the distance, "
+                "visible: fraction of the marker in view. Errors: position in mm and in % of the distance, "
                 "angle "
                 "in degrees. ms: time of a frame with colour, depth, normals and labels."
             )
@@ -112,9 +112,9 @@ def _row(sighting: "Sighting", result: "DemoResult") -> tuple[str, ...]:
     spec = reading.placed.marker.spec
     errors = ("-", "-", "-")
     if reading.position_error is not None and reading.angle_error is not None:
-        share = 100 * reading.position_error / reading.distance
+        percent = 100 * reading.position_error / reading.distance
         angle = math.degrees(reading.angle_error)
-        errors = (f"{reading.position_error * 1e3:.1f}", f"{share:.2f}", f"{angle:.2f}")
+        errors = (f"{reading.position_error * 1e3:.1f}", f"{percent:.2f}", f"{angle:.2f}")
     return (
         sighting.view,
         spec,

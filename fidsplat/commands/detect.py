@@ -178,11 +178,11 @@ _ERRORS = (("position_error_mm", 2), ("angle_error_deg", 3), ("corner_error_px",
 
 def reading_row(reading: "Reading") -> tuple[str, ...]:
     facts = reading.as_dict()
-    verdict, share = "yes" if facts["found"] else "no", facts["visible"]
-    if share == 0 and not facts["found"]:
+    verdict, fraction = "yes" if facts["found"] else "no", facts["visible"]
+    if fraction == 0 and not facts["found"]:
         verdict = "faces away" if reading.tilt > math.pi / 2 else "not in view"
-    elif share <= 0.995:
-        verdict += f", {100 * share:.0f} % in view"
+    elif fraction <= 0.995:
+        verdict += f", {100 * fraction:.0f} % in view"
     return (facts["marker"], verdict, f"{facts['distance_m']:.3f}", *_errors(facts))
 
 

@@ -92,7 +92,7 @@ class Views(Command, ViewSettings):
 @repeatable
 @dataclass(frozen=True)
 class Counts(Command, MeasureSettings):
-    """Count components, rectangles and Gaussians of each marker, and time its making (table 2, figure).
+    """Count components, rectangles and Gaussians of each marker, and time its making (table 2 and a chart).
 
     Compares single modules, runs of rows and the minimum partition, for every mixture. The time from text to
     splats is measured in a process that has made the marker before; keep the machine idle.

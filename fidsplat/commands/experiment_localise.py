@@ -73,8 +73,8 @@ class Localise:
         has_log = log_is_complete(self.log, self.overwrite, source)
         done = 0
 
-        def step(name: str, share: float) -> None:
-            progress(name, (done + share) / len(names))
+        def step(name: str, fraction: float) -> None:
+            progress(name, (done + fraction) / len(names))
 
         folder = Path(self.out)
         sweep = drive_sweep(folder, drive, names, renderer, step, self.overwrite)

@@ -223,20 +223,20 @@ class Marker:
         lines = []
         if placing:
             facts["placed"], block = self.placing.placed(marker, self.device)
-            share, roughness = 100 * facts["placed"]["inlier_share"], 1e3 * facts["placed"]["roughness_m"]
-            rows.append(("surface", f"{share:.0f} % of the patch in one plane, {roughness:.2g} mm RMS"))
+            percent, roughness = 100 * facts["placed"]["inlier_share"], 1e3 * facts["placed"]["roughness_m"]
+            rows.append(("surface", f"{percent:.0f} % of the patch in one plane, {roughness:.2g} mm RMS"))
             appended = f"appended to {self.placing.scene}"
             lines = [appended if self.placing.append else f"\n{block.rstrip()}"]
         return report(self.json, facts, *lines, table=(marker.spec, ("", ""), rows))
 
-    def _refine(self, made: fs.Marker, progress: Callable[[str, float], None]) -> fs.Marker:
+    def _refine(self, marker: fs.Marker, progress: Callable[[str, float], None]) -> fs.Marker:
         """The marker with Gaussians that are optimised on a device."""
         import fidsplat as fs
         from fidsplat.train.refining import ITERATIONS, refine
 
         iterations = ITERATIONS if self.iterations is None else self.iterations
         return refine(
-            made,
+            marker,
             fs.Renderer(self.device),
             iterations,
             progress=lambda step: progress(f"refined, {step.psnr:.1f} dB", step.iteration / iterations),

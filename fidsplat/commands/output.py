@@ -98,7 +98,7 @@ def steps_shown(where: Console, first: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def delayed_progress(after: float = 1.0) -> Iterator[Callable[[str, float], None]]:
-    """Progress callback (description, completed share) whose bar appears on stderr after some seconds.
+    """Progress callback (description, completed fraction) whose bar appears on stderr after some seconds.
 
     A timer thread shows the bar, so that it also appears during long work between two calls.
     """
@@ -108,9 +108,9 @@ def delayed_progress(after: float = 1.0) -> Iterator[Callable[[str, float], None
     timer.daemon = True
     timer.start()
 
-    def progress(description: str, share: float) -> None:
+    def progress(description: str, fraction: float) -> None:
         interrupts.check()
-        bar.update(task, description=description, completed=share)
+        bar.update(task, description=description, completed=fraction)
 
     try:
         yield progress

@@ -89,10 +89,10 @@ def drive_sweep(
     return Sweep("drive", results, [{"variant": name} for name in names], begin)
 
 
-def _estimate(file: Path, drive: Drive, variant: Variant, truth: Run, log: Path) -> dict[str, Any]:
+def _estimate(file: Path, drive: Drive, variant: Variant, poses: Run, log: Path) -> dict[str, Any]:
     """Estimate a variant's trajectory from a log and write it; returns its errors."""
     camera = replace(drive.camera, lens=variant.lens)
-    run, detections, scans = recorded(log, truth)
+    run, detections, scans = recorded(log, poses)
     if variant.ideal:
         detections = drive.ideal_corners(run, detections)
     path, facts = drive.localise(
@@ -114,7 +114,7 @@ def found_of(results: Results) -> dict[str, dict[str, Any]]:
     return {record.key["variant"]: record.result for record in results.done.values()}
 
 
-def table_of(found: VariantResults) -> Frame:
+def table_of(variants: VariantResults) -> Frame:
     """Table with a row per variant: errors in centimetres, degrees and pixels, and numbers of tags."""
     no_corners = [{"median_px": None}] * len(_SPANS)
     return pd.DataFrame(
@@ -132,31 +132,31 @@ def table_of(found: VariantResults) -> Frame:
             f"[px] {span}": fixed(corners["median_px"], 3)
             for span, corners in zip(_SPANS, facts.get("corners", no_corners), strict=True)
         }
-        for name, facts in found.items()
+        for name, facts in variants.items()
     )
 
 
-def write_report(folder: Path, drive: Drive, device: str, found: VariantResults) -> Path:
-    _write_chart(folder, found)
+def write_report(folder: Path, drive: Drive, device: str, variants: VariantResults) -> Path:
+    _write_chart(folder, variants)
     context = {
-        "length": next(iter(found.values()))["length_m"],
+        "length": next(iter(variants.values()))["length_m"],
         "rows": drive.rows,
         "rate": RATE,
         "device": device,
-        "table": table_of(found),
+        "table": table_of(variants),
         "chart": CHART,
     }
     write_page(folder / REPORT, folder, "localise.md.j2", context)
     return folder / REPORT
 
 
-def _write_chart(folder: Path, found: VariantResults) -> None:
+def _write_chart(folder: Path, variants: VariantResults) -> None:
     """Write a chart of true and estimated trajectories, and of the errors of all variants."""
-    errors = {name: 100 * facts["ate_m"] for name, facts in found.items()}
+    errors = {name: 100 * facts["ate_m"] for name, facts in variants.items()}
     shown = [name for name in _PLOTTED if name in errors]
     with chart(folder / CHART, panels=2, size=(11.0, 4.6), one_scale=False) as (figure, axes):
         # show the drive at the default speed, else at the speed of the first measured variant
-        speeds = [VARIANTS[name].speed for name in found]
+        speeds = [VARIANTS[name].speed for name in variants]
         for number, name in enumerate([_truth(None if None in speeds else speeds[0]), *shown]):
             path = load_trajectory(folder / _tum(name)).poses[::10, :2, 3]  # every 0.2 s
             width, colour = (3.0, "#bbbbbb") if number == 0 else (1.0, COLOURS[number % len(COLOURS)])

@@ -151,7 +151,7 @@ def plan_tags(
 
     Args:
         path: camera-to-world poses.
-        progress: called with the current step and its completed share.
+        progress: called with the current step and its completed fraction.
 
     Raises:
         InputError: the scene has no camera, no flat surface is in view of the trajectory, or the family has
@@ -317,12 +317,14 @@ def surface_candidates(
     return candidates
 
 
-def suppress_nearby(found: Sequence[tuple[Surface, np.ndarray]], tag: Marker) -> np.ndarray:
+def suppress_nearby(candidates: Sequence[tuple[Surface, np.ndarray]], tag: Marker) -> np.ndarray:
     """Poses (n, 4, 4) of candidates; of nearby ones only that with the largest inlier share remains."""
-    order = sorted(range(len(found)), key=lambda k: (-found[k][0].inlier_share, found[k][0].roughness))
+    order = sorted(
+        range(len(candidates)), key=lambda k: (-candidates[k][0].inlier_share, candidates[k][0].roughness)
+    )
     chosen: list[np.ndarray] = []
     for k in order:
-        pose = found[k][1]
+        pose = candidates[k][1]
         near = [one for one in chosen if np.linalg.norm(one[:3, 3] - pose[:3, 3]) < tag.size]
         if not any(one[:3, 2] @ pose[:3, 2] > 0.8 for one in near):
             chosen.append(pose)

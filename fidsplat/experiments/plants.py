@@ -121,8 +121,8 @@ def write_plants(
     for done, (kind, number) in enumerate(settings.names):
         file = folder / f"{kind}-{number}.ply"
 
-        def report(step: str, share: float, name: str = file.stem, done: int = done) -> None:
-            progress(f"{name}: {step}", (done + share) / len(settings.names))
+        def report(step: str, fraction: float, name: str = file.stem, done: int = done) -> None:
+            progress(f"{name}: {step}", (done + fraction) / len(settings.names))
 
         report("mesh", 0.0)
         score = None

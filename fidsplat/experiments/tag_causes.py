@@ -276,9 +276,9 @@ def _noise(view: View, electrons: float) -> View:
     return view.exposed(full_well=electrons)
 
 
-def _underexposed(view: View, share: float, gain: float = 1.0) -> View:
+def _underexposed(view: View, fraction: float, gain: float = 1.0) -> View:
     """Reduce the exposure to a fraction of the light, with shot noise and read noise."""
-    return view.exposed(exposure=share, full_well=10_000.0, read_noise=5.0, gain=gain)
+    return view.exposed(exposure=fraction, full_well=10_000.0, read_noise=5.0, gain=gain)
 
 
 def _overexposed(view: View, factor: float) -> View:
@@ -292,11 +292,11 @@ def _fog(view: View, transmittance: float) -> View:
     return view.changed(fog=Fog(-math.log(transmittance) / distance))
 
 
-def _covered(view: View, share: float) -> View:
+def _covered(view: View, fraction: float) -> View:
     """Cover a fraction of the code by a dark leaf, from a random side."""
     size, rng = view.placed.marker.size, view.rng
     angle = math.pi / 2 * int(rng.integers(4)) + rng.uniform(-0.2, 0.2)
-    middle = size * (0.5 - share + 1.0)  # the leaf is two edges wide and ends at the share
+    middle = size * (0.5 - fraction + 1.0)  # the leaf is two edges wide and ends at the fraction
     position = (middle * math.cos(angle), middle * math.sin(angle), -0.02 * size)
     quaternion = [math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)]
     leaf = SplatCloud([position], [quaternion], [(size, 0.8 * size)], [1.0], colors=[_COVER])
@@ -324,10 +324,10 @@ def _direction(placed: PlacedMarker, vector: tuple[float, float, float]) -> tupl
     return x, y, z
 
 
-def _backlight(view: View, share: float) -> View:
+def _backlight(view: View, fraction: float) -> View:
     """Reduce the light of the marker to a fraction of that of its surroundings, for which the camera is
     exposed."""
-    return replace(view, placed=_changed(view.placed, Lighting(exposure=share)))
+    return replace(view, placed=_changed(view.placed, Lighting(exposure=fraction)))
 
 
 def _shadow(view: View, ratio: float) -> View:
@@ -377,14 +377,14 @@ def _glare(view: View, ratio: float) -> View:
     return replace(view, placed=placed, lights=(sky, light))
 
 
-def _dusk(view: View, share: float) -> View:
+def _dusk(view: View, fraction: float) -> View:
     """Reduce the light to a fraction, and compensate it by gain."""
-    return _underexposed(view, share, 1 / share)
+    return _underexposed(view, fraction, 1 / fraction)
 
 
-def _flare(view: View, share: float) -> View:
+def _flare(view: View, fraction: float) -> View:
     """Add veiling glare from a window outside of the image, as a fraction of the light."""
-    return view.exposed(veiling_glare=share, glare_light=(0.6,) * 3)
+    return view.exposed(veiling_glare=fraction, glare_light=(0.6,) * 3)
 
 
 def _cylinder(view: View, degrees: float) -> View:
@@ -401,10 +401,10 @@ def _crumpled(view: View, height: float) -> View:
     return replace(view, placed=_changed(view.placed, shape=sheet))
 
 
-def _box_edge(view: View, share: float) -> View:
+def _box_edge(view: View, fraction: float) -> View:
     """Bend a fraction of the code around the edge of a box."""
     size, axis = view.placed.marker.size, "xy"[view.seed % 2]
-    edge = BoxEdge(0.03 * size, (0.5 - share) * size, axis=axis)
+    edge = BoxEdge(0.03 * size, (0.5 - fraction) * size, axis=axis)
     return replace(view, placed=_changed(view.placed, shape=edge))
 
 

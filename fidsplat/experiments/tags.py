@@ -218,7 +218,7 @@ def tag_sweep(options: TagSettings) -> Iterator[Sweep]:
         scene_of(scene)  # reports download errors before a device is opened
     renderer = Renderer(options.device)
     results = results_of(NAME, options, device_name(renderer))
-    begin = partial(begin_point, renderer=renderer, seed=options.seed, own=options.detector)
+    begin = partial(begin_point, renderer=renderer, seed=options.seed, names=options.detector)
     with thread_pool(options.workers) as pool:
         yield Sweep(NAME, results, points, begin, options.workers, pool, overlap=True)
 
@@ -230,13 +230,13 @@ def views_of(key: Key, seed: int) -> list[View]:
     return views if cause == NONE else [CAUSES[cause].apply(view, key["severity"]) for view in views]
 
 
-def begin_point(key: Key, renderer: Renderer, seed: int, own: Sequence[str] = ()) -> Work:
+def begin_point(key: Key, renderer: Renderer, seed: int, names: Sequence[str] = ()) -> Work:
     """Render the views of a point; returns the function that detects their markers."""
     shots = []
     for view in views_of(key, seed):
         frame = renderer.render(view.complete_scene, view.complete_capture)
         shots.append((view, grey_of(defocused(frame.to_uint8(), view.defocus))))
-    return partial(_detect, key, shots, detectors_of(key["family"], own))
+    return partial(_detect, key, shots, detectors_of(key["family"], names))
 
 
 def _detect(

@@ -128,7 +128,7 @@ def format_of(path: str | os.PathLike[str]) -> Format:
 def load_splats(path: str | os.PathLike[str], progress: Progress | None = None) -> SplatCloud:
     """Read a splat file: .ply, .splat, .spz, .glb, .gltf, .usda, .usdc, .usd, .sog or meta.json.
 
-    progress: callback with the current task and its completed share, 0 to 1; PLY only.
+    progress: callback with the current task and its completed fraction, 0 to 1; PLY only.
 
     Raises InputError for an unknown suffix or a damaged file.
     """

@@ -79,7 +79,7 @@ class TriangleMesh:
             colors = sums / np.maximum(counts, 1)
         return TriangleMesh(points + centre, triangles.astype(np.int32), colors)
 
-    def convex_parts(self, most: int) -> list[TriangleMesh]:
+    def convex_parts(self, max_parts: int) -> list[TriangleMesh]:
         """Approximate convex decomposition (CoACD) into at most this many parts.
 
         Raises:
@@ -90,7 +90,7 @@ class TriangleMesh:
         centre = self.vertices.mean(0)
         mesh = coacd.Mesh(self.vertices - centre, self.faces)
         preprocess = "off" if self.closed else "auto"  # remeshing would take most of the time
-        parts = coacd.run_coacd(mesh, max_convex_hull=most, preprocess_mode=preprocess, seed=0)
+        parts = coacd.run_coacd(mesh, max_convex_hull=max_parts, preprocess_mode=preprocess, seed=0)
         return [TriangleMesh(np.asarray(v) + centre, np.asarray(f, np.int32)) for v, f in parts]
 
 

@@ -36,7 +36,7 @@ def load_ply(path: str | os.PathLike[str], progress: Progress | None = None) -> 
     (`Quality.ellipsoid="ewa_antialiased"`). Integer properties `label` and `plane` become labels and coplanar
     groups. Colours are SH of degree 0 to 3. Invalid splats are dropped with one warning.
 
-    progress: callback with the current task and its completed share, 0 to 1.
+    progress: callback with the current task and its completed fraction, 0 to 1.
 
     Raises InputError for a file that is missing, damaged, not PLY, or without a required property.
     """

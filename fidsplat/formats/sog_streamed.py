@@ -62,19 +62,19 @@ class StreamedSog:
             for span, number in group:
                 yield number, self._part(cloud, span)
 
-    def _part(self, whole: SplatCloud, span: Span) -> SplatCloud:
+    def _part(self, cloud: SplatCloud, span: Span) -> SplatCloud:
         path = self.files[span.file]
-        if whole.dropped:
-            raise InputError(f"{path} must have valid splats, got {sum(whole.dropped.values())} invalid ones")
-        if span.first + span.count > len(whole):
+        if cloud.dropped:
+            raise InputError(f"{path} must have valid splats, got {sum(cloud.dropped.values())} invalid ones")
+        if span.first + span.count > len(cloud):
             raise InputError(
-                f"{self.path}: a range of {path.name} must end by splat {len(whole)}, got "
+                f"{self.path}: a range of {path.name} must end by splat {len(cloud)}, got "
                 f"{span.first + span.count}"
             )
         rows = slice(span.first, span.first + span.count)
-        assert whole.sh is not None
-        shapes = whole.means[rows], whole.quats[rows], all_scales(whole)[rows]
-        return SplatCloud(*shapes, whole.opacities[rows], sh=whole.sh[rows])
+        assert cloud.sh is not None
+        shapes = cloud.means[rows], cloud.quats[rows], all_scales(cloud)[rows]
+        return SplatCloud(*shapes, cloud.opacities[rows], sh=cloud.sh[rows])
 
 
 def read_streamed(path: Path) -> StreamedSog:

@@ -20,15 +20,15 @@ SMOOTH = 0.8
 """standard deviation in pixels of the Gaussian filter before the refinement"""
 
 
-def disparity_of(left: np.ndarray, right: np.ndarray, most: int) -> np.ndarray:
+def disparity_of(left: np.ndarray, right: np.ndarray, max_disparity: int) -> np.ndarray:
     """Disparities (h, w) float32 [px] of a rectified pair of grey images (h, w) uint8; 0: no match.
 
-    most: largest disparity in pixels, a multiple of 16. Matches must be unique, consistent between left and
-    right, and belong to a smooth region.
+    max_disparity: in pixels, a multiple of 16. Matches must be unique, consistent between left and right, and
+    belong to a smooth region.
     """
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
-        numDisparities=most,
+        numDisparities=max_disparity,
         blockSize=BLOCK,
         P1=2 * BLOCK**2,
         P2=16 * BLOCK**2,
@@ -39,15 +39,17 @@ def disparity_of(left: np.ndarray, right: np.ndarray, most: int) -> np.ndarray:
         mode=cv2.STEREO_SGBM_MODE_HH,
     )
     # padding on the left, so that near surfaces at the left edge are matched too
-    padded = [cv2.copyMakeBorder(image, 0, 0, most, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
-    disparity = matcher.compute(*padded)[:, most:].astype(np.float32) / 16
+    padded = [
+        cv2.copyMakeBorder(image, 0, 0, max_disparity, 0, cv2.BORDER_REPLICATE) for image in (left, right)
+    ]
+    disparity = matcher.compute(*padded)[:, max_disparity:].astype(np.float32) / 16
     return _refined(left.astype(np.float32), right.astype(np.float32), np.maximum(disparity, 0))
 
 
-def _refined(left: np.ndarray, right: np.ndarray, found: np.ndarray) -> np.ndarray:
+def _refined(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) -> np.ndarray:
     """Refine disparities by minimising the squared differences of each block."""
     left, right = (cv2.GaussianBlur(image, (0, 0), SMOOTH) for image in (left, right))
-    valid, better = found > 0, found
+    valid, better = disparity > 0, disparity
     columns = np.arange(left.shape[1], dtype=np.float32)
     for _ in range(STEPS):
         warped, gradient = _shifted_rows(right, columns - better)
@@ -56,7 +58,7 @@ def _refined(left: np.ndarray, right: np.ndarray, found: np.ndarray) -> np.ndarr
         below = cv2.boxFilter(gradient**2, -1, (BLOCK, BLOCK))
         above = cv2.boxFilter(gradient**2 * better - gradient * (left - warped), -1, (BLOCK, BLOCK))
         new = above / np.maximum(below, 1e-6)
-        better = np.where(valid & (np.abs(new - found) < 1), new, found).astype(np.float32)
+        better = np.where(valid & (np.abs(new - disparity) < 1), new, disparity).astype(np.float32)
     return better
 
 

@@ -30,16 +30,16 @@ def colour_depth(depth: np.ndarray, span: tuple[float, float] | None = None) -> 
     """
     valid = np.isfinite(depth) & (depth > 0)
     low, high = depth_span([depth]) if span is None else span
-    share = np.clip((high - np.where(valid, depth, high)) / max(high - low, 1e-9), 0, 1)
-    return np.where(valid[:, :, None], _turbo(share), 0).astype(np.uint8)
+    fraction = np.clip((high - np.where(valid, depth, high)) / max(high - low, 1e-9), 0, 1)
+    return np.where(valid[:, :, None], _turbo(fraction), 0).astype(np.uint8)
 
 
 def depth_key(span: tuple[float, float], height: int) -> np.ndarray:
     """Colour bar of `colour_depth` with its range in metres, (height, KEY_WIDTH, 3)."""
     low, high = span
     digits = max(0, 2 - math.floor(math.log10(max(high, 1e-9))))
-    words = [f"{low + share * (high - low):.{min(digits, 6)}f} m" for share in _TICKS]
-    return _colour_bar(height, lambda share: 1 - share, words)
+    words = [f"{low + fraction * (high - low):.{min(digits, 6)}f} m" for fraction in _TICKS]
+    return _colour_bar(height, lambda fraction: 1 - fraction, words)
 
 
 def depth_millimetres(depth: np.ndarray) -> np.ndarray:
@@ -92,7 +92,7 @@ def colour_counts(count: np.ndarray) -> np.ndarray:
 
 def count_key(maximum: int, height: int) -> np.ndarray:
     """Colour bar of `colour_counts` up to a maximum count, (height, KEY_WIDTH, 3)."""
-    return _colour_bar(height, lambda share: share, [f"{round(s * maximum)}" for s in _TICKS])
+    return _colour_bar(height, lambda fraction: fraction, [f"{round(s * maximum)}" for s in _TICKS])
 
 
 def draw_outlines(
@@ -195,17 +195,19 @@ def _colour_bar(height: int, colour: Callable[[np.ndarray], np.ndarray], words: 
     key[top : foot + 1, left:right] = _turbo(colour(np.linspace(1, 0, foot + 1 - top)))[:, None].reshape(
         -1, 1, 3
     )
-    for share, word in zip(_TICKS, words, strict=True):
-        y = round(foot + share * (top - foot))
+    for fraction, word in zip(_TICKS, words, strict=True):
+        y = round(foot + fraction * (top - foot))
         cv2.line(key, (right, y), (right + 5, y), (255, 255, 255), 1)
         write(key, word, (right + 10, y + 5), size=0.45)
     return key
 
 
-def _turbo(share: np.ndarray) -> np.ndarray:
+def _turbo(fraction: np.ndarray) -> np.ndarray:
     """Map values in [0, 1] to the turbo colours, (..., 3) RGB."""
-    levels = np.rint(share * 255).astype(np.uint8)
-    return cv2.applyColorMap(levels.reshape(-1, 1), cv2.COLORMAP_TURBO)[:, 0, ::-1].reshape(*share.shape, 3)
+    levels = np.rint(fraction * 255).astype(np.uint8)
+    return cv2.applyColorMap(levels.reshape(-1, 1), cv2.COLORMAP_TURBO)[:, 0, ::-1].reshape(
+        *fraction.shape, 3
+    )
 
 
 def _colours(values: np.ndarray) -> np.ndarray:

@@ -276,7 +276,7 @@ def marker(
         wear: print defects and wear, such as `fidsplat.markers.Wear(fading=0.4)`, or its text
             "fading=0.4,dirt=0.2,seed=3"; not for facets or drawings with slanted edges.
         max_splats: maximum number of splats; a noisy image may need tens of millions.
-        progress: callback of the current task and its completed share, 0 to 1.
+        progress: callback of the current task and its completed fraction, 0 to 1.
 
     Raises:
         InputError: an invalid argument, or more splats than `max_splats`.
@@ -450,7 +450,7 @@ def _printed(grid: np.ndarray, parsed: Spec, quiet: int, module: float, palette:
     return Printed(grid, boxes, values, angles, regions, module, palette)
 
 
-def _chosen(quality: MarkerQuality, mixture: str | None, given: dict[str, Any]) -> MarkerQuality:
+def _chosen(quality: MarkerQuality, mixture: str | None, changes: dict[str, Any]) -> MarkerQuality:
     """Quality settings with changes; None keeps a setting."""
     instance("quality", quality, MarkerQuality, "an fs.MarkerQuality, e.g. fs.Quality(...).marker")
     name = quality.mixture if mixture is None else text("mixture", mixture)
@@ -461,16 +461,16 @@ def _chosen(quality: MarkerQuality, mixture: str | None, given: dict[str, Any]) 
         )
     if name not in _SETTINGS:
         raise InputError(unknown("mixture", name, _SETTINGS))
-    given = {key: value for key, value in given.items() if value is not None}
-    for key in given:
+    changes = {key: value for key, value in changes.items() if value is not None}
+    for key in changes:
         users = [mixture for mixture, settings in _SETTINGS.items() if key in settings]
         if name not in users:
             raise InputError(
                 f"{key} must be given with mixture {' or '.join(users)}, got {name}; leave it out, or write "
                 f"mixture={users[0]!r}"
             )
-    given.pop("duplicates", None)
-    return replace(quality, mixture=name, **given)
+    changes.pop("duplicates", None)
+    return replace(quality, mixture=name, **changes)
 
 
 def _mixture(quality: MarkerQuality, duplicates: bool) -> tuple[tuple[Template, ...], float]:

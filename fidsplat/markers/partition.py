@@ -76,13 +76,13 @@ def chords(grid: np.ndarray, concave: np.ndarray) -> np.ndarray:
     return np.stack([runs.line[both], runs.start[both], runs.stop[both]], 1)
 
 
-def _cover(found: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _cover(cover: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Index of the horizontal chord that covers each vertex, ends included, or -1; int32 of shape `shape`."""
     owner = np.full(shape, -1, np.int32)
-    length = found[:, 2] - found[:, 1] + 1
-    which = np.repeat(np.arange(len(found), dtype=np.int32), length)
+    length = cover[:, 2] - cover[:, 1] + 1
+    which = np.repeat(np.arange(len(cover), dtype=np.int32), length)
     offset = np.arange(len(which)) - np.repeat(np.cumsum(length) - length, length)
-    owner[found[which, 0], found[which, 1] + offset] = which
+    owner[cover[which, 0], cover[which, 1] + offset] = which
     return owner
 
 

@@ -151,12 +151,12 @@ def _bezier(control: np.ndarray) -> np.ndarray:
 
 
 def _arc(
-    start: np.ndarray, end: np.ndarray, rx: float, ry: float, turn: float, large: bool, sweep: bool
+    start: np.ndarray, end: np.ndarray, rx: float, ry: float, rotation: float, large: bool, sweep: bool
 ) -> list[np.ndarray]:
     """Points along an elliptical arc, without its start (SVG 1.1, appendix F.6)."""
     if not (rx and ry) or np.array_equal(start, end):
         return [end]
-    to_axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    to_axes = np.array([[np.cos(rotation), np.sin(rotation)], [-np.sin(rotation), np.cos(rotation)]])
     half = to_axes @ (start - end) / 2
     grown = max(1.0, np.sqrt((half[0] / rx) ** 2 + (half[1] / ry) ** 2))
     radii = np.array([rx, ry]) * grown

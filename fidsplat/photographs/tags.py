@@ -49,10 +49,10 @@ def parse_tags(texts: Sequence[str]) -> dict[str, Marker]:
     return tags
 
 
-def same_tag(tags: Mapping[str, Marker], made: Marker) -> Marker | None:
+def same_tag(tags: Mapping[str, Marker], tag: Marker) -> Marker | None:
     """The tag with the same content as a marker, also if its spec is spelled differently; None without
     one."""
-    return next((each for each in tags.values() if content_of(each) == content_of(made)), None)
+    return next((each for each in tags.values() if content_of(each) == content_of(tag)), None)
 
 
 def detect_tags(

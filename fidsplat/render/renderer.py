@@ -243,7 +243,7 @@ class Renderer:
         Args:
             step: 1 or more.
             scene, capture, outputs, quality: as `render`.
-            progress: called with the completed share, 0 to 1.
+            progress: called with the completed fraction, 0 to 1.
 
         Raises:
             InputError: as `render`; the device renders complete frames only.

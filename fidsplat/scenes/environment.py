@@ -109,9 +109,9 @@ def quality_tables(quality: Quality | str | None) -> tuple[dict[str, Any], dict[
     return {}, tables
 
 
-def _changes(given: Quality | MarkerQuality, plain: Quality | MarkerQuality) -> dict[str, Any]:
-    """Settings of `given` that differ from the settings of `plain`."""
-    pairs = {name: (getattr(given, name), getattr(plain, name)) for name in setting_types(type(given))}
+def _changes(settings: Quality | MarkerQuality, plain: Quality | MarkerQuality) -> dict[str, Any]:
+    """Settings that differ from the settings of `plain`."""
+    pairs = {name: (getattr(settings, name), getattr(plain, name)) for name in setting_types(type(settings))}
     return {name: value for name, (value, before) in pairs.items() if value != before}
 
 

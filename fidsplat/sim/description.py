@@ -213,7 +213,7 @@ class _Frames:
         return compose(self.pose(base, (*visited, name)), relative) if base else relative
 
 
-def _read_robot(root: ElementTree.Element, found: Description, where: ElementPath) -> None:
+def _read_robot(root: ElementTree.Element, description: Description, where: ElementPath) -> None:
     parents: dict[str, tuple[str, np.ndarray]] = {}
     for joint in root.findall("joint"):
         inside = where.child(name_of(joint, where))
@@ -231,7 +231,7 @@ def _read_robot(root: ElementTree.Element, found: Description, where: ElementPat
             pose = compose(step, pose)
         else:
             raise where.error(f"the joints above the link {name!r} must not form a cycle")
-        found.bodies[name] = pose
+        description.bodies[name] = pose
     for gazebo in root.findall("gazebo"):
         link = gazebo.get("reference", "")
         for sensor in gazebo.findall("sensor"):
@@ -239,14 +239,14 @@ def _read_robot(root: ElementTree.Element, found: Description, where: ElementPat
             if link not in links:
                 raise inside.error(unknown("link", link, links))
             camera = camera_sensor(sensor, link, pose_element(sensor, inside), inside)
-            found.add(sensor.get("name", ""), camera, inside)
+            description.add(sensor.get("name", ""), camera, inside)
     for sensor in root.findall("sensor"):
         inside = where.child(name_of(sensor, where))
         if sensor.find("camera/image") is not None:
             link = _link_of(sensor, "parent", inside)
             if link not in links:
                 raise inside.error(unknown("link", link, links))
-            found.add(sensor.get("name", ""), _own_camera(sensor, link, inside), inside)
+            description.add(sensor.get("name", ""), _own_camera(sensor, link, inside), inside)
 
 
 def _link_of(element: ElementTree.Element, tag: str, where: ElementPath) -> str:

@@ -190,7 +190,7 @@ class Store(Summarised):
 
     @cached_property
     def detail_errors(self) -> list[DetailErrors]:
-        """Measured errors of the levels of detail; for an instanced store, of the other store's levels."""
+        """Measured errors of the levels of detail; for an instanced store, those of the store it places."""
         return load_detail_errors(self._folder, self.header.identity)
 
     @property

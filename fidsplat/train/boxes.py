@@ -38,7 +38,7 @@ class MarkerBox:
     """names of the views in which nothing occludes the marker"""
 
 
-def read_boxes(file: Path, given: Any) -> tuple[MarkerBox, ...]:
+def read_boxes(file: Path, entries: Any) -> tuple[MarkerBox, ...]:
     """Parse the field `boxes` of a data set's metadata: a list of {"matrix": 4 x 4, "visible": view names}.
 
     Raises InputError.
@@ -46,14 +46,14 @@ def read_boxes(file: Path, given: Any) -> tuple[MarkerBox, ...]:
     try:
         boxes = tuple(
             MarkerBox(np.array(each["matrix"], float).reshape(4, 4), frozenset(map(str, each["visible"])))
-            for each in given
+            for each in entries
         )
         if not all(np.isfinite(box.matrix).all() and abs(np.linalg.det(box.matrix)) > 0 for box in boxes):
             raise ValueError
     except (ValueError, TypeError, KeyError):
         raise InputError(
             f'boxes of {file} must be a list of {{"matrix": invertible, 4 x 4, "visible": view names}}, got '
-            f"{str(given)[:80]!r}; run the capture again"
+            f"{str(entries)[:80]!r}; run the capture again"
         ) from None
     return boxes
 

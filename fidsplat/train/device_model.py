@@ -57,12 +57,14 @@ class DeviceModel:
             {name: arrays[name] for name in SHAPES}, {}, {}, *(arrays[name] for name in _STATISTICS)
         )
 
-    def densify(self, made: Densification) -> None:
+    def densify(self, densification: Densification) -> None:
         """Clone, split and prune splats; only new values are copied from the host."""
-        self._kernels.gather_rows(made.rows, made.remaining)
-        self._kernels.write({"means": made.means, "log_scales": made.log_scales}, made.first_split)
+        self._kernels.gather_rows(densification.rows, densification.remaining)
+        self._kernels.write(
+            {"means": densification.means, "log_scales": densification.log_scales}, densification.first_split
+        )
         self._kernels.clear(_STATISTICS)
-        self._number = len(made.rows)
+        self._number = len(densification.rows)
 
     def reset_opacities(self) -> None:
         """Limit opacities to `reset_opacity`, and set their moments to 0."""

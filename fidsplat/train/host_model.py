@@ -44,9 +44,9 @@ class HostModel:
         """The splats, read-only; other models omit harmonics and moments."""
         return self._splats
 
-    def densify(self, made: Densification) -> None:
+    def densify(self, densification: Densification) -> None:
         """Clone, split and prune splats."""
-        self._splats = made.apply(self._splats)
+        self._splats = densification.apply(self._splats)
 
     def reset_opacities(self) -> None:
         """Limit opacities to `reset_opacity`, and set their moments to 0."""

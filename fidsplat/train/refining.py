@@ -113,7 +113,7 @@ def refine(
         capture = Capture(camera, outputs=("rgb", "alpha"), quality=QUALITY, background=tuple(grey))
         frame = renderer.render_differentiable(splats.cloud(), capture)
         by_images, psnr, through = sheet.gradients(camera, frame["rgb"], frame["alpha"], grey)
-        splats.step(frame.backward(by_images), iteration, _share(iteration / iterations))
+        splats.step(frame.backward(by_images), iteration, _rate_factor(iteration / iterations))
         if progress is not None:
             progress(RefineStep(iteration, psnr, through))
     return replace(
@@ -124,7 +124,7 @@ def refine(
     )
 
 
-def _share(done: float) -> float:
+def _rate_factor(done: float) -> float:
     """Learning rate schedule: constant for the first half, then a cosine to 3 %."""
     return 1.0 if done < 0.5 else 0.03 + 0.485 * (1 + math.cos(math.pi * (2 * done - 1)))
 
@@ -222,8 +222,8 @@ class _Parameters:
     def _opacities(self) -> np.ndarray:
         return 1 / (1 + np.exp(-self._values["logits"]))
 
-    def step(self, gradients: dict[str, np.ndarray], iteration: int, share: float) -> None:
-        """One step of Adam, then clamp to the limits."""
+    def step(self, gradients: dict[str, np.ndarray], iteration: int, rate_factor: float) -> None:
+        """One step of Adam with scaled learning rates, then clamp to the limits."""
         values, opacities = self._values, self._opacities()
         scales = np.exp(values["log_scales"])
         raw = {
@@ -238,7 +238,8 @@ class _Parameters:
             first += (1 - BETA1) * (gradient - first)
             second += (1 - BETA2) * (gradient.astype(np.float64) ** 2 - second)
             size = np.sqrt(second / (1 - BETA2**iteration)) + 1e-12
-            values[name] -= share * RATES[name] * factors.get(name, 1) * first / (1 - BETA1**iteration) / size
+            rate = rate_factor * RATES[name] * factors.get(name, 1)
+            values[name] -= rate * first / (1 - BETA1**iteration) / size
         np.clip(values["log_scales"], math.log(MIN_SCALE), math.log(MAX_SCALE), out=values["log_scales"])
         np.clip(values["logits"], -4, MAX_LOGIT, out=values["logits"])
         np.clip(values["colors"], 0, 1, out=values["colors"])

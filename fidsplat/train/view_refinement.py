@@ -85,7 +85,7 @@ class ViewRefinement:
         self.cameras[view] = offset_camera(self.cameras[view], motion)
 
     def add_intrinsics(self, view: int, by_intrinsics: np.ndarray) -> None:
-        """Add the gradient `intrinsics` (4,) of the loss of a view to the sums."""
+        """Add a gradient (4,) of the loss of a view by its intrinsics to the sums."""
         self._intrinsics_sums[self._rows[camera_intrinsics(self._initial[view])]] += by_intrinsics
 
     def change_intrinsics(self, iteration: int) -> None:

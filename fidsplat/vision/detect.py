@@ -143,7 +143,7 @@ def _read_tags(
     family: str,
     refinement: int,
     decimate: float,
-    found: list[Detection],
+    detections: list[Detection],
     loose: list[Detection],
 ) -> None:
     """Detect further tags with a method of corner refinement.
@@ -158,16 +158,16 @@ def _read_tags(
         # OpenCV counts from the centre of the first pixel
         rough = quad.reshape(4, 2).astype(np.float64) + 0.5
         tag = Detection(kind, family, int(tag_id), None, rough)
-        if not _known(tag, found):
+        if not _known(tag, detections):
             # a dark line that touches a corner can shift it by a module
             better = align(grey, rough, dictionary_bits(kind, family, int(tag_id)), unsure=range(4))
-            (loose if better is None else found).append(
+            (loose if better is None else detections).append(
                 tag if better is None else replace(tag, corners=better)
             )
 
 
-def _known(tag: Detection, found: Iterable[Detection]) -> bool:
-    return any(_overlapping(tag, old) for old in found)
+def _known(tag: Detection, detections: Iterable[Detection]) -> bool:
+    return any(_overlapping(tag, old) for old in detections)
 
 
 def _overlapping(one: Detection, other: Detection) -> bool:
@@ -207,8 +207,7 @@ def _qr(grey: np.ndarray, code: zxingcpp.Barcode, scale: np.ndarray) -> Detectio
     rough = corners_of(code) * scale
     bits = (np.array(code.to_image(scale=1, add_quiet_zones=False)) == 0).astype(np.uint8)
     # the fourth corner has no finder pattern, and in the smallest codes no alignment pattern: it can be off
-    # by
-    # a module
+    # by a module
     better = align(grey, rough, bits, unsure=(2,))
     version = (bits.shape[0] - 17) // 4
     family = f"v{version}-{code.ec_level}"

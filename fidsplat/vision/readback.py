@@ -127,10 +127,10 @@ def match(
     return codes, left
 
 
-def detect_marker(made: Marker, image: np.ndarray) -> Detection | None:
+def detect_marker(marker: Marker, image: np.ndarray) -> Detection | None:
     """Detect a marker's code in an image, (h, w) or (h, w, 3) display values; None if not found."""
-    detections = detect(to_uint8(image), families_of([made]), qr=made.kind == "qr")
-    return next((code for code in detections if content_of(code) == content_of(made)), None)
+    detections = detect(to_uint8(image), families_of([marker]), qr=marker.kind == "qr")
+    return next((code for code in detections if content_of(code) == content_of(marker)), None)
 
 
 def corner_error(code: Detection, corners: np.ndarray) -> float:

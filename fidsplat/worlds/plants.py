@@ -223,9 +223,9 @@ def _arc(length: float, rise: float, bend: float, points: int = 8) -> np.ndarray
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
-def _placed(points: np.ndarray, at: np.ndarray, turn: float) -> np.ndarray:
+def _placed(points: np.ndarray, at: np.ndarray, rotation: float) -> np.ndarray:
     """Points (..., 3) rotated about z, then translated."""
-    c, s = math.cos(turn), math.sin(turn)
+    c, s = math.cos(rotation), math.sin(rotation)
     return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + at
 
 
@@ -246,7 +246,7 @@ def _tube(line: np.ndarray, radius: float, colour: Sequence[float]) -> Mesh:
 def _blade(
     rng: np.random.Generator,
     foot: np.ndarray,
-    turn: float,
+    rotation: float,
     length: float,
     wide: float,
     colour: np.ndarray,
@@ -266,7 +266,7 @@ def _blade(
     lift = half * (0.25 * np.abs(v) + waves * np.abs(v) ** 2 * np.sin(4 * math.pi * u + 3 * v + phase))
     points = middle + np.stack([0 * lift, half * v, lift], axis=-1)
     light = 1 + 0.18 * np.abs(v) - 0.08 * np.cos(8 * math.pi * (u - 0.3 * np.abs(v)))
-    return _grid(_placed(points, foot, turn), np.clip(colour * light[..., None], 0, 1))
+    return _grid(_placed(points, foot, rotation), np.clip(colour * light[..., None], 0, 1))
 
 
 def _ball(middle: np.ndarray, radii: Sequence[float], colour: np.ndarray) -> Mesh:

@@ -224,14 +224,14 @@ def test_no_kernel_calls_functions_without_error_bounds():
 
 
 # settings that the compile matrix (test_matrix.py) does not combine with everything
-KNOBS = {
+SETTINGS = {
     "double": {"quality": fs.Quality(blend_precision="float64")},
     "half": {"quality": fs.Quality(blend_precision="float16")},
     "precise": {"quality": fs.Quality(arithmetic="precise")},
 }
 
 
-@pytest.mark.parametrize("name", KNOBS)
+@pytest.mark.parametrize("name", SETTINGS)
 @pytest.mark.parametrize("outputs", [("rgb",), ("rgb", *FURTHER)], ids=["rgb", "all"])
 def test_quality_settings_compile_and_run_with_all_outputs_and_none(renderer, name, outputs):
     cloud = random_splats(20, seed=1, depth=(1, 4)).with_coplanar_groups(np.arange(20) // 2 - 1)
@@ -240,7 +240,7 @@ def test_quality_settings_compile_and_run_with_all_outputs_and_none(renderer, na
     if name == "double":
         cloud = cloud.with_boxes(np.arange(20) // 2 % 2 == 0)
     camera = fs.Camera.pinhole(20, 12, 20.0, 20.0, 10.0, 6.0)
-    frame = renderer.render(cloud, camera, outputs=outputs, **KNOBS[name])
+    frame = renderer.render(cloud, camera, outputs=outputs, **SETTINGS[name])
     assert all(np.isfinite(frame[each]).all() for each in frame)
 
 

@@ -25,7 +25,7 @@ ROUNDING = 2.0**-24
 @pytest.fixture
 def opencl(renderer):
     if not renderer.device.name.startswith("opencl"):
-        pytest.skip("Warp refuses this knob (test_a_device_refuses_by_name_what_it_does_not_do)")
+        pytest.skip("Warp refuses this setting (test_a_device_refuses_by_name_what_it_does_not_do)")
     return renderer
 
 

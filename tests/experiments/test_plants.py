@@ -158,7 +158,7 @@ def test_images_become_a_data_set_and_the_trained_splats_a_plant(tmp_path, monke
     expected = PlantSettings(("lettuce",), 1, views=3, test=2, splats=200, iterations=5)
     out = tmp_path / "out"
     splats = list(
-        write_plants(expected, out, tmp_path, "reference", lambda words, share: reported.append(share))
+        write_plants(expected, out, tmp_path, "reference", lambda step, fraction: reported.append(fraction))
     )
     assert splats == [(out / "lettuce-0.ply", 32.0)]
     data = requested["dataset"]
@@ -181,7 +181,7 @@ def test_blender_renders_a_plant(tmp_path):
         pytest.skip("Blender is not here; fidsplat experiment blender --install")
     expected = PlantSettings(("lettuce",), 1, views=2, test=1, samples=4)
     plants._render(
-        expected, expected.mesh("lettuce", 0), tmp_path / "lettuce-0", python, lambda words, share: None
+        expected, expected.mesh("lettuce", 0), tmp_path / "lettuce-0", python, lambda step, fraction: None
     )
     picture = read_rgba(tmp_path / "lettuce-0/images/view-000.png").astype(int)
     assert picture[0, 0, 3] == 0

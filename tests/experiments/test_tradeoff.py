@@ -71,7 +71,7 @@ def test_every_setting_changes_one_option_of_the_base():
 def test_every_quality_setting_is_varied():
     # first_hit decides where depth_first is, and nothing of rgb; detail_error what of a store is rendered,
     # and scenes here are none (docs/large-scenes.md prices it)
-    assert {knob.name for knob in dataclasses.fields(fs.Quality)} - set(SETTINGS) == {
+    assert {setting.name for setting in dataclasses.fields(fs.Quality)} - set(SETTINGS) == {
         "first_hit",
         "detail_error",
     }
@@ -96,8 +96,9 @@ def test_parts_are_all_different_and_the_informative_ones_come_first():
         assert parts[0]["knob"] == "base"
     full = run.all_points((), (), False)
     assert {part["scene"].partition("@")[0] for part in full} == set(NAMES)
-    knobs = [part.get("knob") for part in full]
-    assert knobs.index("blend_precision") > max(i for i, knob in enumerate(knobs) if knob == "alpha_cutoff")
+    settings = [part.get("knob") for part in full]
+    last_cutoff = max(i for i, setting in enumerate(settings) if setting == "alpha_cutoff")
+    assert settings.index("blend_precision") > last_cutoff
     for point in points(SETTINGS, True):
         assert quality_of(json.loads(json.dumps(point.key()))["quality"]) == point.quality
     again = [quality_of(part["quality"]) for part in full if part.get("quality") is not None]

@@ -64,7 +64,7 @@ def toy(folder: Path, text: str = TOY, name: str = "toy") -> dict:
 def run(file: Path, names, renderers, slow: float = 1000.0, **how) -> list[dict]:
     scenes = {name: SCENES[name] for name in names}
     effort = suite.Effort(rounds=3, seconds=0.0, min_rounds=3, burst=0.01, slow=slow)
-    return suite.Suite(file, scenes, renderers, effort, "a test", **how).run(lambda words, share: None)
+    return suite.Suite(file, scenes, renderers, effort, "a test", **how).run(lambda step, fraction: None)
 
 
 def test_results_have_times_and_errors_and_follow_the_schema(tmp_path):

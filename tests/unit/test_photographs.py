@@ -256,14 +256,14 @@ def test_exif_is_kept_with_upright_pixels(order, tmp_path):
     np.testing.assert_array_equal(read_image(tmp_path / "b.jpg").shape, image.shape)
     (tmp_path / "upright copies").mkdir()
     files = [tmp_path / name for name in ("a.jpg", "b.jpg")]
-    copy_photos(files, tmp_path / "upright copies", lambda words, share: None)
+    copy_photos(files, tmp_path / "upright copies", lambda step, fraction: None)
     copied = read_image(tmp_path / "upright copies" / "a.jpg")
     np.testing.assert_allclose(copied, read_image(tmp_path / "a.jpg"), atol=3)
     assert read_exif((tmp_path / "upright copies" / "a.jpg").read_bytes()).orientation == 1
     (tmp_path / "b.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
     (tmp_path / "twice").mkdir()
     with pytest.raises(InputError, match=r"differ before the suffix, got b\.jpg and b\.png"):
-        copy_photos([*files, tmp_path / "b.png"], tmp_path / "twice", lambda words, share: None)
+        copy_photos([*files, tmp_path / "b.png"], tmp_path / "twice", lambda step, fraction: None)
     # portrait and landscape have different cameras
     assert camera_groups(tmp_path / "upright copies") == [["a.jpg"], ["b.jpg"]]
     for damaged in (rotated[:40], jpeg, b"", rotated.replace(b"II", b"XX").replace(b"MM", b"XX")):
@@ -280,7 +280,7 @@ def test_copies_are_upright_for_colmap_too(suffix, orientation, tmp_path):
     source, folder = tmp_path / f"a.{suffix}", tmp_path / "copies"
     images.fromarray(values).save(source, exif=tags)
     folder.mkdir()
-    copy_photos([source], folder, lambda words, share: None)
+    copy_photos([source], folder, lambda step, fraction: None)
     (copy,) = folder.iterdir()
     with images.open(source) as given, images.open(copy) as image:
         upright = importlib.import_module("PIL.ImageOps").exif_transpose(given)

@@ -29,12 +29,19 @@ def cloud_of(n=5, seed=0, **changes):
 
 
 def fake_marker(
-    spec, size=1.0, mixture=None, quiet_zone=None, quality=None, max_splats=1_000_000, progress=None, **own
+    spec,
+    size=1.0,
+    mixture=None,
+    quiet_zone=None,
+    quality=None,
+    max_splats=1_000_000,
+    progress=None,
+    **changes,
 ):
     """A minimal marker without partitioning: two splats and four corners."""
     if "unknown" in spec:
         raise fs.InputError(f"unknown spec {spec!r}")
-    knobs = replace(quality or fs.MarkerQuality(), **own | ({"mixture": mixture} if mixture else {}))
+    settings = replace(quality or fs.MarkerQuality(), **changes | ({"mixture": mixture} if mixture else {}))
     cloud = fs.SplatCloud(
         [[-size, 0, 0], [size, 0, 0]],
         [[1, 0, 0, 0]] * 2,
@@ -47,8 +54,8 @@ def fake_marker(
     return SimpleNamespace(
         spec=spec,
         size=size,
-        mixture=knobs.mixture,
-        quality=knobs,
+        mixture=settings.mixture,
+        quality=settings,
         quiet_zone=quiet_zone,
         max_splats=max_splats,
         inks=None,

@@ -181,7 +181,10 @@ def test_fly_and_view_render_the_same_image_from_a_pose(here):
     from fidsplat.viewer.settings import Viewpoint
 
     start = (
-        View("yard.ply")._target().scene(None, lambda words, share: None, StartPose(look_at=(0, 0, 1))).camera
+        View("yard.ply")
+        ._target()
+        .scene(None, lambda step, fraction: None, StartPose(look_at=(0, 0, 1)))
+        .camera
     )
     pose = np.linalg.inv(start.world_to_camera)
     w, x, y, z = quaternion = matrix_to_quaternion(pose[:3, :3])

@@ -31,7 +31,7 @@ def whole(dataset, tmp_path_factory):
     """A run from its beginning to its end: the trainer, its steps, the PSNR at first, its file."""
     trainer = Trainer(dataset, fs.Renderer("reference"), iterations=ITERATIONS, **QUICK)
     shares = []
-    at_first = trainer.evaluate(dataset.views, lambda words, share: shares.append(share))
+    at_first = trainer.evaluate(dataset.views, lambda step, fraction: shares.append(fraction))
     assert shares == [(k + 1) / len(dataset.views) for k in range(len(dataset.views))]
     steps = []
     trainer.run(steps.append)

@@ -40,7 +40,7 @@ def test_a_flight_is_its_scene_and_its_poses(flight, monkeypatch):
 
 
 def test_without_a_scene_the_demo_is_shown():
-    scene = View()._target().scene("fast", lambda words, share: None)
+    scene = View()._target().scene("fast", lambda step, fraction: None)
     assert [placed.marker.kind for placed in scene.markers] == ["apriltag", "aruco", "qr"]
     assert scene.capture.quality == fs.Quality.named("fast")
 
@@ -48,7 +48,7 @@ def test_without_a_scene_the_demo_is_shown():
 def test_a_splat_file_is_shown_by_the_quality_that_is_given(tmp_path):
     file = tmp_path / "a.ply"
     fs.save_ply(fs.marker("aruco:4x4_50:7", size=0.4).gaussians, file)
-    scene = View(str(file))._target().scene("samples=2", lambda words, share: None)
+    scene = View(str(file))._target().scene("samples=2", lambda step, fraction: None)
     assert scene.capture.quality.samples == 2
 
 

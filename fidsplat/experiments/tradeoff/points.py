@@ -117,12 +117,12 @@ def quality_of(changes: dict) -> Quality:
     return BASE.with_(**changes | {"marker": marker})
 
 
-def _changes(values: dict, others: dict) -> dict:
+def _changes(values: dict, defaults: dict) -> dict:
     """Values that differ, also in nested dicts."""
     return {
-        name: _changes(value, others[name]) if isinstance(value, dict) else value
+        name: _changes(value, defaults[name]) if isinstance(value, dict) else value
         for name, value in values.items()
-        if value != others[name]
+        if value != defaults[name]
     }
 
 

@@ -55,16 +55,16 @@ class TradeoffSettings:
 
 @contextmanager
 def prepared(
-    options: TradeoffSettings, out: Path, device: str, own: scenes.Views | None = None
+    options: TradeoffSettings, out: Path, device: str, user_views: scenes.Views | None = None
 ) -> Iterator[Sweep]:
     """Sweep with its renderer and results. A view that the device cannot render has a result with `error`.
 
     Raises InputError for invalid options, DeviceError if the device cannot be opened.
     """
-    own, quick = own or {}, options.quick
+    user_views, quick = user_views or {}, options.quick
     keys = (
-        user_points(own, options.settings or (), quick)
-        if own
+        user_points(user_views, options.settings or (), quick)
+        if user_views
         else all_points(options.scenes or (), options.settings or (), quick)
     )
     renderer = Renderer(device)
@@ -73,9 +73,11 @@ def prepared(
         raise InputError(f"--device must not be the reference itself, got {info.name}; give another --device")
     versions = reader_versions() | {"pyopencl": version("pyopencl")}
     facts = run_facts(device_name(renderer), scenes.SEED, versions)
-    facts |= {"kind": info.kind, "title": info.title} | ({"scene": scenes.digests(own)} if own else {})
+    facts |= {"kind": info.kind, "title": info.title} | (
+        {"scene": scenes.digests(user_views)} if user_views else {}
+    )
     results = Results(out / FILE, facts, options.overwrite)
-    session = Session(renderer, own)
+    session = Session(renderer, user_views)
     with thread_pool(options.workers) as pool:
         yield Sweep(
             f"{NAME} on {device}",
@@ -156,8 +158,8 @@ def _view_points(view: str, varied: Iterable[Point], quick: bool) -> list[tuple[
     ]
 
 
-def _by_priority(found: list[tuple[int, Key]]) -> list[Key]:
-    return [key for _, key in sorted(found, key=lambda pair: pair[0])]
+def _by_priority(results: list[tuple[int, Key]]) -> list[Key]:
+    return [key for _, key in sorted(results, key=lambda pair: pair[0])]
 
 
 def _begin(session: Session, key: Key, quick: bool) -> Work:

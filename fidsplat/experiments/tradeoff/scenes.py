@@ -105,8 +105,8 @@ def user_views(views: Mapping[str, BenchScene]) -> dict[str, TradeScene]:
     return {name: TradeScene(name, *view.make()) for name, view in views.items()}
 
 
-def digests(own: Views) -> dict[str, str]:
+def digests(views: Views) -> dict[str, str]:
     """Digests of splats and camera of each view, by name, which identify its results."""
-    clouds = {id(scene.cloud): scene.cloud for scene in own.values()}
+    clouds = {id(scene.cloud): scene.cloud for scene in views.values()}
     splats = {number: digest_of(cloud) for number, cloud in clouds.items()}
-    return {name: digest_of((splats[id(scene.cloud)], scene.camera)) for name, scene in own.items()}
+    return {name: digest_of((splats[id(scene.cloud)], scene.camera)) for name, scene in views.items()}

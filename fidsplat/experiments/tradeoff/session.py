@@ -37,21 +37,21 @@ class Session:
     Reference images are rendered by the renderer, or by OpenCL on the CPU if the renderer lacks float64.
     """
 
-    def __init__(self, renderer: Renderer, own: Views | None = None) -> None:
-        """own: views of the user's files, for which marker qualities have no effect."""
+    def __init__(self, renderer: Renderer, user_views: Views | None = None) -> None:
+        """user_views: views of the user's files, for which marker qualities have no effect."""
         self.renderer, self._precise = renderer, reference_renderer(renderer, Capture())
-        self._own, self._uploaded = own or {}, {}
+        self._user_views, self._uploaded = user_views or {}, {}
         self._make = lru_cache(_SCENES)(make_view)
         self.resident = lru_cache(_SCENES)(self._resident)
         """(view, marker quality) -> splats on the device"""
         self._reference = lru_cache(_REFERENCES)(self._render_reference)
 
     def scene(self, view: str, marker: MarkerQuality) -> TradeScene:
-        return self._own[view] if view in self._own else self._make(view, marker)
+        return self._user_views[view] if view in self._user_views else self._make(view, marker)
 
     def _resident(self, view: str, marker: MarkerQuality) -> ResidentCloud:
         cloud = self.scene(view, marker).cloud
-        if view not in self._own:
+        if view not in self._user_views:
             return self.renderer.upload(cloud)
         if id(cloud) not in self._uploaded:  # views of one file share their splats
             self._uploaded[id(cloud)] = self.renderer.upload(cloud)
@@ -78,7 +78,7 @@ class Session:
         trained splats depend on the projection of their trainer.
         """
         defined = {name: getattr(quality, name) for name in DEFINITION}
-        ellipsoid = quality.ellipsoid if view in self._own else "exact"
+        ellipsoid = quality.ellipsoid if view in self._user_views else "exact"
         return BASE.with_(**defined, ellipsoid=ellipsoid, marker=quality.marker)
 
 
