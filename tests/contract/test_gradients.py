@@ -103,13 +103,13 @@ def test_derivatives_of_3d_gaussians_are_the_references(backend, projection, sol
             assert array.tobytes() == again[name].tobytes(), name
     (shape,) = backend.configs("schedule").values()
     if projection == "exact":
-        assert_same(backend, *scenes[2], shape=shape)
+        assert_same(backend, *scenes[2], config=shape)
 
 
 def test_the_schedule_of_gpus_has_the_references_derivatives(backend):
     for shape in backend.configs("schedule").values():
-        assert_same(backend, *random_scene(2), shape=shape)
-        assert_same(backend, *long_lists(), shape=shape)
+        assert_same(backend, *random_scene(2), config=shape)
+        assert_same(backend, *long_lists(), config=shape)
 
 
 def test_distortions_and_their_derivatives_are_the_references(backend):
@@ -175,7 +175,7 @@ def long_lists():
 def test_long_lists_are_taken_back_in_chunks(backend):
     gradients = assert_same(backend, *long_lists())
     for shape in backend.configs("tape").values():
-        again = assert_same(backend, *long_lists(), shape=shape)
+        again = assert_same(backend, *long_lists(), config=shape)
         assert all(np.array_equal(again[name], gradients[name]) for name in gradients)
 
 

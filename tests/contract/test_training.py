@@ -76,7 +76,7 @@ def test_depths_and_normals_without_distortions_have_the_references_derivatives(
     expected = derivatives(ReferenceBackend(), cloud, capture, distorted=False)
     backend = renderer.backend
     for shape in (None, *backend.configs("schedule").values()):
-        actual = derivatives(backend, cloud, capture, distorted=False, shape=shape)
+        actual = derivatives(backend, cloud, capture, distorted=False, config=shape)
         off = list(differences(actual, expected))
         assert all(one.norm < NORM and one.turned < COSINE for one in off), (shape, off)
 
