@@ -135,6 +135,8 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
             # parity with gsplat and the 2DGS authors: the fragment that would terminate the pixel is dropped
             if p.t * (1.0 - opacity) <= view.stop:
                 p.finished = 1
+                if wp.static(not branchless):
+                    return p
                 weight = 0.0
         p.r = fma(weight, attributes.rgb[0], p.r)
         p.g = fma(weight, attributes.rgb[1], p.g)
