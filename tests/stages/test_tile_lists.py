@@ -124,7 +124,7 @@ def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
 def test_splats_culled_before_projection(backend, monkeypatch):
     """Large clouds have records only for splats that may be visible, in Morton order; splats of equal depth
     are blended in the order of their indices. Views of few, of none, of more than the buffers hold, which
-    are rendered again when they are read, and of few again."""
+    are rendered again when they are read, of few again, and of few after a frame in the cloud's order."""
     cloud, outputs = random_splats(9000, seed=5, scale=(1e-3, 0.05), across=1.5), ("rgb", "splat_id")
     means = cloud.means.copy()
     means[:, 2] = np.round(8 * means[:, 2]) / 8
@@ -146,9 +146,13 @@ def test_splats_culled_before_projection(backend, monkeypatch):
         rendered[-1] += [pipeline.render_view(resident, view) for view in (*views, *views)]
         for images in rendered[-1]:
             images.read("rgb")
+    assert resident.sortable
     culled = 32 * own.pool.size("unculled") // 4
     assert 4096 < culled < 9000
     assert own.pool.size("splats") == culled * pipeline.source.records["Splat"].itemsize
+    resident.part("means", 0, resident.count)
+    assert not resident.sortable
+    rendered = [rendered[0] + rendered[0][:1], [*rendered[1], pipeline.render_view(resident, views[0])]]
     for images, expected in zip(*rendered, strict=True):
         assert images.stats == expected.stats
         for name in outputs:
