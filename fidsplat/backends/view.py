@@ -59,7 +59,7 @@ class View:
     stop: float
     background: tuple[float, float, float]
     """background colour; with fog, the fog's colour"""
-    first_light: float
+    first_hit_transmittance: float
     """transmittance at which the first hit (`depth_first`) is taken"""
     sensor: Sensor = _NO_SENSOR
     fog_density: float = 0.0
@@ -72,7 +72,7 @@ class View:
     """rays of the samples for a camera with a lens; None for a pinhole and for parallel rays"""
     along_ray: bool = False
     """whether depths (and near, far, sort keys) are distances from the camera; else z"""
-    slopes: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    ewa_clamp: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """limits of -x, x, -y, y at z = 1, to which EWA clamps the centre of a splat before it linearises the
     projection"""
     parallel: bool = False
@@ -133,7 +133,7 @@ class View:
             case "vignette_center":
                 half_diagonal = math.hypot(self.width, self.height) / 2 / self.samples
                 return self.center_x / self.samples, self.center_y / self.samples, 1 / half_diagonal
-            case "first_light" | "fog_density":
+            case "first_hit_transmittance" | "fog_density":
                 return (getattr(self, name),)
             case _:
                 return self.sensor.uniforms_of(name)
@@ -202,13 +202,13 @@ class View:
             ceiling=float(np.float32(quality.opacity_ceiling)),
             stop=float(np.float32(quality.transmittance_stop)),
             background=background if plain else (0.0, 0.0, 0.0),
-            first_light=float(np.float32(1 - quality.first_hit)),
+            first_hit_transmittance=float(np.float32(1 - quality.first_hit)),
             sensor=capture.sensor,
             fog_density=0.0 if capture.fog is None else capture.fog.density,
             environment_map=None if plain else background,
             external_depth=external,
             raster=raster,
-            slopes=slopes,
+            ewa_clamp=slopes,
             along_ray=lens is not None and lens.along_ray,
             parallel=parallel,
         )

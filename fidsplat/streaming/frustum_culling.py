@@ -117,7 +117,7 @@ def ewa_extent(view: View, features: FeatureSet, radius: float, max_sigma: np.nd
     """
     if not {"ellipsoid_ewa", "ellipsoid_ewa_antialiased"} & features.names:
         return None
-    slope = 1.0 if view.parallel else math.hypot(1.0, max(map(abs, view.slopes)))
+    slope = 1.0 if view.parallel else math.hypot(1.0, max(map(abs, view.ewa_clamp)))
     return max(view.focal_x, view.focal_y) * slope * radius * max_sigma
 
 

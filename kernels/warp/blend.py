@@ -49,9 +49,9 @@ def make_blend(
     )
     staged = splats.reading(staging.line)
     load, box_of, read = staged.load, staged.box_of, splats.read
-    column_of, cross, cross_ray, cross_slopes = (
+    column_of, cross, intersect_ray, intersect_derivatives = (
         *(intersection.column, intersection.cross),
-        *(intersection.cross_ray, intersection.cross_slopes),
+        *(intersection.intersect_ray, intersection.intersect_derivatives),
     )
     pixels = make_pixel(effects, outputs, k_buffer_size)
     Splat, Rays, Pixel = splats.Splat, pixels.Rays, pixels.Pixel
@@ -64,7 +64,11 @@ def make_blend(
     Intersection, opacity_of = intersection.Intersection, intersection.opacity_of
     asking = bool(output.having(outputs, "fragment"))
     fragments, screen = output.functions(outputs, "fragment"), "lowpass_screen" in effects
-    bent, curved, layered = "rays" in effects, cross_slopes is not None, "compose_coplanar" in effects
+    bent, curved, layered = (
+        "rays" in effects,
+        intersect_derivatives is not None,
+        "compose_coplanar" in effects,
+    )
 
     @wp.func
     def store(p: Pixel, at: int, samples: Samples):
@@ -110,9 +114,9 @@ def make_blend(
     @wp.func
     def intersect(s: Splat, column: wp.vec3, ray: wp.vec3, slopes: SLOPES, x: float, y: float, view: View):
         if wp.static(curved):
-            return cross_slopes(s, ray, slopes, x, y, view)
+            return intersect_derivatives(s, ray, slopes, x, y, view)
         elif wp.static(bent):
-            return cross_ray(s, ray, x, y, view)
+            return intersect_ray(s, ray, x, y, view)
         else:
             return cross(s, column[0], column[1], column[2], x, y, view)
 
@@ -178,10 +182,10 @@ def make_blend(
         end = starts[tile + 1]
         if wp.static(layered):
             p.layers.exist = has_groups(starts[tile], end, lists, coplanar_groups, view)
-        open = unfinished(p, view)
+        alive = unfinished(p, view)
         if wp.static(pair):
             q = new_sample(x0, y0 + 1, number, rays, view)
-            open = open or unfinished(q, view)
+            alive = alive or unfinished(q, view)
         ray, slopes = wp.vec3(), SLOPES()
         if wp.static(bent):
             if p.t > 0.0:
@@ -195,7 +199,7 @@ def make_blend(
             k = starts[tile]
             while k < end:
                 length = wp.min(end - k, STAGED)
-                if not stage(records, lines, lists, k, length, open):
+                if not stage(records, lines, lists, k, length, alive):
                     break
                 view = views[reread(number)]
                 word = warp
@@ -212,7 +216,7 @@ def make_blend(
                     word += wp.static(threads // 32)
                 view = views[reread(number)]
                 count = listed(records, length, cell)
-                if not open:
+                if not alive:
                     count = 0
                 for n in range(count):
                     which = place_in(records, cell, n)
@@ -230,15 +234,15 @@ def make_blend(
                         q = blend_splat(
                             q, s, column, ray, slopes, x, y + 1.0, at, lines, lists, coplanar_groups, view
                         )
-                open = unfinished(p, view)
+                alive = unfinished(p, view)
                 if wp.static(pair):
-                    open = open or unfinished(q, view)
+                    alive = alive or unfinished(q, view)
                 k += length
             again = False
             if wp.static(repeats):
                 p = end_pass(p, lines, lists, view)
-                open = unfinished(p, view)
-                again = stage(records, lines, lists, end, 0, open)
+                alive = unfinished(p, view)
+                again = stage(records, lines, lists, end, 0, alive)
         number, tile_column, tile_row = locate_tile(tile, views)
         view = views[reread(number)]
         at = first_sample(number, view) + y0 * view.tiles_x * view.tile_w + x0
@@ -300,9 +304,9 @@ def make_blend(
                         y = float(row) - s.c[0]
                         if wp.static(curved):
                             at = row * view.width + column
-                            c = cross_slopes(s, rays.rays[at], rays.slopes[at], x, y, view)
+                            c = intersect_derivatives(s, rays.rays[at], rays.slopes[at], x, y, view)
                         elif wp.static(bent):
-                            c = cross_ray(s, rays.rays[row * view.width + column], x, y, view)
+                            c = intersect_ray(s, rays.rays[row * view.width + column], x, y, view)
                         else:
                             c = cross(s, u, v, d, x, y, view)
                         if wp.static(asking):

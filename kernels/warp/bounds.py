@@ -32,9 +32,9 @@ class Bounds:
     half_width: float
     inverse_hy2: float  # 0: a box
     tip: float  # height of the rightmost point of the ellipse
-    disc_x: float
-    disc_y: float
-    disc_r: float  # radius of the low-pass disc; below 0: no disc
+    lowpass_x: float
+    lowpass_y: float
+    lowpass_r: float  # radius of the low-pass disc; below 0: no disc
 
 
 @wp.func
@@ -46,7 +46,7 @@ def box_bounds(x0: float, x1: float, y0: float, y1: float):
     b.half_x = 0.5 * (x1 - x0) * (1.0 + PAD_RELATIVE) + PAD
     b.half_y = 0.5 * (y1 - y0) * (1.0 + PAD_RELATIVE) + PAD
     b.half_width = b.half_x
-    b.disc_r = -1.0
+    b.lowpass_r = -1.0
     return b
 
 
@@ -63,7 +63,7 @@ def ellipse_bounds(x: float, y: float, half_x: float, half_y: float, shear: floa
     # padding the height also shifts a sheared chord
     b.half_width = across * (1.0 + PAD_RELATIVE) + PAD_RELATIVE * half_x + PAD * (1.0 + wp.abs(shear))
     b.inverse_hy2 = 1.0 / (b.half_y * b.half_y)
-    b.disc_r = -1.0
+    b.lowpass_r = -1.0
     return b
 
 
@@ -90,9 +90,9 @@ def make_bounds(screen: bool) -> SimpleNamespace:
         low = b.y - b.half_y
         high = b.y + b.half_y
         if wp.static(screen):
-            if b.disc_r >= 0.0:
-                low = wp.min(low, b.disc_y - b.disc_r)
-                high = wp.max(high, b.disc_y + b.disc_r)
+            if b.lowpass_r >= 0.0:
+                low = wp.min(low, b.lowpass_y - b.lowpass_r)
+                high = wp.max(high, b.lowpass_y + b.lowpass_r)
         first = wp.max(to_sample(wp.ceil(low - 0.5), height), 0)
         end = wp.min(to_sample(wp.floor(high - 0.5) + 1.0, height), height)
         return first, end
@@ -115,13 +115,13 @@ def make_bounds(screen: bool) -> SimpleNamespace:
             x1 = b.x + wp.min(fma(b.shear, right, b.half_width * over), b.half_x)
             x0 = b.x + wp.max(fma(b.shear, left, -b.half_width * under), -b.half_x)
         if wp.static(screen):
-            low = wp.max(top - b.disc_y, -b.disc_r)
-            high = wp.min(bottom - b.disc_y, b.disc_r)
+            low = wp.max(top - b.lowpass_y, -b.lowpass_r)
+            high = wp.min(bottom - b.lowpass_y, b.lowpass_r)
             if low <= high:
                 at = wp.clamp(0.0, low, high)
-                half = wp.sqrt(wp.max(b.disc_r * b.disc_r - at * at, 0.0)) + PAD
-                x0 = wp.min(x0, b.disc_x - half)
-                x1 = wp.max(x1, b.disc_x + half)
+                half = wp.sqrt(wp.max(b.lowpass_r * b.lowpass_r - at * at, 0.0)) + PAD
+                x0 = wp.min(x0, b.lowpass_x - half)
+                x1 = wp.max(x1, b.lowpass_x + half)
         first = wp.max(to_sample(wp.ceil(x0 - 0.5), width), 0)
         end = wp.min(to_sample(wp.floor(x1 - 0.5) + 1.0, width), width)
         return first, end
@@ -148,9 +148,9 @@ def make_bounds(screen: bool) -> SimpleNamespace:
         """Rectangle that contains the tiles of `tile_span` in all rows: left, top, columns, rows."""
         low, high = b.x - b.half_x, b.x + b.half_x
         if wp.static(screen):
-            if b.disc_r >= 0.0:
-                low = wp.min(low, b.disc_x - (b.disc_r + PAD))
-                high = wp.max(high, b.disc_x + (b.disc_r + PAD))
+            if b.lowpass_r >= 0.0:
+                low = wp.min(low, b.lowpass_x - (b.lowpass_r + PAD))
+                high = wp.max(high, b.lowpass_x + (b.lowpass_r + PAD))
         left = divide(wp.max(to_sample(wp.ceil(low - 0.5), view.width), 0), view.tile_w)
         end = wp.min(to_sample(wp.floor(high - 0.5) + 1.0, view.width), view.width)
         top, bottom = tile_rows(b, view)

@@ -195,11 +195,11 @@ def make_boxes(real) -> SimpleNamespace:
         """
         away = wp.length(p)
         grown = half * step / wp.abs(wp.dot(wp.cross(tangent_u, tangent_v), p))
-        by_u = grown * (su + wp.length(wp.cross(tangent_v, p)))
-        by_v = grown * (sv + wp.length(wp.cross(p, tangent_u)))
-        if by_u + by_v < real(0.9):
-            furthest = (away + su + sv) / (one - by_u - by_v)
-            return vec2(su + by_u * furthest, sv + by_v * furthest)
+        grad_u = grown * (su + wp.length(wp.cross(tangent_v, p)))
+        grad_v = grown * (sv + wp.length(wp.cross(p, tangent_u)))
+        if grad_u + grad_v < real(0.9):
+            furthest = (away + su + sv) / (one - grad_u - grad_v)
+            return vec2(su + grad_u * furthest, sv + grad_v * furthest)
         everything = real(1e6) * (away + su + sv)
         return vec2(everything, everything)
 

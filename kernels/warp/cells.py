@@ -130,7 +130,7 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
             far_x = wp.max(wp.abs(shift), wp.abs(shift - float(view.tile_w)))
             above = float(top) - s.c[0]
             c = conic_of(s, far_x, wp.max(wp.abs(above), wp.abs(above + float(view.tile_h))))
-        disc_square = s.half_r2 * fast_reciprocal(view.per_pixel) * (1.0 + _PAD_RELATIVE)
+        lowpass_square = s.half_r2 * fast_reciprocal(view.per_pixel) * (1.0 + _PAD_RELATIVE)
         bits = wp.uint32(0)
         for row in range(first_row, end_row):
             y0 = float(top + row * CELL_H) - s.c[0]
@@ -139,11 +139,11 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
             if wp.static(elliptic):
                 low, high = chord(c, y0, y1)
                 if wp.static(screen):
-                    away = wp.clamp(s.disc_y, y0, y1) - s.disc_y
-                    rest = disc_square - away * away
-                    if rest >= 0.0 and s.disc_x < _NO_DISC:
+                    away = wp.clamp(s.lowpass_y, y0, y1) - s.lowpass_y
+                    rest = lowpass_square - away * away
+                    if rest >= 0.0 and s.lowpass_x < _NO_DISC:
                         half = fast_sqrt(rest) + _PAD
-                        low, high = wp.min(low, s.disc_x - half), wp.max(high, s.disc_x + half)
+                        low, high = wp.min(low, s.lowpass_x - half), wp.max(high, s.lowpass_x + half)
             first = wp.max(int(wp.clamp(wp.ceil(low + shift), 0.0, last + 1.0)), box[0] - left)
             end = wp.min(int(wp.clamp(wp.floor(high + shift), -1.0, last)), box[1] - left - 1)
             if first <= end:

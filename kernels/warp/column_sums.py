@@ -41,7 +41,7 @@ def background_parts(
     stride: int,  # samples per row of the padded grid
     threads: int,  # number of threads
     color: wp.array(dtype=wp.vec4),  # samples: r, g, b, transmittance
-    by_rgb: wp.array(dtype=wp.float32),  # (h w 3)
+    grad_rgb: wp.array(dtype=wp.float32),  # (h w 3)
     parts: wp.array(dtype=wp.float64),  # (threads, 3) out: gradients with respect to the background
 ):
     thread = first + wp.tid()
@@ -50,7 +50,7 @@ def background_parts(
     while pixel < pixels:
         left = wp.float64(color[pixel / width * stride + pixel % width][3])
         for channel in range(3):
-            total[channel] = total[channel] + left * wp.float64(by_rgb[3 * pixel + channel])
+            total[channel] = total[channel] + left * wp.float64(grad_rgb[3 * pixel + channel])
         pixel += threads
     for channel in range(3):
         parts[3 * thread + channel] = total[channel]

@@ -51,11 +51,10 @@ class View:
     log_cut: float
     ceiling: float
     stop: float
-    first_light: float  # maximum transmittance behind a first hit
+    first_hit_transmittance: float  # maximum transmittance behind a first hit
     fog_density: float  # 1 / metres
-    slopes: (
-        wp.vec4d
-    )  # limits of -x, x, -y, y at z = 1, to which EWA clamps the centre of a splat before it linearises
+    # limits of -x, x, -y, y at z = 1, to which EWA clamps the centre of a splat before it linearises
+    ewa_clamp: wp.vec4d
     ray_step: wp.float64  # maximum distance of the rays of neighbouring samples, for boxes behind a lens
     splats: int  # number of splats of the cloud
     ray: wp.vec4  # a sample's ray is ((column - [2]) / [0], (row - [3]) / [1], 1), or (0, 0, 1) for distances

@@ -39,12 +39,12 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
     }
     fields |= output.fields(outputs, "layer")
     Layer = struct_of("Layer", "Fragments of one coplanar group at a sample; group -1: none.", fields)
-    # exist: whether the tile has groups; open: the layer that still accumulates; next: the nearest layer of
-    # this pass, with an infinite depth if there is none; after: depth and group of the layer of the previous
-    # pass
+    # exist: whether the tile has groups; current: the layer that still accumulates; next: the nearest layer
+    # of this pass, with an infinite depth if there is none; after: depth and group of the layer of the
+    # previous pass
     passing = {
         "exist": wp.int32,
-        "open": Layer,
+        "current": Layer,
         "next": Layer,
         "next_z": wp.float32,
         "after_z": wp.float32,
@@ -62,7 +62,7 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
     def start():
         """State before the first pass, in a tile without groups."""
         layers = Layers()
-        layers.open = empty_layer(-1)
+        layers.current = empty_layer(-1)
         layers.next_z = wp.inf
         layers.after_z = -wp.inf
         layers.after_group = -1
@@ -78,24 +78,26 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
 
     @wp.func
     def close(layers: Layers):
-        """Complete the open layer, and store it if it is the nearest of this pass."""
+        """Complete the current layer, and store it if it is the nearest of this pass."""
         after = layers
-        if layers.open.tau > 0.0:
-            z = depth(layers.open)
-            follows = z > layers.after_z or (z == layers.after_z and layers.open.group > layers.after_group)
+        if layers.current.tau > 0.0:
+            z = depth(layers.current)
+            follows = z > layers.after_z or (
+                z == layers.after_z and layers.current.group > layers.after_group
+            )
             if follows and z < layers.next_z:
-                after.next = layers.open
+                after.next = layers.current
                 after.next_z = z
-        after.open = empty_layer(-1)
+        after.current = empty_layer(-1)
         return after
 
     @wp.func
     def select(layers: Layers, group: int):
         """Open the layer of the current splat's group; group -1: no layer."""
-        if group == layers.open.group:
+        if group == layers.current.group:
             return layers
         after = close(layers)
-        after.open = empty_layer(group)
+        after.current = empty_layer(group)
         return after
 
     @wp.func

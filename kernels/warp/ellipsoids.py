@@ -20,7 +20,7 @@ columns"""
 def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
     """Make functions for the equivalent disk of a 3D Gaussian.
 
-    disk(a, b, facet, sizes, p, view): its tangents. surface: its normal. rim: radius of the disk
+    disk(a, b, unit_normal, sizes, p, view): its tangents. surface: its normal. rim: radius of the disk
     that bounds the ellipsoid. reach: half of the ellipsoid's depth range. clipped: bounds of an ellipsoid
     that crosses the plane of the camera.
     """
@@ -64,16 +64,16 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
             k1 = g1 / h
             k2 = g2 / h
         inverse_m = real(wp.inf)
-        u, v, facet, area = a, b, c, one
+        u, v, unit_normal, area = a, b, c, one
         if m > zero:
             inverse_m = shortest / m
             u = e0 * (h / m) - (g0 / m) * (k1 * e1 + k2 * e2)
             v = k2 * e1 - k1 * e2
             # the inverse covariance times `towards`
             n = e0 * (g0 * w0 / s0) + e1 * (g1 * w1 / s1) + e2 * (g2 * w2 / s2)
-            facet = n / wp.sqrt(wp.dot(n, n))
-            area = s0 * wp.max(s1, s2) * m / wp.dot(facet, towards)
-        return u, v, facet, area, inverse_m
+            unit_normal = n / wp.sqrt(wp.dot(n, n))
+            area = s0 * wp.max(s1, s2) * m / wp.dot(unit_normal, towards)
+        return u, v, unit_normal, area, inverse_m
 
     @wp.func
     def image(a: vec3, b: vec3, c: vec3, p: vec3, view: View):
@@ -85,8 +85,8 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
             ahead = one / p[2]
             per_x *= ahead
             per_y *= ahead
-            slope_x = wp.clamp(p[0] * ahead, -real(view.slopes[0]), real(view.slopes[1]))
-            slope_y = wp.clamp(p[1] * ahead, -real(view.slopes[2]), real(view.slopes[3]))
+            slope_x = wp.clamp(p[0] * ahead, -real(view.ewa_clamp[0]), real(view.ewa_clamp[1]))
+            slope_y = wp.clamp(p[1] * ahead, -real(view.ewa_clamp[2]), real(view.ewa_clamp[3]))
         across = per_x * vec3(a[0] - slope_x * a[2], b[0] - slope_x * b[2], c[0] - slope_x * c[2])
         down = per_y * vec3(a[1] - slope_y * a[2], b[1] - slope_y * b[2], c[1] - slope_y * c[2])
         return across, down, vec4(per_x, per_y, slope_x, slope_y)
@@ -111,14 +111,14 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
         return vec3(factor[0] / per[0], factor[1] / per[1], factor[2] / per[1]), before, after
 
     @wp.func
-    def disk(a: vec3, b: vec3, facet: vec3, sizes: vec3, p: vec3, view: View):
+    def disk(a: vec3, b: vec3, unit_normal: vec3, sizes: vec3, p: vec3, view: View):
         """Equivalent disk, from scaled tangents, unit normal and three standard deviations.
 
         Returns its scaled tangents and unit normal, the distance of its plane, the semi-axis conjugate to the
         tangents, 1 / m^2, two factors of its area, and the term of ln(opacity), -inf for a culled splat.
         """
-        c = facet * sizes[2]
-        u, v, normal, offset, third = a, b, facet, zero, vec3()
+        c = unit_normal * sizes[2]
+        u, v, normal, offset, third = a, b, unit_normal, zero, vec3()
         inverse_m2, su, sv, log_share = zero, one, one, -real(wp.inf)
         if wp.static(sharp):
             towards = p

@@ -19,9 +19,14 @@ def make_ellipsoids_backward(effects: tuple[str, ...]):
 
     @wp.func
     def exact(
-        axes: wp.mat33d, sizes: wp.vec3d, p: wp.vec3d, by_a: wp.vec3d, by_b: wp.vec3d, by_bulge: wp.float64
+        axes: wp.mat33d,
+        sizes: wp.vec3d,
+        p: wp.vec3d,
+        grad_a: wp.vec3d,
+        grad_b: wp.vec3d,
+        grad_bulge: wp.float64,
     ):
-        """Gradients with respect to the scaled axes, in rows, and the centre. by_bulge: with respect to
+        """Gradients with respect to the scaled axes, in rows, and the centre. grad_bulge: with respect to
         2 / m^2.
 
         The disk's tangents a, b and p / m are the images of unit vectors e1, e2, e3 under V, whose columns
@@ -49,63 +54,63 @@ def make_ellipsoids_backward(effects: tuple[str, ...]):
         e2[i1] = k2
         e2[i2] = -k1
         inverse_m = shortest / m
-        by_m2 = -_FOUR * by_bulge * inverse_m * inverse_m  # the bulge is 2 / m^2
-        by_y = by_m2 / m * g - inverse_m * (wp.dot(p, by_a) * e1 + wp.dot(p, by_b) * e2)
-        by_y = inverse_m * wp.cw_div(by_y, sizes)
-        share = wp.cw_div(by_y, sizes)
-        by_axes = wp.outer(e1, by_a) + wp.outer(e2, by_b) + wp.outer(share, p)
-        by_axes -= _TWO * (wp.diag(wp.cw_mul(share, along)) * axes)
-        return by_axes, wp.transpose(axes) * by_y
+        grad_m2 = -_FOUR * grad_bulge * inverse_m * inverse_m  # the bulge is 2 / m^2
+        grad_y = grad_m2 / m * g - inverse_m * (wp.dot(p, grad_a) * e1 + wp.dot(p, grad_b) * e2)
+        grad_y = inverse_m * wp.cw_div(grad_y, sizes)
+        share = wp.cw_div(grad_y, sizes)
+        grad_axes = wp.outer(e1, grad_a) + wp.outer(e2, grad_b) + wp.outer(share, p)
+        grad_axes -= _TWO * (wp.diag(wp.cw_mul(share, along)) * axes)
+        return grad_axes, wp.transpose(axes) * grad_y
 
     @wp.func
     def ewa(
-        scaled: wp.mat33d, p: wp.vec3d, by_a: wp.vec3d, by_b: wp.vec3d, by_p: wp.vec3d, by_log: wp.float64,
-        view: View,
+        scaled: wp.mat33d, p: wp.vec3d, grad_a: wp.vec3d, grad_b: wp.vec3d, grad_p: wp.vec3d,
+        grad_log: wp.float64, view: View,
     ):  # fmt: skip
         """Gradients with respect to the scaled axes, in rows, to the centre, and to fx, fy, cx, cy."""
         across, down, per = ellipsoid.image(scaled[0], scaled[1], scaled[2], p, view)
         factor, before, after = ellipsoid.widened(across, down, view)
         spread, ahead = _WIDENING / wp.float64(view.per_pixel), _ONE / p[2]
         per_x, per_y, slope_x, slope_y = per[0], per[1], per[2], per[3]
-        by_l11, by_l21, by_l22 = by_a[0] / per_x, by_a[1] / per_y, by_b[1] / per_y
-        by_per_x = -by_l11 * factor[0] / per_x
-        by_per_y = -(by_l21 * factor[1] + by_l22 * factor[2]) / per_y
-        by_after = _HALF * by_l22 * factor[2] / after
-        by_before = by_after
+        grad_l11, grad_l21, grad_l22 = grad_a[0] / per_x, grad_a[1] / per_y, grad_b[1] / per_y
+        grad_per_x = -grad_l11 * factor[0] / per_x
+        grad_per_y = -(grad_l21 * factor[1] + grad_l22 * factor[2]) / per_y
+        grad_after = _HALF * grad_l22 * factor[2] / after
+        grad_before = grad_after
         if wp.static(antialiased):
-            by_after -= _HALF * by_log / after
-            by_before = by_after + _HALF * by_log / before
-        by_xx = _HALF * (by_l11 - (by_l21 * factor[1] + by_l22 * factor[2]) / factor[0]) / factor[0]
-        by_xx += spread * by_after
-        by_xy, by_yy = by_l21 / factor[0], spread * by_after
-        by_crossed = _TWO * by_before * wp.cross(across, down)
-        by_across = wp.cross(down, by_crossed) + _TWO * by_xx * across + by_xy * down
-        by_down = wp.cross(by_crossed, across) + _TWO * by_yy * down + by_xy * across
-        by_per_x += wp.dot(by_across, across) / per_x
-        by_per_y += wp.dot(by_down, down) / per_y
-        by_across *= per_x
-        by_down *= per_y
+            grad_after -= _HALF * grad_log / after
+            grad_before = grad_after + _HALF * grad_log / before
+        grad_xx = _HALF * (grad_l11 - (grad_l21 * factor[1] + grad_l22 * factor[2]) / factor[0]) / factor[0]
+        grad_xx += spread * grad_after
+        grad_xy, grad_yy = grad_l21 / factor[0], spread * grad_after
+        grad_crossed = _TWO * grad_before * wp.cross(across, down)
+        grad_across = wp.cross(down, grad_crossed) + _TWO * grad_xx * across + grad_xy * down
+        grad_down = wp.cross(grad_crossed, across) + _TWO * grad_yy * down + grad_xy * across
+        grad_per_x += wp.dot(grad_across, across) / per_x
+        grad_per_y += wp.dot(grad_down, down) / per_y
+        grad_across *= per_x
+        grad_down *= per_y
         columns = wp.transpose(scaled)
-        by_slope_x, by_slope_y = -wp.dot(by_across, columns[2]), -wp.dot(by_down, columns[2])
+        grad_slope_x, grad_slope_y = -wp.dot(grad_across, columns[2]), -wp.dot(grad_down, columns[2])
         if slope_x != p[0] * ahead:  # slopes at their limits are constant
-            by_slope_x = wp.float64(0.0)
+            grad_slope_x = wp.float64(0.0)
         if slope_y != p[1] * ahead:
-            by_slope_y = wp.float64(0.0)
-        by_z = by_slope_x * slope_x + by_slope_y * slope_y + by_per_x * per_x + by_per_y * per_y
-        by_center = by_p + ahead * wp.vec3d(by_slope_x, by_slope_y, -by_z)
+            grad_slope_y = wp.float64(0.0)
+        grad_z = grad_slope_x * slope_x + grad_slope_y * slope_y + grad_per_x * per_x + grad_per_y * per_y
+        grad_center = grad_p + ahead * wp.vec3d(grad_slope_x, grad_slope_y, -grad_z)
         # images depend on fx x + cx z and fy y + cy z of the axes and the centre; limits of slopes are
         # constant in pixels
-        by_camera = wp.vec4d(
-            (wp.dot(by_across, columns[0]) + by_center[0] * p[0]) * view.per_focal_x,
-            (wp.dot(by_down, columns[1]) + by_center[1] * p[1]) * view.per_focal_y,
-            (wp.dot(by_across, columns[2]) + by_center[0] * p[2]) * view.per_focal_x,
-            (wp.dot(by_down, columns[2]) + by_center[1] * p[2]) * view.per_focal_y,
+        grad_camera = wp.vec4d(
+            (wp.dot(grad_across, columns[0]) + grad_center[0] * p[0]) * view.per_focal_x,
+            (wp.dot(grad_down, columns[1]) + grad_center[1] * p[1]) * view.per_focal_y,
+            (wp.dot(grad_across, columns[2]) + grad_center[0] * p[2]) * view.per_focal_x,
+            (wp.dot(grad_down, columns[2]) + grad_center[1] * p[2]) * view.per_focal_y,
         )
-        by_ahead = -(slope_x * by_across + slope_y * by_down)
-        return wp.matrix_from_cols(by_across, by_down, by_ahead), by_center, by_camera
+        grad_ahead = -(slope_x * grad_across + slope_y * grad_down)
+        return wp.matrix_from_cols(grad_across, grad_down, grad_ahead), grad_center, grad_camera
 
     @wp.func
-    def normal(axes: wp.mat33d, sizes: wp.vec3d, p: wp.vec3d, by_facet: wp.vec3d):
+    def normal(axes: wp.mat33d, sizes: wp.vec3d, p: wp.vec3d, grad_facet: wp.vec3d):
         """Gradients of the normal (`ellipsoids.surface`) with respect to the unit axes, in rows, their
         lengths, and the centre. A common factor of the lengths has no gradient."""
         shortest = wp.min(wp.min(sizes[0], sizes[1]), sizes[2])
@@ -115,37 +120,39 @@ def make_ellipsoids_backward(effects: tuple[str, ...]):
         outward = wp.transpose(axes) * along
         length = wp.length(outward)
         outward /= length
-        by_outward = (by_facet - wp.dot(by_facet, outward) * outward) / length
-        by_along = axes * by_outward
-        by_dots = wp.cw_mul(by_along, share)
-        by_axes = wp.outer(along, by_outward) + wp.outer(by_dots, p)
-        by_sizes = -_TWO * wp.cw_div(wp.cw_mul(by_along, along), sizes)
-        return by_axes, by_sizes, wp.transpose(axes) * by_dots
+        grad_outward = (grad_facet - wp.dot(grad_facet, outward) * outward) / length
+        grad_along = axes * grad_outward
+        grad_dots = wp.cw_mul(grad_along, share)
+        grad_axes = wp.outer(along, grad_outward) + wp.outer(grad_dots, p)
+        grad_sizes = -_TWO * wp.cw_div(wp.cw_mul(grad_along, along), sizes)
+        return grad_axes, grad_sizes, wp.transpose(axes) * grad_dots
 
     @wp.func
     def backward(
         axes: wp.mat33d,  # unit axes in rows, in the camera's frame
         sizes: wp.vec3d,
         p: wp.vec3d,
-        by_a: wp.vec3d,  # with respect to the disk's tangents and centre
-        by_b: wp.vec3d,
-        by_p: wp.vec3d,
-        by_camera: wp.vec4d,  # with respect to fx, fy, cx, cy
-        by_log: wp.float64,
-        by_bulge: wp.float64,
-        by_facet: wp.vec3d,
+        grad_a: wp.vec3d,  # with respect to the disk's tangents and centre
+        grad_b: wp.vec3d,
+        grad_p: wp.vec3d,
+        grad_camera: wp.vec4d,  # with respect to fx, fy, cx, cy
+        grad_log: wp.float64,
+        grad_bulge: wp.float64,
+        grad_facet: wp.vec3d,
         view: View,
     ):
         """Gradients with respect to the unit axes, in rows, their lengths, the centre, and fx, fy, cx, cy."""
         if wp.static(sharp):
-            by_scaled, by_center = exact(axes, sizes, p, by_a, by_b, by_bulge)
-            by_center += by_p
+            grad_scaled, grad_center = exact(axes, sizes, p, grad_a, grad_b, grad_bulge)
+            grad_center += grad_p
         else:
-            by_scaled, by_center, by_camera = ewa(wp.diag(sizes) * axes, p, by_a, by_b, by_p, by_log, view)
-        by_axes, by_sizes, more = normal(axes, sizes, p, by_facet)
-        by_axes += wp.diag(sizes) * by_scaled
+            grad_scaled, grad_center, grad_camera = ewa(
+                wp.diag(sizes) * axes, p, grad_a, grad_b, grad_p, grad_log, view
+            )
+        grad_axes, grad_sizes, more = normal(axes, sizes, p, grad_facet)
+        grad_axes += wp.diag(sizes) * grad_scaled
         for k in range(3):
-            by_sizes[k] = by_sizes[k] + wp.dot(by_scaled[k], axes[k])
-        return by_axes, by_sizes, by_center + more, by_camera
+            grad_sizes[k] = grad_sizes[k] + wp.dot(grad_scaled[k], axes[k])
+        return grad_axes, grad_sizes, grad_center + more, grad_camera
 
     return backward

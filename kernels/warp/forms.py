@@ -38,9 +38,9 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
     """whether records have edges of boxes; whether they have a flag for boxes"""
     of_box, optics = make_boxes(real), make_optics(camera, real) if camera else None
     Lens = make_lens(camera)
-    at_disc, at_depth, at_edges, at_ray, at_plane, at_flag, at_bulge = (
+    at_lowpass, at_depth, at_edges, at_ray, at_plane, at_flag, at_bulge = (
         layout.word(name)
-        for name in ("disc_x", "z_numerator", "edge_u0", "nuz", "plane_z0", "boxed", "bulge")
+        for name in ("lowpass_x", "z_numerator", "edge_u0", "nuz", "plane_z0", "boxed", "bulge")
     )
 
     @wp.func
@@ -51,7 +51,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
     def forms(
         a: vec3,  # scaled tangents
         b: vec3,
-        facet: vec3,  # unit normal
+        unit_normal: vec3,  # unit normal
         offset: real,  # distance of the plane from the camera's centre, along the normal
         p: vec3,
         su: real,  # su sv: area of the tangents
@@ -79,7 +79,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
         if wp.static(bent):
             # forms of a ray, not of a sample
             anchor = optics.anchor(int(ax), int(ay), in_front, p, view, lens)
-            of_u, of_v, of_d = wp.cross(b, p), wp.cross(p, a), facet * su * sv
+            of_u, of_v, of_d = wp.cross(b, p), wp.cross(p, a), unit_normal * su * sv
             ray = vec3(real(anchor[0]), real(anchor[1]), real(anchor[2]))
             k0 = vec3(wp.dot(of_u, ray), wp.dot(of_v, ray), wp.dot(of_d, ray))
             kx, ky = vec3(of_u[0], of_v[0], of_d[0]), vec3(of_u[1], of_v[1], of_d[1])
@@ -135,8 +135,8 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
             record[at_flag] = wp.where(boxed, 1.0, 0.0)
         if wp.static(screen):
             # far away without a low-pass disc
-            record[at_disc] = wp.where(in_front and not itself, float(center_x - anchor_x), 1.0e18)
-            record[at_disc + 1] = wp.where(in_front, float(center_y - anchor_y), 1.0e18)
+            record[at_lowpass] = wp.where(in_front and not itself, float(center_x - anchor_x), 1.0e18)
+            record[at_lowpass + 1] = wp.where(in_front, float(center_y - anchor_y), 1.0e18)
         if wp.static(exact):
             record[at_bulge] = float(two * inverse_m2)
         if wp.static(parallel):

@@ -30,7 +30,7 @@ def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str,
     z_center D, to avoid cancellation with that of z_numerator; `make_project_backward` adds the rest in
     float64."""
     names = list(_FORMS)
-    names += ("disc_x", "disc_y") if "lowpass_screen" in effects else ()
+    names += ("lowpass_x", "lowpass_y") if "lowpass_screen" in effects else ()
     names += ("z_numerator", "z_numerator_x", "z_numerator_y", "z_center") if "ray_depth" in effects else ()
     names += ("nx", "ny", "nz") if "normal" in outputs else ()
     names += ("bulge",) if EXACT in effects else ()
@@ -102,10 +102,10 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
                 length = wp.length(samples.normal[place])
                 if length > 0.0:
                     unit = samples.normal[place] / length
-                    by_unit = wp.vec3(
+                    grad_unit = wp.vec3(
                         by.normal[3 * pixel], by.normal[3 * pixel + 1], by.normal[3 * pixel + 2]
                     )
-                    loss.normal = (by_unit - wp.dot(by_unit, unit) * unit) / length
+                    loss.normal = (grad_unit - wp.dot(grad_unit, unit) * unit) / length
             if wp.static(distortion):
                 loss.distortion = by.distortion[pixel]
                 loss.spread = samples.distortion[place]
@@ -147,31 +147,31 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         center = line_of(lines, place + zc_line)[zc_lane]
         reach = line_of(lines, place + zr_line)[zr_lane]
         numerator = line_of(lines, place + z_line)[z_lane]
-        z, by_record, by_dot = center, wp.vec3(0.0, 1.0, 0.0), wp.vec2()
+        z, grad_record, grad_dot = center, wp.vec3(0.0, 1.0, 0.0), wp.vec2()
         ahead = c.d > 0.0 and c.d <= s.v[3]
         circle = wp.max(low_pass, HALF_RHO_OF_RANGE)
         if ahead and c.q * inverse_d * inverse_d <= circle:
             met = numerator * inverse_d
             z = wp.clamp(met, center - reach, center + reach)
             if met == z:
-                by_record = wp.vec3(inverse_d, 0.0, (center - z) * inverse_d)
+                grad_record = wp.vec3(inverse_d, 0.0, (center - z) * inverse_d)
         elif ahead:
             beyond, taken = numerator - center * c.d, circle * c.d / c.q
             z = wp.clamp(fma(taken, beyond, center), center - reach, center + reach)
-            by_record = wp.vec3(taken, 1.0 - taken * c.d, circle / c.q * beyond)
-            by_dot = wp.vec2(-taken * beyond / c.q, wp.where(circle == low_pass, beyond * c.d / c.q, 0.0))
-        by_bulge = float(0.0)
+            grad_record = wp.vec3(taken, 1.0 - taken * c.d, circle / c.q * beyond)
+            grad_dot = wp.vec2(-taken * beyond / c.q, wp.where(circle == low_pass, beyond * c.d / c.q, 0.0))
+        grad_bulge = float(0.0)
         if wp.static(thick):
             if s.bulge > 0.0 and ahead:
                 slant = c.q * inverse_d  # q / D: finite for the thinnest needles, whose half_rho overflows
                 share = s.bulge * inverse_d * slant
                 rest = wp.max(1.0 - share, 1.0e-6)  # 1 / (1 + t)
                 t = share / rest
-                by_d = by_record[2] - center * by_record[0]
-                by_bulge = slant * fma(slant, by_dot[0], by_d)
-                by_record[2] = by_record[2] - t * fma(2.0 * slant, by_dot[0], by_d)
-                by_dot[0] = fma(2.0 * t, by_dot[0], by_dot[0]) + by_d * s.bulge * inverse_d / rest
-        return z, by_record, by_dot, by_bulge
+                grad_d = grad_record[2] - center * grad_record[0]
+                grad_bulge = slant * fma(slant, grad_dot[0], grad_d)
+                grad_record[2] = grad_record[2] - t * fma(2.0 * slant, grad_dot[0], grad_d)
+                grad_dot[0] = fma(2.0 * t, grad_dot[0], grad_dot[0]) + grad_d * s.bulge * inverse_d / rest
+        return z, grad_record, grad_dot, grad_bulge
 
     @wp.func
     def back(
@@ -206,16 +206,16 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         weight = light * opacity
         color = wp.vec3(s.c[1], s.c[2], s.c[3])
         worth = wp.dot(loss.light, color)
-        z, by_record, by_dot_depth, by_bulge = float(0.0), wp.vec3(), wp.vec2(), float(0.0)
-        by_z = float(0.0)
+        z, grad_record, grad_dot_depth, grad_bulge = float(0.0), wp.vec3(), wp.vec2(), float(0.0)
+        grad_z = float(0.0)
         if wp.static(has_depth):
             low_pass = float(wp.inf)
             if wp.static(screen):
                 low_pass = c.screen
-            z, by_record, by_dot_depth, by_bulge = depth_at(lines, index, s, c, inverse_d, low_pass)
+            z, grad_record, grad_dot_depth, grad_bulge = depth_at(lines, index, s, c, inverse_d, low_pass)
         if wp.static(depth):
             worth += fma(loss.depth, z, loss.depth_weight)
-            by_z += weight * loss.depth
+            grad_z += weight * loss.depth
         if wp.static(normal):
             facing = wp.vec3(
                 line_of(lines, index * each + wp.static(normals[0][0]))[wp.static(normals[0][1])],
@@ -232,55 +232,55 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
             if z > SPREAD_NEAR:
                 inverse_z = 1.0 / z
                 outward = fma(spread[1], fma(INVERSE_DEPTH, inverse_z, -spread[0]), -spread[2])
-                by_z -= 2.0 * INVERSE_DEPTH * weight * loss.distortion * outward * inverse_z * inverse_z
+                grad_z -= 2.0 * INVERSE_DEPTH * weight * loss.distortion * outward * inverse_z * inverse_z
         gain = worth - loss.behind
         loss.behind = fma(opacity, gain, loss.behind)
-        by_log = weight * gain
+        grad_log = weight * gain
         if not (s.u[3] - decides <= log_ceiling):
-            by_log = 0.0  # clamped to the maximum alpha
+            grad_log = 0.0  # clamped to the maximum alpha
 
-        by_nu, by_nv, by_d = float(0.0), float(0.0), float(0.0)
+        grad_nu, grad_nv, grad_d = float(0.0), float(0.0), float(0.0)
         if on_plane:
-            plane = 2.0 * by_log * inverse_d
-            by_nu = -plane * nu * inverse_d
-            by_nv = -plane * nv * inverse_d
-            by_d = plane * half_rho
+            plane = 2.0 * grad_log * inverse_d
+            grad_nu = -plane * nu * inverse_d
+            grad_nv = -plane * nv * inverse_d
+            grad_d = plane * half_rho
         m = Moments()
         if wp.static(has_depth):
-            numerator = by_z * by_record[0]
+            numerator = grad_z * grad_record[0]
             m[wp.static(at.get("z_numerator", 0))] = numerator
             m[wp.static(at.get("z_numerator_x", 0))] = numerator * x
             m[wp.static(at.get("z_numerator_y", 0))] = numerator * y
-            m[wp.static(at.get("z_center", 0))] = by_z * by_record[1]
-            by_d += by_z * by_record[2]
-            by_nu += 2.0 * by_z * by_dot_depth[0] * nu
-            by_nv += 2.0 * by_z * by_dot_depth[0] * nv
+            m[wp.static(at.get("z_center", 0))] = grad_z * grad_record[1]
+            grad_d += grad_z * grad_record[2]
+            grad_nu += 2.0 * grad_z * grad_dot_depth[0] * nu
+            grad_nv += 2.0 * grad_z * grad_dot_depth[0] * nv
         if wp.static(screen):
-            by_dot = 2.0 * view.per_pixel * by_log
+            grad_dot = 2.0 * view.per_pixel * grad_log
             if on_plane:
-                by_dot = 0.0
-            by_dot -= 2.0 * view.per_pixel * by_z * by_dot_depth[1]
-            m[wp.static(at.get("disc_x", 0))] = by_dot * (x - s.disc_x)
-            m[wp.static(at.get("disc_y", 0))] = by_dot * (y - s.disc_y)
+                grad_dot = 0.0
+            grad_dot -= 2.0 * view.per_pixel * grad_z * grad_dot_depth[1]
+            m[wp.static(at.get("lowpass_x", 0))] = grad_dot * (x - s.lowpass_x)
+            m[wp.static(at.get("lowpass_y", 0))] = grad_dot * (y - s.lowpass_y)
         if wp.static(normal):
             for k in range(3):
                 m[wp.static(at.get("nx", 0)) + k] = weight * loss.normal[k]
         if wp.static(thick):
             if on_plane:
-                by_bulge = fma(by_log, half_rho * half_rho, by_z * by_bulge)
+                grad_bulge = fma(grad_log, half_rho * half_rho, grad_z * grad_bulge)
             else:
-                by_bulge *= by_z
-            m[wp.static(at.get("bulge", 0))] = by_bulge
-        m[0] = by_nu
-        m[1] = by_nu * x
-        m[2] = by_nu * y
-        m[3] = by_nv
-        m[4] = by_nv * x
-        m[5] = by_nv * y
-        m[6] = by_d
-        m[7] = by_d * x
-        m[8] = by_d * y
-        m[9] = by_log
+                grad_bulge *= grad_z
+            m[wp.static(at.get("bulge", 0))] = grad_bulge
+        m[0] = grad_nu
+        m[1] = grad_nu * x
+        m[2] = grad_nu * y
+        m[3] = grad_nv
+        m[4] = grad_nv * x
+        m[5] = grad_nv * y
+        m[6] = grad_d
+        m[7] = grad_d * x
+        m[8] = grad_d * y
+        m[9] = grad_log
         m[10] = weight * loss.light[0]
         m[11] = weight * loss.light[1]
         m[12] = weight * loss.light[2]

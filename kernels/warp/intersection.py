@@ -20,8 +20,8 @@ HALF_RHO_OF_RANGE = wp.constant(wp.float32(math.log(255.0)))
 
 @cache
 def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
-    """Make the struct Intersection and functions column, cross, cross_ray, cross_slopes (None without boxes
-    behind a lens), is_box, opacity_of and depth_of.
+    """Make the struct Intersection and functions column, cross, intersect_ray, intersect_derivatives (None
+    without boxes behind a lens), is_box, opacity_of and depth_of.
     """
     Splat = make_splat(effects, outputs).Splat
     layout = Layout(effects, outputs)
@@ -89,7 +89,7 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
         )
 
     @wp.func
-    def cross_ray(s: Splat, ray: wp.vec3, x: float, y: float, view: View):
+    def intersect_ray(s: Splat, ray: wp.vec3, x: float, y: float, view: View):
         """Intersection of any ray with a splat. x, y: its sample, relative to the splat's anchor."""
         n = forms_of(s, ray)
         c = meet(s, n[0], n[1], n[2], x, y, view)
@@ -97,9 +97,9 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
         return c
 
     @wp.func
-    def cross_slopes(s: Splat, ray: wp.vec3, slopes: SLOPES, x: float, y: float, view: View):
+    def intersect_derivatives(s: Splat, ray: wp.vec3, slopes: SLOPES, x: float, y: float, view: View):
         """Intersection of a ray with a splat or a box. slopes: derivatives of the ray, for edges of boxes."""
-        c = cross_ray(s, ray, x, y, view)
+        c = intersect_ray(s, ray, x, y, view)
         if is_box(s):
             n, of_d = forms_of(s, ray), wp.vec3(s.d[1], s.d[2], s.w[2])
             across = between_curves(n[2], n[0], of_d, wp.vec3(s.u[1], s.u[2], s.w[0]), slopes)
@@ -135,8 +135,8 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
                 c.inside = c.cover > 0.0 and ahead
         c.contributes = c.inside
         if wp.static(screen):
-            ex = x - s.disc_x
-            ey = y - s.disc_y
+            ex = x - s.lowpass_x
+            ey = y - s.lowpass_y
             c.screen = fma(ex, ex, ey * ey) * view.per_pixel
             c.contributes = c.inside or c.screen <= s.half_r2
         return c
@@ -190,8 +190,8 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
         Intersection=Intersection,
         column=column,
         cross=cross,
-        cross_ray=cross_ray,
-        cross_slopes=cross_slopes if curved else None,
+        intersect_ray=intersect_ray,
+        intersect_derivatives=intersect_derivatives if curved else None,
         is_box=is_box,
         facing=facing,
         opacity_of=opacity_of,

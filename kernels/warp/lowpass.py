@@ -26,11 +26,11 @@ def make_filter(real):
     @wp.func
     def widened(a: vec3, b: vec3, by_x: vec3, by_y: vec3, by_depth: vec3):
         """Returns L_uu, L_vu, L_vv and det C, which is not finite for an edge-on disk with parallel rays."""
-        by_u = vec3(wp.dot(by_x, a), wp.dot(by_y, a), whole_depth * wp.dot(by_depth, a))
-        by_v = vec3(wp.dot(by_x, b), wp.dot(by_y, b), whole_depth * wp.dot(by_depth, b))
-        minors = wp.cross(by_u, by_v)
+        grad_u = vec3(wp.dot(by_x, a), wp.dot(by_y, a), whole_depth * wp.dot(by_depth, a))
+        grad_v = vec3(wp.dot(by_x, b), wp.dot(by_y, b), whole_depth * wp.dot(by_depth, b))
+        minors = wp.cross(grad_u, grad_v)
         area2 = minors[2] * minors[2] + minors[1] * minors[1] + minors[0] * minors[0]
-        uu, uv, vv = wp.dot(by_u, by_u), wp.dot(by_u, by_v), wp.dot(by_v, by_v)
+        uu, uv, vv = wp.dot(grad_u, grad_u), wp.dot(grad_u, grad_v), wp.dot(grad_v, grad_v)
         # det(1 + s^2 M^-1) = 1 + s^2 (tr M + s^2) / det M: no cancellation
         grown = one + variance * (uu + vv + variance) / area2
         l_uu = wp.sqrt(one + variance * vv / area2)

@@ -203,9 +203,9 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
                     attributes = attributes_at(color, z, lines, index)
                     if wp.static(boxes):
                         if is_box(s):
-                            p.layers.open = layer.accumulate_box(p.layers.open, attributes, opacity)
+                            p.layers.current = layer.accumulate_box(p.layers.current, attributes, opacity)
                             return p
-                    p.layers.open = layer.accumulate(p.layers.open, attributes, opacity)
+                    p.layers.current = layer.accumulate(p.layers.current, attributes, opacity)
                     return p
                 if not admits(p.layers, z):
                     return p

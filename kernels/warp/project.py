@@ -137,10 +137,10 @@ def make_project(
         tangent_u, tangent_v = splat_pose.tangents(rotation, quat)
         mean = vec3(real(center[0]), real(center[1]), real(center[2]))
         p = rotation * mean + translation
-        facet = wp.cross(tangent_u, tangent_v)
-        offset = wp.dot(facet, p)  # signed distance of the plane from the camera's centre
+        unit_normal = wp.cross(tangent_u, tangent_v)
+        offset = wp.dot(unit_normal, p)  # signed distance of the plane from the camera's centre
         if wp.static(parallel):
-            offset = facet[2]
+            offset = unit_normal[2]
         a, b = tangent_u * su, tangent_v * sv
         depth = p[2]
         if wp.static(ray_depths):
@@ -162,9 +162,9 @@ def make_project(
             if thick:
                 sizes = vec3(su, sv, real(wp.max(thickness[i], SMALLEST_SCALE)))
                 if wp.static(surfaced):
-                    outward = ellipsoid.surface(tangent_u, tangent_v, facet, sizes, p)
-                a, b, facet, offset, third, inverse_m2, su, sv, log_share = ellipsoid.disk(
-                    a, b, facet, sizes, p, view
+                    outward = ellipsoid.surface(tangent_u, tangent_v, unit_normal, sizes, p)
+                a, b, unit_normal, offset, third, inverse_m2, su, sv, log_share = ellipsoid.disk(
+                    a, b, unit_normal, sizes, p, view
                 )
                 log_opacity += float(log_share)
                 half_r2 = log_opacity - view.log_cut
@@ -251,11 +251,11 @@ def make_project(
                 center_x, center_y, in_front = optics.image(p, view, lens)
         if wp.static(screen):
             if in_front:
-                box.disc_x = float(center_x)
-                box.disc_y = float(center_y)
-                box.disc_r = wp.sqrt(half_r2 / view.per_pixel) * (1.0 + PAD_RELATIVE) + PAD
+                box.lowpass_x = float(center_x)
+                box.lowpass_y = float(center_y)
+                box.lowpass_r = wp.sqrt(half_r2 / view.per_pixel) * (1.0 + PAD_RELATIVE) + PAD
             if itself:
-                box.disc_r = -1.0
+                box.lowpass_r = -1.0
         view = views[reread(number)]
         row_first, row_end = limits.rows(box, view.height)
         first_column, end_column = limits.span(box, row_first, row_end, view.width)
@@ -272,7 +272,7 @@ def make_project(
         # loaded again, here and above, to save registers
         view = views[reread(number)]
         record, met = forms(
-            a, b, facet, offset, p, su, sv, center_x, center_y,
+            a, b, unit_normal, offset, p, su, sv, center_x, center_y,
             in_front, boxed, itself, thick, inverse_m2, view, lens,
         )  # fmt: skip
         if not met:
@@ -301,9 +301,9 @@ def make_project(
             record[at_nearest] = key
         if wp.static(surfaced):
             if thick:
-                facet = outward
+                unit_normal = outward
         for k in range(wp.static(len(projects))):
-            record = wp.static(projects[k])(record, wp.static(words[k]), facet, offset)
+            record = wp.static(projects[k])(record, wp.static(words[k]), unit_normal, offset)
         for line in range(wp.static(lines_each)):
             k = 4 * line
             store_line(

@@ -76,13 +76,15 @@ def make_project_backward(
     each, fields = layout.lines, len(names)
     at = {name: place for place, name in enumerate(names)}
     Moments, Totals = (wp.types.vector(fields, real) for real in (wp.float32, wp.float64))
-    screen_filter, has_depth, normal = (name in at for name in ("disc_x", "z_center", "nx"))
+    screen_filter, has_depth, normal = (name in at for name in ("lowpass_x", "z_center", "nx"))
     exact, ewa = EXACT in effects, any(name in effects for name in EWA)
     has_gaussians = exact or ewa
     ellipsoid, solid_backward = make_ellipsoids(effects, wp.float64), make_ellipsoids_backward(effects)
     zc_line, zc_lane = layout.place("z_center")
     terms = max(sh_terms, 1)
-    disc_x, z_numerator, nx, bulge = (at.get(name, 0) for name in ("disc_x", "z_numerator", "nx", "bulge"))
+    lowpass_x, z_numerator, nx, bulge = (
+        at.get(name, 0) for name in ("lowpass_x", "z_numerator", "nx", "bulge")
+    )
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def project_backward(
@@ -99,29 +101,29 @@ def make_project_backward(
         counts: wp.array(dtype=wp.int32),
         ends_by_index: wp.array(dtype=wp.int32),
         moments: wp.array(dtype=Moments),  # by slot
-        by_means: wp.array(dtype=wp.vec3),  # out, as all arrays below; 0 for culled splats
-        by_quats: wp.array(dtype=wp.vec4),
-        by_scales: wp.array(dtype=wp.vec2),
-        by_thickness: wp.array(dtype=wp.float32),  # for clouds with 3D Gaussians
-        by_opacities: wp.array(dtype=wp.float32),
-        by_colors: wp.array(dtype=wp.vec3),
+        grad_means: wp.array(dtype=wp.vec3),  # out, as all arrays below; 0 for culled splats
+        grad_quats: wp.array(dtype=wp.vec4),
+        grad_scales: wp.array(dtype=wp.vec2),
+        grad_thickness: wp.array(dtype=wp.float32),  # for clouds with 3D Gaussians
+        grad_opacities: wp.array(dtype=wp.float32),
+        grad_colors: wp.array(dtype=wp.vec3),
         screen: wp.array(
             dtype=wp.float32
         ),  # norm of the gradient with respect to the projected centre, in half images
-        by_cameras: wp.array(dtype=TEN),
+        grad_cameras: wp.array(dtype=TEN),
     ):
         view = views[0]
         i = first + wp.tid()
-        by_means[i] = wp.vec3()
-        by_quats[i] = wp.vec4()
-        by_scales[i] = wp.vec2()
+        grad_means[i] = wp.vec3()
+        grad_quats[i] = wp.vec4()
+        grad_scales[i] = wp.vec2()
         if wp.static(has_gaussians):
-            by_thickness[i] = 0.0
-        by_opacities[i] = 0.0
+            grad_thickness[i] = 0.0
+        grad_opacities[i] = 0.0
         screen[i] = 0.0
-        by_cameras[i] = TEN()
+        grad_cameras[i] = TEN()
         for k in range(terms):
-            by_colors[i * terms + k] = wp.vec3()
+            grad_colors[i * terms + k] = wp.vec3()
         if keys[i] == CULLED:
             return
         total = Totals()
@@ -132,15 +134,15 @@ def make_project_backward(
 
         # colour
         mean = wp.vec3d(wp.float64(means[i][0]), wp.float64(means[i][1]), wp.float64(means[i][2]))
-        by_rgb = wp.vec3(float(total[10]), float(total[11]), float(total[12]))
-        by_ray = wp.vec3d()  # with respect to the vector from the eye to the centre, in world axes
+        grad_rgb = wp.vec3(float(total[10]), float(total[11]), float(total[12]))
+        grad_ray = wp.vec3d()  # with respect to the vector from the eye to the centre, in world axes
         if wp.static(sh_terms == 0):
-            by_colors[i] = by_rgb
+            grad_colors[i] = grad_rgb
         else:
             clamped = line_of(lines, i * each + 3)  # ay, r, g, b; colours clamped at 0 have no derivative
             for channel in range(3):
                 if not (clamped[channel + 1] > 0.0):
-                    by_rgb[channel] = 0.0
+                    grad_rgb[channel] = 0.0
             away = mean - view.eye
             length = wp.length(away)
             if length > _ZERO:
@@ -148,11 +150,11 @@ def make_project_backward(
             direction = wp.vec3(float(away[0]), float(away[1]), float(away[2]))
             slope = wp.vec3()
             for k in range(terms):
-                by_colors[i * terms + k] = basis_value(k, direction) * by_rgb
-                slope += wp.dot(colors[i * terms + k], by_rgb) * basis_slope(k, direction)
+                grad_colors[i * terms + k] = basis_value(k, direction) * grad_rgb
+                slope += wp.dot(colors[i * terms + k], grad_rgb) * basis_slope(k, direction)
             if length > _ZERO:
-                by_away = wp.vec3d(wp.float64(slope[0]), wp.float64(slope[1]), wp.float64(slope[2]))
-                by_ray = (by_away - wp.dot(by_away, away) * away) / length
+                grad_away = wp.vec3d(wp.float64(slope[0]), wp.float64(slope[1]), wp.float64(slope[2]))
+                grad_ray = (grad_away - wp.dot(grad_away, away) * away) / length
 
         # the disk, in the camera's axes
         q = quats[i]
@@ -166,10 +168,10 @@ def make_project_backward(
         su, sv = wp.float64(wp.max(size[0], SMALLEST_SCALE)), wp.float64(wp.max(size[1], SMALLEST_SCALE))
         a, b = su * unit_a, sv * unit_b
         if wp.static(has_gaussians):
-            facet, sizes = wp.cross(unit_a, unit_b), wp.vec3d(su, sv, _ZERO)
+            unit_normal, sizes = wp.cross(unit_a, unit_b), wp.vec3d(su, sv, _ZERO)
             if thickness[i] > 0.0:
                 sizes[2] = wp.float64(wp.max(thickness[i], SMALLEST_SCALE))
-                of_disk = ellipsoid.disk(a, b, facet, sizes, p, view)
+                of_disk = ellipsoid.disk(a, b, unit_normal, sizes, p, view)
                 a = of_disk[0]
                 b = of_disk[1]
 
@@ -200,73 +202,81 @@ def make_project_backward(
             along = wp.vec3d(total[z_numerator + 1] * per_x, total[z_numerator + 2] * per_y, _ZERO)
             center = wp.float64(line_of(lines, i * each + zc_line)[zc_lane])
             g_d += volume * (p - center * ray) - scale * center * along
-        by_a = wp.cross(g_v, p) + wp.cross(b, g_d)
-        by_b = wp.cross(p, g_u) + wp.cross(g_d, a)
-        by_p = wp.cross(g_u, b) + wp.cross(a, g_v)
-        by_log = total[9]
+        grad_a = wp.cross(g_v, p) + wp.cross(b, g_d)
+        grad_b = wp.cross(p, g_u) + wp.cross(g_d, a)
+        grad_p = wp.cross(g_u, b) + wp.cross(a, g_v)
+        grad_log = total[9]
         if wp.static(has_depth):
-            by_p += volume * form_d
+            grad_p += volume * form_d
         if wp.static(screen_filter):
-            by_x, by_y = total[disc_x] * view.focal_x / p[2], total[disc_x + 1] * view.focal_y / p[2]
-            by_p += wp.vec3d(by_x, by_y, -(by_x * p[0] + by_y * p[1]) / p[2])
+            grad_x, grad_y = (
+                total[lowpass_x] * view.focal_x / p[2],
+                total[lowpass_x + 1] * view.focal_y / p[2],
+            )
+            grad_p += wp.vec3d(grad_x, grad_y, -(grad_x * p[0] + grad_y * p[1]) / p[2])
         # with respect to the projected centre, in half images
-        across = wp.float64(view.width) * by_p[0] * per_x
-        down = wp.float64(view.height) * by_p[1] * per_y
+        across = wp.float64(view.width) * grad_p[0] * per_x
+        down = wp.float64(view.height) * grad_p[1] * per_y
         screen[i] = float(_HALF * p[2] * wp.sqrt(across * across + down * down))
         # images depend on fx x + cx z and fy y + cy z of a, b and p
-        by_fx = per_x * (by_a[0] * a[0] + by_b[0] * b[0] + by_p[0] * p[0])
-        by_fy = per_y * (by_a[1] * a[1] + by_b[1] * b[1] + by_p[1] * p[1])
-        by_cx = per_x * (by_a[0] * a[2] + by_b[0] * b[2] + by_p[0] * p[2])
-        by_cy = per_y * (by_a[1] * a[2] + by_b[1] * b[2] + by_p[1] * p[2])
+        grad_fx = per_x * (grad_a[0] * a[0] + grad_b[0] * b[0] + grad_p[0] * p[0])
+        grad_fy = per_y * (grad_a[1] * a[1] + grad_b[1] * b[1] + grad_p[1] * p[1])
+        grad_cx = per_x * (grad_a[0] * a[2] + grad_b[0] * b[2] + grad_p[0] * p[2])
+        grad_cy = per_y * (grad_a[1] * a[2] + grad_b[1] * b[2] + grad_p[1] * p[2])
         if wp.static(has_depth):
-            by_p[2] = by_p[2] + total[z_numerator + 3]
-        by_su, by_sv = wp.dot(by_a, unit_a), wp.dot(by_b, unit_b)
-        by_unit_a, by_unit_b = su * by_a, sv * by_b
-        by_facet = wp.vec3d()
+            grad_p[2] = grad_p[2] + total[z_numerator + 3]
+        grad_su, grad_sv = wp.dot(grad_a, unit_a), wp.dot(grad_b, unit_b)
+        grad_unit_a, grad_unit_b = su * grad_a, sv * grad_b
+        grad_facet = wp.vec3d()
         if wp.static(normal):
-            by_facet = wp.vec3d(total[nx], total[nx + 1], total[nx + 2])
-            by_facet *= wp.where(height > _ZERO, -_ONE, _ONE)
+            grad_facet = wp.vec3d(total[nx], total[nx + 1], total[nx + 2])
+            grad_facet *= wp.where(height > _ZERO, -_ONE, _ONE)
         if wp.static(has_gaussians):
             if thickness[i] > 0.0:
-                by_axes, by_sizes, by_p, by_camera = solid_backward(
-                    wp.matrix_from_rows(unit_a, unit_b, facet), sizes, p, by_a, by_b, by_p,
-                    wp.vec4d(by_fx, by_fy, by_cx, by_cy), by_log, total[bulge], by_facet, view,
+                grad_axes, grad_sizes, grad_p, grad_camera = solid_backward(
+                    wp.matrix_from_rows(unit_a, unit_b, unit_normal), sizes, p, grad_a, grad_b, grad_p,
+                    wp.vec4d(grad_fx, grad_fy, grad_cx, grad_cy), grad_log, total[bulge], grad_facet, view,
                 )  # fmt: skip
-                by_fx, by_fy, by_cx, by_cy = by_camera[0], by_camera[1], by_camera[2], by_camera[3]
-                by_unit_a, by_unit_b, by_facet = by_axes[0], by_axes[1], by_axes[2]
-                by_su, by_sv = by_sizes[0], by_sizes[1]
+                grad_fx, grad_fy, grad_cx, grad_cy = (
+                    grad_camera[0],
+                    grad_camera[1],
+                    grad_camera[2],
+                    grad_camera[3],
+                )
+                grad_unit_a, grad_unit_b, grad_facet = grad_axes[0], grad_axes[1], grad_axes[2]
+                grad_su, grad_sv = grad_sizes[0], grad_sizes[1]
                 if thickness[i] >= SMALLEST_SCALE:
-                    by_thickness[i] = float(by_sizes[2])
+                    grad_thickness[i] = float(grad_sizes[2])
                 if wp.static(exact):
-                    across = wp.float64(view.width) * by_p[0] * per_x
-                    down = wp.float64(view.height) * by_p[1] * per_y
+                    across = wp.float64(view.width) * grad_p[0] * per_x
+                    down = wp.float64(view.height) * grad_p[1] * per_y
                     screen[i] = float(_HALF * p[2] * wp.sqrt(across * across + down * down))
-        by_scales[i] = wp.vec2(
-            wp.where(size[0] >= SMALLEST_SCALE, float(by_su), 0.0),
-            wp.where(size[1] >= SMALLEST_SCALE, float(by_sv), 0.0),
+        grad_scales[i] = wp.vec2(
+            wp.where(size[0] >= SMALLEST_SCALE, float(grad_su), 0.0),
+            wp.where(size[1] >= SMALLEST_SCALE, float(grad_sv), 0.0),
         )
         if wp.static(normal or has_gaussians):
-            by_unit_a += wp.cross(unit_b, by_facet)
-            by_unit_b += wp.cross(by_facet, unit_a)
+            grad_unit_a += wp.cross(unit_b, grad_facet)
+            grad_unit_b += wp.cross(grad_facet, unit_a)
 
-        turned = wp.cross(p, by_p) + wp.cross(unit_a, by_unit_a) + wp.cross(unit_b, by_unit_b)
-        moved = by_p + turn * by_ray
-        by_cameras[i] = TEN(
-            turned[0], turned[1], turned[2], moved[0], moved[1], moved[2], by_fx, by_fy, by_cx, by_cy
+        turned = wp.cross(p, grad_p) + wp.cross(unit_a, grad_unit_a) + wp.cross(unit_b, grad_unit_b)
+        moved = grad_p + turn * grad_ray
+        grad_cameras[i] = TEN(
+            turned[0], turned[1], turned[2], moved[0], moved[1], moved[2], grad_fx, grad_fy, grad_cx, grad_cy
         )
         back = wp.transpose(turn)
-        by_mean = back * by_p + by_ray
-        u, v = back * by_unit_a, back * by_unit_b
+        grad_mean = back * grad_p + grad_ray
+        u, v = back * grad_unit_a, back * grad_unit_b
         # tangents are 1 - s (y y + z z) and so on with s = 2 / |q|^2
-        by_s = u[1] * (x * y + w * z) - u[0] * (y * y + z * z) + u[2] * (x * z - w * y)
-        by_s += v[0] * (x * y - w * z) - v[1] * (x * x + z * z) + v[2] * (y * z + w * x)
-        inward = -s * by_s
-        by_w = u[1] * z - u[2] * y - v[0] * z + v[2] * x + inward * w
-        by_x4 = u[1] * y + u[2] * z + v[0] * y - _TWO * v[1] * x + v[2] * w + inward * x
-        by_y4 = u[1] * x - _TWO * u[0] * y - u[2] * w + v[0] * x + v[2] * z + inward * y
-        by_z4 = u[1] * w - _TWO * u[0] * z + u[2] * x - v[0] * w - _TWO * v[1] * z + v[2] * y + inward * z
-        by_quats[i] = wp.vec4(float(s * by_w), float(s * by_x4), float(s * by_y4), float(s * by_z4))
-        by_means[i] = wp.vec3(float(by_mean[0]), float(by_mean[1]), float(by_mean[2]))
-        by_opacities[i] = float(by_log / wp.float64(opacities[i]))
+        grad_s = u[1] * (x * y + w * z) - u[0] * (y * y + z * z) + u[2] * (x * z - w * y)
+        grad_s += v[0] * (x * y - w * z) - v[1] * (x * x + z * z) + v[2] * (y * z + w * x)
+        inward = -s * grad_s
+        grad_w = u[1] * z - u[2] * y - v[0] * z + v[2] * x + inward * w
+        grad_x4 = u[1] * y + u[2] * z + v[0] * y - _TWO * v[1] * x + v[2] * w + inward * x
+        grad_y4 = u[1] * x - _TWO * u[0] * y - u[2] * w + v[0] * x + v[2] * z + inward * y
+        grad_z4 = u[1] * w - _TWO * u[0] * z + u[2] * x - v[0] * w - _TWO * v[1] * z + v[2] * y + inward * z
+        grad_quats[i] = wp.vec4(float(s * grad_w), float(s * grad_x4), float(s * grad_y4), float(s * grad_z4))
+        grad_means[i] = wp.vec3(float(grad_mean[0]), float(grad_mean[1]), float(grad_mean[2]))
+        grad_opacities[i] = float(grad_log / wp.float64(opacities[i]))
 
     return project_backward

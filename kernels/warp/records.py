@@ -19,7 +19,7 @@ _WHOLE = {
     "rays": ("nuz", "nvz", "dz", "ray_x", "ray_y", "ray_z"),
 }
 _EXTRA = {
-    "lowpass_screen": ("disc_x", "disc_y"),
+    "lowpass_screen": ("lowpass_x", "lowpass_y"),
     "ray_depth": ("z_numerator", "z_center", "z_reach"),
     "compose_pixel": ("nearest",),
     "ellipsoid_exact": ("bulge",),
@@ -30,12 +30,12 @@ class Layout:
     """Layout of a record: number of lines of four floats, and position of each number.
 
     nu0 + nux x + nuy y is n_u, likewise n_v and D, with x, y in samples relative to the centre of the anchor
-    sample (ax, ay); D is at most d_near beyond the near plane. disc_x, disc_y: projected centre relative to
-    the anchor; z_numerator / D is the depth. columns and rows: [first, end) of the box of samples that the
-    splat may overlap, 16 bits each. Behind a lens x, y, z are a sample's ray minus the anchor's ray (ray_x,
-    ray_y, ray_z), and boxed is 1 for a box, else 0. For parallel rays plane_z0 + plane_zx x + plane_zy y is D
-    times the depth, with a minimum of plane_near. bulge: 2 / m^2 of a 3D Gaussian (ellipsoids.py), else 0.
-    Fields of outputs follow.
+    sample (ax, ay); D is at most d_near beyond the near plane. lowpass_x, lowpass_y: projected centre
+    relative to the anchor; z_numerator / D is the depth. columns and rows: [first, end) of the box of samples
+    that the splat may overlap, 16 bits each. Behind a lens x, y, z are a sample's ray minus the anchor's ray
+    (ray_x, ray_y, ray_z), and boxed is 1 for a box, else 0. For parallel rays plane_z0 + plane_zx x +
+    plane_zy y is D times the depth, with a minimum of plane_near. bulge: 2 / m^2 of a 3D Gaussian
+    (ellipsoids.py), else 0. Fields of outputs follow.
     """
 
     def __init__(self, effects: Iterable[str], outputs: Iterable[str] = ()) -> None:

@@ -42,18 +42,18 @@ def make_slopes(camera: str | None, real):
         s1, s2, s3, s4 = real(lens.k[8]), real(lens.k[9]), real(lens.k[10]), real(lens.k[11])
         below = one + q * (k4 + q * (k5 + q * k6))
         radial = (one + q * (k1 + q * (k2 + q * k3))) / below
-        by_q = k1 + q * (two * k2 + q * three * k3) - radial * (k4 + q * (two * k5 + q * three * k6))
-        by_q /= below
-        mixed = two * (x * y * by_q + p1 * x + p2 * y)
+        grad_q = k1 + q * (two * k2 + q * three * k3) - radial * (k4 + q * (two * k5 + q * three * k6))
+        grad_q /= below
+        mixed = two * (x * y * grad_q + p1 * x + p2 * y)
         prism_a, prism_b = two * (s1 + two * q * s2), two * (s3 + two * q * s4)
-        a_x = radial + two * (x * x * by_q + p1 * y + three * p2 * x) + x * prism_a
-        b_y = radial + two * (y * y * by_q + three * p1 * y + p2 * x) + y * prism_b
+        a_x = radial + two * (x * x * grad_q + p1 * y + three * p2 * x) + x * prism_a
+        b_y = radial + two * (y * y * grad_q + three * p1 * y + p2 * x) + y * prism_b
         a_y, b_x = mixed + y * prism_a, mixed + x * prism_b
         per_z = one / p[2]
-        by_a = vec3(a_x, a_y, -(x * a_x + y * a_y)) * per_z
-        by_b = vec3(b_x, b_y, -(x * b_x + y * b_y)) * per_z
+        grad_a = vec3(a_x, a_y, -(x * a_x + y * a_y)) * per_z
+        grad_b = vec3(b_x, b_y, -(x * b_x + y * b_y)) * per_z
         by_depth = vec3(zero, zero, per_z)
-        return real(view.focal_x) * by_a, real(view.focal_y) * by_b, by_depth, q < real(lens.limit)
+        return real(view.focal_x) * grad_a, real(view.focal_y) * grad_b, by_depth, q < real(lens.limit)
 
     @wp.func
     def slopes_fisheye(p: vec3, view: View, lens: Lens):
@@ -62,13 +62,13 @@ def make_slopes(camera: str | None, real):
         angle = wp.atan2(across, p[2])
         q = angle * angle
         k1, k2, k3, k4 = real(lens.k[0]), real(lens.k[1]), real(lens.k[2]), real(lens.k[3])
-        by_angle = one + q * (three * k1 + q * (real(5.0) * k2 + q * (real(7.0) * k3 + q * real(9.0) * k4)))
+        grad_angle = one + q * (three * k1 + q * (real(5.0) * k2 + q * (real(7.0) * k3 + q * real(9.0) * k4)))
         cos, sin, per_across = one, zero, one / p[2]
         if across > zero:
             cos = p[0] / across
             sin = p[1] / across
             per_across = angle * (one + q * (k1 + q * (k2 + q * (k3 + q * k4)))) / across
-        away = vec3(p[2] * cos, p[2] * sin, -across) * (by_angle / wp.dot(p, p))
+        away = vec3(p[2] * cos, p[2] * sin, -across) * (grad_angle / wp.dot(p, p))
         around = vec3(-sin, cos, zero) * per_across
         by_x, by_y = cos * away - sin * around, sin * away + cos * around
         by_depth = p / wp.dot(p, p)

@@ -23,7 +23,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     thick = EXACT in effects
     # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
     splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
-    splat |= {"disc_x": wp.float32, "disc_y": wp.float32} if screen else {}
+    splat |= {"lowpass_x": wp.float32, "lowpass_y": wp.float32} if screen else {}
     splat |= {"edges": wp.vec4} if edged else {}
     splat |= {"boxed": wp.float32} if flagged else {}
     splat |= {"bulge": wp.float32} if thick else {}
@@ -32,8 +32,8 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     # plane_z0, plane_zx, plane_zy, plane_near
     splat |= {"plane": wp.vec4} if parallel else {}
     Splat = struct_of("Splat", "What of a record each sample needs.", splat)
-    disc_line, disc_lane = layout.place("disc_x")
-    disc_y_lane = layout.place("disc_y")[1]  # on the same line
+    lowpass_line, lowpass_lane = layout.place("lowpass_x")
+    lowpass_y_lane = layout.place("lowpass_y")[1]  # on the same line
     edge_line = layout.place("edge_u0")[0]
     boxed_line, boxed_lane = layout.place("boxed")
     bulge_line, bulge_lane = layout.place("bulge")
@@ -58,9 +58,9 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
             s.d = line(pool, lines, lists, first, which, 2)
             s.c = line(pool, lines, lists, first, which, 3)
             if wp.static(screen):
-                disc = line(pool, lines, lists, first, which, disc_line)
-                s.disc_x = disc[disc_lane]
-                s.disc_y = disc[disc_y_lane]
+                disc = line(pool, lines, lists, first, which, lowpass_line)
+                s.lowpass_x = disc[lowpass_lane]
+                s.lowpass_y = disc[lowpass_y_lane]
             if wp.static(edged):
                 s.edges = line(pool, lines, lists, first, which, edge_line)
             if wp.static(flagged):

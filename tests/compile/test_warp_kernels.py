@@ -151,7 +151,7 @@ def test_the_kernels_compile_for_cuda(kernel, tmp_path):
 @pytest.mark.sweep
 def test_the_base_has_nothing_of_absent_effects_and_takes_no_more_of_a_gpu(tmp_path):
     text, blend = measured(blending(outputs=()), tmp_path, 128)
-    absent = (*OF_SAMPLES, *OF_BOXES, *OF_LAYERS, "finished", "disc_x", "cross_ray", "origin")
+    absent = (*OF_SAMPLES, *OF_BOXES, *OF_LAYERS, "finished", "lowpass_x", "intersect_ray", "origin")
     for name in absent:
         assert not re.search(rf"\b{name}", text), name
     project, projection = measured(projecting(outputs=()), tmp_path / "project", 128)
@@ -186,7 +186,7 @@ def test_derivatives_read_records_where_they_lie(tmp_path):
 def test_a_record_grows_by_the_requested_fields():
     layout = runtime.kernels("records").Layout
     assert layout(()).lines == 5
-    assert layout(("lowpass_screen",)).names[-2:] == ["disc_x", "disc_y"]
+    assert layout(("lowpass_screen",)).names[-2:] == ["lowpass_x", "lowpass_y"]
     assert layout(RECORD, NORMAL).lines == 7
     assert layout(RECORD, NORMAL).place("nz") == (6, 2)
     assert layout(()).place("nz") == (0, 0)

@@ -56,8 +56,8 @@ def covered(records, names, view, rows, columns):
     u, v, d = (of[f"{n}0"] + of[f"{n}x"] * x + of[f"{n}y"] * y for n in ("nu", "nv", "d"))
     half_r2 = of["log_opacity"] - view.log_cut
     covers = (u**2 + v**2 <= half_r2 * d**2) & (d > 0) & (d <= of["d_near"])
-    if "disc_x" in of:
-        covers |= (x - of["disc_x"]) ** 2 + (y - of["disc_y"]) ** 2 <= half_r2
+    if "lowpass_x" in of:
+        covers |= (x - of["lowpass_x"]) ** 2 + (y - of["lowpass_y"]) ** 2 <= half_r2
     covers[:, view.height :] = covers[:, :, view.width :] = False
     by_cell = covers.reshape(-1, rows // 4, 4, columns // 2, 2).any((2, 4))
     tiles = by_cell.reshape(-1, rows // 16, 4, columns // 16, 8).swapaxes(2, 3)

@@ -135,9 +135,9 @@ def test_every_decision_occurs():
     for name in SCENES:
         cloud, features, view = rendered_scene(name)
         ((_, _, images[name]),) = FrozenFrame(cloud, view, features)._blocks
-    assert images["dots"].by_disc[images["dots"].contributes].all()
+    assert images["dots"].by_lowpass[images["dots"].contributes].all()
     both = images["dots and disks"]
-    assert {*both.by_disc[both.contributes].tolist()} == {True, False}
+    assert {*both.by_lowpass[both.contributes].tolist()} == {True, False}
     assert images["ceiling"].clamped[images["ceiling"].contributes].any()
     assert (images["edge-on"].missed & images["edge-on"].contributes).any()
     # depths between the centre's and the plane's

@@ -54,7 +54,7 @@ LAYOUTS: dict[str, Layout] = {
         "slot/lowpass_screen.cl",
         splat=(
             member(
-                "wide disc_x disc_y",
+                "wide lowpass_x lowpass_y",
                 "centre of the low-pass disc relative to the anchor; far away if there is none",
             ),
         ),
@@ -62,7 +62,7 @@ LAYOUTS: dict[str, Layout] = {
             member("float px py pr", "the filter's support: centre and radius [samples]; radius < 0: none"),
         ),
         backward_file="slot/lowpass_screen_backward.cl",
-        record_gradient=(member("float disc_x disc_y", "by the position of the low-pass disc"),),
+        record_gradient=(member("float lowpass_x lowpass_y", "by the position of the low-pass disc"),),
     ),
     "stop_inclusive": Layout(),
     "stop_exclusive": Layout("slot/stop_exclusive.cl", backward_file="slot/stop_exclusive_backward.cl"),
@@ -92,7 +92,7 @@ LAYOUTS: dict[str, Layout] = {
     "ellipsoid_ewa": Layout(
         "slot/ellipsoid_ewa.cl",
         parts=("thickness",),
-        view=(member("real slopes[4]", "of rays, -x, x, -y, y: limits of the linearisation"),),
+        view=(member("real ewa_clamp[4]", "of rays, -x, x, -y, y: limits of the linearisation"),),
         backward_file="slot/ellipsoid_ewa_backward.cl",
     ),
     "ellipsoid_ewa_antialiased": Layout(
@@ -256,7 +256,7 @@ LAYOUTS: dict[str, Layout] = {
     "depth_first": Layout(
         "output/depth_first.cl",
         parts=("ray_depth",),
-        blend=uniforms("first_light", "float first_light"),
+        blend=uniforms("first_hit_transmittance", "float first_hit_transmittance"),
         sample_buffers=(SampleBuffer("float", "depth_first_raw"),),
     ),
     "distance": Layout("output/distance.cl", parts=("depth", "sample_length")),

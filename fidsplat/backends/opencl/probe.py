@@ -152,7 +152,7 @@ class OpenCLProbe(Probe):
                 "bins": len(lengths),
                 "totals": buffer_of(workspace, lengths),
                 "counters": sums,
-                "slot": 4,
+                "counter": 4,
             }
         arguments = pipeline.source.arguments[kernel]
         values = [given[one.name] for one in arguments]

@@ -69,7 +69,7 @@ def _numbers(view: View, row: int, end: int, record: np.dtype) -> list[float]:
         **{"eye": view.eye.tolist(), "focal_x": view.focal_x, "focal_y": view.focal_y},
         **{"center_x": view.center_x, "center_y": view.center_y, "near": view.near, "far": view.far},
         **{"log_cut": view.log_cut, "width": view.width, "height": view.height},
-        **{"filter": 1.0 / view.samples**2, "band": row, "band_end": end, "slopes": view.slopes},
+        **{"filter": 1.0 / view.samples**2, "band": row, "band_end": end, "ewa_clamp": view.ewa_clamp},
     }
     # then the members of a lens and its ray map
     lens = iter(() if view.raster is None else view.raster.uniforms)

@@ -77,9 +77,9 @@ def composite(
         out["depth_median_may_flip"] = may_flip | (
             _pick(span.z_high - span.z_low, last, found, 0.0) > _EXACT_DEPTH * out["depth_median"]
         )
-        first = contributes & (before * (1 - alpha) <= view.first_light)
+        first = contributes & (before * (1 - alpha) <= view.first_hit_transmittance)
         out["depth_first"] = _pick(z, _first(first), np.asarray(first.any(1)), 0.0)
-        out["depth_first_may_flip"] = error_bounds.of_first(span, view.first_light)
+        out["depth_first_may_flip"] = error_bounds.of_first(span, view.first_hit_transmittance)
         out["depth_first_may_flip"] |= (
             _pick(span.z_high - span.z_low, _first(first), np.asarray(first.any(1)), 0.0)
             > _EXACT_DEPTH * out["depth_first"]

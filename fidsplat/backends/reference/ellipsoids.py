@@ -89,7 +89,7 @@ def ewa(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View, antiali
     ahead = np.ones_like(z) if view.parallel else np.where(z > 0, z, 1.0)
     slope_x, slope_y = np.zeros_like(z), np.zeros_like(z)
     if not view.parallel:
-        left, right, up, down = view.slopes
+        left, right, up, down = view.ewa_clamp
         slope_x, slope_y = np.clip(p[:, 0] / ahead, -left, right), np.clip(p[:, 1] / ahead, -up, down)
     per_x, per_y = view.focal_x / ahead, view.focal_y / ahead
     x = (scaled[:, :, 0] - slope_x[:, None] * scaled[:, :, 2]) * per_x[:, None]

@@ -81,9 +81,9 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
         z_high = np.where(d_low > 0, far_dz / np.where(far_dz < 0, d_high, d_low), np.inf)
     if s.screen:
         away, off = np.sqrt(f.offset), _ROUND * (1 + f.dx + f.dy)
-        disc_low, disc_high = np.maximum(away - off, 0) ** 2, (away + off) ** 2
-        nearest = np.minimum(nearest, np.where(disc_low <= s.half_r2 + slack, disc_low, np.inf))
-        furthest = np.minimum(furthest, np.where(disc_high <= s.half_r2 - slack, disc_high, np.inf))
+        lowpass_low, lowpass_high = np.maximum(away - off, 0) ** 2, (away + off) ** 2
+        nearest = np.minimum(nearest, np.where(lowpass_low <= s.half_r2 + slack, lowpass_low, np.inf))
+        furthest = np.minimum(furthest, np.where(lowpass_high <= s.half_r2 - slack, lowpass_high, np.inf))
     low = np.exp(s.log_opacity - furthest * (1 + weight)) * (1 - weight)
     high = np.exp(s.log_opacity - nearest * (1 - weight)) * (1 + weight)
     low, high = np.minimum(low, view.ceiling), np.minimum(high, view.ceiling)
@@ -105,7 +105,7 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
     if s.screen:
         # depths outside the circle are mirrored; where rounding decides, the interval has both (equal on the
         # circle)
-        circle = np.maximum(disc_low, HALF_RHO_OF_RANGE), np.maximum(disc_high, HALF_RHO_OF_RANGE)
+        circle = np.maximum(lowpass_low, HALF_RHO_OF_RANGE), np.maximum(lowpass_high, HALF_RHO_OF_RANGE)
         beyond = _of_mirrored_depth(s, (d_low, d_high), (q_low, q_high), (near_dz, far_dz), circle)
         may_plane = s.coplanar | (plane[0] * (1 - weight) <= circle[1] * (1 + weight))
         may_beyond = ~s.coplanar & ((d_low <= 0) | (plane[1] * (1 + weight) >= circle[0] * (1 - weight)))
@@ -113,7 +113,7 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
         z_high = np.maximum(np.where(may_plane, z_high, -np.inf), np.where(may_beyond, beyond[1], -np.inf))
     z_low, z_high = np.clip(z_low, s.z_low, s.z_high), np.clip(z_high, s.z_low, s.z_high)
     # if a ray does not meet the plane beyond `near`, the fragment has the depth of the centre
-    missed = ~must & s.disc
+    missed = ~must & s.has_lowpass
     z_low = np.where(missed, np.where(may, np.minimum(z_low, s.pz), s.pz), z_low)
     z_high = np.where(missed, np.where(may, np.maximum(z_high, s.pz), s.pz), z_high)
     # the ends of the depth range are a sum and a difference in float32; a disk that faces the camera exactly

@@ -30,7 +30,7 @@ class Decisions:
     """(m,) int: the cloud's splats, nearest first"""
     contributes: np.ndarray
     """whether alpha is above the cut-off and blended before the stop"""
-    by_disc: np.ndarray
+    by_lowpass: np.ndarray
     """whether the low-pass disc has the larger weight"""
     clamped: np.ndarray
     """whether alpha is clamped to its maximum"""
@@ -58,7 +58,7 @@ def decide(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
     return Decisions(
         order=s.order,
         contributes=live & (f.alpha > 0),
-        by_disc=disc < plane,
+        by_lowpass=disc < plane,
         clamped=s.log_opacity - np.minimum(plane, disc) > np.log(view.ceiling),
         missed=(d <= 0) | (d * view.near > f.dz),
         mirrored=s.screen & (q > 2 * np.maximum(f.offset, HALF_RHO_OF_RANGE) * d**2),
@@ -111,7 +111,7 @@ class Blend:
         plane, z_plane = self._plane, self._z_plane
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             disc = self._disc_x**2 + self._disc_y**2
-            half_rho = np.where(decisions.by_disc, disc, plane)
+            half_rho = np.where(decisions.by_lowpass, disc, plane)
             # interpolation factor from the centre's depth to the depth on the plane
             circle = np.where(decisions.wide, disc, HALF_RHO_OF_RANGE)
             self._share = np.where(decisions.mirrored, circle / plane, 1.0)
@@ -146,15 +146,15 @@ class Blend:
         grad_log = np.where(decisions.clamped, 0.0, grad_alpha * self._alpha)
 
         met = decisions.contributes & ~decisions.missed
-        on_plane, mirrored = decisions.contributes & ~decisions.by_disc, met & decisions.mirrored
+        on_plane, mirrored = decisions.contributes & ~decisions.by_lowpass, met & decisions.mirrored
         share = np.where(met, self._share, 0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             grad_share = np.where(mirrored, grad_z * (self._z_plane - self._pz), 0.0)
             # derivative with respect to rho / 2 of the ray-plane intersection
             grad_plane = np.where(mirrored, -grad_share * share / self._plane, 0.0)
             grad_plane -= np.where(on_plane, grad_log, 0.0)
-            grad_disc = np.where(decisions.contributes & decisions.by_disc, grad_log, 0.0)
-            grad_disc -= np.where(mirrored & decisions.wide, grad_share / self._plane, 0.0)
+            grad_lowpass = np.where(decisions.contributes & decisions.by_lowpass, grad_log, 0.0)
+            grad_lowpass -= np.where(mirrored & decisions.wide, grad_share / self._plane, 0.0)
         grad_facing, grad_log_opacity = self._weight.T @ grads.normal, grad_log.sum(0)
         splat_grads = CameraSplats.zeros(len(self._pz))
         for rows, shape in self._shapes:
@@ -164,7 +164,9 @@ class Blend:
             for name, array in vars(results).items():
                 getattr(splat_grads, name)[rows] = array
         for axis, distance in enumerate((self._disc_x, self._disc_y)):
-            splat_grads.center[:, axis] += 2 * np.where(grad_disc != 0, grad_disc * distance, 0.0).sum(0)
+            splat_grads.center[:, axis] += 2 * np.where(grad_lowpass != 0, grad_lowpass * distance, 0.0).sum(
+                0
+            )
         splat_grads.p[:, 2] += (grad_z * (1 - share)).sum(0)
         splat_grads.log_opacity, splat_grads.rgb = grad_log_opacity, self._weight.T @ grads.rgb
         out = CameraSplats.zeros(self._count)

@@ -52,9 +52,9 @@ class Parameters:
         """The view with these intrinsics. The limits of EWA's slopes are constant in samples."""
         fx, fy, cx, cy = self.intrinsics.tolist()
         x, y = (fx, view.focal_x, cx - view.center_x), (fy, view.focal_y, cy - view.center_y)
-        limits = zip(view.slopes, (x, x, y, y), (1, -1, 1, -1), strict=True)
+        limits = zip(view.ewa_clamp, (x, x, y, y), (1, -1, 1, -1), strict=True)
         slopes = tuple((limit * old + sign * moved) / new for limit, (new, old, moved), sign in limits)
-        return replace(view, focal_x=fx, focal_y=fy, center_x=cx, center_y=cy, slopes=slopes)
+        return replace(view, focal_x=fx, focal_y=fy, center_x=cx, center_y=cy, ewa_clamp=slopes)
 
 
 @dataclass

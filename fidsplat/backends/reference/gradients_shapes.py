@@ -174,7 +174,7 @@ class _Projected(_Solid):
         super().__init__(splats)
         self._antialiased, self._focal = antialiased, np.array([view.focal_x, view.focal_y])
         self._per = self._focal / splats.p[:, 2:]
-        left, right, up, down = view.slopes
+        left, right, up, down = view.ewa_clamp
         slopes = splats.p[:, :2] / splats.p[:, 2:]
         self._slopes = np.clip(slopes, (-left, -up), (right, down))
         self._inside = self._slopes == slopes

@@ -109,8 +109,8 @@ class Setup:
         in_front = self.pz >= view.near
         image_x, image_y = optics.centers_of(view, p, in_front)
         in_front &= np.isfinite(image_x)
-        self.disc = in_front & ~unfiltered[order]  # boxes and EWA Gaussians have no low-pass disc
-        self.center_x, self.center_y = (np.where(self.disc, at, np.inf) for at in (image_x, image_y))
+        self.has_lowpass = in_front & ~unfiltered[order]  # boxes and EWA Gaussians have no low-pass disc
+        self.center_x, self.center_y = (np.where(self.has_lowpass, at, np.inf) for at in (image_x, image_y))
         # devices store the affine forms relative to the pixel nearest to the centre's image; there is none if
         # the centre is behind the camera
         self.anchor_x = _anchor(image_x, in_front, view.width)
@@ -154,7 +154,7 @@ _OF_SPLATS = (
     *(
         "normal_error",
         "box",
-        "disc",
+        "has_lowpass",
         "center_x",
         "center_y",
         "anchor_x",

@@ -78,7 +78,7 @@ class _Backward:
             "color": frame.samples.color,
             "background": self._wp.vec3(*frame.view.background),
             "log_ceiling": math.log(frame.view.ceiling),
-            "by_rgb": self._given["by"].rgb,
+            "grad_rgb": self._given["by"].rgb,
         }
 
     def results(self) -> dict[str, Any]:
@@ -90,7 +90,7 @@ class _Backward:
         if self._pairs:
             self._launcher.launch(self._made.project, self._count, self._given)
         else:  # no splat is visible, so there are no moments
-            for array in (*found.values(), self._given["by_cameras"]):
+            for array in (*found.values(), self._given["grad_cameras"]):
                 array.zero_()
         view = self._frame.view
         pixels = view.width * view.height
@@ -99,7 +99,7 @@ class _Backward:
         given = self._given | sizes | {"parts": parts}
         self._launcher.launch(self._made.sums.background_parts, _SHARES, given)
         self._sum_rows(parts, _SHARES, 3, found["background"])
-        self._sum_rows(flat_of(self._given["by_cameras"]), self._count, 10, self._given["by_camera"])
+        self._sum_rows(flat_of(self._given["grad_cameras"]), self._count, 10, self._given["grad_camera"])
         self._launcher.stage(None)
         return found
 
@@ -180,23 +180,23 @@ class _Backward:
         """Allocate the results; each call overwrites them."""
         wp, count, terms = self._wp, self._count, max(self._made.sh_terms, 1)
         kinds = {
-            "by_means": wp.vec3,
-            "by_quats": wp.vec4,
-            "by_scales": wp.vec2,
-            "by_opacities": wp.float32,
+            "grad_means": wp.vec3,
+            "grad_quats": wp.vec4,
+            "grad_scales": wp.vec2,
+            "grad_opacities": wp.float32,
             "screen": wp.float32,
-        } | ({"by_thickness": wp.float32} if self._frame.resident.ellipsoids != "none" else {})
-        found = {name.removeprefix("by_"): self._take(name, count, dtype) for name, dtype in kinds.items()}
-        self._given.setdefault("by_thickness", self._given["by_opacities"])  # not written for disks
-        colors = self._take("by_colors", count * terms, wp.vec3)
+        } | ({"grad_thickness": wp.float32} if self._frame.resident.ellipsoids != "none" else {})
+        found = {name.removeprefix("grad_"): self._take(name, count, dtype) for name, dtype in kinds.items()}
+        self._given.setdefault("grad_thickness", self._given["grad_opacities"])  # not written for disks
+        colors = self._take("grad_colors", count * terms, wp.vec3)
         if self._made.sh_terms:
             found["sh"] = colors.reshape((count, terms))
         else:
             found["colors"] = colors
-        self._take("by_cameras", count, kernels("project_backward").TEN)
-        found["background"] = self._take("by_background", 3, wp.float32)
-        by_camera = self._take("by_camera", 10, wp.float32)
-        found["pose"], found["intrinsics"] = by_camera[:6], by_camera[6:]
+        self._take("grad_cameras", count, kernels("project_backward").TEN)
+        found["background"] = self._take("grad_background", 3, wp.float32)
+        grad_camera = self._take("grad_camera", 10, wp.float32)
+        found["pose"], found["intrinsics"] = grad_camera[:6], grad_camera[6:]
         return found
 
     def _take(self, name: str, size: int, dtype: Any) -> Any:

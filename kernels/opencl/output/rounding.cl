@@ -30,12 +30,12 @@ static inline void add_rounding(Pixel *pixel, const Splat *s, Intersection c, vf
     vint must = VMASK(d_low > 0.0f) & VMASK(d_high <= (1.0f - FORM_ROUNDING) * s->d_near);
     vfloat nearest = VSELECT((vfloat)INFINITY, squared(fmax(root - off, (vfloat)0.0f) / d_high), may);
     vfloat furthest = VSELECT((vfloat)INFINITY, squared((root + off) / d_low), must);
-#ifdef HAS_DISC
-    if (HAS_DISC(s)) {
+#ifdef HAS_LOWPASS
+    if (HAS_LOWPASS(s)) {
         vfloat away = sqrt(screen);
-        vfloat off_disc = FORM_ROUNDING * (sqrt(constants->filter) * (1.0f + 2.0f * (across + down)) + 3.0f * away);
-        nearest = fmin(nearest, squared(fmax(away - off_disc, (vfloat)0.0f)));
-        furthest = fmin(furthest, squared(away + off_disc));
+        vfloat off_lowpass = FORM_ROUNDING * (sqrt(constants->filter) * (1.0f + 2.0f * (across + down)) + 3.0f * away);
+        nearest = fmin(nearest, squared(fmax(away - off_lowpass, (vfloat)0.0f)));
+        furthest = fmin(furthest, squared(away + off_lowpass));
     }
 #endif
     vfloat high = fmin(fragment_opacity(s, nearest, 1.0f) * (1.0f + opacity_rounding(s, nearest)), (vfloat)1.0f);

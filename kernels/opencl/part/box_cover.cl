@@ -17,10 +17,10 @@
         reach = fabs(a.z) + fabs(b.z);
 //@@ camera_box_reach
     }
-//@ footprint_disc_bounds
+//@ footprint_lowpass_bounds
         if (BOX_HERE) bounds.pr = -1.0f;
-//@ footprint_disc
-        if (BOX_HERE) record.disc_x = record.disc_y = 1e18f;
+//@ footprint_lowpass
+        if (BOX_HERE) record.lowpass_x = record.lowpass_y = 1e18f;
 //@ footprint_opacity
     if (IS_BOX(s)) opacity = VMIN(EXP((vfloat)s->log_opacity), (vfloat)constants->ceiling) * c.cover;
 //@ footprint_tau

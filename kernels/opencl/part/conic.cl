@@ -24,7 +24,7 @@
         vfloat v = fmax(fabs(FMA((vfloat)s->nvy, y, FMA((vfloat)s->nvx, x, (vfloat)s->nv0))) - around_v, (vfloat)0.0f);
         vfloat d = FMA((vfloat)s->dy, y, FMA((vfloat)s->dx, x, (vfloat)s->d0)) + around_d;
         vint outside = VMASK(FMA(u, u, v * v) > conic_h * (1.0f + BLOCKS_SLACK) * (d * d)) | VMASK(d < 0.0f);
-//@@ blocks_disc
+//@@ blocks_lowpass
 //@@ blocks_nearest
 //@@ blocks_nearest_stored
         touched &= ~(VBITS(outside) << first);

@@ -33,7 +33,7 @@
 //@ coplanar_blocks_nearest
         if (s->group >= 0) min_depth = -0x1p126f;
         if (until) outside |= VMASK(min_depth >= VLOAD(until + first));
-//@ coplanar_disc_depth
+//@ coplanar_lowpass_depth
         if (s->group >= 0) on_plane = -1;           // also in the low-pass disc
 //@ compose_types
 #define IN_LAYER(s) ((s)->group >= 0)

@@ -5,8 +5,8 @@
 //@ cull_frustum
     real most = sqrt((float)(REAL(-2.0) * view->log_cut));
     real margin = most * SAMPLES + 4, sphere = REAL(1.001) * most * fmax(max_scale, (real)MIN_SCALE);    // for rounding
-    real wide_x = sphere * view->focal_x * (1 + fmax(fabs(view->slopes[0]), fabs(view->slopes[1])));
-    real wide_y = sphere * view->focal_y * (1 + fmax(fabs(view->slopes[2]), fabs(view->slopes[3])));
+    real wide_x = sphere * view->focal_x * (1 + fmax(fabs(view->ewa_clamp[0]), fabs(view->ewa_clamp[1])));
+    real wide_y = sphere * view->focal_y * (1 + fmax(fabs(view->ewa_clamp[2]), fabs(view->ewa_clamp[3])));
     wide_x += extent * (view->focal_x + fabs(view->center_x) + view->width + margin);
     wide_y += extent * (view->focal_y + fabs(view->center_y) + view->height + margin);
     real to_x = view->focal_x * p.x, to_y = view->focal_y * p.y;

@@ -1,13 +1,13 @@
 // Depth along z of a fragment: the ray-plane intersection, clamped to the depth range of the splat's visible part; the depth of the
 // centre where the ray does not intersect the plane beyond `near`. slot/lowpass_screen.cl has the depth of low-pass fragments.
 //@ intersection
-//@@ disc_intersection
+//@@ lowpass_intersection
 //@ mask
-//@@ disc_mask
+//@@ lowpass_mask
 //@ project
     // range of all fragments, including the low-pass disc at any alpha cut-off
     real depth_center = pz, depth_reach = reach;
-//@@ disc_depth_reach
+//@@ lowpass_depth_reach
 //@@ depth_reach
 //@@ coplanar_depth_reach
     if (pz < near) {                // all fragments are beyond `near`
@@ -26,7 +26,7 @@
 //@@ camera_attribute_depth
     vfloat depth = depth_d * inverse_d;
     vint hit = VMASK(c.d > 0.0f);
-//@@ disc_attribute_depth
+//@@ lowpass_attribute_depth
     attributes.z = VSELECT((vfloat)s->z_center,
                      VMIN(VMAX(depth, (vfloat)s->z_center - (vfloat)s->z_reach), (vfloat)s->z_center + (vfloat)s->z_reach), hit);
 //@ layer_accumulate

@@ -3,12 +3,12 @@
 //@ geometry
     vfloat d, z;
     vint hit;               // the depth is z_numerator / D
-//@@ disc_geometry
+//@@ lowpass_geometry
 //@ geometry_make
     g.d = c.d;
     vfloat z_low = s->z_center - s->z_reach, z_high = s->z_center + s->z_reach, depth = s->z_numerator * g.inverse_d;
     vint flat = g.on_plane;                 // the depth is on the plane, if within range
-//@@ disc_geometry_make
+//@@ lowpass_geometry_make
     g.hit = flat & VMASK(depth >= z_low) & VMASK(depth <= z_high);
     g.z = clamp(depth, z_low, z_high);
 //@ sums
@@ -19,7 +19,7 @@ static inline vfloat add_depth(Sums *sums, const Splat *s, const Geometry *g, vf
                                vfloat *grad_nu, vfloat *grad_nv) {
     vfloat grad_numerator = VSELECT((vfloat)0.0f, grad_z * g->inverse_d, g->hit), grad_d = -grad_numerator * g->z;
     vfloat grad_center = VSELECT(grad_z, (vfloat)0.0f, g->hit), grad_q = 0.0f;     // grad_q n_u, grad_q n_v: gradients with respect to n_u, n_v
-//@@ disc_add_depth
+//@@ lowpass_add_depth
 //@@ footprint_add_depth
     sums->z_numerator += grad_numerator;
     sums->z_center += grad_center;

@@ -12,6 +12,6 @@ static inline float tile_nearest(const Splat splat, int left, int top) {
     const vfloat d = FMA(s->dy, y, FMA(s->dx, x, s->d0)) + around_d;        // at most, in the tile
     vfloat min_depth = s->z_center - s->z_reach;
 //@@ camera_blocks_nearest
-//@@ disc_blocks_nearest
+//@@ lowpass_blocks_nearest
     return convert_float_rtn(min_depth);
 }

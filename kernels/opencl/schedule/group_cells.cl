@@ -45,7 +45,7 @@ static inline void touched_cells(local const Splat *s, int left, int top, wide h
         // columns with fragments in the cell's rows of samples
         float y0 = (float)(top + cell_row * CELL_H) - (float)s->ay, y1 = y0 + (float)(CELL_H - 1), low = -INFINITY, high = INFINITY;
 //@@ cells_row
-//@@ cells_disc
+//@@ cells_lowpass
         int first = max((int)clamp(ceil(low + shift), 0.0f, (float)TILE_W), s->x0 - left);
         int last = min((int)clamp(floor(high + shift), -1.0f, (float)(TILE_W - 1)), s->x1 - left - 1);
         if (first <= last) SET_CELLS(cells, cell_row, (2u << (last / CELL_W)) - (1u << (first / CELL_W)));

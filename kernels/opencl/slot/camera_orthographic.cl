@@ -37,7 +37,7 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
     c.inside &= VMASK(c.z >= s.z_near * c.d);
 //@ camera_attribute_depth
     depth_d = c.z;
-//@ camera_disc_depth
+//@ camera_lowpass_depth
         beyond_near = VMASK(c.z >= s->z_near * c.d);
 //@ camera_derivative
         gx.x = view->focal_x * a.x; gx.y = view->focal_x * b.x;

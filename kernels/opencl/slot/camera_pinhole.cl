@@ -9,7 +9,7 @@
         vint hit = VMASK(d > 2.0f * around_d) & VMASK((vfloat)s->z_numerator > 0.0f) & VMASK((vfloat)conic_h == (vfloat)(float)half_r2);
         vfloat depth = fmin((1.0f - BLOCKS_SLACK) * s->z_numerator / d, (vfloat)(s->z_center + s->z_reach));
         min_depth = VSELECT(min_depth, fmax(depth, min_depth), hit);
-//@ camera_disc
+//@ camera_lowpass
         // The low-pass disc never has the larger weight if the splat is wider than it in all of the disc: there D is at least `min_d`, in
         // front of the near plane, and (n_u^2 + n_v^2) / D^2 at most the squared distance.
         real spread = sqrt((kx.z * kx.z + ky.z * ky.z) * (half_r2 / view->filter));
@@ -18,7 +18,7 @@
         // margin for the rounding of the float32 record
         if (facing != 0 && min_d > 0 && (ahead + spread) * near < REAL(0.999) * fabs(determinant) &&
             steep < REAL(1.99) * view->filter * min_d * min_d)
-            record.disc_x = 1e18f;
+            record.lowpass_x = 1e18f;
 //@ camera_derivative
         real ahead = 1 / pz;
         real3_ in_x = {a.x, b.x, p.x}, in_y = {a.y, b.y, p.y}, in_z = {a.z, b.z, p.z};
@@ -27,8 +27,8 @@
         gz.x = a.z * ahead; gz.y = b.z * ahead;
 //@ camera_image
         // Jacobian clamped to 0.3 half images outside of the image, as in gsplat
-        real ahead = 1 / pz, slope_x = fmin(fmax(p.x * ahead, -view->slopes[0]), view->slopes[1]);
-        real slope_y = fmin(fmax(p.y * ahead, -view->slopes[2]), view->slopes[3]);
+        real ahead = 1 / pz, slope_x = fmin(fmax(p.x * ahead, -view->ewa_clamp[0]), view->ewa_clamp[1]);
+        real slope_y = fmin(fmax(p.y * ahead, -view->ewa_clamp[2]), view->ewa_clamp[3]);
         per_x = view->focal_x * ahead;
         per_y = view->focal_y * ahead;
         across.x = per_x * (a.x - slope_x * a.z); across.y = per_x * (b.x - slope_x * b.z); across.z = per_x * (c.x - slope_x * c.z);

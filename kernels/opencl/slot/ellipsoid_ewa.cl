@@ -57,7 +57,7 @@ static inline Projected widened(real3_ across, real3_ down, real spread) {
         if (THICK_HERE) filtered = false;   // EWA has its own low-pass
 //@ camera_steepest
     if (THICK_HERE) steepest = fabs(k0.z);  // makes D equal to 1 at all samples
-//@ footprint_disc_bounds
+//@ footprint_lowpass_bounds
         if (THICK_HERE) bounds.pr = -1.0f;
-//@ footprint_disc
-        if (THICK_HERE) record.disc_x = record.disc_y = 1e18f;
+//@ footprint_lowpass
+        if (THICK_HERE) record.lowpass_x = record.lowpass_y = 1e18f;

@@ -65,9 +65,9 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
     }
 //@ footprint_bounds
     radius = cutoff_radius;
-//@ footprint_disc
+//@ footprint_lowpass
         // the disk's test does not account for fragments of the ellipsoid that `near` removes
-        if (THICK_HERE && pz >= near && pz - reach < near) record.disc_x = (wide)(center_x - anchor_x);
+        if (THICK_HERE && pz >= near && pz - reach < near) record.lowpass_x = (wide)(center_x - anchor_x);
 //@ footprint_intersect
     if (s->bulge > 0.0f) {
         vfloat squared = FMA((vfloat)s->bulge, c.q, c.d * c.d);      // D^2 (1 + rho_disk / m^2)

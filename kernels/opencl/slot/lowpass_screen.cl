@@ -5,11 +5,11 @@
         bounds.px = (float)center_x;
         bounds.py = (float)center_y;
         bounds.pr = pz >= near ? sqrt(half_r2 / (float)view->filter) * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD : -1.0f;
-//@@ footprint_disc_bounds
+//@@ footprint_lowpass_bounds
 //@ bounds_span
-    float disc_low = fmax(y0 - b->py, -b->pr), disc_high = fmin(y1 - b->py, b->pr);
-    if (disc_low <= disc_high) {
-        float at = clamp(0.0f, disc_low, disc_high);
+    float lowpass_low = fmax(y0 - b->py, -b->pr), lowpass_high = fmin(y1 - b->py, b->pr);
+    if (lowpass_low <= lowpass_high) {
+        float at = clamp(0.0f, lowpass_low, lowpass_high);
         float half_chord = FAST_SQRT(fmax(b->pr * b->pr - at * at, 0.0f)) + BOUNDS_PAD;
         *x0 = fmin(*x0, b->px - half_chord);
         *x1 = fmax(*x1, b->px + half_chord);
@@ -20,69 +20,69 @@
         high = fmax(high, b->py + b->pr);
     }
 //@ project
-        record.disc_x = pz >= near ? (wide)(center_x - anchor_x) : 1e18f;
-        record.disc_y = pz >= near ? (wide)(center_y - anchor_y) : 1e18f;
-//@@ camera_disc
-//@@ footprint_disc
+        record.lowpass_x = pz >= near ? (wide)(center_x - anchor_x) : 1e18f;
+        record.lowpass_y = pz >= near ? (wide)(center_y - anchor_y) : 1e18f;
+//@@ camera_lowpass
+//@@ footprint_lowpass
 //@ cells_start
-    const float disc_square = s->disc_x < 1e17f ? (float)(half_r2 / filter) * (1.0f + 1e-4f) : -1.0f;   // -1: no disc
-//@ cells_disc
-            float disc_y = clamp((float)s->disc_y, y0, y1) - (float)s->disc_y, disc_rest = disc_square - disc_y * disc_y;
-            if (disc_rest >= 0.0f) {
-                float half_chord = FAST_SQRT(disc_rest) + CELLS_PAD;
-                low = fmin(low, (float)s->disc_x - half_chord);
-                high = fmax(high, (float)s->disc_x + half_chord);
+    const float lowpass_square = s->lowpass_x < 1e17f ? (float)(half_r2 / filter) * (1.0f + 1e-4f) : -1.0f;   // -1: no disc
+//@ cells_lowpass
+            float lowpass_y = clamp((float)s->lowpass_y, y0, y1) - (float)s->lowpass_y, lowpass_rest = lowpass_square - lowpass_y * lowpass_y;
+            if (lowpass_rest >= 0.0f) {
+                float half_chord = FAST_SQRT(lowpass_rest) + CELLS_PAD;
+                low = fmin(low, (float)s->lowpass_x - half_chord);
+                high = fmax(high, (float)s->lowpass_x + half_chord);
             }
-//@ blocks_disc
-        if (HAS_DISC(s)) {
-            vfloat disc_x = fmax(fabs(x - s->disc_x) - half_x - BLOCKS_PAD, (vfloat)0.0f);
-            vfloat disc_y = fmax(fabs(y - s->disc_y) - half_y - BLOCKS_PAD, (vfloat)0.0f);
-            outside &= VMASK(FMA(disc_x, disc_x, disc_y * disc_y) * filter > half_r2);
+//@ blocks_lowpass
+        if (HAS_LOWPASS(s)) {
+            vfloat lowpass_x = fmax(fabs(x - s->lowpass_x) - half_x - BLOCKS_PAD, (vfloat)0.0f);
+            vfloat lowpass_y = fmax(fabs(y - s->lowpass_y) - half_y - BLOCKS_PAD, (vfloat)0.0f);
+            outside &= VMASK(FMA(lowpass_x, lowpass_x, lowpass_y * lowpass_y) * filter > half_r2);
         }
 //@ intersect_functions
-#define HAS_DISC(s) ((s)->disc_x < 1e17f)       // disc_x is huge without a low-pass disc, NaN where the lens has no image of the centre
+#define HAS_LOWPASS(s) ((s)->lowpass_x < 1e17f)       // lowpass_x is huge without a low-pass disc, NaN where the lens has no image of the centre
 //@ fragment_mask
 // Vectors of pixels skip splats without a disc; for single pixels the test costs as much as it saves.
 #if LANES > 1
-#define SKIPS_DISC(s) (!HAS_DISC(s))
+#define SKIPS_LOWPASS(s) (!HAS_LOWPASS(s))
 #else
-#define SKIPS_DISC(s) false
+#define SKIPS_LOWPASS(s) false
 #endif
 
 static inline vint fragment_mask(const Splat *s, Intersection c, vfloat x, vfloat y, wide half_r2, wide filter,
                                  vfloat *screen) {
     *screen = 0.0f;
-    if (SKIPS_DISC(s)) return c.inside;
-    vfloat ex = x - s->disc_x;
-    vfloat ey = y - s->disc_y;
+    if (SKIPS_LOWPASS(s)) return c.inside;
+    vfloat ex = x - s->lowpass_x;
+    vfloat ey = y - s->lowpass_y;
     *screen = FMA(ex, ex, ey * ey) * filter;
     return c.inside | VMASK(*screen <= half_r2);
 }
 //@ fragment_half_rho
 static inline vfloat fragment_half_rho(const Splat *s, Intersection c, vfloat inverse_d, vfloat screen) {
     vfloat half_rho = HALF_RHO(c, inverse_d);
-    return SKIPS_DISC(s) ? half_rho : VSELECT(screen, VMIN(half_rho, screen), c.inside);
+    return SKIPS_LOWPASS(s) ? half_rho : VSELECT(screen, VMIN(half_rho, screen), c.inside);
 }
-//@ disc_intersection
+//@ lowpass_intersection
     vfloat screen;              // rho / 2 of the low-pass disc
-//@ disc_mask
+//@ lowpass_mask
             c.screen = screen;
-//@ disc_attribute_depth
+//@ lowpass_attribute_depth
     // In the disc, the ray-plane intersection may be far outside of the splat. Beyond the circle rho = 2 ln 255, inside of which a splat
     // has at least 1/255 of its opacity, depths are reflected at the circle: the difference from the centre's depth is multiplied by
     // 2 ln 255 / rho and tends to 0 at the plane's horizon. Where the disc's rho is larger it defines the circle, which makes depth
     // continuous at the disc's border (docs/correctness.md).
-    if (HAS_DISC(s)) {
+    if (HAS_LOWPASS(s)) {
         vfloat circle = VMAX(c.screen, (vfloat)WIDE(5.5412635451584261));
         vint on_plane = VMASK((c.q * inverse_d) * inverse_d <= circle), beyond_near = VMASK(c.d <= s->d_near);
-//@@ camera_disc_depth
-//@@ coplanar_disc_depth
+//@@ camera_lowpass_depth
+//@@ coplanar_lowpass_depth
         hit &= beyond_near;
         depth = VSELECT(FMA(circle * (depth_d - s->z_center * c.d), c.d / c.q, (vfloat)s->z_center), depth, on_plane);
     }
-//@ disc_blocks_nearest
-        if (HAS_DISC(s)) min_depth = fmin(min_depth, (vfloat)fmax((1.0f - BLOCKS_SLACK) * s->z_center, s->z_center - s->z_reach));
-//@ disc_depth_reach
+//@ lowpass_blocks_nearest
+        if (HAS_LOWPASS(s)) min_depth = fmin(min_depth, (vfloat)fmax((1.0f - BLOCKS_SLACK) * s->z_center, s->z_center - s->z_reach));
+//@ lowpass_depth_reach
 #ifndef BOX_HERE
 #define BOX_HERE false
 #endif

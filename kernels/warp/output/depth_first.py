@@ -13,7 +13,7 @@ from . import Output
 @wp.func
 def composite(pixel: Any, attributes: Any, weight: float, view: View):
     p = pixel
-    if p.depth_first == 0.0 and p.t - weight <= view.first_light:
+    if p.depth_first == 0.0 and p.t - weight <= view.first_hit_transmittance:
         p.depth_first = attributes.z
     return p
 
