@@ -213,9 +213,7 @@ def _minimise(at: _State, stage: _Stage, steps: int, settled: float = _SETTLED) 
     """Levenberg-Marquardt at one stage. The last step is not checked by a render."""
     damping, frame = _DAMPING, stage.frame(at.pose)
     if not at.noise:  # the exposure is unknown
-        for _ in range(3):
-            sums = stage.sums(frame, at, noise=0.0)
-            at = at.moved(sums, np.zeros(6))
+        at = at.moved(stage.sums(frame, at), np.zeros(6))
     sums = stage.sums(frame, at)
     for number in range(steps):
         step = _solved(sums, damping)
