@@ -170,9 +170,9 @@ class Bench:
         )
         with delayed_progress() as progress:
             results = measuring.run(progress)
-        failed = [one for one in results if "error" in one]
-        for one in failed:
-            print_lines(console(True), f"{one['scene']}, {one['renderer']}: {one['error']}")
+        failed = [result for result in results if "error" in result]
+        for result in failed:
+            print_lines(console(True), f"{result['scene']}, {result['renderer']}: {result['error']}")
         print_lines(console(False), f"{len(results)} results in {file}")
         return 1 if failed else 0
 

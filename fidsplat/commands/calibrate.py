@@ -47,13 +47,13 @@ class Calibrate:
         file = new_file(str(folder / "calibrate.json"), self.overwrite)
         renderer = fs.Renderer(self.device)
         views = list(show_progress("views", rendered_views(settings, renderer), settings.views))
-        detected = [one for one in views if one is not None]
+        detected = [board for board in views if board is not None]
         if len(detected) < 3:
             raise FidsplatError(
                 f"the board was found in {len(detected)} of {len(views)} views; use a larger size"
             )
-        rows = list(errors_by_count(settings, [one.view for one in detected]))
-        corner = float(np.sqrt(np.mean(np.concatenate([one.errors for one in detected]) ** 2)))
+        rows = list(errors_by_count(settings, [board.view for board in detected]))
+        corner = float(np.sqrt(np.mean(np.concatenate([board.errors for board in detected]) ** 2)))
         facts = {
             "settings": asdict(settings),
             "device": renderer.device.title,

@@ -147,7 +147,7 @@ def _placeholder(kind: Any, repeated: bool) -> str:
         spec = next((mark for mark in get_args(kind) if isinstance(mark, PrimitiveConstructorSpec)), None)
         return spec.metavar if spec else _placeholder(get_args(kind)[0], repeated)
     if get_origin(kind) in (Union, UnionType):
-        kind = next(each for each in get_args(kind) if each is not NoneType)
+        kind = next(member for member in get_args(kind) if member is not NoneType)
     if get_origin(kind) is tuple:
         return _placeholder(get_args(kind)[0], repeated) + ("" if repeated else "...")
     return _PLACEHOLDERS.get(kind, "TEXT")
@@ -169,10 +169,10 @@ def _field_docstrings(kind: type) -> dict[str, str]:
     """Docstrings of a dataclass's fields, including inherited ones, as help texts: without a capital and a
     full stop."""
     texts: dict[str, str] = {}
-    for each in reversed(kind.__mro__):
-        if not dataclasses.is_dataclass(each):
+    for base in reversed(kind.__mro__):
+        if not dataclasses.is_dataclass(base):
             continue
-        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(each))).body
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
         assert isinstance(definition, ast.ClassDef)
         for field, text in zip(definition.body, definition.body[1:], strict=False):
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):

@@ -115,17 +115,17 @@ class Detect:
         from fidsplat.render.flight import scene_at
 
         poses = {} if scene is None else log_poses(path)
-        for one in log_images(path, self.topic):
+        for image in log_images(path, self.topic):
             then = scene
             if scene is not None:
-                pose = poses.get((one.frame, one.stamp))
+                pose = poses.get((image.frame, image.stamp))
                 if pose is None:
                     raise InputError(
-                        f"{path} must have a pose of {one.frame!r} in /tf at the time of {one.name} for "
+                        f"{path} must have a pose of {image.frame!r} in /tf at the time of {image.name} for "
                         "--scene, got none; detect without --scene"
                     )
-                then = scene_at(scene, pose, one.stamp / 1e9)
-            yield one.name, one.image, then
+                then = scene_at(scene, pose, image.stamp / 1e9)
+            yield image.name, image.image, then
 
     def _detect(
         self, name: str, image: "np.ndarray", scene: "Scene | None"

@@ -37,7 +37,7 @@ class Fetch:
                 (s.name, f"{s.splats:,}", f"{s.size / 1e6:.1f}", s.licence, s.author, s.source)
                 for s in scenes.values()
             ]
-            facts = {"scenes": [asdict(each) for each in scenes.values()]}
+            facts = {"scenes": [asdict(captured) for captured in scenes.values()]}
             return report(self.json, facts, table=("Captured scenes", heads, rows))
         with delayed_progress() as progress:
             path = fetch_scene(self.name, progress)

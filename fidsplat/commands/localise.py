@@ -102,11 +102,11 @@ class Localise:
             raise InputError(f"{', '.join(results)} and {self.scene}: {missing}")
         files = [] if self.out is None else [_write(self.out, results, camera)]
         facts = [
-            {"image": name, "found": False, "start": None} | ({} if one is None else one.as_dict())
-            for name, one in results.items()
+            {"image": name, "found": False, "start": None} | ({} if result is None else result.as_dict())
+            for name, result in results.items()
         ]
         heads = ("image", "found", "position [m]", "deviation [mm]", "[deg]", "inliers", "start")
-        table = (f"Poses in {self.scene}", heads, [_row(one) for one in facts])
+        table = (f"Poses in {self.scene}", heads, [_row(result) for result in facts])
         device = renderer.device.title
         return report(self.json, {"device": device, "images": facts, "files": files}, *files, table=table)
 
@@ -132,7 +132,9 @@ def _write(out: str, results: dict[str, Localisation | None], camera: Camera) ->
     from fidsplat.cameras import Trajectory
     from fidsplat.formats import save_trajectory
 
-    poses = {name: one.camera.camera_to_world for name, one in results.items() if one and one.found}
+    poses = {
+        name: result.camera.camera_to_world for name, result in results.items() if result and result.found
+    }
     if not poses:
         raise InputError(f"a pose must be found to write {out}, got none of {len(results)} images")
     trajectory = Trajectory(np.arange(len(poses)), np.array(list(poses.values())))

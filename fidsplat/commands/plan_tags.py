@@ -78,5 +78,5 @@ class PlanTags:
         lines += map(str, files)
         head = ("tag", "position [m]", "poses", "predicted error [cm]")
         return report(
-            self.json, facts | {"files": [str(one) for one in files]}, *lines, table=("", head, rows)
+            self.json, facts | {"files": [str(file) for file in files]}, *lines, table=("", head, rows)
         )

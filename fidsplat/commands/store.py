@@ -143,12 +143,12 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     rows += [("left out", f"{count:,}: {why}") for why, count in facts["left_out"].items()]
     rows += [
         (
-            f"level {one['level']}",
-            f"{counted(one['splats'], 'splats')} in {counted(one['nodes'], 'nodes')}, cells of "
-            f"{one['cell_m']:.3g} m",
+            f"level {level['level']}",
+            f"{counted(level['splats'], 'splats')} in {counted(level['nodes'], 'nodes')}, cells of "
+            f"{level['cell_m']:.3g} m",
         )
-        for one in facts["levels"]
-        if one["level"]
+        for level in facts["levels"]
+        if level["level"]
     ]
     if facts["bounds"]:
         corners = ("(" + ", ".join(f"{value:.4g}" for value in corner) + ")" for corner in facts["bounds"])
@@ -183,14 +183,14 @@ class Measure:
         with delayed_progress() as progress:
             measured = measure_detail(fs.Store(self.store), fs.Renderer(self.device), self.settings, progress)
         if self.json:
-            print_json({"store": self.store, "details": [vars(one) for one in measured]})
+            print_json({"store": self.store, "details": [vars(detail) for detail in measured]})
             return 0
-        for one in measured:
+        for detail in measured:
             rows = (
                 (f"{size:.3f}", "not measured" if error is None else f"{error:.4f}")
-                for size, error in zip(one.sizes, one.errors, strict=True)
+                for size, error in zip(detail.sizes, detail.errors, strict=True)
             )
-            title = f"lowpass {one.lowpass}, level {one.level}, {one.views} views, {one.device}"
+            title = f"lowpass {detail.lowpass}, level {detail.level}, {detail.views} views, {detail.device}"
             print_table(console(False), title, ("cells up to [px]", "largest error of rgb"), rows)
         return 0
 

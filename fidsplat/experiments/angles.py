@@ -71,7 +71,9 @@ def measure_angles(point: dict, markers: MarkerRenderer, seed: int, pool: Execut
     return {
         "spec": spec if category.kind == "apriltag" else printed.family,
         "readers": {
-            name: {key: "".join("01"[getattr(one, key)] for one in by_tilt) for key in ("found", "read")}
+            name: {
+                key: "".join("01"[getattr(at_tilt, key)] for at_tilt in by_tilt) for key in ("found", "read")
+            }
             for name, by_tilt in zip(names, zip(*attempts, strict=True), strict=True)
         },
     }

@@ -118,8 +118,8 @@ def marker_job(category: Category, index: int, seed: int, folder: Path, view: st
         "module": PROTOCOLS["fixed-plane"].module(grid.shape[0]),
         "images": [
             image_job(image_file(folder, view, category.name, index, kind, i), camera)
-            for kind, own in cameras.items()
-            for i, camera in enumerate(own)
+            for kind, cameras_of_kind in cameras.items()
+            for i, camera in enumerate(cameras_of_kind)
         ],
     }
 
@@ -179,15 +179,15 @@ def run_worker(
     Raises DeviceError if Blender fails; complete images remain.
     """
     missing = []
-    for one in objects:
-        existing = [image["file"] for image in one["images"] if Path(image["file"]).is_file()]
+    for item in objects:
+        existing = [image["file"] for image in item["images"] if Path(image["file"]).is_file()]
         yield from map(Path, existing)
-        left = [image for image in one["images"] if image["file"] not in existing]
+        left = [image for image in item["images"] if image["file"] not in existing]
         if left:
-            missing.append({**one, "images": left})
+            missing.append({**item, "images": left})
     if not missing:
         return
-    for folder in {Path(image["file"]).parent for one in missing for image in one["images"]}:
+    for folder in {Path(image["file"]).parent for item in missing for image in item["images"]}:
         writable_folder(folder)
     with tempfile.TemporaryDirectory() as work:
         file, log = Path(work) / "job.json", Path(work) / "stderr.txt"

@@ -22,9 +22,9 @@ def main(job: dict) -> None:
 
 def render(scene, objects: list[dict], build) -> None:
     """Build each object and render its images into their files."""
-    for one in objects:
-        built = build(one)
-        for image in one["images"]:
+    for item in objects:
+        built = build(item)
+        for image in item["images"]:
             aim(scene, image)
             # the worker of a killed run may still write the same image
             part = f"{image['file']}.{os.getpid()}.part.png"

@@ -34,7 +34,7 @@ def measure_counts(point: dict, seed: int) -> dict:
     result["gaussians"], result["seconds"] = {}, {}
     for mixture in mixtures():
         repeats = [marker(spec, mixture=mixture) for _ in range(1 + point["repeats"])]
-        result["seconds"][mixture] = [one.seconds for one in repeats[1:]]
+        result["seconds"][mixture] = [repeat.seconds for repeat in repeats[1:]]
         result["gaussians"][mixture] = {"rectangles": len(repeats[0].cloud)} | {
             name: count
             for name in ("cells", "runs")

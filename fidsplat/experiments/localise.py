@@ -165,7 +165,9 @@ class Drive:
         """Images (480, 640, 3) uint8 of the drive."""
         scene = self.scene(variant.mixture)
         if variant.texture:
-            scene = replace(scene, markers=tuple(each for each in scene.markers if each.marker.id is None))
+            scene = replace(
+                scene, markers=tuple(placed for placed in scene.markers if placed.marker.id is None)
+            )
         camera, motion = replace(self.camera, lens=variant.lens), Motion(run.camera.inverse())
         base = Capture(camera, background=scene.background, motion=motion)
         indices = self.image_indices(run).tolist()
@@ -303,7 +305,13 @@ class Drive:
                 distance = np.linalg.norm(tag.pose[:3, 3] - at.position)
                 error = corner_error(code, at.project(tag.corners))
                 errors[np.searchsorted(DISTANCES, distance)].append(error)
-        return [{"tags": len(own), "median_px": float(np.median(own)) if own else None} for own in errors]
+        return [
+            {
+                "tags": len(errors_of_tag),
+                "median_px": float(np.median(errors_of_tag)) if errors_of_tag else None,
+            }
+            for errors_of_tag in errors
+        ]
 
 
 def errors_of(run: Run, poses: np.ndarray) -> dict[str, float]:
@@ -318,7 +326,9 @@ def errors_of(run: Run, poses: np.ndarray) -> dict[str, float]:
     travelled = np.concatenate([[0], np.cumsum(steps)])
     after = np.searchsorted(travelled, travelled + 1.0)
     pairs = np.flatnonzero(after < len(travelled))
-    true, estimated = (np.linalg.inv(each[pairs]) @ each[after[pairs]] for each in (run.poses, poses))
+    true, estimated = (
+        np.linalg.inv(matrices[pairs]) @ matrices[after[pairs]] for matrices in (run.poses, poses)
+    )
     relative = (np.linalg.inv(true) @ estimated)[:, :2, 3]
     return {
         "ate_m": float(np.sqrt((distance**2).mean())),

@@ -256,7 +256,9 @@ class Survey:
             between = poses[:, None, :3, 3] - self.path[None, :, :3, 3]
             nearest = float(np.linalg.norm(between, axis=2).min())
         else:
-            nearest = min((float(one[one > 0].min()) for one in self._depths if one.any()), default=0.0)
+            nearest = min(
+                (float(depth[depth > 0].min()) for depth in self._depths if depth.any()), default=0.0
+            )
         size, sides = self.tag.size, self.tag.bits.shape[1]
         pixels = size * max(camera.fx, camera.fy) / (sides * nearest) if nearest else math.inf
         if pixels < MODULE:
@@ -273,15 +275,17 @@ class Survey:
         if not self._settings.planar:
             return sightings
         return [
-            Sightings(one.poses, planar_information(one.information, self.path[one.poses], self.up))
-            for one in sightings
+            Sightings(
+                sighting.poses, planar_information(sighting.information, self.path[sighting.poses], self.up)
+            )
+            for sighting in sightings
         ]
 
     def with_tags(self, tags: Sequence[PlacedMarker]) -> np.ndarray:
         """Covariance (6 p, 6 p) of the trajectory, updated by tags."""
         covariance = self.covariance
-        for one in self.sightings(tags):
-            covariance = updated(covariance, one)
+        for sighting in self.sightings(tags):
+            covariance = updated(covariance, sighting)
         return covariance
 
 
@@ -325,8 +329,8 @@ def suppress_nearby(candidates: Sequence[tuple[Surface, np.ndarray]], tag: Marke
     chosen: list[np.ndarray] = []
     for k in order:
         pose = candidates[k][1]
-        near = [one for one in chosen if np.linalg.norm(one[:3, 3] - pose[:3, 3]) < tag.size]
-        if not any(one[:3, 2] @ pose[:3, 2] > 0.8 for one in near):
+        near = [other for other in chosen if np.linalg.norm(other[:3, 3] - pose[:3, 3]) < tag.size]
+        if not any(other[:3, 2] @ pose[:3, 2] > 0.8 for other in near):
             chosen.append(pose)
     return np.array(chosen).reshape(-1, 4, 4)
 
@@ -384,8 +388,8 @@ def sightings_of(
             poses[tag].append(k)
             known[tag].append(information)
     return [
-        Sightings(np.array(own, int), np.array(matrices).reshape(-1, 6, 6))
-        for own, matrices in zip(poses, known, strict=True)
+        Sightings(np.array(numbers, int), np.array(matrices).reshape(-1, 6, 6))
+        for numbers, matrices in zip(poses, known, strict=True)
     ]
 
 

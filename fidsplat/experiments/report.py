@@ -240,10 +240,10 @@ def _panels(
     names.sort(key=lambda name: (name in (PAPER, TRAINED), name != IDEAL))
     missing = [_NAN] * len(categories)
     with chart(file, len(panels), (4.5 * len(panels) + 2, 4.2)) as (figure, axes):
-        for one, (title, series) in zip(axes, panels.items(), strict=True):
-            bars(one, _titles(categories), {name: series.get(name, missing) for name in names})
-            one.set_title(title)
-            one.tick_params(axis="x", labelsize=8)
+        for axis, (title, series) in zip(axes, panels.items(), strict=True):
+            bars(axis, _titles(categories), {name: series.get(name, missing) for name in names})
+            axis.set_title(title)
+            axis.tick_params(axis="x", labelsize=8)
         axes[0].set_ylabel(unit)
         legend_above(figure, axes[0])
 

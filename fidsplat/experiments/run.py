@@ -77,7 +77,7 @@ def _points(name: str, options: Any) -> list[Key]:
     if name == counts.NAME:
         repeats = counts.QUICK_REPEATS if options.quick else counts.FULL_REPEATS
         count = MARKERS if options.markers is None else count  # all five markers take only a second
-        return [{**one, "repeats": repeats} for one in _markers(categories, count)]
+        return [{**marker, "repeats": repeats} for marker in _markers(categories, count)]
     if name == views.NAME:
         number = QUICK_VIEWS if options.quick else TEST_VIEWS
         folder = options.blender_folder
@@ -86,11 +86,11 @@ def _points(name: str, options: Any) -> list[Key]:
         distances, tilts = localisation.QUICK if options.quick else localisation.FULL
         located = _markers((c for c in categories if c.name in localisation.LOCATED), count)
         spans = {"distances": list(distances), "tilts": list(tilts)}
-        return [{**one, "method": m, **spans} for one, m in product(located, options.methods)]
+        return [{**marker, "method": m, **spans} for marker, m in product(located, options.methods)]
     tilts = options.tilts or (angles.QUICK_TILTS if options.quick else angles.FULL_TILTS)
     scans = product(_markers(categories, count), options.methods)
-    scans_of_markers = [{**one, "method": m, "tilts": tilts} for one, m in scans]
-    return [{"protocol": p, **one} for p in options.protocol or PROTOCOLS for one in scans_of_markers]
+    scans_of_markers = [{**marker, "method": m, "tilts": tilts} for marker, m in scans]
+    return [{"protocol": p, **marker} for p in options.protocol or PROTOCOLS for marker in scans_of_markers]
 
 
 def _markers(categories: Iterable[Category], count: int) -> list[Key]:

@@ -73,9 +73,9 @@ def read_summary(file: Path) -> Summary:
     try:
         lines = read_text(file).splitlines()
         facts = [from_json(line.removeprefix(_MARK)) for line in lines if line.startswith(_MARK)]
-        if not all(isinstance(one, dict) for one in facts):
+        if not all(isinstance(item, dict) for item in facts):
             raise ValueError("the lines before its table must be facts")
-        if any("repeated" in one for one in facts):
+        if any("repeated" in item for item in facts):
             raise ValueError(
                 "its format is of an earlier version; make the report again from the .jsonl files"
             )
@@ -84,13 +84,13 @@ def read_summary(file: Path) -> Summary:
         rows = pd.read_csv(table, keep_default_na=False, na_values=[""])
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read {file}: {error}") from error
-    runs = [one["run"] for one in facts if "run" in one]
+    runs = [item["run"] for item in facts if "run" in item]
     if "run" not in rows or not runs:
         raise InputError(
             f"{file} must be a summary that `fidsplat experiment` wrote, got another CSV file; "
             "give another folder"
         )
-    return Summary(rows, runs, [one["note"] for one in facts if "note" in one])
+    return Summary(rows, runs, [item["note"] for item in facts if "note" in item])
 
 
 def join(summaries: Sequence[Summary], keys: Sequence[str]) -> Summary:

@@ -152,7 +152,8 @@ def detectors_of(
     detectors[OWN] = partial(
         attempt_with,
         lambda grey: [
-            (one.name, one.corners) for one in detect(grey, (family,) if dictionary else (), not dictionary)
+            (detection.name, detection.corners)
+            for detection in detect(grey, (family,) if dictionary else (), not dictionary)
         ],
     )
     if not names:

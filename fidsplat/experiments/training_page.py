@@ -40,7 +40,10 @@ def write_training_page(
         name = f"held-out-{len(shown)}.png"
         files.append(write_png(folder / name, side_by_side(trainer.dataset.held_out[row], scores[row])))
         shown.append({"name": scores[row].name, "file": name})
-    table = [{"view": one.name, "PSNR, dB": fixed(one.psnr, 2), "SSIM": fixed(one.ssim, 4)} for one in scores]
+    table = [
+        {"view": score.name, "PSNR, dB": fixed(score.psnr, 2), "SSIM": fixed(score.ssim, 4)}
+        for score in scores
+    ]
     if scores:
         table.append({"view": "mean", "PSNR, dB": fixed(facts["psnr"], 2), "SSIM": fixed(facts["ssim"], 4)})
     settings = asdict(trainer.settings).items()

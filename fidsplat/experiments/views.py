@@ -136,7 +136,7 @@ def measure_views(
     pending = [pool.submit(compare, number, image) for number, image in enumerate(images)]
     measured = [interrupts.result_of(future) for future in pending]
     names = ("psnr", "ssim", "flip", "lpips")
-    return {name: [one[name] for one in measured] if name in measured[0] else None for name in names}
+    return {name: [values[name] for values in measured] if name in measured[0] else None for name in names}
 
 
 def exact_view(spec: str, camera: Camera, linear: bool) -> np.ndarray:

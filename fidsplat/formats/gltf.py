@@ -276,9 +276,11 @@ class _Reader:
     def _check_expansion(self, primitives: list[dict[str, Any]]) -> None:
         """Check the memory of all primitives, since nodes may share a mesh, and attributes an accessor."""
         accessors = [
-            self._document["accessors"][number] for one in primitives for number in one["attributes"].values()
+            self._document["accessors"][number]
+            for primitive in primitives
+            for number in primitive["attributes"].values()
         ]
-        need = sum(_COPIES * 4 * _WIDTHS[each["type"]] * int(each["count"]) for each in accessors)
+        need = sum(_COPIES * 4 * _WIDTHS[accessor["type"]] * int(accessor["count"]) for accessor in accessors)
         size = sum(len(self._buffer(number)) for number in range(len(self._document.get("buffers", []))))
         check_expansion(self._path, need, "its nodes with all their attributes", size)
 

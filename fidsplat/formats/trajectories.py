@@ -287,7 +287,7 @@ def load_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
         if has_colmap(place):
             model = load_colmap(place)
             return dict(zip(model.names, model.cameras, strict=True))
-    files = [one for one in (file, *(file / name for name in _TRANSFORMS)) if one.is_file()]
+    files = [candidate for candidate in (file, *(file / name for name in _TRANSFORMS)) if candidate.is_file()]
     if not files:
         raise InputError(
             "path must be a transforms.json, or a folder with one or with a COLMAP model (cameras.bin), "

@@ -71,7 +71,7 @@ def most_similar(
     width = min(DESCRIPTOR_WIDTH, camera.width)
     height = max(2, round(camera.height * width / camera.width))
     double = camera.resampled(2 * width, 2 * height)
-    views = render([double.with_pose(each.world_to_camera) for each in candidates])
+    views = render([double.with_pose(candidate.world_to_camera) for candidate in candidates])
     if image.shape[2] == 1:
         views = views.mean(axis=3, keepdims=True)
     rendered = np.array([_descriptor(view, width, height) for view in views])

@@ -176,9 +176,9 @@ def localise(
         source = "candidates"
 
         def render_all(at: list[Camera]) -> np.ndarray:
-            return renderer.render_batch(uploaded, [capture.with_(camera=one, outputs="rgb") for one in at])[
-                "rgb"
-            ]
+            return renderer.render_batch(
+                uploaded, [capture.with_(camera=camera, outputs="rgb") for camera in at]
+            )["rgb"]
 
         best = most_similar(pixels, camera, candidates, render_all, TRIED)
         tried = [align(pixels, mask, one, render, kernels, coarse=True) for one in best]

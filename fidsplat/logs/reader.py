@@ -85,17 +85,17 @@ def log_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int], np.ndarray]
     file, store, transforms = path_of(path), typestore(), {}
     with _as_input_error(file):
         for _, kind, _, data in log_messages(file):
-            for one in store.deserialize_cdr(data, kind).transforms if kind == _TRANSFORMS else ():
-                transforms[one.child_frame_id, _stamp(one.header)] = one
+            for stamped in store.deserialize_cdr(data, kind).transforms if kind == _TRANSFORMS else ():
+                transforms[stamped.child_frame_id, _stamp(stamped.header)] = stamped
     children = {frame for frame, _ in transforms}
     poses = {}
     for frame, stamp in transforms:
         pose, parent = np.eye(4), frame
         for _ in range(MAX_DEPTH):
-            one = transforms.get((parent, stamp))
-            if one is None:
+            stamped = transforms.get((parent, stamp))
+            if stamped is None:
                 break
-            pose, parent = _pose(one.transform) @ pose, one.header.frame_id
+            pose, parent = _pose(stamped.transform) @ pose, stamped.header.frame_id
         if parent not in children:
             poses[frame, stamp] = pose
     scenes = {stamp: np.linalg.inv(pose) for (frame, stamp), pose in poses.items() if frame == SCENE}
@@ -119,9 +119,9 @@ def _as_input_error(file: Path) -> Iterator[None]:
 def detections_of(message: Any) -> list[Detection]:
     """Tags of an AprilTagDetectionArray, as `RobotLog.detections` writes them."""
     detections = []
-    for one in message.detections:
-        corners = np.array([(corner.x, corner.y) for corner in one.corners]) + PIXEL_OFFSET
-        detections.append(Detection("apriltag", one.family, one.id, None, corners))
+    for detection in message.detections:
+        corners = np.array([(corner.x, corner.y) for corner in detection.corners]) + PIXEL_OFFSET
+        detections.append(Detection("apriltag", detection.family, detection.id, None, corners))
     return detections
 
 

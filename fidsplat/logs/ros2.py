@@ -81,7 +81,7 @@ class Ros2Topics:
         """Messages of a topic since the last call, oldest first; the first call subscribes to it."""
         if topic not in self._readers:
             self._readers[topic] = DataReader(self._participant, *self._topic(topic, kind))
-        return [one for one in self._readers[topic].take(DEPTH) if isinstance(one, self._type(kind))]
+        return [sample for sample in self._readers[topic].take(DEPTH) if isinstance(sample, self._type(kind))]
 
     def close(self, keep: bool) -> None:
         """End all topics, in this order, since parents must outlive their children."""

@@ -87,7 +87,7 @@ def _source_of(path: Path) -> str | None:
         if path.is_file():
             with path.open("rb") as stream:
                 metadata = make_reader(stream).iter_metadata()
-                return next((one.metadata["source"] for one in metadata if one.name == _METADATA), None)
+                return next((item.metadata["source"] for item in metadata if item.name == _METADATA), None)
     except Exception:  # the errors of two packages: not a readable log
         pass
     return None

@@ -106,7 +106,7 @@ def _halves(
 def _rotated(pieces: np.ndarray, boxes: np.ndarray, angles: np.ndarray) -> np.ndarray:
     """Pieces of boxes that are rotated about the centres of the boxes, moved for a rotation about their
     own."""
-    before, about = ((each[:, :2] + each[:, 2:]) / 2 for each in (pieces, boxes))
+    before, about = ((array[:, :2] + array[:, 2:]) / 2 for array in (pieces, boxes))
     (x, y), c, s = (before - about).T, np.cos(angles), np.sin(angles)
     step = about + np.column_stack([c * x - s * y, s * x + c * y]) - before
     return pieces + np.tile(step, 2)
@@ -182,7 +182,7 @@ def _groups(
         )
         for number, (low, high) in enumerate(pairwise(borders))
     ]
-    groups = np.repeat(np.arange(len(rows), dtype=np.int32), [len(each) for each in rows])
+    groups = np.repeat(np.arange(len(rows), dtype=np.int32), [len(row) for row in rows])
     row_indices = np.concatenate(rows)
     return row_indices, groups, home_group[row_indices] != groups
 

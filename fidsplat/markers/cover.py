@@ -48,7 +48,7 @@ def cover_all(
     """Cover of several regions: rectangles (n, 4), their angles (n,), and the region of each, (n,) uint8."""
     covers = {value: cover(region, shape) for value, region in enumerate(regions) if not region.is_empty}
     boxes, angles = (np.concatenate(parts) for parts in zip(*covers.values(), strict=True))
-    values = np.repeat(np.array(list(covers), np.uint8), [len(own) for _, own in covers.values()])
+    values = np.repeat(np.array(list(covers), np.uint8), [len(pieces) for _, pieces in covers.values()])
     return boxes, angles, values
 
 

@@ -57,7 +57,7 @@ def facet_cloud(spec: str, printed: Printed, progress: Progress) -> SplatCloud:
     value = printed.grid[np.floor(y + rows / 2).astype(int), np.floor(x + columns / 2).astype(int)]
     paper = value != HOLE
     x, width, depth_x, slope_x, y, tall, depth_y, slope_y, value = (
-        each[paper] for each in (x, width, depth_x, slope_x, y, tall, depth_y, slope_y, value)
+        array[paper] for array in (x, width, depth_x, slope_x, y, tall, depth_y, slope_y, value)
     )
     means = np.column_stack([x, y, depth_x + depth_y]) * printed.module
     scales = (

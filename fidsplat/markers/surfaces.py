@@ -316,7 +316,7 @@ class Crumpled(SheetShape):
         ]
         x, y = (tangent / np.linalg.norm(tangent, axis=1, keepdims=True) for tangent in along)
         middle, apart = x + y, x - y  # perpendicular, as x and y have the same length
-        middle, apart = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (middle, apart))
+        middle, apart = (array / np.linalg.norm(array, axis=1, keepdims=True) for array in (middle, apart))
         return Frames(points, (middle + apart) / math.sqrt(2), (middle - apart) / math.sqrt(2))
 
 

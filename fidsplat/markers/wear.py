@@ -200,7 +200,7 @@ def _bled(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
     ink = sheet.present & (sheet.color != sheet.paper).any(2)
     max_distance = math.ceil(distances.max())
     steps = np.arange(-max_distance, max_distance + 1)
-    dy, dx = (each.ravel() for each in np.meshgrid(steps, steps, indexing="ij"))
+    dy, dx = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
     distance = np.hypot(dy, dx)
     padded, color = np.pad(ink, max_distance), sheet.color.copy()
     todo, (h, w) = sheet.present & ~ink, ink.shape

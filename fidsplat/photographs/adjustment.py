@@ -123,11 +123,11 @@ def adjust(cameras: Sequence[Camera], views: Sequence[TagView], sizes: Mapping[s
 
 
 def _check_sizes(scales: Mapping[str, tuple[float, float]], sizes: Mapping[str, float]) -> None:
-    for (one, (a, da)), (other, (b, db)) in combinations(scales.items(), 2):
+    for (tag, (a, da)), (other, (b, db)) in combinations(scales.items(), 2):
         difference = abs(np.log(a / b))
         if difference > max(SAME_SIZE, SIGMAS * float(np.hypot(da, db))):
             raise InputError(
-                f"sizes of tags must agree, got {sizes[one]:g} m for {one} and {sizes[other]:g} m for "
+                f"sizes of tags must agree, got {sizes[tag]:g} m for {tag} and {sizes[other]:g} m for "
                 f"{other}, which has {sizes[other] * a / b:.4g} m by the first; measure their black "
                 "squares"
             )

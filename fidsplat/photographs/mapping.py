@@ -135,8 +135,8 @@ def _pairs(images: Sequence[Any], ordered: bool) -> list[tuple[Any, Any]]:
         return list(combinations(images, 2))
     near = [
         pair
-        for i, one in enumerate(images)
-        for pair in ((one, n) for n in images[i + 1 : i + 1 + NEIGHBOURS])
+        for i, image in enumerate(images)
+        for pair in ((image, n) for n in images[i + 1 : i + 1 + NEIGHBOURS])
     ]
     return list(dict.fromkeys([*near, *combinations(images[::STRIDE], 2)]))
 
@@ -216,21 +216,21 @@ def unregistered(database: Path, registered: Sequence[str]) -> list[tuple[str, s
         best = dict.fromkeys(images, 0)
         pairs, counts = data.read_two_view_geometry_num_inliers()
         for pair, count in zip(map(pycolmap.pair_id_to_image_pair, pairs), counts, strict=True):
-            for each, partner in (pair, pair[::-1]):
+            for image_id, partner in (pair, pair[::-1]):
                 if not registered or images[partner] in registered:
-                    best[each] = max(best[each], count)
-        features = {each: data.num_keypoints_for_image(each) for each in images}
+                    best[image_id] = max(best[image_id], count)
+        features = {image_id: data.num_keypoints_for_image(image_id) for image_id in images}
     missing = []
-    for each, name in sorted(images.items(), key=lambda item: item[1]):
+    for image_id, name in sorted(images.items(), key=lambda item: item[1]):
         if name in registered:
             continue
-        if features[each] < FEW_FEATURES:
-            reason = f"only {features[each]} features, it is blurred, dark or blank"
-        elif best[each] < MIN_MATCHES:
+        if features[image_id] < FEW_FEATURES:
+            reason = f"only {features[image_id]} features, it is blurred, dark or blank"
+        elif best[image_id] < MIN_MATCHES:
             reason = (
-                f"at most {best[each]} matches with another, it shows something else or from too far away"
+                f"at most {best[image_id]} matches with another, it shows something else or from too far away"
             )
         else:
-            reason = f"{best[each]} matches with another, but too few with points of the others"
+            reason = f"{best[image_id]} matches with another, but too few with points of the others"
         missing.append((name, reason))
     return missing

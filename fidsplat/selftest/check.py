@@ -65,7 +65,9 @@ class CheckResult:
     def groups(self) -> dict[str, list[CaseResult]]:
         """Results by the letter of their group."""
         letters = dict.fromkeys(result.case.name[0] for result in self.cases)
-        return {letter: [one for one in self.cases if one.case.name[0] == letter] for letter in letters}
+        return {
+            letter: [result for result in self.cases if result.case.name[0] == letter] for letter in letters
+        }
 
     @property
     def failures(self) -> list[str]:

@@ -251,7 +251,7 @@ class StructuredLight(DepthCamera):
         self, renderer: Renderer, scene: Scene, camera: Camera, rng: np.random.Generator
     ) -> np.ndarray:
         projector = _projector(camera, self.baseline, max(self.near, 0.1))
-        view, shadow = (_view(renderer, scene, each) for each in (camera, projector))
+        view, shadow = (_view(renderer, scene, viewpoint) for viewpoint in (camera, projector))
         x, y, depth = _projected_to(projector, camera, view.depth)
         light = view.grey * view.cosine / np.maximum(view.depth, 0.05) ** 2
         valid = _lit(projector, shadow.depth, x, y, depth) & (light >= self.faintest)

@@ -194,7 +194,7 @@ class TiledCamera:
         mask, back = self._outdated.copy(), inverse(self._origins)
         images = Rig.render(
             self._rig,
-            {name: compose(back, each) for name, each in bodies.items()},
+            {name: compose(back, pose) for name, pose in bodies.items()},
             {self._name: compose(back, poses)},
             outputs=[*(_OUTPUTS[name] for name in self._types), *["alpha"] * ("rgba" in self._types)],
             mask=mask,

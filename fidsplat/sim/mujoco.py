@@ -129,7 +129,7 @@ class MujocoRig(SimulatorRig):
         kind = data.nworld, tuple(groups)
         with wp.ScopedDevice(data.qpos.device):
             if self._contexts[0] != kind:
-                sizes = [(each.camera.width, each.camera.height) for each in self.cameras.values()]
+                sizes = [(camera.camera.width, camera.camera.height) for camera in self.cameras.values()]
                 context = mjw.create_render_context(
                     self._model, data.nworld, sizes, True, True, True,
                     enabled_geom_groups=groups, cam_active=self._camera_ids,
@@ -143,8 +143,8 @@ class MujocoRig(SimulatorRig):
                 ptr=pairs.ptr, dtype=wp.int32, shape=pairs.shape, strides=pairs.strides, device=pairs.device
             )
             images, first = {}, 0
-            for name, each in self.cameras.items():
-                size = each.camera.height, each.camera.width
+            for name, camera in self.cameras.items():
+                size = camera.camera.height, camera.camera.width
                 pixels = slice(first, first := first + size[0] * size[1])
                 arrays = context.rgb_data[:, pixels], context.depth_data[:, pixels], ids[:, pixels]
                 images[name] = device_surface(self.renderer, *arrays, size, red_bit=16)
@@ -152,8 +152,8 @@ class MujocoRig(SimulatorRig):
 
     def _meshes(self, data: Sequence[Any], groups: list[int]) -> dict[str, list[ExternalDepth]]:
         """Images of the model's geoms for each camera and environment, by MuJoCo."""
-        for one in data:
-            instance("data with meshes", one, mujoco.MjData, "a mujoco.MjData")
+        for state in data:
+            instance("data with meshes", state, mujoco.MjData, "a mujoco.MjData")
         self._pinholes()
         option = mujoco.MjvOption()
         option.geomgroup[:] = 0
@@ -161,7 +161,7 @@ class MujocoRig(SimulatorRig):
         images: dict[str, list[ExternalDepth]] = {}
         for (name, camera), number in zip(self.cameras.items(), self._camera_ids, strict=True):
             renderer = self._mesh_renderer(camera.camera.width, camera.camera.height)
-            images[name] = [_mesh_image(renderer, one, number, option) for one in data]
+            images[name] = [_mesh_image(renderer, state, number, option) for state in data]
         return images
 
     def _mesh_renderer(self, width: int, height: int) -> Any:

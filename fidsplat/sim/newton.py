@@ -58,9 +58,9 @@ class NewtonRig(SimulatorRig):
         self._model, self._sensor, self._rays = model, None, dict[str, Any]()
         worlds = model.body_world.numpy() if model.body_count else np.zeros(0, int)
         rows = [np.flatnonzero((worlds == k) | (worlds < 0)) for k in range(max(model.world_count, 1))]
-        if len({len(own) for own in rows}) > 1:
+        if len({len(row) for row in rows}) > 1:
             raise InputError(
-                f"the worlds of a model must have the same bodies, got {sorted({len(own) for own in rows})} "
+                f"the worlds of a model must have the same bodies, got {sorted({len(row) for row in rows})} "
                 "bodies; make a rig for each kind of world"
             )
         names = [model.body_label[k] for k in rows[0]]

@@ -202,13 +202,13 @@ class Rig:
     ) -> dict[str, Sequence[ExternalDepth] | ExternalDepth]:
         if not isinstance(external_depths, Mapping | None):
             raise invalid("external_depths", "{camera name: list of ExternalDepth}", external_depths)
-        for name, each in (external_depths or {}).items():
+        for name, depths in (external_depths or {}).items():
             if name not in self.cameras:
                 raise InputError(unknown("camera", name, self.cameras))
-            stacked = isinstance(each, ExternalDepth) and each.stacked
-            if not (stacked or isinstance(each, Sequence)):
-                raise invalid(f"external_depths[{name!r}]", "a list, one for each environment", each)
-            images = len(each.depth) if isinstance(each, ExternalDepth) else len(each)
+            stacked = isinstance(depths, ExternalDepth) and depths.stacked
+            if not (stacked or isinstance(depths, Sequence)):
+                raise invalid(f"external_depths[{name!r}]", "a list, one for each environment", depths)
+            images = len(depths.depth) if isinstance(depths, ExternalDepth) else len(depths)
             if images != count:
                 raise InputError(
                     f"external_depths[{name!r}] must have {count} images, got {images}; give one for "
@@ -233,15 +233,15 @@ class Rig:
         if isinstance(external, ExternalDepth):
             external = [external.of_views(i) for i in range(count)] if noisy else [external]
         if not noisy:
-            return [capture.with_(external_depth=one) for one in external] or [capture]
+            return [capture.with_(external_depth=depth) for depth in external] or [capture]
         place = list(self.cameras).index(name)
         seeds = [
             (capture.sensor.seed + 0x9E3779B1 * (self._rendered + i) + 0x85EBCA77 * place) % 2**32
             for i in range(count)
         ]
         return [
-            capture.with_(sensor=replace(capture.sensor, seed=seed), external_depth=one)
-            for seed, one in zip(seeds, external or [None] * count, strict=True)
+            capture.with_(sensor=replace(capture.sensor, seed=seed), external_depth=depth)
+            for seed, depth in zip(seeds, external or [None] * count, strict=True)
         ]
 
 

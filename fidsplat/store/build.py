@@ -143,7 +143,7 @@ class _Build:
         """Run `work` in threads, and yield results in the order of inputs. max_pending: maximum number of
         pending results."""
         pending = self.workers if max_pending is None else max_pending - 1
-        return interrupts.ordered_results((pool.submit(work, one) for one in inputs), pending)
+        return interrupts.ordered_results((pool.submit(work, path) for path in inputs), pending)
 
     # inputs to buckets
 
@@ -195,7 +195,7 @@ class _Build:
             records[name] = array[order]
         ends = np.cumsum(np.bincount(buckets, minlength=self.buckets))
         buckets = np.split(records, ends[:-1])
-        return [(number, own) for number, own in enumerate(buckets) if len(own)], dropped
+        return [(number, rows) for number, rows in enumerate(buckets) if len(rows)], dropped
 
     # buckets to chunks
 

@@ -100,7 +100,7 @@ class BuildPlan:
         step = max(1, self.settings.memory // (24 * self.record.itemsize) // WINDOW) * WINDOW
         step = min(step, 4 * WINDOW)
         parts = [spans(source.rows.count, step) for source in self.sources]
-        return [(number, span) for number, own in enumerate(parts) for span in own]
+        return [(number, span) for number, rows in enumerate(parts) for span in rows]
 
     @property
     def disk_bytes(self) -> int:
@@ -141,7 +141,7 @@ def plan_build(sources: Sequence[Source], settings: BuildSettings | None = None)
     means, origin = sample(sources)
     grid = grid_around(means)
     splat_bytes = sum(row_bytes(kind, shapes_of(degree)[name]) for name, kind in kinds.items()) + 8
-    rows = sum(each.count for each in inputs)
+    rows = sum(source.count for source in inputs)
     if rows > MAX_SPLATS:
         raise InputError(f"a store must have at most {MAX_SPLATS:,} splats, got {rows:,}")
     buckets = int(np.clip(-(-rows * splat_bytes // (memory // 16)), 1, _MAX_BUCKETS))

@@ -42,18 +42,18 @@ class Selection:
     @staticmethod
     def of(masks: NodeMasks) -> Selection:
         """All rows of the nodes that masks select."""
-        return Selection(tuple(tuple(np.flatnonzero(each).tolist()) for each in masks))
+        return Selection(tuple(tuple(np.flatnonzero(mask).tolist()) for mask in masks))
 
     @staticmethod
     def of_subchunks(subchunks: Sequence[Subchunks]) -> Selection:
         """The rows of subchunks of each store."""
         return Selection(
-            tuple(tuple(each.nodes.tolist()) for each in subchunks),
-            tuple(tuple(zip(each.first.tolist(), each.rows.tolist(), strict=True)) for each in subchunks),
+            tuple(tuple(part.nodes.tolist()) for part in subchunks),
+            tuple(tuple(zip(part.first.tolist(), part.rows.tolist(), strict=True)) for part in subchunks),
         )
 
     def __len__(self) -> int:
-        return sum(len(set(each)) for each in self.nodes)
+        return sum(len(set(nodes)) for nodes in self.nodes)
 
 
 class ChunkedSplats:

@@ -59,10 +59,10 @@ def allowed_cell_size(measured: Iterable[DetailErrors], level: int, error: float
     The errors of adjacent levels count too, as cells of equal size have similar errors: few views contain
     cells of one level at the edges of surfaces, where errors are largest.
     """
-    near = [one for one in measured if abs(one.level - level) <= 1]
-    if not any(one.level == level for one in near):
+    near = [detail for detail in measured if abs(detail.level - level) <= 1]
+    if not any(detail.level == level for detail in near):
         return 0.0
-    pairs = [pair for one in near for pair in zip(one.sizes, one.errors, strict=True)]
+    pairs = [pair for detail in near for pair in zip(detail.sizes, detail.errors, strict=True)]
     largest, allowed = 0.0, 0.0
     for size in sorted({size for size, _ in pairs}):
         errors = [own for at, own in pairs if at == size and own is not None]
@@ -75,8 +75,8 @@ def allowed_cell_size(measured: Iterable[DetailErrors], level: int, error: float
 def save_detail_errors(folder: Path, identity: str, measured: Sequence[DetailErrors]) -> None:
     """Write measured errors into a store's folder; replace those of the same low-pass filter and level."""
     every = [*load_detail_errors(folder, identity), *measured]
-    known = {(one.lowpass, one.level): one for one in every}
-    rows = [vars(one) for _, one in sorted(known.items())]
+    known = {(detail.lowpass, detail.level): detail for detail in every}
+    rows = [vars(detail) for _, detail in sorted(known.items())]
     write_checked(folder / FILE, {"identity": identity, "details": rows})
 
 
@@ -94,11 +94,13 @@ def load_detail_errors(folder: Path, identity: str) -> list[DetailErrors]:
             return []
         rows = [row | {name: tuple(row[name]) for name in ("sizes", "errors")} for row in content["details"]]
         loaded = [DetailErrors(**row) for row in rows]
-        for one in loaded:
-            if len(one.sizes) != len(one.errors) or list(one.sizes) != sorted(map(float, one.sizes)):
+        for detail in loaded:
+            if len(detail.sizes) != len(detail.errors) or list(detail.sizes) != sorted(
+                map(float, detail.sizes)
+            ):
                 raise ValueError
-            numbers = [*one.sizes, *(error for error in one.errors if error is not None)]
-            known = isinstance(one.lowpass, str) and type(one.level) is int
+            numbers = [*detail.sizes, *(error for error in detail.errors if error is not None)]
+            known = isinstance(detail.lowpass, str) and type(detail.level) is int
             if not known or not all(type(n) in (int, float) and 0 <= n < math.inf for n in numbers):
                 raise ValueError
     except (ValueError, KeyError, TypeError, OverflowError):

@@ -32,7 +32,7 @@ class PartialCloud(SplatCloud):
 
     def __reduce__(self):
         """Pickled and copied as a plain SplatCloud."""
-        return _cloud_of, ({each.name: getattr(self, each.name) for each in fields(self)},)
+        return _cloud_of, ({field.name: getattr(self, field.name) for field in fields(self)},)
 
     @property
     def has_coplanar_groups(self) -> bool:

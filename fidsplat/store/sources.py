@@ -42,7 +42,7 @@ def open_sources(inputs: Sequence[str | os.PathLike[str] | Source]) -> list[Sour
         inputs = [inputs]
     if not isinstance(inputs, Sequence):
         raise invalid("inputs", "a list of splat files", inputs)
-    opened = [one if isinstance(one, Source) else _open(path_of(one)) for one in inputs]
+    opened = [source if isinstance(source, Source) else _open(path_of(source)) for source in inputs]
     if not opened:
         raise InputError("inputs must be at least one splat file, got none")
     return with_distinct_groups(opened)

@@ -204,7 +204,7 @@ class Store(Summarised):
         instance("quality", quality, Quality)
         if not self.levels:
             return (0.0,)  # no levels of detail: always exact
-        measured = [one for one in self.detail_errors if one.lowpass == quality.lowpass]
+        measured = [detail for detail in self.detail_errors if detail.lowpass == quality.lowpass]
         if measured:
             return tuple(
                 allowed_cell_size(measured, level, quality.detail_error) for level in range(self.levels + 1)

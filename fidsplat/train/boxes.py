@@ -46,8 +46,8 @@ def read_boxes(file: Path, entries: Any) -> tuple[MarkerBox, ...]:
     """
     try:
         boxes = tuple(
-            MarkerBox(np.array(each["matrix"], float).reshape(4, 4), frozenset(map(str, each["visible"])))
-            for each in entries
+            MarkerBox(np.array(entry["matrix"], float).reshape(4, 4), frozenset(map(str, entry["visible"])))
+            for entry in entries
         )
         if not all(np.isfinite(box.matrix).all() and abs(np.linalg.det(box.matrix)) > 0 for box in boxes):
             raise ValueError

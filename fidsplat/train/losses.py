@@ -97,7 +97,7 @@ def exposed_loss(
     gain, offset = np.exp(exposure[0]).astype(image.dtype), exposure[1].astype(image.dtype)
     loss, slope = image_loss(gain * image + offset, truth, mask, dssim_weight)
     by_gain = np.where(slope != 0, slope * gain * image, 0)  # ignored pixels may not be finite
-    sums = np.array([each.sum(axis=(0, 1), dtype=np.float64) for each in (by_gain, slope)])
+    sums = np.array([gradient.sum(axis=(0, 1), dtype=np.float64) for gradient in (by_gain, slope)])
     return loss._replace(by_exposure=sums), slope * gain
 
 

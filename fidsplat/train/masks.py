@@ -47,7 +47,7 @@ def mask_file(folder: Path, name: str) -> Path | None:
     programs replace its suffix."""
     image = folder / name
     candidates = (image.with_name(f"{image.name}.png"), image.with_suffix(".png"))
-    return next((one for one in candidates if one.is_file()), None)
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def undistorted_view(name: str, camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> TrainingView:

@@ -239,7 +239,7 @@ class TrainSettings:
         every = [degree * self.sh_every] if degree <= self.sh_degree else []
         every += [self.normal_from + 1] if self.normal_weight else []
         every += [self.distortion_from + 1] if self.distortion_weight else []
-        return min((one for one in every if iteration < one <= self.iterations), default=None)
+        return min((change for change in every if iteration < change <= self.iterations), default=None)
 
     @property
     def refines_cameras(self) -> bool:

@@ -126,7 +126,7 @@ class Trainer:
         if self.renderer.device.kind == "cpu" and "arithmetic" not in self.settings.quality:
             self._quality = self._quality.with_(arithmetic="fast")
         self._captures = [self._capture(view) for view in dataset.views]
-        self._surface_captures = [replace(each, outputs=_SURFACE) for each in self._captures]
+        self._surface_captures = [replace(capture, outputs=_SURFACE) for capture in self._captures]
         self._model = (
             DeviceModel(backend.training(), dataset.views, self.settings)
             if backend.has("training")

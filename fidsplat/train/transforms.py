@@ -113,7 +113,7 @@ def _divided(
 
 def _image_file(file: Path, name: str, others: set[tuple[int, int]]) -> Path:
     candidates = [path_of(file.parent / (name + suffix)) for suffix in _SUFFIXES]
-    image = next((one for one in candidates if one.is_file()), candidates[0])
+    image = next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
     check_other_image(image, others)
     return image
 

@@ -46,7 +46,7 @@ class _Adam:
         for moments, beta, sample in zip(self.moments, self._betas, (gradient, gradient**2), strict=True):
             moments[row] += (1 - beta) * (sample - moments[row])
             corrected.append(moments[row] / (1 - beta**step))
-        mean, square = (one.reshape(2, -1) for one in corrected)
+        mean, square = (moment.reshape(2, -1) for moment in corrected)
         return (-mean / (np.sqrt(square.mean(axis=1, keepdims=True)) + _EPSILON)).ravel()
 
 

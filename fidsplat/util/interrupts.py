@@ -50,8 +50,8 @@ def install() -> dict[int, Any]:
     # None: not set by Python
     return {
         n: signal.signal(n, _handle)
-        for n, own in before.items()
-        if own not in (signal.SIG_IGN, None, _handle)
+        for n, handler in before.items()
+        if handler not in (signal.SIG_IGN, None, _handle)
     }
 
 

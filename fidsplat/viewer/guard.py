@@ -134,7 +134,7 @@ def policy() -> str:
             "another form; pip install 'viser==1.1.1'"
         ) from error
     hashes = [b64encode(sha256(text).digest()).decode() for text in (loader.encode(), program[int(style) :])]
-    scripts = " ".join(f"'sha256-{each}'" for each in hashes)
+    scripts = " ".join(f"'sha256-{digest}'" for digest in hashes)
     return (
         "default-src 'self' data: blob:; connect-src 'self' data: blob: ws: wss:; "
         f"style-src 'unsafe-inline'; script-src {scripts} 'unsafe-eval'; worker-src data: blob:; "

@@ -59,12 +59,12 @@ def read_bundles(readings: Iterable[Reading], camera: Camera) -> list[BundleRead
     for reading in readings:
         if reading.placed.bundle is not None:
             members.setdefault(reading.placed.bundle, []).append(reading)
-    return [_read(name, own, camera) for name, own in members.items()]
+    return [_read(name, tags, camera) for name, tags in members.items()]
 
 
 def _read(name: str, readings: list[Reading], camera: Camera) -> BundleReading:
     first = np.linalg.inv(readings[0].placed.pose)
-    pairs = [(each.placed.corners, each.detection) for each in readings]
+    pairs = [(reading.placed.corners, reading.detection) for reading in readings]
     points = [at @ first[:3, :3].T + first[:3, 3] for at, code in pairs if code is not None]
     corners = [code.corners for _, code in pairs if code is not None]
     facts = name, len(readings), len(corners), readings[0].truth

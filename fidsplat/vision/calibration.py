@@ -72,7 +72,7 @@ def calibrate(views: Sequence[BoardView], start: Camera) -> Camera:
         if isinstance(start.lens, Fisheye):
             # OpenCV 4 has the flags in cv2.fisheye
             flags = sum(getattr(cv2.fisheye, name, None) or getattr(cv2, name) for name in _FISHEYE_FLAGS)
-            rows = [[each.astype(float).swapaxes(0, 1) for each in given] for given in (points, corners)]
+            rows = [[array.astype(float).swapaxes(0, 1) for array in given] for given in (points, corners)]
             _, matrix, values, *_ = cv2.fisheye.calibrate(  # type: ignore[call-overload]
                 *rows, size, np.eye(3), np.zeros((4, 1)), flags=flags
             )

@@ -179,7 +179,7 @@ def greedy(
         enough: called with the covariance; the selection ends when it returns True.
         objective: `gain`, or `error_gain`, which has no bound.
     """
-    limits = np.array([objective(covariance, one) for one in candidates])
+    limits = np.array([objective(covariance, candidate) for candidate in candidates])
     free = limits > 0
     chosen: list[int] = []
     value = 0.0
@@ -214,7 +214,7 @@ def local_search(
     objective."""
     chosen = list(selection.chosen)
     value, after = _with(covariance, candidates, chosen, objective)
-    limits = np.array([objective(covariance, one) for one in candidates])
+    limits = np.array([objective(covariance, candidate) for candidate in candidates])
     order = np.argsort(-limits, kind="stable")
     for _ in range(PASSES):
         before = value
@@ -268,7 +268,9 @@ def _bound(
     """
     if objective is not gain:
         return math.inf
-    return value + sum(sorted((gain(covariance, one) for one in candidates), reverse=True)[: len(chosen)])
+    return value + sum(
+        sorted((gain(covariance, candidate) for candidate in candidates), reverse=True)[: len(chosen)]
+    )
 
 
 def _spread(covariance: np.ndarray, sightings: Sightings, sign: float = 1.0) -> np.ndarray:

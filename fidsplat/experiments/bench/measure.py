@@ -76,7 +76,7 @@ class Result:
         """Milliseconds that each effect adds to a frame: median of the differences of interleaved frames."""
         return {
             # after an interrupt, one of the lists may be longer by a frame
-            name: float(np.median([own - other for own, other in zip(self.timer.ms, less.ms, strict=False)]))
+            name: float(np.median([ms - other for ms, other in zip(self.timer.ms, less.ms, strict=False)]))
             for name, less in self.without.items()
             if less.ms and self.timer.ms
         }

@@ -296,5 +296,13 @@ def suite_scenes(words: Iterable[str], quick: bool, large: bool) -> dict[str, Su
             raise InputError(unknown("scene of the suite", word, (*REGIMES, *SUITE)))
     if words:
         regimes = set(words) - set(SUITE)
-        return {name: one for name, one in SUITE.items() if name in words or one.regime in regimes}
-    return {name: one for name, one in SUITE.items() if (one.quick or not quick) and (large or not one.large)}
+        return {
+            name: definition
+            for name, definition in SUITE.items()
+            if name in words or definition.regime in regimes
+        }
+    return {
+        name: definition
+        for name, definition in SUITE.items()
+        if (definition.quick or not quick) and (large or not definition.large)
+    }

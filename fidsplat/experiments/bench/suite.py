@@ -324,11 +324,13 @@ class Suite:
     def run(self, progress: Progress) -> list[dict[str, Any]]:
         """Measure missing scenes and renderers; returns all results. The file is written after each scene."""
         done = {(result["scene"], result["renderer"]) for result in self.found["results"]}
-        left = [name for name in self._scenes if any((name, one) not in done for one in self._openers)]
+        left = [
+            name for name in self._scenes if any((name, renderer) not in done for renderer in self._openers)
+        ]
         left.sort(key=lambda name: (self._scenes[name].x is not None, self._scenes[name].large))
         try:
             for number, name in enumerate(left):
-                missing = [one for one in self._openers if (name, one) not in done]
+                missing = [renderer for renderer in self._openers if (name, renderer) not in done]
                 report = lambda words, k=number, name=name: progress(f"{name}: {words}", k / len(left))  # noqa: E731
                 self._measure(name, missing, report)
                 self.save()
@@ -342,7 +344,7 @@ class Suite:
         """Write the file with one line per result."""
         compact = partial(json.dumps, allow_nan=False, separators=(",", ":"))
         facts = {name: value for name, value in self.found.items() if name != "results"}
-        lines = ",\n".join(compact(one) for one in self.found["results"])
+        lines = ",\n".join(compact(result) for result in self.found["results"])
         text = f'{compact(facts)[:-1]},"results":[\n{lines}\n]}}\n'
         with interrupts.postponed(), atomic_write(self._file) as stream:
             stream.write(text.encode())
@@ -397,31 +399,33 @@ class Suite:
         report("interleaved frames")
         effort = self._effort
         seconds = effort.seconds * (0.5 if scene.x is not None else 1.0)
-        fast = [one for one in measurements if one.second_ms <= effort.fast]
-        slow = [one for one in measurements if one.second_ms > effort.fast]
-        for one in fast:  # discard the first frame, which had no warm-up
-            one.timer.ms.clear()
-            one.timer.parts.clear()
+        fast = [measurement for measurement in measurements if measurement.second_ms <= effort.fast]
+        slow = [measurement for measurement in measurements if measurement.second_ms > effort.fast]
+        for measurement in fast:  # discard the first frame, which had no warm-up
+            measurement.timer.ms.clear()
+            measurement.timer.parts.clear()
         for timed, done in ((fast, 0), (slow, 1)):
             time_interleaved(
-                [one.timer for one in timed],
+                [measurement.timer for measurement in timed],
                 effort.rounds - done,
                 min_rounds=effort.min_rounds - done,
-                seconds=seconds - done * sum(one.second_ms for one in timed) / 1e3,
+                seconds=seconds - done * sum(measurement.second_ms for measurement in timed) / 1e3,
                 warm_up=1 - done,
                 tick=interrupts.check,
             )
         metered: set[str] = set()
-        for one in measurements:
+        for measurement in measurements:
             # energy is measured for the first setting of each renderer
-            first = one.process.name not in metered and scene.x is None
-            metered.add(one.process.name)
+            first = measurement.process.name not in metered and scene.x is None
+            metered.add(measurement.process.name)
             try:
-                one.finish(self._effort.burst if first else 0.0)
-                self.found["results"].append(rounded(one.result))
+                measurement.finish(self._effort.burst if first else 0.0)
+                self.found["results"].append(rounded(measurement.result))
             except AdapterError as error:
-                self._failed(one.process.name)
-                self._add(name, [one.process.name], {"setting": one.setting, "error": str(error)})
+                self._failed(measurement.process.name)
+                self._add(
+                    name, [measurement.process.name], {"setting": measurement.setting, "error": str(error)}
+                )
 
     def _first_frames(
         self,

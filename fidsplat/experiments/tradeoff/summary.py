@@ -63,7 +63,7 @@ def load(folders: Iterable[Path]) -> list[DeviceResults]:
                     "folder"
                 )
             records.setdefault(record.run["device"], []).append(record)
-        summaries = [summarise(own, rows_of, COLUMNS) for own in records.values()]
+        summaries = [summarise(device_records, rows_of, COLUMNS) for device_records in records.values()]
         summaries += [read_summary(file) for file in sorted(folder.glob("*.csv"))]
         if not summaries:
             raise InputError(f"results must be in {folder}, got none; run fidsplat tradeoff -o {folder}")
