@@ -5,11 +5,13 @@
 // Index space: one work-item per splat.
 // Reads: means. Updates: cells, a counter for each cell of the grid from `low`, `scale` cells per metre: the number of its splats, or, if
 // `scatter`, the position of its next splat. Writes, if `scatter`: order.
-kernel void sort_by_cells(global const float *means, uint count, float4 low, float scale, global uint *cells, int scatter, global int *order) {
+kernel void sort_by_cells(
+    global const float *means, uint count, float low_x, float low_y, float low_z, float scale, global uint *cells, int scatter,
+    global int *order) {
     uint i = get_global_id(0), cell = 0;
     if (i >= count) return;
-    float4 at = ((float4)(vload3(i, means), 0.0f) - low) * scale;
-    uint4 axes = convert_uint4(fmin(fmax(at, 0.0f), (float)((1 << BITS) - 1)));     // 0 for NaN
+    float3 at = (vload3(i, means) - (float3)(low_x, low_y, low_z)) * scale;
+    uint3 axes = convert_uint3(fmin(fmax(at, 0.0f), (float)((1 << BITS) - 1)));     // 0 for NaN
     for (int bit = 0; bit < BITS; bit++)
         cell |= ((axes.x >> bit & 1u) | (axes.y >> bit & 1u) << 1 | (axes.z >> bit & 1u) << 2) << (3 * bit);
     uint position = atomic_inc(cells + cell);

@@ -32,7 +32,7 @@ class MortonOrder:
         self.arrays = {"splat_ids": allocate("the cloud's order", 4 * self._count)}
         """`splat_ids` (n,) int32, indices of the sorted splats in the cloud; then the arrays of `bound`"""
         low, high = np.nanquantile(means[:: self._count // _SAMPLE + 1], (0.01, 0.99), axis=0)
-        grid = cl.cltypes.make_float4(*low, 0.0), np.float32(_SIDE / max(*(high - low), 1e-9))
+        grid = *low.astype(np.float32), np.float32(_SIDE / max(*(high - low), 1e-9))
         cells, starts = allocate("cells", 4 * _SIDE**3), np.zeros(_SIDE**3, np.uint32)
         for scatter in (0, 1):
             cl.enqueue_copy(queue, cells, starts)
