@@ -372,7 +372,7 @@ class Renderer:
             views = Views(tuple(metered), mask=views.mask)
         features, batch = prepare_batch(resident.all_splats, views)
         with self._lock:
-            rendered = (batch.one(number) for number in range(len(batch)))
+            rendered = (batch.view_at(number) for number in range(len(batch)))
             data, scene_indices = resident.gather(
                 rendered, features, (capture.quality for capture in views.captures)
             )
