@@ -1,4 +1,5 @@
 """Boxes: rectangles |u| <= 1, |v| <= 1 of a splat plane with filtered edges (docs/primitives.md).
+(u, v) = (n_u, n_v) / D is the intersection of a sample's ray with the plane.
 
 D + n_u, D - n_u, D + n_v and D - n_v, divided by the lengths of their gradients, are the distances of a
 sample from the four edges, inwards, in samples. For a pinhole they are affine in the sample, so each splat

@@ -37,8 +37,8 @@ def assert_well_formed(names, shapes=SHAPES):
         # resolve may be fused into blend
         argument_names = {one.name for one in source.arguments.get("resolve", source.arguments["blend"])}
         assert {f"{output.name}_out" for output in features.images} <= argument_names
-        assert {one.name for one in source.samples} <= argument_names
-        assert {one.name for one in source.samples} <= {one.name for one in source.arguments["blend"]}
+        assert {one.name for one in source.sample_buffers} <= argument_names
+        assert {one.name for one in source.sample_buffers} <= {one.name for one in source.arguments["blend"]}
 
 
 def test_texts_of_each_effect():

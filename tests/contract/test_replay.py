@@ -68,10 +68,10 @@ def test_counts_of_another_kind_of_frame_are_ignored(opencl):
     resident = machine.upload(random_splats(300, seed=4))
     first, *_ = (machine.render(resident, CAMERA)["rgb"] for _ in range(3))
     (frame,) = resident.data.cached_frames.values()
-    known, state = frame.recorded, machine.backend.pool.state
+    known, state = frame.recorded, machine.backend.pool.generation
     machine.render(resident, fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0)))
     assert np.array_equal(machine.render(resident, CAMERA)["rgb"], first)
-    assert (frame.recorded, machine.backend.pool.state) == (known, state)
+    assert (frame.recorded, machine.backend.pool.generation) == (known, state)
     assert known is not None
 
 
@@ -87,7 +87,7 @@ def test_a_replay_on_a_cpu_enlarges_its_lists(opencl):
     frames = [machine.render(resident, camera) for camera in cameras]
     assert machine.backend.frames - begun == len(cameras)
     (cached,) = resident.data.cached_frames.values()
-    assert cached.recorded.state is machine.backend.pool.state
+    assert cached.recorded.generation is machine.backend.pool.generation
     assert cached.recorded.capacity.pairs > 1.2 * frames[0].stats["pairs"], "lists were enlarged"
     for frame, camera in zip(frames, cameras, strict=True):
         expected = renderer.render(some, camera)

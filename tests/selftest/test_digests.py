@@ -17,7 +17,7 @@ def test_the_table_has_all_scenes():
 @pytest.mark.parametrize("kind", digests.KINDS, ids=lambda kind: kind.name)
 def test_devices_render_the_digests_of_the_table(renderer, monkeypatch, kind):
     """Each kind of scene is on one device in a run, which compiles a feature set for it."""
-    monkeypatch.setattr(pipeline, "MIN_BATCHED", 0)  # set-up is vectorised where it can be
+    monkeypatch.setattr(pipeline, "MIN_VECTORISED", 0)  # set-up is vectorised where it can be
     expected = {seed: row for seed, row in digests.read_table().items() if digests.kind_of(seed) == kind}
     assert len(expected) == digests.COUNT // len(digests.KINDS)
     differing = {

@@ -36,6 +36,17 @@ def test_binning_strategies_make_equal_lists(backend, scale):
     assert np.array_equal(tiled["rgb"], ordered["rgb"])
 
 
+@pytest.mark.parametrize("binning", ["bin_first", "sort_first"])
+def test_the_probe_sums_list_lengths(backend, binning):
+    pipeline = backend.pipeline(
+        select(random_splats(10, seed=5), fs.Capture(CAMERA)), listing(backend, binning)
+    )
+    lengths = np.array([3, 0, 2**31, 5], np.uint32)
+    starts, total = backend.probe().scan(pipeline, lengths)
+    assert total == lengths.sum(dtype=np.uint64)
+    assert np.array_equal(starts, np.concatenate([[0], np.cumsum(lengths)]))
+
+
 def test_no_splat_of_a_complete_image_is_outside_of_its_band(backend):
     """Large splats behind the camera, and a last row of tiles below the image: a splat outside of the band
     has no window, and binning would read unwritten memory."""

@@ -40,7 +40,7 @@ class OpenCLAlignment(AlignmentKernels):
         self._stages: list[dict[str, Any]] = []
 
     def load(self, image: np.ndarray, stages: list[AlignmentStage], max_pixels: int) -> list[int]:
-        with self._workspace.lock, self._workspace.failing("localising"):
+        with self._workspace.lock, self._workspace.device_errors("localising"):
             self._stages = []
             histograms = self._scratch("textures", 4 * BINS * len(stages))
             cl.enqueue_fill_buffer(self._queue, histograms, np.zeros(1, np.uint32), 0, 4 * BINS * len(stages))
@@ -101,7 +101,7 @@ class OpenCLAlignment(AlignmentKernels):
         rgb, depth = (frame.images.buffer(name) for name in ("rgb", "depth"))
         other, step, axis = moved or (frame, 1.0, 0)
         moved_rgb = rgb if moved is None else other.images.buffer("rgb")
-        with self._workspace.lock, self._workspace.failing("localising"):
+        with self._workspace.lock, self._workspace.device_errors("localising"):
             values = self._blurred(rgb, args, "render", 3)
             if moved is not None:
                 moved_rgb = self._blurred(moved_rgb, args, "moved render", 3)
@@ -165,8 +165,8 @@ class OpenCLAlignment(AlignmentKernels):
 
 
 def _unpacked(packed: np.ndarray, channels: int, blocks: bool, moved: bool) -> AlignmentSums:
-    """Unpack the sums of the work-groups: 8 matrix rows, the right-hand side, and a second one or moments,
-    for each of 3 channels, then scalars."""
+    """Unpack the sums of the work-groups. For each of 3 channels: 8 x 8 normal matrix, right-hand side, and a
+    second right-hand side or 6 moments; then scalars."""
     rows = packed[:, :240].reshape(len(packed), 3, 10, 8)[:, :channels]
     total, scalars = rows.sum(axis=0, dtype=float), packed[:, 240:248].sum(axis=0, dtype=float)
     cost, before, inverse_depth = (scalars[4:7] / max(scalars[3], 1)).tolist()

@@ -186,7 +186,7 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
     files += [*_dialect(config, _scalars(features), features.effects), "part/resolve_pixel.cl"]
     if "blend_half" not in layouts:
         files.append("part/blend_float.cl")
-    if config.batch > 1 or config.culls_first:
+    if config.splats_per_item > 1 or config.culls_first:
         files += _frustum_parts(layouts)
     if config.culls_first:
         files.append("part/unculled_splats.cl")
@@ -228,7 +228,7 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
     }
     _refuse_unknown_hooks(files)
     declared = Declarations(_scalars(features), layouts, features.images, fused, kernels_of(config))
-    return Assembler(files, declared, numbers_of(features, config)).source(stages)
+    return Assembler(files, declared, build_constants(features, config)).source(stages)
 
 
 def _frustum_parts(layouts: Collection[str]) -> list[str]:
@@ -244,8 +244,8 @@ def _frustum_parts(layouts: Collection[str]) -> list[str]:
 
 
 def culls_before_projection(features: FeatureSet) -> bool:
-    """Whether groups of splats in Morton order can be culled by bounding spheres. The k-buffer requires the
-    cloud's order; splats of a group may have different poses."""
+    """Whether groups of splats in Morton order can be culled by bounding spheres. Not with the k-buffer,
+    which breaks ties by cloud order, nor with motion, where splats of a group may have different poses."""
     layouts = layouts_of(features)
     excluded = {"compose_pixel", "motion_groups", "shutter_rows"}
     return excluded.isdisjoint(layouts) and bool(_frustum_parts(layouts))
@@ -275,7 +275,7 @@ def _assemble_backward(
     backward = {"BACK_ITEMS": backward_items(features, config), "CHUNK": backward_chunk(features, config)}
     if stages is _STEP:
         backward["AXES"] = 3 if "thickness" in layouts else 2
-    assembler = Assembler(files, declared, numbers_of(features, config) | backward)
+    assembler = Assembler(files, declared, build_constants(features, config) | backward)
     return assembler.source({name: [stage.format(config.schedule) for stage in stages]})
 
 
@@ -317,7 +317,7 @@ def assemble_alignment(items: int) -> KernelSource:
     return Assembler((), declared, numbers).source({"alignment": ("alignment",)})
 
 
-def assemble_check(file: str, config: KernelConfig, float64: bool, effects: Iterable[str] = ()) -> str:
+def assemble_test(file: str, config: KernelConfig, float64: bool, effects: Iterable[str] = ()) -> str:
     """Text of prelude.cl, math.cl and a file of test kernels below kernels/opencl/ (empty: no file). effects:
     files whose sections fill the hooks."""
     numbers = {"LANES": config.lanes, "FAST_FMA": int(config.fast_fma), "SETUP_FP64": int(float64)}
@@ -347,10 +347,10 @@ def _scalars(features: FeatureSet) -> Scalars:
     return Scalars(real, "double" if "blend_double" in features.effects else "float")
 
 
-def numbers_of(features: FeatureSet, config: KernelConfig) -> dict[str, int]:
+def build_constants(features: FeatureSet, config: KernelConfig) -> dict[str, int]:
     """The build constants, by their names in the kernels."""
     numbers = {
-        "BATCH": config.batch,
+        "BATCH": config.splats_per_item,
         "SORT_BLOCKS": config.sort_blocks,
         "FAST_FMA": int(config.fast_fma),
         "LANES": config.lanes,

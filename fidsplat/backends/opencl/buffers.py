@@ -49,7 +49,7 @@ class BufferPool:
         self._zeroed: set[str] = set()
         self._key: Hashable = None
         self._splats = 0
-        self.state = object()
+        self.generation = object()
         """a new object whenever a scratch buffer is replaced or released"""
 
     def size(self, name: str) -> int:
@@ -87,8 +87,8 @@ class BufferPool:
         return size
 
     def trim(self, key: Hashable, size: int, splats: int = 0) -> None:
-        """Release all buffers if the last frames had another key and the buffers exceed `size` bytes. Frames
-        with the same key have buffers of equal size, or smaller buffers for fewer splats."""
+        """Release all buffers if they exceed `size` bytes, and the last frames had another key or fewer
+        splats than the next frame."""
         if key == self._key and splats <= self._splats:
             return
         if self.memory_bytes > size:
@@ -98,7 +98,7 @@ class BufferPool:
     def invalidate_zeros(self) -> None:
         """Mark the contents of zero-filled buffers as unknown, after a failure."""
         self._zeroed.clear()
-        self.state = object()
+        self.generation = object()
 
     def clear(self) -> None:
         self._spare.clear()
@@ -106,7 +106,7 @@ class BufferPool:
         self._buffers.clear()
         self._contents.clear()
         self._zeroed.clear()
-        self.state = object()
+        self.generation = object()
 
     def upload(
         self, queue: cl.CommandQueue, name: str, array: np.ndarray
@@ -130,7 +130,7 @@ class BufferPool:
         if buffer is None or buffer.size < size:
             self._arrays.pop(name, None)
             self._buffers.pop(name, None)
-            self.state = object()
+            self.generation = object()
             buffer = self._buffers[name] = self.allocate(name, size)
         return buffer
 

@@ -108,7 +108,7 @@ class OpenCLChunkCache:
     ) -> Copies | None:
         """Copy rows of chunks into an array. spans: (k, 3) first row of each chunk, its destination, number
         of rows. cached: result of this method for the same rows of another array."""
-        with self._lock, self.workspace.failing("copying splats"):
+        with self._lock, self.workspace.device_errors("copying splats"):
             if cached is not None and cached.evictions == self._evictions:
                 self._launch(name, cached, target)
                 return cached
@@ -120,7 +120,7 @@ class OpenCLChunkCache:
             return copies if len(ranges) == 1 else None
 
     def wait(self) -> None:
-        with self._lock, self.workspace.failing("copying splats"):
+        with self._lock, self.workspace.device_errors("copying splats"):
             if self._last_copy is not None:
                 self._last_copy.wait()
 

@@ -57,8 +57,8 @@ class CommandList:
 
     `record` appends a launch, `launch` appends and submits it, `set` changes arguments by name in all
     launches, `submit` replays the list, `clear` starts another recording, which reuses the kernel objects and
-    sets only arguments that differ. The list keeps no buffer alive: its owner compares `BufferPool.state`
-    before a replay.
+    sets only arguments that differ. The list keeps no buffer alive: its owner compares
+    `BufferPool.generation` before a replay.
     """
 
     def __init__(self, program: Program) -> None:

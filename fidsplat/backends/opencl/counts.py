@@ -19,7 +19,7 @@ VISIBLE, PAIRS, BIG = 0, 2, 6
 @dataclass(frozen=True)
 class Counts:
     big: int
-    """number of splats that cover more tiles than a window stores"""
+    """number of splats whose tiles do not fit into a window (bit mask of 8 x 4 tiles)"""
     pairs: int
     visible: int
 

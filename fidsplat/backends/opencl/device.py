@@ -139,7 +139,7 @@ class OpenCLBackend(Workspace, Backend):
         key = self._key(features, config)
         if key[1].blend_items > self.device.max_work_group_size:
             raise DeviceError(
-                f"tiles must need at most {self.device.max_work_group_size} work-items on "
+                f"a tile must have at most {self.device.max_work_group_size} work-items on "
                 f"{self.info.title}, got {key[1].blend_items} for {key[1].tile_width} x "
                 f"{key[1].tile_height} samples; use another device"
             )

@@ -17,7 +17,7 @@ from fidsplat.backends.opencl.kernel_config import KernelConfig
 from fidsplat.backends.opencl.layout import RAW
 from fidsplat.backends.opencl.memory_plan import MemoryPlan
 from fidsplat.backends.opencl.resident import Resident
-from fidsplat.backends.opencl.uniforms import numbers_of, projection_arrays
+from fidsplat.backends.opencl.uniforms import projection_arrays, scalar_arguments
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
 from fidsplat.effects.catalogue import Output
@@ -38,11 +38,11 @@ class FrameBuffers:
     keys: cl.Buffer
     """sort keys by depth (v, n) uint32"""
     windows: cl.Buffer
-    """tiles that a splat touches (v, n) uint2, or for many tiles its index in `big`"""
+    """tiles that a splat overlaps (v, n) uint2: a bit mask of 8 x 4 tiles at most, or its index in `big`"""
     counters: cl.Buffer
     """totals of the frame, then the length of each tile's list (COUNTERS + t) uint32"""
     big: cl.Buffer
-    """splats that touch more tiles than a window holds (big_capacity) uint32"""
+    """splats whose tiles do not fit into a window (big_capacity) uint32"""
     big_bounds: cl.Buffer
     """records `Bounds` (big_capacity)"""
     order: cl.Buffer
@@ -109,7 +109,7 @@ class DeviceFrame:
         self.workspace, self.commands, self.config = workspace, commands, config
         self.resident, self.plan = resident, plan
         self.projected = resident.count
-        """number of splats of each view that have records; with `culls_first` a capacity"""
+        """records per view: the number of splats, or with `culls_first` the capacity for unculled splats"""
         self.batch, self.views = views, len(views)
         self.view = view = views.view
         self.waits = replay_queue is None or config.binning == "sort_first"
@@ -133,7 +133,7 @@ class DeviceFrame:
         self.buffers = FrameBuffers()
         self.named: dict[str, cl.Buffer] = vars(self.buffers)
         """all buffers, including those of effects and outputs, by the names of the kernel arguments"""
-        self.numbers: dict[str, Any] = numbers_of(view, self.source)
+        self.numbers: dict[str, Any] = scalar_arguments(view, self.source)
         """numbers by the names of the kernel arguments"""
         self.numbers |= {"width": view.width, "height": view.height, "stride": self.stride}
         self.numbers["channel_stride"] = self.views * self.rows * self.stride

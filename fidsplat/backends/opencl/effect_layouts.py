@@ -62,7 +62,7 @@ LAYOUTS: dict[str, Layout] = {
             member("float px py pr", "the filter's support: centre and radius [samples]; radius < 0: none"),
         ),
         backward_file="slot/lowpass_screen_backward.cl",
-        record_gradient=(member("float lowpass_x lowpass_y", "by the position of the low-pass disc"),),
+        record_gradient=(member("float lowpass_x lowpass_y", "with respect to the centre of the low-pass"),),
     ),
     "stop_inclusive": Layout(),
     "stop_exclusive": Layout("slot/stop_exclusive.cl", backward_file="slot/stop_exclusive_backward.cl"),
@@ -85,7 +85,11 @@ LAYOUTS: dict[str, Layout] = {
     "ellipsoid_exact": Layout(
         "slot/ellipsoid_exact.cl",
         parts=("thickness",),
-        splat=(member("wide bulge", "2 / m^2 of a 3D Gaussian, 0 of a disk"),),
+        splat=(
+            member(
+                "wide bulge", "2 / m^2 of a 3D Gaussian, m: Mahalanobis distance of the camera; 0 of a disk"
+            ),
+        ),
         backward_file="slot/ellipsoid_exact_backward.cl",
         record_gradient=(member("float bulge"),),
     ),
@@ -143,12 +147,13 @@ LAYOUTS: dict[str, Layout] = {
     "blend_double": Layout(),
     "blend_half": Layout(
         "slot/blend_half.cl",
-        splat=(member("uint rg b1", "two halves each: r and g, b and -1"),),
+        splat=(member("uint rg b1", "two float16 each: (r, g) and (b, -1)"),),
         packed=(("r", "WORDS_LOW({}rg)"), ("g", "WORDS_HIGH({}rg)"), ("b", "WORDS_LOW({}b1)")),
     ),
     "termination_depths": Layout(
         blend=args(
-            "in uint keys", "out uint termination_depths  // of each tile: the key at which it was finished"
+            "in uint keys",
+            "out uint termination_depths  // of each tile: depth key at which blending stopped",
         )
     ),
     # parts that several effects share
@@ -159,7 +164,12 @@ LAYOUTS: dict[str, Layout] = {
     "polygon": Layout("part/polygon.cl"),
     "ray_map": Layout(
         "part/ray_map.cl",
-        view=(member("real map[6]", "low corner, cells per unit along x and y, cells a side, first row"),),
+        view=(
+            member(
+                "real map[6]",
+                "x, y of the lowest corner, cells per unit along x, y, cells per side, first row",
+            ),
+        ),
         project=args("in short4 ray_map"),
     ),
     "rays": Layout(
@@ -182,7 +192,8 @@ LAYOUTS: dict[str, Layout] = {
         project_step=args("out float activated_thickness"),
     ),
     "step_camera": Layout(
-        "train/step_camera.cl", project_step=args("out real camera_sums  // (work-groups, 10) by the camera")
+        "train/step_camera.cl",
+        project_step=args("out real camera_sums  // (work-groups, 10) with respect to the camera"),
     ),
     "box_cover": Layout("part/box_cover.cl"),
     "box_edges": Layout(
@@ -191,7 +202,7 @@ LAYOUTS: dict[str, Layout] = {
         splat=(
             member(
                 "wide edge_u0 edge_u1 edge_v0 edge_v1",
-                "1 / |grad| of the forms D + n_u, D - n_u, D + n_v, D - n_v",
+                "1 / |grad| of the edge functions D + n_u, D - n_u, D + n_v, D - n_v",
             ),
         ),
         replaced_by=tuple((camera, "rays_box") for camera in _OWN_RAYS),

@@ -36,9 +36,9 @@ def render(frame: DeviceFrame) -> None:
     if frame.plan.chunk:
         render_in_chunks(frame)
     elif frame.config.binning == "sort_first":
-        render_sorted(frame)
+        render_sort_first(frame)
     else:
-        render_tiled(frame)
+        render_bin_first(frame)
 
 
 def allocate_samples(frame: DeviceFrame) -> None:
@@ -51,7 +51,7 @@ def allocate_samples(frame: DeviceFrame) -> None:
             cl.enqueue_fill_buffer(frame.queue, depths, _NO_DEPTH, 0, 4 * frame.tiles)
 
 
-def render_sorted(frame: DeviceFrame) -> None:
+def render_sort_first(frame: DeviceFrame) -> None:
     """Render on a CPU: wait for the number of pairs, then allocate the lists."""
     count, big = frame.resident.count, 0
     frame.upload_view(0, frame.rows)
@@ -71,7 +71,7 @@ def render_sorted(frame: DeviceFrame) -> None:
     frame.pairs, frame.stats = counts.pairs, partial(counts.stats, count)
 
 
-def render_tiled(frame: DeviceFrame) -> None:
+def render_bin_first(frame: DeviceFrame) -> None:
     """Render on a GPU: submit all stages with the list capacity of previous frames, and again with larger
     lists if they exceeded it."""
     frame.upload_view(0, frame.rows)
@@ -88,7 +88,7 @@ def render_tiled(frame: DeviceFrame) -> None:
         blend(frame, all_tiles)
         resolve(frame)
     if frame.waits:
-        complete_tiled(frame, counted, capacity)
+        complete_bin_first(frame, counted, capacity)
     else:
         frame.counted, frame.pairs = counted, capacity
     frame.queue.flush()
@@ -96,7 +96,7 @@ def render_tiled(frame: DeviceFrame) -> None:
     frame.stats = partial(read_stats, reader, frame.buffers.counts, last, count)
 
 
-def complete_tiled(frame: DeviceFrame, counted: cl.Event, capacity: int) -> None:
+def complete_bin_first(frame: DeviceFrame, counted: cl.Event, capacity: int) -> None:
     """Wait for the counts; if they exceed `capacity`, render again with larger buffers."""
     counts = frame.read_counts(counted)
     while counts.big > frame.numbers["big_capacity"]:

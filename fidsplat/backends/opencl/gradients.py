@@ -103,7 +103,7 @@ class OpenCLGradients(GradientPipeline):
         check_gradients(self.features, gradients)
         if not images.is_latest:
             raise InputError(NOT_LATEST_FRAME)
-        with images.frame.workspace.lock, images.frame.workspace.failing(_DOING):
+        with images.frame.workspace.lock, images.frame.workspace.device_errors(_DOING):
             frame = self._backward_frame(images.frame)
             self._submit_blend_backward(frame, gradients)
             return TileGradients(self, images, frame)
@@ -141,7 +141,7 @@ class OpenCLGradients(GradientPipeline):
         if frame.counted is None:
             return None
         count, size = frame.resident.count, (frame.view.width, frame.view.height)
-        return frame.pool.state, count, frame.capacity, size
+        return frame.pool.generation, count, frame.capacity, size
 
     def _record_blend_backward(self, frame: DeviceFrame, log_ceiling: float) -> None:
         features, config = self.features, self._pipeline.config
@@ -270,7 +270,7 @@ class TileGradients:
         """A context that uses the device. Raises InputError after a later frame of the device."""
         if not self._images.is_latest:
             raise InputError(NOT_LATEST_FRAME)
-        with self._frame.workspace.lock, self._frame.workspace.failing(_DOING):
+        with self._frame.workspace.lock, self._frame.workspace.device_errors(_DOING):
             yield
 
     def _allocate_camera_sums(self, frame: DeviceFrame) -> int:
@@ -303,7 +303,7 @@ class TileGradients:
         frame.queue.flush()
 
         def read() -> np.ndarray:
-            with frame.workspace.lock, frame.workspace.failing(_DOING):
+            with frame.workspace.lock, frame.workspace.device_errors(_DOING):
                 cl.wait_for_events(copy_events)
             return gradient
 

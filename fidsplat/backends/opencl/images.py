@@ -102,7 +102,7 @@ class OpenCLImages(Images):
             self._copy(name, into[first:end], (index * len(into) + first) * into[:1].nbytes)
 
     def _copy(self, name: str, into: np.ndarray, offset: int) -> None:
-        with self._workspace.failing(f"rendering {name}"):
+        with self._workspace.device_errors(f"rendering {name}"):
             buffer, after = self.buffer(name), self._completion_events()
             # a separate queue: on the queue of the frames, the copy would wait for the next frame
             cl.enqueue_copy(self._workspace.read_queue, into, buffer, src_offset=offset, wait_for=after)
@@ -126,7 +126,7 @@ class OpenCLImages(Images):
     def read_uint8(self, name: str, index: int = 0) -> np.ndarray:
         workspace, shape, label = self._workspace, self._shape(name), "8 bits of an image"
         into, count = workspace.host_memory.empty(shape, np.uint8), math.prod(shape)
-        with workspace.failing(f"rendering {name}"):
+        with workspace.device_errors(f"rendering {name}"):
             after = self._completion_events()
             with workspace.lock:  # all images share the kernel object with its arguments
                 kernel, values = _uint8_kernel(workspace)
@@ -152,14 +152,14 @@ class OpenCLImages(Images):
         return Array(self._workspace.queue, shape, dtype, data=buffer)
 
     def wait(self) -> None:
-        with self._workspace.failing("rendering"):
+        with self._workspace.device_errors("rendering"):
             for part in self.complete():
                 part.queue.finish()
 
     @property
     def timings(self) -> Mapping[str, float]:
         """Milliseconds by stage. For a replayed frame the first call renders it once more, with profiling."""
-        with self._workspace.failing("rendering"):
+        with self._workspace.device_errors("rendering"):
             rendered = self.complete()
             if self._replay is not None and rendered[0].stages is None:
                 with self._workspace.lock:
@@ -170,7 +170,7 @@ class OpenCLImages(Images):
     @property
     def stats(self) -> Mapping[str, int]:
         """Number of splats of the cloud, and of visible splats and pairs of all views."""
-        with self._workspace.failing("rendering"):
+        with self._workspace.device_errors("rendering"):
             stats = summed(part.stats() for part in self.complete())
             stats = {"splats": 0, "visible": 0, "pairs": 0} | stats | {"splats": self._splats}
             return summed([stats, *(copied.stats() for copied in self._copied)])
@@ -187,7 +187,7 @@ class OpenCLImages(Images):
 
     def termination_depths(self) -> TerminationDepths:
         """Termination depths of a frame with that effect. Raises DeviceError if the device has failed."""
-        with self._workspace.failing("rendering"):
+        with self._workspace.device_errors("rendering"):
             (height, width), view = self._tile, self._view
             keys = np.empty((-(-view.height // height), -(-view.width // width)), np.uint32)
             (rendered,) = self.complete()
@@ -197,7 +197,7 @@ class OpenCLImages(Images):
 
     def copy_tiles(self, other: OpenCLImages, tiles: np.ndarray) -> None:
         """Copy tiles of another frame of the same view. Raises DeviceError if the device has failed."""
-        with self._workspace.failing("rendering"):
+        with self._workspace.device_errors("rendering"):
             after, copied = [*self._completion_events(), *other._completion_events()], None
             for output in self._outputs.values():
                 width = 4 * output.channels  # bytes of a pixel

@@ -32,7 +32,7 @@ class KernelConfig:
     tape: int = 1024
     """splats of a tile whose fragments are stored for the backward pass (`lanes`), 2 KiB each; other
     fragments are computed twice"""
-    batch: int = 1
+    splats_per_item: int = 1
     """splats that a work-item of the project stage sets up, vectorised if more than 1 (`lanes`)"""
     culls_first: bool = False
     """whether splats outside the frustum are culled before projection (part/unculled_splats.cl)"""
@@ -53,7 +53,17 @@ class KernelConfig:
 def cpu_config(lanes: int = 16, cores: int = 8, fast_fma: bool = True) -> KernelConfig:
     """The config for CPUs: a tile per work-item, in the widest vectors."""
     return KernelConfig(
-        "lanes", "sort_first", lanes, lanes, 16, min(max(4 * cores, 8), 256), 11, 1, fast_fma, 32, batch=64
+        "lanes",
+        "sort_first",
+        lanes,
+        lanes,
+        16,
+        min(max(4 * cores, 8), 256),
+        11,
+        1,
+        fast_fma,
+        32,
+        splats_per_item=64,
     )
 
 
@@ -75,7 +85,7 @@ def config_for(features: FeatureSet, config: KernelConfig) -> KernelConfig:
         config = replace(config, schedule="group", lanes=1, tile_width=16, tile_height=16, k_buffer_size=8)
     if config.schedule == "group" or "camera_pinhole" not in features.effects:
         # the set-up of lenses has loops and branches that compilers do not vectorise
-        config = replace(config, batch=1)
+        config = replace(config, splats_per_item=1)
     if not {"compose_pixel", "compose_coplanar_pixel"}.isdisjoint(features.effects):
         # the k-buffer needs the registers of a second pixel
         config = replace(config, rows=1)
@@ -83,7 +93,7 @@ def config_for(features: FeatureSet, config: KernelConfig) -> KernelConfig:
 
 
 def other_configs(own: KernelConfig, kind: str) -> dict[str, KernelConfig]:
-    """Alternative build constants by name, for tests (`Backend.shapes`)."""
+    """Alternative build constants by name, for tests (`Backend.configs`)."""
     if kind == "schedule":
         return {"groups": _groups(own, 16 if own.schedule == "lanes" else 8)}
     if kind == "k_buffer":
@@ -118,7 +128,7 @@ def other_configs(own: KernelConfig, kind: str) -> dict[str, KernelConfig]:
 def _groups(own: KernelConfig, side: int) -> KernelConfig:
     """Constants with the schedule of a GPU and tiles of side x side pixels; side 8 as for small frames."""
     groups = replace(
-        own, schedule="group", binning="bin_first", lanes=1, scan_items=64, k_buffer_size=8, batch=1
+        own, schedule="group", binning="bin_first", lanes=1, scan_items=64, k_buffer_size=8, splats_per_item=1
     )
     if side == 8:
         return small_frame_config(groups)

@@ -27,6 +27,7 @@ VIEW = Record(
 )
 """Uniforms of the projection: one record for each view, then one for each view and moving group."""
 
+# intersection of a ray with the splat's plane: (u, v) = (n_u, n_v) / D, both affine in the sample (splat.cl)
 SPLAT = Record(
     "Splat",
     (
@@ -48,7 +49,7 @@ BOUNDS = Record(
     (
         member("float ex ey", "centre [samples]"),
         member("float hx hy", "half extents of the axis-aligned box"),
-        member("float slope", "the chord at height Y around the centre is"),
+        member("float slope", "chord of row Y, relative to the centre:"),
         member("float half_width", "slope * Y +- half_width * sqrt(1 - Y^2 / hy^2)"),
         member("float inverse_hy2", "0 makes it a box"),
         member("float tip", "height at which the ellipse is widest to the right"),
@@ -58,7 +59,7 @@ BOUNDS = Record(
 RECORD_GRADIENT = Record(
     "RecordGradient",
     (
-        member("float nu0 nux nuy", "gradients by n_u times 1, x, y, summed over a tile"),
+        member("float nu0 nux nuy", "gradients with respect to n_u times 1, x, y, summed over a tile"),
         member("float nv0 nvx nvy"),
         member("float d0 dx dy"),
         member("float log_opacity"),
@@ -72,7 +73,7 @@ _SIZE = args("int width height  // of the sample grid")
 _IMAGE_SIZE = args("int width height  // of the image")
 _BIG = args("uint big_capacity", "in Bounds big_bounds")
 _DIGIT = args("uint count  // capacity in splats of a view", "in uint counters", "uint first shift")
-_WALK = args(
+_BIN_ARGUMENTS = args(
     "uint count  // capacity in splats of a view",
     "in uint order counters",
     "in uint2 windows",
@@ -161,8 +162,8 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("in uint keys indices", _DIGIT),
         *("out uint table", "in uint starts", "out uint keys_out indices_out"),
     ),
-    "bin_count": _WALK,
-    "bin_emit": args(*(_WALK, "in uint starts", "int band_first band_end", "out uint lists")),
+    "bin_count": _BIN_ARGUMENTS,
+    "bin_emit": args(*(_BIN_ARGUMENTS, "in uint starts", "int band_first band_end", "out uint lists")),
     "tile_starts": args(
         "uint tiles capacity", "in uint counters", "out uint starts cursors counts tile_order"
     ),
@@ -202,7 +203,10 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     # derivatives
     "reserve_gradients": args(
-        *(_RESERVED, "out uint big_rows  // (rows of tiles, big splats): tiles above, less the first column")
+        *(
+            _RESERVED,
+            "out uint big_rows  // (rows of tiles, big splats): tiles in the rows above - first column",
+        )
     ),
     "blend_backward": args(
         *(
@@ -216,7 +220,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         _BLENDED,
         "out float checkpoints  // transmittance of each tile in front of every CHUNK splats",
         "out float record_gradients  // records RecordGradient by gradient buffer offset",
-        "out real background_sums  // (tiles, 3) by the background",
+        "out real background_sums  // (tiles, 3) with respect to the background",
         "out float tapes  // a Tape for each work-item",
         "out uint reserved  // second word: number of claimed tiles",
     ),
@@ -228,7 +232,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float grad_scales  // (n, 2)",
         "out float grad_opacities  // (n)",
         "out float screen  // (n)",
-        "out real camera_sums  // (work-groups, 10) by the camera",
+        "out real camera_sums  // (work-groups, 10) with respect to the camera",
     ),
     "project_step": args(
         *("uint count", "in View view", "in Splat splats", "in uint keys", _TILES),
@@ -237,7 +241,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "uint stored_terms  // SH coefficients of a splat",
         "float beta1 beta2 one_minus_beta1 one_minus_beta2 sqrt_correction2 epsilon",
         "float lr_means lr_scales lr_quats lr_logits  // learning rates",
-        "float lr_sh lr_rest  // of degree 0 and above",
+        "float lr_sh lr_rest  // of degree 0; of higher degrees",
         "float scale_penalty opacity_penalty",
         "out float gradient_sums",
         "out float means first_means second_means",
@@ -326,7 +330,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "add_position_noise": args(
         "uint count axes seed_low seed_high iteration purpose",
-        "float size  // metres times 1 / m^2 of the steps",
+        "float size  // factor of the steps [1/m]",
         "float slope threshold  // of the opacity above which splats do not move",
         "in float quats log_scales logits",
         "out float means",
@@ -341,10 +345,10 @@ GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "blend_checkpoints": args(
         *("in Splat splats", "in uint lists starts", _IMAGE_SIZE, _BLENDED),
-        "out float checkpoints  // per pixel and CHUNK splats: transmittance in front, light behind",
+        "out float checkpoints  // per pixel and CHUNK splats: T in front, gradient with respect to T behind",
         "out uint reached_chunks  // (tiles) number of chunks before the transmittance stop",
         "out uint chunk_tiles  // tile of each chunk",
-        "out real background_sums  // (tiles, 3) by the background",
+        "out real background_sums  // (tiles, 3) with respect to the background",
     ),
     "blend_backward": args(
         *("in Splat splats", "in uint lists starts", _TILES, "in uint gradient_offsets", _BLENDED),

@@ -35,7 +35,7 @@ MIN_BIG = 1 << 12
 UNIFORM_BYTES = 1 << 14
 """upper bound of the bytes of uniforms, counts and moving groups"""
 PART_BYTES = {"cpu": 1 << 28}
-"""maximum bytes of a part of a batch without images, by kind of device; larger parts are not faster"""
+"""maximum bytes of the views rendered together, without images, by kind of device; more is not faster"""
 OTHER_PART_BYTES = 1 << 31
 _PART_SAMPLES = 1 << 30
 """maximum samples of a part of a batch; kernels use 32-bit indices for several channels of samples"""

@@ -29,7 +29,7 @@ from fidsplat.cameras.raster import RayRaster
 from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import DeviceError
 
-MIN_BATCHED = 1 << 14
+MIN_VECTORISED = 1 << 14
 """minimum splats of clouds whose set-up is vectorised on CPUs"""
 MIN_CULLED = 3 << 18
 """minimum splats of clouds that are sorted, and culled before projection; smaller ones gain nothing"""
@@ -80,8 +80,8 @@ class OpenCLPipeline(Pipeline):
 
     def render_view(self, resident: Resident, view: View) -> OpenCLImages:
         """Render one view. A frame whose command list is cached is replayed, on a GPU without waiting."""
-        if self._is_too_small_to_batch(resident):
-            return self._unbatched.render_view(resident, view)
+        if self._is_too_small_to_vectorise(resident):
+            return self._unvectorised.render_view(resident, view)
         with self.workspace.rendering():
             key = self._key(view)
             cached = resident.cached_frames.get(key) if view.band is None else None
@@ -105,8 +105,8 @@ class OpenCLPipeline(Pipeline):
     def render(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
         if views.is_single:
             return self.render_view(resident, views.view_at(0))
-        if self._is_too_small_to_batch(resident):
-            return self._unbatched.render(resident, views)
+        if self._is_too_small_to_vectorise(resident):
+            return self._unvectorised.render(resident, views)
         workspace, rendered = self.workspace, []
         with workspace.rendering():
             workspace.switch_to(workspace.queue)
@@ -132,8 +132,8 @@ class OpenCLPipeline(Pipeline):
     def render_complete(self, resident: Resident, view: View) -> DeviceFrame:
         """Render one frame; returns its buffers, which are valid until the next frame. Raises DeviceError if
         it exceeds the memory budget without chunks and bands."""
-        if self._is_too_small_to_batch(resident):
-            return self._unbatched.render_complete(resident, view)
+        if self._is_too_small_to_vectorise(resident):
+            return self._unvectorised.render_complete(resident, view)
         with self.workspace.rendering():
             plan, frame = self._planner.frame(resident, view), None
             if not plan.chunk:
@@ -257,9 +257,9 @@ class OpenCLPipeline(Pipeline):
         """The pipeline with another tile-binning strategy."""
         return self._other(self.features, replace(self.config, binning=binning, culls_first=False))
 
-    def _is_too_small_to_batch(self, resident: Resident) -> bool:
+    def _is_too_small_to_vectorise(self, resident: Resident) -> bool:
         """Whether compiling the vectorised set-up would take longer than it saves, for a small cloud."""
-        return self.config.batch > 1 and resident.count < MIN_BATCHED
+        return self.config.splats_per_item > 1 and resident.count < MIN_VECTORISED
 
     @cached_property
     def _culls(self) -> bool:
@@ -268,10 +268,10 @@ class OpenCLPipeline(Pipeline):
         return tiled and culls_before_projection(self.features)
 
     @cached_property
-    def _unbatched(self) -> OpenCLPipeline:
+    def _unvectorised(self) -> OpenCLPipeline:
         """The pipeline whose projection is not vectorised, for small clouds: compiling the vectorised
         projection takes longer than it saves."""
-        return self._other(self.features, replace(self.config, batch=1))
+        return self._other(self.features, replace(self.config, splats_per_item=1))
 
     def _for_part(self, resident: Resident, plan: MemoryPlan, views: ViewBatch) -> OpenCLPipeline:
         """The pipeline with the fastest tile-binning strategy for a part of a batch."""

@@ -11,7 +11,7 @@ import pyopencl as cl
 from fidsplat.backends.opencl.buffers import BufferPool
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
-from fidsplat.backends.opencl.program import check_kernels
+from fidsplat.backends.opencl.program import compile_test_kernels
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.probing import Probe
 from fidsplat.util.errors import DeviceError
@@ -25,7 +25,7 @@ def evaluate(
     inputs: arrays (n,). outputs: types of arrays (n,). The kernel's arguments are the inputs, then the
     outputs. Without float64, SETUP_FP64 is 0 and `real` is float.
     """
-    kernel = check_kernels(workspace, text=text, lanes=1)["probe"]
+    kernel = compile_test_kernels(workspace, text=text, lanes=1)["probe"]
     given = [buffer_of(workspace, array) for array in inputs]
     made = [np.empty(len(inputs[0]), dtype) for dtype in outputs]
     taken = [buffer_of(workspace, array) for array in made]
@@ -107,7 +107,7 @@ class OpenCLProbe(Probe):
         self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
     ) -> dict[str, np.ndarray]:
         workspace, n = self._workspace, len(exponents)
-        kernels = check_kernels(workspace, "check/arithmetic.cl", effects=("slot/arithmetic_fast.cl",))
+        kernels = compile_test_kernels(workspace, "check/arithmetic.cl", effects=("slot/arithmetic_fast.cl",))
 
         def run(kernel: str, items: int, made: np.ndarray, *given: Any) -> np.ndarray:
             values = [buffer_of(workspace, one) if isinstance(one, np.ndarray) else one for one in given]

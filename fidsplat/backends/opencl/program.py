@@ -14,7 +14,7 @@ from typing import Any
 import pyopencl as cl
 
 from fidsplat.backends.caches import pocl_folder
-from fidsplat.backends.opencl.assemble import KernelSource, assemble_check
+from fidsplat.backends.opencl.assemble import KernelSource, assemble_test
 from fidsplat.backends.opencl.pocl_workarounds import is_pocl, shared_program
 from fidsplat.backends.opencl.pocl_workarounds.target_patch import correct_target, needs_correction
 from fidsplat.backends.opencl.workspace import Workspace
@@ -109,13 +109,13 @@ def _compiled(workspace: Workspace, source: KernelSource) -> dict[str, cl.Progra
     )
 
 
-def check_kernels(
+def compile_test_kernels(
     workspace: Workspace, file: str = "", text: str = "", lanes: int = 0, effects: Sequence[str] = ()
 ) -> dict[str, cl.Kernel]:
     """Compile a file below kernels/opencl/ or a text after prelude.cl and math.cl, like the stages. lanes:
     SIMD width; 0 for the device's. effects: files that fill hooks."""
     config = replace(workspace.config, lanes=lanes) if lanes else workspace.config
-    built = build(workspace, assemble_check(file, config, workspace.info.float64, effects) + text)
+    built = build(workspace, assemble_test(file, config, workspace.info.float64, effects) + text)
     load_invoker()
     return {kernel.function_name: kernel for kernel in built.all_kernels()}
 

@@ -1,6 +1,6 @@
 """Frame replay: the command list of a frame is submitted again for another view of the same cloud. Only
 output images and numbers of the view are set, which is much faster than planning a frame. On a CPU the host
-reads the counts before the lists are written, as in `render_sorted`.
+reads the counts before the lists are written, as in `render_sort_first`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.counts import COUNTERS, Capacity, Counts, enlarged, read_stats
 from fidsplat.backends.opencl.device_frame import DeviceFrame, Rendered
 from fidsplat.backends.opencl.resident import Resident
-from fidsplat.backends.opencl.uniforms import numbers_of, projection_arrays
+from fidsplat.backends.opencl.uniforms import projection_arrays, scalar_arguments
 from fidsplat.backends.view import View
 
 _VIEWS = 256
@@ -36,8 +36,8 @@ class RecordedFrame:
 
     def __init__(self, frame: DeviceFrame) -> None:
         self.workspace, self.commands, self.capacity = frame.workspace, frame.commands, frame.capacity
-        self.state = frame.pool.state
-        """`BufferPool.state` of the bound scratch buffers"""
+        self.generation = frame.pool.generation
+        """`BufferPool.generation` of the bound scratch buffers"""
         self._waits = frame.waits
         """whether the host waits for the counts of each frame"""
         self._rows, self._counter_bytes = frame.rows, frame.pool.size("counters")
@@ -49,7 +49,7 @@ class RecordedFrame:
         self._source = frame.source
         self._view, self._arrays = frame.view, frame.arrays
         self._views: dict[int, tuple[View, dict[str, np.ndarray], dict[str, Any]]] = {
-            id(frame.view): (frame.view, frame.arrays, numbers_of(frame.view, frame.source))
+            id(frame.view): (frame.view, frame.arrays, scalar_arguments(frame.view, frame.source))
         }
         """rendered views with their arrays and numbers"""
         self._bytes = 0
@@ -60,7 +60,7 @@ class RecordedFrame:
     def set_view(self, view: View, queue: cl.CommandQueue) -> bool:
         """Bind the uniforms of a view. Returns False if a scratch buffer was replaced."""
         pool = self.workspace.pool
-        if pool.state is not self.state:
+        if pool.generation is not self.generation:
             return False
         if view is not self._view:
             _, arrays, numbers = self._views.get(id(view)) or self._cache_view(view)
@@ -72,7 +72,7 @@ class RecordedFrame:
                 self._uploads.append(event)
         if not self._waits:
             pool.zeroed("counters", self._counter_bytes, queue)  # other frames do not clear it
-        return pool.state is self.state
+        return pool.generation is self.generation
 
     def submit(self, queue: cl.CommandQueue, splats: int) -> Rendered | None:
         """Render the bound view. None if the host waits for the counts and they exceed the capacity."""
@@ -104,7 +104,7 @@ class RecordedFrame:
             return False
         pairs = enlarged(counts.pairs, self.workspace.pair_budget)
         self.commands.set({"lists": self.workspace.pool.scratch("lists", 4 * pairs)})
-        self.capacity, self.state = Capacity(self.capacity.big, pairs), self.workspace.pool.state
+        self.capacity, self.generation = Capacity(self.capacity.big, pairs), self.workspace.pool.generation
         return True
 
     def render(self, frame: DeviceFrame) -> None:
@@ -131,7 +131,7 @@ class RecordedFrame:
             self._bytes = 0
         self._bytes += size
         # a reference to the view, so that no other view has its id
-        cached = view, self._arrays | arrays, numbers_of(view, self._source)
+        cached = view, self._arrays | arrays, scalar_arguments(view, self._source)
         self._views[id(view)] = cached
         return cached
 

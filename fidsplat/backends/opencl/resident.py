@@ -70,8 +70,8 @@ class Resident(ResidentData):
 
 class UploadedCloud(Resident):
     """A SplatCloud on the device. A CPU reads the host's arrays. Other devices have copies; labels and
-    colours are copied on first use. A cloud of more than half of the memory budget is `streamed`. Once the
-    arrays are sorted, they are copied again if a frame needs the cloud's order, and stay in it."""
+    colours are copied on first use. A cloud of more than half of the memory budget is `streamed`. Sorted
+    arrays are replaced by arrays in cloud order when a frame needs that order, and not sorted again."""
 
     def __init__(self, workspace: Workspace, cloud: SplatCloud) -> None:
         super().__init__(len(cloud))
@@ -89,7 +89,7 @@ class UploadedCloud(Resident):
             return
         self.streamed = total > workspace.memory_budget // 2 or widest > device.max_mem_alloc_size
         if not self.streamed:
-            with workspace.failing("copying the cloud"):
+            with workspace.device_errors("copying the cloud"):
                 self._copy_arrays()
                 workspace.queue.finish()
 

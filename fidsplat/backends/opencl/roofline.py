@@ -8,7 +8,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.interface import Rates
-from fidsplat.backends.opencl.program import check_kernels
+from fidsplat.backends.opencl.program import compile_test_kernels
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.util.errors import DeviceError
 
@@ -20,7 +20,7 @@ _GROUP = 64
 
 def measure_rates(workspace: Workspace) -> Rates:
     """Measure peak rates: the best of several launches each. Takes less than a second."""
-    kernels = check_kernels(workspace, "check/roofline.cl")
+    kernels = compile_test_kernels(workspace, "check/roofline.cl")
     try:
         return Rates(
             copy_bytes=_copy_rate(workspace, kernels["roofline_copy"]),

@@ -92,7 +92,7 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
             arrays, count = {name: resident.sorted_array(name) for name in names}, size
         else:
             arrays = {name: resident.part(name, first, end) for name in names}
-        batch = frame.config.batch
+        batch = frame.config.splats_per_item
         items, group = (count, 64) if batch == 1 else (-(-count // batch), 1)
         frame.launch("project", "project", (items,), (group,), frame.views, count=count, **arrays)
 

@@ -291,7 +291,7 @@ class OpenCLTraining:
 
         def value() -> tuple[Any, ...]:
             self._queue.flush()
-            with self._workspace.failing("training"):
+            with self._workspace.device_errors("training"):
                 absolute, squared, ssim = readback.read(slot)
                 more = () if exposure_gradient is None else (exposure_gradient(),)
             loss = (1 - dssim_weight) * absolute / value_count + dssim_weight * (1 - ssim / size)
@@ -389,9 +389,8 @@ class OpenCLTraining:
         self._replay("count", (), args, lambda: [self._row_launch("count_visible", self._count, args)])
 
     def add_noise(self, size: float, slope: float, threshold: float, words: Sequence[int]) -> None:
-        """Add MCMC noise to the means: random steps in the plane of each disk with `size` times its variance,
-        reduced by a sigmoid of this `slope` for opacities above `threshold`. words: seed (low, high),
-        iteration, purpose."""
+        """Add MCMC noise to the means: steps size * sigmoid(slope (threshold - opacity)) * covariance *
+        standard normal sample, in the plane of a disk. words: seed (low, high), iteration, purpose."""
         names = ("seed_low", "seed_high", "iteration", "purpose")
         args = {"size": size, "slope": slope, "threshold": threshold, **dict(zip(names, words, strict=True))}
         self._launch("add_position_noise", self._count, args)
@@ -419,7 +418,7 @@ class OpenCLTraining:
         return kernel, size, group, [values[name] for name in names]
 
     def _enqueue(self, launch: Launch) -> None:
-        with self._workspace.failing("training"):
+        with self._workspace.device_errors("training"):
             self._commands.clear()
             self._commands.launch(self._queue, *launch)
 
@@ -429,8 +428,8 @@ class OpenCLTraining:
         """Replay a command list of a training step with the arguments `args`. launches: returns the
         launches; called to record again if the key, the splats or the buffers have changed."""
         commands = self._replayed.setdefault(name, CommandList(self._program))
-        key = (*key, self._version, self._workspace.pool.state)
-        with self._workspace.failing("training"):
+        key = (*key, self._version, self._workspace.pool.generation)
+        with self._workspace.device_errors("training"):
             if commands.key != key:
                 commands.clear()
                 for launch in launches():

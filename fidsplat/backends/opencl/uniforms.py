@@ -21,7 +21,7 @@ def scalars_of(view: View) -> dict[str, float]:
     }
 
 
-def numbers_of(view: View, source: KernelSource) -> dict[str, Any]:
+def scalar_arguments(view: View, source: KernelSource) -> dict[str, Any]:
     """All scalar kernel arguments of a view, by name."""
     numbers: dict[str, Any] = scalars_of(view)
     for group, names in source.uniform_groups.items():

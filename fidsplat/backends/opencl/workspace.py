@@ -78,7 +78,7 @@ class Workspace:
                 raise
 
     @contextmanager
-    def failing(self, what: str) -> Iterator[None]:
+    def device_errors(self, what: str) -> Iterator[None]:
         """A context that raises the device's failures as DeviceError. what: for example `rendering rgb`."""
         try:
             yield

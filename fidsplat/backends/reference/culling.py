@@ -42,7 +42,7 @@ def may_contribute(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> np.nda
     for form in (s.forms[:, :, 0], s.forms[:, :, 1]):
         error = rounding(form)
         q_low += np.maximum(np.abs(middle @ form) - half @ np.abs(form) - error, 0) ** 2
-        # the edge of a box is antialiased over half a sample outwards, and the gradient's terms are rounded
+        # the edge of a box splat is antialiased half a sample outwards, and the gradient's terms are rounded
         off = d_error + 1.5 * error + 2 * ROUND * (reach @ (np.abs(d) + np.abs(form)))
         for side in (d + form, d - form):
             meets &= middle @ side + (half + reach) @ np.abs(side) + _SPARE * off > 0

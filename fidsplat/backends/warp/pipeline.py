@@ -186,7 +186,7 @@ class WarpPipeline(Pipeline):
         stats = rendered.counts  # the closure references only the counts, so that the object can be released
 
         def complete() -> Rendered | None:
-            with workspace.failing("while rendering"):
+            with workspace.device_errors("while rendering"):
                 launcher.finish()
             visible, pairs = acquired[1].tolist()
             stats.update(visible=visible, pairs=pairs)
@@ -226,7 +226,7 @@ class WarpPipeline(Pipeline):
         """Key of the launches of a frame: all their arguments except the numbers of the views."""
         workspace, labels = self.workspace, tuple(label for label, _ in view.groups)
         budgets = workspace.memory_budget, workspace.pair_budget, reserved
-        states = workspace.pool.state, cached.inputs.state
+        states = workspace.pool.generation, cached.inputs.state
         external = view.external_depth and view.external_depth.depth.shape
         return cached.capacity, budgets, states, view.raster, view.environment_map, labels, external
 

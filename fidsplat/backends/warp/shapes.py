@@ -24,7 +24,7 @@ def shape_for(device: Any) -> WarpShape:
 
 
 def other_shapes(own: WarpShape, kind: str) -> dict[str, WarpShape]:
-    """Alternative build constants by name, for tests (`Backend.shapes`)."""
+    """Alternative build constants by name, for tests (`Backend.configs`)."""
     if kind == "schedule":
         return {"groups": WarpShape("group", 8, 8)}
     if kind == "binning":

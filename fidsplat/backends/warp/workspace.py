@@ -28,7 +28,7 @@ class ArrayPool:
         """cached views of scratch arrays on the CPU, with their memory as NumPy arrays"""
         self._hosts: dict[str, Any] = {}
         self._spare: dict[str, list[Any]] = {}
-        self.state = object()
+        self.generation = object()
         """a new object whenever a scratch array is replaced"""
         self.holders: WeakSet[Any] = WeakSet()
         """caches that reference scratch arrays; their `release_arrays` is called when an array is replaced"""
@@ -41,7 +41,7 @@ class ArrayPool:
                 del self._arrays[name, dtype], array
                 self._parts.pop((name, dtype), None)
                 self._memory.pop((name, dtype), None)
-                self.state = object()
+                self.generation = object()
                 for holder in list(self.holders):
                     holder.release_arrays()
             array = self._arrays[name, dtype] = self.allocate(name, size, dtype)
@@ -133,11 +133,11 @@ class Workspace:
     @contextmanager
     def working(self, doing: str) -> Iterator[None]:
         """A context with exclusive use of the device, also for reading images, as that may render again."""
-        with self._lock, self.failing(doing), load().ScopedDevice(self.device):
+        with self._lock, self.device_errors(doing), load().ScopedDevice(self.device):
             yield
 
     @contextmanager
-    def failing(self, doing: str) -> Iterator[None]:
+    def device_errors(self, doing: str) -> Iterator[None]:
         """A context that raises the device's failures as DeviceError. doing: the activity."""
         try:
             yield

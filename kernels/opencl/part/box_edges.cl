@@ -1,4 +1,4 @@
-// Edges of boxes (part/box_cover.cl) whose forms are affine in the sample: straight lines with one inverse gradient each.
+// Edges of boxes (part/box_cover.cl) whose edge functions D +- n_u, D +- n_v are affine in the sample: straight lines with one inverse gradient each.
 //@ footprint_functions
 static inline vfloat slab_coverage(vfloat d, vfloat n, wide edge_0, wide edge_1) {
     vfloat above = clamp(FMA(FMA((vfloat)SQRT_2, n, d), (vfloat)edge_0, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);

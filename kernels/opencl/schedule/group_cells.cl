@@ -2,7 +2,7 @@
 // a column each, and loop over the staged splats that overlap it.
 #define GROUP (TILE_W * TILE_H / ROWS)
 #define ITEMS 4                              // work-items per cell
-#define CELLS_X 8                            // cells in a row: one bit each in a byte, four splats' bytes in a word
+#define CELLS_X 8                            // cells in a row: a byte of each splat has one bit per cell; four bytes in a word
 #define CELL_W (TILE_W / CELLS_X)
 #define CELL_H (ITEMS / CELL_W * ROWS)
 #define CELLS_Y (TILE_H / CELL_H)

@@ -9,7 +9,7 @@ static inline vfloat fast_exp(vfloat x) {
     const float rounder = 12582912.0f;                  // 1.5 * 2^23: the last bits of the sum are the integer
     x = fmax(x, (vfloat)-87.0f);
     vfloat sum = FMA(x, (vfloat)1.44269504f, (vfloat)rounder), k = sum - rounder;
-    vfloat r = FMA(k, (vfloat)-0.693359375f, x);        // ln 2 in two words, the first of 9 bits: exact
+    vfloat r = FMA(k, (vfloat)-0.693359375f, x);        // Cody-Waite reduction: the high part of ln 2 has 9 bits, so k times it is exact
     r = FMA(k, (vfloat)2.12194440e-4f, r);
     vfloat p = FMA((vfloat)8.29030946e-3f, r, (vfloat)4.18979935e-2f);
     p = FMA(p, r, (vfloat)1.66676372e-1f);
