@@ -20,7 +20,7 @@ from tradeoff_report import EXACT, verdict, write_report
 
 from fidsplat.experiments.charts import chart, label_points, literal, plain_ticks
 from fidsplat.experiments.pages import NOTHING, fill_template, number, percent
-from fidsplat.experiments.summary import Frame
+from fidsplat.experiments.summary import Table
 from fidsplat.experiments.tradeoff.plot import disk_scenes
 from fidsplat.experiments.tradeoff.points import ABLATION, PRESET
 from fidsplat.experiments.tradeoff.scenes import HARD
@@ -59,7 +59,7 @@ CONSTANTS = (
     Constant("exponentials by GPU instructions", "3DGS, gsplat, HiGS", ABLATION, "arithmetic approximate"),
     Constant("colours and transmittance in float16", "HiGS", ABLATION, "blend_precision float16"),
     Constant("**`gsplat`**: gsplat's constants together", "gsplat, 2DGS", PRESET, "gsplat"),
-    Constant("**`fast`**: 2/255, T = 1/256, float32 set-up", "ours", PRESET, "fast"),
+    Constant("**`fast`**: 2/255, T = 1/256, float32 projection", "ours", PRESET, "fast"),
     Constant("**`standard`**: 1e-5, T = 1e-4, exponentials", "ours", PRESET, "standard"),
 )
 
@@ -86,7 +86,7 @@ def write_accuracy(folders: Sequence[Path], page: Path = PAGE, report: Path = RE
     write_file(page, f"{before}{BEGIN}{block}{END}{after}")
 
 
-def constants_table(devices: Sequence[DeviceResults]) -> Frame:
+def constants_table(devices: Sequence[DeviceResults]) -> Table:
     """Table of constants: time saved relative to the exact image, largest error, and verdicts."""
     rows = []
     for constant in CONSTANTS:

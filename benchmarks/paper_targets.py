@@ -18,7 +18,7 @@ import pandas as pd
 from fidsplat.experiments import angles, counts, views
 from fidsplat.experiments.methods import IDEAL
 from fidsplat.experiments.report import ANGLES, VIEWS, load
-from fidsplat.experiments.summary import Frame
+from fidsplat.experiments.summary import Table
 from fidsplat.experiments.sweep import Record, folder_records
 from fidsplat.experiments.views import LINEAR
 from fidsplat.util.files import atomic_write
@@ -46,7 +46,7 @@ class Target(NamedTuple):
     reached: bool
 
 
-def targets(folders: Sequence[Path]) -> Frame:
+def targets(folders: Sequence[Path]) -> Table:
     """Table with a row for each target that has measurements."""
     found: list[Target] = []
     rows = {name: summary.rows for name, summary in load(folders).items()}
@@ -65,7 +65,7 @@ Hits = dict[float, str]
 _SCAN = ["protocol", "category", "marker", "method", "reader"]
 
 
-def with_gaps(rows: Frame, records: Iterable[Record]) -> Frame:
+def with_gaps(rows: Table, records: Iterable[Record]) -> Table:
     """Rows of scans with columns of their gap to the ideal texture (see `_gap_columns`), from raw results."""
     longest: dict[tuple, Hits] = {}
     for record in records:
@@ -107,14 +107,14 @@ def _gap_columns(read: Hits, ideal: Hits, method: str) -> dict[str, float | None
     return row
 
 
-def _best(rows: Frame) -> Iterator[tuple[str, str, Frame]]:
+def _best(rows: Table) -> Iterator[tuple[str, str, Table]]:
     """Mixture, method and rows of each mixture with a target, rendered with the filter `best`."""
     for mixture in ALLOWED_GAP:
         method = f"{mixture}/best"
         yield mixture, method, rows[rows["method"] == method]
 
 
-def _gaps(rows: Frame) -> Iterator[Target]:
+def _gaps(rows: Table) -> Iterator[Target]:
     """Gaps of the largest tilt, as in the paper, and of the largest without a miss."""
     for mixture, method, own in _best(rows):
         allowed = ALLOWED_GAP[mixture]
@@ -137,7 +137,7 @@ def _gap(worst: float) -> str:
     return "-" if pd.isna(worst) else "not read frontally" if worst >= NEVER else f"{worst:+.1f}"
 
 
-def _misses(rows: Frame) -> Iterator[Target]:
+def _misses(rows: Table) -> Iterator[Target]:
     for mixture, method, own in _best(rows):
         for (protocol, category), scans in own.groupby(["protocol", "category"], sort=False):
             sums = scans.groupby("reader")[["missed", "below"]].sum()
@@ -154,7 +154,7 @@ def _misses(rows: Frame) -> Iterator[Target]:
                 )
 
 
-def _paper_angles(rows: Frame) -> Iterator[Target]:
+def _paper_angles(rows: Table) -> Iterator[Target]:
     rows = rows[(rows["protocol"] == "fixed-module") & (rows["reader"] == "zxing-tall")]
     for column, words in (("read", "largest tilt that is read"), ("read_all", "read without a miss up to")):
         means = rows.assign(value=rows[column].fillna(0.0)).groupby(["category", "method"])["value"]
@@ -175,7 +175,7 @@ def _paper_angles(rows: Frame) -> Iterator[Target]:
                     )
 
 
-def _views(rows: Frame) -> Iterator[Target]:
+def _views(rows: Table) -> Iterator[Target]:
     means = rows.groupby(["truth", "category", "method"])[["psnr", "ssim"]].mean()
 
     def mean(method: str, metric: str = "psnr") -> float | None:
@@ -209,7 +209,7 @@ def _views(rows: Frame) -> Iterator[Target]:
                 )
 
 
-def _counts(rows: Frame) -> Iterator[Target]:
+def _counts(rows: Table) -> Iterator[Target]:
     for category, own in rows.groupby("category", sort=False):
         gaussians = own.pivot(index="marker", columns="mixture", values="gaussians")
         rectangles = own.groupby("marker")[["rectangles_dark", "rectangles_light"]].first().sum(axis=1)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 
 from fidsplat.experiments.pages import NOTHING, fill_template, fixed, number, percent
-from fidsplat.experiments.summary import Frame, Row, provenance
+from fidsplat.experiments.summary import Row, Table, provenance
 from fidsplat.experiments.tradeoff.plot import INVISIBLE, disk_scenes, write_chart
 from fidsplat.experiments.tradeoff.points import ABLATION, COMBINED, MARKER, PRESET
 from fidsplat.experiments.tradeoff.scenes import HARD, is_marker
@@ -89,7 +89,7 @@ def save_results(folders: Sequence[Path], folder: Path) -> tuple[dict[str, Devic
     return devices, files
 
 
-def settings_table(device: DeviceResults) -> Frame:
+def settings_table(device: DeviceResults) -> Table:
     """Time of each setting relative to the base, its largest error, and a verdict on the first scene that has
     it; for all scenes without markers."""
     rows: dict[tuple[str, str], dict[str, str]] = {}
@@ -119,7 +119,7 @@ def verdict(device: DeviceResults, point: Row, base: tuple[str, str] | None = No
     return "no effect" if found == "dominated" and point["maximum"] <= INVISIBLE / 2 else found
 
 
-def markers_table(device: DeviceResults) -> Frame:
+def markers_table(device: DeviceResults) -> Table:
     """Time of marker qualities, without a low-pass with nine samples per pixel, and errors relative to the
     printed texture."""
     view, rows = f"{SHOWN_MARKER}@{TILT}", []
@@ -196,7 +196,7 @@ def cheapest_within(device: DeviceResults, scenes: Iterable[str], bound: float) 
     Settings are compared by the product of their times; errors within certificates do not count.
     """
     scenes = list(scenes)
-    rows: Frame = pd.concat([device.same_definition(scene) for scene in scenes])
+    rows: Table = pd.concat([device.same_definition(scene) for scene in scenes])
     best: tuple[float, list[Row]] = (math.inf, [])
     for _, found in rows.groupby(["knob", "value"], sort=False):
         error = found["beyond"].fillna(found["maximum"]).max()

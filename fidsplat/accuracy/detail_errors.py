@@ -44,11 +44,14 @@ def measure_detail(
         progress: called with the current step and its completed fraction, 0 to 1.
 
     Raises:
-        InputError: the store is instanced or has no splats or levels of detail, or an option is invalid.
+        InputError: the store has instances, no splats or no levels of detail, or an option is invalid.
     """
     settings = settings_with(DetailSettings, settings, changes)
     if store.poses is not None:
-        raise InputError(f"store must not be instanced, got {store.path}; measure {store.header.store}")
+        raise InputError(
+            f"store must be a store without instances, got {store.path}; pass {store.header.store}, which it "
+            "instances"
+        )
     if not len(store) or not store.nodes["level"].any():
         raise InputError(
             f"{store.path} must have levels of detail, got none; build it again with levels, from more splats"

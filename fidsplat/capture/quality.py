@@ -136,8 +136,9 @@ class Quality:
     layer after which the transmittance is at most 1 - first_hit."""
 
     setup_precision: str = "float64"
-    """Arithmetic of the per-splat set-up. `float32` shifts small and grazing splats (docs/correctness.md) and
-    saves time on devices with slow float64; devices without float64 always use it."""
+    """Arithmetic of the per-splat projection. `float32` shifts small and grazing splats
+    (docs/correctness.md) and saves time on devices with slow float64. Devices without float64 always use
+    it."""
 
     arithmetic: str = "fast"
     """Exponentials and logarithms of blending. `fast`: polynomials, within 2.3 ulp for exponentials and 1.1

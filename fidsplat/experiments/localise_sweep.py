@@ -16,7 +16,7 @@ from fidsplat.cameras import Trajectory
 from fidsplat.experiments.charts import COLOURS, chart, legend_above
 from fidsplat.experiments.localise import DISTANCES, RATE, VARIANTS, Drive, Variant, record, recorded
 from fidsplat.experiments.pages import fixed, write_page
-from fidsplat.experiments.summary import Frame
+from fidsplat.experiments.summary import Table
 from fidsplat.experiments.sweep import Key, Results, Sweep, Work
 from fidsplat.formats import load_trajectory, save_trajectory
 from fidsplat.logs import RobotLog, check_log
@@ -114,7 +114,7 @@ def found_of(results: Results) -> dict[str, dict[str, Any]]:
     return {record.key["variant"]: record.result for record in results.done.values()}
 
 
-def table_of(variants: VariantResults) -> Frame:
+def table_of(variants: VariantResults) -> Table:
     """Table with a row per variant: errors in centimetres, degrees and pixels, and numbers of tags."""
     no_corners = [{"median_px": None}] * len(_SPANS)
     return pd.DataFrame(

@@ -11,7 +11,7 @@ import jinja2
 import pandas as pd
 from markupsafe import Markup
 
-from fidsplat.experiments.summary import Frame
+from fidsplat.experiments.summary import Table
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import printable, read_text, writable_folder, write_file
 from fidsplat.util.markup import escaped
@@ -68,7 +68,7 @@ def fill_template(
     return environment.get_template(template).render(**context, folder=prefix)
 
 
-def markdown_table(frame: Frame) -> Markup:
+def markdown_table(frame: Table) -> Markup:
     """Format a table as Markdown, with all columns right-aligned except the first."""
     rows = [frame.columns, ["---", *["---:"] * (len(frame.columns) - 1)], *frame.itertuples(index=False)]
     return Markup("\n".join("| " + " | ".join(map(_cell, row)) + " |" for row in rows))

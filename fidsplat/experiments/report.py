@@ -14,7 +14,7 @@ from fidsplat.experiments.charts import bars, chart, legend_above
 from fidsplat.experiments.methods import FILTERS, IDEAL, mixtures, with_linear_light
 from fidsplat.experiments.pages import NOTHING, fixed, number, page_and_folder, write_page
 from fidsplat.experiments.setup import CATEGORIES, COLLECTIONS, PROTOCOLS
-from fidsplat.experiments.summary import Frame, Row, Summary, join, provenance, read_summary, summarise
+from fidsplat.experiments.summary import Row, Summary, Table, join, provenance, read_summary, summarise
 from fidsplat.experiments.sweep import Record, folder_records
 from fidsplat.experiments.views import LINEAR, TRUTHS
 from fidsplat.util.errors import InputError, damaged_data
@@ -79,7 +79,7 @@ def _titles(categories: Iterable[str]) -> list[str]:
     return [CATEGORIES[name].title for name in categories]
 
 
-def _counts(rows: Frame, folder: Path) -> dict[str, Frame]:
+def _counts(rows: Table, folder: Path) -> dict[str, Table]:
     """Tables 1 and 2, and their charts."""
     categories = category_order(rows["category"])
     used = [name for name in mixtures() if name in set(rows["mixture"])]
@@ -120,7 +120,7 @@ def _counts(rows: Frame, folder: Path) -> dict[str, Frame]:
     return {"sizes": pd.DataFrame(sizes), "seconds": pd.DataFrame(seconds)}
 
 
-def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
+def _angles(rows: Table, folder: Path) -> dict[str, Table]:
     """Table 3 for each protocol, and its chart."""
     rows = _best_reader(rows)
     categories, methods = category_order(rows["category"]), method_order(rows["method"])
@@ -145,7 +145,7 @@ def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
     return tables
 
 
-def _best_reader(rows: Frame) -> Frame:
+def _best_reader(rows: Table) -> Table:
     """Rows of the best detector of each method."""
     ranks = {name: rank for names in _READERS.values() for rank, name in enumerate(names)}
     rank = rows["reader"].map(ranks)
@@ -161,7 +161,7 @@ def _angle(values: Row) -> str:
     return f"{measured.mean():.1f}" + (f" ({never} of {len(values)} never)" if never else "")
 
 
-def _views(rows: Frame, folder: Path) -> dict:
+def _views(rows: Table, folder: Path) -> dict:
     """Table 4 for ground truth of display values and of linear light, and its chart."""
     categories, measured = category_order(rows["category"]), set(rows["truth"])
     paper_psnr = {name: {key: value[0] for key, value in row.items()} for name, row in VIEWS.items()}
@@ -188,7 +188,7 @@ def _views(rows: Frame, folder: Path) -> dict:
     return {"tables": tables, "views": int(rows["amount"].max()), "rows": len(rows), "measured": count}
 
 
-def _localisation(rows: Frame) -> Frame:
+def _localisation(rows: Table) -> Table:
     """Median position error by every second distance, and number of views that were read."""
     methods = method_order(rows["method"])
     rows = rows[rows["distance_m"].isin(sorted(set(rows["distance_m"]))[::2])]
@@ -209,7 +209,7 @@ def _table(
     methods: Sequence[str],
     cells: Mapping[tuple[str, str], str],
     paper: Mapping[str, Mapping],
-) -> Frame:
+) -> Table:
     """Table by category: the paper's figures if any, then fidsplat's by category and method."""
     theirs = {PAPER: "ours", TRAINED: 17} if paper else {}
     return pd.DataFrame(

@@ -139,13 +139,14 @@ class ImageSettings(MeasureSettings):
             return
         if not folder.is_dir():
             raise InputError(
-                f"--trained must be a folder with models such as 2dgs-17/small-0.ply, got {folder}"
+                f"--trained must be a folder with models such as 2dgs-17/small-0.ply, got {folder}; train "
+                "models with benchmarks/baseline.py"
             )
         models = [method for method in self.methods if method.startswith("2dgs-")]
         if not models:
             raise InputError(
                 f"--trained must have at least one of the folders 2dgs-3, 2dgs-5, 2dgs-9 and 2dgs-17, "
-                f"got {folder}; train models by benchmarks/baseline.py"
+                f"got {folder}; train models with benchmarks/baseline.py"
             )
         for model, category, index in product(
             models, chosen_categories(self.category), range(self.marker_count)
@@ -153,7 +154,8 @@ class ImageSettings(MeasureSettings):
             file = folder / model / f"{category.name}-{index}.ply"
             if not file.is_file():
                 raise InputError(
-                    f"{file} must exist, got none; --category and --markers skip untrained markers"
+                    f"{file} must be a trained model, got no file; train it, or restrict the markers with "
+                    "--category and --markers"
                 )
 
 

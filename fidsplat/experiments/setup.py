@@ -103,7 +103,7 @@ COLLECTIONS = (3, 5, 9, 17)
 """numbers of training views; each collection contains the smaller ones"""
 TEST_VIEWS = 20
 MAX_TEST_TILT = 60.0
-"""maximum tilt of test views in degrees, which is inside the ring of the densest collection"""
+"""maximum tilt of test views in degrees, which is inside the ring of the largest training set"""
 
 # tilt and azimuth in degrees: front, sides, above and below, diagonals, a wide ring
 _VIEWS = (
@@ -115,7 +115,7 @@ _VIEWS = (
 
 
 def training_cameras(views: int = COLLECTIONS[-1]) -> list[Camera]:
-    """Cameras of a collection. Raises InputError for a number outside `COLLECTIONS`."""
+    """Cameras of a training set of 3, 5, 9 or 17 views. Raises InputError for another number."""
     if views not in COLLECTIONS:
         raise InputError(f"number of training views must be 3, 5, 9 or 17, got {views}")
     return [_around(tilt, azimuth) for tilt, azimuth in _VIEWS[:views]]

@@ -21,7 +21,7 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, read_text, write_file
 
 _MARK = "# "
-Frame: TypeAlias = Any
+Table: TypeAlias = Any
 """a `pandas.DataFrame` with cells of unknown type"""
 Row: TypeAlias = Any
 """a `pandas.Series`"""
@@ -31,9 +31,9 @@ Row: TypeAlias = Any
 class Summary:
     """A table of results."""
 
-    rows: Frame
+    rows: Table
     runs: list[dict[str, Any]]
-    """facts of each run (`fidsplat.util.provenance.run_facts`), and its number of `points`"""
+    """facts of each run (`fidsplat.util.provenance.run_facts`), and its number of measurements, `points`"""
     notes: list[str] = field(default_factory=list)
     """notes for readers of the table"""
 
@@ -110,8 +110,9 @@ def join(summaries: Sequence[Summary], keys: Sequence[str]) -> Summary:
     return Summary(rows, [runs[number] for number in used], notes)
 
 
-def provenance(summaries: Mapping[str, Summary]) -> Frame:
-    """Table of runs by the name of their summary: points, device, commit, code and date."""
+def provenance(summaries: Mapping[str, Summary]) -> Table:
+    """Table of runs, one row each: name of the summary, number of measurements, device, commit, digest of the
+    code, date."""
     return pd.DataFrame(
         [
             {

@@ -110,8 +110,8 @@ def _assembled(
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """A marker in a scene, and the capture by a camera."""
+class MarkerView:
+    """A test image: a scene, the pose of a marker in it, and the camera's distance, angles and settings."""
 
     scene: Scene
     """scene without the marker"""
@@ -160,15 +160,15 @@ class View:
     def complete_capture(self) -> Capture:
         return self.capture.with_(camera=self.camera)
 
-    def changed(self, **parts: Any) -> View:
+    def changed(self, **parts: Any) -> MarkerView:
         """The view with changed fields of its capture."""
         return replace(self, capture=self.capture.with_(**parts))
 
-    def exposed(self, **parts: Any) -> View:
+    def exposed(self, **parts: Any) -> MarkerView:
         """The view with a sensor that integrates linear light and has an sRGB response."""
         return self.changed(sensor=Sensor(decode="srgb", response="srgb", seed=self.seed, **parts))
 
-    def moving(self, pixels: float, shutter: Shutter) -> View:
+    def moving(self, pixels: float, shutter: Shutter) -> MarkerView:
         """The view with a camera that moves sideways, so that the marker moves by this number of pixels per
         second at time 0."""
         camera = self.camera
@@ -186,7 +186,7 @@ class View:
         return np.random.default_rng(self.seed)
 
 
-def view_of(scene: str, spec: str, seed: str) -> View:
+def view_of(scene: str, spec: str, seed: str) -> MarkerView:
     """A view without a cause, with random distance, tilt, roll and aim.
 
     Views with equal seeds have equal poses for all specs, causes and severities.
@@ -196,7 +196,7 @@ def view_of(scene: str, spec: str, seed: str) -> View:
     edges = EDGES * math.exp(rng.uniform(-0.15, 0.15))
     tilt, azimuth = math.radians(rng.uniform(0, 40)), math.radians(rng.uniform(-25, 25))
     roll, aim = math.radians(rng.uniform(-20, 20)), rng.uniform(-0.05, 0.05, 2)
-    return View(
+    return MarkerView(
         base,
         placed_in(scene, spec),
         int(rng.integers(2**31)),
@@ -222,10 +222,10 @@ class Cause:
     form: str
     """format of the amount, e.g. "{:.0f}" """
     unit: str
-    change: Callable[[View, float], View]
+    change: Callable[[MarkerView, float], MarkerView]
     """function from a view and an amount to the changed view"""
 
-    def apply(self, view: View, severity: float) -> View:
+    def apply(self, view: MarkerView, severity: float) -> MarkerView:
         """Apply the cause to a view. Raises InputError for a severity outside 0 to 1."""
         number("severity", severity, "a number from 0 to 1", 0, 1)
         return self.change(view, self.amount(severity))
@@ -243,17 +243,17 @@ def _geometric(first: float, last: float) -> Callable[[float], float]:
     return lambda severity: first * (last / first) ** severity
 
 
-def _distance(view: View, edges: float) -> View:
+def _distance(view: MarkerView, edges: float) -> MarkerView:
     """Move the camera to a distance in edges of the code."""
     return replace(view, edges=view.edges * edges / EDGES)
 
 
-def _angle(view: View, degrees: float) -> View:
+def _angle(view: MarkerView, degrees: float) -> MarkerView:
     """Tilt the camera by degrees from the marker's normal."""
     return replace(view, tilt=math.copysign(math.radians(degrees), view.tilt))
 
 
-def _lens(view: View, k1: float) -> View:
+def _lens(view: MarkerView, k1: float) -> MarkerView:
     """Distort the image by the radial coefficient -k1; the marker is near a corner, where distortion is
     large."""
     signs = view.rng.choice((-1.0, 1.0), 2)
@@ -261,38 +261,38 @@ def _lens(view: View, k1: float) -> View:
     return view.changed(camera=replace(view.camera, lens=BrownConrady(k1=-k1)))
 
 
-def _blur(view: View, pixels: float) -> View:
+def _blur(view: MarkerView, pixels: float) -> MarkerView:
     """Move the camera during the exposure, so that the marker moves by pixels."""
     return view.moving(pixels, Shutter(exposure_time=1.0, sub_poses=max(2, math.ceil(pixels / 2))))
 
 
-def _rolling(view: View, pixels: float) -> View:
+def _rolling(view: MarkerView, pixels: float) -> MarkerView:
     """Move the camera during the readout of the rows, so that the marker moves by pixels per frame."""
     return view.moving(pixels, Shutter(readout=1.0, rows_per_band=6))
 
 
-def _noise(view: View, electrons: float) -> View:
+def _noise(view: MarkerView, electrons: float) -> MarkerView:
     """Add shot noise of a sensor with this full well in electrons."""
     return view.exposed(full_well=electrons)
 
 
-def _underexposed(view: View, fraction: float, gain: float = 1.0) -> View:
+def _underexposed(view: MarkerView, fraction: float, gain: float = 1.0) -> MarkerView:
     """Reduce the exposure to a fraction of the light, with shot noise and read noise."""
     return view.exposed(exposure=fraction, full_well=10_000.0, read_noise=5.0, gain=gain)
 
 
-def _overexposed(view: View, factor: float) -> View:
+def _overexposed(view: MarkerView, factor: float) -> MarkerView:
     """Multiply the exposure by a factor; light above 1 saturates."""
     return view.exposed(exposure=factor)
 
 
-def _fog(view: View, transmittance: float) -> View:
+def _fog(view: MarkerView, transmittance: float) -> MarkerView:
     """Add fog with this transmittance between camera and marker, 0 to 1."""
     distance = view.edges * view.placed.marker.size
     return view.changed(fog=Fog(-math.log(transmittance) / distance))
 
 
-def _covered(view: View, fraction: float) -> View:
+def _covered(view: MarkerView, fraction: float) -> MarkerView:
     """Cover a fraction of the code by a dark leaf, from a random side."""
     size, rng = view.placed.marker.size, view.rng
     angle = math.pi / 2 * int(rng.integers(4)) + rng.uniform(-0.2, 0.2)
@@ -303,7 +303,7 @@ def _covered(view: View, fraction: float) -> View:
     return replace(view, cover=leaf.with_boxes())
 
 
-def _transparent(view: View, opacity: float) -> View:
+def _transparent(view: MarkerView, opacity: float) -> MarkerView:
     """Multiply the opacities of the marker's splats by a factor, 0 to 1."""
     printed, cloud = view.placed.marker, view.placed.marker.cloud
     thin = SplatCloud(
@@ -313,7 +313,7 @@ def _transparent(view: View, opacity: float) -> View:
     return replace(view, placed=replace(view.placed, marker=replace(printed, cloud=thin)))
 
 
-def _defocused(view: View, radius: float) -> View:
+def _defocused(view: MarkerView, radius: float) -> MarkerView:
     """Blur the image by a disk with a radius in pixels."""
     return replace(view, defocus=radius)
 
@@ -324,13 +324,13 @@ def _direction(placed: PlacedMarker, vector: tuple[float, float, float]) -> tupl
     return x, y, z
 
 
-def _backlight(view: View, fraction: float) -> View:
+def _backlight(view: MarkerView, fraction: float) -> MarkerView:
     """Reduce the light of the marker to a fraction of that of its surroundings, for which the camera is
     exposed."""
     return replace(view, placed=_changed(view.placed, Lighting(exposure=fraction)))
 
 
-def _shadow(view: View, ratio: float) -> View:
+def _shadow(view: MarkerView, ratio: float) -> MarkerView:
     """Cast shadows of planks; ratio: irradiance by the sun over irradiance in the shade. The camera is
     exposed for sunlit areas."""
     cover, sun = _planks(view.placed.marker.size, view.seed % VARIANTS)
@@ -363,7 +363,7 @@ def _planks(size: float, number: int) -> tuple[SplatCloud, tuple[float, float, f
     return planks.with_boxes(), tuple(sun.tolist())
 
 
-def _glare(view: View, ratio: float) -> View:
+def _glare(view: MarkerView, ratio: float) -> MarkerView:
     """Add a lamp that a laminated marker reflects into the camera; ratio: irradiance by the lamp over the
     other light."""
     placed = _changed(view.placed, Lighting("lights", roughness=0.25, view="camera"))
@@ -377,43 +377,43 @@ def _glare(view: View, ratio: float) -> View:
     return replace(view, placed=placed, lights=(sky, light))
 
 
-def _dusk(view: View, fraction: float) -> View:
+def _dusk(view: MarkerView, fraction: float) -> MarkerView:
     """Reduce the light to a fraction, and compensate it by gain."""
     return _underexposed(view, fraction, 1 / fraction)
 
 
-def _flare(view: View, fraction: float) -> View:
+def _flare(view: MarkerView, fraction: float) -> MarkerView:
     """Add veiling glare from a window outside of the image, as a fraction of the light."""
     return view.exposed(veiling_glare=fraction, glare_light=(0.6,) * 3)
 
 
-def _cylinder(view: View, degrees: float) -> View:
+def _cylinder(view: MarkerView, degrees: float) -> MarkerView:
     """Bend the code to an arc of this many degrees on a cylinder."""
     radius = view.placed.marker.size / math.radians(max(degrees, 1e-5))
     axis = "xy"[view.seed % 2]
     return replace(view, placed=_changed(view.placed, shape=Cylinder(radius, axis=axis)))
 
 
-def _crumpled(view: View, height: float) -> View:
+def _crumpled(view: MarkerView, height: float) -> MarkerView:
     """Crumple the sheet to a height in edges of the code."""
     size = view.placed.marker.size
     sheet = Crumpled(height * size, size, seed=view.seed % VARIANTS)
     return replace(view, placed=_changed(view.placed, shape=sheet))
 
 
-def _box_edge(view: View, fraction: float) -> View:
+def _box_edge(view: MarkerView, fraction: float) -> MarkerView:
     """Bend a fraction of the code around the edge of a box."""
     size, axis = view.placed.marker.size, "xy"[view.seed % 2]
     edge = BoxEdge(0.03 * size, (0.5 - fraction) * size, axis=axis)
     return replace(view, placed=_changed(view.placed, shape=edge))
 
 
-def _faded(view: View, contrast: float) -> View:
+def _faded(view: MarkerView, contrast: float) -> MarkerView:
     """Reduce the contrast of the print to a fraction."""
     return _worn("fading")(view, 1 - contrast)
 
 
-def _worn(name: str) -> Callable[[View, float], View]:
+def _worn(name: str) -> Callable[[MarkerView, float], MarkerView]:
     """Function that changes one field of `Wear`."""
     return lambda view, severity: replace(
         view, placed=_changed(view.placed, wear=Wear(**{name: severity}, seed=view.seed % VARIANTS))

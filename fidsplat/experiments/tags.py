@@ -18,7 +18,15 @@ import numpy as np
 from fidsplat.experiments.run import device_name, results_of
 from fidsplat.experiments.settings import ShardSettings
 from fidsplat.experiments.sweep import Key, Record, Sweep, Work, shard, thread_pool
-from fidsplat.experiments.tag_causes import CAPTURED, CAUSES, GREENHOUSE, SCENES, View, scene_of, view_of
+from fidsplat.experiments.tag_causes import (
+    CAPTURED,
+    CAUSES,
+    GREENHOUSE,
+    SCENES,
+    MarkerView,
+    scene_of,
+    view_of,
+)
 from fidsplat.images.files import write_png
 from fidsplat.images.filters import defocused, grey_of
 from fidsplat.markers.spec import Detector
@@ -224,8 +232,8 @@ def tag_sweep(options: TagSettings) -> Iterator[Sweep]:
         yield Sweep(NAME, results, points, begin, options.workers, pool, overlap=True)
 
 
-def views_of(key: Key, seed: int) -> list[View]:
-    """Views of a point, with its cause applied."""
+def views_of(key: Key, seed: int) -> list[MarkerView]:
+    """Test images of a measurement, with its cause applied."""
     spec, cause = FAMILIES[key["family"]], key["cause"]
     views = [view_of(key["scene"], spec, f"{seed} {key['scene']} {k}") for k in range(key["views"])]
     return views if cause == NONE else [CAUSES[cause].apply(view, key["severity"]) for view in views]
@@ -242,7 +250,7 @@ def begin_point(key: Key, renderer: Renderer, seed: int, names: Sequence[str] = 
 
 def _detect(
     key: Key,
-    shots: Iterable[tuple[View, np.ndarray]],
+    shots: Iterable[tuple[MarkerView, np.ndarray]],
     detectors: dict[str, Callable[[np.ndarray, Target], Attempt]],
 ) -> dict[str, Any]:
     """Errors of each view by detector, as `Errors`."""
@@ -256,7 +264,7 @@ def _detect(
     return {"errors": errors}
 
 
-def errors_of(corners: np.ndarray | None, view: View) -> Errors:
+def errors_of(corners: np.ndarray | None, view: MarkerView) -> Errors:
     """Errors of detected corners (4, 2); None without corners or pose."""
     if corners is None:
         return None

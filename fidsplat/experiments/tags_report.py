@@ -13,7 +13,7 @@ import pandas as pd
 
 from fidsplat.experiments.charts import COLOURS, chart, legend_above
 from fidsplat.experiments.pages import NOTHING, page_and_folder, write_page
-from fidsplat.experiments.summary import Frame, Summary, provenance, summarise
+from fidsplat.experiments.summary import Summary, Table, provenance, summarise
 from fidsplat.experiments.sweep import Record
 from fidsplat.experiments.tag_causes import CAUSES
 from fidsplat.experiments.tags import FAMILIES, NAME, NONE, OWN, rows_of
@@ -34,7 +34,7 @@ def view_table(records: Sequence[Record]) -> Summary:
     return summarise(records, rows_of, (*_GROUP, "read", *_ERRORS))
 
 
-def statistics_of(rows: Frame, seed: int, by: Sequence[str] = _GROUP) -> Frame:
+def statistics_of(rows: Table, seed: int, by: Sequence[str] = _GROUP) -> Table:
     """Detection rates and errors of groups of views, with 95 % intervals."""
     return pd.DataFrame(
         dict(zip(by, names, strict=True)) | _statistics(group, seed)
@@ -42,7 +42,7 @@ def statistics_of(rows: Frame, seed: int, by: Sequence[str] = _GROUP) -> Frame:
     )
 
 
-def _statistics(group: Frame, seed: int) -> dict[str, Any]:
+def _statistics(group: Table, seed: int) -> dict[str, Any]:
     read = group[group["read"]]
     row: dict[str, Any] = {"amount": len(group)}
     for name, hits in (("rate", len(read)), ("precise", int((read["corner_px"] <= PRECISE).sum()))):
@@ -70,7 +70,7 @@ def breaking_severity(severities: Sequence[float], rates: Sequence[float]) -> fl
     return None
 
 
-def breaks_of(rates: Frame) -> Frame:
+def breaks_of(rates: Table) -> Table:
     """Table of causes and families with the amount at which each detector reads half of the views.
 
     rates: `statistics_of` by family, detector, cause and severity.
@@ -90,7 +90,7 @@ def breaks_of(rates: Frame) -> Frame:
     return pd.DataFrame(table)
 
 
-def compact(breaks: Frame) -> Frame:
+def compact(breaks: Table) -> Table:
     """Table of `breaks_of` with one row per cause and one column per family."""
     detectors = list(breaks.columns[3:])
     names = {
@@ -107,13 +107,13 @@ def compact(breaks: Frame) -> Frame:
     )
 
 
-def _detectors(rates: Frame) -> list[str]:
+def _detectors(rates: Table) -> list[str]:
     known = [*TITLES, OWN]
     names = dict.fromkeys(rates["detector"])
     return sorted(names, key=lambda name: known.index(name) if name in known else len(known))
 
 
-def _errors(statistics: Frame) -> Frame:
+def _errors(statistics: Table) -> Table:
     """Table of the errors of each detector, with intervals."""
 
     def cell(row: Any, name: str) -> str:
@@ -137,7 +137,7 @@ def _errors(statistics: Frame) -> Frame:
     )
 
 
-def write_report(records: Sequence[Record], folder: Path, out: Path, seed: int) -> tuple[list[Path], Frame]:
+def write_report(records: Sequence[Record], folder: Path, out: Path, seed: int) -> tuple[list[Path], Table]:
     """Write tags.csv into the folder of results, and the page with its charts.
 
     out: folder for report.md and its charts, or FILE.md, with a folder of that name for its charts.
@@ -178,7 +178,7 @@ def write_report(records: Sequence[Record], folder: Path, out: Path, seed: int) 
     return [page, folder / f"{NAME}.csv", *(file for _, file in files)], breaks
 
 
-def _curves(rates: Frame, causes: Sequence[str], file: Path) -> None:
+def _curves(rates: Table, causes: Sequence[str], file: Path) -> None:
     """Write a chart of detection rates by severity with Wilson intervals: a row per family, a column per
     cause."""
     families = [name for name in FAMILIES if name in set(rates["family"])]

@@ -258,15 +258,15 @@ def marker(
         size: metres, edge of the code itself, without quiet zone (the width of a board or an image).
         mixture: "exact" (default), a box for each rectangle, which only fidsplat renders
             (`SplatCloud.with_boxes`; `Marker.gaussians` are for other renderers and for files); "fitted" or
-            "paper": Gaussians; "facets": Gaussians for renderers that sort by depth at each pixel, modules
-            only.
+            "paper": Gaussians; "facets": Gaussians for renderers that sort by depth at each pixel, only for
+            markers that consist of modules.
         quiet_zone: width of the white margin in modules; default 1 for tags, 4 for QR, 2 for boards, 0 for
             images and drawings.
         levels, density, duplicates: of the mixture `paper` only, see `paper_template`; default 4, 3, False.
         template: of the mixtures `fitted` and (for `Marker.gaussians`) `exact` only: Gaussians of a
             rectangle, 1, 5, 9, 13, 25, 41, 121 or 562; default 25.
-        growth: overlap in modules, 0 to 1, of a rectangle across sides that border only its own colour,
-            against seams; default: the value for which the fitted templates are optimised, and 0 for paper.
+        growth: distance in modules, 0 to 1, by which a rectangle extends into neighbours of its own colour,
+            to close seams; default: the value for which the fitted templates are optimised, 0 for paper.
         black, white: RGB of the dark and light modules in [0, 1], black darker than white; default (0, 0, 0)
             and (1, 1, 1). Printed ink and paper are nearer to (0.05, 0.05, 0.05) and (0.85, 0.85, 0.85).
         quality: defaults of mixture, levels, density, growth and template (`Quality.marker`); settings of
@@ -299,7 +299,9 @@ def marker(
     palette = np.array(parsed.colors or (inks or _INKS)[::-1], np.float32)
     surface, old = shape_of(shape), wear_of(wear)
     if chosen.mixture == "facets" and not (surface is None and old is None):
-        raise InputError("shape and wear must be left out with mixture facets; use exact or fitted")
+        raise InputError(
+            "mixture must be exact, fitted or paper for a marker with shape or wear, got facets; use exact"
+        )
     if surface is not None:
         surface.fit(_half(grid, size / (bits.shape[1] - 2 * parsed.outside)))
     if chosen.mixture == "facets":

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from fidsplat.render.certified_error import ErrorImage
 
 SceneIndices = Callable[[], np.ndarray] | None
-"""function that returns the index in the scene of each device splat, (n,) int32; None: equal indices"""
+"""function that returns the index in the scene of each splat of the gathered cloud, (n,) int32; None: equal
+indices"""
 
 
 class ImageMapping(Mapping[str, np.ndarray]):

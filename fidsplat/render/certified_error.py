@@ -11,23 +11,25 @@ ideal. Q has no stop and no ceiling, and the cut-off e = `MAX_OMITTED` / n, with
 where the first term is measured, for any requested quality, and the second is bounded:
 
 1. Compositing is affine in each opacity: d C / d alpha_k = T_k (c_k - B_k), with T_k the transmittance in
-   front of fragment k and B_k the colour behind it, a mean of colours and background. Replacing the opacities
-   of Q by exact ones, one after the other from the back, moves a colour by at most sum_k T_k |d alpha_k| R,
-   with T_k of Q and R the range of the colours.
-2. A fragment that Q omits has an opacity below e. There are at most n per pixel: n e R = `MAX_OMITTED` R. The
+   front of fragment k and B_k the colour behind it, a mean of colours and background. Replace the alphas of Q
+   by the exact ones, back to front. Each replacement changes a colour by at most T_k |d alpha_k| R, with T_k
+   of Q and R the range of the colours.
+2. A fragment that Q omits has an alpha below e. There are at most n per pixel: n e R = `MAX_OMITTED` R. The
    radius of a footprint grows with sqrt(ln(1 / e)), so that Q has about twice the fragments of the default.
-3. Interval arithmetic over the rounding of the ray-splat intersection bounds the opacity of a fragment of Q,
+3. Interval arithmetic over the rounding of the ray-splat intersection bounds the alpha of a fragment of Q,
    also where rounding decides whether the fragment exists (at the near plane, at the horizon of the splat's
    plane, and at the edge of the footprint). Kernels add up T_k times the distance to the farther end of the
    interval: the output `rounding` (kernels/opencl/output/rounding.cl).
-4. Each product of a transmittance is rounded, which changes the colour behind it, at most 2^-24 T C, and each
-   sum of colours, at most 2^-24 (1 - T) C, C the largest absolute colour: 2^-24 C for each fragment, which
-   `rounding` counts too. The sums over samples, sub-frames and spherical harmonics add `sums` times 2^-24.
+4. Rounding T changes the colour behind a fragment by at most 2^-24 T C. Rounding the colour sum changes it by
+   at most 2^-24 (1 - T) C. C is the largest absolute colour. The sum is 2^-24 C per fragment. Rounding the
+   products T alpha and T alpha c adds at most 2^-24 C each for all fragments of a pixel together. `rounding`
+   therefore contains 1.5 x 2^-24 per fragment. The sums over samples, sub-frames and spherical harmonics add
+   2^-24 C for each of their roundings (`error_reference`).
 
-R and C are bounded by the colours of all splats and of the background. If an effect is not in `_BOUNDED`, or
-rgb itself is composited in float64, Q is composited in float64, and only its float32 image is rounded. The
-bound excludes the rounding of the float64 set-up and, with order="pixel", the order of two fragments whose
-depths differ by less than float64's rounding.
+R and C are bounded by the colours of all splats and of the background. Q is composited in float64 if an
+effect is not in `_BOUNDED` or rgb is composited in float64. Then only the conversion of its image to float32
+is rounded. The bound excludes the rounding of the float64 projection and, with order="pixel", the order of
+two fragments whose depths differ by less than float64's rounding.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import InputError
 
 MAX_OMITTED = 2.0**-23
-"""maximum sum of the opacities of a pixel's fragments that the reference image omits"""
+"""maximum sum of the alphas of a pixel's fragments that the reference image omits"""
 _SLACK = 1.01
 """relative safety margin for the rounding of the bounds"""
 _UNIT_ROUNDOFF = 2.0**-24
@@ -72,11 +74,11 @@ _REMEDIES = {
     "lowpass_pixel": ("lowpass='pixel'", "lowpass='screen'"),
     "external_depth": ("an external depth image", "a capture without external_depth"),
     "compose_coplanar": (
-        "coplanar groups (markers and other printed planes) in order='pixel'",
+        "coplanar groups (of markers, or given by coplanar_groups) with order='pixel'",
         "order='centre'",
     ),
     "compose_pixel": ("order='pixel'", "order='centre'"),
-    "footprint": ("boxes (markers with mixture='exact')", "markers with mixture='fitted'"),
+    "footprint": ("box splats (markers with mixture='exact')", "markers with mixture='fitted'"),
     "background": ("a gradient or panorama background", "a background of one colour"),
     "shutter": (
         "a shutter with an exposure time or a readout",
@@ -90,12 +92,12 @@ _SENSOR_ARGUMENTS = {"noise": "full_well", "quantise": "bits", "response": "resp
 
 
 def cutoff_of(splats: int) -> float:
-    """Alpha cut-off for which the opacities of omitted fragments have a sum of at most `MAX_OMITTED`."""
+    """Alpha cut-off for which the alphas of omitted fragments have a sum of at most `MAX_OMITTED`."""
     return MAX_OMITTED / max(splats, 1)
 
 
 def ideal_quality(quality: Quality, cutoff: float) -> Quality:
-    """The quality of a reference image: a smaller cut-off, no stop, no ceiling and a float64 set-up."""
+    """The quality of a reference image: a smaller cut-off, no stop, no ceiling and a float64 projection."""
     return quality.with_(
         alpha_cutoff=cutoff,
         detail_error=0.0,
@@ -148,18 +150,18 @@ def error_reference(data: Any, capture: Capture, backend: Backend) -> ErrorRefer
     _refuse_unbounded(capture)
     if not isinstance(data, ResidentData):
         raise InputError(
-            "the splats must be in memory for the output 'error', got a store; render store.cloud() if "
+            "splats must be in memory for the output 'error', got a store; render store.cloud() if "
             "it fits into memory, or leave out the output 'error'"
         )
     quality = ideal_quality(capture.quality, cutoff_of(data.count))
     features, view = _prepared(data, capture, quality, backend)
-    # number of float32 roundings in the sums of samples, sub-frames and spherical harmonics
-    sums = 8 + features.samples**2 + len(view.sub_frames) + (32 if features.sh_degree else 0)
+    # float32 roundings in the sums of samples, sub-frames and spherical harmonics
+    roundings = 8 + features.samples**2 + len(view.sub_frames) + (32 if features.sh_degree else 0)
     low, high = data.color_range()
     for color in _colors_behind(view):
         low, high = min(low, float(np.min(color))), max(high, float(np.max(color)))
     color_bound = max(high - low, abs(low), abs(high))
-    return ErrorReference(features, view, color_bound, _SLACK * (_UNIT_ROUNDOFF * sums + MAX_OMITTED))
+    return ErrorReference(features, view, color_bound, _SLACK * (_UNIT_ROUNDOFF * roundings + MAX_OMITTED))
 
 
 def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -> tuple[FeatureSet, View]:
@@ -194,7 +196,7 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
 
 def _remedy_of(effect: str) -> tuple[str, str]:
     words = (words for prefix, words in _REMEDIES.items() if effect.startswith(prefix))
-    return next(words, (effect, "less"))
+    return next(words, (effect, "other settings"))
 
 
 def _refuse_unbounded(capture: Capture) -> None:

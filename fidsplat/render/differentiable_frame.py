@@ -43,15 +43,15 @@ class DifferentiableFrame(Frame):
             gradients: derivatives of the loss with respect to the outputs, float32 arrays, by output name:
                 `rgb` (h, w, 3), `alpha` (h, w), `depth` (h, w) [1/m], `normal` (h, w, 3), `distortion`
                 (h, w). NumPy arrays, arrays of the device (pyopencl, Warp), or arrays with DLPack (torch,
-                JAX, CuPy) on the host or on the device of Warp. Device arrays are not copied.
+                JAX, CuPy) on the host or on Warp's device. Device arrays are not copied.
                 Outputs without an entry have a gradient of 0.
-            on_device: return arrays of the device (pyopencl, Warp; NumPy float64 of the reference), which are
-                valid until the next call, instead of NumPy float32.
+            on_device: return device arrays (pyopencl, Warp; NumPy float64 on the device `reference`), which
+                are valid until the next call, instead of NumPy float32.
 
         Returns:
             Derivatives of the loss with respect to the n splats: `means` (n, 3) [1/m]; `quats` (n, 4),
             w x y z, not normalised; `scales` (n, 2) [1/m]; `opacities` (n,); `colors` (n, 3) or `sh`
-            (n, k, 3); `thickness` (n,) [1/m] if there are 3D Gaussians, 0 for disks. Furthermore
+            (n, k, 3); `thickness` (n,) [1/m], the third scale, if there are 3D Gaussians, 0 for disks. Also
             `background` (3,); `pose` (6,), a rotation vector [1/rad] and a translation [1/m] applied after
             `world_to_camera`, in camera axes; `screen` (n,), the densification statistic of 2DGS trainers:
             the norm of the derivative with respect to the projected centre, in half image sizes. Splats that

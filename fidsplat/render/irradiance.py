@@ -88,7 +88,7 @@ class LightField:
                 _difference(irradiance[::2, 1::2], (coarse[:, 1:] + coarse[:, :-1]) / 2),
                 _difference(irradiance[1::2, ::2], (coarse[1:] + coarse[:-1]) / 2),
             )
-            # the error of the coarser grid, at least twice the error of this grid
+            # `error` is of the coarser grid; halving the spacing at least halves the error
             if error <= 2 * step * irradiance.max():
                 break
         return field
@@ -132,7 +132,8 @@ class LightField:
         return radiance
 
     def reflected(self, directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Weighted sums (rows, columns, v, 3) of the radiance from directions (v, k, 3)."""
+        """Weighted sums (rows, columns, v, 3) of the radiance from directions (v, k, 3): v viewers, k samples
+        each."""
         return sum(  # type: ignore[return-value]
             np.einsum("vk,yxvkc->yxvc", weights * weight, self._images[:, :, *pixel])
             for pixel, weight in self._pixel_neighbours(directions)

@@ -1,5 +1,6 @@
 """Lighting of markers: colours of their splats from the light of the scene. Panoramas measure the radiance
-around a marker, and shadow maps the visibility of explicit lights. Boxes are split where the light changes.
+around a marker, and shadow maps the visibility of explicit lights. Box splats are split where the light
+changes.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.response import to_light
 
 MAX_PARTS_PER_MODULE = 8
-"""maximum number of parts per module and axis into which a box is split"""
+"""maximum number of parts per module of a marker and axis into which a box splat is split"""
 MAX_POINTS = 256
 """maximum number of sample points along a side of a square marker"""
 MIN_HARMONIC_ROUGHNESS = 0.5
-"""minimum roughness for which harmonics of degree 3 represent reflections (docs/effects.md)"""
+"""minimum roughness for which spherical harmonics of degree 3 represent reflections (docs/effects.md)"""
 PANORAMA_QUALITY = "fast,lowpass=none,samples=2"
 """quality of panoramas; a low-pass filter would enlarge small splats to the size of their coarse pixels"""
 _DARK = 1e-6
@@ -125,7 +126,8 @@ class _Environment:
 
 
 class _SamplePoints(NamedTuple):
-    """Sample points on the splats of a marker, at which light is measured: a grid on each box, row by row."""
+    """Sample points on the splats of a marker, at which light is measured: a grid on each box splat, row by
+    row."""
 
     local: np.ndarray
     """(m, 3) in the marker's frame"""
@@ -141,7 +143,7 @@ class _SamplePoints(NamedTuple):
         return np.cumsum(self.grid_sizes.prod(axis=1)) - self.grid_sizes.prod(axis=1)
 
 
-class _Light(NamedTuple):
+class _IncomingLight(NamedTuple):
     """Light that arrives at the sample points of a marker."""
 
     irradiance: np.ndarray
@@ -153,54 +155,57 @@ class _Light(NamedTuple):
 
 def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
     """The marker in the colours of its light, without `light`."""
-    light = Lighting.of(placed.light)
-    assert light is not None
-    _check_roughness(light, environment)
+    lighting = Lighting.of(placed.light)
+    assert lighting is not None
+    _check_roughness(lighting, environment)
     cloud = placed.marker.cloud
-    points = _points(placed, light)
-    incoming = _incoming_light(placed, light, points, environment)
-    brdf = None if light.roughness is None else GlossyBrdf(light.roughness, light.reflectance)
+    points = _points(placed, lighting)
+    incoming = _incoming_light(placed, lighting, points, environment)
+    brdf = None if lighting.roughness is None else GlossyBrdf(lighting.roughness, lighting.reflectance)
     diffuse = incoming.irradiance / np.pi
-    if brdf is not None and light.view == "camera":
+    if brdf is not None and lighting.view == "camera":
         reflected, transmitted = _reflection_to_camera(points, incoming, brdf, environment)
         diffuse = np.concatenate([diffuse * transmitted[:, None], reflected], 1)
-    albedo = light.ink + (light.paper - light.ink) * to_light(_rgb(cloud), "srgb")
+    albedo = lighting.ink + (lighting.paper - lighting.ink) * to_light(_rgb(cloud), "srgb")
     radiance = albedo[points.splat] * diffuse[:, :3]
     if diffuse.shape[1] > 3:
         radiance = radiance + diffuse[:, 3:]
-    max_points = None if brdf is None or light.view == "camera" else MAX_PARTS_PER_MODULE
-    splat, corners, part = _split(points, light.displayed(radiance), light.step, max_points)
-    means, scales = _placed_parts(cloud, points, splat, corners)
+    max_points = None if brdf is None or lighting.view == "camera" else MAX_PARTS_PER_MODULE
+    splat, extents, part = _split(points, lighting.displayed(radiance), lighting.step, max_points)
+    means, scales = _placed_parts(cloud, points, splat, extents)
     count = np.bincount(part)
     mean = np.stack([np.bincount(part, values) / count for values in radiance.T], 1)
     colors: dict[str, np.ndarray] = {}
-    if brdf is None or light.view == "camera":
-        colors["colors"] = light.displayed(mean)
+    if brdf is None or lighting.view == "camera":
+        colors["colors"] = lighting.displayed(mean)
     else:
         lights = [(point, np.bincount(part, visible) / count) for point, visible in incoming.points]
         incoming = incoming._replace(points=lights)
-        sh = _harmonics_of_parts(placed, light, cloud, splat, means, mean, incoming)
+        sh = _harmonics_of_parts(placed, lighting, cloud, splat, means, mean, incoming)
         # back to the marker's frame, from which the scene rotates harmonics to the world
         colors["sh"] = rotation_of_coefficients(3, placed.pose[:3, :3].T) @ sh
     lit = _rebuilt(cloud, splat, means, scales, **colors)
     return replace(placed, marker=replace(placed.marker, cloud=lit), light=None)
 
 
-def _check_roughness(light: Lighting, environment: _Environment) -> None:
-    """Raise InputError if harmonics cannot represent the gloss, or there is no camera for it."""
-    if light.roughness is None:
+def _check_roughness(lighting: Lighting, environment: _Environment) -> None:
+    """Raise InputError if spherical harmonics cannot represent the reflection, or it requires a camera."""
+    if lighting.roughness is None:
         return
-    if light.view == "any" and light.roughness < MIN_HARMONIC_ROUGHNESS:
+    if lighting.view == "any" and lighting.roughness < MIN_HARMONIC_ROUGHNESS:
         raise InputError(
-            f"light: roughness must be at least {MIN_HARMONIC_ROUGHNESS:g} with view='any', as harmonics of "
-            f"degree 3 cannot represent sharper reflections, got {light.roughness:g}; use view='camera'"
+            f"roughness of a marker's light must be at least {MIN_HARMONIC_ROUGHNESS:g} with view='any', as "
+            f"harmonics of degree 3 cannot represent sharper reflections, got {lighting.roughness:g}; use "
+            "view='camera'"
         )
-    if light.view == "camera" and environment.camera is None:
-        raise InputError("light: the scene must have a camera for view='camera', got none; add a camera")
+    if lighting.view == "camera" and environment.camera is None:
+        raise InputError(
+            "the scene must have a camera for markers whose light has view='camera', got none; add a camera"
+        )
 
 
-def _points(placed: PlacedMarker, light: Lighting) -> _SamplePoints:
-    """Sample points of a marker: a grid on each box, the centre of each Gaussian."""
+def _points(placed: PlacedMarker, lighting: Lighting) -> _SamplePoints:
+    """Sample points of a marker: a grid on each box splat, the centre of each Gaussian."""
     cloud, pose = placed.marker.cloud, placed.pose
     area = 4 * float((cloud.scales[:, 0] * cloud.scales[:, 1]).sum(dtype=np.float64))
     pitch = max(placed.marker.module / MAX_PARTS_PER_MODULE, np.sqrt(area) / MAX_POINTS)
@@ -220,24 +225,24 @@ def _points(placed: PlacedMarker, light: Lighting) -> _SamplePoints:
         local = local + offset[:, axis] * rotations[splat, :, axis]
     # the front of a marker faces its -z
     normals = -rotations[splat, :, 2] @ pose[:3, :3].T
-    clearance = placed.marker.size / 20 if light.clearance is None else light.clearance
+    clearance = placed.marker.size / 20 if lighting.clearance is None else lighting.clearance
     surface = ReceiverPoints(local @ pose[:3, :3].T + pose[:3, 3], normals, pitch, clearance)
     return _SamplePoints(local, splat, grid_sizes, surface)
 
 
 def _incoming_light(
-    placed: PlacedMarker, light: Lighting, points: _SamplePoints, environment: _Environment
-) -> _Light:
+    placed: PlacedMarker, lighting: Lighting, points: _SamplePoints, environment: _Environment
+) -> _IncomingLight:
     """Measure the light at the sample points: panoramas for the field, shadow maps for the lights."""
     surface, positions = points.surface, points.local[:, :2]
-    field = _field(placed, light, points, environment)
+    field = _field(placed, lighting, points, environment)
     irradiance = np.empty((len(positions), 3))
     for rows in _by_normal(surface.normals):
         irradiance[rows] = field.irradiance(surface.normals[rows[0]], positions[rows])
     lights = []
-    for number, lamp in enumerate(environment.lights):
-        casters, extent = environment.casters(lamp, surface)
-        for point in light_points(lamp, surface.middle):
+    for number, light in enumerate(environment.lights):
+        casters, extent = environment.casters(light, surface)
+        for point in light_points(light, surface.middle):
             motion, renderer = environment.scene.motion, environment.renderer
             visible = visibility(point, surface, casters, motion, extent, renderer)
             if visible.any():
@@ -246,11 +251,11 @@ def _incoming_light(
                 cosine = np.einsum("mc,mc->m", directions, surface.normals)
                 irradiance += unshadowed * (np.maximum(cosine, 0) * visible)[:, None]
                 lights.append((point, visible))
-    return _Light(irradiance, field, lights)
+    return _IncomingLight(irradiance, field, lights)
 
 
 def _field(
-    placed: PlacedMarker, light: Lighting, points: _SamplePoints, environment: _Environment
+    placed: PlacedMarker, lighting: Lighting, points: _SamplePoints, environment: _Environment
 ) -> LightField:
     """Radiance around the marker from splats and background. Raises InputError if it is black."""
     surface, positions = points.surface, points.local[:, :2]
@@ -262,28 +267,28 @@ def _field(
         panorama_points = local_points @ placed.pose[:3, :3].T + placed.pose[:3, 3]
         panorama_points = panorama_points + max(surface.clearance, 1e-6) * surface.normals[nearest]
         parts: dict[str, Any] = {"outputs": ("rgb", "alpha")}
-        if light.ambient is not None:
+        if lighting.ambient is not None:
             parts["background"] = (0.0, 0.0, 0.0)
-        frames = environment.panoramas(panorama_points, light.rows, 1e-4, **parts)
+        frames = environment.panoramas(panorama_points, lighting.rows, 1e-4, **parts)
         panoramas = []
         for frame in frames:
-            radiance = to_light(frame["rgb"], light.response).reshape(-1, 3)
-            if light.ambient is not None:
-                radiance = radiance + (1 - np.asarray(frame["alpha"]).reshape(-1, 1)) * light.ambient
+            radiance = to_light(frame["rgb"], lighting.response).reshape(-1, 3)
+            if lighting.ambient is not None:
+                radiance = radiance + (1 - np.asarray(frame["alpha"]).reshape(-1, 1)) * lighting.ambient
             panoramas.append(radiance)
         return np.stack(panoramas)
 
-    if light.source == "lights":
-        if light.ambient is None and not environment.lights:
+    if lighting.source == "lights":
+        if lighting.ambient is None and not environment.lights:
             raise InputError(
-                f"marker {placed.label} with light 'lights' must have a light, got none; add [[lights]] or "
-                "ambient = [0.5, 0.5, 0.5]"
+                f"the scene must have lights for marker {placed.label} (light = 'lights'), got none; add "
+                "[[lights]] or ambient = [0.5, 0.5, 0.5]"
             )
-        return LightField.uniform(light.ambient or (0.0, 0.0, 0.0))
+        return LightField.uniform(lighting.ambient or (0.0, 0.0, 0.0))
     normal = unit(surface.normals.mean(axis=0))
-    levels = tuple(count for count in GRIDS if 3 <= count <= light.panoramas) or (light.panoramas,)
-    field = LightField.measured(light.rows, levels, positions, radiance_at, normal, light.step)
-    if light.ambient is None and field.radiance.max() < _DARK:
+    levels = tuple(count for count in GRIDS if 3 <= count <= lighting.panoramas) or (lighting.panoramas,)
+    field = LightField.measured(lighting.rows, levels, positions, radiance_at, normal, lighting.step)
+    if lighting.ambient is None and field.radiance.max() < _DARK:
         raise InputError(
             f"the panorama at marker {placed.label}, {placed.marker.spec}, must not be black, got no light; "
             "add splats or a background, set ambient light (ambient = [0.5, 0.5, 0.5]), or use light = "
@@ -305,8 +310,10 @@ def _split(
     """Split splats into parts in which the colours (m, 3) of points differ by at most `step`. max_points:
     maximum number of points along a side of a part.
 
-    Returns the splat (p,) of each part; its columns and rows [x0, x1) x [y0, y1) on the splat's grid, (p, 4)
-    x0, y0, x1, y1; and the part (m,) of each point.
+    Returns:
+        splat (p,): index of the splat of each part.
+        extents (p, 4): x0, y0, x1, y1 of each part on the splat's grid, ends exclusive.
+        part (m,): index of the part of each point.
     """
     splat, part = np.arange(len(points.grid_sizes)), points.splat.copy()
     extents = np.pad(points.grid_sizes, ((0, 0), (2, 0)))
@@ -350,7 +357,7 @@ def _placed_parts(
 
 
 def _reflection_to_camera(
-    points: _SamplePoints, incoming: _Light, brdf: GlossyBrdf, environment: _Environment
+    points: _SamplePoints, incoming: _IncomingLight, brdf: GlossyBrdf, environment: _Environment
 ) -> tuple[np.ndarray, np.ndarray]:
     """Specular radiance (m, 3) from points to the scene's camera, and factor (m,) of their diffuse colour."""
     surface = points.surface
@@ -389,16 +396,16 @@ def _highlights(
 
 def _harmonics_of_parts(
     placed: PlacedMarker,
-    light: Lighting,
+    lighting: Lighting,
     cloud: SplatCloud,
     splat: np.ndarray,
     means: np.ndarray,
     diffuse: np.ndarray,
-    incoming: _Light,
+    incoming: _IncomingLight,
 ) -> np.ndarray:
     """Spherical harmonics (p, 16, 3), in the axes of the world, of the glossy colours of parts."""
-    assert light.roughness is not None
-    brdf, rotation = GlossyBrdf(light.roughness, light.reflectance), placed.pose[:3, :3]
+    assert lighting.roughness is not None
+    brdf, rotation = GlossyBrdf(lighting.roughness, lighting.reflectance), placed.pose[:3, :3]
     positions = (means + cloud.origin) @ rotation.T + placed.pose[:3, 3]
     normals = -quaternion_to_matrix(cloud.quats)[splat, :, 2] @ rotation.T
     sh = np.empty((len(splat), 16, 3))
@@ -415,7 +422,7 @@ def _harmonics_of_parts(
             total = _highlights(positions[rows], normals[rows], viewers, brdf, lights)
             total += transmitted[:, None] * diffuse[rows, None]
             total += incoming.field.interpolated(reflected, means[rows, :2])
-            sh[rows] = fit_harmonics(views, light.displayed(total))
+            sh[rows] = fit_harmonics(views, lighting.displayed(total))
     return sh
 
 
@@ -424,8 +431,8 @@ def _rgb(cloud: SplatCloud) -> np.ndarray:
     colors = cloud.plain_colors
     if colors is None:
         raise InputError(
-            f"a lit marker must have plain colours, got harmonics of degree {cloud.sh_degree}; leave "
-            "out its light"
+            f"a marker with light must have plain colours, got spherical harmonics of degree "
+            f"{cloud.sh_degree}; leave out its light"
         )
     return colors
 
@@ -437,7 +444,7 @@ def _rebuilt(
     scales: np.ndarray | None = None,
     **colors: np.ndarray,
 ) -> SplatCloud:
-    """Cloud of parts of splats, or of all splats, with other colours. splat: (p,) splat of each part."""
+    """Copy of a cloud with new colours; with `splat` (p,), one row for each part of a splat."""
     rows = np.arange(len(cloud)) if splat is None else splat
     scales = cloud.scales[rows] if scales is None else scales
     if cloud.thickness is not None:

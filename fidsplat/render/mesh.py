@@ -75,7 +75,7 @@ def scene_mesh(
     captures = [capture.with_(camera=camera) for camera in views]
     frames = renderer.render_views(renderer.upload(scene), captures)
     for k, frame in enumerate(frames):
-        depth = frame["depth_first"]
+        depth = frame["depth_first"]  # at an opacity of one half (`median_depth_capture`)
         field.allocate(depth, views[k])
         images.append((depth, _cosine(frame["normal"], views[k]), frame.to_uint8()))
         report("rendering views", 0.5 * (k + 1) / len(views))

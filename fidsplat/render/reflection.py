@@ -36,8 +36,13 @@ class GlossyBrdf(NamedTuple):
     def reflected(
         self, cosine: np.ndarray, to_viewer: np.ndarray, to_light: np.ndarray, normal: np.ndarray
     ) -> np.ndarray:
-        """BRDF times the cosine of the light (n, v): radiance towards viewers (n, v, 3) per irradiance of a
-        surface that faces the light. cosine: (n, v) of viewer and normal (n, 3); to_light: (n, 3)."""
+        """BRDF times cosine to the light, (n, v): radiance towards each viewer per unit of irradiance
+        perpendicular to the light.
+
+        Args:
+            cosine: (n, v), between directions to viewers and normals.
+            to_viewer, to_light, normal: unit directions (n, v, 3), (n, 3) and (n, 3).
+        """
         square = self.alpha**2
         light = np.einsum("nc,nc->n", to_light, normal)[:, None]
         above = (cosine > _MIN_COSINE) & (light > _MIN_COSINE)

@@ -206,7 +206,7 @@ class Renderer:
             capture, outputs, quality, **fields: as in `render`. Outputs are some of `rgb`, `alpha`, `depth`
                 and `normal`; docs/gradients.md lists the supported effects.
             distortion: render the image `distortion` (h, w) too: sum over pairs of a pixel's splats of
-                w_i w_j (m_i - m_j)^2, m the depth in a depth buffer, the depth distortion of 2DGS.
+                w_i w_j (m_i - m_j)^2, m the depth in normalised device coordinates, as in 2DGS.
 
         Raises:
             InputError: as `render`; an effect or an output without a gradient.

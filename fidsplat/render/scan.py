@@ -51,7 +51,7 @@ class Scan:
     label: np.ndarray | None
     """(r, beams) int32, -1 where there is no return; None if not requested"""
     poses: np.ndarray
-    """(bands, 4, 4) world_from_lidar of each pose of the scan"""
+    """(k, 4, 4) world_from_lidar, one for each interval of the scan"""
 
     @cached_property
     def time(self) -> np.ndarray:
@@ -91,10 +91,12 @@ class Scan:
         lidar."""
         pattern = self.lidar.pattern
         if not isinstance(pattern, Spinning):
-            raise InputError("the lidar of a range image must be a Spinning, got a Rosette")
+            raise InputError(
+                "the lidar of Scan.image must have the pattern Spinning, got a Rosette; use Scan.points"
+            )
         if name not in ("range", "intensity", "label") or getattr(self, name) is None:
             raise InputError(
-                f"an image of a scan must be range, intensity or a requested label, got {name!r}"
+                f"name must be range, intensity or, for scans with label=True, label, got {name!r}"
             )
         values = getattr(self, name)
         return values.reshape(len(values), pattern.columns, pattern.rings).swapaxes(1, 2)
@@ -152,9 +154,8 @@ def scan(
         pose: world_from_lidar, (4, 4) or (position, quaternion w, x, y, z), of a sensor with x forward, y
             left and z up; None: at the scene's camera at `start`.
         renderer: None: one for the scene's device.
-        motion: `Motion(camera=...)` has the pose lidar_from_world at a time, instead of `pose`; `groups`
-            moves splats. None: the sensor has one pose for all beams, also in a scene whose camera moves, and
-            the scene's groups move as its motion states.
+        motion: `camera` is a function of time that returns lidar_from_world, instead of `pose`; `groups`
+            moves splats. None: one pose for all beams, and groups follow the scene's motion.
         start: seconds, start of the scan; None: the time of the scene's shutter.
         label: whether the scan has labels of splats.
         index: number of the scan, which selects its random noise.
@@ -167,8 +168,8 @@ def scan(
     capture = request.capture(pose)
     assert capture.camera is not None
     frame = renderer.render(resident, capture)
-    bands = capture.shutter.bands(capture.camera.height)
-    poses = [capture.motion.moved(capture.camera, middle).camera_to_world for _, _, middle in bands]
+    intervals = capture.shutter.bands(capture.camera.height)
+    poses = [capture.motion.moved(capture.camera, middle).camera_to_world for _, _, middle in intervals]
     return request.decoded(dict(frame), np.stack(poses), whole_number("index", index, 0, 2**32 - 1))
 
 
@@ -252,14 +253,15 @@ class ScanRequest:
             scene_camera = self.base.camera and self.base.motion.moved(self.base.camera, self.start)
             camera = camera.with_pose(camera_to_world=_pose_of(pose, scene_camera))
         elif pose is not None:
-            raise InputError("the lidar must have either pose or motion.camera, got both; leave one out")
+            raise InputError("a scan must have either pose or motion.camera, got both; leave one out")
         quality = replace(
             self.base.quality,
             samples=1,
             lowpass="none",
             alpha_cutoff=max(self.base.quality.alpha_cutoff, _ALPHA_CUTOFF),
             first_hit=lidar.opacity,
-            transmittance_stop=(1 - lidar.opacity) * (1 - 1e-6),  # behind the surface; below its rounding
+            # below the transmittance at the surface, so that rounding does not stop blending before it
+            transmittance_stop=(1 - lidar.opacity) * (1 - 1e-6),
         )
         return replace(
             self.base,
@@ -279,7 +281,7 @@ class ScanRequest:
         )
 
     def decoded(self, images: Mapping[str, np.ndarray], poses: np.ndarray, number_of_scan: int) -> Scan:
-        """Convert rendered images to a scan. poses: (bands, 4, 4) world_from_lidar."""
+        """Convert rendered images to a scan. poses: (k, 4, 4) world_from_lidar of each interval."""
         lidar, pixels = self.lidar, self.lidar.pixels(self.start, self.moving)
 
         def by_ray(image: np.ndarray) -> np.ndarray:

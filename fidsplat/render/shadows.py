@@ -99,8 +99,8 @@ def light_points(light: Light, middle: np.ndarray) -> list[LightPoint]:
 def shadow_casters(
     light: Light, surface: ReceiverPoints, centres: np.ndarray, radii: np.ndarray
 ) -> np.ndarray:
-    """Rows of the spheres, centres (n, 3) and radii (n,), that may cast shadows on a surface: in front
-    of the surface, and in a capsule around both; for a sun in a cone."""
+    """Rows of the spheres, centres (n, 3) and radii (n,), that may cast shadows on a surface: in front of the
+    surface, and inside the capsule from the surface to the light (a cone for a sun)."""
     middle, normal = surface.middle, surface.normals.mean(axis=0)
     radius = surface.radius + _MARGIN * surface.pitch
     length, offsets = float(np.linalg.norm(normal)), centres - middle

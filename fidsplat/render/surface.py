@@ -46,7 +46,7 @@ def surface_at(
 
     Args:
         scene: splats and markers, at the time of the scene's shutter.
-        camera: at its own pose; by default the scene's, at the time of its shutter.
+        camera: used at its own pose. Default: the scene's camera at the shutter time.
         pixel: (x, y), 0 to width and 0 to height.
         ray: (origin (3,), direction (3,)) in the world, instead of camera and pixel.
         radius: metres, radius of the patch; by default 2 % of the width of the image, at least 8 pixels.
@@ -83,7 +83,7 @@ def surface_at(
 
 
 def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = None) -> Surface:
-    """The surface at a pixel of an image of the median depth.
+    """Fit a plane around a pixel of a median depth image.
 
     Args:
         depth: (h, w) metres, the output `depth_first` at `first_hit=0.5`; 0 where the opacity is below 0.5.
@@ -116,6 +116,7 @@ def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = 
 def median_depth_capture(capture: Capture, *outputs: str) -> Capture:
     """The capture of the median depth, output as `depth_first`, and of other outputs: at the shutter's time,
     without sensor, fog and external depth image."""
+    # `depth_first` with first_hit = 0.5: the depth at which the opacity reaches one half
     quality = replace(capture.quality, samples=1, first_hit=MEDIAN_OPACITY)
     motion, shutter = Motion(None, capture.motion.groups), Shutter(time=capture.shutter.time)
     outputs = ("depth_first", *outputs)
@@ -148,9 +149,9 @@ def _ray_camera(ray) -> Camera:
     try:
         origin, direction = (real_array("ray", part, "three numbers") for part in ray)
     except (TypeError, ValueError):
-        raise InputError(f"ray must be an origin (3,) and a direction (3,), got {ray!r}") from None
+        raise InputError(f"ray must be an origin (3,) and a non-zero direction (3,), got {ray!r}") from None
     if origin.shape != (3,) or direction.shape != (3,) or not direction.any():
-        raise InputError(f"ray must be an origin (3,) and a direction (3,), not 0, got {ray!r}")
+        raise InputError(f"ray must be an origin (3,) and a non-zero direction (3,), got {ray!r}")
     up = np.eye(3)[np.argmin(np.abs(direction))]
     unit_direction = direction / np.linalg.norm(direction)
     return Camera.look_at(PATCH_SIZE, PATCH_SIZE, _RAY_FOV, origin, origin + unit_direction, up, near=1e-3)
@@ -169,7 +170,10 @@ def _patch(camera: Camera, pixel: tuple[float, float], radius: float) -> Camera:
 def _median_of(depth: np.ndarray) -> float:
     depths = depth[depth > 0]
     if not len(depths):
-        raise InputError("the surface must have splats at this pixel, got none; give another pixel")
+        raise InputError(
+            f"the image near the pixel must have an opacity of at least {MEDIAN_OPACITY}, got less; give "
+            "another pixel"
+        )
     return float(np.median(depths))
 
 

@@ -42,7 +42,7 @@ class Arithmetic:
     """Measured arithmetic of a device."""
 
     float64: bool
-    """whether the device has float64, for the per-splat set-up"""
+    """whether the device has float64, for the per-splat projection"""
     denormals: bool
     """whether float32 numbers below 1.2e-38 are not flushed to 0"""
     ulp: dict[str, float]

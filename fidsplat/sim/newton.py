@@ -59,9 +59,10 @@ class NewtonRig(SimulatorRig):
         worlds = model.body_world.numpy() if model.body_count else np.zeros(0, int)
         rows = [np.flatnonzero((worlds == k) | (worlds < 0)) for k in range(max(model.world_count, 1))]
         if len({len(row) for row in rows}) > 1:
+            counts = ", ".join(map(str, sorted({len(row) for row in rows})))
             raise InputError(
-                f"the worlds of a model must have the same bodies, got {sorted({len(row) for row in rows})} "
-                "bodies; make a rig for each kind of world"
+                f"all worlds of a model must have the same number of bodies, got {counts}; create one "
+                "NewtonRig per group of equal worlds"
             )
         names = [model.body_label[k] for k in rows[0]]
         for name in self.bodies:

@@ -14,8 +14,8 @@ def mean_square_distances(points: np.ndarray) -> np.ndarray:
     """Mean squared distance (n,) float64 of each point (n, 3) to its three nearest neighbours; 0 for a
     single point.
 
-    Points are divided into boxes of at most 256. The points of a box are compared with those of all boxes
-    within the largest distance to a third neighbour inside the box.
+    Each leaf of a k-d tree has at most 256 points. Its points are compared with the points of all leaves that
+    are closer than the largest distance to a third neighbour inside the leaf.
     """
     points = np.asarray(points, np.float64)
     if len(points) < 2:
@@ -37,7 +37,7 @@ def mean_square_distances(points: np.ndarray) -> np.ndarray:
 
 
 def _boxes(points: np.ndarray) -> list[np.ndarray]:
-    """Indices of the points of each box. Boxes are halved along their longest side until they are small."""
+    """Indices of the points of each leaf. Boxes are halved along their longest side until they are small."""
     todo, done = [np.arange(len(points))], []
     while todo:
         box = todo.pop()

@@ -245,7 +245,7 @@ def test_effects_without_a_bound_are_refused(renderer, parts, effect, remedy):
             "exposure_time=0",
         ),
         ("marker", {}, "coplanar groups", "order='centre'"),
-        ("boxes", {}, r".*boxes \(markers with mixture='exact'\)", "mixture='fitted'"),
+        ("boxes", {}, r".*box splats \(markers with mixture='exact'\)", "mixture='fitted'"),
         (
             "spheres",
             {"quality": "ellipsoid=exact"},

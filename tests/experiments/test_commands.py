@@ -191,7 +191,7 @@ def test_trained_models_that_are_missing_are_shown_before_the_work(capsys, tmp_p
     words = ("all", "--quick", "--trained", tmp_path, "-o", tmp_path / "out")
     status, _, err = run(capsys, *words)
     assert status == 2
-    assert "small-0.ply must exist, got none; --category and --markers skip" in err
+    assert "small-0.ply must be a trained model, got no file; train it" in err
     ExperimentSettings(tmp_path, category=("apriltag",), markers=1, trained=tmp_path).check()
 
 

@@ -417,7 +417,7 @@ def test_errors_of_light_that_cannot_be_computed():
         lit(of_lights(SUN, roughness=0.3))
     with pytest.raises(fs.InputError, match="the scene must have a camera"):
         lit(of_lights(SUN, roughness=0.3, view="camera"))
-    with pytest.raises(fs.InputError, match="must have a light, got none; add"):
+    with pytest.raises(fs.InputError, match=r"must have lights for marker 1 .*, got none; add"):
         lit(replace(dark, markers=[PlacedMarker(TAG, light="lights")]))
 
 

@@ -126,16 +126,16 @@ def test_the_scenes_camera_is_at_the_time_of_the_shutter(renderer):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"pixel": (159.0, 1.0)}, "the surface must .*got"),
+        ({"pixel": (159.0, 1.0)}, "must have an opacity of .*got"),
         ({"pixel": (161.0, 1.0)}, r"pixel must be \(x, y\) in the image, 0 to 160"),
         (
             {"pixel": (80.0, 60.0), "ray": (AT, NORMAL)},
-            "exactly one of pixel and ray must be arguments, got both",
+            "exactly one of pixel and ray must be given, got both",
         ),
-        ({}, "exactly one of pixel and ray must be arguments, got neither"),
+        ({}, "exactly one of pixel and ray must be given, got neither"),
         ({"pixel": (80.0, 60.0), "radius": -1.0}, "radius must be a positive length"),
         ({"pixel": (80.0, 60.0), "radius": "1"}, "radius must be a positive length"),
-        ({"ray": (AT, (0.0, 0.0, 0.0))}, r"direction \(3,\), not 0"),
+        ({"ray": (AT, (0.0, 0.0, 0.0))}, r"a non-zero direction \(3,\)"),
         ({"ray": 3}, "ray must be an origin"),
     ],
 )
@@ -148,7 +148,7 @@ def test_what_has_no_surface_is_refused(renderer, arguments, words):
 def test_haze_is_no_surface(renderer):
     haze = plane(AT, NORMAL)
     thin = fs.SplatCloud(haze.means, haze.quats, haze.scales, np.full(len(haze), 0.05), colors=haze.colors)
-    with pytest.raises(fs.InputError, match="the surface must have splats"):
+    with pytest.raises(fs.InputError, match=r"must have an opacity of at least 0\.5"):
         fs.Scene([thin], camera=camera()).surface_at(pixel=(70.0, 60.0), renderer=renderer)
 
 
@@ -255,7 +255,7 @@ def test_a_click_places_a_marker(tmp_path):
         viewer._controls._places.value = True
         viewer._controls._spec.value = "apriltag:36h11:9"
         viewer._click(SimpleNamespace(client_id=1, screen_pos=(0.01, 0.5)))
-        assert "the surface must" in client.said.content
+        assert "must have an opacity" in client.said.content
         assert not fs.Scene.load(tmp_path / "scene.toml").markers
         viewer._click(SimpleNamespace(client_id=1, screen_pos=(0.6, 0.4)))
         assert "Appended to scene.toml" in client.said.content

@@ -133,7 +133,7 @@ def test_newtons_shapes_are_composited_in_all_worlds(states, scene):
     with pytest.raises(fs.InputError, match=r"unknown body 'bx' \(did you mean 'box'\?\)"):
         NewtonRig(model, scene, {1: "bx"}, CAMERAS, **arguments)
     builder.add_world(newton.ModelBuilder())
-    with pytest.raises(fs.InputError, match="the worlds of a model must have the same bodies"):
+    with pytest.raises(fs.InputError, match="all worlds of a model must have the same number of bodies"):
         NewtonRig(builder.finalize(device="cpu"), scene, {1: "box"}, CAMERAS, **arguments)
 
 

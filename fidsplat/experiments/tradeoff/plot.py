@@ -42,9 +42,10 @@ def write_plot(folders: Sequence[Path], file: Path) -> None:
         if all(scene in device.scenes for device in devices):
             write_chart(devices, scene, file)
             return
-    titles = " and ".join(device.title for device in devices)
+    titles = ", ".join(device.title for device in devices)
     raise InputError(
-        f"the devices must have a common scene to plot, got none of {titles}; measure one on all"
+        f"the devices to plot must have measurements of one common scene, got {titles} without one; measure "
+        "a scene on all of them"
     )
 
 

@@ -217,7 +217,7 @@ def _marker_points(quick: bool) -> Iterator[Point]:
 
 
 def _combinations(quick: bool) -> Iterator[Point]:
-    """Combinations of cut-off and stop, in precise and fast arithmetic, some with a float32 set-up."""
+    """Combinations of cut-off and stop, in precise and fast arithmetic, some with a float32 projection."""
     cutoffs = _COMBINED_CUTOFFS[1::2] if quick else _COMBINED_CUTOFFS
     for more, text in (({}, ""), (_FAST, ", fast"), (_FASTEST, ", fast, float32 set-up")):
         stops = (_FASTEST_STOP,) if quick or more is _FASTEST else _COMBINED_STOPS

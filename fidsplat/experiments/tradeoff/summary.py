@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from fidsplat.capture.quality import PRESETS
-from fidsplat.experiments.summary import Frame, Row, Summary, join, read_summary, summarise
+from fidsplat.experiments.summary import Row, Summary, Table, join, read_summary, summarise
 from fidsplat.experiments.sweep import Record, folder_records
 from fidsplat.experiments.tradeoff.points import PRESET, SETTINGS, Point, preset
 from fidsplat.experiments.tradeoff.run import NAME
@@ -86,7 +86,7 @@ class DeviceResults:
         self.summary, self.name = summary, run["device"]
         self.title, self.kind = run.get("title", self.name), run.get("kind", "device")
         stale = (rows["knob"] == PRESET) & (rows["quality"] != rows["value"].map(_current_quality))
-        points: Frame = rows[rows["error"].isna() & ~stale]
+        points: Table = rows[rows["error"].isna() & ~stale]
         names = pd.MultiIndex.from_frame(points[["scene", "knob", "value"]], names=[None] * 3)
         self.points = points.set_index(names)
         known = [view for name in NAMES for view in views_of(name)]
@@ -99,17 +99,17 @@ class DeviceResults:
         key = (scene, setting, value)
         return self.points.loc[key] if key in self.points.index else None
 
-    def of(self, scene: str) -> Frame:
+    def of(self, scene: str) -> Table:
         """Measured rows of a scene, in the order of `SETTINGS`.
 
         `ms` is the ratio of the time to the base's, times the median time of the base.
         """
-        rows: Frame = self.points[self.points["scene"] == scene]
+        rows: Table = self.points[self.points["scene"] == scene]
         order = rows["knob"].map(list(("base", *SETTINGS)).index)
         rows = rows.iloc[order.argsort(kind="stable")]
         return rows.assign(ms=self.base_ms(scene) * rows["ratio"])
 
-    def same_definition(self, scene: str) -> Frame:
+    def same_definition(self, scene: str) -> Table:
         """Rows with the low-pass, samples and order of the base setting, whose errors are comparable."""
         rows = self.of(scene)
         # gsplat's stop requires the order of centres, which equals the base's without coplanar groups
