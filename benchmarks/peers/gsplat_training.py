@@ -177,7 +177,7 @@ class AuthorsPeer(Peer):
             scales=torch.exp(values["scales"][:, :2]),
             rotations=torch.nn.functional.normalize(values["quats"]),
         )
-        # gradients by positions are already relative to half the image size; gsplat would multiply them again
+        # gradients with respect to positions are already in half image sizes; gsplat would scale them
         meta = {"gradient_2dgs": screen, "width": 2, "height": 2, "n_cameras": 1, "gaussian_ids": None}
         return image.permute(1, 2, 0), meta | {"radii": radii[None, :, None].expand(1, count, 2)}
 

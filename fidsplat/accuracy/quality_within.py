@@ -100,8 +100,8 @@ def choose(
     requested = replace(requested, camera=camera, outputs=("rgb",), sensor=Sensor())
     for name, value in (("scene", scene), ("camera", camera)):
         if value is None and (ms is not None or scene is not None or camera is not None):
-            what = "ms" if ms is not None else "an error that is measured"
-            raise InputError(f"{name} must be given with {what}, got none; give scene=... and capture=...")
+            what = "ms" if ms is not None else "an error to measure"
+            raise InputError(f"{name} must be given with {what}, got none; pass scene=... and capture=...")
     renderer = device if isinstance(device, Renderer) else Renderer(device or default_device())
     pareto_front = candidates.load(renderer.device.kind)
     if scene is None:

@@ -140,7 +140,7 @@ def nerfstudio_arguments(transforms: Any, frame: Any) -> PinholeArguments:
         fx = _focal_length(values, "x", width)
         fy = _focal_length(values, "y", height) if values.keys() & {"fl_y", "camera_angle_y"} else fx
         cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
-    except InputError:  # a ValueError too
+    except InputError:  # a subclass of ValueError
         raise
     except (KeyError, TypeError, ValueError, OverflowError):
         raise InputError(

@@ -85,7 +85,7 @@ class BrownConrady:
         return math.sqrt(min(_first_root(slope), _first_root(denominator)))
 
     def _distorted(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Image coordinates and their derivatives by x and y: a, b, a_x, a_y, b_x, b_y."""
+        """Image coordinates and their derivatives with respect to x and y: a, b, a_x, a_y, b_x, b_y."""
         q = x * x + y * y
         numerator = 1 + q * (self.k1 + q * (self.k2 + q * self.k3))
         denominator = 1 + q * (self.k4 + q * (self.k5 + q * self.k6))

@@ -93,7 +93,8 @@ class Bench:
             return self._run_suite()
         if self.quick or self.overwrite or self.adapters is not None:
             raise InputError(
-                "--quick, --adapters and --overwrite must be given with --suite; add it, or omit them"
+                "--quick, --adapters and --overwrite must be given with --suite, got bench without it; add "
+                "--suite, or omit them"
             )
         from rich.progress import Progress, TextColumn
 

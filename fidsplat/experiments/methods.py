@@ -95,7 +95,7 @@ class MarkerRenderer:
             return lambda camera: plane_image(plain.grid, module, camera, background=BACKGROUND)
         renderer = self.renderer
         if renderer is None:
-            raise InputError(f"a renderer must be given for the method {method}, got none")
+            raise InputError(f"a renderer must be given for the method {method}, got none; pass a Renderer")
         head, _, filtered = method.partition("/")
         if filtered:
             cloud = marker(spec, module * plain.bits.shape[1], mixture=head).cloud
@@ -107,7 +107,10 @@ class MarkerRenderer:
             cloud = load_ply(self.trained / method / f"{name}.ply").transformed(scale)
             quality = Quality.named(_TRAINED_QUALITY)
         else:
-            raise InputError(f"a folder of trained models must be given for the method {method}, got none")
+            raise InputError(
+                f"a folder of trained models must be given for the method {method}, got none; pass "
+                "--trained DIR"
+            )
         resident = renderer.upload(cloud)
         linear = in_linear_light(method)
         ground = BACKGROUND_LIGHT if linear else BACKGROUND

@@ -408,7 +408,7 @@ def _visible(camera: Camera, depth: np.ndarray, samples: np.ndarray) -> np.ndarr
 
 def _camera(scene: Scene) -> Camera:
     if scene.camera is None:
-        raise InputError("the scene of a plan must have a camera, got none; add a [camera] table")
+        raise InputError("the scene of plan-tags must have a camera, got none; add a [camera] table")
     return scene.camera
 
 

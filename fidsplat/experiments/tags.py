@@ -172,7 +172,9 @@ def detectors_of(
             detectors[name] = partial(attempt_with, load_detector(name))
         elif name in missing_readers():
             package = missing_readers()[name]
-            raise InputError(f"the detector {name} requires {package}; pip install {package}")
+            raise InputError(
+                f"{package} must be installed for the detector {name}, got none; pip install {package}"
+            )
         elif name not in every:
             raise InputError(unknown("detector", name, every) + "; or module:function for your own")
     return {name: detectors[name] for name in names if name in detectors}

@@ -8,7 +8,7 @@ files) colour. The element vertex has four 32-bit words per splat:
                                     3 x 10 bits: the others in that order, in [-1, 1] / sqrt(2)
     packed_color                    8 bits each of r, g, b (in [min, max] of the chunk, or [0, 1]) and opacity
 
-An element sh contains the bands above 0, one byte per coefficient in [-4, 4], in the order of f_rest.
+An element sh contains the degrees above 0, one byte per coefficient in [-4, 4], in the order of f_rest.
 """
 
 import numpy as np

@@ -80,7 +80,7 @@ def _plain_rows(header: Header) -> Rows:
     targets |= {f"scale_{i}": ("scales", slice(None), i) for i in range(scales)}
     targets["opacity"] = ("opacities",)
     targets |= {f"f_dc_{c}": ("sh", slice(None), 0, c) for c in range(3)}
-    # f_rest has all higher bands of red, then of green, then of blue
+    # f_rest has all degrees above 0 of red, then of green, then of blue
     targets |= {
         f"f_rest_{c * (k - 1) + i}": ("sh", slice(None), 1 + i, c) for c in range(3) for i in range(k - 1)
     }

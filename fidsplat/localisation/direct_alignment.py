@@ -297,7 +297,7 @@ def image_noise(image: np.ndarray) -> float:
 
 
 def _bread(at: _State, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.ndarray:
-    """Derivative of the score by pose and exposure, by differences of renders.
+    """Derivative of the score with respect to pose and exposure, by finite differences of images.
 
     A motion along the ray of a pixel and a rotation about it do not change the pixel, so that the derivatives
     by z follow from those by x and y behind a pinhole.

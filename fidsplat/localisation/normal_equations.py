@@ -135,8 +135,8 @@ class _Target:
         self.turning, self.shifting = (
             np.ascontiguousarray(np.moveaxis(a, 0, 2), np.float32) for a in (turning, by_point)
         )
-        """(2, 3, n) derivatives of pixel coordinates x and y by a rotation of the camera axes, and by a
-        translation of points at depth 1"""
+        """(2, 3, n) derivatives of pixel coordinates x and y with respect to a rotation of the camera axes,
+        and to a translation of points at depth 1"""
         self.rays = rays.T.astype(np.float32)
 
     def by_block(self, values: np.ndarray) -> np.ndarray:

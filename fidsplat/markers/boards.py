@@ -75,7 +75,8 @@ def _bits(spec: BoardSpec) -> tuple[Spec, np.ndarray]:
     places, step = tag_positions(spec, side), side + GAP
     if len(places) > known:
         raise InputError(
-            f"{spec.text!r} needs {len(places)} tags, but {family} has {known}; use a smaller board"
+            f"a board of {family} must have at most {known} tags, got {len(places)} for {spec.text!r}; use a "
+            "smaller board"
         )
     beyond = {"charuco": 0, "gridboard": -GAP, "aprilgrid": GAP}[spec.kind]
     y, x = np.indices((spec.rows * step + beyond, spec.columns * step + beyond))

@@ -114,7 +114,7 @@ def _bands(region: shapely.MultiPolygon) -> np.ndarray:
 
 
 def _sides(region: shapely.MultiPolygon) -> tuple[np.ndarray, _Sides]:
-    """Edges (n, 2, 2) of a region, and their pieces for bands."""
+    """Edges (n, 2, 2) of a region, and the pieces along which rotated rectangles are placed."""
     starts, stops, inward, angles = [], [], [], []
     for polygon in region.geoms:
         rings = [polygon.exterior, *polygon.interiors]

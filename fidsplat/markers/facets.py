@@ -46,7 +46,8 @@ def facet_cloud(spec: str, printed: Printed, progress: Progress) -> SplatCloud:
     """
     if printed.angles is not None:
         raise InputError(
-            f"mixture='facets' requires edges along modules, got {spec}; use 'exact' or 'fitted'"
+            f"mixture must be 'exact' or 'fitted' for a marker that does not consist of modules, got "
+            f"'facets' for {spec}; leave it out"
         )
     progress("splats", 0.0)
     rows, columns = printed.grid.shape

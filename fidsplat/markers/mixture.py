@@ -189,7 +189,7 @@ CLASSES = ((1.3, 1.0), (2.6, 2.0), (5.2, 4.0), (10.4, 8.0))
 
 
 class Ladder(NamedTuple):
-    """Parameters of the geometric series of Gaussians."""
+    """Geometric series of Gaussians towards each end of a side, with distances that decrease by `ratio`."""
 
     ratio: float
     pairs: int

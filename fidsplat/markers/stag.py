@@ -99,7 +99,9 @@ def _detect(grey: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     try:
         from stag import detectMarkers  # type: ignore[import-not-found]
     except ImportError as error:
-        raise DeviceError("detection of stag requires stag-python; pip install stag-python") from error
+        raise DeviceError(
+            "stag-python must be installed to detect STags, got none; pip install stag-python"
+        ) from error
     for library in codes():
         corners, ids, _ = detectMarkers(grey, int(library[2:]), errorCorrection=_CORRECTED)
         for number, quad in zip(np.ravel(ids), corners, strict=True):

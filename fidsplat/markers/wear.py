@@ -141,7 +141,10 @@ def worn(spec: str, printed: Printed, wear: Wear) -> Printed:
         InputError: a drawing with edges off its module grid.
     """
     if printed.regions is not None:
-        raise InputError(f"wear requires edges along modules, got {spec}; use image:FILE of the drawing")
+        raise InputError(
+            f"a marker with wear must consist of modules, got a drawing with slanted edges, {spec}; use "
+            "image:FILE of the drawing"
+        )
     cells = max(1, min(CELLS, WIDEST // max(printed.grid.shape)))
     fine = printed.grid.repeat(cells, 0).repeat(cells, 1)
     palette = printed.palette.astype(np.float64)

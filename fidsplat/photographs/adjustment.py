@@ -218,7 +218,7 @@ class _Corners:
         """Residuals (views, 4, 2) and derivatives (views, 4, 2, 1 + 6 tags) by the logarithm of the unit, and
         each tag's rotation vector and translation."""
         residuals, arms, local = self._project(unit, poses)
-        # derivative of a pixel by a point of the camera's frame, then of the world's
+        # derivative of a pixel with respect to a point in the camera's frame, then in the world's
         x, y, z = np.moveaxis(local, -1, 0)
         zero = np.zeros_like(x)
         rows = [np.stack([1 / z, zero, -x / z**2], -1), np.stack([zero, 1 / z, -y / z**2], -1)]

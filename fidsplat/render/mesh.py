@@ -119,7 +119,7 @@ def _bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Corners of the box with the middle 99 % of the centres along each axis."""
     cloud = scene.cloud()
     if not len(cloud):
-        raise InputError("the scene of a mesh must have at least one splat, got none")
+        raise InputError("the scene of a mesh must have at least one splat, got none; add splats or markers")
     low, high = np.percentile(cloud.means.astype(np.float64), (0.5, 99.5), axis=0) + cloud.origin
     margin = np.percentile(cloud.scales, 90)
     return low - margin, high + margin

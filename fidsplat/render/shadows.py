@@ -192,7 +192,7 @@ def _depth_image(camera: Camera, points: np.ndarray) -> np.ndarray:
         total, count = np.zeros((height, width)), np.zeros((height, width))
         np.add.at(total, (row, column), residual)
         np.add.at(count, (row, column), 1)
-        for dy in (-1, 0, 1):  # also in the neighbours of the points' pixels
+        for dy in (-1, 0, 1):  # pixels without points use the residuals of their neighbours
             for dx in (-1, 0, 1):
                 if dx or dy:
                     total += 1e-6 * np.roll(total, (dy, dx), (0, 1))

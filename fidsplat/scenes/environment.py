@@ -20,7 +20,7 @@ _Part = TypeVar("_Part", Sensor, Fog)
 
 
 def read_part(top: Table, name: str, kind: type[_Part]) -> _Part | None:
-    """The sensor or the fog of a scene file; None without the table. Raises InputError with the key."""
+    """Read the table [sensor] or [fog] of a scene file; None without it. Raises InputError with the key."""
     if name not in top:
         return None
     table = top.table(name, names_of(kind))

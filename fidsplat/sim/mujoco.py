@@ -175,7 +175,7 @@ class MujocoRig(SimulatorRig):
                 self._renderers[width, height] = mujoco.Renderer(self._model, height, width)
             except Exception as error:  # OpenGL platforms raise various classes
                 raise InputError(
-                    f"meshes need OpenGL, which MuJoCo could not open ({error}); without a display set "
+                    f"OpenGL must be usable by MuJoCo to render meshes, got {error}; without a display set "
                     "MUJOCO_GL=egl or MUJOCO_GL=osmesa before MuJoCo is imported"
                 ) from error
             finally:

@@ -111,7 +111,7 @@ def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
 def check_color_range(colors: np.ndarray) -> np.ndarray:
     """Raise InputError for colours from 0 to 255; white must be 1."""
     if colors.dtype == np.uint8 and colors.size and colors.max() > 1:
-        raise InputError("colors must have 1 as white, got bytes up to 255; give colors / 255")
+        raise InputError("colors must be numbers in which 1 is white, got bytes up to 255; pass colors / 255")
     return colors
 
 

@@ -53,7 +53,7 @@ def relocate_and_grow(splats: Splats, settings: TrainSettings, iteration: int) -
 
 
 def add_noise(splats: Splats, settings: TrainSettings, iteration: int, rate: float) -> None:
-    """Add noise with each splat's covariance to the means, with less noise for opaque splats.
+    """Add noise with each splat's covariance to the means; it decreases with opacity.
 
     rate: learning rate of the means [m].
     """

@@ -36,7 +36,8 @@ def _detector(family: str):
         import pupil_apriltags  # type: ignore[import-not-found]
     except ImportError as error:
         raise DeviceError(
-            f"detection of apriltag:{family} requires pupil-apriltags; pip install pupil-apriltags"
+            f"pupil-apriltags must be installed to detect apriltag:{family}, got none; "
+            "pip install pupil-apriltags"
         ) from error
 
     class Detector(pupil_apriltags.Detector):

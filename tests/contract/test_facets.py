@@ -68,7 +68,10 @@ def test_an_image_keeps_its_colours_and_a_drawing_with_slants_is_refused(tmp_pat
     drawing.write_text(
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><path d="M1 1L8 2L3 8Z" fill="red"/></svg>'
     )
-    with pytest.raises(fs.InputError, match="mixture='facets' requires edges along modules"):
+    with pytest.raises(
+        fs.InputError,
+        match="mixture must be 'exact' or 'fitted' for a marker that does not consist of modules",
+    ):
         fs.marker(f"svg:{drawing}", mixture="facets")
     drawing.write_text(
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><path d="M1 1H8V4H1Z" fill="red"/></svg>'

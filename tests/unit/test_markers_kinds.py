@@ -76,7 +76,7 @@ def test_april_grids():
         ("charuco:1x5:4x4_50", "must have 2 to 64 columns and rows"),
         ("gridboard:0x5:4x4_50", "must have 1 to 64 columns and rows"),
         ("gridboard:5x5:4x4_51", "unknown tag family"),
-        ("gridboard:8x8:4x4_50", "needs 64 tags, but 4x4_50 has 50"),
+        ("gridboard:8x8:4x4_50", "of 4x4_50 must have at most 50 tags, got 64"),
         ("tga36h11:5", "did you mean 'apriltag:36h11:5'"),
         ("4x4_50", "did you mean 'aruco:4x4_50:ID'"),
         ("tag36h11,5", "did you mean 'apriltag:36h11:5'"),

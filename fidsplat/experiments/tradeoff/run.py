@@ -70,7 +70,7 @@ def prepared(
     renderer = Renderer(device)
     info = renderer.device
     if info.always_float64:
-        raise InputError(f"--device must not be the reference itself, got {info.name}; give another --device")
+        raise InputError(f"--device must be another device than reference, got {info.name}; leave it out")
     versions = reader_versions() | {"pyopencl": version("pyopencl")}
     facts = run_facts(device_name(renderer), scenes.SEED, versions)
     facts |= {"kind": info.kind, "title": info.title} | (
@@ -163,7 +163,7 @@ def _by_priority(results: list[tuple[int, Key]]) -> list[Key]:
 
 
 def _begin(session: Session, key: Key, quick: bool) -> Work:
-    """Render the images of a point; returns the function that evaluates them."""
+    """Render the images of a measurement; returns the function that evaluates them."""
     view = key["scene"]
     quality = points.quality_of(key["quality"])
     frame, times = time_point(session, view, quality, QUICK if quick else FULL)

@@ -156,7 +156,7 @@ def beyond_certificates(difference: np.ndarray, scene: TradeScene, quality: Qual
 
     A certificate bounds the change of a pixel by decisions of `quality` within rounding of their thresholds.
     It is subtracted from the error of the pixels with the largest errors. None if the scene has too many
-    splats or the reference cannot render it.
+    splats or the device `reference` cannot render it.
 
     Args:
         difference: (h, w) largest error of each pixel over the channels.
