@@ -7,8 +7,8 @@
 Errors are of the random scenes of tests/contract/test_gradients.py: for the array of each parameter the
 relative error and one less the cosine, as median and maximum over the scenes; the number of scenes with
 errors above 1e-4; and the largest of these relative to the change by units in the last place of means and
-quaternions. Times are of a frame and of its gradients with respect to colour, with resident splats: medians of
-each stage by the device's clock.
+quaternions. Times are of a frame and of its gradients with respect to colour, with resident splats: medians
+of each stage by the device's clock.
 """
 
 from __future__ import annotations

@@ -127,7 +127,7 @@ class Target:
 
 
 def find_checkpoint(source: Path) -> Path | None:
-    """Checkpoint of a training run's folder, or the source if it is a checkpoint; None otherwise.
+    """Checkpoint in the folder of a training, or the source if it is a checkpoint; None otherwise.
 
     Raises:
         InputError: the folder contains several checkpoints.
@@ -167,7 +167,7 @@ def flight_source(folder: Path) -> tuple[str, str]:
 
 
 class Training:
-    """Splats of a training run, read from its checkpoint, which changes during the training."""
+    """Splats of a training, read from its checkpoint, which changes during the training."""
 
     def __init__(self, file: Path, quality: str | None = None) -> None:
         self.file, self._quality = file, quality

@@ -69,7 +69,7 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
             "a capture with external_depth must have a shutter with exposure_time=0 and readout=0, got "
             f"{shutter.exposure_time:g} and {shutter.readout:g}"
         )
-    # boxes and EWA have their own low-pass filter
+    # box splats and EWA have their own low-pass filter
     ewa_only = cloud.ellipsoids == "all" and ellipsoid != "exact"
     filtered = cloud.footprint == "box" or ewa_only
     lowpass = "none" if filtered else quality.lowpass

@@ -171,13 +171,13 @@ def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
     if diffuse.shape[1] > 3:
         radiance = radiance + diffuse[:, 3:]
     max_points = None if brdf is None or lighting.view == "camera" else MAX_PARTS_PER_MODULE
-    splat, extents, part = _split(points, lighting.displayed(radiance), lighting.step, max_points)
+    splat, extents, part = _split(points, lighting.encode(radiance), lighting.step, max_points)
     means, scales = _placed_parts(cloud, points, splat, extents)
     count = np.bincount(part)
     mean = np.stack([np.bincount(part, values) / count for values in radiance.T], 1)
     colors: dict[str, np.ndarray] = {}
     if brdf is None or lighting.view == "camera":
-        colors["colors"] = lighting.displayed(mean)
+        colors["colors"] = lighting.encode(mean)
     else:
         lights = [(point, np.bincount(part, visible) / count) for point, visible in incoming.points]
         incoming = incoming._replace(points=lights)
@@ -422,7 +422,7 @@ def _harmonics_of_parts(
             total = _highlights(positions[rows], normals[rows], viewers, brdf, lights)
             total += transmitted[:, None] * diffuse[rows, None]
             total += incoming.field.interpolated(reflected, means[rows, :2])
-            sh[rows] = fit_harmonics(views, lighting.displayed(total))
+            sh[rows] = fit_harmonics(views, lighting.encode(total))
     return sh
 
 

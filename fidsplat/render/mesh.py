@@ -95,7 +95,7 @@ def _cosine(normal: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def views_around(scene: Scene, low: np.ndarray, high: np.ndarray) -> list[Camera]:
-    """Cameras on a sphere around a box, spaced by the golden angle, without cameras below level ground."""
+    """Cameras on a sphere around a bounding box, spaced by the golden angle, without cameras below level ground."""
     up_axis = guess_up(scene.cloud())
     center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     distance = radius / math.sin(FOV / 2)
@@ -116,7 +116,7 @@ def views_around(scene: Scene, low: np.ndarray, high: np.ndarray) -> list[Camera
 
 
 def _bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the box with the middle 99 % of the centres along each axis."""
+    """Corners of the bounding box of the middle 99 % of the centres along each axis."""
     cloud = scene.cloud()
     if not len(cloud):
         raise InputError("the scene of a mesh must have at least one splat, got none; add splats or markers")

@@ -96,8 +96,8 @@ class Lighting:
             requirement = '"srgb", "linear" or a gamma from {:g} to {:g}'.format(*GAMMA_RANGE)
             number("light: response", self.response, requirement, *GAMMA_RANGE)
 
-    def displayed(self, radiance: np.ndarray) -> np.ndarray:
-        """Colours of reflected radiance."""
+    def encode(self, radiance: np.ndarray) -> np.ndarray:
+        """Convert reflected radiance to colours in display space."""
         with np.errstate(over="ignore"):
             return np.minimum(to_colors(self.exposure * radiance, self.response), LARGEST)
 

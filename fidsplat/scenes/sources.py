@@ -137,7 +137,9 @@ def framing_camera(
 def _extent(cloud: SplatCloud | Store) -> tuple[np.ndarray, np.ndarray]:
     if len(cloud) == 0:
         return -np.ones(3), np.ones(3)
-    if isinstance(cloud, Store):  # by the boxes of its chunks, which are small compared with the scene
+    if isinstance(
+        cloud, Store
+    ):  # by the bounding boxes of its chunks, which are small compared with the scene
         return cloud.bounds(REACH)
     half_extents = cloud.half_extents(REACH)
     share = 0.5 if len(cloud) >= MANY else 0.0

@@ -199,7 +199,7 @@ def with_thinnest_last(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarra
 
 
 def check_one_footprint(groups: np.ndarray | None, boxes: np.ndarray | None) -> None:
-    """Raise InputError for a coplanar group that has both boxes and Gaussians."""
+    """Raise InputError for a coplanar group that has both box splats and Gaussians."""
     if groups is None or boxes is None:
         return
     mixed = np.intersect1d(groups[(groups >= 0) & boxes], groups[~boxes])

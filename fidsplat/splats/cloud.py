@@ -67,11 +67,11 @@ class SplatCloud(PickledByFields, Summarised):
     """(n,) int32, or None: splats with the same id >= 0 are coplanar and composited without an order
     (`with_coplanar_groups`); -1 for splats in no group"""
     boxes: np.ndarray | None = None
-    """(n,) bool, or None if all are False: True for a box with uniform opacity in |u|, |v| <= 1 and
+    """(n,) bool, or None if all are False: True for a box splat, with uniform opacity in |u|, |v| <= 1 and
     ``scales`` as half sides (`with_boxes`), False for a Gaussian"""
     thickness: np.ndarray | None = None
     """(n,) float32, metres, or None if all are 0: standard deviation along the normal, above 0 for a 3D
-    Gaussian, 0 for a disk or a box"""
+    Gaussian, 0 for a disk or a box splat"""
     dropped: dict[str, int] = field(default_factory=dict)
     """reason -> number of splats dropped by the constructor"""
 
@@ -247,7 +247,7 @@ class SplatCloud(PickledByFields, Summarised):
         return (self.means - half).min(axis=0) + self.origin, (self.means + half).max(axis=0) + self.origin
 
     def half_extents(self, sigmas: float) -> np.ndarray:
-        """Half extents (n, 3) float64 [m] along the world axes: Gaussians to `sigmas`, boxes to corners."""
+        """Half extents (n, 3) float64 [m] along the world axes: Gaussians to `sigmas`, box splats to corners."""
         sigmas = number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
         rotations = quaternion_to_matrix(self.quats)
         axes = rotations[:, :, :2] * (sigmas * self.scales.astype(np.float64))[:, None, :]

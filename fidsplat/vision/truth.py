@@ -52,7 +52,7 @@ class MarkerTruth:
 
 @dataclass(frozen=True, eq=False)
 class GroupTruth:
-    """Mask and box of the splats of one label."""
+    """Mask and bounding box of the splats of one label."""
 
     label: int
     labels: np.ndarray = field(repr=False)
@@ -139,7 +139,7 @@ def marker_truth(placed: PlacedMarker, camera: Camera, label: np.ndarray | None 
 
 
 def groups_of(label: np.ndarray) -> dict[int, GroupTruth]:
-    """Masks and boxes by label of a label image (h, w) int32; -1 is the background."""
+    """Masks and bounding boxes by label of a label image (h, w) int32; -1 is the background."""
     starts = np.ones(label.shape, bool)  # of the runs of equal labels in rows, which are fewer than pixels
     starts[:, 1:] = label[:, 1:] != label[:, :-1]
     at = np.flatnonzero(starts)

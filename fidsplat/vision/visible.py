@@ -79,7 +79,7 @@ def _area(polygons: np.ndarray) -> np.ndarray:
 
 
 def visible(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = None) -> Visible:
-    """Visible share and box of a marker's outline.
+    """Visible share and bounding box of a marker's outline.
 
     label: (h, w) int32, the labels of the image; None: no occlusion.
     """

@@ -212,7 +212,7 @@ def _marker_points(quick: bool) -> Iterator[Point]:
         text = marker_text(quality)
         if quality != BASE.marker:
             yield Point(MARKER, text, BASE.with_(marker=quality))
-        if quality.mixture != "exact":  # boxes are always filtered
+        if quality.mixture != "exact":  # box splats are always antialiased
             yield Point(MARKER, f"{text}, 3 x 3", BASE.with_(marker=quality, **SHARP))
 
 
