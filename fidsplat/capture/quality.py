@@ -42,7 +42,7 @@ class MarkerQuality:
     """
 
     mixture: str = "exact"
-    """`exact`: one box splat per rectangle, with edges filtered by the pixel; opaque and sharp at any distance.
+    """`exact`: one box splat per rectangle, with antialiased edges; opaque and sharp at any distance.
     `fitted`: Gaussians by templates optimised on complete markers; for splat files and other renderers.
     `facets`: Gaussians in planes that intersect along the edges of modules; opaque and sharp, but only with
     `order="pixel"`. `paper`: Gaussians as in the paper's section 3.2."""

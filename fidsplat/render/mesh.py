@@ -95,7 +95,7 @@ def _cosine(normal: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def views_around(scene: Scene, low: np.ndarray, high: np.ndarray) -> list[Camera]:
-    """Cameras on a sphere around a bounding box, spaced by the golden angle, without cameras below level ground."""
+    """Cameras on a sphere around a bounding box, spaced by the golden angle; none below level ground."""
     up_axis = guess_up(scene.cloud())
     center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     distance = radius / math.sin(FOV / 2)

@@ -247,7 +247,7 @@ class SplatCloud(PickledByFields, Summarised):
         return (self.means - half).min(axis=0) + self.origin, (self.means + half).max(axis=0) + self.origin
 
     def half_extents(self, sigmas: float) -> np.ndarray:
-        """Half extents (n, 3) float64 [m] along the world axes: Gaussians to `sigmas`, box splats to corners."""
+        """Half extents (n, 3) float64 [m] along world axes: Gaussians to `sigmas`, box splats to corners."""
         sigmas = number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
         rotations = quaternion_to_matrix(self.quats)
         axes = rotations[:, :, :2] * (sigmas * self.scales.astype(np.float64))[:, None, :]
