@@ -29,6 +29,7 @@ class ResidentCloud:
         capture: Capture,
         labels: np.ndarray | None = None,
     ) -> None:
+        """data: an uploaded cloud, or the device chunks of a store."""
         self.backend, self.data, self._labels = backend, data, labels
         self.all_splats: Any = data.scene if isinstance(data, Residency) else data
         """all splats of the scene: on the device, or, for stores, only partly on the device"""

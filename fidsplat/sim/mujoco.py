@@ -10,7 +10,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera, Orthographic
 from fidsplat.capture.environment import ExternalDepth
-from fidsplat.render.device_surface import MESH_LABEL, MESH_OFFSET, device_surface
+from fidsplat.render.device_external_depth import MESH_LABEL, MESH_OFFSET, device_external_depth
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.sim.poses import OPENGL
@@ -147,7 +147,7 @@ class MujocoRig(SimulatorRig):
                 size = camera.camera.height, camera.camera.width
                 pixels = slice(first, first := first + size[0] * size[1])
                 arrays = context.rgb_data[:, pixels], context.depth_data[:, pixels], ids[:, pixels]
-                images[name] = device_surface(self.renderer, *arrays, size, red_bit=16)
+                images[name] = device_external_depth(self.renderer, *arrays, size, red_bit=16)
         return images
 
     def _meshes(self, data: Sequence[Any], groups: list[int]) -> dict[str, list[ExternalDepth]]:

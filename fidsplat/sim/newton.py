@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.render.device_surface import device_surface
+from fidsplat.render.device_external_depth import device_external_depth
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.sim.poses import OPENGL, compose
@@ -102,7 +102,7 @@ class NewtonRig(SimulatorRig):
             meshes.update(state, transforms, self._rays[name], **images)
             colors, depths, ids = (array.reshape((len(places), -1)) for array in images.values())
             ids = ids.view(wp.int32)
-            depth_images[name] = device_surface(
+            depth_images[name] = device_external_depth(
                 self.renderer, colors, depths, ids, (camera.height, camera.width), red_bit=0
             )
         return depth_images

@@ -1,4 +1,4 @@
-"""Residency of a scene's chunks on a device, with prefetch of the next view's chunks."""
+"""Device chunk cache of a scene with stores, with prefetch of the next view's chunks."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def double_buffered(items: Iterator[T]) -> Iterator[T]:
 
 
 class Residency:
-    """Chunks of a scene on a device, loaded by view; for one thread at a time."""
+    """Device chunk cache of a scene with stores, loaded by view; for one thread at a time."""
 
     def __init__(self, scene: ChunkedSplats, backend: Backend) -> None:
         self.scene, self._backend, self.chunks = scene, backend, DeviceChunks(scene)

@@ -14,7 +14,7 @@ MESH_OFFSET = 2e-3
 """metres by which surfaces of simulators are offset away from the camera"""
 
 
-def device_surface(
+def device_external_depth(
     renderer: Renderer, packed: Any, depths: Any, ids: Any, size: tuple[int, int], red_bit: int
 ) -> ExternalDepth:
     """External depth images of all views, in the memory of the renderer's device.
