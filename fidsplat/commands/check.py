@@ -61,7 +61,7 @@ class Check:
         if self.fuzz is not None and self.fuzz < 1:
             raise InputError(f"--fuzz must be at least 1 splat, got {self.fuzz}")
         if self.fuzz is not None and self.digests:
-            raise InputError("--fuzz and --digests are separate checks; give one of them")
+            raise InputError("at most one of --fuzz and --digests must be given, got both; leave one out")
         where = console(self.json)
         with where.status("opening the device"):
             renderer = fs.Renderer(self.device)

@@ -32,7 +32,9 @@ class MeshOptions:
 
     def __post_init__(self) -> None:
         if not self.mesh and (self.voxel, self.cameras, self.faces, self.parts) != (None, None, None, 32):
-            raise InputError("--voxel, --cameras, --faces and --parts must be given with --mesh; add it")
+            raise InputError(
+                "--voxel, --cameras, --faces and --parts must be given with --mesh, got none; add it"
+            )
         if self.parts < 1:
             raise InputError(f"--parts must be at least 1, got {self.parts}")
 

@@ -45,7 +45,7 @@ class Placing:
         if self.scene is None and (self.append or any(value is not None for value in others)):
             raise InputError(
                 "--up, --lift, --radius, --light and --append must be given with --scene SCENE and "
-                "--at-pixel X Y"
+                "--at-pixel X Y, got neither; add them"
             )
         if self.append and not str(self.scene).lower().endswith(".toml"):
             raise InputError(f"--append must have a scene file (.toml), got {self.scene}")
@@ -159,7 +159,7 @@ class Marker:
         from fidsplat.capture.quality import LADDER
 
         if self.native_2dgs and self.out is None:
-            raise InputError("--native-2dgs must be given with -o FILE.ply")
+            raise InputError("--native-2dgs must be given with -o FILE.ply, got no -o; add it")
         file = new_file(self.out, self.overwrite) if self.out is not None else None
         if file is not None and file.suffix.lower() != ".ply":
             raise InputError(f"-o must be a .ply file, got {file}")
@@ -168,7 +168,10 @@ class Marker:
         refined = self.mixture == "refined"
         placing = self.placing.scene is not None
         if not refined and (self.iterations is not None or (self.device is not None and not placing)):
-            raise InputError("--iterations and --device must be given with --mixture refined")
+            raise InputError(
+                "--iterations and --device must be given with --mixture refined, got "
+                f"{self.mixture or 'no mixture'}; add it, or leave them out"
+            )
         mixture = "fitted" if refined else self.mixture
         quality = fs.Quality.of(self.quality).marker
         if refined and self.quality is None:

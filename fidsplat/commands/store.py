@@ -90,7 +90,10 @@ class Place:
         from fidsplat.store.instances import grid_poses
 
         if (self.grid is None) == (self.poses is None):
-            raise InputError("give either --grid NX,NY,NZ or --poses FILE")
+            raise InputError(
+                "exactly one of --grid NX,NY,NZ and --poses FILE must be given, got "
+                f"{'neither' if self.poses is None else 'both'}"
+            )
         if self.poses is not None:
             poses = list(fs.load_trajectory(self.poses).poses)
         else:

@@ -37,4 +37,6 @@ class CaptureSettings:
         whole_number("--frames", self.frames, 3, 10_000)
         whole_number("--max-side", self.max_side, 64, 32_767)
         if self.scale is not None and self.tag:
-            raise InputError("--scale must be given without --tag, whose size determines the scale")
+            raise InputError(
+                "--scale must be given without --tag, whose size determines the scale, got both; omit one"
+            )

@@ -285,7 +285,9 @@ class SimulatorRig(Rig):
         views |= _by_name("camera", cameras, tuple(self.cameras))
         if meshes is not False:
             if external_depths is not None:
-                raise InputError("meshes and external_depths exclude each other; give one of them")
+                raise InputError(
+                    "at most one of meshes and external_depths must be given, got both; leave one out"
+                )
             external_depths = self._geometry(state, views, meshes)
         return super().render(body_poses, views, outputs=outputs, external_depths=external_depths, mask=mask)
 

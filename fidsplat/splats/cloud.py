@@ -326,7 +326,7 @@ class SplatCloud(PickledByFields, Summarised):
         return self._replaced(coplanar_groups=ids if (ids >= 0).any() else None)
 
     def with_boxes(self, boxes: bool | np.ndarray = True) -> "SplatCloud":
-        """A copy with box footprints where ``boxes``, one bool or (n,) bools, is True.
+        """A copy with box splats where ``boxes``, one bool or (n,) bools, is True.
 
         A box is a rectangle of uniform opacity: its scales are half sides in metres, its edges are filtered
         by the pixel. In a coplanar group the coverage of boxes adds up, so a partition into boxes with

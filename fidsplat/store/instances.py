@@ -63,7 +63,8 @@ def place_store(
         )
     if source.has_coplanar_groups:
         raise InputError(
-            f"{source.path} has coplanar groups, which cannot be instanced; put markers into a scene file"
+            f"an instanced store must be without coplanar groups, got {source.path}; put its markers into a "
+            "scene file"
         )
     try:
         matrices = np.stack([real_array("a pose", pose_matrix(pose, "a pose")) for pose in poses])

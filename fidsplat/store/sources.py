@@ -60,7 +60,9 @@ def _open(file: Path) -> Source:
 def source_of(cloud: SplatCloud, name: Path, stamp: str) -> Source:
     """A source of the splats of a cloud."""
     if cloud.boxes is not None:
-        raise InputError("a store cannot contain box footprints; put markers into a scene file next to it")
+        raise InputError(
+            "splats of a store must be Gaussians, got box splats; put markers into a scene file next to it"
+        )
     arrays = present_arrays(cloud) | {"scales": all_scales(cloud)}
     arrays.pop("thickness", None)
     columns = {name: (array.shape[1:], array.dtype.type) for name, array in arrays.items()}

@@ -139,7 +139,7 @@ class Store(Summarised):
 
     @property
     def footprint(self) -> str:
-        """Always `gaussian`: a store cannot contain box footprints."""
+        """Always `gaussian`: a store has no box splats."""
         return "gaussian"
 
     @property

@@ -78,7 +78,7 @@ def load_lpips() -> Callable[[np.ndarray, np.ndarray], float]:
 
         net = lpips.LPIPS(net="alex", verbose=False).eval().requires_grad_(False)
     except (ImportError, OSError) as error:
-        raise InputError(f"--lpips needs the package lpips: {error}; pip install lpips") from error
+        raise InputError(f"lpips must be usable for --lpips, got {error}; pip install lpips") from error
 
     def measure(image: np.ndarray, truth: np.ndarray) -> float:
         pair = (np.repeat(255 * grey[:, :, None], 3, axis=2) for grey in (image, truth))

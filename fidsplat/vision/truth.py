@@ -192,7 +192,7 @@ def optical_flow(
         raise invalid("label", "an image of the size of depth, or None", label)
     points = points_of(depth, before)
     if motions and label is None:
-        raise InputError("motions need a label image, got None; render with 'label'")
+        raise InputError("label must be an image with motions, got None; render with the output 'label'")
     for value, motion in (motions or {}).items():
         motion = pose_matrix(motion, f"the motion of label {value}")
         check_similarity(motion, f"the motion of label {value}", rigid=True)

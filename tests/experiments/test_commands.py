@@ -180,7 +180,7 @@ def test_what_is_wrong_with_the_last_experiment_is_shown_before_the_first(capsys
     assert "angles.jsonl must be of the same versions and code" in err
     status, _, err = run(capsys, *words, "--lpips", "--overwrite")
     assert status == 2
-    assert "--lpips needs the package lpips" in err
+    assert "lpips must be usable for --lpips" in err
     assert read_records(tmp_path / "counts.jsonl") == []
     assert (tmp_path / "angles.jsonl").read_text() == old  # --overwrite drops nothing for it
 

@@ -65,7 +65,7 @@ def test_flip_of_equal_and_of_opposite_images():
 def test_lpips_is_that_of_its_package(monkeypatch):
     """The network of the package sees three equal channels from -1 to 1; without it, the error names it."""
     monkeypatch.setitem(sys.modules, "lpips", None)
-    with pytest.raises(fs.InputError, match=r"--lpips needs the package lpips: .*; pip install lpips"):
+    with pytest.raises(fs.InputError, match=r"lpips must be usable for --lpips, got .*; pip install lpips"):
         load_lpips()
 
     class Network:

@@ -168,7 +168,7 @@ def test_the_command_writes_a_mesh(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["a.glb", "--voxel", "0.1"], "must be given with --mesh"),
+        (["a.glb", "--voxel", "0.1"], "must be given with --mesh, got none"),
         (["a.spz", "--mesh"], "the suffix of a mesh must be .glb"),
         (["a.glb", "--mesh", "--voxel", "-1"], "voxel must be a positive length in metres, got -1"),
         (["a.glb", "--mesh", "--voxel", "1e-9"], "voxel must be at least"),

@@ -86,7 +86,7 @@ assert rows[1] < rows[0] - 5  # the ball has moved up
 
 both = MujocoRig(model, scene, {1: "box"}, renderer=fs.Renderer("reference"))
 assert "'flat' with the lens orthographic" in refusal(lambda: both.render(data, meshes=True))
-assert "exclude each other" in refusal(lambda: rig.render(data, meshes=True, external_depths={}))
+assert "got both; leave one out" in refusal(lambda: rig.render(data, meshes=True, external_depths={}))
 assert "a geom group of meshes must be" in refusal(lambda: rig.render(data, meshes=[6]))
 assert "data with meshes must be a mujoco.MjData" in refusal(lambda: rig._meshes([None], True))
 print("done")

@@ -113,7 +113,7 @@ def test_flow_of_what_does_not_move_is_nothing(frame, scene):
 
 
 def test_flow_that_cannot_be(frame, scene):
-    with pytest.raises(fs.InputError, match="need a label image"):
+    with pytest.raises(fs.InputError, match="label must be an image with motions"):
         optical_flow(frame["depth"], scene.camera, scene.camera, motions={1: np.eye(4)})
     with pytest.raises(fs.InputError, match="motion of label 1 must be rigid"):
         optical_flow(frame["depth"], scene.camera, scene.camera, frame["label"], {1: np.diag([2, 2, 2, 1])})
