@@ -182,7 +182,7 @@ def test_what_another_kind_reallocated_is_not_replayed(renderer, ahead, replayed
     # earlier tests may have left larger arrays
     monkeypatch.setattr(ahead.pool, "_arrays", {})
     monkeypatch.setattr(ahead.pool, "_parts", {})
-    monkeypatch.setattr(ahead.pool, "state", object())
+    monkeypatch.setattr(ahead.pool, "generation", object())
     small = [renderer.render(resident, CAPTURE) for _ in range(4)]
     renderer.render(resident, CAPTURE.with_(camera=large))
     small += [renderer.render(resident, CAPTURE) for _ in range(2)]

@@ -224,7 +224,7 @@ def test_gaussians_of_a_bent_marker(renderer):
     camera = fs.Camera.look_at(160, 160, 0.7, (0, 0, -0.35), (0, 0, 0))
     image = renderer.render(marker.cloud, camera, background=(0.5, 0.5, 0.5))["rgb"]
     assert [code.name for code in detect(to_uint8(image), ["apriltag:16h5"])] == ["apriltag:16h5:3"]
-    with pytest.raises(fs.InputError, match="mixture facets"):
+    with pytest.raises(fs.InputError, match="got facets; use exact"):
         fs.marker(SPEC, SIZE, "facets", shape=Cylinder(0.1))
 
 

@@ -133,11 +133,11 @@ def test_wrong_wear_is_refused(tmp_path):
         fs.marker(SPEC, wear="fadin=0.5")
     with pytest.raises(fs.InputError, match="wear must be a Wear, its text or None"):
         fs.marker(SPEC, wear=0.5)
-    with pytest.raises(fs.InputError, match="mixture facets"):
+    with pytest.raises(fs.InputError, match="got facets; use exact"):
         fs.marker(SPEC, mixture="facets", wear="fading=0.5")
     drawing = tmp_path / "a.svg"
     drawing.write_text('<svg viewBox="0 0 9 9"><path d="M1 1L8 2L4 8Z" fill="black"/></svg>')
-    with pytest.raises(fs.InputError, match="edges along modules"):
+    with pytest.raises(fs.InputError, match="a drawing with slanted edges"):
         fs.marker(f"svg-16:{drawing}", wear="fading=0.5")
     (tmp_path / "scene.toml").write_text(f'[[markers]]\nspec = "{SPEC}"\nsize = 1.0\nwear = {{dirt = 2}}\n')
     with pytest.raises(fs.InputError, match=r"markers\[0\]\.wear: dirt must be a severity"):

@@ -226,7 +226,7 @@ class WarpPipeline(Pipeline):
         """Key of the launches of a frame: all their arguments except the numbers of the views."""
         workspace, labels = self.workspace, tuple(label for label, _ in view.groups)
         budgets = workspace.memory_budget, workspace.pair_budget, reserved
-        states = workspace.pool.generation, cached.inputs.state
+        states = workspace.pool.generation, cached.inputs.generation
         external = view.external_depth and view.external_depth.depth.shape
         return cached.capacity, budgets, states, view.raster, view.environment_map, labels, external
 
