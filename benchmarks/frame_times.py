@@ -185,7 +185,7 @@ def peers(cloud: fs.SplatCloud, camera: fs.Camera) -> dict[str, Callable[[], Any
         torch.cuda.synchronize()
         return frame.reshape(camera.height, camera.width, -1)[..., :3]
 
-    return {"gsplat": render_gsplat, "HiGS": render_higs}
+    return {f"gsplat {gsplat.__version__}": render_gsplat, "HiGS": render_higs}
 
 
 def measure(row: Row, devices: list[str], repeats: int) -> list[dict]:
@@ -237,18 +237,19 @@ def main() -> None:
     parser.add_argument("--devices", nargs="+", help="our devices (default: --device)")
     arguments = parser.parse_args()
     devices = arguments.devices or [arguments.device]
-    records = []
+    versions = facts(fs.Renderer(devices[0])) | ({} if gsplat is None else {"gsplat": gsplat.__version__})
+    records: list[dict] = []
     for scene in arguments.scenes:
         for row in rows_of(scene):
             found = measure(row, devices, arguments.repeats)
             records += found
+            keep({**versions, "results": records}, None if arguments.json == "-" else arguments.json)
             for record in found:
                 PROGRESS.print(f"{row.name} {record['renderer']}: {record['frame_ms']:.3f} ms")
             gc.collect()
             if torch is not None:
                 torch.cuda.empty_cache()
-    versions = {} if gsplat is None else {"gsplat": gsplat.__version__}
-    if not keep({**facts(fs.Renderer(devices[0])), **versions, "results": records}, arguments.json):
+    if not keep({**versions, "results": records}, arguments.json):
         rows = [
             (
                 record["scene"],
