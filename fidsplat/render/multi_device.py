@@ -48,8 +48,8 @@ class SeveralDevices:
         memory_budget: bytes per device.
 
     Raises:
-        InputError: no device, or devices of different models, whose frames may differ. DeviceError: a device
-        cannot be used.
+        InputError: no device, or devices of different models, whose frames may differ.
+        DeviceError: a device cannot be used.
     """
 
     def __init__(self, devices: Iterable[str], memory_budget: int | None = None) -> None:

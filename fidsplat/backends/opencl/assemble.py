@@ -1,7 +1,8 @@
 """Kernel source assembly: flat program texts from a FeatureSet and a KernelConfig. Needs no OpenCL.
 
 A frame needs two programs, `lists` and `frame`: drivers cache compiled programs by their text, and most
-feature sets have the same `lists`. Gradients (`gradients`, `step`) and `training` are separate programs.
+feature sets have the same `lists`. Gradients (`gradients`, `step`), `training` and `alignment` are
+separate programs.
 
 A line `//@@ name` in a stage's file is a hook: it is replaced by the sections `//@ name` of the chosen
 effects' files, or by an empty line. `//@@ struct NAME` and `//@@ arguments KERNEL` are replaced by

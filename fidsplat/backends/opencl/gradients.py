@@ -185,9 +185,8 @@ class OpenCLGradients(GradientPipeline):
         """Raise CapacityExceeded if the lists were too small."""
         if (pairs := frame.count_pairs()) is None:
             raise CapacityExceeded
-        if (
-            self._pair_limit < pairs * 9 // 8
-        ):  # change the limit seldom, as frames with another limit are recorded again
+        # change the limit seldom, as frames with another limit are recorded again
+        if self._pair_limit < pairs * 9 // 8:
             self._pair_limit = pairs * 5 // 4
 
     def _bind_gradients(self, frame: DeviceFrame, gradients: Mapping[str, Any]) -> None:

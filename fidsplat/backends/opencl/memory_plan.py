@@ -32,6 +32,8 @@ KEY_BYTES, WINDOW_BYTES, SORT_BYTES = 4, 8, 16
 """bytes per splat of sort keys, of tile windows, and of keys and indices during the sort"""
 MIN_BIG = 1 << 12
 """initial capacity for big splats"""
+TILE_TABLES = 5
+"""words per tile of bin_first and bin_local: counters, starts, cursors, order and termination depths"""
 UNIFORM_BYTES = 1 << 14
 """upper bound of the bytes of uniforms, counts and moving groups"""
 PART_BYTES = {"cpu": 1 << 28}
@@ -138,7 +140,7 @@ class MemoryPlanner:
         config, tiles = self._config, self.tiles(view)
         samples = tiles * config.tile_width * config.tile_height
         if config.binning != "sort_first":
-            return samples, 4 * 3 * tiles
+            return samples, 4 * TILE_TABLES * tiles
         bins = 1 << config.radix_bits
         return samples, 4 * ((tiles + bins) * (config.sort_blocks + 2) + 3 * config.sort_blocks)
 

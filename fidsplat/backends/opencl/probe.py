@@ -43,8 +43,8 @@ class _PoisonedPool(BufferPool):
     def scratch(self, name: str, size: int) -> cl.Buffer:
         return self._filled(super().scratch(name, size))
 
-    def acquire(self, name: str, size: int) -> cl.Buffer:
-        return self._filled(super().acquire(name, size))
+    def acquire(self, name: str, size: int, larger: bool = False) -> cl.Buffer:
+        return self._filled(super().acquire(name, size, larger))
 
     def allocate(self, name: str, size: int) -> cl.Buffer:
         return self._filled(super().allocate(name, size))

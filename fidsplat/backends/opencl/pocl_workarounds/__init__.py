@@ -28,8 +28,7 @@ def shared_program(context: cl.Context, text: str, options: tuple[str, ...]) -> 
     """The program of a text compiled with these options, in this call or an earlier one."""
     short = declared(text, context.devices[0].platform.version)
     if short is not None:
-        with suppress(
-            cl.RuntimeError
-        ):  # the text calls a function that the header does not declare, or is invalid
+        # the build fails if the text calls a function that the header does not declare, or is invalid
+        with suppress(cl.RuntimeError):
             return cl.Program(context, short).build(options=[*options, OPTION])
     return cl.Program(context, text).build(options=list(options))
