@@ -12,7 +12,8 @@ import numpy as np
 from fidsplat.cameras import Camera
 
 BINS, SHIFT, FIRST_BIN = 256, 19, 113 << 4
-"""histograms of positive float32, 16 bins per octave from 2^-14 to 4: bin = (bits >> SHIFT) - FIRST_BIN"""
+"""bins of the histograms of gradient magnitudes and residuals, positive float32: 16 per octave from 2^-14 to
+4, bin = (bits >> SHIFT) - FIRST_BIN"""
 
 
 class AlignmentStage(NamedTuple):
@@ -108,14 +109,15 @@ class AlignmentKernels(ABC):
 
     @abstractmethod
     def load(self, image: np.ndarray, stages: list[AlignmentStage], max_pixels: int) -> list[int]:
-        """Prepare an image (h, w, 1 or 3), float32 display values, for all stages; returns the number of
-        pixels of each. A stage uses about `max_pixels` pixels, those with the largest gradients."""
+        """Prepare an image (h, w, 1 or 3), float32 display values, for all pyramid levels (`stages`); returns
+        the number of pixels of each. A level uses about `max_pixels` pixels, those with the largest
+        gradients."""
 
     @abstractmethod
     def sums(
         self, stage: int, frame: Any, fit: AlignmentFit, moved: MovedFrame | None = None, blocks: bool = False
     ) -> AlignmentSums:
-        """Sums of a stage for a Frame with rgb and depth. blocks: whether to return sums of each block."""
+        """Sums of a pyramid level for a Frame with rgb and depth. blocks: whether to sum each block too."""
 
 
 def bins_of(values: np.ndarray) -> np.ndarray:

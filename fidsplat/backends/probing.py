@@ -22,7 +22,7 @@ class Probe(ABC):
     @abstractmethod
     def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
         """Four expressions that a compiler may contract to fused multiply-adds, for a, b (n,) float32: a b -
-        a b; a b + a; (a/3)(b/3) - (a/3)(b/3) in the precision of the set-up; fma(a, b, -(a b))."""
+        a b; a b + a; (a/3)(b/3) - (a/3)(b/3) in the precision of the projection; fma(a, b, -(a b))."""
 
     @abstractmethod
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
@@ -30,15 +30,15 @@ class Probe(ABC):
 
     @abstractmethod
     def arithmetic(
-        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+        self, exponents: np.ndarray, fractions: np.ndarray, dividends: np.ndarray, divisors: np.ndarray
     ) -> dict[str, np.ndarray]:
         """The device's mathematical functions, compiled as in the stages, for arguments (n,) float64, n a
         multiple of 16.
 
-        Returns (n,) float32: `exp` and `fast_exp` of exponents, `log` and `fast_log` of shares, `division`
-        above / below, `sqrt` of below, `fma` above * below + above; (n,) float64 if the device has it:
-        `division64`, `sqrt64`, `log64`; `denormal` (2,) float32: half of the smallest normal number, and
-        twice that.
+        Returns (n,) float32: `exp` and `fast_exp` of exponents, `log` and `fast_log` of fractions, `division`
+        dividends / divisors, `sqrt` of divisors, `fma` dividends * divisors + dividends; (n,) float64 if the
+        device has it: `division64`, `sqrt64`, `log64`; `denormal` (2,) float32: half of the smallest normal
+        number, and twice that.
         """
 
     @abstractmethod

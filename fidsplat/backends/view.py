@@ -56,7 +56,9 @@ class View:
     log_cut: float
     """natural logarithm of the alpha cut-off, rounded to float32"""
     ceiling: float
+    """maximum alpha of a fragment"""
     stop: float
+    """transmittance at which blending terminates early"""
     background: tuple[float, float, float]
     """background colour; with fog, the fog's colour"""
     first_hit_transmittance: float

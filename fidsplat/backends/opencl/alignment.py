@@ -37,51 +37,51 @@ class OpenCLAlignment(AlignmentKernels):
         self._items = 1 if workspace.config.schedule == "lanes" else 32
         self._program = Program(workspace, assemble_alignment(self._items))
         self._commands = CommandList(self._program)
-        self._stages: list[dict[str, Any]] = []
+        self._levels: list[dict[str, Any]] = []
 
     def load(self, image: np.ndarray, stages: list[AlignmentStage], max_pixels: int) -> list[int]:
         with self._workspace.lock, self._workspace.device_errors("localising"):
-            self._stages = []
+            self._levels = []
             histograms = self._scratch("textures", 4 * BINS * len(stages))
             cl.enqueue_fill_buffer(self._queue, histograms, np.zeros(1, np.uint32), 0, 4 * BINS * len(stages))
             source = full = self._upload("image", image), image.shape
-            for number, stage in reversed([*enumerate(stages)]):  # each level from the next finer one
-                args, source = self._prepared(number, stage, source, full, histograms)
-                self._stages.insert(0, args)
+            for number, level in reversed([*enumerate(stages)]):  # each level from the next finer one
+                args, source = self._prepared(number, level, source, full, histograms)
+                self._levels.insert(0, args)
             counts = np.empty((len(stages), BINS), np.uint32)
             cl.enqueue_copy(self._queue, counts, histograms)
         pixels = []
-        for args, histogram in zip(self._stages, counts.astype(np.int64), strict=True):
+        for args, histogram in zip(self._levels, counts.astype(np.int64), strict=True):
             args["min_bin"] = min_bin = lowest_bin(histogram, max_pixels)
             pixels.append(int(histogram[min_bin:].sum()))
         return pixels
 
     def _prepared(
-        self, number: int, stage: AlignmentStage, source: _Image, full: _Image, histograms: cl.Buffer
+        self, number: int, level: AlignmentStage, source: _Image, full: _Image, histograms: cl.Buffer
     ) -> tuple[dict[str, Any], _Image]:
-        """Arguments of a stage's kernels, and its image before the blur. source: the next finer image."""
-        camera = stage.camera
+        """Kernel arguments of a pyramid level, and its image before blur. source: the next finer image."""
+        camera = level.camera
         finer, (full_height, full_width, channels) = source
         if full_width % camera.width or full_height % camera.height:
             finer, (full_height, full_width, _) = full
         width, height, size = camera.width, camera.height, 4 * camera.width * camera.height
         args = {
-            **{"width": width, "height": height, "channels": channels, "block_size": stage.block_size},
+            **{"width": width, "height": height, "channels": channels, "block_size": level.block_size},
             **{"full_width": full_width, "full_height": full_height},
             **{"ratio_x": full_width / width, "ratio_y": full_height / height},
             **{"focal_x": camera.fx, "focal_y": camera.fy, "center_x": camera.cx, "center_y": camera.cy},
             **{"lens": int(camera.lens is not None), "rays": finer, "taps": finer, "mask": finer},
-            **{"masked": int(stage.ignored is not None), "radius": len(stage.taps) - 1, "row": number},
+            **{"masked": int(level.ignored is not None), "radius": len(level.taps) - 1, "row": number},
             "bins": self._scratch(f"bins {number}", size // 4),
             "counts": histograms,
         }
         if camera.lens is not None:
             raster = raster_of(camera.lens, width, height, camera.fx, camera.fy, camera.cx, camera.cy)
             args["rays"] = self._upload(f"rays {number}", raster.rays)
-        if stage.ignored is not None:
-            args["mask"] = self._upload(f"mask {number}", stage.ignored.astype(np.uint8))
+        if level.ignored is not None:
+            args["mask"] = self._upload(f"mask {number}", level.ignored.astype(np.uint8))
         if args["radius"]:
-            args["taps"] = self._upload(f"taps {number}", stage.taps)
+            args["taps"] = self._upload(f"taps {number}", level.taps)
         image = finer
         if (width, height) != (full_width, full_height):
             image = self._scratch(f"image {number}", channels * size)
@@ -94,7 +94,7 @@ class OpenCLAlignment(AlignmentKernels):
     def sums(
         self, stage: int, frame: Any, fit: AlignmentFit, moved: MovedFrame | None = None, blocks: bool = False
     ) -> AlignmentSums:
-        args, channels = self._stages[stage], len(fit.gain)
+        args, channels = self._levels[stage], len(fit.gain)
         height, width, block_size = args["height"], args["width"], args["block_size"]
         count = -(-height // block_size) * -(-width // block_size)
         groups = count if blocks else min(count, _GROUPS[self._items])
@@ -104,7 +104,7 @@ class OpenCLAlignment(AlignmentKernels):
         with self._workspace.lock, self._workspace.device_errors("localising"):
             values = self._blurred(rgb, args, "render", 3)
             if moved is not None:
-                moved_rgb = self._blurred(moved_rgb, args, "moved render", 3)
+                moved_rgb = self._blurred(moved_rgb, args, "moved frame", 3)
             counts = self._scratch("errors", 4 * BINS)
             cl.enqueue_fill_buffer(self._queue, counts, np.zeros(1, np.uint32), 0, 4 * BINS)
             sums = self._scratch("sums", 4 * groups * _SUMS)
@@ -130,7 +130,7 @@ class OpenCLAlignment(AlignmentKernels):
         return min(height, _GROUPS[self._items])
 
     def _blurred(self, image: cl.Buffer, args: dict[str, Any], name: str, channels: int) -> cl.Buffer:
-        """An image convolved with the taps of a stage; the image itself without blur."""
+        """An image convolved with the taps of a pyramid level; the image itself without blur."""
         if not args["radius"]:
             return image
         for vertical in (0, 1):

@@ -2,7 +2,8 @@
 
 A frame needs two programs, `lists` and `frame`: drivers cache compiled programs by their text, and most
 feature sets have the same `lists`. Gradients (`gradients`, `step`), `training` and `alignment` are
-separate programs.
+separate programs. An effect is a feature option: a camera model, compositing order, colour type or sensor
+step, for example.
 
 A line `//@@ name` in a stage's file is a hook: it is replaced by the sections `//@ name` of the chosen
 effects' files, or by an empty line. `//@@ struct NAME` and `//@@ arguments KERNEL` are replaced by
@@ -65,7 +66,8 @@ _FRAME = (
     "schedule/{}",
     "resolve",
 )
-"""stages of the program `frame`; `{}` is the schedule; `pack` is used by the strategy `sort_first` only"""
+"""stages of the program `frame`; `{}` is the schedule; `_cells`: culling by blocks of a tile's pixels;
+`pack` is used by the strategy `sort_first` only"""
 _GRADIENTS = (
     *("prelude", "math", "splat", "bounds", "record_gradients", "blend_backward"),
     *("schedule/{}_cells", "schedule/{}_backward", "set_up_backward", "project_backward"),
@@ -79,7 +81,8 @@ _HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")
 _HOOKS = re.compile(r"^[ \t]*//@@ (\w+)(?: \w+)?[ \t]*$", re.MULTILINE)
 _COMMENT = re.compile(r"[ \t]*//.*")
 _SECTION = re.compile(r"//@ (\w+)[ \t]*")
-# both patterns begin with a literal, which `re` finds 20 times as fast as a word boundary
+# the type `wide` (`Scalars.wide`) and its constants; both patterns begin with a literal, which `re` finds 20
+# times as fast as a word boundary
 _WIDE_CONSTANT = re.compile(r"WIDE\(([^()]+)\)")
 _WIDE = re.compile(r"wide(?<=\bwide)\b")
 _EFFECT_ARGUMENTS = {
@@ -180,7 +183,7 @@ def layouts_of(features: FeatureSet) -> dict[str, Layout]:
 def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
     """Assemble the source of a feature set. Raises DeviceError if a file fills an unknown hook."""
     layouts = layouts_of(features)
-    # blend and resolve are fused if a pixel has one sample and one pose, and no other pass adds to it
+    # blend and resolve are fused if a pixel has one sample and one pose, and no other kernel adds to it
     separate = {"rays", "shutter_exposure", "shutter_rows"}
     fused = features.samples == 1 and "background_constant" in layouts and separate.isdisjoint(layouts)
     files = [layout.file for layout in layouts.values() if layout.file]
@@ -195,7 +198,7 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
         files.append("part/resolve_fused.cl")
     if config.binning == "bin_first":
         files.append("list/tiled.cl")
-    # bounds of the depth in a tile exist for the pinhole only
+    # depth keys per tile need bounds of a splat's depth in a tile, which only the pinhole has
     keys_by_tile = {"compose_pixel", "camera_pinhole"} <= layouts.keys() and config.binning != "sort_first"
     if keys_by_tile:
         layouts["tile_keys"] = LAYOUTS["tile_keys"]
@@ -205,6 +208,7 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
     elif config.schedule == "lanes":
         files.append("part/tile_loop_lanes.cl")
     if not layouts.keys().isdisjoint({"compose_pixel", "coplanar_layers"}):
+        # several k-buffer passes over a tile's list; each needs a splat's minimum depth in the block or tile
         files += ["part/passes.cl", f"part/passes_{config.schedule}.cl"]
         files.append("part/blocks_nearest.cl" if config.schedule == "lanes" else "part/tile_nearest.cl")
     if "termination_depths" in layouts:  # after all passes through a list
@@ -459,7 +463,7 @@ class Declarations:
         self.structs = {record.name: record for record in records}
 
     def arguments(self, kernel: str) -> tuple[Argument, ...]:
-        """A kernel's own arguments, then those of the effects in their order, each name once."""
+        """A kernel's own arguments, then the arguments of effects in effect order, each name once."""
         merged = {argument.name: argument for argument in self._kernels[kernel]}
         if field := _EFFECT_ARGUMENTS.get(kernel):
             for layout in self._layouts:

@@ -184,7 +184,8 @@ class BufferPool:
 
 
 class RayBuffers:
-    """The buffers `rays`, `ray_map` and so on (kernels/opencl/slot) of the lenses in use."""
+    """Buffers of the lenses in use: rays of the samples, and the inverse lookup table `ray_map`, a pyramid of
+    image bounds (part/ray_map.cl)."""
 
     def __init__(self, pool: BufferPool, queue: cl.CommandQueue) -> None:
         self._pool, self._queue = pool, queue

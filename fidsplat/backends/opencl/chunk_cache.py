@@ -24,9 +24,9 @@ from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.workspace import Workspace
 
 _CACHE_DIVISOR = 4
-"""the cache has at most the memory budget divided by this"""
+"""maximum size of the cache: the memory budget divided by this"""
 _CLOUD_DIVISOR = 3
-"""a gathered cloud that is not streamed has at most the memory budget divided by this"""
+"""maximum size of a gathered cloud that is not streamed: the memory budget divided by this"""
 _INITIAL_SLOTS = 16
 _MAX_LAUNCH = 1 << 15
 """maximum number of chunks of a launch: the smallest limit of any device for the second dimension"""
@@ -237,7 +237,7 @@ class OpenCLChunkCache:
 
 
 class GatheredChunks(Resident):
-    """A cloud of cached chunks; `streamed` if it exceeds its share of the memory budget."""
+    """A cloud assembled from cached chunks; `streamed` if it exceeds its fraction of the memory budget."""
 
     coherent = True
 

@@ -49,9 +49,9 @@ class Scalars:
     """The C types that depend on the build."""
 
     real: str
-    """type of the per-splat set-up: float or double"""
+    """type of the per-splat projection: float or double"""
     wide: str
-    """type of fragments: float or double"""
+    """type of fragments in the blend stage: float or double"""
 
     def of(self, ctype: str) -> str:
         """The C type of `ctype`."""
@@ -148,7 +148,7 @@ def args(*declared: str | tuple[Argument, ...]) -> tuple[Argument, ...]:
 
 
 def uniforms(group: str, *declarations: str, note: str = "") -> tuple[Argument, ...]:
-    """Arguments for all numbers of a group of uniforms (`View.uniform`), in their order."""
+    """Arguments for all numbers of a group of uniforms (`View.uniform`), in the order of the group."""
     words = [declaration.split() for declaration in declarations]
     named = [(ctype, name) for ctype, *names in words for name in names]
     return tuple(
@@ -171,7 +171,8 @@ class SampleBuffer:
 
 @dataclass(frozen=True)
 class Layout:
-    """Declaration of an effect: its kernel file, and its additions to records and kernel arguments."""
+    """Declaration of an effect (feature option), output or shared part: its kernel file, and its additions to
+    records and kernel arguments."""
 
     file: str = ""
     """file below kernels/opencl/; empty: none"""

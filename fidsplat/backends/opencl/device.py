@@ -42,7 +42,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import DeviceError, UnknownDeviceError
 from fidsplat.util.files import user_cache
 
-_FEW_SAMPLES = 2560  # for each compute unit: one of an H200 runs 2048 work-items at once
+_FEW_SAMPLES = 2560  # per compute unit; a compute unit of an H200 runs 2048 work-items at once
 _PYOPENCL_FILES = ("binary", "info", "source.cl")
 _NO_PATCH_NEEDED = (
     "a newer PoCL (Debian: pocl-opencl-icd; conda: pocl) or Intel's runtime for CPUs needs no patch "
@@ -275,7 +275,9 @@ def _describe(device: cl.Device, name: str) -> DeviceInfo:
         "gpu" if device.type & cl.device_type.GPU else "cpu" if device.type & cl.device_type.CPU else "other"
     )
     float64 = "cl_khr_fp64" in device.extensions
-    remarks = ["no float64: per-splat set-up in float32"] * (not float64) + [_PATCHED] * _needs_patch(device)
+    remarks = ["no float64: per-splat projection in float32"] * (not float64) + [_PATCHED] * _needs_patch(
+        device
+    )
     return DeviceInfo(
         name=name,
         title=device.name.strip(),

@@ -191,8 +191,8 @@ class DeviceFrame:
         views: int = 1,
         **arguments: Any,
     ) -> cl.Event:
-        """Submit a kernel with at least `items` work-items per view. arguments: those that the
-        frame does not have, by name."""
+        """Submit a kernel with at least `items` work-items per view. arguments: values by name,
+        for arguments that the frame does not define."""
         size = tuple([-(-count // side) * side for count, side in zip(items, group, strict=True)])
         if views > 1:
             size, group = (*size, views), (*group, 1)

@@ -13,7 +13,7 @@ _RAYS = args("in float rays  // 3 channels X, Y, Z; NaN outside the field of vie
 _OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
 
 LAYOUTS: dict[str, Layout] = {
-    # slots: one of each kind
+    # feature options: one of each kind
     "camera_pinhole": Layout("slot/camera_pinhole.cl", parts=("chord", "conic", "perspective")),
     "camera_brown_conrady": Layout(
         "slot/camera_brown_conrady.cl",
@@ -32,7 +32,7 @@ LAYOUTS: dict[str, Layout] = {
     "camera_orthographic": Layout(
         "slot/camera_orthographic.cl",
         parts=("chord", "conic"),
-        splat=(member("wide z0 zx zy", "depth times D = z0 + zx x + zy y"), member("wide z_near")),
+        splat=(member("wide z0 zx zy", "depth * D = z0 + zx x + zy y"), member("wide z_near")),
     ),
     "color_rgb": Layout(
         "slot/color_rgb.cl",
@@ -55,7 +55,7 @@ LAYOUTS: dict[str, Layout] = {
         splat=(
             member(
                 "wide lowpass_x lowpass_y",
-                "centre of the low-pass disc relative to the anchor; far away if there is none",
+                "centre of the low-pass disc relative to the anchor pixel; far away if there is none",
             ),
         ),
         bounds=(
@@ -64,8 +64,10 @@ LAYOUTS: dict[str, Layout] = {
         backward_file="slot/lowpass_screen_backward.cl",
         record_gradient=(member("float lowpass_x lowpass_y", "with respect to the centre of the low-pass"),),
     ),
+    # whether the fragment that crosses the early-termination threshold is composited
     "stop_inclusive": Layout(),
     "stop_exclusive": Layout("slot/stop_exclusive.cl", backward_file="slot/stop_exclusive_backward.cl"),
+    # compositing order: of splats by their centres, or of fragments per pixel
     "compose_ordered": Layout("slot/compose_ordered.cl"),
     "compose_pixel": Layout(
         "slot/compose_pixel.cl",
@@ -74,6 +76,7 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "compose_coplanar": Layout(parts=("compose_ordered", "coplanar_layers")),
     "compose_coplanar_pixel": Layout(parts=("compose_pixel", "coplanar_layers")),
+    # a box is a splat with a hard-edged, rectangular footprint
     "footprint_gaussian": Layout(),
     "footprint_box": Layout("slot/footprint_box.cl", parts=("box_edges",)),
     "footprint_mixed": Layout(
@@ -86,9 +89,7 @@ LAYOUTS: dict[str, Layout] = {
         "slot/ellipsoid_exact.cl",
         parts=("thickness",),
         splat=(
-            member(
-                "wide bulge", "2 / m^2 of a 3D Gaussian, m: Mahalanobis distance of the camera; 0 of a disk"
-            ),
+            member("wide bulge", "thickness term: 2 / m^2, m: Mahalanobis distance of the camera; 0: a disk"),
         ),
         backward_file="slot/ellipsoid_exact_backward.cl",
         record_gradient=(member("float bulge"),),
@@ -96,7 +97,11 @@ LAYOUTS: dict[str, Layout] = {
     "ellipsoid_ewa": Layout(
         "slot/ellipsoid_ewa.cl",
         parts=("thickness",),
-        view=(member("real ewa_clamp[4]", "of rays, -x, x, -y, y: limits of the linearisation"),),
+        view=(
+            member(
+                "real ewa_clamp[4]", "limits of -x, x, -y, y of the ray at which the projection is linearised"
+            ),
+        ),
         backward_file="slot/ellipsoid_ewa_backward.cl",
     ),
     "ellipsoid_ewa_antialiased": Layout(
@@ -157,25 +162,25 @@ LAYOUTS: dict[str, Layout] = {
         )
     ),
     # parts that several effects share
-    "chord": Layout("part/chord.cl"),
+    "chord": Layout("part/chord.cl"),  # columns of an ellipse in a range of rows
     "conic": Layout("part/conic.cl", replaced_by=(("ellipsoids_only", "conic_facing"),)),
-    "conic_facing": Layout("part/conic_facing.cl"),
+    "conic_facing": Layout("part/conic_facing.cl"),  # disks that face the camera
     "perspective": Layout("part/perspective.cl"),
-    "polygon": Layout("part/polygon.cl"),
+    "polygon": Layout("part/polygon.cl"),  # bounds of a disk by a circumscribed polygon
     "ray_map": Layout(
         "part/ray_map.cl",
         view=(
             member(
                 "real map[6]",
-                "x, y of the lowest corner, cells per unit along x, y, cells per side, first row",
+                "grid of `ray_map`: lowest corner x, y, cells per unit of x, y, cells per side, first row",
             ),
         ),
-        project=args("in short4 ray_map"),
+        project=args("in short4 ray_map  // inverse lens table: columns and rows of a cell of rays"),
     ),
     "rays": Layout(
         "part/rays.cl",
         splat=(
-            member("wide nuz nvz dz", "n_u = nu0 + nux X + nuy Y + nuz Z, likewise n_v and D"),
+            member("wide nuz nvz dz", "n_u = nu0 + nux X + nuy Y + nuz Z, likewise n_v, D (layout.py)"),
             member("wide ray_x ray_y ray_z", "X, Y, Z are relative to this ray"),
         ),
         project=_RAYS,
@@ -215,7 +220,10 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "ray_depth": Layout(
         "part/ray_depth.cl",
-        splat=(member("wide z_numerator", "depth = z_numerator / D"), member("wide z_center z_reach")),
+        splat=(
+            member("wide z_numerator", "depth = z_numerator / D"),
+            member("wide z_center z_reach", "depths are clamped to z_center +- z_reach"),
+        ),
         backward_file="part/ray_depth_backward.cl",
         record_gradient=(member("float z_numerator z_center"),),
     ),
@@ -226,7 +234,7 @@ LAYOUTS: dict[str, Layout] = {
         project=args("cloud int coplanar_groups  // (n) index of the splat's group; -1: none"),
     ),
     "tile_keys": Layout("part/tile_keys.cl", emit=args("in Splat splats")),
-    "coverage": Layout("part/coverage.cl"),
+    "coverage": Layout("part/coverage.cl"),  # minimum alpha of masks
     "ray": Layout(resolve=RAY_UNIFORMS),
     "row_rotation": Layout("part/row_rotation.cl", resolve=args("array float row_rotations  // (h, 3, 3)")),
     # rays of fisheyes and panoramas have a length of 1
@@ -255,7 +263,9 @@ LAYOUTS: dict[str, Layout] = {
     "distortion": Layout(
         "output/distortion.cl",
         parts=("ray_depth",),
-        sample_buffers=(SampleBuffer("float", "distortion_raw", 4, "the first m, W, sum w m, sum w m^2"),),
+        sample_buffers=(
+            SampleBuffer("float", "distortion_raw", 4, "m of the first fragment; sums of w, w m, w m^2"),
+        ),
         backward_file="output/distortion_backward.cl",
         blend_backward=args("in float distortion_raw  // 4 channels", "in float grad_distortion  // (h, w)"),
     ),
@@ -309,7 +319,12 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "decode_srgb": Layout("post/decode_srgb.cl"),
     "veiling_glare": Layout(
-        "post/veiling_glare.cl", resolve=uniforms("veiling_glare", "float glare_rest glare_r glare_g glare_b")
+        "post/veiling_glare.cl",
+        resolve=uniforms(
+            "veiling_glare",
+            "float glare_rest glare_r glare_g glare_b",
+            note="value = glare_rest * value + glare; glare_rest: 1 - veiling glare",
+        ),
     ),
     "exposure": Layout("post/exposure.cl", resolve=uniforms("exposure", "float exposure")),
     "vignetting": Layout(
@@ -329,7 +344,7 @@ LAYOUTS: dict[str, Layout] = {
             "noise",
             "float shot_variance read_variance",
             "uint noise_seed",
-            note="at value 1, and at every value",
+            note="variances: of shot noise at value 1, of read noise at every value",
         ),
     ),
     "saturation": Layout("post/saturation.cl", resolve=uniforms("saturation", "float saturation")),
@@ -349,7 +364,7 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "quantise": Layout("post/quantise.cl", resolve=uniforms("quantise_steps", "float quantise_steps")),
 }
-"""declaration of each effect, and of the parts that several share"""
+"""declaration of each feature option, output and sensor effect, and of the parts that several share"""
 
 
 def extension_layout(extension: Extension) -> Layout:

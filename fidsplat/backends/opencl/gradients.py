@@ -62,8 +62,8 @@ class OpenCLDifferentiable(DifferentiableImages):
 
 
 class OpenCLGradients(GradientPipeline):
-    """Compiled stages with their gradients. Frames of a training run differ only in numeric arguments: their
-    command lists are replayed, also of the backward pass while its buffers are the same."""
+    """Compiled stages with their gradients. Frames of a training run differ only in numeric arguments, so
+    their command lists are replayed. The backward pass is replayed only with the same buffers."""
 
     def __init__(self, pipeline: OpenCLPipeline) -> None:
         self._pipeline, self.features = pipeline, pipeline.features
@@ -241,7 +241,7 @@ class TileGradients:
         """Submit an optimiser step (kernels/opencl/project_step.cl), compiled by
         `OpenCLGradients.compile_step`.
 
-        arguments: those that the frame does not have. with_camera: whether to return a function that waits
+        arguments: values that the frame does not define. with_camera: whether to return a function that waits
         for the gradient (10,) with respect to the camera: pose and intrinsics.
         """
         with self._latest_frame():

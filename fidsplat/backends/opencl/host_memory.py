@@ -16,7 +16,7 @@ import numpy as np
 import pyopencl as cl
 
 _MINIMUM = 1 << 18
-"""minimum bytes of locked memory: smaller images are copied as fast to ordinary memory"""
+"""minimum bytes of locked memory: smaller images are copied to ordinary memory at the same speed"""
 _MAXIMUM = 1 << 30
 """maximum bytes that are locked at once; further images use ordinary memory"""
 

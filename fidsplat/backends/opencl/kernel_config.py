@@ -17,13 +17,16 @@ class KernelConfig:
     binning: str
     """tile-binning strategy (tiling.py): `sort_first`, `bin_first` or `bin_local`"""
     lanes: int
+    """SIMD width of the vectors of floats; 1: scalars"""
     tile_width: int
     tile_height: int
+    """size of a tile [samples]"""
     sort_blocks: int
     """number of blocks into which the counting sorts divide their input (`sort_first`)"""
     radix_bits: int
     """bits per pass of the depth sort (`sort_first`)"""
     scan_items: int
+    """work-group size of prefix sums and of `bin_local`"""
     fast_fma: bool
     k_buffer_size: int
     """fragments of a pixel that the k-buffer sorts by depth at once; at most 254, or 31 in `group`"""
@@ -33,7 +36,7 @@ class KernelConfig:
     """splats of a tile whose fragments are stored for the backward pass (`lanes`), 2 KiB each; other
     fragments are computed twice"""
     splats_per_item: int = 1
-    """splats that a work-item of the project stage sets up, vectorised if more than 1 (`lanes`)"""
+    """splats that a work-item of the project stage projects, vectorised if more than 1 (`lanes`)"""
     culls_first: bool = False
     """whether splats outside the frustum are culled before projection (part/unculled_splats.cl)"""
     dialect: str = ""
@@ -84,7 +87,7 @@ def config_for(features: FeatureSet, config: KernelConfig) -> KernelConfig:
         # float64 kernels are not vectorised
         config = replace(config, schedule="group", lanes=1, tile_width=16, tile_height=16, k_buffer_size=8)
     if config.schedule == "group" or "camera_pinhole" not in features.effects:
-        # the set-up of lenses has loops and branches that compilers do not vectorise
+        # the projection through lenses has loops and branches that compilers do not vectorise
         config = replace(config, splats_per_item=1)
     if not {"compose_pixel", "compose_coplanar_pixel"}.isdisjoint(features.effects):
         # the k-buffer needs the registers of a second pixel

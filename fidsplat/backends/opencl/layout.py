@@ -27,7 +27,8 @@ VIEW = Record(
 )
 """Uniforms of the projection: one record for each view, then one for each view and moving group."""
 
-# intersection of a ray with the splat's plane: (u, v) = (n_u, n_v) / D, both affine in the sample (splat.cl)
+# intersection of a ray with the splat's plane: (u, v) = (n_u, n_v) / D; n_u, n_v and D are affine in the
+# sample position (x, y) relative to the anchor (splat.cl)
 SPLAT = Record(
     "Splat",
     (
@@ -37,7 +38,7 @@ SPLAT = Record(
         member("wide d_near", "D at depth `near`: a fragment is in front of the near plane if D <= d_near"),
         member("wide log_opacity"),
         member("wide r g b"),
-        member("float ax ay", "anchor pixel, a whole number"),
+        member("float ax ay", "anchor: pixel, an integer, that is the origin of x and y"),
         member("short y0 y1", "rows [y0, y1) that the splat can touch"),
         member("short x0 x1", "columns [x0, x1)"),
     ),
@@ -49,7 +50,7 @@ BOUNDS = Record(
     (
         member("float ex ey", "centre [samples]"),
         member("float hx hy", "half extents of the axis-aligned box"),
-        member("float slope", "chord of row Y, relative to the centre:"),
+        member("float slope", "columns of the ellipse in row Y, relative to the centre:"),
         member("float half_width", "slope * Y +- half_width * sqrt(1 - Y^2 / hy^2)"),
         member("float inverse_hy2", "0 makes it a box"),
         member("float tip", "height at which the ellipse is widest to the right"),
@@ -59,7 +60,7 @@ BOUNDS = Record(
 RECORD_GRADIENT = Record(
     "RecordGradient",
     (
-        member("float nu0 nux nuy", "gradients with respect to n_u times 1, x, y, summed over a tile"),
+        member("float nu0 nux nuy", "sums over a tile of the gradient with respect to n_u, times 1, x, y"),
         member("float nv0 nvx nvy"),
         member("float d0 dx dy"),
         member("float log_opacity"),
@@ -101,7 +102,7 @@ _RESERVED = args(
 )
 
 _BLENDED = args(
-    "wide log_cut ceiling stop filter",
+    "wide log_cut ceiling stop filter  // ceiling: maximum alpha; stop: transmittance of early termination",
     *("float log_ceiling", "float background_r background_g background_b"),
     *("int stride  // of the padded image", "uint channel_stride", "in float grad_rgb  // (h, w, 3)"),
 )
@@ -122,15 +123,18 @@ _LOSS_SIZE = args(
 )
 _MASK = args("int masked", "in uchar mask  // (rows, pixels), where `masked`")
 _ALIGNED = args(
-    *("int width height channels", "uint min_bin  // the lowest bin of textured pixels"),
-    *(_EXPOSURE, "in uchar bins", "in float image rgb"),
+    *("int width height channels", "uint min_bin  // lowest histogram bin that is used"),
+    *(_EXPOSURE, "in uchar bins  // histogram bins of gradient magnitudes", "in float image rgb"),
 )
 _IMAGES = args("out float images")
 _SURFACE = args(
     _IMAGE_SIZE,
     "float inverse_x inverse_y middle_x middle_y  // 1 / focal lengths, and the principal point [px]",
 )
-_RENDERED_SH = args("uint count rendered_terms stored_terms", "int as_rgb")
+_RENDERED_SH = args(
+    *("uint count", "uint rendered_terms stored_terms  // SH coefficients of a splat and channel"),
+    "int as_rgb  // whether to write RGB colours, at degree 0",
+)
 
 _ROTATION = "float " + " ".join(f"rotation_{row}{column}" for row in range(3) for column in range(3))
 
@@ -205,7 +209,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_gradients": args(
         *(
             _RESERVED,
-            "out uint big_rows  // (rows of tiles, big splats): tiles in the rows above - first column",
+            "out uint big_rows  // (rows of tiles, big splats): tiles in higher rows, minus first column",
         )
     ),
     "blend_backward": args(
@@ -238,7 +242,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("uint count", "in View view", "in Splat splats", "in uint keys", _TILES),
         *("in uint gradient_offsets", "in float record_gradients"),
         "int add_statistics update sparse  // sparse: update only splats that contribute",
-        "uint stored_terms  // SH coefficients of a splat",
+        "uint stored_terms  // SH coefficients of a splat and channel",
         "float beta1 beta2 one_minus_beta1 one_minus_beta2 sqrt_correction2 epsilon",
         "float lr_means lr_scales lr_quats lr_logits  // learning rates",
         "float lr_sh lr_rest  // of degree 0; of higher degrees",
@@ -267,13 +271,13 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "align_texture": args(
         *("int width height channels row", _MASK, "in float image", "out uchar bins"),
-        "out uint counts  // (stages, BINS); row: the stage",
+        "out uint counts  // (pyramid levels, BINS); row: the level",
     ),
     "align_errors": args(_ALIGNED, "out uint counts  // (BINS)"),
     "align_sums": args(
         _ALIGNED,
         "in uint counts",
-        "int block_size huber has_moved axis lens  // has_moved: whether there is a moved render",
+        "int block_size huber has_moved axis lens  // has_moved: whether `moved` is a MovedFrame",
         "float focal_x focal_y center_x center_y noise_factor noise_before step",
         "in float depth rays moved",
         "out float result  // (work-groups, SUMS + 1)",
@@ -306,7 +310,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "surface_normals": args(
         _SURFACE,
         _MASK,
-        "float normal_share  // of each pixel",
+        "float normal_share  // weight of the loss of each pixel",
         "in float depth normal alpha",
         "out float grad_normal",
         "out float differences  // (rows, columns, 2, 3)",
@@ -318,7 +322,10 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float activated_quats activated_scales activated_thickness activated_opacities",
     ),
     "activate_sh": args(_RENDERED_SH, "in float sh", "out float activated_sh"),
-    "gather_rows": args("uint count row copied", "in uint rows", "in float source", "out float gathered"),
+    "gather_rows": args(
+        *("uint count", "uint row copied  // floats per row, number of copied rows; later rows are zero"),
+        *("in uint rows", "in float source", "out float gathered"),
+    ),
     "count_visible": args(
         "uint count",
         _ROTATION,
@@ -329,7 +336,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float visible_counts",
     ),
     "add_position_noise": args(
-        "uint count axes seed_low seed_high iteration purpose",
+        *("uint count axes seed_low seed_high iteration", "uint purpose  // random stream"),
         "float size  // factor of the steps [1/m]",
         "float slope threshold  // of the opacity above which splats do not move",
         "in float quats log_scales logits",

@@ -26,12 +26,12 @@ from fidsplat.util.errors import DeviceError, bytes_words
 DEFAULT_CHUNK = 1 << 20
 """splats of a chunk; a power of two, so that the chunks of every array start at aligned addresses"""
 _MAX_CHUNK = 1 << 23
-"""maximum splats of a chunk that needs little of the memory: larger chunks have fewer launches"""
+"""maximum splats of a chunk if memory is ample: larger chunks need fewer launches"""
 _MIN_CHUNK = 1 << 10
 KEY_BYTES, WINDOW_BYTES, SORT_BYTES = 4, 8, 16
 """bytes per splat of sort keys, of tile windows, and of keys and indices during the sort"""
 MIN_BIG = 1 << 12
-"""initial capacity for big splats"""
+"""initial capacity for big splats, which touch more tiles than a window"""
 TILE_TABLES = 5
 """words per tile of bin_first and bin_local: counters, starts, cursors, order and termination depths"""
 UNIFORM_BYTES = 1 << 14
@@ -54,7 +54,7 @@ class MemoryPlan:
     capacity: int
     """maximum visible splats of one band, if the cloud is projected in chunks"""
     total: int
-    """total bytes including the cloud; exceeded only with more than `MIN_BIG` big splats"""
+    """total bytes including the cloud; exceeded only by frames with more than `MIN_BIG` big splats"""
 
 
 class Part(NamedTuple):

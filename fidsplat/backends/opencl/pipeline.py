@@ -30,7 +30,7 @@ from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import DeviceError
 
 MIN_VECTORISED = 1 << 14
-"""minimum splats of clouds whose set-up is vectorised on CPUs"""
+"""minimum splats of clouds whose projection is vectorised on CPUs"""
 MIN_CULLED = 3 << 18
 """minimum splats of clouds that are sorted, and culled before projection; smaller ones gain nothing"""
 _MAX_FRAMES = 32
@@ -47,7 +47,7 @@ class CachedFrame:
     buffer_key: tuple[Any, ...]
     """key of frames with equal buffer sizes"""
     raster: RayRaster | None
-    """raster of the lens, referenced to keep its rays on the device"""
+    """ray table of the lens, referenced to keep its buffers on the device"""
     recorded: RecordedFrame | None = None
 
 
@@ -258,7 +258,7 @@ class OpenCLPipeline(Pipeline):
         return self._other(self.features, replace(self.config, binning=binning, culls_first=False))
 
     def _is_too_small_to_vectorise(self, resident: Resident) -> bool:
-        """Whether compiling the vectorised set-up would take longer than it saves, for a small cloud."""
+        """Whether compiling the vectorised projection would take longer than it saves, for a small cloud."""
         return self.config.splats_per_item > 1 and resident.count < MIN_VECTORISED
 
     @cached_property

@@ -104,7 +104,7 @@ class OpenCLProbe(Probe):
         return evaluate(self._workspace, NOT_A_NUMBER, (x,), (np.int32,) * 4)
 
     def arithmetic(
-        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+        self, exponents: np.ndarray, fractions: np.ndarray, dividends: np.ndarray, divisors: np.ndarray
     ) -> dict[str, np.ndarray]:
         workspace, n = self._workspace, len(exponents)
         kernels = compile_test_kernels(workspace, "check/arithmetic.cl", effects=("slot/arithmetic_fast.cl",))
@@ -116,14 +116,14 @@ class OpenCLProbe(Probe):
             cl.enqueue_copy(workspace.queue, made, out)
             return made
 
-        single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
+        single = [array.astype(np.float32) for array in (exponents, fractions, dividends, divisors)]
         names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log", "reciprocal")
         made, count, items = np.empty((8, n), np.float32), np.uint32(n), n // workspace.config.lanes
         try:
             parts = run("arithmetic_float", items, made, count, *single)
             results: dict[str, np.ndarray] = dict(zip(names, parts, strict=True))
             if workspace.info.float64:
-                parts = run("arithmetic_real", n, np.empty((3, n)), count, above, below)
+                parts = run("arithmetic_real", n, np.empty((3, n)), count, dividends, divisors)
                 results |= dict(zip(("division64", "sqrt64", "log64"), parts, strict=True))
             smallest = np.array([np.finfo(np.float32).tiny, 0.5], np.float32)
             results["denormal"] = run("arithmetic_denormal", 1, np.empty(2, np.float32), smallest)

@@ -127,7 +127,7 @@ class BackgroundCompiler:
         self._threads: dict[Hashable, threading.Thread] = {}
 
     def begin(self, key: Hashable, compile: Callable[[], object]) -> None:
-        """Start to compile. An error is raised when the program is needed, as it is then compiled again."""
+        """Start to compile. Errors are raised only when the program is needed and compiled again."""
         if key in self._threads:
             return
         # not in the thread: `build` changes the filters of all threads

@@ -34,7 +34,7 @@ class Resident(ResidentData):
     buffer_key: object = None
     """key of clouds whose frames may share buffers"""
     coherent = False
-    """whether splats with neighbouring indices are close to each other, as in stores"""
+    """whether splats with neighbouring indices are close to each other, as in chunked scenes on disk"""
     sortable = False
     """whether `sorted_array` is available"""
 
@@ -70,8 +70,8 @@ class Resident(ResidentData):
 
 class UploadedCloud(Resident):
     """A SplatCloud on the device. A CPU reads the host's arrays. Other devices have copies; labels and
-    colours are copied on first use. A cloud of more than half of the memory budget is `streamed`. Sorted
-    arrays are replaced by arrays in cloud order when a frame needs that order, and not sorted again."""
+    colours are copied on first use. A cloud of more than half of the memory budget is `streamed`. When
+    a frame needs cloud order, arrays in that order replace the sorted arrays for good."""
 
     def __init__(self, workspace: Workspace, cloud: SplatCloud) -> None:
         super().__init__(len(cloud))

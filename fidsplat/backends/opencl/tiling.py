@@ -4,7 +4,7 @@
 counting sorts over a few contiguous blocks: long sequential loops, no atomics. `bin_first` (GPU): the
 projection counts the splats of each tile, (splat, tile) pairs are written in any order, and each tile's list
 is sorted in local memory. `bin_local`: like `bin_first`, with counters in local memory, for many small views
-and for stores, where atomics of neighbouring splats on one tile's counter would serialise.
+and for chunked scenes on disk, where atomics of neighbouring splats on one tile's counter would serialise.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ _GROUP_SPLATS = 4096
 """splats per work-group of the strategy `bin_local`"""
 _ITEMS = 256
 """work-group size: BIN_ITEMS and SORT_ITEMS of the kernels"""
-_START_TILES, _START_SHARES = 512, 32
-"""tiles per work-group of the kernel `tile_starts`, and maximum number of work-groups, each of which reads
-all list lengths"""
+_START_TILES, _MAX_START_GROUPS = 512, 32
+"""tiles per work-group of the kernel `tile_starts`, and maximum number of work-groups: each reads all list
+lengths"""
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 
 
@@ -274,7 +274,7 @@ def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
     frame.scratch("starts", 4 * (frame.tiles + 1))
     frame.scratch("cursors", 4 * frame.tiles)
     frame.scratch("tile_order", 4 * frame.tiles)
-    groups = 1 + min(-(-frame.tiles // _START_TILES), _START_SHARES)
+    groups = 1 + min(-(-frame.tiles // _START_TILES), _MAX_START_GROUPS)
     arguments = {"tiles": frame.tiles, "capacity": capacity}
     return frame.launch("bin", "tile_starts", (groups * items,), (items,), **arguments)
 

@@ -390,7 +390,7 @@ class OpenCLTraining:
 
     def add_noise(self, size: float, slope: float, threshold: float, words: Sequence[int]) -> None:
         """Add MCMC noise to the means: steps size * sigmoid(slope (threshold - opacity)) * covariance *
-        standard normal sample, in the plane of a disk. words: seed (low, high), iteration, purpose."""
+        standard normal sample, in the plane of a disk. words: seed (low, high), iteration, random stream."""
         names = ("seed_low", "seed_high", "iteration", "purpose")
         args = {"size": size, "slope": slope, "threshold": threshold, **dict(zip(names, words, strict=True))}
         self._launch("add_position_noise", self._count, args)

@@ -1,4 +1,4 @@
-"""Per-splat set-up of the reference renderer: culling, camera transform, forms, colours, depth order."""
+"""Per-splat projection of the reference renderer: culling, camera transform, forms, colours, depth order."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class Rendered:
         return self
 
     def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device by stage, in their order."""
+        """Milliseconds on the device by stage, in the order of execution."""
         return self.profile() if self.profile else self.launcher.timings()
 
 

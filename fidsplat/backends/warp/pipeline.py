@@ -223,7 +223,7 @@ class WarpPipeline(Pipeline):
         cached.token = token
 
     def _token(self, cached: _CachedFrame, view: View, reserved: int) -> tuple[Any, ...]:
-        """Key of the launches of a frame: all their arguments except the numbers of the views."""
+        """Key of the launches of a frame: all their arguments except the numeric uniforms."""
         workspace, labels = self.workspace, tuple(label for label, _ in view.groups)
         budgets = workspace.memory_budget, workspace.pair_budget, reserved
         states = workspace.pool.generation, cached.inputs.generation

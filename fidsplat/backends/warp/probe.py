@@ -28,14 +28,14 @@ class WarpProbe(Probe):
         return list(found)
 
     def arithmetic(
-        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+        self, exponents: np.ndarray, fractions: np.ndarray, dividends: np.ndarray, divisors: np.ndarray
     ) -> dict[str, np.ndarray]:
         workspace, n = self._workspace, len(exponents)
-        single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
+        single = [array.astype(np.float32) for array in (exponents, fractions, dividends, divisors)]
         (found,) = run(workspace, "arithmetic", n, single, [np.zeros((8, n), np.float32)])
         names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log", "reciprocal")
         results: dict[str, np.ndarray] = dict(zip(names, found, strict=True))
-        (found,) = run(workspace, "arithmetic_wide", n, [above, below], [np.zeros((3, n))])
+        (found,) = run(workspace, "arithmetic_wide", n, [dividends, divisors], [np.zeros((3, n))])
         results |= dict(zip(("division64", "sqrt64", "log64"), found, strict=True))
         smallest = np.array([np.finfo(np.float32).tiny, 0.5], np.float32)
         (results["denormal"],) = run(workspace, "denormal", 1, [smallest], [np.zeros(2, np.float32)])

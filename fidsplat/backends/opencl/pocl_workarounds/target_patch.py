@@ -1,8 +1,8 @@
 """Correction of PoCL 3.0's target processor in memory: the last resort; FIDSPLAT_NO_POCL_PATCH forbids it.
 
-PoCL 3.0 gets the processor's name from LLVM 14. For a newer processor (AMD Zen 5) the name is "generic", with
-which every build fails ("unknown target CPU", pocl issues #512, #1049), and Zen 4 "znver3" (without AVX-512),
-with which builds crash. PoCL 3.1 reads POCL_LLVM_CPU_NAME; 3.0 has no such setting. The name is replaced in
+PoCL 3.0 gets the processor's name from LLVM 14. For a newer processor (AMD Zen 5) the name is "generic", and
+every build fails ("unknown target CPU", pocl issues #512, #1049). For Zen 4 it is "znver3" (without AVX-512),
+and builds crash. PoCL 3.1 reads POCL_LLVM_CPU_NAME; 3.0 has no such setting. The name is replaced in
 the field `llvm_cpu` of PoCL's device record by the name for which PoCL built its kernel library.
 """
 
