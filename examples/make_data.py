@@ -45,8 +45,8 @@ def panel(middle, along, across, color, step: float = 0.08) -> fs.SplatCloud:
     """Rectangle of overlapping disks. along, across: half sides, perpendicular vectors in metres."""
     u, v = np.array(along, float), np.array(across, float)
     counts = [max(2, round(2 * np.linalg.norm(side) / step)) for side in (u, v)]
-    shares = [(np.arange(n) + 0.5) / n * 2 - 1 for n in counts]
-    a, b = (grid.ravel() for grid in np.meshgrid(*shares))
+    fractions = [(np.arange(n) + 0.5) / n * 2 - 1 for n in counts]
+    a, b = (grid.ravel() for grid in np.meshgrid(*fractions))
     axes = np.stack([u / np.linalg.norm(u), v / np.linalg.norm(v)])
     frame = np.column_stack([*axes, np.cross(*axes)])
     quat = np.tile(matrix_to_quaternion(frame), (len(a), 1))

@@ -1,4 +1,4 @@
-"""Measurement of the errors of a store's levels of detail: frames with merged cells and exact frames."""
+"""Errors of levels of detail of a store (chunks on disk): frames with merged cells and exact frames."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def measure_detail(
     settings = settings_with(DetailSettings, settings, changes)
     if store.poses is not None:
         raise InputError(
-            f"store must be a store without instances, got {store.path}; pass {store.header.store}, which it "
-            "instances"
+            f"store must be a store without instances, got {store.path}; pass the store of its splats, "
+            f"{store.header.store}"
         )
     if not len(store) or not store.nodes["level"].any():
         raise InputError(

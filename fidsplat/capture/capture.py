@@ -1,4 +1,4 @@
-"""Capture: all settings of a frame except the splats."""
+"""Capture: a render request, with all settings of a frame except the splats."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _DEFAULTS = {"motion": _MOTION, "shutter": _SHUTTER, "sensor": _SENSOR}
 
 @dataclass(frozen=True, eq=False)
 class Capture(PickledByFields):
-    """Camera, outputs, quality, background, motion, shutter, sensor and fog of a frame.
+    """Render request: camera, outputs, quality, background, motion, shutter, sensor and fog of a frame.
 
     Raises InputError for a value of the wrong type; output names are validated when the frame is rendered.
     """

@@ -167,7 +167,7 @@ class Lidar:
     """metres at which a surface of 10 % reflectivity, facing the sensor, is detected with a probability of
     90 %. The signal is proportional to reflectivity, cosine of incidence and inverse square of the range"""
     dropouts: float = 0.0
-    """share of returns that are dropped at random, 0 to 1"""
+    """fraction of returns that are dropped at random, 0 to 1"""
     reflectivity: dict[int, float] = field(default_factory=dict)
     """label -> reflectivity of its splats, 0 or more; by default the luminance of a splat's colour in linear
     light"""
@@ -188,10 +188,10 @@ class Lidar:
             ("far", self.near, 1e9, "metres, from near to 1e9"),
             ("divergence", 1e-9, 0.5, "radians, above 0"),
             ("separation", 0.0, 1e9, "metres, at least 0"),
-            ("opacity", 1e-3, 0.999, "a share from 0.001 to 0.999"),
+            ("opacity", 1e-3, 0.999, "a fraction from 0.001 to 0.999"),
             ("noise", 0.0, 1e9, "metres, at least 0"),
             ("noise_growth", 0.0, 1.0, "a number from 0 to 1"),
-            ("dropouts", 0.0, 1.0, "a share from 0 to 1"),
+            ("dropouts", 0.0, 1.0, "a fraction from 0 to 1"),
         ):
             number(f"lidar {name}", getattr(self, name), requirement, low, high)
         if not isinstance(self.detection_range, int | float) or not self.detection_range > 0:

@@ -59,7 +59,7 @@ class Sensor:
     decode: str = "linear"
     """encoding of the frame's colours: "linear" light, or "srgb" display colours, which are decoded"""
     veiling_glare: float = 0.0
-    """share of the light, 0 to below 1, that the lens scatters evenly over the image"""
+    """fraction of the light, 0 to below 1, that the lens scatters evenly over the image"""
     glare_light: tuple[float, ...] = ()
     """RGB of the scattered light; empty: the mean of the image, measured in a small frame"""
     auto_exposure: float = 0.0

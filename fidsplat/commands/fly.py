@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 DEFAULT_FOLDER = "fidsplat-flight"
 CAMERA = "camera"
-"""name of the camera's frame and topics in a log"""
+"""name of the frame and topics of the camera in a ROS 2 log"""
 
 
 @dataclass

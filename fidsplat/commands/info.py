@@ -57,7 +57,7 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
         return rows
 
     scales, opacities = (" / ".join(f"{v:.3g}" for v in facts[key]) for key in ("scales", "opacities"))
-    shares = " / ".join(map(str, PERCENTILES))
+    percents = " / ".join(map(str, PERCENTILES))
     low, high = facts["middle_bounds"]
     place = f"position = {point(facts['marker_position'])}, quaternion = {point(facts['marker_quaternion'])}"
     place += ": a tenth of the scene, in front of its middle"
@@ -66,7 +66,7 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
         ("bounds", " to ".join(map(point, facts["bounds"])) + " m"),
         ("middle 99 %", f"{point(low)} to {point(high)} m"),
         ("up", f"{facts['up']}? ({facts['up_because']}), {facts['height']:.3g} m high"),
-        ("longer scale", f"{scales} m at {shares} %; {facts['aspect']:.2g} times the shorter (median)"),
-        ("opacity", f"{opacities} at {shares} %"),
+        ("longer scale", f"{scales} m at {percents} %; {facts['aspect']:.2g} times the shorter (median)"),
+        ("opacity", f"{opacities} at {percents} %"),
         ("a first marker", f"size = {facts['marker_size']:g}, {place}"),
     ]

@@ -69,8 +69,10 @@ class PlanTags:
             f"{without:.3g} cm without them, {with_tags:.3g} cm with them",
         ]
         if facts["bound"] is not None:
-            share = 100 * facts["objective"] / max(facts["bound"], 1e-9)
-            lines.append(f"information {facts['objective']:.1f} nats, at least {share:.0f} % of the optimum")
+            fraction = 100 * facts["objective"] / max(facts["bound"], 1e-9)
+            lines.append(
+                f"information {facts['objective']:.1f} nats, at least {fraction:.0f} % of the optimum"
+            )
         if self.settings.target is None and len(rows) < self.settings.count:
             lines.append(
                 f"fewer than {self.settings.count}: other candidates overlap these, or add no information"

@@ -160,7 +160,7 @@ class Render(RenderInput):
             with delayed_progress() as progress:
                 step = 1 if self.every is None else self.every
                 return renderer.render_subsampled(
-                    step, scene, None, self.outputs, quality, lambda share: progress("rendering", share)
+                    step, scene, None, self.outputs, quality, lambda fraction: progress("rendering", fraction)
                 )
         with console(self.json).status("rendering"):
             return renderer.render(scene, outputs=self.outputs, quality=quality)

@@ -162,9 +162,9 @@ def _bar(trainer: Trainer) -> Iterator:
         mean = {"loss": 0.0, "psnr": 0.0}
 
         def show(step: Step) -> None:
-            share = max(0.02, 1 / (step.iteration - first))  # weight of this step in the running mean
-            mean["loss"] += share * (step.loss - mean["loss"])
-            mean["psnr"] += share * (min(step.psnr, 100.0) - mean["psnr"])
+            weight = max(0.02, 1 / (step.iteration - first))  # of this step in the running mean
+            mean["loss"] += weight * (step.loss - mean["loss"])
+            mean["psnr"] += weight * (min(step.psnr, 100.0) - mean["psnr"])
             rate = (step.iteration - first) / (time.perf_counter() - begun)
             words = f"loss {mean['loss']:.4f}  {mean['psnr']:.1f} dB  {step.splats:,} splats  {rate:.1f} it/s"
             bars.update(task, completed=step.iteration, now=words)

@@ -34,7 +34,7 @@ TARGET = 0.1
 """maximum error of the projection in pixels for `needed`"""
 TILT = 45.0
 """largest tilt of the board in degrees"""
-SHARE = 0.45, 0.9
+WIDTHS = 0.45, 0.9
 """range of the board's width relative to the image's width"""
 
 
@@ -84,15 +84,15 @@ class CalibrationSettings:
 
     def camera(self, rng: np.random.Generator) -> Camera:
         """The camera at a random pose from which the board is visible."""
-        share, tilt, around, roll = rng.uniform((*SHARE[:1], 0, 0, -0.5), (*SHARE[1:], 1, 2 * math.pi, 0.5))
-        distance = self.made.size * self.truth.fx / (share * self.truth.width)
+        width, tilt, around, roll = rng.uniform((*WIDTHS[:1], 0, 0, -0.5), (*WIDTHS[1:], 1, 2 * math.pi, 0.5))
+        distance = self.made.size * self.truth.fx / (width * self.truth.width)
         tilt = math.radians(TILT) * math.sqrt(tilt)
         back = np.array(
             [math.sin(tilt) * math.cos(around), math.sin(tilt) * math.sin(around), -math.cos(tilt)]
         )
         # the board reaches the corners of the image, where distortion is largest; half of it may be outside
         edges = np.array([1.0, self.truth.height / self.truth.width])
-        aside = rng.uniform(-0.5, 0.5, 2) * edges / share * self.made.size
+        aside = rng.uniform(-0.5, 0.5, 2) * edges / width * self.made.size
         target = np.array([*aside, 0.0])
         looking = Camera.look_at(
             *self.size, 1.0, target + distance * back, target, (math.sin(roll), -math.cos(roll), 0.0)

@@ -37,7 +37,7 @@ from fidsplat.vision.readback import Reading, read_back
 from fidsplat.worlds.yard import OUTPUTS, demo_scene, demo_views, sunlit
 
 COMPLETE = 0.98
-"""visible share above which a marker counts as completely visible: its quiet zone has soft edges"""
+"""visible fraction above which a marker counts as completely visible: its quiet zone has soft edges"""
 MAX_POSITION_ERROR = 0.01
 """maximum position error relative to the distance"""
 _FRAMES = 3

@@ -13,7 +13,7 @@ from fidsplat.experiments.plane import plane_image
 from fidsplat.scenes import PlacedMarker
 
 _MIN_COVERAGE = 1 / 512
-"""minimum covered share of a pixel that belongs to a tag"""
+"""minimum covered fraction of a pixel that belongs to a tag"""
 
 
 def tag_depth_image(tags: Iterable[PlacedMarker], camera: Camera, behind: np.ndarray) -> ExternalDepth:

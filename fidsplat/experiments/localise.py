@@ -368,7 +368,7 @@ def record(
 
 
 def recorded(path: str | os.PathLike[str], truth: Run) -> tuple[Run, list[list[Detection]], list[np.ndarray]]:
-    """Read a log: wheels and gyroscope with the true poses, detected tags, and points (n, 3).
+    """Read a ROS 2 log: wheels and gyroscope with the true poses, detected tags, and points (n, 3).
 
     Raises:
         InputError: the file is not a log.

@@ -68,7 +68,7 @@ def drive_sweep(
 
     @cache
     def log_of(rendering: Variant, name: str) -> Path:
-        """Log of the measurements that variants share; an interrupted sweep reads existing logs."""
+        """ROS 2 log of the measurements that all variants use; an interrupted sweep reads existing logs."""
         path, run = out / f"{_stem(name)}.mcap", run_at(rendering.speed)
         source = digest_of((drive, rendering, facts["code"], facts["device"]))
         if not check_log(path, overwrite, source):
@@ -90,7 +90,7 @@ def drive_sweep(
 
 
 def _estimate(file: Path, drive: Drive, variant: Variant, poses: Run, log: Path) -> dict[str, Any]:
-    """Estimate a variant's trajectory from a log and write it; returns its errors."""
+    """Estimate the trajectory of a variant from a ROS 2 log and write it; returns its errors."""
     camera = replace(drive.camera, lens=variant.lens)
     run, detections, scans = recorded(log, poses)
     if variant.ideal:

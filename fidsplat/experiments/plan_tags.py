@@ -51,10 +51,10 @@ STEEP = math.sqrt(0.5)
 """maximum cosine of the angle between the normal of a wall and the vertical"""
 FLAT = 0.1
 """maximum roughness of a candidate, relative to the size of the tag"""
-SHARE = 0.9
-"""minimum share of the tag's area that is in the plane"""
+MIN_INLIERS = 0.9
+"""minimum fraction of the tag's area that is in the plane"""
 _DEPTH = 0.02, 0.01
-"""tolerance of the occlusion test in metres and as a share of the distance: nearer depths occlude a tag"""
+"""tolerance of the occlusion test in metres and as a fraction of the distance: nearer depths occlude a tag"""
 
 
 OBJECTIVES: dict[str, Objective] = {"information": gain, "error": error_gain}
@@ -316,13 +316,13 @@ def surface_candidates(
                 surface = surface_of(depth, camera, (x, y), radius)
             except InputError:
                 continue
-            if surface.inlier_share >= SHARE and surface.roughness <= FLAT * tag.size:
+            if surface.inlier_share >= MIN_INLIERS and surface.roughness <= FLAT * tag.size:
                 candidates.append((surface, surface.pose([up, -view[1, :3], view[2, :3]])))
     return candidates
 
 
 def suppress_nearby(candidates: Sequence[tuple[Surface, np.ndarray]], tag: Marker) -> np.ndarray:
-    """Poses (n, 4, 4) of candidates; of nearby ones only that with the largest inlier share remains."""
+    """Poses (n, 4, 4) of candidates; of nearby ones only that with the largest inlier fraction remains."""
     order = sorted(
         range(len(candidates)), key=lambda k: (-candidates[k][0].inlier_share, candidates[k][0].roughness)
     )

@@ -3,7 +3,7 @@
 Analytic antialiasing, as in font rasterisers. A texture of square modules is constant except for jumps at
 module edges, which are straight segments in a pinhole image. By Green's theorem the mean of a pixel is a sum
 over segments that cross it or pass on its left: segments are cut at pixel borders, and each part contributes
-its jump times its height times the share of the pixel on its right. The result is exact up to float64
+its jump times its height times the fraction of the pixel on its right. The result is exact up to float64
 rounding.
 """
 
@@ -85,7 +85,7 @@ def _project(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def _accumulate(begin: np.ndarray, end: np.ndarray, jump: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Image (h, w): for each pixel the sum over segments of jump times the share of the pixel on their right.
+    """Image (h, w): sum over segments of jump times the fraction of the pixel on their right, per pixel.
 
     begin, end: (n, 2) pixels. jump: (n,).
     """
@@ -99,12 +99,13 @@ def _accumulate(begin: np.ndarray, end: np.ndarray, jump: np.ndarray, shape: tup
     keep = (row >= 0) & (row < h) & (column < w) & (rise != 0)
     row, column, rise, x = row[keep].astype(int), column[keep], rise[keep], middle[keep, 0]
     # segments left of the image count completely from the first column on
-    share = np.where(column >= 0, column + 1 - x, 1.0)
+    fraction = np.where(column >= 0, column + 1 - x, 1.0)
     column = np.maximum(column, 0).astype(int)
     flat = row * (w + 1) + column
     size = h * (w + 1)
     contributions = (
-        np.bincount(flat, rise * share, size) + np.bincount(flat + 1, rise * (1 - share), size + 1)[:size]
+        np.bincount(flat, rise * fraction, size)
+        + np.bincount(flat + 1, rise * (1 - fraction), size + 1)[:size]
     )
     return np.cumsum(contributions.reshape(h, w + 1), axis=1)[:, :w]
 

@@ -30,10 +30,10 @@ class FolderSettings:
 
 @dataclass(frozen=True)
 class ShardSettings(FolderSettings):
-    """Share of a sweep that one machine measures."""
+    """Fraction of a sweep that one machine measures."""
 
     shard: str | None = None
-    """Share of the work to measure, as i/n; `fidsplat experiment merge` joins the shares."""
+    """Part of the work to measure, as i/n; `fidsplat experiment merge` joins the parts."""
     overwrite: bool = False
     """Replace existing results."""
 

@@ -218,12 +218,12 @@ RESAMPLES = 1000
 
 
 def wilson(hits: int, count: int) -> tuple[float, float]:
-    """Wilson score interval of a share (Wilson 1927); (0, 1) without measurements."""
+    """Wilson score interval of a fraction (Wilson 1927); (0, 1) without measurements."""
     if count == 0:
         return 0.0, 1.0
-    share, square = hits / count, NORMAL**2 / count
-    middle = (share + square / 2) / (1 + square)
-    half = NORMAL / (1 + square) * math.sqrt(share * (1 - share) / count + square / (4 * count))
+    fraction, square = hits / count, NORMAL**2 / count
+    middle = (fraction + square / 2) / (1 + square)
+    half = NORMAL / (1 + square) * math.sqrt(fraction * (1 - fraction) / count + square / (4 * count))
     # exact ends if there are no hits or only hits
     return 0.0 if hits == 0 else middle - half, 1.0 if hits == count else middle + half
 

@@ -19,7 +19,7 @@ from fidsplat.util.provenance import run_facts
 MAX_VIEWS = 4
 """maximum number of images of held-out views"""
 _POINTS = 200
-"""points per curve, each the mean of an equal share of the run"""
+"""points per curve, each the mean of an equal part of the run"""
 
 
 def write_training_page(
@@ -74,7 +74,7 @@ def side_by_side(view: TrainingView, score: ViewScore) -> np.ndarray:
 
 
 def _means(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres and means of equal shares of a curve, without infinite values."""
+    """Centres and means of equal parts of a curve, without infinite values."""
     parts = [part for part in np.array_split(np.arange(len(values)), _POINTS) if len(part)]
     finite = [values[part][np.isfinite(values[part])] for part in parts]
     means = [float(np.mean(part)) if len(part) else np.nan for part in finite]

@@ -263,9 +263,9 @@ def _quantised(values: np.ndarray) -> tuple[list[float], np.ndarray]:
     in one dimension."""
     ordered = np.sort(values.astype(np.float64), axis=None)
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
-    shares = np.linspace(0, len(ordered) - 1, 128).astype(int)
+    rows = np.linspace(0, len(ordered) - 1, 128).astype(int)
     # half of the initial entries at quantiles, half equidistant, so that rare large values have a small error
-    book = np.sort(np.concatenate([ordered[shares], np.linspace(ordered[0], ordered[-1], 128)]))
+    book = np.sort(np.concatenate([ordered[rows], np.linspace(ordered[0], ordered[-1], 128)]))
     for _ in range(_ROUNDS):
         ends = np.concatenate([[0], np.searchsorted(ordered, (book[1:] + book[:-1]) / 2), [len(ordered)]])
         counts = np.diff(ends)

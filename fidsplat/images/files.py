@@ -66,9 +66,9 @@ def read_on_background(path: str | os.PathLike[str], background: Sequence[float]
     rgba = read_rgba(path)
     if rgba[:, :, 3].min() == 255:
         return rgba[:, :, :3].copy()
-    share = rgba[:, :, 3:] / 255.0
-    over = np.clip(background, 0, 1) * 255 * (1 - share)
-    return np.rint(rgba[:, :, :3] * share + over).astype(np.uint8)
+    opacity = rgba[:, :, 3:] / 255.0
+    over = np.clip(background, 0, 1) * 255 * (1 - opacity)
+    return np.rint(rgba[:, :, :3] * opacity + over).astype(np.uint8)
 
 
 def is_video(path: str | os.PathLike[str]) -> bool:

@@ -19,6 +19,6 @@ def defocused(image: np.ndarray, radius: float) -> np.ndarray:
         return image
     half = math.ceil(radius)
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
-    # weights at the edge of the disk are the covered share of a pixel's width
+    # weights at the edge of the disk are the covered fraction of a pixel's width
     disk = np.clip(radius + 0.5 - np.hypot(x, y), 0, 1)
     return cv2.filter2D(image, -1, disk / disk.sum(), borderType=cv2.BORDER_REPLICATE)

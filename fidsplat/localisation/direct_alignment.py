@@ -48,11 +48,11 @@ COARSE = 2
 MIN_BLOCK, BLOCKS = 6, 15
 """independent blocks of the covariance: minimum side in pixels, and number along the shorter side"""
 MIN_INLIERS = 0.6
-"""share of matching blocks from which a pose counts as found"""
+"""fraction of matching blocks from which a pose counts as found"""
 MIN_CORRELATION, MIN_CONTRAST, MIN_PIXELS = 0.7, 0.02, 12
 """normalised correlation of a matching block; minimum contrast and textured pixels of a block that counts"""
 MIN_BLOCKS = 24
-"""minimum denominator of the share of matching blocks: twice the number of unknowns"""
+"""minimum denominator of the fraction of matching blocks: twice the number of unknowns"""
 MIN_IMAGE_NOISE = 0.005
 """minimum noise of an image, display values"""
 _QUARTILE = 1.1
@@ -87,7 +87,7 @@ class Alignment:
     """(6, 6) of a rotation vector [rad] and a translation [m] applied after `world_to_camera`; infinite if
     the image does not determine the pose"""
     inliers: float
-    """share of the textured blocks that match the render; 0 for a blank image"""
+    """fraction of the textured blocks that match the render; 0 for a blank image"""
     noise: float
     """standard deviation of the residuals of a pixel, display values"""
     gain: np.ndarray
@@ -108,8 +108,8 @@ def stages_of(camera: Camera, mask: np.ndarray | None = None) -> list[tuple[Alig
         side = max(MIN_BLOCK, min(width, height) // BLOCKS)
         hidden = None
         if ignored is not None:  # pixels whose blur or gradient contains an ignored pixel
-            shares = smoothed(resized(ignored, width, height)[:, :, None], max(blur, 0.7))
-            hidden = shares[:, :, 0] > 1e-3
+            fractions = smoothed(resized(ignored, width, height)[:, :, None], max(blur, 0.7))
+            hidden = fractions[:, :, 0] > 1e-3
         stage = AlignmentStage(camera.resampled(width, height), hidden, taps_of(blur), side)
         stages.append((stage, steps))
     return stages
@@ -269,10 +269,11 @@ def _last_steps(at: _State, stage: _Stage) -> tuple[Alignment, bool]:
 
 
 def _agreement(sums: AlignmentSums, noise: float) -> tuple[float, float]:
-    """Share of matching blocks, and their reduced chi-squared. A block matches if the normalised correlation
-    (NCC) of image and render is above MIN_CORRELATION; the share is of the blocks with contrast, or of
-    MIN_BLOCKS if these are fewer. The chi-squared is its third quartile relative to that of noise alone, at
-    least 1.
+    """Fraction of matching blocks, and their reduced chi-squared.
+
+    A block matches if the normalised correlation (NCC) of image and render is above MIN_CORRELATION. The
+    denominator is the number of blocks with contrast, at least MIN_BLOCKS. The chi-squared is its third
+    quartile relative to that of noise alone, at least 1.
 
     noise: standard deviation of the noise of the image, in units of the render.
     """

@@ -46,8 +46,8 @@ class Localisation:
     """(6, 6) covariance of a rotation vector [rad] and a translation [m] applied after `world_to_camera`, in
     camera axes, as the gradient `pose`; infinite if the image does not determine the pose"""
     inliers: float
-    """share of the textured blocks of the image that match the scene (normalised correlation above 0.7), 0 to
-    1"""
+    """fraction, 0 to 1, of the textured blocks of the image that match the scene (normalised correlation
+    above 0.7)"""
     noise: float
     """standard deviation of the residuals of a pixel, display values"""
     start: str

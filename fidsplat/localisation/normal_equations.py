@@ -61,11 +61,11 @@ class HostAlignment(AlignmentKernels):
         error = np.sqrt((residuals**2).mean(axis=0))
         noise = max(noise_factor(len(values)) * _median(error), MIN_NOISE)
         noise = min(noise, fit.noise) if fit.noise else noise
-        share, weights, cost = _robust(error, noise, fit.huber)
+        normalised, weights, cost = _robust(error, noise, fit.huber)
         matrix_weights = weights
         if not fit.huber:  # the derivative of the weighted residual, averaged over directions among channels
-            inner = np.maximum(1 - share**2, 0)
-            matrix_weights = np.maximum(inner**2 - 4 * share**2 * inner / len(values), 0)
+            inner = np.maximum(1 - normalised**2, 0)
+            matrix_weights = np.maximum(inner**2 - 4 * normalised**2 * inner / len(values), 0)
         across, down = np.concatenate([target.turning, target.shifting * inverse_depth], axis=1)
         columns, column_weights = residuals[None], weights
         if moved is not None:
@@ -153,11 +153,15 @@ class _Target:
 def _robust(error: np.ndarray, noise: float, huber: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Errors relative to the robust threshold, weights and losses."""
     if huber:
-        share = error / np.float32(HUBER * noise)
-        return share, 1 / np.maximum(share, 1), np.where(share < 1, share**2 / 2, share - 0.5)
-    share = error / np.float32(TUKEY * min(noise, MAX_NOISE))
-    inner = np.maximum(1 - share**2, 0)
-    return share, inner**2, 1 - inner**3
+        normalised = error / np.float32(HUBER * noise)
+        return (
+            normalised,
+            1 / np.maximum(normalised, 1),
+            np.where(normalised < 1, normalised**2 / 2, normalised - 0.5),
+        )
+    normalised = error / np.float32(TUKEY * min(noise, MAX_NOISE))
+    inner = np.maximum(1 - normalised**2, 0)
+    return normalised, inner**2, 1 - inner**3
 
 
 def _median(values: np.ndarray) -> float:

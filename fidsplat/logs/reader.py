@@ -1,4 +1,4 @@
-"""Reader of images and poses in logs."""
+"""Reader of images and poses in ROS 2 logs (MCAP files, rosbag2 folders)."""
 
 from __future__ import annotations
 

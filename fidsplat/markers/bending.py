@@ -25,7 +25,7 @@ SAMPLES = 5
 """samples of the distance along each edge of a rectangle"""
 
 MARGIN = 0.9
-"""maximum deviation at samples as a share of the bound, which the deviation between samples may reach"""
+"""maximum deviation at samples as a fraction of the bound, which the deviation between samples may reach"""
 
 TURN = np.radians(30)
 """Maximum rotation of the normal within a coplanar group. A layer has no order, so that the two sides of a
@@ -119,8 +119,8 @@ def _deviations(
     module, middle = printed.module, np.array(printed.grid.shape[::-1]) / 2
     centre = ((boxes[:, :2] + boxes[:, 2:]) / 2 - middle) * module
     half = (boxes[:, 2:] - boxes[:, :2]) * (module / 2)
-    share = np.linspace(-1, 1, SAMPLES)
-    steps = np.stack(np.meshgrid(share, share), -1).reshape(-1, 2)
+    offsets = np.linspace(-1, 1, SAMPLES)
+    steps = np.stack(np.meshgrid(offsets, offsets), -1).reshape(-1, 2)
     offset = half[:, None] * steps
     if printed.angles is not None:
         c, s = np.cos(printed.angles[owner])[:, None], np.sin(printed.angles[owner])[:, None]

@@ -182,7 +182,7 @@ class Marker(PickledByFields):
         printed = printed if self.wear is None else worn(self.spec, printed, self.wear)
         mixture = fitted_templates(self.quality.template), fitted_growth()
         sheet = _Sheet(f"as Gaussians {self.spec}", self.size, self.module, self.max_splats, self.shape)
-        return sheet.gaussians(printed, *mixture, lambda task, share: None)
+        return sheet.gaussians(printed, *mixture, lambda task, fraction: None)
 
     @cached_property
     def rectangles(self) -> list[Rectangle]:
@@ -282,7 +282,7 @@ def marker(
         InputError: an invalid argument, or more splats than `max_splats`.
     """
     start = time.perf_counter()
-    progress = (lambda task, share: None) if progress is None else progress
+    progress = (lambda task, fraction: None) if progress is None else progress
     max_splats = whole_number("max_splats", max_splats, 1, 2**31 - 1)
     parsed = parse_spec(spec)
     changes = {"levels": levels, "density": density, "growth": growth, "template": template}

@@ -144,12 +144,12 @@ def _widths(sides: _Sides, edges: np.ndarray, tree: shapely.STRtree) -> np.ndarr
 
     At each sample an inscribed circle that touches the side shrinks until it has no other edges inside.
     """
-    share = (
+    fraction = (
         1 - np.cos(np.pi * (np.arange(9) + 0.5) / 9)
     ) / 2  # more samples near corners, where the width varies
-    share = np.append(share, (1, 1))
+    fraction = np.append(fraction, (1, 1))
     bend = np.append(np.zeros(9), (0.5, 1))
-    at = sides.start[:, None] + share[:, None] * (sides.stop - sides.start)[:, None]
+    at = sides.start[:, None] + fraction[:, None] * (sides.stop - sides.start)[:, None]
     angle = sides.inward[:, None] - bend * sides.turn[:, None]
     normal = np.stack([np.cos(angle), np.sin(angle)], -1).reshape(-1, 2)
     at, radius = at.reshape(-1, 2), np.full(angle.size, BAND)
@@ -194,7 +194,7 @@ def grow_rotated(
     growth: float,
 ) -> np.ndarray:
     """Extend rectangles of `cover_all` across sides if the extension stays in their region, by `growth`
-    modules or the same share of their width."""
+    modules or the same fraction of their width."""
     grown = boxes.copy()
     for value, region in enumerate(regions):
         shapely.prepare(region)

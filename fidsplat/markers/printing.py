@@ -50,7 +50,7 @@ def refuse_more(spec: str, count: int, max_splats: int, words: str = "") -> None
     if count > max_splats:
         raise InputError(
             f"{spec} must have at most {max_splats:,} splats, got {words}{count:,}; use a smaller image or a "
-            "smaller mixture, or increase max_splats (--max-splats N)"
+            "mixture with fewer Gaussians per rectangle, or increase max_splats (--max-splats N)"
         )
 
 

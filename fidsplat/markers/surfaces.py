@@ -301,8 +301,8 @@ class Crumpled(SheetShape):
         azimuth = np.pi * (np.arange(WAVES) + rng.random(WAVES)) / WAVES
         ways = np.column_stack([np.cos(azimuth), np.sin(azimuth)])
         wave = 2 * np.pi / self.length * rng.uniform(0.6, 1.4, WAVES)
-        share = rng.uniform(0.5, 1.5, WAVES)
-        tall = self.height * share / share.sum()
+        weights = rng.uniform(0.5, 1.5, WAVES)
+        tall = self.height * weights / weights.sum()
         start = rng.uniform(0, 2 * np.pi, WAVES)
 
         phase = wave * (xy @ ways.T) + start

@@ -36,7 +36,7 @@ SCRATCH, SCRATCHED = 0.09, 0.5
 """mean width of a scratch in modules; area of the scratches at severity 1, relative to the sheet"""
 
 TORN = 0.75
-"""share of the sheet that is torn off at severity 1"""
+"""fraction of the sheet that is torn off at severity 1"""
 
 FOLD = 0.9
 """legs of the corner that is folded over at severity 1, relative to the shorter edge"""
@@ -68,7 +68,7 @@ class Wear:
     fading: float = 0.0
     """contrast lost by the ink"""
     dirt: float = 0.0
-    """share of the sheet with dirt"""
+    """fraction of the sheet with dirt"""
     drops: float = 0.0
     """area of water drops, which magnify the code below, relative to the sheet"""
     scratches: float = 0.0
@@ -78,7 +78,7 @@ class Wear:
     fold: float = 0.0
     """corner folded over the front, with legs of 0.9 of the sheet's edge at 1"""
     cover: float = 0.0
-    """share of the sheet covered by an opaque object with a straight edge"""
+    """fraction of the sheet covered by an opaque object with a straight edge"""
     seed: int = 0
     """seed of all random numbers"""
 
@@ -351,7 +351,7 @@ def _noise(sheet: Sheet, wide: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def _ranks(sheet: Sheet, values: np.ndarray) -> np.ndarray:
-    """Rank of each cell: share of the sheet's cells with a lower value, 0 to 1; 1 without paper."""
+    """Rank of each cell: fraction of the sheet's cells with a lower value, 0 to 1; 1 without paper."""
     rank = np.ones(sheet.present.shape)
     order = np.argsort(values[sheet.present], kind="stable")
     ranks = np.empty(len(order))

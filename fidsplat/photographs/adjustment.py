@@ -25,9 +25,9 @@ MIN_NOISE = 0.02
 REJECTED = 6.0
 """a detection whose error is above this number of pixels, and of medians, is of something else"""
 MAX_ERROR = 0.005
-"""largest error of a detection, as a share of the image's width"""
+"""largest error of a detection, as a fraction of the image's width"""
 MAX_REJECTED = 0.3
-"""largest share of rejected detections of a tag"""
+"""largest fraction of rejected detections of a tag"""
 SAME_SIZE, SIGMAS = 0.05, 5.0
 """scales of two tags contradict each other beyond this relative difference and number of standard errors"""
 MIN_PARALLAX = 0.02

@@ -10,12 +10,12 @@ from fidsplat.vision.fisher_information import pose_jacobian
 
 MIN_FEATURES = 30
 """features of a photograph for an estimate"""
-MIN_SHARE, MIN_DISPLACEMENT = 0.008, 0.15
-"""share of the errors' squares, and pixels, from which on a rolling shutter is reported"""
+MIN_FRACTION, MIN_DISPLACEMENT = 0.008, 0.15
+"""minimum fraction of the squared errors, and displacement in pixels, to report a rolling shutter"""
 
 
 def readout_motion(model: Model) -> tuple[float, float]:
-    """Estimate a constant motion of each camera during the readout. Returns the share of the squared
+    """Estimate a constant motion of each camera during the readout. Returns the fraction of the squared
     reprojection errors that it explains beyond chance by three standard deviations, and its displacement
     between the first and the last row [px], the median over the photographs.
 

@@ -1,4 +1,4 @@
-"""Pipeline from photographs to a metric data set; the folder `work` stores completed steps."""
+"""Pipeline from photographs to a metric data set; the folder `work` has the completed steps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from fidsplat.photographs.mapping import (
     unregistered,
 )
 from fidsplat.photographs.photos import camera_groups, copy_frames, copy_photos, source_files
-from fidsplat.photographs.rolling_shutter import MIN_DISPLACEMENT, MIN_SHARE, readout_motion
+from fidsplat.photographs.rolling_shutter import MIN_DISPLACEMENT, MIN_FRACTION, readout_motion
 from fidsplat.photographs.settings import CaptureSettings
 from fidsplat.photographs.tags import detect_tags, parse_tags, same_tag
 from fidsplat.scenes.parts import PlacedMarker
@@ -33,7 +33,7 @@ from fidsplat.util.progress import Progress, no_progress
 
 INPUTS = "inputs.json"
 SNAP = 0.02
-"""largest distance of a picked pixel from a feature, as a share of the image's width"""
+"""largest distance of a picked pixel from a feature, as a fraction of the image's width"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ def photographs_to_scene(
     Args:
         source: a folder of photographs, or a video.
         out: folder. Finished steps in its folder `work` are not repeated for the same photographs.
-        progress: called with the current step and its share done.
+        progress: called with the current step and its fraction done.
         overwrite: restart, also for other photographs.
 
     Raises InputError if a photograph cannot be read, if too few can be registered, or if tags contradict.
@@ -126,8 +126,8 @@ def photographs_to_scene(
     missing = unregistered(database, model.names)
     count = sum(map(len, groups))
     metric = adjustment is not None or picks is not None
-    share, displaced = readout_motion(model)
-    readout = displaced if share > MIN_SHARE and displaced > MIN_DISPLACEMENT else 0.0
+    fraction, displaced = readout_motion(model)
+    readout = displaced if fraction > MIN_FRACTION and displaced > MIN_DISPLACEMENT else 0.0
     undetected = tuple(spec for spec in tags if adjustment is None or spec not in adjustment.poses)
     return Captured(
         scene,

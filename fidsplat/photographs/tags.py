@@ -18,7 +18,7 @@ from fidsplat.vision.detect import detect
 from fidsplat.vision.readback import content_of, families_of
 
 THICK = 0.15
-"""half the thickness of a tag's box, as a share of its size"""
+"""half the thickness of a tag's box, as a fraction of its size"""
 _MIN_MODULE = 3.0
 """pixels: smallest module whose colour is measured"""
 _MIN_CONTRAST = 0.1

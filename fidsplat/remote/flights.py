@@ -55,7 +55,7 @@ class PackedWork:
                 same = Store(path).identity == identity
             except InputError as error:
                 raise InputError(
-                    f"workers must share the disk of stores, got on {socket.gethostname()}: {error}; copy "
+                    f"workers must have access to all stores, got on {socket.gethostname()}: {error}; copy "
                     "the store there, or render without --ray"
                 ) from None
             if not same:

@@ -65,8 +65,8 @@ class RayEngine:
         self.workers = workers or gpus or machines
         # fractions of fewer cores and GPUs, as Ray never starts an actor without its resources
         self._actor = ray.remote(Worker).options(
-            num_cpus=_share(cores, self.workers),
-            num_gpus=_share(gpus, self.workers),
+            num_cpus=_per_worker(cores, self.workers),
+            num_gpus=_per_worker(gpus, self.workers),
             max_restarts=0,
             scheduling_strategy="SPREAD",
         )
@@ -125,8 +125,8 @@ class RayEngine:
             raise WorkerLost(" ".join(str(error).split())[:500]) from error
 
 
-def _share(count: int, workers: int) -> float:
-    """Share of a core or GPU per worker, so that all workers can run."""
+def _per_worker(count: int, workers: int) -> float:
+    """Fraction of a core or GPU per worker, so that all workers can run."""
     return 1 / -(-workers // count) if count else 0
 
 

@@ -1,7 +1,8 @@
 """The output `error`: a certified upper bound of |rgb - ideal| per pixel, for the largest channel.
 
-The ideal is the image without approximations: no alpha cut-off, no transmittance stop, no opacity ceiling,
-exact arithmetic. Low-pass, order, samples and the near plane are part of its definition.
+The ideal is the image without approximations: no alpha cut-off, no early termination (transmittance stop), no
+maximum alpha (opacity ceiling), exact arithmetic. It has the low-pass filter, compositing order, samples per
+pixel and near plane of the requested quality.
 
 The renderer renders twice: rgb with the requested quality, and a reference image Q, which approximates the
 ideal. Q has no stop and no ceiling, and the cut-off e = `MAX_OMITTED` / n, with n the number of splats. Then
@@ -21,10 +22,10 @@ where the first term is measured, for any requested quality, and the second is b
    plane, and at the edge of the footprint). Kernels add up T_k times the distance to the farther end of the
    interval: the output `rounding` (kernels/opencl/output/rounding.cl).
 4. Rounding T changes the colour behind a fragment by at most 2^-24 T C. Rounding the colour sum changes it by
-   at most 2^-24 (1 - T) C. C is the largest absolute colour. The sum is 2^-24 C per fragment. Rounding the
-   products T alpha and T alpha c adds at most 2^-24 C each for all fragments of a pixel together. `rounding`
-   therefore contains 1.5 x 2^-24 per fragment. The sums over samples, sub-frames and spherical harmonics add
-   2^-24 C for each of their roundings (`error_reference`).
+   at most 2^-24 (1 - T) C. C is the largest absolute colour. Both together change it by at most 2^-24 C per
+   fragment. Rounding the products T alpha and T alpha c adds at most 2^-24 C each for all fragments of a
+   pixel together. `rounding` therefore contains 1.5 x 2^-24 per fragment. The sums over samples, sub-frames
+   and spherical harmonics add 2^-24 C for each of their roundings (`error_reference`).
 
 R and C are bounded by the colours of all splats and of the background. Q is composited in float64 if an
 effect is not in `_BOUNDED` or rgb is composited in float64. Then only the conversion of its image to float32
@@ -66,7 +67,8 @@ _BOUNDED = frozenset(
         *("arithmetic_precise", "arithmetic_fast"),
     )
 )
-"""effects whose float32 rounding is bounded by the kernels"""
+"""effects whose float32 rounding is bounded by the kernels; stop_*: whether the fragment that crosses the
+transmittance stop is composited, compose_*: compositing order, per splat or per pixel"""
 
 _REMEDIES = {
     "camera": ("a distorted or non-pinhole camera", "a pinhole camera"),
@@ -97,7 +99,8 @@ def cutoff_of(splats: int) -> float:
 
 
 def ideal_quality(quality: Quality, cutoff: float) -> Quality:
-    """The quality of a reference image: a smaller cut-off, no stop, no ceiling and a float64 projection."""
+    """The quality of a reference image: a smaller cut-off, no early termination, alphas up to 1, and a
+    float64 projection."""
     return quality.with_(
         alpha_cutoff=cutoff,
         detail_error=0.0,

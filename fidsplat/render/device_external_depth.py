@@ -9,9 +9,9 @@ from fidsplat.capture.environment import DeviceExternalDepth, ExternalDepth
 from fidsplat.render.renderer import Renderer
 
 MESH_LABEL = -2
-"""label of surface 0 of a simulator; surface i has MESH_LABEL - i"""
+"""label of mesh 0 (geom or body) of a simulator; mesh i has MESH_LABEL - i"""
 MESH_OFFSET = 2e-3
-"""metres by which surfaces of simulators are offset away from the camera"""
+"""metres by which meshes of simulators are offset away from the camera"""
 
 
 def device_external_depth(
@@ -21,7 +21,7 @@ def device_external_depth(
 
     Args:
         packed, depths, ids: wp.arrays (views, pixels): colours in uint32, with red from the bit `red_bit`;
-            depths along z [m]; int32 ids of surfaces, negative where there is none.
+            depths along z [m]; int32 ids of meshes, negative where there is none.
         size: height and width of the images.
     """
     wp, device = load(), packed.device

@@ -54,7 +54,7 @@ class Flight:
     times: Sequence[float] | np.ndarray
     """(n,) seconds on the trajectory's clock, increasing; one frame per time"""
     capture: Capture
-    """capture of every frame; the camera's motion and the shutter's time are replaced"""
+    """camera and settings of every frame; the camera's motion and the shutter's time are replaced"""
 
     def __post_init__(self) -> None:
         if self.capture.camera is None:

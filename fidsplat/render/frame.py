@@ -39,9 +39,9 @@ class Frame(ImageMapping):
         error: ErrorImage | None = None,
         index: int = 0,
     ) -> None:
-        """images: the backend's images; index: position of this view in them. capture: what was rendered.
-        scene_indices: indices of the splats in the scene, for `splat_id`. error: the output `error`, computed
-        when it is read; None if it was not requested."""
+        """images: the backend's images; index: position of this view in them. capture: its camera and
+        settings. scene_indices: indices of the splats in the scene, for `splat_id`. error: the output
+        `error`, computed when it is read; None if it was not requested."""
         super().__init__(images, capture.outputs, scene_indices, index)
         self._error, self.capture = error, capture
         """The capture of this frame. `read_back` and `truth_of` use its camera, shutter and motion."""

@@ -1,4 +1,4 @@
-"""Light field of a marker: radiance from panoramas at its points, and the irradiance that they cause."""
+"""Light field of a marker: radiance from panoramas at its points, and the resulting irradiance."""
 
 from __future__ import annotations
 
@@ -65,9 +65,9 @@ class LightField:
     ) -> LightField:
         """Refine the grid until the error of interpolated irradiance is at most `step` times its maximum.
 
-        levels: numbers of panoramas along a side; the error of the last is not checked. positions: (m, 2) on
-        the marker. radiance_at: function of positions (k, 2) that returns radiance (k, d, 3). normal: (3,)
-        surface normal of the compared irradiance.
+        levels: numbers of panoramas along a side, ascending; the last is accepted without a check.
+        positions: (m, 2) on the marker. radiance_at: function of positions (k, 2) that returns
+        radiance (k, d, 3). normal: (3,) surface normal of the compared irradiance.
         """
         field = LightField(*panorama_directions(rows))
         field.low, field.high = positions.min(axis=0), positions.max(axis=0)
@@ -88,7 +88,7 @@ class LightField:
                 _difference(irradiance[::2, 1::2], (coarse[:, 1:] + coarse[:, :-1]) / 2),
                 _difference(irradiance[1::2, ::2], (coarse[1:] + coarse[:-1]) / 2),
             )
-            # `error` is of the coarser grid; halving the spacing at least halves the error
+            # `error` is that of the previous, coarser grid; halving the spacing at least halves it
             if error <= 2 * step * irradiance.max():
                 break
         return field

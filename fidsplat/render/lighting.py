@@ -1,6 +1,6 @@
 """Lighting of markers: colours of their splats from the light of the scene. Panoramas measure the radiance
-around a marker, and shadow maps the visibility of explicit lights. Box splats are split where the light
-changes.
+around a marker, and shadow maps the visibility of explicit lights. Box splats (hard-edged rectangles) are
+split where the light changes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.response import to_light
 
 MAX_PARTS_PER_MODULE = 8
-"""maximum number of parts per module of a marker and axis into which a box splat is split"""
+"""maximum number of parts per module, along each axis, into which a box splat of a marker is split"""
 MAX_POINTS = 256
 """maximum number of sample points along a side of a square marker"""
 MIN_HARMONIC_ROUGHNESS = 0.5

@@ -173,7 +173,7 @@ class SeveralDevices:
         return list(pairwise(rows.tolist()))
 
     def _balance(self, rows: list[int], seconds: list[float]) -> None:
-        """Move the borders of the bands to equalise their times; the rows of a band count alike."""
+        """Move the borders of the bands to equalise their times; rows of a band count as equally costly."""
         if len(rows) < len(self.renderers) or max(seconds) <= _MAX_IMBALANCE * np.mean(seconds):
             return
         elapsed = np.concatenate([[0.0], np.cumsum(seconds)])

@@ -33,7 +33,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.store.store import Store
 from fidsplat.streaming.bands import BandData
-from fidsplat.streaming.residency import Residency, double_buffered
+from fidsplat.streaming.device_chunk_cache import DeviceChunkCache, double_buffered
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import invalid, whole_number
 from fidsplat.util.errors import InputError, unknown
@@ -98,7 +98,8 @@ class Renderer:
     def upload(self, scene: Scene | SplatCloud | Store) -> ResidentCloud:
         """Copy a scene's splats to the device, to render them many times.
 
-        `render` uses the capture of this scene by default. Chunks of a store are read when a view needs them.
+        `render` uses the capture of this scene by default. A store is a scene in
+        chunks on disk; its chunks are read when a view needs them.
         """
         check_process(self._pid, "Renderer")
         capture = scene.capture if isinstance(scene, Scene) else _DEFAULT_CAPTURE
@@ -106,7 +107,7 @@ class Renderer:
         stored = Scene(stores=(scene,)) if isinstance(scene, Store) else scene
         cloud = stored.splats if isinstance(stored, Scene) else stored
         if isinstance(cloud, ChunkedSplats):
-            return ResidentCloud(self.backend, Residency(cloud, self.backend), capture)
+            return ResidentCloud(self.backend, DeviceChunkCache(cloud, self.backend), capture)
         if not isinstance(cloud, SplatCloud):
             raise invalid("scene", "a Scene, a SplatCloud or a Store", scene, "Scene.load reads a file")
         with self._lock:
@@ -214,7 +215,7 @@ class Renderer:
         """
         requested = _capture_of(scene, capture, outputs=outputs, quality=quality, **fields)
         resident = self._resident(scene)
-        if isinstance(resident.data, Residency):
+        if isinstance(resident.data, DeviceChunkCache):
             raise InputError(
                 "scene must be a SplatCloud or a Scene without stores to be differentiated, got a store; "
                 "load its splats first"
@@ -293,8 +294,9 @@ class Renderer:
         """Render one cloud many times: one Frame for each capture or camera, in order.
 
         The cloud is uploaded once, kernels and buffers are reused, and an asynchronous device renders the
-        next frame while the caller uses the previous one. Arguments and errors: see `render`; a motion of the
-        camera replaces the pose of each camera. An error of a capture is raised after the frames before it.
+        next frame while the caller uses the previous one. Arguments and errors: see `render`. A camera
+        motion of a capture replaces the pose of its camera. An error of a capture is raised after the frames
+        before it.
         """
         # read once: an iterator of names would be exhausted by the first frame
         outputs = None if outputs is None else output_names(outputs)
@@ -309,7 +311,7 @@ class Renderer:
         requested = (
             _capture_of(scene, capture, outputs=outputs, quality=quality, **fields) for capture in remaining
         )
-        if isinstance(resident.data, Residency):
+        if isinstance(resident.data, DeviceChunkCache):
             requested = resident.data.prefetched(requested)
         yield from double_buffered(self._render(resident, capture) for capture in requested)
 
@@ -419,7 +421,7 @@ class Renderer:
         with self._lock:  # scratch buffers and kernel arguments belong to one frame at a time
             config, data = self.backend.frame_config(view), resident.data
             pipeline = self.backend.pipeline(features, config)
-            if not isinstance(data, Residency):
+            if not isinstance(data, DeviceChunkCache):
                 images = _images_of(pipeline, data, view, subsampling)
                 if reference is None:
                     return Frame(images, capture)

@@ -14,24 +14,24 @@ from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
 from fidsplat.effects import FeatureSet
 from fidsplat.render.array_export import SceneIndices
-from fidsplat.streaming.residency import Residency
+from fidsplat.streaming.device_chunk_cache import DeviceChunkCache
 from fidsplat.util.errors import InputError
 
 
 class ResidentCloud:
-    """A cloud on a renderer's device, which is rendered without another upload. For a store, only the chunks
-    that a view needs are uploaded and cached."""
+    """A cloud on a renderer's device, which is rendered without another upload. For a store (a
+    scene in chunks on disk), only the chunks that a view needs are uploaded and cached."""
 
     def __init__(
         self,
         backend: Backend,
-        data: ResidentData | Residency,
+        data: ResidentData | DeviceChunkCache,
         capture: Capture,
         labels: np.ndarray | None = None,
     ) -> None:
-        """data: an uploaded cloud, or the device chunks of a store."""
+        """data: an uploaded cloud, or the device chunk cache of a store."""
         self.backend, self.data, self._labels = backend, data, labels
-        self.all_splats: Any = data.scene if isinstance(data, Residency) else data
+        self.all_splats: Any = data.scene if isinstance(data, DeviceChunkCache) else data
         """all splats of the scene: on the device, or, for stores, only partly on the device"""
         self.capture = capture
         """capture of the uploaded scene, the default of `render`"""
@@ -59,6 +59,6 @@ class ResidentCloud:
         self, views: Iterable[View], features: FeatureSet, qualities: Iterable[Quality]
     ) -> tuple[Any, SceneIndices]:
         """Upload the splats that these views need. Returns them and their scene indices."""
-        if isinstance(self.data, Residency):
+        if isinstance(self.data, DeviceChunkCache):
             return self.data.gather(list(views), features, qualities)
         return self.data, None

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 _REFLECTIVITY = 0.1  # reflectivity for which `Lidar.detection_range` is stated
 _ODDS_AT_RANGE = 9  # odds of a detection at that range: a probability of 90 %
 # the odds are proportional to signal^4: a third of the signal is detected with a probability of 10 %
-_ALPHA_CUTOFF = 1e-3  # minimum alpha of a fragment; fainter ones hardly move the surface at `Lidar.opacity`
+# minimum alpha of a fragment; fainter ones hardly change the distance at which alpha reaches `Lidar.opacity`
+_ALPHA_CUTOFF = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +47,12 @@ class Scan:
     range: np.ndarray
     """(r, beams) float32 metres; 0 where there is no return"""
     intensity: np.ndarray
-    """(r, beams) float32: reflectivity times cosine of incidence, times the share of the beam; 0 where there
-    is no return"""
+    """(r, beams) float32: reflectivity times cosine of incidence, times the fraction of the beam's area that
+    is on the surface; 0 where there is no return"""
     label: np.ndarray | None
     """(r, beams) int32, -1 where there is no return; None if not requested"""
     poses: np.ndarray
-    """(k, 4, 4) world_from_lidar, one for each interval of the scan"""
+    """(k, 4, 4) world_from_lidar, one for each rolling-shutter band of the scan"""
 
     @cached_property
     def time(self) -> np.ndarray:
@@ -168,8 +169,8 @@ def scan(
     capture = request.capture(pose)
     assert capture.camera is not None
     frame = renderer.render(resident, capture)
-    intervals = capture.shutter.bands(capture.camera.height)
-    poses = [capture.motion.moved(capture.camera, middle).camera_to_world for _, _, middle in intervals]
+    bands = capture.shutter.bands(capture.camera.height)
+    poses = [capture.motion.moved(capture.camera, middle).camera_to_world for _, _, middle in bands]
     return request.decoded(dict(frame), np.stack(poses), whole_number("index", index, 0, 2**32 - 1))
 
 
@@ -281,7 +282,7 @@ class ScanRequest:
         )
 
     def decoded(self, images: Mapping[str, np.ndarray], poses: np.ndarray, number_of_scan: int) -> Scan:
-        """Convert rendered images to a scan. poses: (k, 4, 4) world_from_lidar of each interval."""
+        """Convert rendered images to a scan. poses: (k, 4, 4) world_from_lidar of each band."""
         lidar, pixels = self.lidar, self.lidar.pixels(self.start, self.moving)
 
         def by_ray(image: np.ndarray) -> np.ndarray:

@@ -58,7 +58,7 @@ def captured_scenes() -> dict[str, CapturedScene]:
 def fetch_scene(name: str, progress: Progress = no_progress) -> Path:
     """Path of a captured scene in the user's cache; downloads it on first use, from `MIRROR` if it is set.
 
-    progress: called with the current step and its share done, 0 to 1.
+    progress: called with the current step and its fraction done, 0 to 1.
 
     Raises InputError for an unknown name, a failed download or a wrong checksum.
     """

@@ -80,7 +80,7 @@ def read_scene(
     """Read the fields of `SceneParts` from a scene file and the files that it names, relative to its folder.
 
     quality: replaces the quality of the file, also for markers. progress: called with the current step and
-    its share done.
+    its fraction done.
 
     Raises InputError with file and key.
     """

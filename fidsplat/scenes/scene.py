@@ -54,7 +54,7 @@ class Scene(SceneParts, Summarised):
         """Read a scene file (docs/scene-files.md).
 
         quality: replaces the quality of the file; its marker settings apply to markers without their own.
-        progress: called with the current step and its share done, 0 to 1.
+        progress: called with the current step and its fraction done, 0 to 1.
 
         Raises InputError with file and key.
         """

@@ -1,4 +1,4 @@
-"""Scenes from any input: scene files, or splat files and stores with a camera that frames them."""
+"""Scenes from scene files, or from splat files and stores (chunks on disk) with a camera that frames them."""
 
 from __future__ import annotations
 
@@ -142,9 +142,9 @@ def _extent(cloud: SplatCloud | Store) -> tuple[np.ndarray, np.ndarray]:
     ):  # by the bounding boxes of its chunks, which are small compared with the scene
         return cloud.bounds(REACH)
     half_extents = cloud.half_extents(REACH)
-    share = 0.5 if len(cloud) >= MANY else 0.0
-    low = np.percentile(cloud.means - half_extents, share, axis=0)
-    high = np.percentile(cloud.means + half_extents, 100 - share, axis=0)
+    percent = 0.5 if len(cloud) >= MANY else 0.0
+    low = np.percentile(cloud.means - half_extents, percent, axis=0)
+    high = np.percentile(cloud.means + half_extents, 100 - percent, axis=0)
     return low + cloud.origin, high + cloud.origin
 
 

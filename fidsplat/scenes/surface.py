@@ -11,9 +11,9 @@ from fidsplat.util.arguments import direction, number
 from fidsplat.util.errors import InputError
 
 TOLERANCE = 0.1
-"""maximum distance of an inlier from the plane, as a share of the radius of the patch"""
-MIN_SHARE = 0.5
-"""minimum share of inliers"""
+"""maximum distance of an inlier from the plane, as a fraction of the radius of the patch"""
+MIN_FRACTION = 0.5
+"""minimum fraction of inliers"""
 GRAZING = 0.02
 """minimum cosine between the ray and the normal"""
 LIFT = 1e-3
@@ -35,7 +35,7 @@ class Surface:
     normal: np.ndarray
     """(3,) float64 unit vector in the world, towards the camera"""
     inlier_share: float
-    """share of inliers among the pixels of the patch, 0.5 to 1"""
+    """fraction of inliers among the pixels of the patch, 0.5 to 1"""
     roughness: float
     """RMS distance of the inliers from the plane [m]"""
     radius: float
@@ -75,9 +75,9 @@ def fit_surface(points: np.ndarray, origin: np.ndarray, ray: np.ndarray, radius:
         InputError: less than half of the pixels are in one plane, or the ray is parallel to it.
     """
     filled = points[np.isfinite(points).all(1)]
-    share = len(filled) / max(len(points), 1)
-    if share < MIN_SHARE or len(filled) < 3:
-        raise InputError(_refusal(f"{100 - 100 * share:.0f} % of the patch without splats"))
+    fraction = len(filled) / max(len(points), 1)
+    if fraction < MIN_FRACTION or len(filled) < 3:
+        raise InputError(_refusal(f"{100 - 100 * fraction:.0f} % of the patch without splats"))
     centre = filled.mean(0)
     local, tolerance = filled - centre, TOLERANCE * radius
     triples = np.random.default_rng(0).integers(0, len(local), (_TRIPLES, 3))
@@ -105,9 +105,9 @@ def fit_surface(points: np.ndarray, origin: np.ndarray, ray: np.ndarray, radius:
             break
     residuals = (local - middle) @ normal
     inside = np.abs(residuals) <= tolerance
-    share = float(inside.sum() / len(points))
-    if share < MIN_SHARE:
-        raise InputError(_refusal(f"{100 * share:.0f} %"))
+    fraction = float(inside.sum() / len(points))
+    if fraction < MIN_FRACTION:
+        raise InputError(_refusal(f"{100 * fraction:.0f} %"))
     ray = ray / np.linalg.norm(ray)
     slope = float(ray @ normal)
     if abs(slope) < GRAZING:
@@ -117,11 +117,11 @@ def fit_surface(points: np.ndarray, origin: np.ndarray, ray: np.ndarray, radius:
     normal = -np.sign(slope) * normal
     distance = float((centre + middle - origin) @ normal) / -abs(slope)
     rms = float(np.sqrt(np.mean(residuals[inside] ** 2)))
-    return Surface(origin + distance * ray, normal, share, rms, float(radius))
+    return Surface(origin + distance * ray, normal, fraction, rms, float(radius))
 
 
 def _refusal(got: str) -> str:
     return (
-        f"the surface must be one plane in at least {100 * MIN_SHARE:.0f} % of the patch, got {got}; "
+        f"the surface must be one plane in at least {100 * MIN_FRACTION:.0f} % of the patch, got {got}; "
         "give another pixel or radius"
     )

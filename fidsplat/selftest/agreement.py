@@ -31,7 +31,7 @@ COLOR_TOLERANCE = declared_output("rgb").tolerance
 DEPTH_TOLERANCE = declared_output("depth").tolerance
 """relative slack for the rounding of the comparison"""
 RARE = 1e-3
-"""maximum share of pixels with a certificate above `RISKY`"""
+"""maximum fraction of pixels with a certificate above `RISKY`"""
 RISKY = 0.05
 CATALOGUED = Quality(alpha_cutoff=1 / 255)
 """alpha cut-off of the catalogue's cases; the fuzzer and the contract tests use the presets"""
@@ -66,7 +66,7 @@ class Difference:
     """Error of one output of one frame relative to the reference.
 
     Errors are in units of the output, or relative if the output is declared so. For discontinuous outputs the
-    error is the share of pixels that differ.
+    error is the fraction of pixels that differ.
     """
 
     output: str
@@ -75,7 +75,7 @@ class Difference:
     excess: float
     """largest error beyond certificate and tolerance; at most 0 if the device agrees"""
     risky: float
-    """share of pixels whose certificate exceeds `RISKY`"""
+    """fraction of pixels whose certificate exceeds `RISKY`"""
     finite: bool
 
     @property
@@ -90,7 +90,7 @@ class Difference:
 
 
 def tolerance_of(name: str) -> float:
-    """Allowed error of an output beyond its certificate; for discontinuous outputs the share of pixels, 0."""
+    """Allowed error of an output beyond its certificate; 0 (fraction of pixels) if discontinuous."""
     output = declared_output(name)
     return 0.0 if output.discontinuous else output.tolerance
 
@@ -144,7 +144,7 @@ def _certificate(name: str, truth: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _flips(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tuple[float, float]:
-    """Share of pixels in which a discontinuous output differs, and share that differs without a
+    """Fraction of pixels in which a discontinuous output differs, and fraction that differs without a
     certificate."""
     output, want = declared_output(name), truth[name]
     limit = output.tolerance * want if output.relative else truth.get(f"{name}_bound", output.tolerance)

@@ -69,15 +69,15 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
         return None
     generator = np.random.default_rng(seed)
     exponents = generator.uniform(-14, 0, _COUNT).astype(np.float32).astype(float)
-    shares = log_uniform(generator, 2.0**-24, 1.0, _COUNT).astype(np.float32).astype(float)
+    fractions = log_uniform(generator, 2.0**-24, 1.0, _COUNT).astype(np.float32).astype(float)
     above, below = (
         log_uniform(generator, 1e-9, 1e9, _COUNT).astype(np.float32).astype(float) for _ in range(2)
     )
-    got = backend.probe().arithmetic(exponents, shares, above, below)
+    got = backend.probe().arithmetic(exponents, fractions, above, below)
     wide_above, wide_below = above.astype(np.longdouble), below.astype(np.longdouble)
     truth = {
         "exp": np.exp(exponents),
-        "log": np.log(shares),
+        "log": np.log(fractions),
         "division": above / below,
         "sqrt": np.sqrt(below),
         "fma": above * below + above,
@@ -85,7 +85,7 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
         "sqrt64": np.sqrt(wide_below),
         "log64": np.log(wide_below),
         "fast_exp": np.exp(exponents),
-        "fast_log": np.log(shares),
+        "fast_log": np.log(fractions),
         "reciprocal": 1 / below,
     }
     ulp = {name: worst(got[name], truth[name]) for name in truth if name in got}
@@ -191,7 +191,7 @@ def f5(renderer: Renderer) -> Found:
         error = np.abs(other.read(name) - base.read(name)).max()
         yield Finding(f"{name}: difference between schedules", float(error), 5e-6)
     labels = (other.read("label") != base.read("label")).mean()
-    yield Finding("share of pixels with another label", float(labels), 1e-3)
+    yield Finding("fraction of pixels with another label", float(labels), 1e-3)
 
 
 def in_a_row(depths) -> SplatCloud:

@@ -37,8 +37,8 @@ QUALITIES = (
     Quality(samples=2),
     Quality.named("gsplat"),
 )
-SHARES = (0.5, 0.15, 0.15, 0.1, 0.1)
-"""share of the scenes with each quality"""
+PROBABILITIES = (0.5, 0.15, 0.15, 0.1, 0.1)
+"""probability of each quality"""
 _SAVE_EVERY = 5.0  # seconds
 
 
@@ -94,7 +94,7 @@ def scene_of(seed: int) -> FrameSpec:
     ).with_coplanar_groups(planes)
     cx, cy = generator.uniform(-0.2, 1.2, 2) * [width, height]
     camera = Camera.pinhole(width, height, focal, focal, cx, cy, pose, near=near)
-    quality = QUALITIES[int(generator.choice(len(QUALITIES), p=SHARES))]
+    quality = QUALITIES[int(generator.choice(len(QUALITIES), p=PROBABILITIES))]
     return FrameSpec(cloud, camera, quality, ALL_OUTPUTS)
 
 

@@ -357,7 +357,7 @@ def c4(renderer: Renderer) -> Found:
     # the intersection line of two splats may move across a few pixels
     _, before, after = largest_jump(renderer, camera_path(crossing(), "pixel", 2))
     jumped = float((np.abs(after - before).max(2) > SMOOTH).mean())
-    yield Finding("share of pixels that jump at intersections in a step of 1e-4 deg", jumped, 1e-3)
+    yield Finding("fraction of pixels that jump at intersections in a step of 1e-4 deg", jumped, 1e-3)
     spec = FrameSpec(crossing(), camera(), Quality(order="pixel"), ("rgb",))
     shuffled = FrameSpec(_shuffled(spec.cloud), spec.camera, spec.quality, ("rgb",))
     change = np.abs(render(renderer, shuffled)["rgb"] - render(renderer, spec)["rgb"]).max()

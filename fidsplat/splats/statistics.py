@@ -77,9 +77,9 @@ def level_rotation(up) -> np.ndarray:
 
 
 def guess_up(cloud: SplatCloud) -> Up:
-    """The up axis of a cloud, from a sample of its splats: away from the level areas, if they are a share of
-    `MIN_GROUND` and twice that of any vertical area; else along y or z if it is by far the longest side; else
-    -y."""
+    """The up axis of a cloud, from a sample of its splats: away from the level areas, if their fraction is
+    at least `MIN_GROUND` and twice that of any vertical area; else along y or z if it is by far
+    the longest side; else -y."""
     if not len(cloud):
         return Up("-y", "no splats", False)
     sample = slice(None, None, -(-len(cloud) // MAX_SAMPLE))

@@ -1,4 +1,4 @@
-"""Out-of-core build of a store: a bucket sort by Morton code, then levels of detail from the bottom up.
+"""Out-of-core build of a store (chunks on disk): bucket sort by Morton code, then levels of detail bottom up.
 
 Inputs are read once, in windows of rows, and distributed over bucket files; each bucket is then sorted and
 written. Progress is saved, so that an interrupted build resumes. `BuildSettings.memory` limits the memory.
@@ -56,7 +56,7 @@ def build_store(
         settings: `BuildSettings`; None: the defaults. `changes` are settings by name: chunk, memory, levels,
             sh_degree, colors.
         overwrite: whether to replace an existing store when the new one is complete.
-        progress: called with the current step and its share done, 0 to 1.
+        progress: called with the current step and its fraction done, 0 to 1.
 
     Raises:
         InputError: an invalid input, an existing store or one that another process builds, too little disk

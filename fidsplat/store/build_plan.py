@@ -80,8 +80,8 @@ class BuildPlan:
     @property
     def merge_bytes(self) -> int:
         """Maximum memory to merge nodes into one of the next level."""
-        each, share = _MERGE_BYTES
-        return int(REDUCTION * min(self.settings.chunk, self.rows) * (each + share * self.splat_bytes))
+        each, factor = _MERGE_BYTES
+        return int(REDUCTION * min(self.settings.chunk, self.rows) * (each + factor * self.splat_bytes))
 
     @cached_property
     def record(self) -> np.dtype:

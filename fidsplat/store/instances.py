@@ -1,4 +1,4 @@
-"""Instanced stores: the splats of another store at many poses, without copies."""
+"""Instanced stores (scenes in chunks on disk): splats of another store at many poses, without copies."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 The splats of a cell whose normals have the same main axis are merged into one disk by moment matching,
 weighted by opacity times area: the disk has their mean, their covariance without its smallest axis, their
 mean colour, and an opacity that preserves opacity times area. Where cells are smaller than pixels, the merged
-splat covers the same share of a pixel. fidsplat/accuracy/detail_errors.py measures the error.
+splat covers the same fraction of a pixel. fidsplat/accuracy/detail_errors.py measures the error.
 
 The opacity can exceed 1, as the low-pass filter reduces the alpha of splats smaller than a pixel. A cell with
 an edge between bright and dark splats becomes two splats; a single one would shift the edge by up to an

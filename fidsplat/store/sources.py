@@ -1,4 +1,4 @@
-"""Sources of a store: splat files, read in windows of rows and converted to the store's columns."""
+"""Splat files from which a store (chunks on disk) is built, read in windows of rows."""
 
 from __future__ import annotations
 

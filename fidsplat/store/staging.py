@@ -1,4 +1,4 @@
-"""Staging folder: a store is written next to its destination and renamed when it is complete."""
+"""Staging folder: a store (chunks on disk) is written next to its destination and renamed when complete."""
 
 from __future__ import annotations
 

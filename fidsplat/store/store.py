@@ -1,4 +1,4 @@
-"""Store: splats on disk, memory-mapped."""
+"""Store: a scene in chunks on disk, memory-mapped."""
 
 from __future__ import annotations
 
@@ -221,11 +221,11 @@ class Store(Summarised):
         """Minimum and maximum corners, (instances * nodes, 3) float64 [m] relative to the origin, of boxes
         around the splats of each node to `sigmas` standard deviations."""
         sigmas = checked_number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
-        nodes, share = self.nodes, min(sigmas / layout.FAR, 1.0)
+        nodes, fraction = self.nodes, min(sigmas / layout.FAR, 1.0)
         beyond = np.maximum(sigmas - layout.FAR, 0.0) * nodes["reach"].astype(np.float64)[:, None]
         # a box's extent is a convex function of the standard deviations: interpolation bounds it from above
-        low = (1 - share) * nodes["low"].astype(np.float64) + share * nodes["far_low"] - beyond
-        high = (1 - share) * nodes["high"].astype(np.float64) + share * nodes["far_high"] + beyond
+        low = (1 - fraction) * nodes["low"].astype(np.float64) + fraction * nodes["far_low"] - beyond
+        high = (1 - fraction) * nodes["high"].astype(np.float64) + fraction * nodes["far_high"] + beyond
         if self.poses is None:
             return low, high
         center, half = (low + high) / 2, (high - low) / 2

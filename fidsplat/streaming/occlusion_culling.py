@@ -30,7 +30,7 @@ _MAX_GROWTH = 2.0
 """maximum factor by which a guess grows per pass, as the added nodes may occlude the rest"""
 _MAX_VISIBLE = 0.7
 """fraction of visible splats above which all splats of a view are rendered"""
-_PROBE_SHARE, _PROBE_SPLATS = 4, 4_000_000
+_PROBE_DIVISOR, _PROBE_SPLATS = 4, 4_000_000
 """minimum size of a pass after which culling may be abandoned: 1 / 4 of the view's splats, and 4 million"""
 _PAUSE = 16
 """number of views without occlusion culling after a view with little occlusion"""
@@ -116,7 +116,7 @@ class OcclusionCulling:
             nearest_missing = _nearest(full, missing, max(_INITIAL_SPLATS, int(_MAX_GROWTH * bands[0].count)))
             pairs = zip(_minus(bands[0].nodes, occluded), nearest_missing, strict=True)
             bands = [full.with_nodes(tuple(a | b for a, b in pairs)).without_occluded_subchunks(termination)]
-            probe = max(full.count // _PROBE_SHARE, _PROBE_SPLATS)
+            probe = max(full.count // _PROBE_DIVISOR, _PROBE_SPLATS)
             if visible > _MAX_VISIBLE * full.count and bands[0].count > probe:
                 break
         self._pause = _PAUSE

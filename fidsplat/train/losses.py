@@ -60,7 +60,7 @@ def image_loss(
         image: (h, w, 3) float, rendered, not clamped.
         truth: (h, w, 3) float display values.
         mask: (h, w) bool, False for ignored pixels; None: none is ignored.
-        dssim_weight: share of 1 - SSIM, 0 to 1.
+        dssim_weight: weight of 1 - SSIM, 0 to 1.
 
     Returns:
         the loss, and its gradient (h, w, 3) in the dtype of the image.
@@ -159,10 +159,10 @@ def normal_loss(
     valid = valid[:, :, None] & (length > 0)
     unit = np.where(valid, crossed, 0) / np.where(valid, length, 1)
     inner = normal[1:-1, 1:-1]
-    share = np.where(valid, alpha[1:-1, 1:-1, None], 0) / depth.size
+    fraction = np.where(valid, alpha[1:-1, 1:-1, None], 0) / depth.size
     along = (unit * inner).sum(2, keepdims=True)
-    by_normal[1:-1, 1:-1] = -share * unit
-    by_crossed = -share * (inner - along * unit) / np.where(valid, length, 1)
+    by_normal[1:-1, 1:-1] = -fraction * unit
+    by_crossed = -fraction * (inner - along * unit) / np.where(valid, length, 1)
     by_down, by_across = np.cross(across, by_crossed), np.cross(by_crossed, down)
     by_points = np.zeros_like(points)
     by_points[2:, 1:-1] += by_down
@@ -170,4 +170,4 @@ def normal_loss(
     by_points[1:-1, 2:] += by_across
     by_points[1:-1, :-2] -= by_across
     by_depth = (by_points * rays).sum(2)
-    return float((share * (1 - along)).sum(dtype=np.float64)), by_depth, by_normal
+    return float((fraction * (1 - along)).sum(dtype=np.float64)), by_depth, by_normal

@@ -127,7 +127,7 @@ class Splats:
 def initial_splats(dataset: Dataset, settings: TrainSettings) -> Splats:
     """Initial splats at the points of a data set: scales by the distance to neighbours, random rotations.
 
-    At most `max_splats` points are used, evenly spaced in their order.
+    At most `max_splats` points are used, evenly spaced in the order of the data set.
     """
     count = min(len(dataset.points), settings.max_splats)
     rows = np.arange(count) * len(dataset.points) // count

@@ -64,7 +64,7 @@ class TrainSettings:
     """iterations between increments of the degree"""
 
     dssim_weight: float = 0.2
-    """share of 1 - SSIM in the loss; the rest is the mean absolute difference"""
+    """weight of 1 - SSIM in the loss; the rest is the mean absolute difference"""
 
     distortion_weight: float = 0.0
     """weight of the mean depth distortion after `distortion_from` iterations; 2DGS uses 100 to 1000 for
@@ -259,5 +259,5 @@ class TrainSettings:
 
 def _decayed(iteration: int, first: float, last: float, steps: int) -> float:
     """Exponential decay from `first` to `last` in a number of steps."""
-    share = min(whole_number("iteration", iteration, 0, 2**63 - 1) / steps, 1.0)
-    return first ** (1 - share) * last**share
+    fraction = min(whole_number("iteration", iteration, 0, 2**63 - 1) / steps, 1.0)
+    return first ** (1 - fraction) * last**fraction

@@ -277,7 +277,7 @@ class Trainer:
         are fitted, gains and offsets are fitted to each view.
 
         Args:
-            progress: called with a description and the share of views done, 0 to 1.
+            progress: called with a description and the fraction of views done, 0 to 1.
         """
         progress = callback("progress", progress)
         views = self.dataset.held_out if views is None else views

@@ -97,7 +97,7 @@ def result_of(future: Future[T]) -> T:
 
 
 def ordered_results(futures: Iterable[Future[T]], pending: int) -> Iterator[T]:
-    """Results of tasks in their order, which an iterable submits one by one; at most `pending` tasks are
+    """Results of tasks in submission order; an iterable submits them one by one; at most `pending` tasks are
     submitted in advance. Signals interrupt the waiting."""
     from collections import deque
 

@@ -124,7 +124,7 @@ class Settings:
     exposure: float = 1.0
     """exposure factor of the sensor"""
     noise: float = 0.0
-    """shot noise of white as a share of white; 0: none"""
+    """shot noise of white as a fraction of white; 0: none"""
     time: float = 0.0
     """seconds on the clock of the scene's motions"""
     exposure_ms: float = 0.0

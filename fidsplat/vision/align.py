@@ -14,7 +14,7 @@ import numpy as np
 ITERATIONS = 8  # maximum steps of the three rounds: blurred, sharp, sharp with robust weights
 SETTLED = 0.003  # pixels: maximum motion of a corner in the last step
 FINE_BLUR = 0.7  # pixels, standard deviation of the blur
-# difference from the model, as a share of the contrast, above which a pixel has less weight (occlusion)
+# difference from the model, as a fraction of the contrast, above which a pixel has less weight (occlusion)
 TOLERANCE = 0.25
 # a fit with a lower correlation has converged to another place
 MIN_CORRELATION = 0.7

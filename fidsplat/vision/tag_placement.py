@@ -87,11 +87,11 @@ def odometry_covariance(
         moved[:3, :3] = moved[3:, 3:] = rotation
         moved[:3, 3:] = -rotation @ _cross(shift)
         angle = np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))
-        share = float(np.linalg.norm(shift) + angle) + 1e-6
+        weight = float(np.linalg.norm(shift) + angle) + 1e-6
         row, before = slice(6 * k, 6 * k + 6), slice(0, 6 * k)
         out[row, before] = moved @ out[6 * k - 6 : 6 * k, before]
         out[before, row] = out[row, before].T
-        added = share * _drift(poses[k], (metres, radians), up)
+        added = weight * _drift(poses[k], (metres, radians), up)
         out[row, row] = moved @ out[6 * k - 6 : 6 * k, 6 * k - 6 : 6 * k] @ moved.T + added
     return out
 

@@ -31,7 +31,7 @@ class MarkerTruth:
     corners: np.ndarray
     """(4, 2) pixels of the code's corners, NaN behind the camera"""
     visible: float
-    """visible share, 0 to 1, of the marker with one module of its quiet zone; accounts for occlusion if there
+    """visible fraction, 0 to 1, of the marker with one module of its quiet zone; with occlusion if there
     is a label image"""
     box: Box | None
     """bounding box of the visible part; None if nothing is visible"""

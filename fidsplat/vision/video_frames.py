@@ -14,7 +14,7 @@ WIDTH = 480
 _CORNERS, _QUALITY, _APART = 200, 0.01, 8
 """number of tracked corners, their minimum quality relative to the best, and distance in pixels"""
 STEP, FEW = 0.02, 20
-"""motion between chosen frames as a share of the image's width; number of frames below which it is less"""
+"""motion between chosen frames as a fraction of the image's width; number of frames below which it is less"""
 LOST = 0.3
 """motion of a pair of frames with too few tracked corners"""
 _MIN_TRACKED = 8
@@ -24,7 +24,7 @@ def measure_frames(frames: Iterable[np.ndarray]) -> Iterator[tuple[float, float]
     """Sharpness of each frame (h, w, 3) uint8, and its motion since the one before.
 
     Sharpness is the variance of the Laplacian relative to that of the grey values; motion is the median
-    displacement of tracked corners (Lucas and Kanade 1981), as a share of the image's width.
+    displacement of tracked corners (Lucas and Kanade 1981), as a fraction of the image's width.
     """
     before: np.ndarray | None = None
     for frame in frames:

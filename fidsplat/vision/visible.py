@@ -19,12 +19,12 @@ GRID = 1e-6
 
 
 class Visible(NamedTuple):
-    """Visible share and bounding box of a marker."""
+    """Visible fraction and bounding box of a marker."""
 
-    share: float
-    """visible share of its outline in an unbounded image, 0 to 1"""
+    fraction: float
+    """visible fraction of its outline in an unbounded image, 0 to 1"""
     box: tuple[float, float, float, float] | None
-    """bounding box in pixels x0, y0, x1, y1, without occlusion; None for a share of 0"""
+    """bounding box in pixels x0, y0, x1, y1, without occlusion; None for a fraction of 0"""
 
 
 def visible_part(placed: PlacedMarker, camera: Camera) -> tuple[shapely.Geometry, shapely.Geometry]:
@@ -50,9 +50,9 @@ def _flat(placed: PlacedMarker, camera: Camera, corners: np.ndarray) -> shapely.
         depth = points @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
         points = points if (depth > camera.near).all() else _clipped(points, depth - camera.near)
     else:  # sides are curved
-        share = np.arange(POINTS)[:, None] / POINTS
+        fraction = np.arange(POINTS)[:, None] / POINTS
         points = np.concatenate(
-            [a + share * (b - a) for a, b in zip(points, np.roll(points, -1, 0), strict=True)]
+            [a + fraction * (b - a) for a, b in zip(points, np.roll(points, -1, 0), strict=True)]
         )
     at = camera.project(points)
     at = at[np.isfinite(at).all(1)]
@@ -79,21 +79,21 @@ def _area(polygons: np.ndarray) -> np.ndarray:
 
 
 def visible(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = None) -> Visible:
-    """Visible share and bounding box of a marker's outline.
+    """Visible fraction and bounding box of a marker's outline.
 
     label: (h, w) int32, the labels of the image; None: no occlusion.
     """
     area, part = visible_part(placed, camera)
     if shapely.is_empty(part):
         return Visible(0.0, None)
-    share = min(float(shapely.area(part) / shapely.area(area)), 1.0)
+    fraction = min(float(shapely.area(part) / shapely.area(area)), 1.0)
     x0, y0, x1, y1 = shapely.bounds(part).tolist()
     if label is not None:
         y, x = np.mgrid[int(y0) : min(int(y1) + 1, camera.height), int(x0) : min(int(x1) + 1, camera.width)]
         inside = shapely.contains_xy(part, x + 0.5, y + 0.5)
         labelled = label[y[inside], x[inside]] == placed.label
-        share *= float(labelled.mean()) if labelled.size else 0.0
-    return Visible(share, (x0, y0, x1, y1))
+        fraction *= float(labelled.mean()) if labelled.size else 0.0
+    return Visible(fraction, (x0, y0, x1, y1))
 
 
 class Outline(NamedTuple):

@@ -75,9 +75,9 @@ class Mesh:
         # stratified by area: independent samples would leave holes
         steps = (np.arange(count) + rng.uniform()) / count * area.sum()
         face = np.minimum(np.searchsorted(np.cumsum(area), steps), len(area) - 1)
-        share = rng.uniform(size=(count, 2))
-        share = np.where(share.sum(1, keepdims=True) > 1, 1 - share, share)
-        weights = np.column_stack([1 - share.sum(1), share])[:, :, None]
+        fraction = rng.uniform(size=(count, 2))
+        fraction = np.where(fraction.sum(1, keepdims=True) > 1, 1 - fraction, fraction)
+        weights = np.column_stack([1 - fraction.sum(1), fraction])[:, :, None]
         size = 0.7 * math.sqrt(area.sum() / count)
         return disks(
             (at[face] * weights).sum(1),
@@ -93,8 +93,8 @@ def tomato(rng: np.random.Generator) -> Mesh:
     height = rng.uniform(1.1, 1.4)
     stem = _stem(rng, height)
     parts = [_tube(stem, 0.008, STALK)]
-    for at, azimuth, share in _nodes(rng, stem, 18):
-        length = rng.uniform(0.26, 0.34) * (1.15 - 0.5 * share)
+    for at, azimuth, fraction in _nodes(rng, stem, 18):
+        length = rng.uniform(0.26, 0.34) * (1.15 - 0.5 * fraction)
         rachis = _placed(_arc(length, rng.uniform(0.2, 0.5), 1.3), at, azimuth)
         parts.append(_tube(rachis, 0.003, STALK))
         shade = _shade(rng, LEAF)
@@ -121,10 +121,10 @@ def cucumber(rng: np.random.Generator) -> Mesh:
     height = rng.uniform(1.3, 1.7)
     stem = _stem(rng, height)
     parts = [_tube(stem, 0.007, STALK)]
-    for at, azimuth, share in _nodes(rng, stem, 20):
-        stalk = _placed(_arc(rng.uniform(0.1, 0.16) * (1.15 - 0.4 * share), 0.6, 0.6), at, azimuth)
+    for at, azimuth, fraction in _nodes(rng, stem, 20):
+        stalk = _placed(_arc(rng.uniform(0.1, 0.16) * (1.15 - 0.4 * fraction), 0.6, 0.6), at, azimuth)
         parts.append(_tube(stalk, 0.004, STALK))
-        size = rng.uniform(0.18, 0.26) * (1.15 - 0.5 * share)
+        size = rng.uniform(0.18, 0.26) * (1.15 - 0.5 * fraction)
         parts.append(_blade(rng, stalk[-1], azimuth, size, 1.05, _shade(rng, LEAF), lobes=0.18, droop=0.9))
     for at, azimuth, _ in _nodes(rng, stem, 5, 0.3, 0.75):
         stalk = _placed(_arc(0.07, 0.2, 2.0), at, azimuth)
@@ -209,10 +209,10 @@ def _nodes(
     rng: np.random.Generator, stem: np.ndarray, count: int, low: float = 0.12, high: float = 0.98
 ) -> list[tuple[np.ndarray, float, float]]:
     """Position, azimuth and relative height of each leaf base on a stem."""
-    shares = np.linspace(low, high, count) + rng.normal(0, 0.01, count)
+    fractions = np.linspace(low, high, count) + rng.normal(0, 0.01, count)
     azimuths = GOLDEN * np.arange(count) + rng.uniform(0, 2 * math.pi) + rng.normal(0, 0.25, count)
-    line = [np.interp(shares, np.linspace(0, 1, len(stem)), axis) for axis in stem.T]
-    return list(zip(np.column_stack(line), azimuths.tolist(), shares.tolist(), strict=True))
+    line = [np.interp(fractions, np.linspace(0, 1, len(stem)), axis) for axis in stem.T]
+    return list(zip(np.column_stack(line), azimuths.tolist(), fractions.tolist(), strict=True))
 
 
 def _arc(length: float, rise: float, bend: float, points: int = 8) -> np.ndarray:

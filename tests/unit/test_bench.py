@@ -10,9 +10,9 @@ import fidsplat as fs
 from fidsplat.backends.opencl.device import OpenCLBackend
 from fidsplat.cli import main
 from fidsplat.experiments.bench import catalogue, measure
+from fidsplat.experiments.bench.ablation import without_effects
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, BenchScene, scene_names
 from fidsplat.experiments.bench.measure import overdraw
-from fidsplat.experiments.bench.shares import without_effects
 from fidsplat.experiments.bench.table import scene_table
 from fidsplat.scenes.random_clouds import random_cloud, standard_camera
 from fidsplat.util.timing import WARM_UP, Timer

@@ -375,7 +375,9 @@ def test_with_ideal_corners_it_knows_its_way():
     sightings = []
     for k in requested.image_indices(moved):
         camera = camera_at(requested.camera, moved.poses[k])
-        tags = [p for p in house.markers if p.marker.kind == "apriltag" and visible(p, camera).share > 0.99]
+        tags = [
+            p for p in house.markers if p.marker.kind == "apriltag" and visible(p, camera).fraction > 0.99
+        ]
         near = [p for p in tags if np.linalg.norm(p.pose[:3, 3] - camera.position) < 1.5]
         sightings.append(
             [Detection("apriltag", "36h11", p.marker.id, None, camera.project(p.corners)) for p in near]

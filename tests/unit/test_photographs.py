@@ -17,7 +17,7 @@ from fidsplat.photographs.adjustment import TagView, adjust
 from fidsplat.photographs.frame import camera_up, world_frame
 from fidsplat.photographs.mapping import Model
 from fidsplat.photographs.photos import camera_groups, copy_photos
-from fidsplat.photographs.rolling_shutter import MIN_DISPLACEMENT, MIN_SHARE, readout_motion
+from fidsplat.photographs.rolling_shutter import MIN_DISPLACEMENT, MIN_FRACTION, readout_motion
 from fidsplat.photographs.settings import CaptureSettings
 from fidsplat.photographs.steps import parse_scale, photographs_to_scene, scale_of
 from fidsplat.photographs.tags import box_of, module_colors, parse_tags, same_tag
@@ -209,7 +209,7 @@ def test_a_rolling_shutter_of_moving_cameras_is_found(speed):
         tuple("abcdef"), tuple(cameras), points, np.zeros((300, 3), np.uint8), tuple(collected), tracks
     )
     share, displaced = readout_motion(model)
-    assert (share > MIN_SHARE and displaced > MIN_DISPLACEMENT) == (speed > 0)
+    assert (share > MIN_FRACTION and displaced > MIN_DISPLACEMENT) == (speed > 0)
     if speed:
         assert displaced == pytest.approx(585 / 3 * 1.3 * speed, rel=0.5)
 

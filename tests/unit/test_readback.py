@@ -28,11 +28,11 @@ def test_the_visible_share_counts_the_labels_inside_the_outline(scene):
     camera = demo_views()["frontal"]
     placed = scene.markers[0]
     label = np.full((camera.height, camera.width), placed.label)
-    assert visible(placed, camera, label).share == 1.0
+    assert visible(placed, camera, label).fraction == 1.0
     middle = camera.project(placed.pose[None, :3, 3])[0]
     label[:, round(middle[0]) :] = 0
-    assert visible(placed, camera, label).share == pytest.approx(0.5, abs=0.01)
-    assert visible(placed, camera, np.zeros_like(label)).share == 0.0
+    assert visible(placed, camera, label).fraction == pytest.approx(0.5, abs=0.01)
+    assert visible(placed, camera, np.zeros_like(label)).fraction == 0.0
 
 
 def test_what_is_outside_the_image_or_facing_away_is_not_visible(scene):
@@ -42,11 +42,11 @@ def test_what_is_outside_the_image_or_facing_away_is_not_visible(scene):
         camera.width, camera.height, camera.fx, camera.fy, 0, camera.cy, camera.world_to_camera
     )
     label = np.full((camera.height, camera.width), placed.label)
-    assert visible(placed, half, label).share == 0.0
+    assert visible(placed, half, label).fraction == 0.0
     behind = fs.Camera.look_at(640, 480, 1.0, (0, 0, 3), (0, 0, 0))
-    assert visible(placed, behind, np.full((480, 640), placed.label)).share == 0.0
+    assert visible(placed, behind, np.full((480, 640), placed.label)).fraction == 0.0
     away = fs.Camera.look_at(640, 480, 1.0, (0, 0, -3), (0, 0, -4))
-    assert visible(placed, away, np.full((480, 640), placed.label)).share == 0.0
+    assert visible(placed, away, np.full((480, 640), placed.label)).fraction == 0.0
 
 
 def test_detections_are_matched_by_what_they_say_and_then_by_nearness(scene):
@@ -110,7 +110,7 @@ def test_the_outline_of_a_marker_that_is_not_square(spec):
     low, high = corners.min(0)[:2] - margin, corners.max(0)[:2] + margin
     (x0, y0), (x1, y1) = ((at + np.array([0.1, -0.05])) * (200, 260) / 2.0 + (150, 125) for at in (low, high))
     assert visible(placed, camera).box == pytest.approx((x0, y0, x1, y1), abs=1e-9)
-    assert visible(placed, camera).share == pytest.approx(1.0)
+    assert visible(placed, camera).fraction == pytest.approx(1.0)
 
 
 def test_what_the_images_edge_cuts_off():
@@ -118,7 +118,7 @@ def test_what_the_images_edge_cuts_off():
     from behind."""
     placed, straight = outlined(position=(0, 0, -1))
     aside = fs.Camera.pinhole(320, 240, straight.fx, straight.fy, 0.0, 120, straight.world_to_camera)
-    assert visible(placed, aside).share == pytest.approx(0.5, abs=1e-9)
+    assert visible(placed, aside).fraction == pytest.approx(0.5, abs=1e-9)
     whole, part = visible_part(placed, aside)
     assert shapely.bounds(part)[:2] == pytest.approx((0, 120 - 0.125 * straight.fx), abs=1e-6)
     assert shapely.area(whole) == pytest.approx((0.25 * straight.fx) ** 2)
@@ -134,7 +134,7 @@ def test_what_the_images_edge_cuts_off():
     hit = (np.abs(at[:, :2]) < 0.125).all(1)
     assert shapely.area(part) == pytest.approx(hit.sum(), rel=0.02)
     behind, camera = outlined(position=(0, 0, 1))
-    assert visible(behind, camera).share == 0.0
+    assert visible(behind, camera).fraction == 0.0
 
 
 @pytest.mark.parametrize("spec", ["charuco:5x4:4x4_50", "gridboard:3x2:5x5_100", "aprilgrid:3x2:36h11"])

@@ -10,7 +10,7 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.remote.flights import FlightWork, render_flight
 from fidsplat.remote.queue import ATTEMPTS, WorkerLost, drain
-from fidsplat.remote.ray_engine import _share
+from fidsplat.remote.ray_engine import _per_worker
 from fidsplat.render.flight import Flight, FlightFolder
 from fidsplat.scenes import PlacedMarker
 
@@ -71,11 +71,11 @@ def test_an_item_that_kills_its_workers_is_named():
 
 
 @pytest.mark.parametrize(
-    ("count", "workers", "share"), [(8, 3, 1), (2, 2, 1), (2, 3, 0.5), (2, 5, 1 / 3), (0, 4, 0)]
+    ("count", "workers", "fraction"), [(8, 3, 1), (2, 2, 1), (2, 3, 0.5), (2, 5, 1 / 3), (0, 4, 0)]
 )
-def test_every_worker_finds_a_place(count, workers, share):
-    assert _share(count, workers) == share
-    assert count == 0 or count * int(1 / share) >= workers  # however they are spread
+def test_every_worker_finds_a_place(count, workers, fraction):
+    assert _per_worker(count, workers) == fraction
+    assert count == 0 or count * int(1 / fraction) >= workers  # however they are spread
 
 
 def flight(**parts) -> Flight:
@@ -138,7 +138,7 @@ def test_workers_read_stores_at_the_same_path(tmp_path):
     assert ours == here
     store.path.rename(tmp_path / "b.fss")
     with pytest.raises(
-        fs.InputError, match=r"must share the disk of stores, got on .*a\.fss must be the folder of a store"
+        fs.InputError, match=r"must have access to all stores, got on .*a\.fss must be the folder of a store"
     ):
         pickle.loads(sent)()
     fs.save_ply(fs.marker("aruco:4x4_50:3", size=0.4, mixture="fitted").cloud, tmp_path / "a.ply")

@@ -54,7 +54,7 @@ def culling(monkeypatch):
     rendered, counts = occlusion_culling.OcclusionCulling.render, []
     monkeypatch.setattr(occlusion_culling, "MIN_SPLATS", 0)
     monkeypatch.setattr(occlusion_culling, "_INITIAL_SPLATS", 3000)
-    monkeypatch.setattr(occlusion_culling, "_PROBE_SHARE", 1)
+    monkeypatch.setattr(occlusion_culling, "_PROBE_DIVISOR", 1)
     monkeypatch.setattr(occlusion_culling, "_PAUSE", 0)
     monkeypatch.setattr(subchunks, "ROWS", 24)
 
@@ -190,7 +190,7 @@ def test_views_of_similar_size_reuse_memory(town, culling, monkeypatch):
 
 def test_transparent_splats_occlude_nothing(tmp_path, culling, monkeypatch):
     monkeypatch.setattr(occlusion_culling, "_PAUSE", 2)
-    monkeypatch.setattr(occlusion_culling, "_PROBE_SHARE", 4)
+    monkeypatch.setattr(occlusion_culling, "_PROBE_DIVISOR", 4)
     monkeypatch.setattr(occlusion_culling, "_INITIAL_SPLATS", 500)
     cloud = splats(4)
     faint = fs.SplatCloud(

@@ -12,7 +12,7 @@ import numpy as np
 from fidsplat.cameras import Camera, Trajectory
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
-from fidsplat.experiments.bench.shares import ReducedScene, middle_camera, without_effects
+from fidsplat.experiments.bench.ablation import ReducedScene, middle_camera, without_effects
 from fidsplat.markers import marker
 from fidsplat.render.flight import Flight
 from fidsplat.scenes import PlacedMarker, Scene

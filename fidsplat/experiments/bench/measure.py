@@ -17,14 +17,14 @@ from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
 from fidsplat.effects import select
+from fidsplat.experiments.bench.ablation import ReducedScene, middle_camera
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED, BenchScene
 from fidsplat.experiments.bench.model import Counts, roofline_ms
-from fidsplat.experiments.bench.shares import ReducedScene, middle_camera
 from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.splats.cloud import SplatCloud
-from fidsplat.streaming.residency import Residency
+from fidsplat.streaming.device_chunk_cache import DeviceChunkCache
 from fidsplat.util.errors import FidsplatError
 from fidsplat.util.timing import Timer, frame_timer, time_interleaved
 
@@ -241,7 +241,7 @@ def overdraw(renderer: Renderer, resident: ResidentCloud, camera: Camera, qualit
         FidsplatError: the device fails, or its backend does not count fragments.
     """
     data = resident.data
-    assert not isinstance(data, Residency), "splats must be in memory"
+    assert not isinstance(data, DeviceChunkCache), "splats must be in memory"
     features, view = prepare(data, Capture(camera, quality=quality))
     features = replace(features, outputs=("overdraw",))
     return renderer.backend.pipeline(features).render_view(data, view).read("overdraw", 0)

@@ -5,8 +5,8 @@ from fidsplat.experiments.bench.measure import Result
 LEGEND = (
     "ms: median (quartiles) of complete frames; medians of the stages by the device's clock. Splats are "
     "resident and the image stays on the device. host: time until the call returns. x roofline: multiple of "
-    "the minimum time at the device's measured peak rates (devlog/roofline.md). of which: time and share "
-    "that an effect adds to the frame; shares overlap if effects depend on each other."
+    "the minimum time at the device's measured peak rates (devlog/roofline.md). of which: time and "
+    "percentage that an effect adds to the frame; they overlap if effects depend on each other."
 )
 
 
@@ -26,8 +26,8 @@ def scene_table(results: list[Result]) -> tuple[list[str], list[list[str]]]:
         rows.append([f"of which {effect}"])
         for result in results:
             ms = result.effects.get(effect)
-            share = "-" if ms is None else f"{ms:.2f} ({100 * ms / result.timer.median:.0f} %)"
-            rows[-1] += [share, ""]
+            text = "-" if ms is None else f"{ms:.2f} ({100 * ms / result.timer.median:.0f} %)"
+            rows[-1] += [text, ""]
     facts = ("host", "first frame", *results[0].counts, "splats/s", "memory")
     for fact in facts:
         rows.append([fact])

@@ -1,4 +1,4 @@
-"""Time share of each effect of a frame: the same frames without one effect at a time."""
+"""Ablation of effects: the same frames without one effect at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Device chunk cache of a scene with stores, with prefetch of the next view's chunks."""
+"""Device chunk cache of a scene with stores (chunks on disk), with prefetch for the next view."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def double_buffered(items: Iterator[T]) -> Iterator[T]:
         previous = following
 
 
-class Residency:
+class DeviceChunkCache:
     """Device chunk cache of a scene with stores, loaded by view; for one thread at a time."""
 
     def __init__(self, scene: ChunkedSplats, backend: Backend) -> None:
