@@ -189,7 +189,7 @@ def test_what_a_device_refuses_is_a_result(tmp_path, monkeypatch):
     [
         (["--scenes", "qr11"], "unknown scene 'qr11' (did you mean 'qr10'?)"),
         (["--settings", "alpha_cutof"], "unknown setting 'alpha_cutof' (did you mean 'alpha_cutoff'?)"),
-        (["--device", "reference"], "give another --device"),
+        (["--device", "reference"], "must be another device than reference"),
     ],
 )
 def test_wrong_arguments_are_one_line(capsys, tmp_path, monkeypatch, words, message):

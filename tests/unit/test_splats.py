@@ -159,7 +159,7 @@ def test_what_files_hold_instead_is_hinted_at(name, value, hint):
 def test_bytes_are_no_colours():
     arrays = parts()
     arrays["colors"] = np.full((6, 3), 255, np.uint8)
-    with pytest.raises(fs.InputError, match=r"got bytes up to 255; give colors / 255"):
+    with pytest.raises(fs.InputError, match=r"got bytes up to 255; pass colors / 255"):
         fs.SplatCloud(**arrays)
     arrays["colors"] = np.ones((6, 3), np.uint8)
     assert fs.SplatCloud(**arrays).colors.max() == 1
