@@ -133,6 +133,8 @@ class Sweep:
     """number of points that are rendered before their evaluation, so that evaluation disturbs no timing"""
     pool: Executor | None = None
     """executor that evaluates the points of a batch in parallel"""
+    overlap: bool = False
+    """whether the next batch is rendered while a batch is evaluated; not for sweeps that measure time"""
     record_errors: bool = False
     """whether a FidsplatError of `begin` is stored as the result of the point, as `error`"""
     limit: TimeLimit | None = None
@@ -153,18 +155,24 @@ class Sweep:
     def run(self) -> Iterator[Record]:
         """Measure the missing points; yields each record after it is written to the file.
 
-        An interrupt loses at most one batch.
+        An interrupt loses at most one batch, with `overlap` two.
         """
-        left = self.left
+        left, last = self.left, iter(())
         for first in range(0, len(left), self.batch):
             if self.limit is not None and not self.limit.allows():
-                return
+                break
             keys = left[first : first + self.batch]
             with nullcontext() if self.limit is None else self.limit.batch():
                 work = [self._begin(key) for key in keys]
                 results = map(_call, work) if self.pool is None else self.pool.map(_call, work)
-                for key, result in zip(keys, results, strict=True):
-                    yield self.results.append(key, result)
+                begun = zip(keys, results, strict=True)
+                yield from self._written(last if self.overlap else begun)
+                last = begun
+        yield from self._written(last)
+
+    def _written(self, evaluated: Iterable[tuple[Key, dict[str, Any]]]) -> Iterator[Record]:
+        for key, result in evaluated:
+            yield self.results.append(key, result)
 
     def _begin(self, key: Key) -> Work:
         try:

@@ -14,6 +14,7 @@ from fidsplat.experiments.sweep import (
     missing_shards,
     read_records,
     shard,
+    thread_pool,
 )
 from fidsplat.util.provenance import run_facts
 
@@ -75,6 +76,21 @@ def test_a_batch_is_begun_before_its_first_end(tmp_path):
 
     list(Sweep("counts", Results(tmp_path / "a.jsonl", facts()), POINTS[:3], begin, batch=2).run())
     assert order == [("begin", 0), ("begin", 1), ("end", 0), ("end", 1), ("begin", 2), ("end", 2)]
+
+
+def test_with_overlap_a_batch_is_begun_before_the_results_of_the_last_one_are_written(tmp_path):
+    file = tmp_path / "a.jsonl"
+    written = []
+
+    def begin(key):
+        written.append(len(read_records(file)))
+        return lambda: {"value": key["index"]}
+
+    with thread_pool(2) as pool:
+        sweep = Sweep("counts", Results(file, facts()), POINTS[:5], begin, 2, pool, overlap=True)
+        actual = [record.result["value"] for record in sweep.run()]
+    assert actual == [point["index"] for point in POINTS[:5]]
+    assert written == [0, 0, 0, 0, 2]
 
 
 def test_a_point_that_was_refused_is_tried_again(tmp_path):
