@@ -231,7 +231,7 @@ def tag_sweep(options: TagSettings) -> Iterator[Sweep]:
     results = results_of(NAME, options, device_name(renderer))
     begin = partial(begin_point, renderer=renderer, seed=options.seed, names=options.detector)
     with thread_pool(options.workers) as pool:
-        yield Sweep(NAME, results, points, begin, batch=2 * options.workers, pool=pool)
+        yield Sweep(NAME, results, points, begin, options.workers, pool, overlap=True)
 
 
 def views_of(key: Key, seed: int) -> list[MarkerView]:
