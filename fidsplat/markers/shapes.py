@@ -70,7 +70,7 @@ def filled(rings: Rings, rule: str) -> shapely.MultiPolygon:
     rule: "nonzero" (the winding number) or "evenodd" (the number of crossings).
     """
     lines = [shapely.LinearRing(ring).simplify(FLAT) for ring in rings if len(ring) > 2]
-    faces = shapely.get_parts(shapely.polygonize(shapely.get_parts(shapely.union_all(lines))))
+    faces = shapely.get_parts(shapely.polygonize(shapely.get_parts(shapely.union_all(lines, grid_size=GRID))))
     winding = np.zeros(len(faces), np.int64)
     x, y = shapely.get_coordinates(shapely.point_on_surface(faces)).T[..., None]
     for line in lines:

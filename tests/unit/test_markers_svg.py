@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import fidsplat as fs
@@ -90,6 +90,7 @@ def test_gaussians_stay_within_their_colour(tmp_path):
 
 
 @settings(max_examples=60)
+@example([(0.0, 0.0), (2.0, 1.0), (0.0, 1e-30), (2.0, 0.0), (0.0, 1.0)], False)
 @given(st.lists(st.tuples(st.floats(-3, 15), st.floats(-3, 15)), min_size=3, max_size=8), st.booleans())
 def test_what_rings_enclose(points, evenodd):
     """Against the winding number as the sum over triangles from one corner to each edge."""
