@@ -190,11 +190,11 @@ def peers(cloud: fs.SplatCloud, camera: fs.Camera) -> dict[str, Callable[[], Any
 
 def measure(row: Row, devices: list[str], repeats: int) -> list[dict]:
     """Records of a row by renderer and setting."""
-    renderers = {device: fs.Renderer(device) for device in devices}
     compared = [(devices[0], setting) for setting in row.settings]
     if row.every_device:
         compared += [(device, "standard") for device in devices[1:]]
-    resident = {device: renderers[device].upload(row.cloud) for device in dict(compared)}
+    renderers = {device: fs.Renderer(device) for device in dict(compared)}
+    resident = {device: renderer.upload(row.cloud) for device, renderer in renderers.items()}
     images, timers = {}, {}
     for device, setting in compared:
         capture = fs.Capture(row.camera, quality=Quality.of(setting))

@@ -161,14 +161,14 @@ def plan_tags(
     survey = Survey(scene, path, settings, renderer, progress)
     poses = survey.candidate_poses()
     tag = survey.tag
-    candidates = survey.sightings([PlacedMarker(tag, pose) for pose in poses])
-    visible = [k for k, one in enumerate(candidates) if len(one.poses)]
+    sightings = survey.sightings([PlacedMarker(tag, pose) for pose in poses])
+    visible = [k for k, one in enumerate(sightings) if len(one.poses)]
     if not visible:
         raise InputError(
             "the trajectory must have a flat surface of a tag's size in view below 70 degrees, got none; "
             + survey.remedy(poses)
         )
-    candidates, poses = [candidates[k] for k in visible], poses[visible]
+    sightings, poses = [sightings[k] for k in visible], poses[visible]
     conflicts = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2) < 2.2 * tag.radius
     np.fill_diagonal(conflicts, False)
     covariance, target = survey.covariance, settings.target or 0.0
@@ -176,17 +176,17 @@ def plan_tags(
     survey.report("selecting", 0.8)
     selection = greedy(
         covariance,
-        candidates,
+        sightings,
         settings.count,
         conflicts,
         lambda now: position_error(now) <= target,
         objective,
     )
     if settings.target is None:
-        selection = local_search(covariance, candidates, selection, conflicts, objective)
+        selection = local_search(covariance, sightings, selection, conflicts, objective)
     errors = [position_error(covariance)]
     for k in selection.chosen:
-        covariance = updated(covariance, candidates[k])
+        covariance = updated(covariance, sightings[k])
         errors.append(position_error(covariance))
     planned = tuple(
         PlacedMarker(marker(f"apriltag:{settings.family}:{ids[number]}", settings.size), poses[k])
@@ -196,10 +196,10 @@ def plan_tags(
     return Plan(
         replace(scene, markers=(*scene.markers, *planned)),
         planned,
-        tuple(len(candidates[k].poses) for k in selection.chosen),
+        tuple(len(sightings[k].poses) for k in selection.chosen),
         tuple(errors),
         selection,
-        len(candidates),
+        len(sightings),
         survey.path,
     )
 

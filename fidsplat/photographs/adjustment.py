@@ -94,24 +94,22 @@ def adjust(cameras: Sequence[Camera], views: Sequence[TagView], sizes: Mapping[s
             "photographs with the complete tag"
         )
     typical, used, rejected, scales, poses = float(np.median(known)), [], [], {}, {}
-    for tag, estimates in units.items():
+    for tag, unit in units.items():
         found = seen[tag]
-        poses[tag] = _first_pose(
-            _Corners(cameras, found, sizes, [tag]), tag, relative[tag], estimates or typical
-        )
-        if estimates is not None:
+        poses[tag] = _first_pose(_Corners(cameras, found, sizes, [tag]), tag, relative[tag], unit or typical)
+        if unit is not None:
             for _ in range(2):
-                good = _inliers(cameras, found, sizes, estimates, poses)
+                good = _inliers(cameras, found, sizes, unit, poses)
                 if len(found) - len(good) > MAX_REJECTED * len(found) or len(good) < 2:
                     raise InputError(
                         f"{tag} must be at one place in all photographs, got {len(found) - len(good)} of "
                         f"{len(found)} detections elsewhere; remove photographs of a second copy of the tag, "
                         "or in which it was moved"
                     )
-                estimates, moved, error = _solve(cameras, good, sizes, estimates, {tag: poses[tag]})
+                unit, moved, error = _solve(cameras, good, sizes, unit, {tag: poses[tag]})
                 poses |= moved
-            good = _inliers(cameras, found, sizes, estimates, poses)
-            scales[tag] = (1 / estimates, error)
+            good = _inliers(cameras, found, sizes, unit, poses)
+            scales[tag] = (1 / unit, error)
             rejected += [view for view in found if view not in good]
             found = good
         used += found
@@ -146,10 +144,10 @@ def _first_unit(positions: np.ndarray, offsets: np.ndarray) -> float | None:
     positions: (n, 3) of the cameras, in the unit of the model. offsets: (n, 3) to the tag, in metres.
     """
     i, j = np.triu_indices(len(positions), 1)
-    distance, moved = offsets[i] - offsets[j], positions[j] - positions[i]
-    squares = (distance**2).sum(1)
+    between, moved = offsets[i] - offsets[j], positions[j] - positions[i]
+    squares = (between**2).sum(1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = (moved * distance).sum(1) / squares
+        ratios = (moved * between).sum(1) / squares
     usable = (squares > (MIN_PARALLAX * np.linalg.norm(offsets[i], axis=1)) ** 2) & (ratios > 0)
     if not usable.any():
         return None

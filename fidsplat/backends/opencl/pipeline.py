@@ -240,7 +240,7 @@ class OpenCLPipeline(Pipeline):
         """Cache the plan of a frame; the next frame with this key is recorded."""
         cached, raster = resident.cached_frames, frame.view.raster
         if raster is not None:
-            rasters = {frame.raster for frame in cached.values()} - {None, raster}
+            rasters = {other.raster for other in cached.values()} - {None, raster}
             if len(rasters) >= _MAX_RASTERS:
                 cached.clear()
         if len(cached) >= _MAX_FRAMES:

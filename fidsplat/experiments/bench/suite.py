@@ -437,7 +437,8 @@ class Suite:
         submissions: list[list[int]],
     ) -> list[Measurement]:
         """Load a scene and render the first frames of each setting. Raises AdapterError."""
-        process, times = self._process(renderer), []
+        process = self._process(renderer)
+        measurements: list[Measurement] = []
         settings = {key: claims for key, claims in process.settings.items() if views.kind in claims}
         reason = process.skipped or ("" if settings else f"does not render {views.kind}")
         if reason:
@@ -446,19 +447,19 @@ class Suite:
         loaded = process.ask("load", file=str(file))
         for setting, claims in settings.items():
             result = {"scene": name, "renderer": renderer, "setting": setting}
-            one = Measurement(process, setting, result | loaded, submissions)
-            image = one.first(references, claims[views.kind], file.with_name("image.npy"))
+            measurement = Measurement(process, setting, result | loaded, submissions)
+            image = measurement.first(references, claims[views.kind], file.with_name("image.npy"))
             if views.scene is not None:
                 readings, _ = read_back(np.clip(image, 0, 1), views.scene, views.camera)
-                one.result["tags"] = means(readings)
-            if one.second_ms > TOO_SLOW:
-                reason = f"a frame takes {one.second_ms / 1e3:.3g} s, more than {TOO_SLOW / 1e3:g} s"
+                measurement.result["tags"] = means(readings)
+            if measurement.second_ms > TOO_SLOW:
+                reason = f"a frame takes {measurement.second_ms / 1e3:.3g} s, more than {TOO_SLOW / 1e3:g} s"
                 self._add(name, [renderer], {"setting": setting, "skipped": reason})
             else:
-                times.append(one)
-            if one.second_ms > self._effort.slow or self._scenes[name].x is not None:
+                measurements.append(measurement)
+            if measurement.second_ms > self._effort.slow or self._scenes[name].x is not None:
                 break
-        return times
+        return measurements
 
     def _failed(self, renderer: str) -> None:
         """End the process of a renderer that failed; the next scene starts a new one."""
