@@ -204,7 +204,7 @@ def in_a_row(depths) -> SplatCloud:
 @case(
     "F6",
     "sorting and prefix sums",
-    "1 to 4097 splats around the number of chunks; ties, one depth, descending, half of them culled",
+    "1 to 4097 splats around the number of sort blocks; ties, one depth, descending, half of them culled",
 )
 def f6(renderer: Renderer) -> Found:
     # depth order, tile lists and their starts at awkward lengths, against NumPy's stable sort
@@ -214,9 +214,9 @@ def f6(renderer: Renderer) -> Found:
     generator = np.random.default_rng(67)
     features, view = prepare(in_a_row([1.0]), Capture(VIEW))
     unsorted = unlisted = tried = 0
-    for shape in backend.configs("sorting").values():
-        pipeline = backend.pipeline(features, shape)
-        c = shape.chunks
+    for config in backend.configs("sorting").values():
+        pipeline = backend.pipeline(features, config)
+        c = config.sort_blocks
         for n in sorted({1, 2, 3, c - 1, c, c + 1, 2 * c + 1, 255, 256, 257, 1000, 4097} - {0}):
             for kind in ("random", "few values", "one value", "descending", "half culled"):
                 depths = generator.uniform(1.0, 9.0, n)

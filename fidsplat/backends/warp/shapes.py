@@ -15,7 +15,7 @@ class WarpShape:
     tile_height: int
     k_buffer_size: int = 8
     """size of the k-buffer: fragments of a pixel that are sorted by depth at once"""
-    chunks: int = 1
+    sort_blocks: int = 1
     """number of blocks into which the sorts divide their input"""
 
 
