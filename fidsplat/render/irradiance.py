@@ -63,7 +63,7 @@ class LightField:
         normal: np.ndarray,
         step: float,
     ) -> LightField:
-        """Refine the grid until the error of interpolated irradiance is at most `step` times its maximum.
+        """Refine the grid until the interpolated irradiance is within `step` times the maximum.
 
         levels: numbers of panoramas along a side, ascending; the last is accepted without a check.
         positions: (m, 2) on the marker. radiance_at: function of positions (k, 2) that returns
@@ -89,7 +89,7 @@ class LightField:
                 _difference(irradiance[1::2, ::2], (coarse[1:] + coarse[:-1]) / 2),
             )
             # `error` is that of the previous, coarser grid; halving the spacing at least halves it
-            if error <= 2 * step * irradiance.max():
+            if error <= step * irradiance.max():
                 break
         return field
 

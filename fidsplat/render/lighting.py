@@ -171,7 +171,7 @@ def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
     if diffuse.shape[1] > 3:
         radiance = radiance + diffuse[:, 3:]
     max_points = None if brdf is None or lighting.view == "camera" else MAX_PARTS_PER_MODULE
-    splat, extents, part = _split(points, lighting.encode(radiance), lighting.step, max_points)
+    splat, extents, part = _split(points, radiance, lighting.step, max_points)
     means, scales = _placed_parts(cloud, points, splat, extents)
     count = np.bincount(part)
     mean = np.stack([np.bincount(part, values) / count for values in radiance.T], 1)
@@ -305,10 +305,10 @@ def _by_normal(normals: np.ndarray, within: float = 1e-4) -> Iterator[np.ndarray
 
 
 def _split(
-    points: _SamplePoints, colors: np.ndarray, step: float, max_points: int | None
+    points: _SamplePoints, radiance: np.ndarray, step: float, max_points: int | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split splats into parts in which the colours (m, 3) of points differ by at most `step`. max_points:
-    maximum number of points along a side of a part.
+    """Split splats into parts whose radiance (m, 3) differs from their mean by at most `step` times the mean
+    of all channels. max_points: maximum number of points along a side of a part.
 
     Returns:
         splat (p,): index of the splat of each part.
@@ -322,10 +322,11 @@ def _split(
     rows = np.arange(len(part))  # points of the parts that may still be split
     while True:
         rows = rows[np.argsort(part[rows], kind="stable")]
-        parts, starts = np.unique(part[rows], return_index=True)
-        spread = np.maximum.reduceat(colors[rows], starts) - np.minimum.reduceat(colors[rows], starts)
+        parts, starts, counts = np.unique(part[rows], return_index=True, return_counts=True)
+        mean = np.add.reduceat(radiance[rows], starts) / counts[:, None]
+        high, low = (reduce.reduceat(radiance[rows], starts) for reduce in (np.maximum, np.minimum))
         size = extents[parts, 2:] - extents[parts, :2]
-        too_large = spread.max(axis=1) > step
+        too_large = np.maximum(high - mean, mean - low).max(axis=1) > step * mean.mean(axis=1)
         if max_points is not None:
             too_large |= size.max(axis=1) > max_points
         too_large &= size.max(axis=1) > 1

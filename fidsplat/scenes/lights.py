@@ -65,9 +65,9 @@ class Lighting:
     """height in pixels of the panoramas by which light is measured, 8 to 1024"""
     panoramas: int = 5
     """maximum number of panoramas along a side of the marker: 1, 2, 3, 5, 9 or 17"""
-    step: float = 0.02
-    """largest difference of colour within a rectangle, above which the rectangle is split; and largest error
-    of interpolated light, relative to the marker's largest light, above which more panoramas are rendered"""
+    step: float = 0.04
+    """largest relative error of a rectangle's radiance, above which the rectangle is split; and of light that
+    is interpolated between panoramas, relative to the marker's largest, above which more are rendered"""
     clearance: float | None = None
     """distance in front of the marker [m] within which splats do not occlude light; None: size / 20"""
 

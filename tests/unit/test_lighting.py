@@ -128,6 +128,20 @@ def test_point_and_spot_fall_with_the_square_of_the_distance():
         assert lit(scene)[0].max() == pytest.approx(0.85 * share, rel=2e-3)
 
 
+def test_rectangles_of_ink_and_paper_are_within_the_step_of_their_light():
+    """Light of a near lamp in the corners of each rectangle, in closed form."""
+    lamp = fs.PointLight(position=(0.05, -0.02, -0.1), intensity=0.05)
+    light, cloud = lit(of_lights(lamp, step=0.05))
+    for corner in ((-1, -1), (1, -1), (-1, 1), (1, 1)):
+        at = np.array(lamp.position) - cloud.world_means()
+        at[:, :2] -= (cloud.scales[:, :2] - TAG.module / 16) * corner  # the outer sample points
+        expected = 0.05 / math.pi * -at[:, 2] / (at**2).sum(1) ** 1.5
+        dark = light[:, 0] < 0.3 * expected
+        assert 0 < dark.sum() < len(dark)
+        error = np.abs(light[:, 0] - expected * np.where(dark, 0.05, 0.85)) / light[:, 0]
+        assert error.max() < 0.051
+
+
 @pytest.mark.parametrize("quaternion", [(1, 0, 0, 0), (0.9, 0.2, -0.3, 0.1)])
 def test_a_shadow_has_its_edge_at_the_computed_place(quaternion):
     """A half plane before the marker, in the marker's frame; the sun has a slope of 0.5 along x."""
