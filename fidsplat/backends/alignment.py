@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -42,6 +42,28 @@ class AlignmentFit(NamedTuple):
     with the gradients of the frame"""
     noise: float = 0.0
     """standard deviation of the residuals at the previous pose; 0: from the median of the residuals"""
+
+
+class Estimate(NamedTuple):
+    """Estimate of pose and exposure."""
+
+    pose: np.ndarray
+    """(4, 4) world_to_camera"""
+    fit: AlignmentFit
+    noise: float = 0.0
+    """standard deviation of the residuals of a channel; 0: the exposure is unknown"""
+
+
+class RenderedScene(Protocol):
+    """A scene on a device."""
+
+    def render(self, camera: Camera) -> Any:
+        """Frame with rgb and depth of a camera."""
+        ...
+
+    def prepared(self, camera: Camera) -> tuple[Any, Any, Any, np.ndarray]:
+        """Pipeline, resident cloud, view and origin (3,) of the frame of a camera."""
+        ...
 
 
 class MovedFrame(NamedTuple):
@@ -91,6 +113,8 @@ HUBER, TUKEY = 1.5, 4.685
 """robust thresholds in standard deviations of the noise"""
 MIN_NOISE, MAX_NOISE = 1e-2, 0.03
 """limits of the noise, display values; residuals above TUKEY * MAX_NOISE never fit"""
+GAINS = 0.05, 20.0
+"""limits of the gain of the image relative to the render"""
 _MEDIAN = {1: 0.4549, 3: 2.3660}
 """median of the chi-squared distribution, by degrees of freedom"""
 
@@ -103,21 +127,37 @@ def noise_factor(channels: int) -> float:
 class AlignmentKernels(ABC):
     """Kernels for the residuals between an image and rendered frames, and for sums over these residuals."""
 
+    _stages: list[AlignmentStage]
+    _scene: RenderedScene
+
     def __init__(self) -> None:
         self.lock = threading.RLock()
         """held from `load` to the last `sums` of an image"""
 
     @abstractmethod
-    def load(self, image: np.ndarray, stages: list[AlignmentStage], max_pixels: int) -> list[int]:
-        """Prepare an image (h, w, 1 or 3), float32 display values, for all pyramid levels (`stages`); returns
-        the number of pixels of each. A level uses about `max_pixels` pixels, those with the largest
-        gradients."""
+    def load(
+        self, image: np.ndarray, stages: list[AlignmentStage], max_pixels: int, scene: RenderedScene
+    ) -> list[int]:
+        """Prepare an image (h, w, 1 or 3), float32 display values, for all pyramid levels (`stages`) and a
+        scene; returns the number of pixels of each. A level uses about `max_pixels` pixels, those with the
+        largest gradients."""
+
+    def frame(self, stage: int, pose: np.ndarray, moved: bool = False) -> Any:
+        """Frame of the scene at a pose, valid until the next frame with this value of `moved`."""
+        return self._scene.render(self._stages[stage].camera.with_pose(pose))
 
     @abstractmethod
     def sums(
         self, stage: int, frame: Any, fit: AlignmentFit, moved: MovedFrame | None = None, blocks: bool = False
     ) -> AlignmentSums:
-        """Sums of a pyramid level for a Frame with rgb and depth. blocks: whether to sum each block too."""
+        """Sums of a pyramid level for a frame. blocks: whether to sum each block too."""
+
+    def minimise(
+        self, stage: int, at: Estimate, steps: int, settled: float, damping: float
+    ) -> Estimate | None:
+        """Levenberg-Marquardt on the device, as `direct_alignment.minimised` with Huber's loss; None if the
+        device cannot."""
+        return None
 
 
 def bins_of(values: np.ndarray) -> np.ndarray:

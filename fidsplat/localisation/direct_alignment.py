@@ -13,27 +13,26 @@ independent, the pixels within a block may be correlated.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from fidsplat.backends.alignment import (
+    GAINS,
     MIN_NOISE,
     AlignmentFit,
     AlignmentKernels,
     AlignmentStage,
     AlignmentSums,
+    Estimate,
     MovedFrame,
 )
 from fidsplat.cameras import Camera
 from fidsplat.cameras.pose_offset import offset_pose
+from fidsplat.localisation.normal_equations import Source
 from fidsplat.util.errors import InputError
 from fidsplat.vision.pyramid import resized, smoothed, taps_of
-
-Render = Callable[[Camera], Any]
-"""function that renders rgb and depth of a camera"""
 
 MAX_PIXELS = 20_000
 """maximum number of pixels of a level; pixels with the largest gradients are used"""
@@ -57,8 +56,6 @@ MIN_IMAGE_NOISE = 0.005
 """minimum noise of an image, display values"""
 _QUARTILE = 1.1
 """third quartile of the reduced chi-squared of blocks with noise alone"""
-GAINS = 0.05, 20.0
-"""limits of the gain of the image relative to the render"""
 MIN_INFORMATION = 1e-9
 """smallest eigenvalue of the scaled information matrix of a determined pose"""
 _DAMPING = 1e-3
@@ -119,8 +116,7 @@ def align(
     image: np.ndarray,
     mask: np.ndarray | None,
     start: Camera,
-    render: Render,
-    kernels: AlignmentKernels,
+    scene: Source,
     coarse: bool = False,
     max_side: int = MAX_SIDE,
 ) -> Alignment:
@@ -130,8 +126,7 @@ def align(
         image: (h, w, 3) or (h, w, 1) float32 display values.
         mask: (h, w) bool, False for ignored pixels.
         start: camera of the image at its assumed pose.
-        render: renders the scene.
-        kernels: sums over pixels.
+        scene: the scene.
         coarse: the stages of the coarsest level only, without a covariance.
         max_side: maximum side in pixels of the finest level.
     """
@@ -139,67 +134,57 @@ def align(
     finest = start.resampled(max(1, round(start.width / shrink)), max(1, round(start.height / shrink)))
     image = resized(image, finest.width, finest.height)
     stages = stages_of(finest, mask)[: COARSE if coarse else None]
+    kernels = scene.kernels()
     with kernels.lock:
-        found = _align(image, finest, render, kernels, stages, coarse)
+        counts = kernels.load(image, [stage for stage, _ in stages], MAX_PIXELS, scene)
+        if not all(counts):
+            camera = stages[counts.index(0)][0].camera
+            raise InputError(
+                "localisation must have pixels away from the border and from ignored pixels, got none at "
+                f"{camera.width} x {camera.height}; give a larger image or a mask that ignores less"
+            )
+        found = _align(image, finest, kernels, stages, coarse)
     return replace(found, camera=start.with_pose(found.camera.world_to_camera))
 
 
 def _align(
     image: np.ndarray,
     start: Camera,
-    render: Render,
     kernels: AlignmentKernels,
     stages: list[tuple[AlignmentStage, int]],
     coarse: bool,
 ) -> Alignment:
-    counts = kernels.load(image, [stage for stage, _ in stages], MAX_PIXELS)
-    if not all(counts):
-        camera = stages[counts.index(0)][0].camera
-        raise InputError(
-            "localisation must have pixels away from the border and from ignored pixels, got none at "
-            f"{camera.width} x {camera.height}; give a larger image or a mask that ignores less"
-        )
     channels = image.shape[2]
-    at = _State(start.world_to_camera, AlignmentFit(np.ones(channels), np.zeros(channels), huber=True))
+    at = Estimate(start.world_to_camera, AlignmentFit(np.ones(channels), np.zeros(channels), huber=True))
     for number, (stage, steps) in enumerate(stages):
         if steps:
-            at = _minimise(at, _Stage(number, stage.camera, render, kernels), steps)
+            at = _minimise(at, _Stage(number, stage.camera, kernels), steps)
     if coarse:
         return Alignment(start.with_pose(at.pose), np.full((6, 6), np.nan), 0.0, at.noise, at.fit.gain)
-    return _finish(at, _Stage(len(stages) - 1, start, render, kernels, image_noise(image)))
+    return _finish(at, _Stage(len(stages) - 1, start, kernels, image_noise(image)))
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
-    """Estimate of pose and exposure."""
-
-    pose: np.ndarray
-    """(4, 4) world_to_camera"""
-    fit: AlignmentFit
-    noise: float = 0.0
-
-    def moved(self, sums: AlignmentSums, step: np.ndarray) -> _State:
-        """The estimate after a step (6 + 2 c,) of pose and exposure."""
-        gains, offsets = _exposure_of(sums) if self.fit.huber else (1 + step[6::2], step[7::2])
-        fit = self.fit._replace(
-            gain=np.clip(self.fit.gain * gains, *GAINS), offset=self.fit.offset + self.fit.gain * offsets
-        )
-        return _State(offset_pose(self.pose, step[:6]), fit, sums.noise)
+def _moved(at: Estimate, sums: AlignmentSums, step: np.ndarray) -> Estimate:
+    """The estimate after a step (6 + 2 c,) of pose and exposure."""
+    gains, offsets = _exposure_of(sums) if at.fit.huber else (1 + step[6::2], step[7::2])
+    fit = at.fit._replace(
+        gain=np.clip(at.fit.gain * gains, *GAINS), offset=at.fit.offset + at.fit.gain * offsets
+    )
+    return Estimate(offset_pose(at.pose, step[:6]), fit, sums.noise)
 
 
 @dataclass(frozen=True, eq=False)
 class _Stage:
     number: int
     camera: Camera
-    render: Render
     kernels: AlignmentKernels
     image_noise: float = 0.0
 
-    def frame(self, pose: np.ndarray) -> Any:
+    def frame(self, pose: np.ndarray, moved: bool = False) -> Any:
         """The scene at a pose (4, 4)."""
-        return self.render(self.camera.with_pose(pose))
+        return self.kernels.frame(self.number, pose, moved)
 
-    def sums(self, frame: Any, at: _State, noise: float = 0.0, **options: Any) -> AlignmentSums:
+    def sums(self, frame: Any, at: Estimate, noise: float = 0.0, **options: Any) -> AlignmentSums:
         """Sums over the pixels of the stage."""
         return self.kernels.sums(self.number, frame, at.fit._replace(noise=noise), **options)
 
@@ -209,15 +194,17 @@ class _Stage:
         return max(self.camera.fx, self.camera.fy) * math.sqrt(turn + shift * sums.inverse_depth)
 
 
-def _minimise(at: _State, stage: _Stage, steps: int, settled: float = _SETTLED) -> _State:
+def _minimise(at: Estimate, stage: _Stage, steps: int, settled: float = _SETTLED) -> Estimate:
     """Levenberg-Marquardt at one stage. The last step is not checked by a render."""
+    if (found := stage.kernels.minimise(stage.number, at, steps, settled, _DAMPING)) is not None:
+        return found
     damping, frame = _DAMPING, stage.frame(at.pose)
     if not at.noise:  # the exposure is unknown
-        at = at.moved(stage.sums(frame, at), np.zeros(6))
+        at = _moved(at, stage.sums(frame, at), np.zeros(6))
     sums = stage.sums(frame, at)
     for number in range(steps):
         step = _solved(sums, damping)
-        tried, size = at.moved(sums, step), stage.pixels(step[:6], sums)
+        tried, size = _moved(at, sums, step), stage.pixels(step[:6], sums)
         if size < settled or number == steps - 1:
             return tried
         candidate = stage.sums(stage.frame(tried.pose), tried, sums.noise)
@@ -228,18 +215,18 @@ def _minimise(at: _State, stage: _Stage, steps: int, settled: float = _SETTLED) 
     return at
 
 
-def _finish(at: _State, stage: _Stage) -> Alignment:
+def _finish(at: Estimate, stage: _Stage) -> Alignment:
     """Run the last steps; if they do not converge, run them again after steps with Huber's loss. Tukey's loss
     is not convex, and ignores edges displaced by more than a fraction of a pixel."""
     alignment, settled = _last_steps(at, stage)
     return alignment if settled else _last_steps(_minimise(at, stage, _FULL_STEPS, _FULL_SETTLED), stage)[0]
 
 
-def _last_steps(at: _State, stage: _Stage) -> tuple[Alignment, bool]:
+def _last_steps(at: Estimate, stage: _Stage) -> tuple[Alignment, bool]:
     """Minimise Tukey's loss by Newton's method with a line search. Returns the alignment, with an infinite
     covariance if the pixels do not determine it, and whether all steps decreased the loss and converged. The
     derivative of the score is computed at the first step only."""
-    at, best, settled, rejected = _State(at.pose, at.fit._replace(huber=False)), None, False, False
+    at, best, settled, rejected = Estimate(at.pose, at.fit._replace(huber=False)), None, False, False
     step, inverse = np.zeros(6 + 2 * len(at.fit.gain)), None
     for _ in range(_LAST_STEPS):
         frame = stage.frame(at.pose)
@@ -248,13 +235,13 @@ def _last_steps(at: _State, stage: _Stage) -> tuple[Alignment, bool]:
             inverse = _inverse(sums, _bread(at, sums, stage, frame))
         elif sums.cost_before > _INCREASE * best[1].cost:
             step, rejected = step / 4, True
-            at = best[0].moved(best[1], step)
+            at = _moved(best[0], best[1], step)
             continue
         best = at, sums
         if settled := inverse is None:
             break
         step, errors = inverse @ _right(sums), (_scores(sums) @ inverse.T)[:, :6]
-        at = at.moved(sums, step)
+        at = _moved(at, sums, step)
         square = step[:6] @ np.linalg.lstsq(errors.T @ errors, step[:6], rcond=None)[0]
         exact = sums.noise > 1.001 * MIN_NOISE or stage.pixels(step[:6], sums) < _REPEATED_PIXELS
         if settled := square < _REPEATED**2 and exact:
@@ -297,7 +284,7 @@ def image_noise(image: np.ndarray) -> float:
     return max(deviation, MIN_IMAGE_NOISE)
 
 
-def _bread(at: _State, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.ndarray:
+def _bread(at: Estimate, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.ndarray:
     """Derivative of the score with respect to pose and exposure, by finite differences of images.
 
     A motion along the ray of a pixel and a rotation about it do not change the pixel, so that the derivatives
@@ -312,7 +299,7 @@ def _bread(at: _State, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.nda
         motion[axis] = size = (
             angle_step if axis < 3 else angle_step / max(math.sqrt(sums.inverse_depth), 1e-3)
         )
-        other = stage.frame(offset_pose(at.pose, motion))
+        other = stage.frame(offset_pose(at.pose, motion), moved=True)
         rhs = stage.sums(frame, at, sums.noise, moved=MovedFrame(other, size, axis % 3)).rhs
         columns[:, :, axis] = rhs[:, :, 0]
         if pinhole:

@@ -15,8 +15,7 @@ from fidsplat.capture.sensor import Sensor
 from fidsplat.images.files import pixels_of
 from fidsplat.localisation.direct_alignment import MAX_SIDE, MIN_INLIERS, MIN_SIDE, align
 from fidsplat.localisation.initial_pose import most_similar, pose_of_markers
-from fidsplat.localisation.normal_equations import alignment_kernels
-from fidsplat.render.frame import Frame
+from fidsplat.localisation.normal_equations import Source
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.scenes import Scene
@@ -155,12 +154,7 @@ def localise(
         if not isinstance(scene, ResidentCloud)
         else scene
     )
-
-    def render(at: Camera) -> Frame:
-        return renderer.render(uploaded, capture.with_(camera=at))
-
-    kernels = alignment_kernels(renderer, uploaded)
-
+    rendered = Source(renderer, uploaded, capture)
     source, starts = "start", []
     if start is not None:
         pose = start.world_to_camera if isinstance(start, Camera) else start
@@ -181,9 +175,9 @@ def localise(
             )["rgb"]
 
         best = most_similar(pixels, camera, candidates, render_all, TRIED)
-        tried = [align(pixels, mask, one, render, kernels, coarse=True) for one in best]
+        tried = [align(pixels, mask, one, rendered, coarse=True) for one in best]
         starts = [min(tried, key=lambda one: one.noise).camera]
-    alignment = align(pixels, mask, starts[0], render, kernels, max_side=max_side)
+    alignment = align(pixels, mask, starts[0], rendered, max_side=max_side)
     return Localisation(alignment.camera, alignment.covariance, alignment.inliers, alignment.noise, source)
 
 

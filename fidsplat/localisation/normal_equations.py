@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,27 +20,54 @@ from fidsplat.backends.alignment import (
     AlignmentStage,
     AlignmentSums,
     MovedFrame,
+    RenderedScene,
     bins_of,
     lowest_bin,
     noise_factor,
 )
+from fidsplat.backends.prepare import prepare
+from fidsplat.cameras import Camera
+from fidsplat.capture.capture import Capture
+from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.vision.pyramid import convolved, resized
 
 
-def alignment_kernels(renderer: Renderer, resident: ResidentCloud) -> AlignmentKernels:
-    """Alignment kernels of the device, or else NumPy, as for stores, whose frames may be on the host."""
-    if renderer.backend.has("alignment") and resident.data is resident.all_splats:
-        return renderer.backend.alignment()
-    return HostAlignment()
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A scene that is rendered for alignment."""
+
+    renderer: Renderer
+    resident: ResidentCloud
+    capture: Capture
+
+    def render(self, camera: Camera) -> Frame:
+        """Frame with rgb and depth of a camera."""
+        return self.renderer.render(self.resident, self.capture.with_(camera=camera))
+
+    def prepared(self, camera: Camera) -> tuple[Any, Any, Any, np.ndarray]:
+        """Pipeline, resident cloud, view and origin (3,) of the frame of a camera."""
+        splats, backend = self.resident.all_splats, self.renderer.backend
+        features, view = prepare(splats, self.capture.with_(camera=camera))
+        pipeline = backend.pipeline(features, backend.frame_config(view))
+        return pipeline, self.resident.data, view, splats.origin
+
+    def kernels(self) -> AlignmentKernels:
+        """Alignment kernels of the device, or else NumPy, as for stores, whose frames may be on the host."""
+        if self.renderer.backend.has("alignment") and self.resident.data is self.resident.all_splats:
+            return self.renderer.backend.alignment()
+        return HostAlignment()
 
 
 class HostAlignment(AlignmentKernels):
     """Sums on the host over the textured pixels of a stage."""
 
-    def load(self, image: np.ndarray, stages: list[AlignmentStage], max_pixels: int) -> list[int]:
+    def load(
+        self, image: np.ndarray, stages: list[AlignmentStage], max_pixels: int, scene: RenderedScene
+    ) -> list[int]:
         """Prepare the image for its stages."""
+        self._stages, self._scene = stages, scene
         self._targets = [_Target(image, stage, max_pixels) for stage in stages]
         self._rendered: tuple[Any, ...] = ()
         return [len(target.rows) for target in self._targets]

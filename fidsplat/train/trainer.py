@@ -22,7 +22,6 @@ from fidsplat.capture.quality import Quality
 from fidsplat.effects import FeatureSet, select
 from fidsplat.effects.differentiable import with_distortion
 from fidsplat.formats import save_ply
-from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.splats.cloud import SplatCloud
@@ -303,15 +302,12 @@ class Trainer:
         """The capture of a view at its localised pose; unchanged if its own pose matches the image better."""
         # lazy, since these modules import marker detectors
         from fidsplat.localisation.direct_alignment import align
-        from fidsplat.localisation.normal_equations import alignment_kernels
-
-        def render(camera: Camera) -> Frame:
-            return self.renderer.render(resident, capture.with_(camera=camera, outputs=("rgb", "depth")))
+        from fidsplat.localisation.normal_equations import Source
 
         image = view.image.astype(np.float32) / 255
-        kernels = alignment_kernels(self.renderer, resident)
+        source = Source(self.renderer, resident, capture.with_(outputs=("rgb", "depth")))
         try:
-            alignment = align(image, view.mask, view.camera, render, kernels)
+            alignment = align(image, view.mask, view.camera, source)
         except InputError:  # all pixels of the coarsest level are masked
             return capture
         both = capture, capture.with_(camera=alignment.camera)

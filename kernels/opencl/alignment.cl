@@ -111,7 +111,7 @@ static inline float residuals_of(
     return sqrt(square / channels);
 }
 
-#define EXPOSURE const float gain[3] = {gain_red, gain_green, gain_blue}, offset[3] = {offset_red, offset_green, offset_blue}
+#define EXPOSURE const float gain[3] = {fit[0], fit[1], fit[2]}, offset[3] = {fit[3], fit[4], fit[5]}
 
 // Index space: any number of work-groups of ITEMS, by rows. Adds the errors of textured pixels to a histogram.
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_errors(
@@ -169,6 +169,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
     local float partial[ITEMS][SUMS];
     local float shared_noise;
     EXPOSURE;
+    const float noise_before = fit[6];
     uint item = get_local_id(0);
     if (item == 0) {
         float own = fmax(noise_factor * median_of(counts), MIN_NOISE);
@@ -238,4 +239,21 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
         result[into + k] = sum;
     }
     if (item == 0) result[into + SUMS] = noise;
+}
+
+// Index space: one work-group. Reads: the sums of `groups` work-groups, and the counts of the rendered frame. Writes: their totals, the
+// noise, and 1 if the frame exceeded its buffers, else 0; clears the histogram of `align_errors`.
+kernel void align_totals(
+//@@ arguments align_totals
+) {
+    for (uint k = get_local_id(0); k < SUMS; k += get_local_size(0)) {
+        float sum = 0.0f;
+        for (int g = 0; g < groups; g++) sum += result[g * (size_t)(SUMS + 1) + k];
+        totals[k] = sum;
+    }
+    for (uint k = get_local_id(0); k < BINS; k += get_local_size(0)) counts[k] = 0;
+    if (get_local_id(0) == 0) {
+        totals[SUMS] = result[SUMS];
+        totals[SUMS + 1] = frame_counts[0] > big_capacity || frame_counts[1] > pair_capacity || frame_counts[2];
+    }
 }

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.alignment import AlignmentFit, MovedFrame
+from fidsplat.backends.alignment import AlignmentFit, Estimate, MovedFrame
 from fidsplat.cameras.pose_offset import offset_camera
 from fidsplat.cli import main
 from fidsplat.images.files import write_png
+from fidsplat.localisation import direct_alignment
 from fidsplat.localisation.direct_alignment import stages_of
-from fidsplat.localisation.normal_equations import HostAlignment
+from fidsplat.localisation.normal_equations import HostAlignment, Source
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.vision.pose import pose_error
 
@@ -224,7 +225,7 @@ def test_sums_of_the_device_agree_with_numpy(renderer, room, lens):
     moved = offset_camera(camera, np.array([0, 0, 0, 0, 1e-3, 0]))
     both = HostAlignment(), renderer.backend.alignment()
     noisy = image + np.random.default_rng(1).normal(0, 0.01, image.shape).astype(np.float32)
-    host, device = [kernels.load(noisy, stages, 1500) for kernels in both]
+    host, device = [kernels.load(noisy, stages, 1500, None) for kernels in both]
     assert host == device
     assert min(host) > 300
     assert host[0] < 1700
@@ -239,6 +240,37 @@ def test_sums_of_the_device_agree_with_numpy(renderer, room, lens):
             tolerance = 3e-3 if lens else 2e-5  # the device differentiates the rays by differences
             scale = np.abs(value).max(initial=1e-9)
             assert other[name] == pytest.approx(value, abs=tolerance * scale), name
+
+
+@pytest.mark.parametrize(("far", "sky"), [(7, False), (1.5, True)])
+def test_steps_on_the_device_agree_with_numpy(room, monkeypatch, far, sky):
+    """Levenberg-Marquardt with the schedule of a GPU. From a far start a step is rejected; with a sky, kernel
+    arguments depend on the pose."""
+    scene, _, image = room
+    renderer = fs.Renderer("opencl")
+    monkeypatch.setattr(renderer.backend, "config", renderer.backend.configs("binning")["bin_first"])
+    monkeypatch.setattr(renderer.backend, "_alignment", None)
+    capture = scene.capture.with_(outputs=("rgb", "depth"))
+    if sky:
+        capture = capture.with_(background=fs.Gradient((0.2, 0.4, 0.9), (0.5, 0.4, 0.3)))
+        image = renderer.render(scene, capture, outputs="rgb")["rgb"]
+    source = Source(renderer, renderer.upload(scene), capture)
+    image = image * np.float32([0.7, 0.9, 1.1]) + np.float32(0.03)
+    start = offset_camera(scene.camera, far * START).world_to_camera
+    levels = [stage for stage, _ in stages_of(scene.camera)]
+    at = Estimate(start, AlignmentFit(np.ones(3), np.zeros(3), huber=True))
+    numpy, kernels = HostAlignment(), source.kernels()
+    for each in (numpy, kernels):
+        each.load(image, levels, 1500, source)
+    device = None
+    while device is None:  # first, NumPy's frames enlarge the buffers of the lists
+        host = direct_alignment._minimise(at, direct_alignment._Stage(3, levels[3].camera, numpy), 6, 0.02)
+        device = kernels.minimise(3, at, 6, 0.02, 1e-3)
+    np.testing.assert_allclose(device.pose, host.pose, atol=2e-5)
+    np.testing.assert_allclose(device.fit.gain, host.fit.gain, rtol=1e-4)
+    np.testing.assert_allclose(device.fit.offset, host.fit.offset, atol=1e-4)
+    assert device.noise == pytest.approx(host.noise, rel=1e-3)
+    assert sky == (pose_difference(scene.camera.with_pose(device.pose), scene.camera)[0] < 5)
 
 
 def test_a_store_is_localised_in(renderer, room, tmp_path):

@@ -322,6 +322,15 @@ def assemble_alignment(items: int) -> KernelSource:
     return Assembler((), declared, numbers).source({"alignment": ("alignment",)})
 
 
+@cache
+def assemble_alignment_step(float64: bool) -> KernelSource:
+    """Assemble the kernel of a step of Levenberg-Marquardt, for views in float64 or float32."""
+    low, high = alignment.GAINS
+    numbers = {"SETUP_FP64": int(float64), "MIN_GAIN": f"{low}f", "MAX_GAIN": f"{high}f"}
+    declared = Declarations(Scalars("double" if float64 else "float", "float"))
+    return Assembler((), declared, numbers).source({"alignment": ("prelude", "alignment_step")})
+
+
 def assemble_test(file: str, config: KernelConfig, float64: bool, effects: Iterable[str] = ()) -> str:
     """Text of prelude.cl, math.cl and a file of test kernels below kernels/opencl/ (empty: no file). effects:
     files whose sections fill the hooks."""

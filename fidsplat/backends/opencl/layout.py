@@ -124,7 +124,8 @@ _LOSS_SIZE = args(
 _MASK = args("int masked", "in uchar mask  // (rows, pixels), where `masked`")
 _ALIGNED = args(
     *("int width height channels", "uint min_bin  // lowest histogram bin that is used"),
-    *(_EXPOSURE, "in uchar bins  // histogram bins of gradient magnitudes", "in float image rgb"),
+    "in float fit  // gain, then offset of three channels, noise at the previous pose or 0",
+    *("in uchar bins  // histogram bins of gradient magnitudes", "in float image rgb"),
 )
 _IMAGES = args("out float images")
 _SURFACE = args(
@@ -278,9 +279,17 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         _ALIGNED,
         "in uint counts",
         "int block_size huber has_moved axis lens  // has_moved: whether `moved` is a MovedFrame",
-        "float focal_x focal_y center_x center_y noise_factor noise_before step",
+        "float focal_x focal_y center_x center_y noise_factor step",
         "in float depth rays moved",
         "out float result  // (work-groups, SUMS + 1)",
+    ),
+    "align_totals": args(
+        *("int groups", "uint big_capacity pair_capacity", "in float result", "in uint frame_counts"),
+        *("out uint counts", "out float totals  // (SUMS + 2)"),
+    ),
+    "align_step": args(
+        *("int channels", "float focal settled  // pixels: a smaller motion ends the stage"),
+        *("in float totals", "out float fit state", "out real pose view  // pose: the last accepted"),
     ),
     # training
     "loss_load": args(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK, _IMAGES),
