@@ -108,24 +108,25 @@ class CocoAnnotations:
 
 def _of_group(group: GroupTruth) -> dict[str, Any]:
     x0, y0, x1, y1 = map(int, group.box)
-    height, width = group.labels.shape
-    counts = run_lengths(group.labels[:, x0:x1] == group.label, height * x0, height * (width - x1))
+    counts = run_lengths(group.labels[y0:y1, x0:x1] == group.label, (x0, y0), group.labels.shape)
     return {
-        "segmentation": {"counts": counts, "size": [height, width]},
+        "segmentation": {"counts": counts, "size": list(group.labels.shape)},
         "bbox": [float(x) for x in (x0, y0, x1 - x0, y1 - y0)],
         "area": float(sum(counts[1::2])),
         "iscrowd": 0,
     }
 
 
-def run_lengths(mask: np.ndarray, before: int = 0, after: int = 0) -> list[int]:
+def run_lengths(mask: np.ndarray, at: tuple[int, int] = (0, 0), shape: Any = None) -> list[int]:
     """Encode a mask (h, w) bool as COCO's uncompressed run lengths: column by column, False first.
 
-    before, after: numbers of False pixels that precede and follow the mask's columns.
+    at: x and y of the mask in an image of the shape (height, width), which is False elsewhere.
     """
-    flat = np.concatenate([[False], mask.ravel(order="F"), [False]])
-    edges = np.flatnonzero(flat[1:] != flat[:-1]) + before
-    size = before + mask.size + after
-    lengths = np.diff(np.concatenate([[0], edges])).tolist()
-    rest = size - int(edges[-1]) if len(edges) else size
+    height, width = mask.shape if shape is None else shape
+    columns = np.pad(mask.T, ((0, 0), (1, 1)))
+    column, row = np.nonzero(columns[:, 1:] != columns[:, :-1])
+    edges, counts = np.unique((at[0] + column) * height + at[1] + row, return_counts=True)
+    edges = edges[counts == 1]  # not where a run continues in the next column
+    lengths = np.diff(edges, prepend=0).tolist()
+    rest = height * width - int(edges[-1] if len(edges) else 0)
     return [*lengths, rest] if rest else lengths

@@ -15,7 +15,7 @@ from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.splats.rotations import check_similarity, pose_matrix
 from fidsplat.util.arguments import instance, invalid, real_array
 from fidsplat.util.errors import InputError
-from fidsplat.vision.visible import visible
+from fidsplat.vision.visible import Visible, visible
 
 Box = tuple[float, float, float, float]
 """pixels x0, y0, x1, y1"""
@@ -95,11 +95,15 @@ def truth_of(frame: Mapping[str, np.ndarray], scene: Scene, camera: Camera | Non
     first = next(iter(frame))
     camera, markers = at_shutter(frame, scene, camera, np.shape(frame[first]))
     label = frame.get("label")
-    return Truth(
-        camera,
-        [marker_truth(placed, camera, label) for placed in markers],
-        {} if label is None else groups_of(label),
+    groups = {} if label is None else groups_of(label)
+    corners = camera.project(np.reshape([placed.corners for placed in markers], (-1, 3))).reshape(-1, 4, 2)
+    parts = (
+        visible(placed, camera, label) if label is None or placed.label in groups else Visible(0.0, None)
+        for placed in markers
     )
+    poses = (camera.world_to_camera @ placed.pose for placed in markers)
+    truths = zip(markers, poses, corners, parts, strict=True)
+    return Truth(camera, [MarkerTruth(*facts, *part) for *facts, part in truths], groups)
 
 
 def at_shutter(
@@ -140,15 +144,15 @@ def marker_truth(placed: PlacedMarker, camera: Camera, label: np.ndarray | None 
 
 def groups_of(label: np.ndarray) -> dict[int, GroupTruth]:
     """Masks and bounding boxes by label of a label image (h, w) int32; -1 is the background."""
-    starts = np.ones(label.shape, bool)  # of the runs of equal labels in rows, which are fewer than pixels
-    starts[:, 1:] = label[:, 1:] != label[:, :-1]
-    at = np.flatnonzero(starts)
-    values, ends = label.reshape(-1)[at], np.append(at[1:], label.size)
+    flat, width = label.reshape(-1), label.shape[1]
+    # runs of equal labels are fewer than pixels; some continue in the next row
+    starts = np.concatenate([[0], np.flatnonzero(flat[1:] != flat[:-1]) + 1])
+    values, ends = flat[starts], np.append(starts[1:], flat.size) - 1
     groups = {}
     for value in np.unique(values[values >= 0]).tolist():
-        first, last = at[values == value], ends[values == value] - 1
-        (top, bottom), width = first[[0, -1]] // label.shape[1], label.shape[1]
-        box = (first % width).min(), top, (last % width).max() + 1, bottom + 1
+        rows, columns = np.divmod(np.stack([starts, ends])[:, values == value], width)
+        columns[:, rows[0] < rows[1]] = [[0], [width - 1]]
+        box = columns[0].min(), rows.min(), columns[1].max() + 1, rows.max() + 1
         groups[value] = GroupTruth(value, label, tuple(map(float, box)))  # type: ignore[arg-type]
     return groups
 

@@ -89,11 +89,27 @@ def visible(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = Non
     fraction = min(float(shapely.area(part) / shapely.area(area)), 1.0)
     x0, y0, x1, y1 = shapely.bounds(part).tolist()
     if label is not None:
-        y, x = np.mgrid[int(y0) : min(int(y1) + 1, camera.height), int(x0) : min(int(x1) + 1, camera.width)]
-        inside = shapely.contains_xy(part, x + 0.5, y + 0.5)
-        labelled = label[y[inside], x[inside]] == placed.label
-        fraction *= float(labelled.mean()) if labelled.size else 0.0
+        bounds = int(x0), int(y0), min(int(x1) + 1, camera.width), min(int(y1) + 1, camera.height)
+        inside = _raster(part, *bounds)
+        labelled = label[bounds[1] : bounds[3], bounds[0] : bounds[2]] == placed.label
+        fraction *= np.count_nonzero(labelled & inside) / max(np.count_nonzero(inside), 1)
     return Visible(fraction, (x0, y0, x1, y1))
+
+
+def _raster(area: shapely.Geometry, x0: int, y0: int, x1: int, y1: int) -> np.ndarray:
+    """Mask (y1 - y0, x1 - x0) of the pixels whose centres are in polygons, by scanlines and the even-odd
+    rule."""
+    at, ring = shapely.get_coordinates(shapely.get_rings(shapely.get_parts(area)), return_index=True)
+    at = at - (x0 + 0.5, y0 + 0.5)
+    a, b = (ends[ring[1:] == ring[:-1]] for ends in (at[:-1], at[1:]))
+    first, end = np.ceil(np.sort([a[:, 1], b[:, 1]], 0)).astype(int)  # rows that an edge crosses
+    edge = np.repeat(np.arange(len(a)), end - first)
+    row = np.arange(len(edge)) + np.repeat(first - np.cumsum(end - first) + end - first, end - first)
+    a, b = a[edge], b[edge]
+    x = a[:, 0] + (row - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
+    toggles = np.zeros((y1 - y0, x1 - x0 + 1), np.uint8)
+    np.add.at(toggles, (row, np.clip(np.ceil(x), 0, x1 - x0).astype(int)), 1)
+    return np.cumsum(toggles[:, :-1], 1, np.uint8) % 2 > 0
 
 
 class Outline(NamedTuple):

@@ -137,6 +137,22 @@ def test_what_the_images_edge_cuts_off():
     assert visible(behind, camera).fraction == 0.0
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_the_visible_share_of_a_bent_marker_counts_pixels_in_its_outline(seed):
+    """Parts of a cylinder and of a crumpled sheet, cut off by the image's edge; labels at random."""
+    rng = np.random.default_rng(seed)
+    shape = ("cylinder,radius=0.06", "crumpled,height=0.01,length=0.1,seed=1")[seed]
+    placed = PlacedMarker(fs.marker("apriltag:36h11:5", size=0.2, shape=shape))
+    camera = fs.Camera.look_at(160, 120, 1.2, (0.15, 0.1, -0.2), (0.07, 0.02, 0.0))
+    label = rng.integers(0, 2, (120, 160)) * placed.label
+    outline, part = visible_part(placed, camera)
+    y, x = np.mgrid[0.5:120, 0.5:160]
+    inside = shapely.contains_xy(part, x, y)
+    assert 0 < shapely.area(part) < shapely.area(outline)
+    expected = (label[inside] == placed.label).mean() * shapely.area(part) / shapely.area(outline)
+    assert visible(placed, camera, label).fraction == pytest.approx(expected, abs=1e-9)
+
+
 @pytest.mark.parametrize("spec", ["charuco:5x4:4x4_50", "gridboard:3x2:5x5_100", "aprilgrid:3x2:36h11"])
 def test_a_board_gives_one_pose(renderer, spec):
     """Also from half of its tags; a tag elsewhere in the image is not assigned to the board."""

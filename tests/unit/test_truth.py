@@ -128,13 +128,28 @@ def test_truth_of_an_image_of_another_size(scene, frame):
         truth_of(dict(frame), fs.Scene())
 
 
+@pytest.mark.parametrize(("x", "y", "shape"), [(0, 0, (5, 7)), (0, 0, (5, 9)), (2, 3, (9, 10))])
 @pytest.mark.parametrize("seed", range(4))
-def test_run_lengths_are_those_of_the_mask(seed):
-    mask = np.random.default_rng(seed).random((5, 7)) < (0, 0.3, 0.7, 1)[seed]
-    lengths = run_lengths(mask)
+def test_run_lengths_are_those_of_the_mask(seed, x, y, shape):
+    mask = np.zeros(shape, bool)
+    part = mask[y : y + 5, x : x + 7]
+    part[:] = np.random.default_rng(seed).random((5, 7)) < (0, 0.3, 0.7, 1)[seed]
+    lengths = run_lengths(part, (x, y), shape)
     assert sum(lengths) == mask.size
+    assert 0 not in lengths[1:]
     values = np.repeat(np.arange(len(lengths)) % 2, lengths).astype(bool)
     np.testing.assert_array_equal(values.reshape(mask.shape, order="F"), mask)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_boxes_are_those_of_the_pixels(seed):
+    """Of labels whose runs continue in the next row, too."""
+    label = np.random.default_rng(seed).choice([-1, 0, 7, 7, 7, 7], (4, 5)).astype(np.int32)
+    groups = groups_of(label)
+    assert groups.keys() == set(np.unique(label)) - {-1}
+    for value, group in groups.items():
+        y, x = np.nonzero(label == value)
+        assert group.box == (x.min(), y.min(), x.max() + 1, y.max() + 1)
 
 
 def test_coco_reads_what_we_write(tmp_path, truth, scene, frame):
