@@ -63,7 +63,7 @@ def measure(backend: OpenCLBackend) -> Numbers:
     # the driver keeps what it has compiled, and has no log of what it kept: a kernel that is new each time
     name = f"unlike_{secrets.token_hex(8)}"
     unlike = f"kernel void {name}(global int *out) {{ out[0] = 1; }}\n"
-    texts = [program.compiled + unlike for program in assemble(features, backend.config).programs.values()]
+    texts = [program.text + unlike for program in assemble(features, backend.config).programs.values()]
     return dict(sorted(one for text in texts for one in _of_text(backend, text, name).items()))
 
 

@@ -16,8 +16,8 @@ BINS, SHIFT, FIRST_BIN = 256, 19, 113 << 4
 4, bin = (bits >> SHIFT) - FIRST_BIN"""
 
 
-class AlignmentStage(NamedTuple):
-    """One level of the image pyramid, and a blur filter for it."""
+class CoarseToFineStage(NamedTuple):
+    """Stage of coarse-to-fine alignment: a level of the image pyramid, and a blur filter for it."""
 
     camera: Camera
     """size, intrinsics and lens of the level"""
@@ -66,7 +66,7 @@ class RenderedScene(Protocol):
         ...
 
 
-class MovedFrame(NamedTuple):
+class PerturbedFrame(NamedTuple):
     """Frame of the same scene after a small camera motion, for derivatives by finite differences."""
 
     frame: Any
@@ -88,7 +88,7 @@ class AlignmentSums:
     matrix: np.ndarray
     """(c, 8, 8) outer product of a row with itself, weighted by the second derivative of the loss"""
     rhs: np.ndarray
-    """(c, 8, 1) row times residual. With a MovedFrame (c, 8, 2): row times d, and row times -d times a
+    """(c, 8, 1) row times residual. With a PerturbedFrame (c, 8, 2): row times d, and row times -d times a
     component of the ray, where d is the derivative of the rendered value with respect to the motion"""
     squared_residuals: np.ndarray
     """(c,)"""
@@ -127,7 +127,7 @@ def noise_factor(channels: int) -> float:
 class AlignmentKernels(ABC):
     """Kernels for the residuals between an image and rendered frames, and for sums over these residuals."""
 
-    _stages: list[AlignmentStage]
+    _stages: list[CoarseToFineStage]
     _scene: RenderedScene
 
     def __init__(self) -> None:
@@ -136,21 +136,26 @@ class AlignmentKernels(ABC):
 
     @abstractmethod
     def load(
-        self, image: np.ndarray, stages: list[AlignmentStage], max_pixels: int, scene: RenderedScene
+        self, image: np.ndarray, stages: list[CoarseToFineStage], max_pixels: int, scene: RenderedScene
     ) -> list[int]:
-        """Prepare an image (h, w, 1 or 3), float32 display values, for all pyramid levels (`stages`) and a
-        scene; returns the number of pixels of each. A level uses about `max_pixels` pixels, those with the
+        """Prepare an image (h, w, 1 or 3), float32 display values, for all stages of alignment and a
+        scene; returns the number of pixels of each. A stage uses about `max_pixels` pixels, those with the
         largest gradients."""
 
-    def frame(self, stage: int, pose: np.ndarray, moved: bool = False) -> Any:
-        """Frame of the scene at a pose, valid until the next frame with this value of `moved`."""
+    def frame(self, stage: int, pose: np.ndarray, perturbed: bool = False) -> Any:
+        """Frame of the scene at a pose, valid until the next frame with this value of `perturbed`."""
         return self._scene.render(self._stages[stage].camera.with_pose(pose))
 
     @abstractmethod
     def sums(
-        self, stage: int, frame: Any, fit: AlignmentFit, moved: MovedFrame | None = None, blocks: bool = False
+        self,
+        stage: int,
+        frame: Any,
+        fit: AlignmentFit,
+        perturbed: PerturbedFrame | None = None,
+        blocks: bool = False,
     ) -> AlignmentSums:
-        """Sums of a pyramid level for a frame. blocks: whether to sum each block too."""
+        """Sums of a stage for a frame. blocks: whether to sum each block too."""
 
     def minimise(
         self, stage: int, at: Estimate, steps: int, settled: float, damping: float

@@ -11,8 +11,9 @@ import numpy as np
 from fidsplat.backends.view import FAR_EYE, View, rotated
 
 _SHARED = (
-    *("width", "height", "samples", "log_cut", "ceiling", "stop", "first_hit_transmittance", "sensor"),
-    *("background", "fog_density", "environment_map", "external_depth", "along_ray", "parallel"),
+    *("width", "height", "samples", "sensor", "background", "fog_density", "environment_map"),
+    *("log_alpha_cutoff", "opacity_ceiling", "transmittance_stop", "first_hit_transmittance"),
+    *("external_depth", "along_ray", "parallel"),
 )
 _PER_VIEW = ("focal_x", "focal_y", "center_x", "center_y", "near", "far", "ewa_clamp")
 _INDEX_0 = np.zeros(1, np.uint32)

@@ -246,8 +246,8 @@ class Pipeline(ABC):
         """Whether the frame fits the memory budget without dividing the cloud into chunks."""
         return True
 
-    def trace(self, resident: Any, view: View) -> dict[str, np.ndarray]:
-        """Render one view, and return the data between the stages for tests; empty by default."""
+    def render_intermediates(self, resident: Any, view: View) -> dict[str, np.ndarray]:
+        """Render one view; returns the buffers between the stages, for tests. Empty by default."""
         return {}
 
 

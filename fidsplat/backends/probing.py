@@ -50,9 +50,9 @@ class Probe(ABC):
         """Prefix sums modulo 2^32 of list lengths (n,) uint32: (n + 1,) uint32; and the total."""
 
     @abstractmethod
-    def boxes(self, pipeline: Any, trace: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Bounding boxes (n, 4) int in samples of the splats of a `Pipeline.trace`: columns [x0, x1), rows
-        [y0, y1); undefined for culled splats."""
+    def boxes(self, pipeline: Any, buffers: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Bounding boxes (n, 4) int in samples of the splats, from a result of
+        `Pipeline.render_intermediates`: columns [x0, x1), rows [y0, y1); undefined for culled splats."""
 
     @contextmanager
     def poisoned(self) -> Iterator[None]:

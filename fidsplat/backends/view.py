@@ -53,11 +53,11 @@ class View:
     """(3,) metres: camera centre minus the cloud's origin; far behind the camera for parallel rays"""
     near: float
     far: float
-    log_cut: float
+    log_alpha_cutoff: float
     """natural logarithm of the alpha cut-off, rounded to float32"""
-    ceiling: float
+    opacity_ceiling: float
     """maximum alpha of a fragment"""
-    stop: float
+    transmittance_stop: float
     """transmittance at which blending terminates early"""
     background: tuple[float, float, float]
     """background colour; with fog, the fog's colour"""
@@ -200,9 +200,9 @@ class View:
             eye=eye - FAR_EYE * rotation[2] if parallel else eye,
             near=camera.near,
             far=camera.far,
-            log_cut=float(np.float32(math.log(quality.alpha_cutoff))),
-            ceiling=float(np.float32(quality.opacity_ceiling)),
-            stop=float(np.float32(quality.transmittance_stop)),
+            log_alpha_cutoff=float(np.float32(math.log(quality.alpha_cutoff))),
+            opacity_ceiling=float(np.float32(quality.opacity_ceiling)),
+            transmittance_stop=float(np.float32(quality.transmittance_stop)),
             background=background if plain else (0.0, 0.0, 0.0),
             first_hit_transmittance=float(np.float32(1 - quality.first_hit)),
             sensor=capture.sensor,

@@ -23,10 +23,10 @@ from fidsplat.backends.alignment import (
     MIN_NOISE,
     AlignmentFit,
     AlignmentKernels,
-    AlignmentStage,
     AlignmentSums,
+    CoarseToFineStage,
     Estimate,
-    MovedFrame,
+    PerturbedFrame,
 )
 from fidsplat.cameras import Camera
 from fidsplat.cameras.pose_offset import offset_pose
@@ -91,7 +91,7 @@ class Alignment:
     """(c,) gain of the image relative to the render, by channel"""
 
 
-def stages_of(camera: Camera, mask: np.ndarray | None = None) -> list[tuple[AlignmentStage, int]]:
+def stages_of(camera: Camera, mask: np.ndarray | None = None) -> list[tuple[CoarseToFineStage, int]]:
     """Stages from coarse to fine for a camera, with maximum numbers of steps of `_minimise`. The first is
     blurred more, for a larger basin of convergence; the last is not blurred, so that it has the noise of the
     image."""
@@ -107,7 +107,7 @@ def stages_of(camera: Camera, mask: np.ndarray | None = None) -> list[tuple[Alig
         if ignored is not None:  # pixels whose blur or gradient contains an ignored pixel
             fractions = smoothed(resized(ignored, width, height)[:, :, None], max(blur, 0.7))
             hidden = fractions[:, :, 0] > 1e-3
-        stage = AlignmentStage(camera.resampled(width, height), hidden, taps_of(blur), side)
+        stage = CoarseToFineStage(camera.resampled(width, height), hidden, taps_of(blur), side)
         stages.append((stage, steps))
     return stages
 
@@ -151,7 +151,7 @@ def _align(
     image: np.ndarray,
     start: Camera,
     kernels: AlignmentKernels,
-    stages: list[tuple[AlignmentStage, int]],
+    stages: list[tuple[CoarseToFineStage, int]],
     coarse: bool,
 ) -> Alignment:
     channels = image.shape[2]
@@ -180,9 +180,9 @@ class _Stage:
     kernels: AlignmentKernels
     image_noise: float = 0.0
 
-    def frame(self, pose: np.ndarray, moved: bool = False) -> Any:
+    def frame(self, pose: np.ndarray, perturbed: bool = False) -> Any:
         """The scene at a pose (4, 4)."""
-        return self.kernels.frame(self.number, pose, moved)
+        return self.kernels.frame(self.number, pose, perturbed)
 
     def sums(self, frame: Any, at: Estimate, noise: float = 0.0, **options: Any) -> AlignmentSums:
         """Sums over the pixels of the stage."""
@@ -299,8 +299,8 @@ def _bread(at: Estimate, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.n
         motion[axis] = size = (
             angle_step if axis < 3 else angle_step / max(math.sqrt(sums.inverse_depth), 1e-3)
         )
-        other = stage.frame(offset_pose(at.pose, motion), moved=True)
-        rhs = stage.sums(frame, at, sums.noise, moved=MovedFrame(other, size, axis % 3)).rhs
+        other = stage.frame(offset_pose(at.pose, motion), perturbed=True)
+        rhs = stage.sums(frame, at, sums.noise, perturbed=PerturbedFrame(other, size, axis % 3)).rhs
         columns[:, :, axis] = rhs[:, :, 0]
         if pinhole:
             columns[:, :, axis // 3 * 3 + 2] += rhs[:, :, 1]

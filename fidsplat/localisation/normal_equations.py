@@ -17,9 +17,9 @@ from fidsplat.backends.alignment import (
     TUKEY,
     AlignmentFit,
     AlignmentKernels,
-    AlignmentStage,
     AlignmentSums,
-    MovedFrame,
+    CoarseToFineStage,
+    PerturbedFrame,
     RenderedScene,
     bins_of,
     lowest_bin,
@@ -64,7 +64,7 @@ class HostAlignment(AlignmentKernels):
     """Sums on the host over the textured pixels of a stage."""
 
     def load(
-        self, image: np.ndarray, stages: list[AlignmentStage], max_pixels: int, scene: RenderedScene
+        self, image: np.ndarray, stages: list[CoarseToFineStage], max_pixels: int, scene: RenderedScene
     ) -> list[int]:
         """Prepare the image for its stages."""
         self._stages, self._scene = stages, scene
@@ -77,7 +77,7 @@ class HostAlignment(AlignmentKernels):
         stage: int,
         frame: Any,
         fit: AlignmentFit,
-        moved: MovedFrame | None = None,
+        perturbed: PerturbedFrame | None = None,
         blocks: bool = False,
     ) -> AlignmentSums:
         target = self._targets[stage]
@@ -96,9 +96,12 @@ class HostAlignment(AlignmentKernels):
             matrix_weights = np.maximum(inner**2 - 4 * normalised**2 * inner / len(values), 0)
         across, down = np.concatenate([target.turning, target.shifting * inverse_depth], axis=1)
         columns, column_weights = residuals[None], weights
-        if moved is not None:
-            change = (_at(target.blurred(moved.frame), target.rows) - values) / np.float32(moved.size)
-            columns, column_weights = np.stack([change, -target.rays[moved.axis] * change]), matrix_weights
+        if perturbed is not None:
+            change = (_at(target.blurred(perturbed.frame), target.rows) - values) / np.float32(perturbed.size)
+            columns, column_weights = (
+                np.stack([change, -target.rays[perturbed.axis] * change]),
+                matrix_weights,
+            )
         matrix, rhs, block_rhs, block_matrices, block_moments = [], [], [], [], []
         for channel, (gx, gy) in enumerate(zip(*slopes, strict=True)):
             row = np.stack([*-(gx * across + gy * down), values[channel], np.ones_like(gx)]).astype(float)
@@ -135,7 +138,7 @@ class HostAlignment(AlignmentKernels):
 class _Target:
     """The image at one stage, at its textured pixels."""
 
-    def __init__(self, image: np.ndarray, stage: AlignmentStage, max_pixels: int) -> None:
+    def __init__(self, image: np.ndarray, stage: CoarseToFineStage, max_pixels: int) -> None:
         camera, self.taps = stage.camera, stage.taps
         width, height = camera.width, camera.height
         values = convolved(resized(image, width, height), stage.taps)

@@ -153,15 +153,15 @@ def _flips(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tup
     return float(differs.mean()), float((differs & ~may_flip).mean())
 
 
-def trace(renderer: Renderer, spec: FrameSpec, shape=None) -> dict[str, np.ndarray]:
-    """Buffers between the stages of a frame, and its outputs. shape: replaces the build constants."""
+def render_intermediates(renderer: Renderer, spec: FrameSpec, shape=None) -> dict[str, np.ndarray]:
+    """Render a frame; returns the buffers between its stages, and its outputs. shape: other build constants."""
     features, view = spec.prepared()
     backend = renderer.backend
     if shape is not None and backend.has("probe"):
         pipeline = backend.pipeline(features, shape)
     else:
         pipeline = backend.pipeline(features)
-    return pipeline.trace(backend.upload(spec.cloud), view)
+    return pipeline.render_intermediates(backend.upload(spec.cloud), view)
 
 
 def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray], outputs) -> int:
@@ -177,14 +177,14 @@ def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray],
     return int(different.sum())
 
 
-def out_of_order(traced: Mapping[str, np.ndarray], expected: np.ndarray) -> int:
-    """Number of splats of a trace that violate the expected depth order, in tile lists or overall. expected:
-    (visible,) indices in depth order."""
-    if "lists" not in traced:
-        return int((traced["order"] != expected).sum())
-    rank = np.full(len(traced["keys"]), -1)
+def out_of_order(buffers: Mapping[str, np.ndarray], expected: np.ndarray) -> int:
+    """Number of splats that violate the expected depth order, in tile lists or overall. buffers: result of
+    `render_intermediates`. expected: (visible,) indices in depth order."""
+    if "lists" not in buffers:
+        return int((buffers["order"] != expected).sum())
+    rank = np.full(len(buffers["keys"]), -1)
     rank[expected] = np.arange(len(expected))
-    places, starts = rank[traced["lists"]], traced["starts"].astype(np.int64)
+    places, starts = rank[buffers["lists"]], buffers["starts"].astype(np.int64)
     follows = np.ones(len(places), bool)  # whether a splat comes after its predecessor in the same list
     follows[starts[:-1][starts[:-1] < len(places)]] = False
     return int((places < 0).sum() + (follows[1:] & (np.diff(places) <= 0)).sum())

@@ -228,20 +228,20 @@ def f6(renderer: Renderer) -> Found:
                     depths = np.sort(depths)[::-1]
                 elif kind == "half culled":
                     depths[::2] *= -1
-                trace = pipeline.trace(backend.upload(in_a_row(depths)), view)
-                keys = trace["keys"]
+                buffers = pipeline.render_intermediates(backend.upload(in_a_row(depths)), view)
+                keys = buffers["keys"]
                 visible = np.flatnonzero(keys != CULLED)
                 expected = visible[np.argsort(keys[visible], kind="stable")]
-                unsorted += out_of_order(trace, expected) > 0
+                unsorted += out_of_order(buffers, expected) > 0
                 unsorted += not np.array_equal(visible, np.flatnonzero(depths > 0))
-                unlisted += not _lists_are_complete(trace, len(expected))
+                unlisted += not _lists_are_complete(buffers, len(expected))
                 tried += 1
     yield Finding(f"unstable depth orders, of {tried}", unsorted, 0)
     yield Finding("tile lists that lack a splat or have a wrong start", unlisted, 0)
 
 
-def _lists_are_complete(trace: dict[str, np.ndarray], visible: int) -> bool:
-    starts = trace["starts"].astype(np.int64)
-    complete = starts[0] == 0 and starts[-1] == len(trace["lists"]) and bool((np.diff(starts) >= 0).all())
+def _lists_are_complete(buffers: dict[str, np.ndarray], visible: int) -> bool:
+    starts = buffers["starts"].astype(np.int64)
+    complete = starts[0] == 0 and starts[-1] == len(buffers["lists"]) and bool((np.diff(starts) >= 0).all())
     # all splats are on the axis: the tiles around the centre list every one
     return complete and int(np.diff(starts).max()) == visible

@@ -8,7 +8,14 @@ import numpy as np
 
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes.random_clouds import log_uniform, random_splats
-from fidsplat.selftest.agreement import ALL_OUTPUTS, CULLED, FrameSpec, differing, render, trace
+from fidsplat.selftest.agreement import (
+    ALL_OUTPUTS,
+    CULLED,
+    FrameSpec,
+    differing,
+    render,
+    render_intermediates,
+)
 from fidsplat.selftest.case import Finding, Found, case
 from fidsplat.selftest.clouds import camera, quaternion, rotation, splats, subset_of
 from fidsplat.splats.cloud import SplatCloud
@@ -67,9 +74,9 @@ def a2(renderer: Renderer) -> Found:
     yield _spec(_ring())
     # removing the culled splats must not change the image
     spec = _spec(_ring())
-    traced = trace(renderer, spec)
+    buffers = render_intermediates(renderer, spec)
     visible = (
-        traced["order"] if traced["keys"].dtype != np.uint32 else np.flatnonzero(traced["keys"] != CULLED)
+        buffers["order"] if buffers["keys"].dtype != np.uint32 else np.flatnonzero(buffers["keys"] != CULLED)
     )
     fewer = _spec(subset_of(spec.cloud, np.sort(visible)))
     changed = differing(render(renderer, spec), render(renderer, fewer), ALL_OUTPUTS)
@@ -98,9 +105,9 @@ def a4(renderer: Renderer) -> Found:
     spec = _spec(SplatCloud.concatenate(clouds), width=93, height=77)
     if not renderer.backend.has("probe"):
         return
-    base = trace(renderer, spec)
+    base = render_intermediates(renderer, spec)
     for name, shape in renderer.backend.configs("tiles").items():
-        changed = differing(base, trace(renderer, spec, shape), ALL_OUTPUTS)
+        changed = differing(base, render_intermediates(renderer, spec, shape), ALL_OUTPUTS)
         yield Finding(f"pixels that change with tiles of {name}", changed, 0)
 
 

@@ -20,7 +20,7 @@ from fidsplat.cameras import BrownConrady, Camera, Fisheye, Orthographic
 from fidsplat.capture.quality import Quality
 from fidsplat.capture.sensor import Sensor
 from fidsplat.render.renderer import Renderer
-from fidsplat.selftest.agreement import CULLED, FrameSpec, render, trace
+from fidsplat.selftest.agreement import CULLED, FrameSpec, render, render_intermediates
 from fidsplat.splats.cloud import SplatCloud
 
 COUNT = 200
@@ -209,12 +209,12 @@ def digest_of(renderer: Renderer, seed: int) -> Digest:
 def stage_digests(renderer: Renderer, seed: int) -> dict[str, str]:
     """Digests of intermediate results: records of visible splats, sort keys, samples."""
     spec = scene_of(seed)
-    data = trace(renderer, spec)
+    data = render_intermediates(renderer, spec)
     return {name: _sha256(array)[:8] for name, array in stages_of(data, spec, renderer.backend).items()}
 
 
 def stages_of(data: Mapping[str, np.ndarray], spec: FrameSpec, backend: Backend) -> dict[str, np.ndarray]:
-    """Intermediate results of a trace, converted to a device-independent layout."""
+    """Buffers between the stages of a frame, converted to a device-independent layout."""
     keys, visible = data["keys"], data["keys"] != CULLED
     features, _ = spec.prepared()
     records = data["records"]

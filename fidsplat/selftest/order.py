@@ -20,7 +20,7 @@ from fidsplat.selftest.agreement import (
     differing,
     out_of_order,
     render,
-    trace,
+    render_intermediates,
 )
 from fidsplat.selftest.case import Finding, Found, case
 from fidsplat.selftest.clouds import camera, quaternion, rotation, splats, subset_of
@@ -255,20 +255,20 @@ def c1(renderer: Renderer) -> Found:
 
 def _keys_and_order(renderer: Renderer, spec: FrameSpec) -> tuple[int, int]:
     """Number of keys that differ from the depth by more than 2 ulp, and of splats out of order."""
-    traced = trace(renderer, spec)
+    buffers = render_intermediates(renderer, spec)
     view = view_of(spec.capture, spec.cloud.origin)
     depth = (spec.cloud.means.astype(float) @ view.rotation.T + view.translation)[:, 2]
-    keys = traced["keys"]
+    keys = buffers["keys"]
     if keys.dtype == np.uint32:
         visible = np.flatnonzero(keys != CULLED)
         bits = keys[visible]
         decoded = np.where(bits & 0x80000000, bits & 0x7FFFFFFF, ~bits).view(np.float32)
     else:  # the reference backend has depths instead of sort keys
-        visible = np.sort(traced["order"])
+        visible = np.sort(buffers["order"])
         decoded = keys[visible]
     off = np.abs(decoded - depth[visible]) > 2 * np.spacing(np.abs(depth[visible]).astype(np.float32))
     expected = visible[np.argsort(decoded, kind="stable")]
-    return int(off.sum()), out_of_order(traced, expected)
+    return int(off.sum()), out_of_order(buffers, expected)
 
 
 def _depths(values) -> FrameSpec:
@@ -297,7 +297,7 @@ def c2(renderer: Renderer) -> Found:
     orders = [_keys_and_order(renderer, spec) for spec in _key_specs()]
     yield Finding("keys beyond 2 ulp of their depth", sum(pair[0] for pair in orders), 0)
     yield Finding("splats that violate the order by depth and index", sum(pair[1] for pair in orders), 0)
-    keys = trace(renderer, next(_key_specs()))["keys"]
+    keys = render_intermediates(renderer, next(_key_specs()))["keys"]
     yield Finding("neighbouring depths with one key", len(keys) - len(np.unique(keys)), 0)
 
 
@@ -310,7 +310,7 @@ def c3(renderer: Renderer) -> Found:
     yield Finding("pixels that change when rendered again", changed, 0)
     if renderer.backend.has("probe"):
         tiles = next(iter(renderer.backend.configs("tiles").values()))
-        changed = differing(copies, trace(renderer, spec, tiles), ALL_OUTPUTS)
+        changed = differing(copies, render_intermediates(renderer, spec, tiles), ALL_OUTPUTS)
         yield Finding("pixels that change with another tile size", changed, 0)
     plain = FrameSpec(subset_of(spec.cloud, np.arange(300)), spec.camera, outputs=("rgb",))
     yield Finding(

@@ -106,7 +106,7 @@ def _has_pixel_lowpass(features: FeatureSet) -> bool:
 
 def cutoff_radius(view: View) -> float:
     """Radius [standard deviations] at which the alpha of the most opaque splats is the cut-off, padded."""
-    return PADDING * math.sqrt(2.0 * (math.log(MAX_OPACITY) - view.log_cut))
+    return PADDING * math.sqrt(2.0 * (math.log(MAX_OPACITY) - view.log_alpha_cutoff))
 
 
 def ewa_extent(view: View, features: FeatureSet, radius: float, max_sigma: np.ndarray) -> np.ndarray | None:

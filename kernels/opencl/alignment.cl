@@ -205,7 +205,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                 down /= dot(ray_dy, down);
                 float3 turn_x = cross(ray, across), turn_y = cross(ray, down);
                 float8 motion_x = (float8)(turn_x, across * inverse, 0.0f, 0.0f), motion_y = (float8)(turn_y, down * inverse, 0.0f, 0.0f);
-                float scale = axis == 0 ? -ray.x : axis == 1 ? -ray.y : -ray.z, of_column = has_moved ? curved : weight;
+                float scale = axis == 0 ? -ray.x : axis == 1 ? -ray.y : -ray.z, of_column = has_perturbed ? curved : weight;
                 float squares[3] = {0.0f, 0.0f, 0.0f};
                 for (int c = 0; c < channels; c++) {
                     float gx = (value_of(rgb, i + 1, c, channels) - value_of(rgb, i - 1, c, channels)) / 2.0f;
@@ -215,14 +215,14 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                         gy = (gy + (image[(i + width) * channels + c] - image[(i - width) * channels + c]) / 2.0f / gain[c]) / 2.0f;
                     }
                     float value = value_of(rgb, i, c, channels), column = residual[c];
-                    if (has_moved) column = (value_of(moved, i, c, channels) - value) / step;
+                    if (has_perturbed) column = (value_of(perturbed, i, c, channels) - value) / step;
                     float8 row = -(gx * motion_x + gy * motion_y), *total = totals + c * CHANNEL_ROWS;
                     row.s67 = (float2)(value, 1.0f);
                     float8 weighted = curved * row, entry = of_column * column * row;
                     for (int k = 0; k < 8; k++) total[k] += ((const float *)&weighted)[k] * row;
                     total[8] += entry;
                     float own = value + residual[c];
-                    total[9] += has_moved ? scale * entry : (float8)(own, value, own * own, value * value, own * value, 1.0f, 0.0f, 0.0f);
+                    total[9] += has_perturbed ? scale * entry : (float8)(own, value, own * own, value * value, own * value, 1.0f, 0.0f, 0.0f);
                     squares[c] = weight * residual[c] * residual[c];
                 }
                 others += (float8)(squares[0], squares[1], squares[2], 1.0f, cost, before, inverse * inverse, 0.0f);

@@ -19,7 +19,7 @@ typedef struct {
 } Pixel;
 
 typedef struct {            // uniforms of the blend stage
-    wide log_cut, ceiling, stop, filter;
+    wide log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter;
 } BlendConstants;
 
 static inline void pixel_start(Pixel *pixel) {
@@ -43,7 +43,7 @@ static inline Attributes fragment_attributes(const Splat *s, Intersection c, vfl
 
 // Composites a fragment in front of all later fragments, where `mask` is set and the pixel is not terminated.
 static inline void composite(Pixel *pixel, const Attributes *attributes, vfloat opacity, vint mask, const BlendConstants *constants) {
-    vint live = mask & VMASK(pixel->t > constants->stop);
+    vint live = mask & VMASK(pixel->t > constants->transmittance_stop);
 //@@ stop
 //@@ color_composite
 //@@ composite
@@ -52,7 +52,7 @@ static inline void composite(Pixel *pixel, const Attributes *attributes, vfloat 
 
 // Pixels that are not terminated.
 static inline vint pixel_transmits(const Pixel *pixel, const BlendConstants *constants) {
-    return VMASK(pixel->t > constants->stop)
+    return VMASK(pixel->t > constants->transmittance_stop)
 //@@ transmits
         ;
 }
@@ -71,7 +71,7 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Intersection c, vin
 //@@ blend_parameters
 ) {
     vfloat inverse_d = INVERSE_D(c);
-    vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, inverse_d, screen), constants->ceiling);
+    vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, inverse_d, screen), constants->opacity_ceiling);
 //@@ footprint_opacity
     const Attributes attributes = fragment_attributes(s, c, inverse_d);
 //@@ occlude

@@ -8,7 +8,7 @@
 
 //@@ compose_types
 typedef struct {            // uniforms of the blend stage
-    wide log_cut, ceiling, stop, filter;
+    wide log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter;
     float log_ceiling;
 } BlendConstants;
 
@@ -35,7 +35,7 @@ static inline vfloat pixel_transmittance(const Pixel *pixel) {
 
 // Composited opacity of a fragment; attenuates the pixel's transmittance by it.
 static inline vfloat attenuate(Pixel *pixel, vfloat opacity, vint mask, const BlendConstants *constants) {
-    vint live = mask & VMASK(pixel->t > constants->stop);
+    vint live = mask & VMASK(pixel->t > constants->transmittance_stop);
 //@@ stop
     vfloat composited = VSELECT((vfloat)0.0f, opacity, live);
     pixel->t = pixel->t - pixel->t * composited;

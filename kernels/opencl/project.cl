@@ -106,7 +106,7 @@ kernel void project(
     real3_ p = rotate_to_camera(view, mean);
     p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
     wide log_opacity = (wide)ln((real)opacity);
-    wide half_r2 = log_opacity - (wide)view->log_cut;
+    wide half_r2 = log_opacity - (wide)view->log_alpha_cutoff;
     if (!(half_r2 > 0.0f && opacity > 0.0f && opacity < INFINITY)) return;        // also culls NaN
 
     // columns of the rotation of an unnormalised quaternion

@@ -221,7 +221,7 @@ def make_blend_backward(
         own = (start / CHUNK + tile) * threads + item
 
         chunks = int(0)
-        while start + chunks * CHUNK < end and any_of_block(light > view.stop):
+        while start + chunks * CHUNK < end and any_of_block(light > view.transmittance_stop):
             first = start + chunks * CHUNK
             checkpoints[own + chunks * threads] = light
             for place in range(wp.min(CHUNK, end - first)):
@@ -300,7 +300,7 @@ def make_blend_backward(
                 fragments[at * CHUNK + place] = wp.vec2(light, opacity)
                 if opacity != 0.0:
                     lights[at] = transmittance_behind(light, opacity)
-                    if not (lights[at] > view.stop):
+                    if not (lights[at] > view.transmittance_stop):
                         left -= 1
         return left
 

@@ -48,9 +48,9 @@ class View:
     tiles_y: int
     samples: int  # per pixel and axis
     per_pixel: float  # (pixels per sample)^2: converts squared samples to squared pixels
-    log_cut: float
-    ceiling: float
-    stop: float
+    log_alpha_cutoff: float
+    opacity_ceiling: float
+    transmittance_stop: float
     first_hit_transmittance: float  # maximum transmittance behind a first hit
     fog_density: float  # 1 / metres
     # limits of -x, x, -y, y at z = 1, to which EWA clamps the centre of a splat before it linearises

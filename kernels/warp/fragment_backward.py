@@ -120,12 +120,12 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         """Opacity of a splat at a sample with transmittance `light`, with the decisions of the forward pass:
         0 if it is not blended, -1 if it terminates the sample without being blended."""
         opacity = float(0.0)
-        if light > view.stop:
+        if light > view.transmittance_stop:
             c = crossed(s, float(column) - s.d[3], float(row) - s.c[0], view)
             if c.contributes:
                 opacity = opacity_of(s, c, 1.0 / c.d, view)
                 if wp.static(exclusive):
-                    if light * (1.0 - opacity) <= view.stop:
+                    if light * (1.0 - opacity) <= view.transmittance_stop:
                         opacity = -1.0
         return opacity
 

@@ -145,14 +145,14 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
     def opacity_of(s: Splat, c: Intersection, inverse_d: float, view: View) -> float:
         if wp.static(boxes):
             if is_box(s):
-                return wp.min(exp(s.u[3]), view.ceiling) * c.cover
+                return wp.min(exp(s.u[3]), view.opacity_ceiling) * c.cover
         half_rho = c.q * inverse_d * inverse_d
         if wp.static(screen):
             if c.inside:
                 half_rho = wp.min(half_rho, c.screen)
             else:
                 half_rho = c.screen
-        return wp.min(exp(s.u[3] - half_rho), view.ceiling)
+        return wp.min(exp(s.u[3] - half_rho), view.opacity_ceiling)
 
     @wp.func
     def depth_of(

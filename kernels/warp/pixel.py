@@ -102,13 +102,13 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
     def unfinished(p: Pixel, view: View) -> bool:
         """Whether a later fragment can still contribute."""
         if wp.static(exclusive):
-            return p.t > view.stop and p.finished == 0
+            return p.t > view.transmittance_stop and p.finished == 0
         elif wp.static(k_buffered):
-            return p.t > view.stop and p.k_buffer.after_z < wp.inf
+            return p.t > view.transmittance_stop and p.k_buffer.after_z < wp.inf
         elif wp.static(layered):
-            return p.t > view.stop and p.layers.after_z < wp.inf
+            return p.t > view.transmittance_stop and p.layers.after_z < wp.inf
         else:
-            return p.t > view.stop
+            return p.t > view.transmittance_stop
 
     @wp.func
     def attributes_at(color: wp.vec3, z: float, lines: wp.array(dtype=wp.vec4), index: int):
@@ -128,12 +128,12 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         """Composite a fragment or layer in front of all later fragments, unless the pixel is terminated."""
         p = pixel
         if wp.static(not branchless):
-            if not (p.t > view.stop):
+            if not (p.t > view.transmittance_stop):
                 return p
         weight = p.t * opacity
         if wp.static(exclusive):
             # parity with gsplat and the 2DGS authors: the fragment that would terminate the pixel is dropped
-            if p.t * (1.0 - opacity) <= view.stop:
+            if p.t * (1.0 - opacity) <= view.transmittance_stop:
                 p.finished = 1
                 if wp.static(not branchless):
                     return p
@@ -247,7 +247,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
             if wp.static(exclusive):
                 p.finished = 0
             unstopped = view
-            unstopped.stop = -1.0
+            unstopped.transmittance_stop = -1.0
             p = composite(p, attributes, 1.0, unstopped)
         return p
 

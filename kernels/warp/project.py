@@ -122,7 +122,7 @@ def make_project(
         counts[at] = 0
         # conditions are written so that a NaN culls
         log_opacity = float(ln(real(opacity)))
-        half_r2 = log_opacity - view.log_cut
+        half_r2 = log_opacity - view.log_alpha_cutoff
         if not (half_r2 > 0.0 and opacity > 0.0 and opacity < wp.inf):
             return
         if not (size[0] >= 0.0 and size[0] < wp.inf and size[1] >= 0.0 and size[1] < wp.inf):
@@ -167,7 +167,7 @@ def make_project(
                     a, b, unit_normal, sizes, p, view
                 )
                 log_opacity += float(log_share)
-                half_r2 = log_opacity - view.log_cut
+                half_r2 = log_opacity - view.log_alpha_cutoff
                 if not (half_r2 > 0.0):
                     return
                 itself = wp.static(drawn_ewa)
@@ -177,7 +177,7 @@ def make_project(
                 if here:
                     wide = widened(a, b, by_x, by_y, by_depth)
                     log_opacity -= float(half * ln(wide[3]))
-                    half_r2 = log_opacity - view.log_cut
+                    half_r2 = log_opacity - view.log_alpha_cutoff
                     if not (half_r2 > 0.0):
                         return  # also edge-on for parallel rays: infinitely thin and faint
                     a = wide[0] * a + wide[1] * b

@@ -73,7 +73,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
                 s.origin = wp.vec3(s.w[3], rest[0], rest[1])
             if wp.static(parallel):
                 s.plane = line(pool, lines, lists, first, which, plane_line)
-            s.half_r2 = s.u[3] - view.log_cut
+            s.half_r2 = s.u[3] - view.log_alpha_cutoff
             return s
 
         @wp.func

@@ -197,7 +197,7 @@ def test_arguments_and_local_memory_without_effects(renderer, schedule):
     local = cl.kernel_work_group_info.LOCAL_MEM_SIZE
     arguments = {}
     for name in pipeline.source.arguments:
-        kernel = cl.Kernel(pipeline.program.compiled[name], name)
+        kernel = cl.Kernel(pipeline.program.programs[name], name)
         head = re.search(rf"void {name}\(([^{{]*?)\)\s*\{{", pipeline.source.text)
         assert head, name
         arguments[name] = kernel.num_args, len(re.findall(r"\bglobal\b", head[1]))

@@ -35,7 +35,7 @@ SETS = {
 def offsets_on(backend, source: KernelSource) -> dict[str, dict[str, int]]:
     """Offsets on the device by record and field, and under "" the size of the record."""
     structs = re.findall(
-        r"typedef struct[^{]*\{[^}]*\} (?:View|Splat|Bounds);", source.programs["frame"].compiled
+        r"typedef struct[^{]*\{[^}]*\} (?:View|Splat|Bounds);", source.programs["frame"].text
     )
     assert len(structs) == len(source.records)
     requested, lines = [], []
@@ -80,8 +80,7 @@ def test_kernels_have_the_declared_arguments(renderer, shape):
     requested = combination(all_effects("fisheye") if shape.schedule == "lanes" else all_effects(None))
     source = assemble(requested.features(), shape)
     programs = [
-        build(renderer.backend, program.compiled, "-cl-kernel-arg-info")
-        for program in source.programs.values()
+        build(renderer.backend, program.text, "-cl-kernel-arg-info") for program in source.programs.values()
     ]
     info, spaces = cl.kernel_arg_info, cl.kernel_arg_address_qualifier
     kernels = {kernel.function_name: kernel for program in programs for kernel in program.all_kernels()}

@@ -9,7 +9,7 @@ from test_agreement import coplanar_cloud
 
 import fidsplat as fs
 from fidsplat.effects import select
-from fidsplat.selftest.agreement import FrameSpec, differing, trace
+from fidsplat.selftest.agreement import FrameSpec, differing, render_intermediates
 from fidsplat.selftest.arithmetic import BOUNDS, worst
 
 CAMERA = fs.Camera.look_at(83, 61, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
@@ -91,11 +91,11 @@ def test_faint_fragments_stay_faint(renderer):
 @pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
 def test_both_schedules_are_bit_identical(renderer, cloud):
     image = FrameSpec(cloud, CAMERA, FAST, ALL_OUTPUTS)
-    own_trace, other = (
-        trace(renderer, image),
-        trace(renderer, image, renderer.backend.configs("schedule")["groups"]),
+    own, other = (
+        render_intermediates(renderer, image),
+        render_intermediates(renderer, image, renderer.backend.configs("schedule")["groups"]),
     )
-    assert differing(own_trace, other, ALL_OUTPUTS) == 0
+    assert differing(own, other, ALL_OUTPUTS) == 0
 
 
 def test_instructions_of_a_vendor_change_what_the_quality_allows(renderer):
@@ -105,12 +105,12 @@ def test_instructions_of_a_vendor_change_what_the_quality_allows(renderer):
         pytest.skip("the device has no dialect")
     for quality in (FAST, PRECISE, FAST.with_(order="pixel")):
         picture = FrameSpec(random_splats(3000, seed=2, scale=(1e-3, 0.8)), CAMERA, quality, ALL_OUTPUTS)
-        own_trace, other = trace(renderer, picture), trace(renderer, picture, shape)
-        assert differing(own_trace, other, ALL_OUTPUTS) == 0
+        own, other = render_intermediates(renderer, picture), render_intermediates(renderer, picture, shape)
+        assert differing(own, other, ALL_OUTPUTS) == 0
     for changes, bound in (({"arithmetic": "approximate"}, 2e-4), ({"blend_precision": "float16"}, 2.0**-7)):
         picture = FrameSpec(random_splats(3000, seed=2, scale=(1e-3, 0.8)), CAMERA, FAST.with_(**changes))
-        own_trace, other = trace(renderer, picture), trace(renderer, picture, shape)
-        assert np.abs(own_trace["rgb"] - other["rgb"]).max() < bound
+        own, other = render_intermediates(renderer, picture), render_intermediates(renderer, picture, shape)
+        assert np.abs(own["rgb"] - other["rgb"]).max() < bound
 
 
 def test_blending_in_float64_takes_the_library_s():

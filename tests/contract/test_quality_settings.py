@@ -162,13 +162,13 @@ def test_half_precision_has_the_same_bits_in_both_schedules_and_words(opencl, mo
         own, groups = (
             replace(shape, dialect="") for shape in (backend.config, backend.configs("schedule")["groups"])
         )
-        expected = backend.pipeline(features, own).trace(backend.upload(cloud), view)
-        plain = backend.pipeline(features, groups).trace(backend.upload(cloud), view)
+        expected = backend.pipeline(features, own).render_intermediates(backend.upload(cloud), view)
+        plain = backend.pipeline(features, groups).render_intermediates(backend.upload(cloud), view)
         with monkeypatch.context() as patch:
             patch.setattr(assembly, "_dialect", lambda *_: [str(file)])
             packed = backend.pipeline(features, replace(groups, tape=1))
         assert "word_fma" in packed.source.text
-        words = packed.trace(backend.upload(cloud), view)
+        words = packed.render_intermediates(backend.upload(cloud), view)
         for name in capture.outputs:
             assert np.array_equal(plain[name], expected[name])
             assert np.array_equal(words[name], expected[name])

@@ -7,7 +7,14 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.scenes.random_clouds import random_splats
-from fidsplat.selftest.agreement import ALL_OUTPUTS, CULLED, FrameSpec, differing, render, trace
+from fidsplat.selftest.agreement import (
+    ALL_OUTPUTS,
+    CULLED,
+    FrameSpec,
+    differing,
+    render,
+    render_intermediates,
+)
 from fidsplat.selftest.clouds import camera, rotation, splats, subset_of
 from fidsplat.selftest.order import tag
 
@@ -39,7 +46,7 @@ def test_tile_sizes(renderer, spec):
         pytest.skip("renders without tiles")
     own = render(renderer, spec)
     for shape in renderer.backend.configs("tiles").values():
-        assert differing(own, trace(renderer, spec, shape), ALL_OUTPUTS) == 0, shape
+        assert differing(own, render_intermediates(renderer, spec, shape), ALL_OUTPUTS) == 0, shape
 
 
 def test_one_tile_for_the_complete_image(renderer):
@@ -51,10 +58,10 @@ def test_one_tile_for_the_complete_image(renderer):
     whole = replace(own, tile_width=width, tile_height=height)
     for cloud in CLOUDS.values():
         spec = FrameSpec(cloud, camera(width, height, 20.0), outputs=ALL_OUTPUTS)
-        traced = trace(renderer, spec, whole)
-        assert len(traced["starts"]) == 2
+        buffers = render_intermediates(renderer, spec, whole)
+        assert len(buffers["starts"]) == 2
         for shape in renderer.backend.configs("tiles").values():
-            assert differing(traced, trace(renderer, spec, shape), ALL_OUTPUTS) == 0, shape
+            assert differing(buffers, render_intermediates(renderer, spec, shape), ALL_OUTPUTS) == 0, shape
 
 
 def test_a_batch_equals_its_single_frames(renderer):
@@ -84,7 +91,7 @@ def test_frames_of_one_upload_equal_those_of_a_new_renderer(renderer):
 
 
 def test_removing_culled_splats_changes_nothing(renderer, spec):
-    keys = trace(renderer, spec)["keys"]
+    keys = render_intermediates(renderer, spec)["keys"]
     visible = np.flatnonzero(keys != CULLED)
     fewer = replace(spec, cloud=subset_of(spec.cloud, visible))
     assert differing(render(renderer, spec), render(renderer, fewer), ALL_OUTPUTS) == 0

@@ -10,7 +10,7 @@ import fidsplat as fs
 from fidsplat.cameras import Camera
 from fidsplat.scenes.random_clouds import load_scene, standard_camera
 from fidsplat.selftest import clouds, order
-from fidsplat.selftest.agreement import FrameSpec, differing, render, trace
+from fidsplat.selftest.agreement import FrameSpec, differing, render, render_intermediates
 from fidsplat.selftest.clouds import splats, subset_of
 from fidsplat.selftest.order import (
     SMOOTH,
@@ -27,7 +27,7 @@ from fidsplat.selftest.order import (
 @pytest.mark.parametrize("away", [0.0, 1.0])
 def test_fronto_parallel_splats_do_tie(renderer, away):
     """Case C1 requires ties: rounding leaves few distinct depths of 200 splats."""
-    keys = trace(renderer, order.fronto_parallel(away))["keys"]
+    keys = render_intermediates(renderer, order.fronto_parallel(away))["keys"]
     assert len(np.unique(keys)) < 50
 
 
@@ -73,9 +73,9 @@ def test_images_do_not_depend_on_the_size_of_the_k_buffer(renderer, cloud):
     """A k-buffer of one or few fragments needs several passes and is bit-identical."""
     spec = FrameSpec(cloud, clouds.camera(50, 40, 40.0), fs.Quality(order="pixel"), ALL_OUTPUTS)
     shapes = renderer.backend.configs("k_buffer")
-    expected = trace(renderer, spec)
+    expected = render_intermediates(renderer, spec)
     for name, shape in shapes.items():
-        assert differing(trace(renderer, spec, shape), expected, spec.outputs) == 0, name
+        assert differing(render_intermediates(renderer, spec, shape), expected, spec.outputs) == 0, name
 
 
 def _faint(count, seed, depth, scale, opacity=0.3, across=2.0):
@@ -131,7 +131,12 @@ def test_deferral_and_lookahead_are_bit_identical(renderer, name):
     view = views.get(name, clouds.camera(34, 20, 30.0))
     spec = FrameSpec(NEAR_ELSEWHERE[name], view, fs.Quality(order="pixel"), ("rgb", "depth", "normal"))
     groups = renderer.backend.configs("schedule")["groups"]
-    assert differing(trace(renderer, spec, groups), trace(renderer, spec), spec.outputs) == 0
+    assert (
+        differing(
+            render_intermediates(renderer, spec, groups), render_intermediates(renderer, spec), spec.outputs
+        )
+        == 0
+    )
 
 
 def test_of_equal_depths_in_the_k_buffer_the_first_is_in_front(renderer):

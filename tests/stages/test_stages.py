@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, random_splats
-from traces import CAMERA, CULLED, listing, traced
+from stage_buffers import CAMERA, CULLED, intermediates_of, listing
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
@@ -36,7 +36,7 @@ def footprint(cloud, view, index, dot=True):
     # center + tangents @ (u, v) = depth * ray
     system = np.concatenate([np.broadcast_to(tangents, (*rays.shape[:2], 3, 2)), -rays[..., None]], axis=-1)
     solution = np.linalg.solve(system, np.broadcast_to(-center[:, None], (*rays.shape, 1)))[..., 0]
-    half_r2 = np.log(float(cloud.opacities[index])) - view.log_cut
+    half_r2 = np.log(float(cloud.opacities[index])) - view.log_alpha_cutoff
     inside = (solution[..., :2] ** 2).sum(-1) <= 2 * half_r2 * (1 - 1e-6)
     inside &= solution[..., 2] >= view.near
     if dot and center[2] >= view.near:
@@ -54,16 +54,16 @@ def test_lists_have_all_overlapped_tiles_and_few_others(backend, seed, scale, li
     """Cases A1, A3 to A5: no tile is missing for any pose; bounds in front of the camera are tight."""
     cloud = random_splats(120, seed, scale=scale)
     shape = listing(backend, lists)
-    trace, view = traced(backend, cloud, fs.Quality(alpha_cutoff=1 / 255), shape=shape)
+    buffers, view = intermediates_of(backend, cloud, fs.Quality(alpha_cutoff=1 / 255), shape=shape)
     tiles_x = -(-view.width // shape.tile_width)
     listed = [set() for _ in range(len(cloud))]
-    for tile in range(len(trace["starts"]) - 1):
-        for index in trace["lists"][trace["starts"][tile] : trace["starts"][tile + 1]]:
+    for tile in range(len(buffers["starts"]) - 1):
+        for index in buffers["lists"][buffers["starts"][tile] : buffers["starts"][tile + 1]]:
             listed[index].add(tile)
     needed_in_front = listed_in_front = 0
     for index in range(len(cloud)):
         if cloud.opacities[index] <= 1 / 255:
-            assert trace["keys"][index] == CULLED
+            assert buffers["keys"][index] == CULLED
             continue
         rows, columns = footprint(cloud, view, index)
         needed = set((rows // shape.tile_height * tiles_x + columns // shape.tile_width).tolist())
@@ -90,7 +90,7 @@ def test_bounds_contain_the_rims_of_huge_disks(backend):
     features, view = prepare(disks, fs.Capture(CAMERA, ALL_OUTPUTS, quality))
     assert np.array_equal(view.rotation, np.eye(3))
     pipeline = backend.pipeline(features)
-    boxes = backend.probe().boxes(pipeline, pipeline.trace(backend.upload(disks), view))
+    boxes = backend.probe().boxes(pipeline, pipeline.render_intermediates(backend.upload(disks), view))
     rows, columns = np.mgrid[0 : view.height, 0 : view.width] + 0.5
     for (x0, x1, y0, y1), mean, radius in zip(boxes, disks.means, disks.scales[:, 0], strict=True):
         x, y, z = mean.astype(float) + view.translation
@@ -113,32 +113,32 @@ def test_keys_are_depths_and_the_order_is_total(backend):
         np.concatenate([cloud.opacities] * 2),
         colors=np.concatenate([cloud.colors] * 2),
     )
-    trace, view = traced(backend, doubled, fs.Quality())
-    keys = trace["keys"]
+    buffers, view = intermediates_of(backend, doubled, fs.Quality())
+    keys = buffers["keys"]
     visible = np.flatnonzero(keys != CULLED)
     order = visible[np.argsort(keys[visible], kind="stable")]
     depth = (means[visible].astype(float) @ view.rotation.T + view.translation)[:, 2]
     bits = keys[visible]
     decoded = np.where(bits & 0x80000000, bits & 0x7FFFFFFF, ~bits).view(np.float32)
     assert np.all(np.abs(decoded - depth) <= 2 * np.spacing(np.abs(depth).astype(np.float32)))
-    assert out_of_order(trace, order) == 0
-    assert len(set(trace["lists"])) > 0
-    assert set(trace["lists"]) <= set(visible)
+    assert out_of_order(buffers, order) == 0
+    assert len(set(buffers["lists"])) > 0
+    assert set(buffers["lists"]) <= set(visible)
 
 
 def test_quaternions_are_normalised(backend):
     """Bit-identical for quaternions of twice the length."""
     cloud, longer = random_splats(100, seed=6), random_splats(100, seed=6)
     object.__setattr__(longer, "quats", 2 * longer.quats)
-    batch_images = [traced(backend, each, fs.Quality())[0]["rgb"] for each in (cloud, longer)]
+    batch_images = [intermediates_of(backend, each, fs.Quality())[0]["rgb"] for each in (cloud, longer)]
     assert np.array_equal(*batch_images)
     assert batch_images[0].any()
 
 
 def test_culled_splats_change_nothing(backend):
     cloud = random_splats(400, seed=6)
-    trace, _ = traced(backend, cloud, fs.Quality())
-    visible = np.flatnonzero(trace["keys"] != CULLED)
+    buffers, _ = intermediates_of(backend, cloud, fs.Quality())
+    visible = np.flatnonzero(buffers["keys"] != CULLED)
     assert 0 < len(visible) < 400
     fewer = fs.SplatCloud(
         cloud.means[visible],
@@ -147,7 +147,7 @@ def test_culled_splats_change_nothing(backend):
         cloud.opacities[visible],
         colors=cloud.colors[visible],
     )
-    assert np.array_equal(traced(backend, fewer, fs.Quality())[0]["rgb"], trace["rgb"])
+    assert np.array_equal(intermediates_of(backend, fewer, fs.Quality())[0]["rgb"], buffers["rgb"])
 
 
 @pytest.mark.parametrize("lists", ["sort_first", "bin_first"])
@@ -156,24 +156,24 @@ def test_splats_between_the_samples_are_culled(backend, lists):
     cloud = random_splats(20000, seed=3, scale=(1e-5, 3e-4))
     features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS, fs.Quality(lowpass="none")))
     pipeline = backend.pipeline(features, listing(backend, lists))
-    trace = pipeline.trace(backend.upload(cloud), view)
-    visible = trace["keys"] != CULLED
-    x0, x1, y0, y1 = backend.probe().boxes(pipeline, trace)[visible].T
+    buffers = pipeline.render_intermediates(backend.upload(cloud), view)
+    visible = buffers["keys"] != CULLED
+    x0, x1, y0, y1 = backend.probe().boxes(pipeline, buffers)[visible].T
     assert 5 < visible.sum() < 1000
     assert (x0 < x1).all()
     assert (y0 < y1).all()
-    assert trace["rgb"].any()
+    assert buffers["rgb"].any()
 
 
 def test_tile_sizes_are_bit_identical(backend):
     """Cases A4 and A5: detects errors of the bounds."""
     cloud = random_splats(300, seed=3)
     quality = fs.Quality()
-    base, _ = traced(backend, cloud, quality)
+    base, _ = intermediates_of(backend, cloud, quality)
     for size, other in backend.configs("tiles").items():
-        trace, _ = traced(backend, cloud, quality, shape=other)
+        buffers, _ = intermediates_of(backend, cloud, quality, shape=other)
         for name in ALL_OUTPUTS:
-            assert np.array_equal(trace[name], base[name]), f"{name} differs with {size}"
+            assert np.array_equal(buffers[name], base[name]), f"{name} differs with {size}"
 
 
 @pytest.mark.parametrize("lowpass", ["screen", "none"])
@@ -184,10 +184,10 @@ def test_the_box_of_a_record_contains_all_fragments(backend, lowpass):
     features = select(cloud, fs.Capture(outputs=ALL_OUTPUTS, quality=quality))
     view = View.of(fs.Capture(CAMERA, quality=quality), cloud.origin)
     pipeline = backend.pipeline(features)
-    trace = pipeline.trace(backend.upload(cloud), view)
-    boxes = backend.probe().boxes(pipeline, trace)
+    buffers = pipeline.render_intermediates(backend.upload(cloud), view)
+    boxes = backend.probe().boxes(pipeline, buffers)
     fragments = 0
-    for index in np.flatnonzero(trace["keys"] != CULLED):
+    for index in np.flatnonzero(buffers["keys"] != CULLED):
         rows, columns = footprint(cloud, view, index, dot=lowpass == "screen")
         for axis, places in enumerate((columns, rows)):
             first, end = boxes[index, 2 * axis : 2 * axis + 2]
@@ -201,7 +201,7 @@ def test_the_bounds_of_a_box_are_its_corners(backend):
     box = fs.SplatCloud([(0.2, 0.1, 3)], [(1, 0, 0, 0)], [(0.3, 0.2)], [1.0], colors=[(1, 1, 1)]).with_boxes()
     features, view = prepare(box, fs.Capture(CAMERA, ALL_OUTPUTS))
     pipeline = backend.pipeline(features)
-    bounds = backend.probe().boxes(pipeline, pipeline.trace(backend.upload(box), view))[0]
+    bounds = backend.probe().boxes(pipeline, pipeline.render_intermediates(backend.upload(box), view))[0]
     low, high = (view.rotation @ (x, y, 3) + view.translation for x, y in ((-0.1, -0.1), (0.5, 0.3)))
     expected = [
         *(view.focal_x * corner[0] / corner[2] + view.center_x for corner in (low, high)),
@@ -214,12 +214,12 @@ def test_layers_do_not_depend_on_tile_size_or_schedule(backend, renderer):
     """Four intersecting coplanar groups, and ungrouped splats."""
     planes = np.random.default_rng(9).choice([-1, -1, -1, 0, 1, 2, 3], 300)
     cloud = random_splats(300, seed=9, scale=(0.05, 0.5)).with_coplanar_groups(planes)
-    base, _ = traced(backend, cloud, fs.Quality())
-    other, _ = traced(backend, cloud, fs.Quality(), shape=backend.configs("schedule")["groups"])
+    base, _ = intermediates_of(backend, cloud, fs.Quality())
+    other, _ = intermediates_of(backend, cloud, fs.Quality(), shape=backend.configs("schedule")["groups"])
     for name in ("rgb", "alpha", "normal", "depth"):
         assert np.abs(other[name] - base[name]).max() < 2e-5, name
     *_, (size, shape) = backend.configs("tiles").items()
-    tiled, _ = traced(backend, cloud, fs.Quality(), shape=shape)
+    tiled, _ = intermediates_of(backend, cloud, fs.Quality(), shape=shape)
     for name in ALL_OUTPUTS:
         assert np.array_equal(tiled[name], base[name]), f"{name} differs with {size}"
 
@@ -229,16 +229,16 @@ def test_splats_of_coplanar_groups_are_first_in_each_list(backend, order):
     """Group after group, whatever is between their centres."""
     generator = np.random.default_rng(2)
     cloud = random_splats(200, seed=2, depth=(2.0, 4.0)).with_coplanar_groups(generator.integers(-1, 3, 200))
-    trace, _ = traced(backend, cloud, fs.Quality(order=order))
-    for start, end in pairwise(trace["starts"]):
-        groups = cloud.coplanar_groups[trace["lists"][start:end]]
+    buffers, _ = intermediates_of(backend, cloud, fs.Quality(order=order))
+    for start, end in pairwise(buffers["starts"]):
+        groups = cloud.coplanar_groups[buffers["lists"][start:end]]
         assert (np.diff(np.where(groups < 0, 3, groups)) >= 0).all()
 
 
 def test_schedules_agree(backend, renderer):
     cloud = random_splats(300, seed=9)
-    base, _ = traced(backend, cloud, fs.Quality())
-    other, _ = traced(backend, cloud, fs.Quality(), shape=backend.configs("schedule")["groups"])
+    base, _ = intermediates_of(backend, cloud, fs.Quality())
+    other, _ = intermediates_of(backend, cloud, fs.Quality(), shape=backend.configs("schedule")["groups"])
     for name in ("rgb", "alpha", "normal", "depth"):
         assert np.allclose(other[name], base[name], rtol=1e-5, atol=2e-6), name
     assert np.array_equal(other["label"], base["label"])

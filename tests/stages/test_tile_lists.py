@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, random_splats
-from traces import CAMERA, CULLED, listing, traced
+from stage_buffers import CAMERA, CULLED, intermediates_of, listing
 
 import fidsplat as fs
 from fidsplat.backends.batched_views import ViewBatch
@@ -23,7 +23,7 @@ def test_binning_strategies_make_equal_lists(backend, scale):
     """Small splats, and splats that overlap more tiles than a window of list/tiled.cl."""
     cloud = random_splats(2500, seed=5, scale=scale)
     tiled, ordered = (
-        traced(backend, cloud, fs.Quality(lowpass="none"), shape=listing(backend, lists))[0]
+        intermediates_of(backend, cloud, fs.Quality(lowpass="none"), shape=listing(backend, lists))[0]
         for lists in ("bin_first", "sort_first")
     )
     assert max(np.diff(tiled["starts"].astype(int))) > 20
@@ -54,8 +54,8 @@ def test_no_splat_of_a_complete_image_is_outside_of_its_band(backend):
     camera = fs.Camera.pinhole(33, 17, 30.0, 30.0, 5.0, 3.0)
     features, view = prepare(cloud, fs.Capture(camera, quality=fs.Quality(lowpass="pixel")))
     assert view.height % backend.config.tile_height
-    trace = backend.pipeline(features).trace(backend.upload(cloud), view)
-    assert not (trace["keys"] == CULLED - 1).any()
+    buffers = backend.pipeline(features).render_intermediates(backend.upload(cloud), view)
+    assert not (buffers["keys"] == CULLED - 1).any()
 
 
 @pytest.mark.parametrize(
@@ -217,12 +217,12 @@ def test_a_list_longer_than_local_memory_is_sorted(backend):
     """tile_lists.cl sorts 2048 pairs or the indices of 8192 at once in local memory, longer lists in global
     memory as well."""
     cloud = random_splats(11000, seed=8, depth=(1.0, 9.0), scale=(0.2, 0.3), across=0.1)
-    trace, _ = traced(backend, cloud, fs.Quality(), shape=backend.configs("schedule")["groups"])
-    visible = np.flatnonzero(trace["keys"] != CULLED)
-    lengths = np.diff(trace["starts"].astype(int))
+    buffers, _ = intermediates_of(backend, cloud, fs.Quality(), shape=backend.configs("schedule")["groups"])
+    visible = np.flatnonzero(buffers["keys"] != CULLED)
+    lengths = np.diff(buffers["starts"].astype(int))
     assert max(lengths) > 8192
     assert any((lengths > 2048) & (lengths <= 8192))
-    assert out_of_order(trace, visible[np.argsort(trace["keys"][visible], kind="stable")]) == 0
+    assert out_of_order(buffers, visible[np.argsort(buffers["keys"][visible], kind="stable")]) == 0
 
 
 def test_unaligned_arrays_of_a_cloud(backend):
@@ -236,7 +236,7 @@ def test_unaligned_arrays_of_a_cloud(backend):
         arrays[name] = flat[1:].reshape(array.shape)
     cloud = fs.SplatCloud(means=base.means, opacities=base.opacities, colors=base.colors, **arrays)
     assert all(getattr(cloud, name).ctypes.data % 16 for name in arrays)
-    batch_images = [traced(backend, each, fs.Quality())[0]["rgb"] for each in (base, cloud)]
+    batch_images = [intermediates_of(backend, each, fs.Quality())[0]["rgb"] for each in (base, cloud)]
     assert np.array_equal(*batch_images)
 
 
@@ -264,13 +264,13 @@ def test_lists_of_all_depth_distributions_are_sorted(backend, depths):
     )
     camera = fs.Camera.pinhole(CAMERA.width, CAMERA.height, 150.0, 150.0, 80.0, 58.0)
     features, view = prepare(cloud, fs.Capture(camera, ALL_OUTPUTS))
-    trace = backend.pipeline(features, backend.configs("schedule")["groups"]).trace(
+    buffers = backend.pipeline(features, backend.configs("schedule")["groups"]).render_intermediates(
         backend.upload(cloud), view
     )
-    visible = np.flatnonzero(trace["keys"] != CULLED)
-    longest = max(np.diff(trace["starts"].astype(int)))
+    visible = np.flatnonzero(buffers["keys"] != CULLED)
+    longest = max(np.diff(buffers["starts"].astype(int)))
     assert 1000 < longest <= 1500
-    assert out_of_order(trace, visible[np.argsort(trace["keys"][visible], kind="stable")]) == 0
+    assert out_of_order(buffers, visible[np.argsort(buffers["keys"][visible], kind="stable")]) == 0
 
 
 @pytest.mark.parametrize("lists", ["sort_first", "bin_first"])

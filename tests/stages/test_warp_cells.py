@@ -54,7 +54,7 @@ def covered(records, names, view, rows, columns):
     y, x = np.mgrid[:rows, :columns]
     x, y = x - of["ax"], y - of["ay"]
     u, v, d = (of[f"{n}0"] + of[f"{n}x"] * x + of[f"{n}y"] * y for n in ("nu", "nv", "d"))
-    half_r2 = of["log_opacity"] - view.log_cut
+    half_r2 = of["log_opacity"] - view.log_alpha_cutoff
     covers = (u**2 + v**2 <= half_r2 * d**2) & (d > 0) & (d <= of["d_near"])
     if "lowpass_x" in of:
         covers |= (x - of["lowpass_x"]) ** 2 + (y - of["lowpass_y"]) ** 2 <= half_r2

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.alignment import AlignmentFit, Estimate, MovedFrame
+from fidsplat.backends.alignment import AlignmentFit, Estimate, PerturbedFrame
 from fidsplat.cameras.pose_offset import offset_camera
 from fidsplat.cli import main
 from fidsplat.images.files import write_png
@@ -233,7 +233,7 @@ def test_sums_of_the_device_agree_with_numpy(renderer, room, lens):
     for number, fitted, change in ((0, fit, False), (4, fit, False), (3, fit._replace(huber=False), True)):
         render = partial(renderer.render, resident, outputs=("rgb", "depth"))
         frame = render(stages[number].camera)
-        options = {"moved": MovedFrame(render(moved), 1e-3, 1)} if change else {"blocks": True}
+        options = {"perturbed": PerturbedFrame(render(moved), 1e-3, 1)} if change else {"blocks": True}
         fitted = fitted._replace(noise=0.02 if change else 0.0)
         one, other = (vars(kernels.sums(number, frame, fitted, **options)) for kernels in both)
         for name, value in one.items():

@@ -263,19 +263,19 @@ def test_splats_are_within_the_bounds_of_their_box(name):
     cloud, backend = splats(2, thick=True), fs.Renderer("opencl").backend
     capture = CAPTURES[name].with_(outputs=("alpha",))
     features, view = prepare(cloud, capture)
-    trace = backend.pipeline(features).trace(backend.upload(cloud), view)
+    buffers = backend.pipeline(features).render_intermediates(backend.upload(cloud), view)
     assert cloud.thickness is not None
     largest = np.maximum(cloud.scales.max(axis=1), cloud.thickness).astype(np.float64)
 
     def boxes(sigmas):
         return cloud.means - sigmas * largest[:, None], cloud.means + sigmas * largest[:, None]
 
-    shown = np.flatnonzero(trace["keys"] < 0xFFFFFFFE)
-    keys = TerminationDepths.of_keys(trace["keys"], (1, 1)).depths
+    shown = np.flatnonzero(buffers["keys"] < 0xFFFFFFFE)
+    keys = TerminationDepths.of_keys(buffers["keys"], (1, 1)).depths
     least = occlusion_test.min_sort_keys(view, features, boxes)
     assert (least[shown] <= keys[shown]).all()
     # one tile for each sample: only tiles that the splat touches do not terminate
-    records, rectangles = trace["records"], np.full((len(cloud), 4), -1)
+    records, rectangles = buffers["records"], np.full((len(cloud), 4), -1)
     for i in shown:
         rectangles[i] = records["y0"][i], records["y1"][i], records["x0"][i], records["x1"][i]
     for i in shown[:: max(1, len(shown) // 50)]:

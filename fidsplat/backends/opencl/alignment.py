@@ -13,10 +13,10 @@ from fidsplat.backends.alignment import (
     BINS,
     AlignmentFit,
     AlignmentKernels,
-    AlignmentStage,
     AlignmentSums,
+    CoarseToFineStage,
     Estimate,
-    MovedFrame,
+    PerturbedFrame,
     RenderedScene,
     lowest_bin,
     noise_factor,
@@ -58,7 +58,7 @@ class OpenCLAlignment(AlignmentKernels):
         """keeps arrays alive until the device has read them"""
 
     def load(
-        self, image: np.ndarray, stages: list[AlignmentStage], max_pixels: int, scene: RenderedScene
+        self, image: np.ndarray, stages: list[CoarseToFineStage], max_pixels: int, scene: RenderedScene
     ) -> list[int]:
         with self._workspace.lock, self._workspace.device_errors("localising"):
             self._levels, self._stages, self._scene, self._replayed = [], stages, scene, None
@@ -77,7 +77,7 @@ class OpenCLAlignment(AlignmentKernels):
         return pixels
 
     def _prepared(
-        self, number: int, level: AlignmentStage, source: _Image, full: _Image, histograms: cl.Buffer
+        self, number: int, level: CoarseToFineStage, source: _Image, full: _Image, histograms: cl.Buffer
     ) -> tuple[dict[str, Any], _Image]:
         """Kernel arguments of a pyramid level, and its image before blur. source: the next finer image."""
         camera = level.camera
@@ -111,43 +111,50 @@ class OpenCLAlignment(AlignmentKernels):
         self._by_groups("align_texture", self._rows(height), args)
         return args, (image, (height, width, channels))
 
-    def frame(self, stage: int, pose: np.ndarray, moved: bool = False) -> Any:
+    def frame(self, stage: int, pose: np.ndarray, perturbed: bool = False) -> Any:
         with self._workspace.rendering():
-            replayed = self._replay(stage, pose, moved)
+            replayed = self._replay(stage, pose, perturbed)
             if replayed is not None and replayed.frame.count_pairs() is not None:
-                return replayed.images(moved)
+                return replayed.images(perturbed)
         return super().frame(stage, pose)
 
-    def _replay(self, stage: int, pose: np.ndarray, moved: bool = False) -> _Replayed | None:
+    def _replay(self, stage: int, pose: np.ndarray, perturbed: bool = False) -> _Replayed | None:
         """Submit a frame of a pyramid level without waiting; None on CPUs, and for frames whose command list
         depends on the pose."""
         replayed = self._replayed
         if replayed is None or not replayed.is_bound(stage):
             camera = self._stages[stage].camera.with_pose(pose)
             self._replayed = replayed = _Replayed.of(self._workspace, stage, *self._scene.prepared(camera))
-            if replayed is None or not moved:
+            if replayed is None or not perturbed:
                 return replayed
         replayed.set_pose(pose)
-        replayed.submit(moved)
+        replayed.submit(perturbed)
         return replayed
 
     def sums(
-        self, stage: int, frame: Any, fit: AlignmentFit, moved: MovedFrame | None = None, blocks: bool = False
+        self,
+        stage: int,
+        frame: Any,
+        fit: AlignmentFit,
+        perturbed: PerturbedFrame | None = None,
+        blocks: bool = False,
     ) -> AlignmentSums:
         channels, args = len(fit.gain), self._levels[stage]
         groups = self._groups(args, blocks)
         with self._workspace.lock, self._workspace.device_errors("localising"):
             args = self._sum_arguments(args, frame, fit, groups)
-            if moved is not None:
-                args["moved"] = self._blurred(moved.frame.images.buffer("rgb"), args, "moved frame", 3)
-                args |= {"has_moved": 1, "step": moved.size, "axis": moved.axis}
+            if perturbed is not None:
+                args["perturbed"] = self._blurred(
+                    perturbed.frame.images.buffer("rgb"), args, "perturbed frame", 3
+                )
+                args |= {"has_perturbed": 1, "step": perturbed.size, "axis": perturbed.axis}
             cl.enqueue_fill_buffer(self._queue, args["counts"], _ZERO, 0, 4 * BINS)
             self._upload_fit(fit)
             self._by_groups("align_errors", self._rows(args["height"]), args)
             self._by_groups("align_sums", groups, args)
             packed = np.empty((groups, _SUMS), np.float32)
             cl.enqueue_copy(self._queue, packed, args["result"])
-        return _unpacked(packed, channels, blocks, moved is not None)
+        return _unpacked(packed, channels, blocks, perturbed is not None)
 
     def minimise(
         self, stage: int, at: Estimate, steps: int, settled: float, damping: float
@@ -216,8 +223,8 @@ class OpenCLAlignment(AlignmentKernels):
         """Arguments of `align_errors` and `align_sums` for a frame; submits its blur."""
         values = self._blurred(frame.images.buffer("rgb"), args, "render", 3, commands)
         return args | {
-            **{"rgb": values, "depth": frame.images.buffer("depth"), "moved": values},
-            **{"has_moved": 0, "step": 1.0, "axis": 0, "huber": int(fit.huber), "row": 0},
+            **{"rgb": values, "depth": frame.images.buffer("depth"), "perturbed": values},
+            **{"has_perturbed": 0, "step": 1.0, "axis": 0, "huber": int(fit.huber), "row": 0},
             **{"counts": self._scratch("errors", 4 * BINS), "fit": self._scratch("fit", 28)},
             **{"result": self._scratch("sums", 4 * groups * _SUMS)},
             "noise_factor": noise_factor(len(fit.gain)),
@@ -337,21 +344,21 @@ class _Replayed:
         if self._rotation:
             self._set_rotation(self._written())
 
-    def submit(self, moved: bool = False) -> None:
-        """Render the current pose. moved: into other images than usual."""
-        if moved and len(self._buffers) == 1:
+    def submit(self, perturbed: bool = False) -> None:
+        """Render the current pose. perturbed: into other images than usual."""
+        if perturbed and len(self._buffers) == 1:
             pool = self._workspace.pool
             self._buffers.append(
-                {name: pool.scratch(f"moved {name}", own.size) for name, own in self._buffers[0].items()}
+                {name: pool.scratch(f"perturbed {name}", own.size) for name, own in self._buffers[0].items()}
             )
-        self.frame.commands.set(self._buffers[moved])
+        self.frame.commands.set(self._buffers[perturbed])
         self._workspace.frames = self._number = self._workspace.frames + 1
         self.frame.events = self.frame.commands.submit(self._queue)
         self.frame.counted = self.frame.events[-1]
 
-    def images(self, moved: bool = False) -> Any:
+    def images(self, perturbed: bool = False) -> Any:
         return SimpleNamespace(
-            images=SimpleNamespace(buffer=lambda name: self._buffers[moved][f"{name}_out"])
+            images=SimpleNamespace(buffer=lambda name: self._buffers[perturbed][f"{name}_out"])
         )
 
     def _written(self) -> np.ndarray:
@@ -371,7 +378,7 @@ class _Replayed:
         return self._workspace.switch_to(self._workspace.replay_queue)
 
 
-def _unpacked(packed: np.ndarray, channels: int, blocks: bool, moved: bool) -> AlignmentSums:
+def _unpacked(packed: np.ndarray, channels: int, blocks: bool, perturbed: bool) -> AlignmentSums:
     """Unpack the sums of the work-groups. For each of 3 channels: 8 x 8 normal matrix, right-hand side, and a
     second right-hand side or 6 moments; then scalars."""
     rows = packed[:, :240].reshape(len(packed), 3, 10, 8)[:, :channels]
@@ -379,7 +386,7 @@ def _unpacked(packed: np.ndarray, channels: int, blocks: bool, moved: bool) -> A
     cost, before, inverse_depth = (scalars[4:7] / max(scalars[3], 1)).tolist()
     used = rows[packed[:, 243] > 0 if blocks else slice(0)].astype(float)
     return AlignmentSums(
-        *(total[:, :8], np.moveaxis(total[:, 8 : 9 + moved], 1, 2), scalars[:channels]),
+        *(total[:, :8], np.moveaxis(total[:, 8 : 9 + perturbed], 1, 2), scalars[:channels]),
         *(used[:, :, 8], used[:, :, :8], used[:, :, 9, :6]),
         *(cost, before, inverse_depth, float(packed[0, 248])),
     )

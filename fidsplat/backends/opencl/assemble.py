@@ -104,20 +104,20 @@ _EFFECT_ARGUMENTS = {
 
 
 @dataclass(frozen=True)
-class ProgramText:
-    """OpenCL C of a program."""
+class ProgramSource:
+    """OpenCL C source of a program."""
 
     listing: str
-    """with comments"""
-    compiled: str
-    """without comments, with the same line numbers"""
+    """with comments, for reading"""
+    text: str
+    """without comments, as compiled; lines have the same numbers"""
 
 
 @dataclass
 class KernelSource:
     """Flat kernel sources with their declarations for the host."""
 
-    programs: dict[str, ProgramText]
+    programs: dict[str, ProgramSource]
     records: dict[str, np.dtype]
     """structs of the texts, as NumPy types"""
     arguments: dict[str, tuple[Argument, ...]]
@@ -133,7 +133,7 @@ class KernelSource:
     @property
     def text(self) -> str:
         """The compiled text of all programs, without comments."""
-        return "".join(program.compiled for program in self.programs.values())
+        return "".join(program.text for program in self.programs.values())
 
     @property
     def digest(self) -> str:
@@ -402,7 +402,7 @@ class Assembler:
         arguments = {kernel: declared.arguments(kernel) for kernel in self._used["arguments"]}
         return KernelSource(texts, records, arguments, declared.sample_buffers, declared.scalars)
 
-    def _program(self, name: str, stages: Iterable[str]) -> ProgramText:
+    def _program(self, name: str, stages: Iterable[str]) -> ProgramSource:
         body = ""
         for stage in stages:
             file = f"{stage}.cl"
@@ -414,7 +414,7 @@ class Assembler:
         for number, value in sorted(self._defines.items()):
             if number in bare:  # an unused number must not change the text
                 head += f"#define {number} {value}\n"
-        return ProgramText(f"// the program `{name}`\n{head}{body}", f"\n{head}{bare}")
+        return ProgramSource(f"// the program `{name}`\n{head}{body}", f"\n{head}{bare}")
 
     def _fill(self, hook: str, subject: str) -> Iterator[str]:
         if hook in self._used:

@@ -96,7 +96,7 @@ class CommandList:
         number = self._launch_counts.get(kernel, 0)
         commands = self._reusable.setdefault(kernel, [])
         if number == len(commands):
-            kernel_object = cl.Kernel(self.program.compiled[kernel], kernel)
+            kernel_object = cl.Kernel(self.program.programs[kernel], kernel)
             commands.append(Command(kernel_object, kernel, self.program.types[kernel]))
         command = commands[number]
         command.stage, command.size, command.group = stage, size, group

@@ -122,7 +122,7 @@ class OpenCLGradients(GradientPipeline):
         self._bind_gradients(frame, gradients)
         reserved = frame.scratch("reserved", 8)
         cl.enqueue_fill_buffer(frame.queue, reserved, _ZERO, 0, 8)
-        ceiling = math.log(frame.view.ceiling)
+        ceiling = math.log(frame.view.opacity_ceiling)
         commands, key = self._tile_commands, self._key(frame)
         if key is not None and commands.key == key:
             values = {f"grad_{name}": frame.named[f"grad_{name}"] for name in self._output_gradients}

@@ -19,7 +19,7 @@ VIEW = Record(
         member("real eye[3]", "camera centre relative to the cloud's origin [m]"),
         member("real focal_x focal_y center_x center_y", "intrinsics of the sample grid [samples]"),
         member("real near far", "[m]"),
-        member("real log_cut", "ln(alpha cut-off)"),
+        member("real log_alpha_cutoff", "ln(alpha cut-off)"),
         member("real width height", "of the sample grid"),
         member("real filter", "(pixels per sample)^2, for filters that are defined in pixels"),
         member("real band band_end", "rows of samples to render"),
@@ -102,7 +102,7 @@ _RESERVED = args(
 )
 
 _BLENDED = args(
-    "wide log_cut ceiling stop filter  // ceiling: maximum alpha; stop: transmittance of early termination",
+    "wide log_alpha_cutoff opacity_ceiling transmittance_stop filter",
     *("float log_ceiling", "float background_r background_g background_b"),
     *("int stride  // of the padded image", "uint channel_stride", "in float grad_rgb  // (h, w, 3)"),
 )
@@ -110,7 +110,7 @@ _BLENDED = args(
 _BLEND = args(
     *("in Splat splats", "in uint lists starts"),
     "uint band_first  // the first tile of this launch; lists begin with its list",
-    *(_SIZE, "wide log_cut ceiling stop filter"),
+    *(_SIZE, "wide log_alpha_cutoff opacity_ceiling transmittance_stop filter"),
     "uint channel_stride  // samples per channel of raw, of all views",
     "out float raw  // 4 channels: r, g, b, transmittance",
 )
@@ -272,15 +272,15 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "align_texture": args(
         *("int width height channels row", _MASK, "in float image", "out uchar bins"),
-        "out uint counts  // (pyramid levels, BINS); row: the level",
+        "out uint counts  // (stages, BINS); row: the stage",
     ),
     "align_errors": args(_ALIGNED, "out uint counts  // (BINS)"),
     "align_sums": args(
         _ALIGNED,
         "in uint counts",
-        "int block_size huber has_moved axis lens  // has_moved: whether `moved` is a MovedFrame",
+        "int block_size huber has_perturbed axis lens  // has_perturbed: whether `perturbed` is given",
         "float focal_x focal_y center_x center_y noise_factor step",
-        "in float depth rays moved",
+        "in float depth rays perturbed",
         "out float result  // (work-groups, SUMS + 1)",
     ),
     "align_totals": args(

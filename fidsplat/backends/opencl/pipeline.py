@@ -282,8 +282,8 @@ class OpenCLPipeline(Pipeline):
         few = len(views) > 1 and self._planner.tiles(views.view) <= tiling.LOCAL_TILES
         return self._with_binning("bin_local") if few or resident.coherent else self
 
-    def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
-        """Render one view, and return the data between the stages: keys (n,) uint32; starts (tiles + 1,)
+    def render_intermediates(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
+        """Render one view; returns the buffers between the stages: keys (n,) uint32; starts (tiles + 1,)
         uint32; lists (pairs,) uint32, of the last band; records (n,) of the struct `Splat`; raw (4, rows,
         columns) float32: r, g, b, transmittance; output images by name."""
         with self.workspace.rendering():

@@ -161,8 +161,8 @@ class OpenCLProbe(Probe):
         words = contents(workspace, sums).view(np.uint32)
         return places, int(words[place]) | int(words[place + 1]) << 32
 
-    def boxes(self, pipeline: OpenCLPipeline, trace: Mapping[str, np.ndarray]) -> np.ndarray:
-        return np.stack([trace["records"][name].astype(int) for name in ("x0", "x1", "y0", "y1")], 1)
+    def boxes(self, pipeline: OpenCLPipeline, buffers: Mapping[str, np.ndarray]) -> np.ndarray:
+        return np.stack([buffers["records"][name].astype(int) for name in ("x0", "x1", "y0", "y1")], 1)
 
     def _poisoned_pool(self) -> BufferPool:
         return _PoisonedPool(self._workspace)

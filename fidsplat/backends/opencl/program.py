@@ -78,8 +78,8 @@ class Program:
     """The kernels of one source on one device."""
 
     def __init__(self, workspace: Workspace, source: KernelSource) -> None:
-        self.source, self.compiled = source, _compiled(workspace, source)
-        """the program of each kernel"""
+        self.source, self.programs = source, _compile(workspace, source)
+        """`programs`: the OpenCL program of each kernel, by the kernel's name"""
         self.types: dict[str, list[Callable[[Any], Any] | None]] = {}
         """NumPy type of each argument of a kernel; None for a buffer"""
         for kernel, arguments in source.arguments.items():
@@ -88,21 +88,21 @@ class Program:
                 types.append(None if argument.access else source.scalars.dtype(argument.ctype).type)
 
 
-def _compiled(workspace: Workspace, source: KernelSource) -> dict[str, cl.Program]:
-    """Compile a source; returns the program of each kernel.
+def _compile(workspace: Workspace, source: KernelSource) -> dict[str, cl.Program]:
+    """Compile a source; returns the OpenCL program of each kernel.
 
     PoCL's cache may return a program without kernels if another process is writing the entry, or was killed
     while writing it. A retry with another option uses another cache entry.
     """
     load_invoker()
     for attempt in range(3):
-        options, compiled = [f"-DATTEMPT_{attempt}"] if attempt else [], {}
-        for text in source.programs.values():
-            program = build(workspace, text.compiled, *options)
+        options, programs = [f"-DATTEMPT_{attempt}"] if attempt else [], {}
+        for each in source.programs.values():
+            program = build(workspace, each.text, *options)
             for kernel in program.all_kernels():
-                compiled[kernel.function_name] = program
-        if source.arguments.keys() <= compiled.keys():
-            return compiled
+                programs[kernel.function_name] = program
+        if source.arguments.keys() <= programs.keys():
+            return programs
     raise DeviceError(
         f"{workspace.info.title} returned a program without its kernels; the cache of compiled kernels may "
         f"be damaged; remove {pocl_folder()}"

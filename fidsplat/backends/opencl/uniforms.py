@@ -14,9 +14,10 @@ from fidsplat.backends.view import View
 def scalars_of(view: View) -> dict[str, float]:
     """Scalar kernel arguments that every program has, by name."""
     red, green, blue = view.background
+    names = ("log_alpha_cutoff", "opacity_ceiling", "transmittance_stop")
     return {
-        **{"log_cut": view.log_cut, "ceiling": view.ceiling, "stop": view.stop},
-        **{"filter": 1.0 / view.samples**2},
+        **{name: getattr(view, name) for name in names},
+        "filter": 1.0 / view.samples**2,
         **{"background_r": red, "background_g": green, "background_b": blue},
     }
 
@@ -68,7 +69,7 @@ def _numbers(view: View, row: int, end: int, record: np.dtype) -> list[float]:
         **{"rotation": view.rotation.ravel().tolist(), "translation": view.translation.tolist()},
         **{"eye": view.eye.tolist(), "focal_x": view.focal_x, "focal_y": view.focal_y},
         **{"center_x": view.center_x, "center_y": view.center_y, "near": view.near, "far": view.far},
-        **{"log_cut": view.log_cut, "width": view.width, "height": view.height},
+        **{"log_alpha_cutoff": view.log_alpha_cutoff, "width": view.width, "height": view.height},
         **{"filter": 1.0 / view.samples**2, "band": row, "band_end": end, "ewa_clamp": view.ewa_clamp},
     }
     # then the members of a lens and its ray map

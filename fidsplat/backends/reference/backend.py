@@ -123,7 +123,7 @@ class ReferencePipeline(Pipeline):
         count = len(resident.cloud)
         return HostImages(images, {"reference": took}, {"splats": count, "visible": count, "pairs": 0})
 
-    def trace(self, resident: ReferenceCloud, view: View) -> dict[str, np.ndarray]:
+    def render_intermediates(self, resident: ReferenceCloud, view: View) -> dict[str, np.ndarray]:
         """Render one view; returns the depth order, the float32 keys, and the images with the certificate."""
         splats = Setup(resident.cloud, view, self.features)
         images = self.render_view(resident, view).arrays_of(0)

@@ -36,7 +36,7 @@ def composite(
         span = surface.occlude(f, span)
     sort = by_depth if s.by_depth else by_layers if s.coplanar_groups is not None else by_center
     ordered = sort(s, f, span)
-    before, live, final = transmittance(ordered.alpha, view.stop, s.exclusive)
+    before, live, final = transmittance(ordered.alpha, view.transmittance_stop, s.exclusive)
     if surface is not None:
         ordered = surface.append_to(ordered)
         before = np.column_stack([before, final])
@@ -99,7 +99,9 @@ def composite(
         out["splat_id"] = np.where(out["splat_id"] >= 0, s.order[out["splat_id"].astype(int)], -1)
     if "blended" in features.names:
         out["blended"] = np.where(contributes, ordered.count, 0).sum(1)
-        out["blended_bound"] = error_bounds.of_count(span, ordered.count, ordered.count_bound, view.stop)
+        out["blended_bound"] = error_bounds.of_count(
+            span, ordered.count, ordered.count_bound, view.transmittance_stop
+        )
     return out
 
 

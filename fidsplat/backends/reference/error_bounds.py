@@ -86,7 +86,7 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
         furthest = np.minimum(furthest, np.where(lowpass_high <= s.half_r2 - slack, lowpass_high, np.inf))
     low = np.exp(s.log_opacity - furthest * (1 + weight)) * (1 - weight)
     high = np.exp(s.log_opacity - nearest * (1 - weight)) * (1 + weight)
-    low, high = np.minimum(low, view.ceiling), np.minimum(high, view.ceiling)
+    low, high = np.minimum(low, view.opacity_ceiling), np.minimum(high, view.opacity_ceiling)
     if s.box.any():
         # rounding errors of the distance to an edge: two forms, a product, a sum, and the gradient near the
         # edge
@@ -96,7 +96,7 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
                 for e, edge, terms in zip((e_u, e_u, e_v, e_v), f.edges, f.edge_terms, strict=True)
             ]
         )
-        whole = np.minimum(np.exp(s.log_opacity), view.ceiling)
+        whole = np.minimum(np.exp(s.log_opacity), view.opacity_ceiling)
         lowest = whole * cover(f.edges, f.n_u, f.n_v, f.d, -off - _ROUND) * (1 - _WEIGHT)
         highest = whole * cover(f.edges, f.n_u, f.n_v, f.d, off + _ROUND) * (1 + _WEIGHT)
         low = np.where(s.box, np.where(must, lowest, 0.0), low)
@@ -154,16 +154,16 @@ def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.nda
     bound = (before * (span.high - span.low)).sum(1)
     t_low = span.front_low * (1 - span.high) * (1 - STOP)
     t_high = span.front_high * (1 - span.low) * (1 + STOP)
-    may_stop = (span.high > 0) & (t_low <= view.stop) & (t_high >= view.stop)
+    may_stop = (span.high > 0) & (t_low <= view.transmittance_stop) & (t_high >= view.transmittance_stop)
     # an exclusive stop omits the fragment that reaches the threshold, an inclusive one only later fragments
-    lost = span.front_high * span.high if s.exclusive else np.full_like(before, view.stop)
+    lost = span.front_high * span.high if s.exclusive else np.full_like(before, view.transmittance_stop)
     # if the order changes, the transmittance in front decides whether a fragment is blended
     may_miss = (
         (span.high > 0)
-        & (span.front_low * (1 - STOP) <= view.stop)
-        & (span.front_high * (1 + STOP) >= view.stop)
+        & (span.front_low * (1 - STOP) <= view.transmittance_stop)
+        & (span.front_high * (1 + STOP) >= view.transmittance_stop)
     )
-    unsure = np.maximum(np.where(may_stop, lost, 0.0), np.where(may_miss, view.stop, 0.0))
+    unsure = np.maximum(np.where(may_stop, lost, 0.0), np.where(may_miss, view.transmittance_stop, 0.0))
     bound += unsure.max(1, initial=0.0)
     return bound + (span.front_high * moved).sum(1)
 

@@ -64,10 +64,10 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
             z = np.where((q <= 2 * circle * d_solid**2) | s.coplanar, z, mirrored)
     if s.screen:
         half_rho = np.minimum(half_rho, np.where(offset <= s.half_r2, offset, np.inf))
-    alpha = np.minimum(np.exp(s.log_opacity - half_rho), view.ceiling)
+    alpha = np.minimum(np.exp(s.log_opacity - half_rho), view.opacity_ceiling)
     if s.box.any():
         visible = (d > 0) & (d * view.near <= dz)
-        full_opacity = np.minimum(np.exp(s.log_opacity), view.ceiling)
+        full_opacity = np.minimum(np.exp(s.log_opacity), view.opacity_ceiling)
         alpha = np.where(s.box, np.where(visible, full_opacity * cover(edges, n_u, n_v, d, 0.0), 0.0), alpha)
     meets_plane = (d_solid > 0) & (d_solid * view.near <= dz)
     z = np.where(meets_plane, np.clip(z, s.z_low, s.z_high), s.pz)

@@ -49,7 +49,7 @@ class Decisions:
 def decide(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
     """The decisions of the forward pass at samples (k,) at grid positions x, y."""
     f = fragments_of(s, view, x, y)
-    _, live, final = transmittance(f.alpha, view.stop, s.exclusive)
+    _, live, final = transmittance(f.alpha, view.transmittance_stop, s.exclusive)
     d, q = ellipsoid_forms(s.inverse_m2, f.d, f.n_u**2 + f.n_v**2)
     inside = (q <= 2 * s.half_r2 * d**2) & (d > 0) & (d * view.near <= f.dz)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -59,7 +59,7 @@ def decide(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
         order=s.order,
         contributes=live & (f.alpha > 0),
         by_lowpass=disc < plane,
-        clamped=s.log_opacity - np.minimum(plane, disc) > np.log(view.ceiling),
+        clamped=s.log_opacity - np.minimum(plane, disc) > np.log(view.opacity_ceiling),
         missed=(d <= 0) | (d * view.near > f.dz),
         mirrored=s.screen & (q > 2 * np.maximum(f.offset, HALF_RHO_OF_RANGE) * d**2),
         wide=f.offset > HALF_RHO_OF_RANGE,
@@ -116,7 +116,7 @@ class Blend:
             circle = np.where(decisions.wide, disc, HALF_RHO_OF_RANGE)
             self._share = np.where(decisions.mirrored, circle / plane, 1.0)
             z = self._pz + self._share * (z_plane - self._pz)
-            opacity = np.where(decisions.clamped, view.ceiling, np.exp(log_opacity - half_rho))
+            opacity = np.where(decisions.clamped, view.opacity_ceiling, np.exp(log_opacity - half_rho))
         self._z = np.where(decisions.contributes, np.where(decisions.missed, self._pz, z), 0.0)
         self._inverse = np.where(decisions.contributes, inverse_depth(self._z), 0.0)
         self._alpha = np.where(decisions.contributes, opacity, 0.0)

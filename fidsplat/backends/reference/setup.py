@@ -46,7 +46,7 @@ class Setup:
             area = area * area_factor
             with np.errstate(divide="ignore"):
                 log_opacity = log_opacity - np.log(area_factor)
-        half_r2 = log_opacity - view.log_cut
+        half_r2 = log_opacity - view.log_alpha_cutoff
         if view.along_ray:
             long_a, long_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
             reach, box_reach = np.maximum(long_a, long_b), long_a + long_b

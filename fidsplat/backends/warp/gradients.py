@@ -77,7 +77,7 @@ class _Backward:
             "samples": frame.samples,
             "color": frame.samples.color,
             "background": self._wp.vec3(*frame.view.background),
-            "log_ceiling": math.log(frame.view.ceiling),
+            "log_ceiling": math.log(frame.view.opacity_ceiling),
             "grad_rgb": self._given["by"].rgb,
         }
 

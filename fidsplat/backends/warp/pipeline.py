@@ -107,8 +107,8 @@ class WarpPipeline(Pipeline):
         images = WarpImages(self.workspace, self.outputs, views.size, views.total, resident.count)
         return images, ImageArrays(images.allocate, self.workspace.first_index, images.nbytes)
 
-    def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
-        """Render one view, and return the data between the stages: keys (n,) uint32; starts (tiles + 1,);
+    def render_intermediates(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
+        """Render one view; returns the buffers between the stages: keys (n,) uint32; starts (tiles + 1,);
         lists (pairs,), of the last band; records (n, words) float32; raw (4, rows, columns) float32: r, g,
         b, transmittance; output images by name."""
         frame, images = self.render_counted(resident, view)

@@ -40,7 +40,7 @@ static inline void add_rounding(Pixel *pixel, const Splat *s, Intersection c, vf
 #endif
     vfloat high = fmin(fragment_opacity(s, nearest, 1.0f) * (1.0f + opacity_rounding(s, nearest)), (vfloat)1.0f);
     vfloat low = fragment_opacity(s, furthest, 1.0f) * (1.0f - opacity_rounding(s, furthest));
-    vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->ceiling);
+    vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->opacity_ceiling);
     opacity = VSELECT((vfloat)0.0f, opacity, mask);
     vint blended = mask & VMASK(pixel->t > 0.0f);
     pixel->rounding += pixel->t * fmax(high - opacity, opacity - low) + VSELECT((vfloat)0.0f, (vfloat)(1.5f * UNIT), blended);

@@ -22,7 +22,7 @@
 //@ footprint_lowpass
         if (BOX_HERE) record.lowpass_x = record.lowpass_y = 1e18f;
 //@ footprint_opacity
-    if (IS_BOX(s)) opacity = VMIN(EXP((vfloat)s->log_opacity), (vfloat)constants->ceiling) * c.cover;
+    if (IS_BOX(s)) opacity = VMIN(EXP((vfloat)s->log_opacity), (vfloat)constants->opacity_ceiling) * c.cover;
 //@ footprint_tau
     // in a layer, boxes add up opacities, where Gaussians add up optical depths
     if (IS_BOX(s)) tau = opacity;

@@ -2,7 +2,7 @@
 // (unculled_splats.cl). The frustum's side planes are moved outwards by `margin` samples, the reach of the low-pass and the padding
 // of bounds. Not for boxes: edges that meet at a sharp angle are filtered far beyond their corner.
 //@ cull_frustum
-    real most = sqrt((float)(REAL(-2.0) * view->log_cut));
+    real most = sqrt((float)(REAL(-2.0) * view->log_alpha_cutoff));
     real margin = most * SAMPLES + 4, sphere = extent + REAL(1.001) * most * fmax(max_scale, (real)MIN_SCALE);    // for rounding
     real left = view->center_x + margin, right = view->center_x - view->width - margin;
     real above = view->center_y + margin, below = view->center_y - view->height - margin;

@@ -3,7 +3,7 @@
 //@ max_scale
     max_scale = fmax(max_scale, (real)thickness[i]);
 //@ cull_frustum
-    real most = sqrt((float)(REAL(-2.0) * view->log_cut));
+    real most = sqrt((float)(REAL(-2.0) * view->log_alpha_cutoff));
     real margin = most * SAMPLES + 4, sphere = REAL(1.001) * most * fmax(max_scale, (real)MIN_SCALE);    // for rounding
     real wide_x = sphere * view->focal_x * (1 + fmax(fabs(view->ewa_clamp[0]), fabs(view->ewa_clamp[1])));
     real wide_y = sphere * view->focal_y * (1 + fmax(fabs(view->ewa_clamp[2]), fabs(view->ewa_clamp[3])));

@@ -2,7 +2,7 @@
 // a margin that are larger by 1 / sqrt(1 - (R k)^2), with R the cut-off radius and k = 1/8, contain the widened disk
 // (fidsplat/streaming/frustum_culling.py has the proof). Splats outside of the band of rows are culled too.
 //@ cull_frustum
-    real most = sqrt((float)(REAL(-2.0) * view->log_cut));
+    real most = sqrt((float)(REAL(-2.0) * view->log_alpha_cutoff));
     real deep = REAL(0.126) * most, larger = deep < 1 ? most / sqrt(1 - deep * deep) : INFINITY;
     real margin = REAL(0.5) * larger + 4, sphere = extent + REAL(1.001) * larger * fmax(max_scale, (real)MIN_SCALE);    // for rounding
     real left = view->center_x + margin, right = view->center_x - view->width - margin;

@@ -12,7 +12,7 @@
             PREFETCH(splats + lists[min(chunk + which + PREFETCH_SPLATS, end - 1)]);
             PREFETCH((global const char *)(splats + lists[min(chunk + which + PREFETCH_SPLATS, end - 1)]) + 64);
             const Splat s = splats[lists[chunk + which]];
-            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter
+            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_alpha_cutoff, constants.filter
 //@@ blocks_arguments
             );
         }
@@ -25,7 +25,7 @@
             for (; own != 0; own &= own - 1) {
                 const uint k = chunk + 63 - (uint)clz(own & -own);
                 const Splat s = splats[lists[k]];
-                wide half_r2 = s.log_opacity - constants.log_cut;
+                wide half_r2 = s.log_opacity - constants.log_alpha_cutoff;
 //@ tile_loop_end
             }
             pixels[block] = pixel;

@@ -19,7 +19,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     local uint touched[CELLS_X * CELLS_Y][ITEMS];           // [cell][work-item]: bits of the splats in the work-item's share
     local uchar cell_splats[CELLS_X * CELLS_Y][CELLS_STRIDE];    // [cell]: staged splats that overlap it, in order
     local int alive;
-    const BlendConstants constants = {log_cut, ceiling, stop, filter};
+    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter};
     uint tile = longest_first ? tile_order[get_group_id(0)] : band_first + get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
     uint view_index = tile / (uint)(tiles_x * tiles_y), here = tile - view_index * (uint)(tiles_x * tiles_y);
@@ -71,7 +71,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
             Staged copy;
             for (int part = 0; part < VECTORS; part++) copy.words[part] = staged[which].words[part];
             const Splat s = copy.splat;
-            wide half_r2 = s.log_opacity - constants.log_cut;
+            wide half_r2 = s.log_opacity - constants.log_alpha_cutoff;
             wide x = (wide)(px - s.ax);
             wide nu_x = FMA(s.nux, x, s.nu0), nv_x = FMA(s.nvx, x, s.nv0), d_x = FMA(s.dx, x, s.d0);
             for (int row = 0; row < ROWS; row++) {

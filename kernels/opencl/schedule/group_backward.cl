@@ -20,7 +20,7 @@ static inline Intersection intersect_at(const Splat *s, int px, int py, const Bl
     *y = (wide)(py - s->ay);
     *nu_x = FMA(s->nux, *x, s->nu0);
     *nv_x = FMA(s->nvx, *x, s->nv0);
-    *half_r2 = s->log_opacity - constants->log_cut;
+    *half_r2 = s->log_opacity - constants->log_alpha_cutoff;
     return intersect_row(s, *nu_x, *nv_x, FMA(s->dx, *x, s->d0), *y, *half_r2);
 }
 
@@ -34,7 +34,7 @@ static inline FragmentTerms fragment_terms(const Splat *s, int px, int py, const
     Intersection c = intersect_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     FragmentTerms terms;
     terms.mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
-    terms.opacity = fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->ceiling);
+    terms.opacity = fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->opacity_ceiling);
     const Geometry g = geometry_of(s, c, nu_x, nv_x, y, screen);
     terms.grad_weight = fragment_by_weight(s, gradient, &g);
     return terms;
@@ -46,7 +46,7 @@ static inline wide forward_fragment(const Splat *s, int px, int py, Pixel *pixel
     Intersection c = intersect_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     int mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
     if (!VANY(mask)) return 0.0f;
-    return attenuate(pixel, fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->ceiling), mask, constants);
+    return attenuate(pixel, fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->opacity_ceiling), mask, constants);
 }
 
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
@@ -62,7 +62,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
     local float parts[3 * PARTS];
     local int alive;
     local uint max_reached;
-    const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};
+    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter, log_ceiling};
     uint tile_index = get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W;
     int x0 = (int)(tile_index % (uint)tiles_x) * TILE_W, y0 = (int)(tile_index / (uint)tiles_x) * TILE_H;
@@ -106,7 +106,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         bool unfinished = false;
-        for (int row = 0; row < ROWS; row++) unfinished |= pixels[row].t > stop;
+        for (int row = 0; row < ROWS; row++) unfinished |= pixels[row].t > transmittance_stop;
         if (unfinished) alive = 1;
         find_cells(staged, length, x0, y0, &constants, cells, touched);
         barrier(CLK_LOCAL_MEM_FENCE);
@@ -128,7 +128,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
                 for (uint to = k + next < listed ? (batch - start + which[next]) / CHUNK : beyond; chunk < to; chunk++)
                     for (int row = 0; row < ROWS; row++) {
                         checkpoint[(size_t)chunk * PIXELS + row * TILE_W] = (float2)(transmittances[row], grad_weights[row]);
-                        if (transmittances[row] > stop) last_reached = chunk + 1;
+                        if (transmittances[row] > transmittance_stop) last_reached = chunk + 1;
                         transmittances[row] = pixel_transmittance(&pixels[row]);
                         grad_weights[row] = 0.0f;
                     }
@@ -152,7 +152,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
             for (int k = 0; k < min(PREFETCH_CHUNKS, last + 1); k++) {
                 checkpoint[(size_t)(last - k) * PIXELS + row * TILE_W].y = behind;
                 transmitted_behind += loaded[k].y;
-                behind = loaded[k].x > stop ? transmitted_behind / loaded[k].x : gradients[row].behind;
+                behind = loaded[k].x > transmittance_stop ? transmitted_behind / loaded[k].x : gradients[row].behind;
             }
         }
     }
@@ -198,7 +198,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     local float2 *fragments = (local float2 *)scratch;      // [splat][pixel]: transmittance, opacity; then weight, gradient of ln(opacity)
     local PixelGradient shared[PIXELS];
     local uint offsets[CHUNK], within[PATCHES];               // bits: splats whose bounds overlap a patch
-    const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};
+    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter, log_ceiling};
     uint id = get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H, tiles = tiles_x * tiles_y;
     if (id >= starts[tiles] / CHUNK + tiles) return;
@@ -258,7 +258,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
         for (int k = 0; k < PIXELS_PER_ITEM; k++) {
             int y = y0 + top + 4 * k;
             wide transmittance = 0.0f, opacity = 0.0f;
-            if (pixels[k].t > stop && px >= s.x0 && px < s.x1 && y >= s.y0 && y < s.y1) {
+            if (pixels[k].t > transmittance_stop && px >= s.x0 && px < s.x1 && y >= s.y0 && y < s.y1) {
                 transmittance = pixels[k].t;
                 opacity = forward_fragment(&s, px, y, &pixels[k], &constants);
             }

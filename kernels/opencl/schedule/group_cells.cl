@@ -63,7 +63,7 @@ static inline void find_cells(local const Staged *staged, uint length, int left,
         uint which = share * SHARE + lane, bits = 0;
         local const Splat *s = &staged[which].splat;
         if (which < length) {
-            touched_cells(s, left, top, s->log_opacity - constants->log_cut, constants->filter, &bits
+            touched_cells(s, left, top, s->log_opacity - constants->log_alpha_cutoff, constants->filter, &bits
 //@@ cells_arguments
             );
         }
@@ -72,7 +72,7 @@ static inline void find_cells(local const Staged *staged, uint length, int left,
 #else
     for (uint which = get_local_id(0); which < length; which += GROUP) {
         local const Splat *s = &staged[which].splat;
-        touched_cells(s, left, top, s->log_opacity - constants->log_cut, constants->filter, (local uchar *)cells + which
+        touched_cells(s, left, top, s->log_opacity - constants->log_alpha_cutoff, constants->filter, (local uchar *)cells + which
 //@@ cells_arguments
         );
     }

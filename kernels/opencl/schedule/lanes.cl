@@ -9,7 +9,7 @@
 kernel void blend(
 //@@ arguments blend
 ) {
-    const BlendConstants constants = {log_cut, ceiling, stop, filter};
+    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter};
     uint tile = band_first + get_global_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
     const uint view_tiles = (uint)(tiles_x * tiles_y), view_index = tile / view_tiles, across = (uint)tiles_x;

@@ -41,7 +41,7 @@ static inline BlockOrigin block_origin(const Splat *s, const Tile *tile) {
 
 static inline Block block_of(const Splat *s, const Tile *tile, const BlockOrigin *origin, int block) {
     Block b;
-    wide half_r2 = s->log_opacity - tile->constants->log_cut;
+    wide half_r2 = s->log_opacity - tile->constants->log_alpha_cutoff;
     b.x = origin->x + tile->left[block];
     b.y = origin->y + tile->top[block];
     b.nu_x = FMA((vfloat)s->nux, b.x, (vfloat)s->nu0);
@@ -54,7 +54,7 @@ static inline Block block_of(const Splat *s, const Tile *tile, const BlockOrigin
 // Attenuates the live blocks by the splat and records its fragments on the tape. Returns the blocks that are still live.
 static inline uint forward_splat(const Splat *s, const Tile *tile, Pixel *pixels, uint alive, global Tape *tape, uint tape_index) {
     const BlendConstants *constants = tile->constants;
-    uint touched = alive & touched_blocks(s, tile->x0, tile->y0, s->log_opacity - constants->log_cut, constants->filter), contributing = 0;
+    uint touched = alive & touched_blocks(s, tile->x0, tile->y0, s->log_opacity - constants->log_alpha_cutoff, constants->filter), contributing = 0;
     uint length = tape->length;
     const BlockOrigin at = block_origin(s, tile);
     for (; touched != 0; touched &= touched - 1) {
@@ -62,11 +62,11 @@ static inline uint forward_splat(const Splat *s, const Tile *tile, Pixel *pixels
         const Block b = block_of(s, tile, &at, block);
         if (UNLIKELY(!VANY(b.mask))) continue;
         vfloat half_rho = fragment_half_rho(s, b.intersection, INVERSE_D(b.intersection), b.screen);
-        vfloat opacity = fragment_opacity(s, half_rho, constants->ceiling);
+        vfloat opacity = fragment_opacity(s, half_rho, constants->opacity_ceiling);
         tape->transmittance[length] = pixels[block].t;
         tape->opacity[length++] = attenuate(&pixels[block], opacity, b.mask, constants);
         contributing |= 1u << block;
-        if (UNLIKELY(!VANY(VMASK(pixel_transmittance(&pixels[block]) > constants->stop)))) alive &= ~(1u << block);
+        if (UNLIKELY(!VANY(VMASK(pixel_transmittance(&pixels[block]) > constants->transmittance_stop)))) alive &= ~(1u << block);
     }
     tape->length = length;
     tape->blocks[tape_index] = contributing;
@@ -117,7 +117,7 @@ static inline void store_zero_gradient(global float *record_gradients, uint offs
 kernel void blend_backward(
 //@@ arguments blend_backward
 ) {
-    const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};
+    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter, log_ceiling};
     const int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
     global Tape *tape = (global Tape *)tapes + get_global_id(0);
     Tile tile;
@@ -192,7 +192,7 @@ kernel void blend_backward(
                 alive = in_image;
                 for (int block = 0; block < BLOCKS; block++) {
                     pixel_start(&pixels[block], VLOAD(own + (size_t)chunk * CHECKPOINT_FLOATS + block * LANES));
-                    if (!VANY(VMASK(pixels[block].t > constants.stop))) alive &= ~(1u << block);
+                    if (!VANY(VMASK(pixels[block].t > constants.transmittance_stop))) alive &= ~(1u << block);
                 }
                 for (uint k = first; k < position; k++) {
                     PREFETCH_SPLAT(min(k + PREFETCH_SPLATS, end - 1));

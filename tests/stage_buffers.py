@@ -11,9 +11,9 @@ CULLED = np.uint32(0xFFFFFFFF)
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 
 
-def traced(backend, cloud, quality, shape=None):
+def intermediates_of(backend, cloud, quality, shape=None):
     features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS, quality))
-    return backend.pipeline(features, shape).trace(backend.upload(cloud), view), view
+    return backend.pipeline(features, shape).render_intermediates(backend.upload(cloud), view), view
 
 
 def listing(backend, lists):
