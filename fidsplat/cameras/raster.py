@@ -1,4 +1,4 @@
-"""Rays of a lens on a grid of samples, and the pyramid of their bounds, with which kernels cull splats."""
+"""Rays of a lens on a grid of samples, and the inverse lookup table with which kernels bound splats."""
 
 from __future__ import annotations
 
@@ -85,9 +85,9 @@ class RayRaster:
         squared = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
         return float(np.sqrt(np.nanmax(squared))) * 1.00001
 
-    def chart(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates (x, y) of rays in which kernels bound splats: the undistorted pinhole image in samples,
-        or, for a fisheye or a ray table, the stereographic projection (X, Y) / (|ray| + Z)."""
+    def lut_coordinates(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates (x, y) of rays in `bounds_pyramid`: in the undistorted pinhole image, in samples; for a
+        fisheye or a ray table, of the stereographic projection (X, Y) / (|ray| + Z)."""
         x, y, z = np.moveaxis(rays.astype(np.float64), -1, 0)
         if isinstance(self.lens, Fisheye | RayTable):
             denominator = z + np.sqrt(x * x + y * y + z * z)
@@ -96,7 +96,8 @@ class RayRaster:
 
     @cached_property
     def bounds_pyramid(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pyramid of grids over the `chart`, cells x cells to 1 x 1, with the bounds of each cell's samples.
+        """Inverse lookup table of the lens, from ray directions to samples: a pyramid of grids over the
+        `lut_coordinates`, from cells x cells to 1 x 1, with the bounds of each cell's samples.
 
         Returns boxes (cells^2 + (cells / 2)^2 + ... + 1, 4) int16, the first and last column and the first
         and last row of the samples whose rays are in a cell (last < first if there are none); and (low_x,
@@ -108,7 +109,7 @@ class RayRaster:
         cells = 1
         while 2 * cells <= min(MAX_CELLS, max(self.width, self.height) // 2):
             cells *= 2
-        x, y = self.chart(self.rays[rows, columns])
+        x, y = self.lut_coordinates(self.rays[rows, columns])
         low = np.array([x.min(), y.min()])
         # the samples at the upper edge belong to the last cell
         scale = cells * (1 - 1e-9) / np.maximum(np.array([x.max(), y.max()]) - low, 1e-12)

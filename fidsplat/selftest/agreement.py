@@ -154,7 +154,7 @@ def _flips(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tup
 
 
 def render_intermediates(renderer: Renderer, spec: FrameSpec, shape=None) -> dict[str, np.ndarray]:
-    """Render a frame; returns the buffers between its stages, and its outputs. shape: other build constants."""
+    """Render a frame; returns the buffers between its stages, and its outputs. shape: build constants."""
     features, view = spec.prepared()
     backend = renderer.backend
     if shape is not None and backend.has("probe"):

@@ -104,7 +104,7 @@ def worst(got: np.ndarray, truth: np.ndarray) -> float:
 @case(
     "F1",
     "products are rounded before they are subtracted",
-    "a b - a b in float32 and in the setup's precision; FMA where requested",
+    "a b - a b in float32 and in the projection's precision; FMA where requested",
 )
 def f1(renderer: Renderer) -> Found:
     # products are rounded before subtraction, and FMA fuses if the device declares it
@@ -115,7 +115,7 @@ def f1(renderer: Renderer) -> Found:
     a, b = generator.uniform(0.5, 2.0, (2, 4096)).astype(np.float32)
     difference, total, wide, fused = probe.contraction(a, b)
     yield Finding("a b - a b that is not 0", int(np.count_nonzero(difference)), 0)
-    yield Finding("the same in the setup's precision", int(np.count_nonzero(wide)), 0)
+    yield Finding("the same in the projection's precision", int(np.count_nonzero(wide)), 0)
     yield Finding("a b + c that is not rounded twice", int(np.count_nonzero(total != a * b + a)), 0)
     product = a.astype(float) * b.astype(float)  # exact, and so is its rounding error
     expected = (product - (a * b)) if probe.fuses else np.zeros(len(a))

@@ -29,7 +29,18 @@ TABLE = Path(__file__).with_name("digests.csv")
 OUTPUTS = ("rgb", "alpha", "depth", "normal", "label")
 _FORMS = (
     *("nu0", "nux", "nuy", "nv0", "nvx", "nvy", "d0", "dx", "dy", "d_near", "log_opacity", "ax", "ay"),
-    *("r", "g", "b", "lowpass_x", "lowpass_y", "z_numerator", "z_center", "z_reach", "nearest", "bulge"),
+    *(
+        "r",
+        "g",
+        "b",
+        "lowpass_x",
+        "lowpass_y",
+        "z_numerator",
+        "z_center",
+        "z_reach",
+        "nearest",
+        "ellipsoid_term",
+    ),
     *("nx", "ny", "nz", "nuz", "nvz", "dz", "ray_x", "ray_y", "ray_z"),
     *("edge_u0", "edge_u1", "edge_v0", "edge_v1"),
 )

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.train.random_numbers import Purpose, uniform
+from fidsplat.train.random_numbers import RandomStream, uniform
 from fidsplat.util.arguments import instance, invalid, items, real_array, text, three_numbers, whole_number
 from fidsplat.util.errors import InputError
 
@@ -166,8 +166,8 @@ class Dataset:
         the cameras' frustums up to a depth of three scene extents."""
         count = whole_number("the number of random points", count, 0, MAX_POINTS)
         seed = whole_number("the seed", seed, 0, 2**63 - 1)
-        cameras, draws = [view.camera for view in self.views], uniform(seed, Purpose.POINTS, 0, count)
-        shades = uniform(seed, Purpose.POINTS, 0, count, draw=1)
+        cameras, draws = [view.camera for view in self.views], uniform(seed, RandomStream.POINTS, 0, count)
+        shades = uniform(seed, RandomStream.POINTS, 0, count, draw=1)
         low, high, faced = viewed_cube(cameras)
         if faced:
             points = low + draws[:, :3] * (high - low)

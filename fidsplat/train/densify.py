@@ -13,7 +13,7 @@ import numpy as np
 
 from fidsplat.splats.rotations import quaternion_to_matrix
 from fidsplat.train.parameters import Splats, TrainingError, logit, sigmoid
-from fidsplat.train.random_numbers import Purpose, normal
+from fidsplat.train.random_numbers import RandomStream, normal
 from fidsplat.train.settings import TrainSettings
 
 COPIES = 2
@@ -131,7 +131,7 @@ def _split_values(
     axes = scales.shape[1]
     directions = quaternion_to_matrix(values["quats"])[:, :, :axes]
     calls = range(-(-COPIES * axes // 4))  # four numbers each
-    draws = np.hstack([normal(settings.seed, Purpose.SPLITS, iteration, splits, draw) for draw in calls])
+    draws = np.hstack([normal(settings.seed, RandomStream.SPLITS, iteration, splits, draw) for draw in calls])
     means = np.concatenate([values["means"]] * COPIES)
     for copy in range(COPIES):
         offset = scales * draws[:, axes * copy : axes * (copy + 1)]

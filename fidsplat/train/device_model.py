@@ -16,7 +16,7 @@ from fidsplat.train.losses import Loss
 from fidsplat.train.mcmc import NOISE_CUTOFF, NOISE_SLOPE
 from fidsplat.train.optimiser import HIGHER_SH_RATE
 from fidsplat.train.parameters import NAMES, SHAPES, Splats
-from fidsplat.train.random_numbers import Purpose
+from fidsplat.train.random_numbers import RandomStream
 from fidsplat.train.settings import TrainSettings
 
 _PREFIXES = ("", "first_", "second_")
@@ -127,5 +127,5 @@ class DeviceModel:
     def add_noise(self, iteration: int, rate: float) -> None:
         """Add MCMC noise to the means. rate: learning rate of the means [m]."""
         seed = self._settings.seed
-        words = (seed & 0xFFFFFFFF, seed >> 32, iteration, int(Purpose.NOISE))
+        words = (seed & 0xFFFFFFFF, seed >> 32, iteration, int(RandomStream.NOISE))
         self._kernels.add_noise(rate * self._settings.noise, NOISE_SLOPE, 1 - NOISE_CUTOFF, words)

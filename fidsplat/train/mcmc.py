@@ -12,7 +12,7 @@ import numpy as np
 from fidsplat.splats.rotations import quaternion_to_matrix
 from fidsplat.train.densify import with_statistics_reset
 from fidsplat.train.parameters import NAMES, Splats, TrainingError, sigmoid
-from fidsplat.train.random_numbers import Purpose, normal, uniform
+from fidsplat.train.random_numbers import RandomStream, normal, uniform
 from fidsplat.train.settings import TrainSettings
 
 MAX_COPIES = 51
@@ -37,7 +37,7 @@ def relocate_and_grow(splats: Splats, settings: TrainSettings, iteration: int) -
             f"{settings.dead_opacity:g}; check the data set's cameras and points"
         )
     if len(dead):
-        sources = alive[_sample(opacities[alive], len(dead), settings, Purpose.RELOCATION, iteration)]
+        sources = alive[_sample(opacities[alive], len(dead), settings, RandomStream.RELOCATION, iteration)]
         _divide_among_copies(splats, sources, settings)
         for name in NAMES:
             splats.values[name][dead] = splats.values[name][sources]
@@ -46,7 +46,7 @@ def relocate_and_grow(splats: Splats, settings: TrainSettings, iteration: int) -
                 array[sources] = 0
     target = min(settings.max_splats, int(settings.growth * len(splats)))
     if target > len(splats):
-        sources = _sample(splats.opacities, target - len(splats), settings, Purpose.GROWTH, iteration)
+        sources = _sample(splats.opacities, target - len(splats), settings, RandomStream.GROWTH, iteration)
         _divide_among_copies(splats, sources, settings)
         splats = splats.append({name: splats.values[name][sources] for name in NAMES})
     return with_statistics_reset(splats)
@@ -59,7 +59,7 @@ def add_noise(splats: Splats, settings: TrainSettings, iteration: int, rate: flo
     """
     scales = splats.scales.astype(np.float64)
     axes = quaternion_to_matrix(splats.values["quats"])[:, :, : scales.shape[1]]
-    draws = normal(settings.seed, Purpose.NOISE, iteration, len(splats))[:, :3]
+    draws = normal(settings.seed, RandomStream.NOISE, iteration, len(splats))[:, :3]
     transparent = sigmoid(-NOISE_SLOPE * (splats.opacities.astype(np.float64) - (1 - NOISE_CUTOFF)))
     inside = np.einsum("nji,nj->ni", axes, draws) * scales**2
     step = np.einsum("nij,nj->ni", axes, inside) * (transparent * rate * settings.noise)[:, None]
@@ -67,11 +67,11 @@ def add_noise(splats: Splats, settings: TrainSettings, iteration: int, rate: flo
 
 
 def _sample(
-    weights: np.ndarray, count: int, settings: TrainSettings, purpose: Purpose, iteration: int
+    weights: np.ndarray, count: int, settings: TrainSettings, stream: RandomStream, iteration: int
 ) -> np.ndarray:
     """Random indices (count,), with probabilities proportional to the weights."""
     sums = np.cumsum(weights, dtype=np.float64)
-    draws = uniform(settings.seed, purpose, iteration, count)[:, 0] * sums[-1]
+    draws = uniform(settings.seed, stream, iteration, count)[:, 0] * sums[-1]
     return np.minimum(np.searchsorted(sums, draws, side="right"), len(weights) - 1)
 
 

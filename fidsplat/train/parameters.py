@@ -10,7 +10,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import C0
 from fidsplat.train.dataset import Dataset
 from fidsplat.train.neighbours import mean_square_distances
-from fidsplat.train.random_numbers import Purpose, uniform
+from fidsplat.train.random_numbers import RandomStream, uniform
 from fidsplat.train.settings import TrainSettings
 from fidsplat.util.errors import FidsplatError, InputError
 
@@ -141,7 +141,7 @@ def initial_splats(dataset: Dataset, settings: TrainSettings) -> Splats:
         {
             "means": points - dataset.origin,
             "log_scales": np.repeat(np.log(scale)[:, None], settings.axes, axis=1),
-            "quats": uniform(settings.seed, Purpose.ROTATIONS, 0, count),
+            "quats": uniform(settings.seed, RandomStream.ROTATIONS, 0, count),
             "logits": np.full(count, logit(settings.start_opacity)),
             "sh": sh,
         }

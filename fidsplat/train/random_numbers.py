@@ -1,4 +1,4 @@
-"""Counter-based random numbers: functions of seed, iteration, purpose and splat index alone.
+"""Counter-based random numbers: functions of seed, iteration, stream and splat index alone.
 
 Philox 4x32-10: Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011. The kernel version is
 in kernels/opencl/train/position_noise.cl.
@@ -16,8 +16,8 @@ _LOW = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
 
 
-class Purpose(IntEnum):
-    """Purpose of random numbers; each has its own stream."""
+class RandomStream(IntEnum):
+    """RandomStream of random numbers; each has its own stream."""
 
     VIEWS = 0
     ROTATIONS = 1
@@ -45,27 +45,31 @@ def philox(counters: np.ndarray, key: int) -> np.ndarray:
     return np.stack([c0, c1, c2, c3], axis=1).astype(np.uint32)
 
 
-def uniform(seed: int, purpose: Purpose, iteration: int, of: int | np.ndarray, draw: int = 0) -> np.ndarray:
+def uniform(
+    seed: int, stream: RandomStream, iteration: int, of: int | np.ndarray, draw: int = 0
+) -> np.ndarray:
     """Uniform numbers (n, 4) float64 in (0, 1), four for each index.
 
     Args:
         of: indices (n,), or n for the first n.
-        draw: distinguishes several calls for one purpose and iteration.
+        draw: distinguishes several calls for one stream and iteration.
     """
     indices = np.arange(of) if isinstance(of, int) else of
     counters = np.empty((len(indices), 4), np.uint32)
     counters[:, 0] = indices
-    counters[:, 1:] = iteration, purpose, draw
+    counters[:, 1:] = iteration, stream, draw
     return (philox(counters, seed) + 0.5) * 2.0**-32
 
 
-def normal(seed: int, purpose: Purpose, iteration: int, of: int | np.ndarray, draw: int = 0) -> np.ndarray:
+def normal(
+    seed: int, stream: RandomStream, iteration: int, of: int | np.ndarray, draw: int = 0
+) -> np.ndarray:
     """Standard normal numbers (n, 4) float64 (Box and Muller) for each index; arguments of `uniform`."""
-    u = uniform(seed, purpose, iteration, of, draw)
+    u = uniform(seed, stream, iteration, of, draw)
     radius, angle = np.sqrt(-2 * np.log(u[:, :2])), 2 * np.pi * u[:, 2:]
     return np.concatenate([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
-def permutation(seed: int, purpose: Purpose, iteration: int, count: int) -> np.ndarray:
+def permutation(seed: int, stream: RandomStream, iteration: int, count: int) -> np.ndarray:
     """A random permutation of 0 to count - 1."""
-    return np.argsort(uniform(seed, purpose, iteration, count)[:, 0], kind="stable")
+    return np.argsort(uniform(seed, stream, iteration, count)[:, 0], kind="stable")

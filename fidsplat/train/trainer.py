@@ -34,7 +34,7 @@ from fidsplat.train.host_model import HostModel
 from fidsplat.train.losses import Loss
 from fidsplat.train.optimiser import learning_rates
 from fidsplat.train.parameters import Splats, TrainingError, initial_splats, splats_from_cloud
-from fidsplat.train.random_numbers import Purpose, permutation
+from fidsplat.train.random_numbers import RandomStream, permutation
 from fidsplat.train.scores import ViewScore, score_view
 from fidsplat.train.settings import TrainSettings
 from fidsplat.train.view_refinement import INTRINSICS_EVERY, ViewRefinement, with_exposure_of
@@ -514,7 +514,7 @@ class Trainer:
         count = len(self.dataset.views)
         epoch, index = divmod(iteration - 1, count)
         if self._order[0] != epoch:
-            self._order = epoch, permutation(self.settings.seed, Purpose.VIEWS, epoch, count)
+            self._order = epoch, permutation(self.settings.seed, RandomStream.VIEWS, epoch, count)
         return int(self._order[1][index])
 
     def _densify(self) -> None:

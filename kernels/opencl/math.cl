@@ -129,10 +129,10 @@ static inline vfloat VMAX(vfloat a, vfloat b) { return VSELECT(b, a, a > b); }
 #define FIRST_LANE(v) ((v).s0)
 #endif
 
-// Natural logarithm in the per-splat setup, for normal x > 0; finite for every other x. Only sums and products, so that results are
+// Natural logarithm in the projection of a splat, for normal x > 0; finite for every other x. Only sums and products, so that results are
 // bit-identical on every device: range reduction and polynomial of fdlibm (e_log.c), below 1 ulp in double.
 static inline real ln(real x) {
-#if SETUP_FP64
+#if PROJECTION_FP64
     const long root_half = 0x3FE6A09E667F3BCDL;         // bits of sqrt(1/2)
     long bits = as_long(x) - root_half;
     real k = (real)(bits >> 52), f = as_double((bits & 0xFFFFFFFFFFFFFL) + root_half) - 1;

@@ -1,18 +1,18 @@
 // Build constants, which `assemble` prints above this file, and the numeric types derived from them.
 // LANES          pixels that one work-item computes as a vector (1 on a GPU, 8 or 16 on a CPU)
 // TILE_W TILE_H  pixels of a tile; the lanes schedule requires TILE_W == LANES
-// BATCH          splats that a work-item of `project` sets up (1 on a GPU)
+// BATCH          splats that a work-item of `project` projects (1 on a GPU)
 // SORT_BLOCKS         contiguous blocks into which the stable counting sorts divide a list
 //   RADIX_BITS     digit width of the depth sort
 // SCAN_ITEMS     work-items of the single work-group of a scan
-// SETUP_FP64     1: per-splat setup in double
+// PROJECTION_FP64  1: project splats in double
 //   SAMPLES        n of the n x n samples per pixel
 
 // Contraction is written by hand (FMA in math.cl), never left to the compiler: a pixel must be bit-identical in every
 // schedule, tile size and set of outputs, and order and culling must not depend on the device.
 #pragma OPENCL FP_CONTRACT OFF
 
-#if SETUP_FP64
+#if PROJECTION_FP64
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 typedef double real;
 #define REAL(x) x

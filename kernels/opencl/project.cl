@@ -5,7 +5,7 @@
 // Writes: splats[at], windows[at] (tile bits) of visible splats; keys[at]: depth key, CULLED or OUT_OF_BAND; big, big_bounds
 //         and their number in counters: splats that overlap more tiles than a window has.
 //
-// The setup is computed in `real` (double where the device has it) from float inputs.
+// The projection is computed in `real` (double where the device has it) from float inputs.
 
 // [m]; invisible, and large enough that quotients are not float32 denormals
 #define MIN_SCALE 1e-20f
@@ -60,7 +60,7 @@ typedef union {
 
 #define RETURN_CULLED return
 #if BATCH > 1
-// CPUs: set-up of splat i, written to column k of `batch`, in a loop that compilers vectorise. Only splats that cross the near plane
+// CPUs: projection of splat i, written to column k of `batch`, in a loop that compilers vectorise. Only splats that cross the near plane
 // need a loop of their own: with `crosses_near` unset, their key becomes CROSSES_NEAR.
 #define CROSSES_NEAR 0xFFFFFFFDu
 #define KEY batch->keys[k]
@@ -72,7 +72,7 @@ typedef union {
     uint scalars[sizeof(Bounds) / 4];
 } BoundsWords;
 
-INLINE void set_up(
+INLINE void project_splat(
 //@@ arguments project
     , uint i, uint view_index, Batch *batch, uint k, bool crosses_near)
 #else
@@ -167,7 +167,7 @@ kernel void project(
 
     // Edge-on within rounding: the plane has no visible side, and only the low-pass may render the splat. The test depends on the
     // plane only, not on the splat's size or the focal length.
-    real facing = fabs(offset) > (SETUP_FP64 ? REAL(1e-13) : REAL(1e-6)) * sqrt(dot3(p, p)) ? scale : 0;
+    real facing = fabs(offset) > (PROJECTION_FP64 ? REAL(1e-13) : REAL(1e-6)) * sqrt(dot3(p, p)) ? scale : 0;
 //@@ camera_facing
     real z_numerator = determinant * facing;                               // depth = z_numerator / D
 
@@ -202,7 +202,7 @@ static inline Bounds bounds_of(const Batch *batch, uint k) {
     return words.bounds;
 }
 
-// Writes the record, window and keys of a splat after its set-up. No copies in memory: reading four words that were written one by one
+// Writes the record, window and keys of a projected splat. No copies in memory: reading four words that were written one by one
 // would stall.
 #define record splats[at]
 #define bounds bounds_of(batch, k)
@@ -250,7 +250,7 @@ INLINE void write_splat(
 #undef record
 #undef bounds
 #endif
-#if BATCH > 1 || defined(GROUP_SPLATS)
+#if BATCH > 1 || defined(CULLING_GROUP)
 // Key of splats that are culled by a bounding sphere; 0 for others. Their centres are at most `extent` from `mean`; infinite: not culled.
 INLINE uint frustum_key(global const View *view, real3_ mean, real extent, real max_scale) {
     real3_ p = rotate_to_camera(view, mean);
@@ -297,12 +297,12 @@ kernel void project(
     uint padded = (length + 7) & ~7u;
     for (uint k = length; k < padded; k++) visible[k] = visible[0];
     VECTORISE for (uint k = 0; k < padded; k++)
-        set_up(
+        project_splat(
 //@@ passed project
             , visible[k], view_index, &batch, k, false);
     for (uint k = 0; k < length; k++) {
         if (batch.keys[k] == CROSSES_NEAR)
-            set_up(
+            project_splat(
 //@@ passed project
                 , visible[k], view_index, &batch, k, true);
         write_splat(

@@ -1,4 +1,4 @@
-// Gradients with respect to the cloud's arrays and the camera, from those of set_up_backward.cl.
+// Gradients with respect to the cloud's arrays and the camera, from those of project_splat_backward.cl.
 // Index space: one work-item per splat, in groups of POSE_ITEMS.
 // Reads:  view, the cloud, splats, keys, windows, big_bounds, gradient_offsets, record_gradients.
 // Writes: gradients with respect to the cloud's arrays, 0 for culled splats; camera_sums, with respect to the camera.
@@ -11,7 +11,7 @@ kernel __attribute__((reqd_work_group_size(POSE_ITEMS, 1, 1))) void project_back
     SplatGradient splat_grad = {{0}};
     if (i < count) {
         splat_grad = splat_gradient(
-            i, view, means, quats, scales, opacities, CLOUD_TERMS, SH_TERMS, splats, keys, windows, big_capacity, big_bounds, width,
+            i, view, means, quats, scales, opacities, CLOUD_COEFFICIENTS, SH_COEFFICIENTS, splats, keys, windows, big_capacity, big_bounds, width,
             height, gradient_offsets, record_gradients
 //@@ footprint_arguments
         );
@@ -21,8 +21,8 @@ kernel __attribute__((reqd_work_group_size(POSE_ITEMS, 1, 1))) void project_back
         grad_opacities[i] = splat_grad.opacity;
         screen[i] = splat_grad.screen;
 //@@ footprint_results
-        global float *grad_terms = BY_TERMS + (size_t)i * SH_TERMS * 3;
-        for (int k = 0; k < SH_TERMS; k++)
+        global float *grad_terms = GRAD_COEFFICIENTS + (size_t)i * SH_COEFFICIENTS * 3;
+        for (int k = 0; k < SH_COEFFICIENTS; k++)
             for (int c = 0; c < 3; c++) grad_terms[3 * k + c] = splat_grad.basis[k] * splat_grad.color[c];
     }
     for (int k = 0; k < 10; k++) camera[k][item] = splat_grad.grad_camera[k];

@@ -1,25 +1,25 @@
-// Adam step on the gradients of set_up_backward.cl, which stay in local memory: in training it replaces project_backward.
+// Adam step on the gradients of project_splat_backward.cl, which stay in local memory: in training it replaces project_backward.
 // Index space: one work-item per splat, in groups of STEP_ITEMS.
 // Reads:  view, splats, keys, windows, big_bounds, gradient_offsets, record_gradients. Updates: if `add_statistics`, the sums of screen-space gradients;
 // if `update`, the parameters, Adam's moments, and the activated parameters.
 #define STEP_ITEMS 64
-#define VALUES (3 * SH_TERMS)       // rendered colour values per splat
-#if LANES > 1 && !PLAIN
-#define TERMS_CAPACITY 16               // a full vector
+#define VALUES (3 * SH_COEFFICIENTS)       // rendered colour values per splat
+#if LANES > 1 && !IS_RGB
+#define COEFFICIENTS_CAPACITY 16               // a full vector
 #else
-#define TERMS_CAPACITY SH_TERMS
+#define COEFFICIENTS_CAPACITY SH_COEFFICIENTS
 #endif
 kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step(
 //@@ arguments project_step
 ) {
     local float grad_means[3 * STEP_ITEMS], grad_scales[AXES * STEP_ITEMS], grad_quats[4 * STEP_ITEMS], grad_opacities[STEP_ITEMS];
-    local float grad_colors[3 * STEP_ITEMS], basis[TERMS_CAPACITY * STEP_ITEMS];
+    local float grad_colors[3 * STEP_ITEMS], basis[COEFFICIENTS_CAPACITY * STEP_ITEMS];
     local uchar skipped[STEP_ITEMS];
 //@@ step_local
     uint i = get_global_id(0), item = get_local_id(0), first = get_group_id(0) * STEP_ITEMS;
     if (i < count) {
         const SplatGradient splat_grad = splat_gradient(
-            i, view, means, activated_quats, activated_scales, activated_opacities, sh, stored_terms, splats, keys, windows, big_capacity,
+            i, view, means, activated_quats, activated_scales, activated_opacities, sh, stored_coefficients, splats, keys, windows, big_capacity,
             big_bounds, width, height, gradient_offsets, record_gradients
 #if AXES == 3
             , activated_thickness
@@ -34,7 +34,7 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
         for (int k = 0; k < 4; k++) grad_quats[4 * item + k] = splat_grad.quat[k];
         grad_opacities[item] = splat_grad.opacity;
         for (int k = 0; k < 3; k++) grad_colors[3 * item + k] = splat_grad.color[k];
-        for (int k = 0; k < SH_TERMS; k++) basis[TERMS_CAPACITY * item + k] = splat_grad.basis[k];
+        for (int k = 0; k < SH_COEFFICIENTS; k++) basis[COEFFICIENTS_CAPACITY * item + k] = splat_grad.basis[k];
         // parameters without gradient keep their values and Adam's moments
         bool depends = splat_grad.opacity != 0.0f;
         for (int k = 0; k < 3; k++) depends |= splat_grad.mean[k] != 0.0f || splat_grad.basis[0] * splat_grad.color[k] != 0.0f;
@@ -108,12 +108,12 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
     }
 
     // the rendered colours are the SH parameters, unless some degrees are not rendered or degree 0 is rendered as plain colours
-    const bool separate = PLAIN || SH_TERMS < stored_terms;
-#if LANES > 1 && !PLAIN
+    const bool separate = IS_RGB || SH_COEFFICIENTS < stored_coefficients;
+#if LANES > 1 && !IS_RGB
     if (i < count && !skipped[item]) {
-        size_t row = i * (size_t)(3 * stored_terms), out = i * (size_t)VALUES;
+        size_t row = i * (size_t)(3 * stored_coefficients), out = i * (size_t)VALUES;
         // value k belongs to term k / 3 and channel k % 3; values behind the last term are unused
-        float16 b = vload16(0, basis + TERMS_CAPACITY * item), c = 0.0f;
+        float16 b = vload16(0, basis + COEFFICIENTS_CAPACITY * item), c = 0.0f;
         c.s012 = vload3(item, grad_colors);
         const float16 by[3] = {
             b.s0001112223334445 * c.s0120120120120120,
@@ -140,11 +140,11 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
     for (uint k = item; k < min(count - first, (uint)STEP_ITEMS) * VALUES; k += STEP_ITEMS) {
         uint which = k / VALUES, within = k % VALUES;
         if (skipped[which]) continue;
-        size_t at = (first + which) * (size_t)(3 * stored_terms) + within;
-        float gradient = basis[TERMS_CAPACITY * which + within / 3] * grad_colors[3 * which + within % 3];
-        if (PLAIN) gradient = SH_C0 * sh[at] + 0.5f > 0.0f ? SH_C0 * gradient : 0.0f;
+        size_t at = (first + which) * (size_t)(3 * stored_coefficients) + within;
+        float gradient = basis[COEFFICIENTS_CAPACITY * which + within / 3] * grad_colors[3 * which + within % 3];
+        if (IS_RGB) gradient = SH_C0 * sh[at] + 0.5f > 0.0f ? SH_C0 * gradient : 0.0f;
         float value = ADAM(sh, at, gradient, within < 3 ? lr_sh : lr_rest);
-        if (separate) activated_sh[(size_t)first * VALUES + k] = PLAIN ? plain_color(value) : value;
+        if (separate) activated_sh[(size_t)first * VALUES + k] = IS_RGB ? plain_color(value) : value;
     }
 #endif
 }

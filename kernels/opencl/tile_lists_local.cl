@@ -2,16 +2,16 @@
 // tiles. A work-group counts the pairs of many splats per tile, then reserves all list entries of a tile by one atomic. The
 // kernels of tile_lists.cl, which complete the lists, take one global atomic per pair, and atomics on one tile are serialised.
 
-#define GROUP_SPLATS 4096             // splats of a work-group
+#define WORK_GROUP_SPLATS 4096             // splats of a work-group
 #define LOCAL_TILES 4096         // tiles with a count in local memory
 
 // Splats of the work-group [first, end), as indices among those of all views.
-typedef struct { uint first, end; } Share;
+typedef struct { uint first, end; } SplatRange;
 
-static inline Share share_of(uint count) {
-    uint before = get_group_id(1) * count, first = get_group_id(0) * GROUP_SPLATS;
-    Share share = {before + first, before + min(first + GROUP_SPLATS, count)};
-    return share;
+static inline SplatRange splat_range_of(uint count) {
+    uint before = get_group_id(1) * count, first = get_group_id(0) * WORK_GROUP_SPLATS;
+    SplatRange range = {before + first, before + min(first + WORK_GROUP_SPLATS, count)};
+    return range;
 }
 
 // Tiles that are counted: all tiles of a small view, else a rectangle around the windows of the work-group's splats. corner: as in
@@ -19,14 +19,14 @@ static inline Share share_of(uint count) {
 typedef struct { uint corner; int columns, tiles; } Area;
 
 // extents: scratch of four values.
-static inline Area area_of(const Share *share, int tiles, int tiles_x, global const uint2 *restrict windows,
+static inline Area area_of(const SplatRange *range, int tiles, int tiles_x, global const uint2 *restrict windows,
                            global const uint *restrict keys, local int *extents) {
     Area area = {0, tiles_x, tiles};
     if (tiles <= LOCAL_TILES) return area;
     if (get_local_id(0) < 4) extents[get_local_id(0)] = 0xFFFF;
     barrier(CLK_LOCAL_MEM_FENCE);
     int4 extent = 0xFFFF;          // left, top, -right, -bottom
-    for (uint splat = share->first + get_local_id(0); splat < share->end; splat += SCAN_ITEMS) {
+    for (uint splat = range->first + get_local_id(0); splat < range->end; splat += SCAN_ITEMS) {
         if (keys[splat] == CULLED || windows[splat].y == 0) continue;
         int left = windows[splat].x & 0xFFFFu, top = windows[splat].x >> 16;
         extent = min(extent, (int4)(left, top, -left, -top));
@@ -52,36 +52,36 @@ static inline int area_tile(const Area *area, int position, int tiles_x) {
 }
 
 // Number of pairs of each tile of the area. pair_counts: one word per tile.
-static inline void count_pairs(const Share *share, const Area *area, global const uint2 *restrict windows, global const uint *restrict keys,
+static inline void count_pairs(const SplatRange *range, const Area *area, global const uint2 *restrict windows, global const uint *restrict keys,
                           local uint *pair_counts) {
     for (int position = get_local_id(0); position < area->tiles; position += SCAN_ITEMS) pair_counts[position] = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (uint splat = share->first + get_local_id(0); splat < share->end; splat += SCAN_ITEMS) {
+    for (uint splat = range->first + get_local_id(0); splat < range->end; splat += SCAN_ITEMS) {
         if (keys[splat] == CULLED) continue;
         for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1) atomic_inc(pair_counts + area_index(area, window));
     }
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-// Index space: for each view a work-group for every GROUP_SPLATS splats.
+// Index space: for each view a work-group for every WORK_GROUP_SPLATS splats.
 // Reads: windows, keys. Adds to: counters.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void count_local(
 //@@ arguments count_local
 ) {
     local uint pair_counts[LOCAL_TILES];
     local int extents[4];
-    const Share share = share_of(count);
+    const SplatRange range = splat_range_of(count);
     int tiles = tiles_of(width, height), tiles_x = (width + TILE_W - 1) / TILE_W;
     counters += COUNTERS + get_group_id(1) * (uint)tiles;
-    const Area area = area_of(&share, tiles, tiles_x, windows, keys, extents);
+    const Area area = area_of(&range, tiles, tiles_x, windows, keys, extents);
     if (area.tiles > LOCAL_TILES) {      // too many tiles for local memory
-        for (uint splat = share.first + get_local_id(0); splat < share.end; splat += SCAN_ITEMS) {
+        for (uint splat = range.first + get_local_id(0); splat < range.end; splat += SCAN_ITEMS) {
             if (keys[splat] == CULLED) continue;
             for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1) atomic_inc(counters + window_tile(window, tiles_x));
         }
         return;
     }
-    count_pairs(&share, &area, windows, keys, pair_counts);
+    count_pairs(&range, &area, windows, keys, pair_counts);
     for (int position = get_local_id(0); position < area.tiles; position += SCAN_ITEMS)
         if (pair_counts[position] != 0) atomic_add(counters + area_tile(&area, position, tiles_x), pair_counts[position]);
 }
@@ -94,14 +94,14 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
     local uint pair_counts[LOCAL_TILES];
     local uint visible;
     local int extents[4];
-    const Share share = share_of(count);
+    const SplatRange range = splat_range_of(count);
     int tiles = tiles_of(width, height), tiles_x = (width + TILE_W - 1) / TILE_W, before = (int)get_group_id(1) * tiles;
     const Band band = {tiles_x, band_first, band_end, starts[band_first], capacity};
     if (get_local_id(0) == 0) visible = 0;
-    const Area area = area_of(&share, tiles, tiles_x, windows, keys, extents);
+    const Area area = area_of(&range, tiles, tiles_x, windows, keys, extents);
     bool counted = area.tiles <= LOCAL_TILES;
     if (counted) {
-        count_pairs(&share, &area, windows, keys, pair_counts);
+        count_pairs(&range, &area, windows, keys, pair_counts);
         for (int position = get_local_id(0); position < area.tiles; position += SCAN_ITEMS) {
             if (pair_counts[position] == 0) continue;
             int tile = before + area_tile(&area, position, tiles_x);
@@ -110,7 +110,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     uint visible_here = 0;
-    for (uint splat = share.first + get_local_id(0); splat < share.end; splat += SCAN_ITEMS) {
+    for (uint splat = range.first + get_local_id(0); splat < range.end; splat += SCAN_ITEMS) {
         uint key = keys[splat];
         if (key == CULLED) continue;
         if (first_band) visible_here++;

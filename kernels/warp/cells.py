@@ -61,10 +61,10 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
         """Ellipse of a disk. far_x, far_y: maximum distance of the tile's samples from the anchor."""
         h = s.half_r2
         if wp.static(thick):
-            # q <= h (D^2 + bulge q); near 1 the rounding of the difference exceeds _SLACK
-            if s.bulge > 0.0:
-                if s.bulge * h < 0.95:
-                    h = h / (1.0 - s.bulge * h)
+            # q <= h (D^2 + ellipsoid_term q); near 1 the rounding of the difference exceeds _SLACK
+            if s.ellipsoid_term > 0.0:
+                if s.ellipsoid_term * h < 0.95:
+                    h = h / (1.0 - s.ellipsoid_term * h)
                 else:
                     h = wp.inf
         u0, ux, uy = s.u[0], s.u[1], s.u[2]

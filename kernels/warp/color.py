@@ -50,8 +50,8 @@ def basis_value(k: int, d: wp.vec3) -> float:
 
 
 @cache
-def make_color(sh_terms: int, real):
-    """Make color_of(i, colors, away), with away = centre - camera in world axes. sh_terms: 0 for plain
+def make_color(sh_coefficients: int, real):
+    """Make color_of(i, colors, away), with away = centre - camera in world axes. sh_coefficients: 0 for plain
     colours."""
     vec3 = wp.types.vector(3, real)
 
@@ -67,8 +67,8 @@ def make_color(sh_terms: int, real):
             toward = away * (real(1.0) / length)
             direction = wp.vec3(float(toward[0]), float(toward[1]), float(toward[2]))
         rgb = wp.vec3(0.5, 0.5, 0.5)
-        for k in range(wp.static(max(sh_terms, 1))):
-            rgb = fma3(basis_value(k, direction), colors[i * sh_terms + k], rgb)
+        for k in range(wp.static(max(sh_coefficients, 1))):
+            rgb = fma3(basis_value(k, direction), colors[i * sh_coefficients + k], rgb)
         return wp.vec3(wp.max(rgb[0], 0.0), wp.max(rgb[1], 0.0), wp.max(rgb[2], 0.0))
 
-    return harmonic if sh_terms else plain
+    return harmonic if sh_coefficients else plain

@@ -55,7 +55,9 @@ class View:
     fog_density: float  # 1 / metres
     # limits of -x, x, -y, y at z = 1, to which EWA clamps the centre of a splat before it linearises
     ewa_clamp: wp.vec4d
-    ray_step: wp.float64  # maximum distance of the rays of neighbouring samples, for boxes behind a lens
+    max_ray_derivative: (
+        wp.float64
+    )  # maximum distance of the rays of neighbouring samples, for boxes behind a lens
     splats: int  # number of splats of the cloud
     ray: wp.vec4  # a sample's ray is ((column - [2]) / [0], (row - [3]) / [1], 1), or (0, 0, 1) for distances
 

@@ -54,7 +54,7 @@ def make_ellipsoids_backward(effects: tuple[str, ...]):
         e2[i1] = k2
         e2[i2] = -k1
         inverse_m = shortest / m
-        grad_m2 = -_FOUR * grad_bulge * inverse_m * inverse_m  # the bulge is 2 / m^2
+        grad_m2 = -_FOUR * grad_bulge * inverse_m * inverse_m  # the ellipsoid_term is 2 / m^2
         grad_y = grad_m2 / m * g - inverse_m * (wp.dot(p, grad_a) * e1 + wp.dot(p, grad_b) * e2)
         grad_y = inverse_m * wp.cw_div(grad_y, sizes)
         share = wp.cw_div(grad_y, sizes)

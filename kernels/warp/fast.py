@@ -1,5 +1,5 @@
 """Exponentials and logarithms by sums and products, which all devices round equally. Blending uses them for
-`arithmetic="fast"`, the per-splat set-up always.
+`arithmetic="fast"`, the projection of splats always.
 
 Polynomials and error bounds are those of kernels/opencl/slot/arithmetic_fast.cl and math.cl; results are
 bit-identical.
@@ -55,7 +55,7 @@ def fast_log(x: float) -> float:
 
 @cache
 def make_log(real):
-    """Make the natural logarithm for the set-up, for normal x > 0; finite for every other x."""
+    """Make the natural logarithm for the projection, for normal x > 0; finite for every other x."""
     integer, shift = (wp.int64, 52) if real is wp.float64 else (wp.int32, 23)
     root_half = wp.constant(integer(0x3FE6A09E667F3BCD if real is wp.float64 else 0x3F3504F3))
     mantissa, exponent = wp.constant(integer((1 << shift) - 1)), wp.constant(integer(shift))

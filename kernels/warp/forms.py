@@ -40,7 +40,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
     Lens = make_lens(camera)
     at_lowpass, at_depth, at_edges, at_ray, at_plane, at_flag, at_bulge = (
         layout.word(name)
-        for name in ("lowpass_x", "z_numerator", "edge_u0", "nuz", "plane_z0", "boxed", "bulge")
+        for name in ("lowpass_x", "z_numerator", "edge_u0", "nuz", "plane_z0", "boxed", "ellipsoid_term")
     )
 
     @wp.func

@@ -33,7 +33,7 @@ def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str,
     names += ("lowpass_x", "lowpass_y") if "lowpass_screen" in effects else ()
     names += ("z_numerator", "z_numerator_x", "z_numerator_y", "z_center") if "ray_depth" in effects else ()
     names += ("nx", "ny", "nz") if "normal" in outputs else ()
-    names += ("bulge",) if EXACT in effects else ()
+    names += ("ellipsoid_term",) if EXACT in effects else ()
     return tuple(names)
 
 
@@ -139,10 +139,10 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         low_pass: float,
     ):
         """Depth of a fragment, and its derivatives with respect to z_numerator; z_center; D at constant
-        z_numerator - z_center D; q; `low_pass`, rho / 2 of the low-pass disc; and the bulge of a 3D Gaussian.
-        Beyond a circle, which may be the disc's, depth is z_center + circle (z_numerator - z_center D) D / q.
+        z_numerator - z_center D; q; `low_pass`, rho / 2 of the low-pass disc; and
+        the ellipsoid_term of a 3D Gaussian. Beyond a circle, which may be the disc's, depth is z_center + circle (z_numerator - z_center D) D / q.
         A depth that rounding moves out of the splat's range has the derivatives of the centre's depth. For a
-        3D Gaussian, D and q in `c` are D and q of its disk times 1 + t, t = bulge q / D^2."""
+        3D Gaussian, D and q in `c` are D and q of its disk times 1 + t, t = ellipsoid_term q / D^2."""
         place = index * each
         center = line_of(lines, place + zc_line)[zc_lane]
         reach = line_of(lines, place + zr_line)[zr_lane]
@@ -162,15 +162,17 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
             grad_dot = wp.vec2(-taken * beyond / c.q, wp.where(circle == low_pass, beyond * c.d / c.q, 0.0))
         grad_bulge = float(0.0)
         if wp.static(thick):
-            if s.bulge > 0.0 and ahead:
+            if s.ellipsoid_term > 0.0 and ahead:
                 slant = c.q * inverse_d  # q / D: finite for the thinnest needles, whose half_rho overflows
-                share = s.bulge * inverse_d * slant
+                share = s.ellipsoid_term * inverse_d * slant
                 rest = wp.max(1.0 - share, 1.0e-6)  # 1 / (1 + t)
                 t = share / rest
                 grad_d = grad_record[2] - center * grad_record[0]
                 grad_bulge = slant * fma(slant, grad_dot[0], grad_d)
                 grad_record[2] = grad_record[2] - t * fma(2.0 * slant, grad_dot[0], grad_d)
-                grad_dot[0] = fma(2.0 * t, grad_dot[0], grad_dot[0]) + grad_d * s.bulge * inverse_d / rest
+                grad_dot[0] = (
+                    fma(2.0 * t, grad_dot[0], grad_dot[0]) + grad_d * s.ellipsoid_term * inverse_d / rest
+                )
         return z, grad_record, grad_dot, grad_bulge
 
     @wp.func
@@ -270,7 +272,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
                 grad_bulge = fma(grad_log, half_rho * half_rho, grad_z * grad_bulge)
             else:
                 grad_bulge *= grad_z
-            m[wp.static(at.get("bulge", 0))] = grad_bulge
+            m[wp.static(at.get("ellipsoid_term", 0))] = grad_bulge
         m[0] = grad_nu
         m[1] = grad_nu * x
         m[2] = grad_nu * y

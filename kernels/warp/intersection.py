@@ -121,8 +121,8 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
             # product form: no division, no special value of D
             c.inside = c.q <= s.half_r2 * (c.d * c.d) and ahead
         if wp.static(thick):
-            if s.bulge > 0.0:
-                squared = fma(s.bulge, c.q, c.d * c.d)  # D^2 (1 + rho of the disk / m^2)
+            if s.ellipsoid_term > 0.0:
+                squared = fma(s.ellipsoid_term, c.q, c.d * c.d)  # D^2 (1 + rho of the disk / m^2)
                 c.inside = c.q <= s.half_r2 * squared and c.d > 0.0 and squared <= s.v[3] * c.d
                 # as for a disk: rho / 2 is q / d^2, and depth is proportional to 1 / d
                 inverse = 1.0 / c.d

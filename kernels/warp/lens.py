@@ -1,8 +1,8 @@
 """Lenses with a ray buffer: projection of points, and bounds of splats in the image.
 
-Bounds are computed in a chart of directions: the undistorted image of a distorted camera, the stereographic
-projection of a fisheye. A map from the cells of the chart to samples converts them to bounds of samples, so
-that they hold for the rays in the buffer.
+Bounds are computed in two coordinates of directions: the undistorted image of a distorted camera, the
+stereographic projection of a fisheye. An inverse lookup table, from cells of these coordinates to samples,
+converts them to bounds of samples, so that they hold for the rays in the buffer.
 """
 
 import math
@@ -18,8 +18,8 @@ COEFFICIENTS = {
     "camera_brown_conrady": wp.types.vector(12, wp.float64),  # k1 to k6, p1, p2, s1 to s4
     "camera_fisheye": wp.vec4d,  # k1 to k4
 }
-"""distortion coefficients of the lenses that have a map; in uniforms they precede the limit of the field of
-view, squared radius at which the distortion folds back, or maximum angle
+"""distortion coefficients of the lenses that have a lookup table; in uniforms they precede the limit of the
+field of view: squared radius at which the distortion folds back, or maximum angle
 """
 LENSES = (*COEFFICIENTS, "camera_equirectangular")
 
@@ -36,8 +36,8 @@ def make_lens(camera: str | None):
             "cells": wp.array(dtype=wp.vec4s),
             "side": wp.int32,  # cells per side
             "low": wp.vec2d,  # corner of the first cell
-            "per_unit": wp.vec2d,  # cells per unit of the chart
-            "top": wp.int32,  # row of the map's image that is the first row of this band
+            "per_unit": wp.vec2d,  # cells per unit of the coordinates
+            "top": wp.int32,  # row of the table's image that is the first row of this band
         }
     return struct_of("Lens", "Inputs of the projection by a lens.", fields if camera else {})
 
@@ -47,13 +47,13 @@ def make_optics(camera: str, real) -> SimpleNamespace:
     """Make functions of a lens.
 
     image(p, view, lens): image coordinates of a point, and whether it is in the field of view. anchor(x, y,
-    imaged, p, view, lens): the ray to which a splat's forms are relative. Bounds in samples: mapped(x0, x1,
-    y0, y1, lens) of a box of the chart, enclose(a, b, p, radius, view, lens) of a disk.
+    imaged, p, view, lens): the ray to which a splat's forms are relative. Bounds in samples: lut_bounds(x0, x1,
+    y0, y1, lens) of a box of the lookup table, enclose(a, b, p, radius, view, lens) of a disk.
     """
     Lens = make_lens(camera)
     vec2, vec3 = wp.types.vector(2, real), wp.types.vector(3, real)
     zero, half, one, two, pi = real(0.0), real(0.5), real(1.0), real(2.0), real(math.pi)
-    # margins for the rounding of rays and of the per-sample test: relative; radians or chart units; cells
+    # margins for the rounding of rays and of the per-sample test: relative; radians or units; cells
     more, pad, margin = real(1.0002), real(1e-6), real(0.02)
 
     @wp.func
@@ -74,8 +74,8 @@ def make_optics(camera: str, real) -> SimpleNamespace:
         return pi
 
     @wp.func
-    def mapped(x0: real, x1: real, y0: real, y1: real, lens: Lens):
-        """Bounds of the samples whose rays are in [x0, x1] x [y0, y1] of the chart."""
+    def lut_bounds(x0: real, x1: real, y0: real, y1: real, lens: Lens):
+        """Bounds of the samples whose rays are in [x0, x1] x [y0, y1] of the lookup table."""
         side = lens.side
         end = real(side)
         low = vec2(
@@ -180,7 +180,7 @@ def make_optics(camera: str, real) -> SimpleNamespace:
             else:
                 x0, x1, y0, y1 = -real(wp.inf), real(wp.inf), -real(wp.inf), real(wp.inf)
         more_x, more_y = (x1 - x0) * (more - one) + pad, (y1 - y0) * (more - one) + pad
-        return mapped(x0 - more_x, x1 + more_x, y0 - more_y, y1 + more_y, lens)
+        return lut_bounds(x0 - more_x, x1 + more_x, y0 - more_y, y1 + more_y, lens)
 
     @wp.func
     def image_panorama(p: vec3, view: View, lens: Lens):
@@ -234,4 +234,4 @@ def make_optics(camera: str, real) -> SimpleNamespace:
         "camera_equirectangular": image_panorama,
     }[camera]
     enclose = {"camera_fisheye": enclose_fisheye, "camera_equirectangular": enclose_panorama}.get(camera)
-    return SimpleNamespace(Lens=Lens, image=image, anchor=anchor, mapped=mapped, enclose=enclose)
+    return SimpleNamespace(Lens=Lens, image=image, anchor=anchor, lut_bounds=lut_bounds, enclose=enclose)

@@ -34,12 +34,16 @@ NONE, BITS = wp.constant(wp.uint32(0)), wp.constant(wp.uint64(32))
 
 @cache
 def make_project(
-    effects: tuple[str, ...], outputs: tuple[str, ...], sh_terms: int, precision: str, every_bounds: bool
+    effects: tuple[str, ...],
+    outputs: tuple[str, ...],
+    sh_coefficients: int,
+    precision: str,
+    every_bounds: bool,
 ):
     """Make the projection kernel for the effects and outputs that affect the records of projected splats.
 
     Args:
-        sh_terms: SH coefficients per colour channel, 0 for plain colours. every_bounds: write the bounds of
+        sh_coefficients: SH coefficients per colour channel, 0 for plain colours. every_bounds: write the bounds of
         all visible splats; otherwise only of splats whose tiles exceed the bit mask `windows`.
     """
     layout = Layout(effects, outputs)
@@ -61,7 +65,7 @@ def make_project(
     thick_too = exact or drawn_ewa
     surfaced = drawn_ewa and len(projects) > 0
     ellipsoid = make_ellipsoids(effects, real)
-    limits, color_of, widened = make_bounds(screen), make_color(sh_terms, real), make_filter(real)
+    limits, color_of, widened = make_bounds(screen), make_color(sh_coefficients, real), make_filter(real)
     ln = make_log(real)
     splat_pose = make_splat_pose(effects, real)
     Moving = splat_pose.Moving
@@ -97,7 +101,7 @@ def make_project(
         quats: wp.array(dtype=wp.vec4),  # (n) w x y z
         scales: wp.array(dtype=wp.vec2),  # (n) [m]
         opacities: wp.array(dtype=wp.float32),  # (n)
-        colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_terms)
+        colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_coefficients)
         coplanar_groups: wp.array(dtype=wp.int32),  # (n) index of the splat's coplanar group; -1: none
         boxes: wp.array(dtype=wp.int32),  # (n) 1: a box; for clouds with boxes and other splats
         thickness: wp.array(dtype=wp.float32),  # (n) [m], for clouds with 3D Gaussians; 0: a disk
@@ -231,7 +235,7 @@ def make_project(
         elif wp.static(boxes_too):
             if boxed:
                 # the disk around a larger rectangle
-                sides = of_box.spread(tangent_u, tangent_v, p, su, sv, real(view.ray_step))
+                sides = of_box.spread(tangent_u, tangent_v, p, su, sv, real(view.max_ray_derivative))
                 side_u, side_v = tangent_u * sides[0], tangent_v * sides[1]
                 range_z = sqrt_two * wp.length(vec2(side_u[2], side_v[2]))
                 box = bounds_of(side_u, side_v, p, sqrt_two, range_z, center_x, center_y, view, lens)
@@ -245,7 +249,7 @@ def make_project(
         if wp.static(mapped):
             x0, x1 = real(box.x - box.half_x), real(box.x + box.half_x)
             y0, y1 = real(box.y - box.half_y), real(box.y + box.half_y)
-            box = optics.mapped(x0, x1, y0, y1, lens)
+            box = optics.lut_bounds(x0, x1, y0, y1, lens)
         if wp.static(bent):
             if in_front:
                 center_x, center_y, in_front = optics.image(p, view, lens)

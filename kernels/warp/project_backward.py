@@ -68,10 +68,10 @@ def basis_slope(k: int, d: wp.vec3) -> wp.vec3:
 
 @cache
 def make_project_backward(
-    effects: tuple[str, ...], outputs: tuple[str, ...], names: tuple[str, ...], sh_terms: int
+    effects: tuple[str, ...], outputs: tuple[str, ...], names: tuple[str, ...], sh_coefficients: int
 ):
     """Make the kernel of the backward pass of the projection. effects, outputs: of the record. names: names
-    of the moments. sh_terms: SH coefficients per colour, 0 for plain colours."""
+    of the moments. sh_coefficients: SH coefficients per colour, 0 for plain colours."""
     layout = Layout(effects, outputs)
     each, fields = layout.lines, len(names)
     at = {name: place for place, name in enumerate(names)}
@@ -81,9 +81,9 @@ def make_project_backward(
     has_gaussians = exact or ewa
     ellipsoid, solid_backward = make_ellipsoids(effects, wp.float64), make_ellipsoids_backward(effects)
     zc_line, zc_lane = layout.place("z_center")
-    terms = max(sh_terms, 1)
-    lowpass_x, z_numerator, nx, bulge = (
-        at.get(name, 0) for name in ("lowpass_x", "z_numerator", "nx", "bulge")
+    terms = max(sh_coefficients, 1)
+    lowpass_x, z_numerator, nx, ellipsoid_term = (
+        at.get(name, 0) for name in ("lowpass_x", "z_numerator", "nx", "ellipsoid_term")
     )
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
@@ -95,7 +95,7 @@ def make_project_backward(
         scales: wp.array(dtype=wp.vec2),
         thickness: wp.array(dtype=wp.float32),  # for clouds with 3D Gaussians; 0: a disk
         opacities: wp.array(dtype=wp.float32),
-        colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_terms)
+        colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_coefficients)
         lines: wp.array(dtype=wp.vec4),
         keys: wp.array(dtype=wp.uint32),
         counts: wp.array(dtype=wp.int32),
@@ -136,7 +136,7 @@ def make_project_backward(
         mean = wp.vec3d(wp.float64(means[i][0]), wp.float64(means[i][1]), wp.float64(means[i][2]))
         grad_rgb = wp.vec3(float(total[10]), float(total[11]), float(total[12]))
         grad_ray = wp.vec3d()  # with respect to the vector from the eye to the centre, in world axes
-        if wp.static(sh_terms == 0):
+        if wp.static(sh_coefficients == 0):
             grad_colors[i] = grad_rgb
         else:
             clamped = line_of(lines, i * each + 3)  # ay, r, g, b; colours clamped at 0 have no derivative
@@ -235,7 +235,7 @@ def make_project_backward(
             if thickness[i] > 0.0:
                 grad_axes, grad_sizes, grad_p, grad_camera = solid_backward(
                     wp.matrix_from_rows(unit_a, unit_b, unit_normal), sizes, p, grad_a, grad_b, grad_p,
-                    wp.vec4d(grad_fx, grad_fy, grad_cx, grad_cy), grad_log, total[bulge], grad_facet, view,
+                    wp.vec4d(grad_fx, grad_fy, grad_cx, grad_cy), grad_log, total[ellipsoid_term], grad_facet, view,
                 )  # fmt: skip
                 grad_fx, grad_fy, grad_cx, grad_cy = (
                     grad_camera[0],

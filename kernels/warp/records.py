@@ -22,7 +22,7 @@ _EXTRA = {
     "lowpass_screen": ("lowpass_x", "lowpass_y"),
     "ray_depth": ("z_numerator", "z_center", "z_reach"),
     "compose_pixel": ("nearest",),
-    "ellipsoid_exact": ("bulge",),
+    "ellipsoid_exact": ("ellipsoid_term",),
 }
 
 
@@ -34,7 +34,7 @@ class Layout:
     relative to the anchor; z_numerator / D is the depth. columns and rows: [first, end) of the box of samples
     that the splat may overlap, 16 bits each. Behind a lens x, y, z are a sample's ray minus the anchor's ray
     (ray_x, ray_y, ray_z), and boxed is 1 for a box, else 0. For parallel rays plane_z0 + plane_zx x +
-    plane_zy y is D times the depth, with a minimum of plane_near. bulge: 2 / m^2 of a 3D Gaussian
+    plane_zy y is D times the depth, with a minimum of plane_near. ellipsoid_term: 2 / m^2 of a 3D Gaussian
     (ellipsoids.py), else 0. Fields of outputs follow.
     """
 

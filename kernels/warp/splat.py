@@ -26,7 +26,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     splat |= {"lowpass_x": wp.float32, "lowpass_y": wp.float32} if screen else {}
     splat |= {"edges": wp.vec4} if edged else {}
     splat |= {"boxed": wp.float32} if flagged else {}
-    splat |= {"bulge": wp.float32} if thick else {}
+    splat |= {"ellipsoid_term": wp.float32} if thick else {}
     # w: factors of the ray's Z, then the anchor's X; origin: the anchor's ray
     splat |= {"w": wp.vec4, "origin": wp.vec3} if bent else {}
     # plane_z0, plane_zx, plane_zy, plane_near
@@ -36,7 +36,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     lowpass_y_lane = layout.place("lowpass_y")[1]  # on the same line
     edge_line = layout.place("edge_u0")[0]
     boxed_line, boxed_lane = layout.place("boxed")
-    bulge_line, bulge_lane = layout.place("bulge")
+    bulge_line, bulge_lane = layout.place("ellipsoid_term")
     box_line, box_lane = layout.place("columns")  # and rows
     ray_line, plane_line = layout.place("nuz")[0], layout.place("plane_z0")[0]
 
@@ -66,7 +66,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
             if wp.static(flagged):
                 s.boxed = line(pool, lines, lists, first, which, boxed_line)[boxed_lane]
             if wp.static(thick):
-                s.bulge = line(pool, lines, lists, first, which, bulge_line)[bulge_lane]
+                s.ellipsoid_term = line(pool, lines, lists, first, which, bulge_line)[bulge_lane]
             if wp.static(bent):
                 s.w = line(pool, lines, lists, first, which, ray_line)
                 rest = line(pool, lines, lists, first, which, ray_line + 1)

@@ -98,7 +98,15 @@ def test_record_sizes_follow_from_the_effects():
 
 def test_options_of_3d_gaussians_do_not_change_other_scenes():
     """No option of 3D Gaussians changes the text of a scene without them."""
-    words = ("thickness", "THICK_HERE", "bulge", "conjugate_disk", "slopes", "ellipsoid", "conic_facing")
+    words = (
+        "thickness",
+        "THICK_HERE",
+        "ellipsoid_term",
+        "conjugate_disk",
+        "slopes",
+        "ellipsoid",
+        "conic_facing",
+    )
     for outputs, shape in ((("rgb",), SHAPE), (tuple(FURTHER), GROUP)):
         plain = assemble(select(COLORS, fs.Capture(outputs=outputs)), shape)
         assert not [word for word in words if word in plain.text]

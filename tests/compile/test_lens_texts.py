@@ -26,7 +26,14 @@ CAMERAS = {
 LENS_FILES = {
     *("slot/camera_brown_conrady", "slot/camera_fisheye", "slot/camera_equirectangular"),
     *("slot/camera_orthographic", "slot/shutter_exposure", "slot/shutter_rows", "slot/motion_groups"),
-    *("part/rays", "part/ray_map", "part/polygon", "part/rays_box", "part/rays_length", "part/world_ray"),
+    *(
+        "part/rays",
+        "part/inverse_lens_lut",
+        "part/polygon",
+        "part/rays_box",
+        "part/rays_length",
+        "part/world_ray",
+    ),
 }
 
 
@@ -76,7 +83,7 @@ def test_record_sizes_of_lenses():
         "orthographic": 96,
     }
     assert not any(
-        LAYOUTS[name].splat for name in ("shutter_exposure", "motion_groups", "ray_map", "polygon")
+        LAYOUTS[name].splat for name in ("shutter_exposure", "motion_groups", "inverse_lens_lut", "polygon")
     )
 
 

@@ -77,7 +77,7 @@ def test_lowpass_and_samples(renderer, lowpass, samples):
 
 
 def test_fast_preset_is_as_accurate_as_its_constants(renderer):
-    """Float32 set-up costs accuracy (case B1): this preset is held to a tenth of an 8-bit step."""
+    """Float32 projection costs accuracy (case B1): this preset is held to a tenth of an 8-bit step."""
     quality = fs.Quality.named("fast")
     cloud = random_splats(200, seed=0, depth=(0.5, 6.0))
     frame = renderer.render(cloud, CAMERA, quality=quality)

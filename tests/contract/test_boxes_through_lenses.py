@@ -156,7 +156,7 @@ def test_light_is_that_of_the_image(renderer, camera, size, shifts):
 
 @pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama"])
 def test_boxes_through_lenses_in_single_precision(renderer, name):
-    """The set-up of devices without float64, held as Gaussians are: to a tenth of an 8-bit step."""
+    """The projection of devices without float64, held as Gaussians are: to a tenth of an 8-bit step."""
     cloud = random_splats(100, 0, depth=(0.5, 6.0)).with_boxes()
     frame = renderer.render(cloud, CAMERAS[name], ALL_OUTPUTS, "fast")
     expected = reference_pixels(cloud, CAMERAS[name], ("rgb",), "fast")

@@ -266,7 +266,7 @@ def test_bands_are_bit_identical(renderer, name):
 
 @pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama", "parallel"])
 def test_lenses_in_single_precision(renderer, name):
-    """The set-up of devices without float64, held as the pinhole's is: to a tenth of an 8-bit step."""
+    """The projection of devices without float64, held as the pinhole's is: to a tenth of an 8-bit step."""
     cloud = random_splats(200, 0, depth=(0.5, 6.0))
     frame = renderer.render(cloud, CAMERAS[name], quality="fast")
     expected = reference_pixels(cloud, CAMERAS[name], ("rgb",), "fast")

@@ -17,7 +17,7 @@ def test_the_table_has_all_scenes():
 @pytest.mark.parametrize("kind", digests.KINDS, ids=lambda kind: kind.name)
 def test_devices_render_the_digests_of_the_table(renderer, monkeypatch, kind):
     """Each kind of scene is on one device in a run, which compiles a feature set for it."""
-    monkeypatch.setattr(pipeline, "MIN_VECTORISED", 0)  # set-up is vectorised where it can be
+    monkeypatch.setattr(pipeline, "MIN_VECTORISED", 0)  # projection is vectorised where it can be
     expected = {seed: row for seed, row in digests.read_table().items() if digests.kind_of(seed) == kind}
     assert len(expected) == digests.COUNT // len(digests.KINDS)
     differing = {
@@ -29,7 +29,7 @@ def test_devices_render_the_digests_of_the_table(renderer, monkeypatch, kind):
 
 
 def test_digests_do_not_depend_on_vectorised_set_up(renderer):
-    """The scenes have few splats, whose set-up is not vectorised."""
+    """The scenes have few splats, whose projection is not vectorised."""
     for seed, expected in digests.read_table().items():
         if seed % 50 == 0:
             assert digests.digest_of(renderer, seed) == expected, digests.kind_of(seed).name

@@ -140,11 +140,11 @@ def test_what_makes_no_lens(make, words):
 
 @pytest.mark.parametrize("lens", [BrownConrady(-0.3, 0.1, p1=0.01), Fisheye(0.1)], ids=lambda lens: lens.kind)
 def test_the_map_knows_every_sample(lens):
-    """Any rectangle of the chart: the boxes of the cells that it meets hold all samples whose rays lie in
+    """any rectangle of the lookup table: the boxes of the cells that it meets hold all samples whose rays lie in
     it."""
     raster = RayRaster(lens, 90, 70, 60.0, 60.0, 45.0, 35.0)
     boxes, (low_x, low_y, scale_x, scale_y, cells) = raster.bounds_pyramid
-    x, y = raster.chart(raster.rays)
+    x, y = raster.lut_coordinates(raster.rays)
     generator, first = np.random.default_rng(3), 0
     size = int(cells)
     while size >= 1:

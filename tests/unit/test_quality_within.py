@@ -254,7 +254,7 @@ def test_a_device_without_a_setting(renderer, held_out, monkeypatch):
 
     def lacking(self, cloud, capture=None, outputs=None, quality=None, **more):
         if fs.Quality.of(quality).setup_precision == "float32":
-            raise fs.DeviceError("no set-up in float32")
+            raise fs.DeviceError("no projection in float32")
         return draw(self, cloud, capture, outputs, quality, **more)
 
     monkeypatch.setattr(fs.Renderer, "render", lacking)

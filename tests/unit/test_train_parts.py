@@ -11,7 +11,7 @@ from fidsplat.train.losses import C1, C2, blurred, image_loss, normal_loss, wind
 from fidsplat.train.neighbours import mean_square_distances
 from fidsplat.train.optimiser import adam_step, parameter_gradients
 from fidsplat.train.parameters import Splats, TrainingError, logit, sigmoid
-from fidsplat.train.random_numbers import Purpose, normal, permutation, philox, uniform
+from fidsplat.train.random_numbers import RandomStream, normal, permutation, philox, uniform
 
 
 def images(seed=0, size=(9, 12)):
@@ -207,17 +207,17 @@ def test_philox_gives_what_its_authors_print():
 
 
 def test_random_numbers_are_of_their_splat_iteration_and_purpose_only():
-    few, many = (uniform(5, Purpose.SPLITS, 100, count) for count in (10, 1000))
+    few, many = (uniform(5, RandomStream.SPLITS, 100, count) for count in (10, 1000))
     np.testing.assert_array_equal(few, many[:10])
-    others = [(6, Purpose.SPLITS, 100), (5, Purpose.NOISE, 100), (5, Purpose.SPLITS, 101)]
+    others = [(6, RandomStream.SPLITS, 100), (5, RandomStream.NOISE, 100), (5, RandomStream.SPLITS, 101)]
     for other in others:
         assert (uniform(*other, 10) != few).all()
-    assert (uniform(5, Purpose.SPLITS, 100, 10, draw=1) != few).all()
+    assert (uniform(5, RandomStream.SPLITS, 100, 10, draw=1) != few).all()
     assert ((many > 0) & (many < 1)).all()
-    draws = normal(5, Purpose.NOISE, 1, 20_000)
+    draws = normal(5, RandomStream.NOISE, 1, 20_000)
     assert np.abs(draws.mean(0)).max() < 0.03
     assert np.abs(np.cov(draws.T) - np.eye(4)).max() < 0.03
-    assert sorted(permutation(0, Purpose.VIEWS, 3, 50)) == list(range(50))
+    assert sorted(permutation(0, RandomStream.VIEWS, 3, 50)) == list(range(50))
 
 
 @pytest.mark.parametrize("pairs", [None, 1000])

@@ -70,10 +70,10 @@ _FRAME = (
 `pack` is used by the strategy `sort_first` only"""
 _GRADIENTS = (
     *("prelude", "math", "splat", "bounds", "record_gradients", "blend_backward"),
-    *("schedule/{}_cells", "schedule/{}_backward", "set_up_backward", "project_backward"),
+    *("schedule/{}_cells", "schedule/{}_backward", "project_splat_backward", "project_backward"),
 )
 _STEP = (
-    *("prelude", "math", "splat", "bounds", "record_gradients", "set_up_backward"),
+    *("prelude", "math", "splat", "bounds", "record_gradients", "project_splat_backward"),
     *("train/activation_functions", "train/adam", "project_step"),
 )
 _TRAINING = ("surface", "exposure", "activation_functions", "activate", "gather_rows", "position_noise")
@@ -306,7 +306,7 @@ def kernels_of(config: KernelConfig) -> Mapping[str, tuple[Argument, ...]]:
 def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> KernelSource:
     """Assemble the kernels of loss, regularisation and optimiser, for vectors of `lanes` floats."""
     files = ("loss_values", "loss" if lanes == 1 else "loss_strips", *_TRAINING)
-    numbers = {"LANES": lanes, "FAST_FMA": int(fast_fma and lanes > 1), "SETUP_FP64": int(float64)}
+    numbers = {"LANES": lanes, "FAST_FMA": int(fast_fma and lanes > 1), "PROJECTION_FP64": int(float64)}
     declared = Declarations(Scalars("double" if float64 else "float", "float"))
     stages = ("prelude", "math", *(f"train/{file}" for file in files))
     return Assembler((), declared, numbers).source({"training": stages})
@@ -334,7 +334,7 @@ def assemble_alignment_step(float64: bool) -> KernelSource:
 def assemble_test(file: str, config: KernelConfig, float64: bool, effects: Iterable[str] = ()) -> str:
     """Text of prelude.cl, math.cl and a file of test kernels below kernels/opencl/ (empty: no file). effects:
     files whose sections fill the hooks."""
-    numbers = {"LANES": config.lanes, "FAST_FMA": int(config.fast_fma), "SETUP_FP64": int(float64)}
+    numbers = {"LANES": config.lanes, "FAST_FMA": int(config.fast_fma), "PROJECTION_FP64": int(float64)}
     scalars = Scalars("double" if float64 else "float", "float")
     stages = ("prelude", "math", *([file.removesuffix(".cl")] if file else ()))
     files = [*effects, *_dialect(config, scalars)]
@@ -371,7 +371,7 @@ def build_constants(features: FeatureSet, config: KernelConfig) -> dict[str, int
         "RADIX_BITS": config.radix_bits,
         "SAMPLES": features.samples,
         "SCAN_ITEMS": config.scan_items,
-        "SETUP_FP64": int(features.setup_precision == "float64"),
+        "PROJECTION_FP64": int(features.setup_precision == "float64"),
         "SH_DEGREE": features.sh_degree,
         "TILE_H": config.tile_height,
         "TILE_W": config.tile_width,

@@ -184,8 +184,8 @@ class BufferPool:
 
 
 class RayBuffers:
-    """Buffers of the lenses in use: rays of the samples, and the inverse lookup table `ray_map`, a pyramid of
-    image bounds (part/ray_map.cl)."""
+    """Buffers of the lenses in use: rays of the samples, and the inverse lookup table (LUT) from ray directions
+    to samples (part/inverse_lens_lut.cl)."""
 
     def __init__(self, pool: BufferPool, queue: cl.CommandQueue) -> None:
         self._pool, self._queue = pool, queue
@@ -201,14 +201,16 @@ class RayBuffers:
             sizes[rows, columns] = {"rays": self._planar("rays", raster.rays, rows, columns)}
             if raster.lens.kind != "equirectangular":
                 maps = self._buffers.setdefault(raster.full_raster or raster, {}).setdefault((0, 0), {})
-                if "ray_map" not in maps:
-                    maps["ray_map"] = self._upload("ray_map", raster.bounds_pyramid[0])
-                sizes[rows, columns]["ray_map"] = maps["ray_map"]
+                if "inverse_lens_lut" not in maps:
+                    maps["inverse_lens_lut"] = self._upload("inverse_lens_lut", raster.bounds_pyramid[0])
+                sizes[rows, columns]["inverse_lens_lut"] = maps["inverse_lens_lut"]
         buffers = sizes[rows, columns]
-        if slopes and "ray_slopes" not in buffers:
+        if slopes and "ray_derivatives" not in buffers:
             flat = raster.ray_derivatives.reshape(raster.height, raster.width, 6)
-            buffers["ray_slopes"] = self._planar("ray_slopes", flat, rows, columns)
-            buffers["ray_step"] = self._upload("ray_step", np.array([raster.max_ray_derivative], np.float32))
+            buffers["ray_derivatives"] = self._planar("ray_derivatives", flat, rows, columns)
+            buffers["max_ray_derivative"] = self._upload(
+                "max_ray_derivative", np.array([raster.max_ray_derivative], np.float32)
+            )
         return buffers
 
     def _planar(self, name: str, array: np.ndarray, rows: int, columns: int) -> cl.Buffer:

@@ -276,5 +276,5 @@ class DeviceFrame:
     def bind_rays(self) -> None:
         """Bind the ray buffers of a lens, and its map from directions to samples."""
         assert self.view.raster is not None
-        slopes = self.source.has_argument("blend", "ray_slopes")
+        slopes = self.source.has_argument("blend", "ray_derivatives")
         self.named |= self.workspace.ray_buffers.of(self.view.raster, self.rows, self.stride, slopes)

@@ -17,7 +17,7 @@ LAYOUTS: dict[str, Layout] = {
     "camera_pinhole": Layout("slot/camera_pinhole.cl", parts=("chord", "conic", "perspective")),
     "camera_brown_conrady": Layout(
         "slot/camera_brown_conrady.cl",
-        parts=("perspective", "ray_map", "rays"),
+        parts=("perspective", "inverse_lens_lut", "rays"),
         view=(
             member("real lens[12]", "k1 to k6, p1, p2, s1 to s4"),
             member("real lens_fold", "squared radius where the polynomial stops being monotonic"),
@@ -25,7 +25,7 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "camera_fisheye": Layout(
         "slot/camera_fisheye.cl",
-        parts=("polygon", "ray_map", "rays"),
+        parts=("polygon", "inverse_lens_lut", "rays"),
         view=(member("real lens[4]", "k1 to k4"), member("real lens_limit", "half field of view [rad]")),
     ),
     "camera_equirectangular": Layout("slot/camera_equirectangular.cl", parts=("polygon", "rays")),
@@ -89,10 +89,13 @@ LAYOUTS: dict[str, Layout] = {
         "slot/ellipsoid_exact.cl",
         parts=("thickness",),
         splat=(
-            member("wide bulge", "thickness term: 2 / m^2, m: Mahalanobis distance of the camera; 0: a disk"),
+            member(
+                "wide ellipsoid_term",
+                "thickness term: 2 / m^2, m: Mahalanobis distance of the camera; 0: a disk",
+            ),
         ),
         backward_file="slot/ellipsoid_exact_backward.cl",
-        record_gradient=(member("float bulge"),),
+        record_gradient=(member("float ellipsoid_term"),),
     ),
     "ellipsoid_ewa": Layout(
         "slot/ellipsoid_ewa.cl",
@@ -167,15 +170,15 @@ LAYOUTS: dict[str, Layout] = {
     "conic_facing": Layout("part/conic_facing.cl"),  # disks that face the camera
     "perspective": Layout("part/perspective.cl"),
     "polygon": Layout("part/polygon.cl"),  # bounds of a disk by a circumscribed polygon
-    "ray_map": Layout(
-        "part/ray_map.cl",
+    "inverse_lens_lut": Layout(
+        "part/inverse_lens_lut.cl",
         view=(
             member(
-                "real map[6]",
-                "grid of `ray_map`: lowest corner x, y, cells per unit of x, y, cells per side, first row",
+                "real lens_lut[6]",
+                "grid of `inverse_lens_lut`: lowest corner x, y, cells per unit of x, y, cells per side, first row",
             ),
         ),
-        project=args("in short4 ray_map  // inverse lens table: columns and rows of a cell of rays"),
+        project=args("in short4 inverse_lens_lut  // columns and rows of the samples in a cell of rays"),
     ),
     "rays": Layout(
         "part/rays.cl",
@@ -215,8 +218,10 @@ LAYOUTS: dict[str, Layout] = {
     "rays_box": Layout(
         "part/rays_box.cl",
         parts=("box_cover",),
-        project=args("in float ray_step  // (1) maximum angle between the rays of neighbouring samples"),
-        blend=args("in float ray_slopes  // 6 channels dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy"),
+        project=args(
+            "in float max_ray_derivative  // (1) maximum angle between the rays of neighbouring samples"
+        ),
+        blend=args("in float ray_derivatives  // 6 channels dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy"),
     ),
     "ray_depth": Layout(
         "part/ray_depth.cl",

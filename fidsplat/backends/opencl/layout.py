@@ -133,7 +133,10 @@ _SURFACE = args(
     "float inverse_x inverse_y middle_x middle_y  // 1 / focal lengths, and the principal point [px]",
 )
 _RENDERED_SH = args(
-    *("uint count", "uint rendered_terms stored_terms  // SH coefficients of a splat and channel"),
+    *(
+        "uint count",
+        "uint rendered_coefficients stored_coefficients  // SH coefficients of a splat and channel",
+    ),
     "int as_rgb  // whether to write RGB colours, at degree 0",
 )
 
@@ -243,7 +246,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("uint count", "in View view", "in Splat splats", "in uint keys", _TILES),
         *("in uint gradient_offsets", "in float record_gradients"),
         "int add_statistics update sparse  // sparse: update only splats that contribute",
-        "uint stored_terms  // SH coefficients of a splat and channel",
+        "uint stored_coefficients  // SH coefficients of a splat and channel",
         "float beta1 beta2 one_minus_beta1 one_minus_beta2 sqrt_correction2 epsilon",
         "float lr_means lr_scales lr_quats lr_logits  // learning rates",
         "float lr_sh lr_rest  // of degree 0; of higher degrees",
@@ -345,7 +348,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float visible_counts",
     ),
     "add_position_noise": args(
-        *("uint count axes seed_low seed_high iteration", "uint purpose  // random stream"),
+        *("uint count axes seed_low seed_high iteration", "uint random_stream"),
         "float size  // factor of the steps [1/m]",
         "float slope threshold  // of the opacity above which splats do not move",
         "in float quats log_scales logits",

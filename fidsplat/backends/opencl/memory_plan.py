@@ -70,7 +70,7 @@ class MemoryPlanner:
         self, device: Workspace, source: KernelSource, features: FeatureSet, config: KernelConfig
     ) -> None:
         self._device, self._source, self._config = device, source, config
-        self._has_ray_slopes = source.has_argument("blend", "ray_slopes")
+        self._has_ray_slopes = source.has_argument("blend", "ray_derivatives")
         self._has_camera_uniforms = not _CAMERA_UNIFORMS.isdisjoint(source.uniform_groups)
         self._channels = RAW.channels
         for samples in source.sample_buffers:

@@ -12,8 +12,8 @@ from fidsplat.backends.opencl.assemble import kernel_text
 from fidsplat.backends.opencl.program import build
 from fidsplat.backends.opencl.workspace import Workspace
 
-GROUP = 32
-"""splats of a group: GROUP_SPLATS of part/unculled_splats.cl"""
+CULLING_GROUP = 32
+"""splats of a group that is culled as a whole: CULLING_GROUP of part/unculled_splats.cl"""
 _SIDE = 128
 """cells of the grid along an axis (kernels/opencl/morton_order.cl)"""
 _SAMPLE = 10_000
@@ -25,7 +25,7 @@ class MortonOrder:
 
     def __init__(self, workspace: Workspace, means: np.ndarray, buffer: cl.Buffer) -> None:
         """means, buffer: the positions (n, 3) on the host and on the device."""
-        self._workspace, self._count, self.groups = workspace, len(means), -(-len(means) // GROUP)
+        self._workspace, self._count, self.groups = workspace, len(means), -(-len(means) // CULLING_GROUP)
         program = build(workspace, kernel_text("morton_order.cl"))
         self._kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
         queue, allocate = workspace.queue, workspace.pool.allocate
@@ -51,10 +51,14 @@ class MortonOrder:
     def gather(self, name: str, source: cl.Buffer, row_bytes: int) -> cl.Buffer:
         """The rows of an array in this order."""
         words = row_bytes // 4
-        gathered = self._workspace.pool.allocate(f"the cloud's {name}", self.groups * GROUP * row_bytes)
+        gathered = self._workspace.pool.allocate(
+            f"the cloud's {name}", self.groups * CULLING_GROUP * row_bytes
+        )
         size, order = np.uint64(self._count * words), self.arrays["splat_ids"]
         self._launch(
-            "gather_splats", self.groups * GROUP * words, (source, order, size, np.uint32(words), gathered)
+            "gather_splats",
+            self.groups * CULLING_GROUP * words,
+            (source, order, size, np.uint32(words), gathered),
         )
         return gathered
 
@@ -62,12 +66,16 @@ class MortonOrder:
         """Compute the bounding spheres of all groups: `spheres` (n, 4) float32 and `max_scales` (n,)."""
         optional = ("thickness", "boxes")
         inputs = [arrays.get(name, arrays["scales"]) for name in ("means", "scales", "opacities", *optional)]
-        sizes = *(np.int32(name in arrays) for name in optional), np.uint32(GROUP), np.uint32(self.groups)
+        sizes = (
+            *(np.int32(name in arrays) for name in optional),
+            np.uint32(CULLING_GROUP),
+            np.uint32(self.groups),
+        )
         for name, row_bytes in {"spheres": 16, "max_scales": 4}.items():
             self.arrays[name] = self._workspace.pool.allocate(name, row_bytes * self.groups)
         outputs = self.arrays["spheres"], self.arrays["max_scales"]
         self._launch("bound_groups", self.groups, (*inputs, *sizes, *outputs))
 
     def _launch(self, kernel: str, items: int, arguments: tuple[Any, ...]) -> None:
-        items = -(-items // GROUP) * GROUP
-        self._kernels[kernel](self._workspace.queue, (items,), (GROUP,), *arguments).wait()
+        items = -(-items // CULLING_GROUP) * CULLING_GROUP
+        self._kernels[kernel](self._workspace.queue, (items,), (CULLING_GROUP,), *arguments).wait()

@@ -23,7 +23,7 @@ def evaluate(
     """Compile `text` after prelude.cl and math.cl, and run its kernel `probe` with a work-item per element.
 
     inputs: arrays (n,). outputs: types of arrays (n,). The kernel's arguments are the inputs, then the
-    outputs. Without float64, SETUP_FP64 is 0 and `real` is float.
+    outputs. Without float64, PROJECTION_FP64 is 0 and `real` is float.
     """
     kernel = compile_test_kernels(workspace, text=text, lanes=1)["probe"]
     given = [buffer_of(workspace, array) for array in inputs]

@@ -20,14 +20,14 @@ from fidsplat.backends.bands import split_by_cost
 from fidsplat.backends.opencl.counts import BIG, COUNTERS, PAIRS, VISIBLE, Counts, enlarged
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.memory_plan import KEY_BYTES, MIN_BIG, WINDOW_BYTES
-from fidsplat.backends.opencl.morton_order import GROUP
+from fidsplat.backends.opencl.morton_order import CULLING_GROUP
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.util.errors import DeviceError
 
 LOCAL_TILES = 4096
 """maximum tiles of a view that are counted in local memory (as in tile_lists_local.cl)"""
-_GROUP_SPLATS = 4096
-"""splats per work-group of the strategy `bin_local`"""
+_WORK_GROUP_SPLATS = 4096
+"""splats per work-group of the strategy `bin_local` (as in tile_lists_local.cl)"""
 _ITEMS = 256
 """work-group size: BIN_ITEMS and SORT_ITEMS of the kernels"""
 _START_TILES, _MAX_START_GROUPS = 512, 32
@@ -59,13 +59,13 @@ def allocate_counters(frame: DeviceFrame, words: int, big: int = 0) -> None:
 
 def cull(frame: DeviceFrame, big: int) -> None:
     """List the groups of splats that are not culled by their bounding spheres, and set `frame.projected`."""
-    pool, groups = frame.pool, -(-frame.resident.count // GROUP)
-    frame.scratch("unculled", 4 * MIN_BIG // GROUP)
+    pool, groups = frame.pool, -(-frame.resident.count // CULLING_GROUP)
+    frame.scratch("unculled", 4 * MIN_BIG // CULLING_GROUP)
     for name in ("spheres", "max_scales", "splat_ids"):
         frame.bind(name, frame.resident.sorted_array(name))
     while True:
         capacity = min(pool.size("unculled") // 4, groups)
-        frame.projected = GROUP * capacity
+        frame.projected = CULLING_GROUP * capacity
         frame.launch("project", "cull_groups", (groups,), (_ITEMS,), groups=groups, capacity=capacity)
         if not frame.waits:
             break
@@ -318,7 +318,7 @@ def launch_local(frame: DeviceFrame, kernel: str, **arguments: Any) -> None:
     """Submit a kernel of tile_lists_local.cl."""
     count, items = frame.resident.count, frame.config.scan_items
     if count:
-        groups = -(-count // _GROUP_SPLATS)
+        groups = -(-count // _WORK_GROUP_SPLATS)
         frame.launch("bin", kernel, (groups * items,), (items,), frame.views, count=count, **arguments)
 
 

@@ -222,7 +222,11 @@ class OpenCLTraining:
                 self._bound[f"activated_{name}"] = self._workspace.pool.allocate(f"the splats' {name}", size)
             if "thickness" not in shapes:  # not used
                 self._bound["activated_thickness"] = self._bound["activated_scales"]
-            self._bound |= {"rendered_terms": rendered, "stored_terms": stored, "as_rgb": int(degree == 0)}
+            self._bound |= {
+                "rendered_coefficients": rendered,
+                "stored_coefficients": stored,
+                "as_rgb": int(degree == 0),
+            }
             self._launch("activate", count)
             if shared:
                 self._bound["activated_sh"] = self._bound["sh"]
@@ -391,7 +395,7 @@ class OpenCLTraining:
     def add_noise(self, size: float, slope: float, threshold: float, words: Sequence[int]) -> None:
         """Add MCMC noise to the means: steps size * sigmoid(slope (threshold - opacity)) * covariance *
         standard normal sample, in the plane of a disk. words: seed (low, high), iteration, random stream."""
-        names = ("seed_low", "seed_high", "iteration", "purpose")
+        names = ("seed_low", "seed_high", "iteration", "random_stream")
         args = {"size": size, "slope": slope, "threshold": threshold, **dict(zip(names, words, strict=True))}
         self._launch("add_position_noise", self._count, args)
 

@@ -14,8 +14,8 @@ from fidsplat.backends.interface import Backend, DeviceInfo, HostImages, Pipelin
 from fidsplat.backends.reference.blend import composite
 from fidsplat.backends.reference.culling import may_contribute
 from fidsplat.backends.reference.gradients import ReferenceGradients
+from fidsplat.backends.reference.projection import ProjectedSplats
 from fidsplat.backends.reference.resolve import resolve
-from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
@@ -125,7 +125,7 @@ class ReferencePipeline(Pipeline):
 
     def render_intermediates(self, resident: ReferenceCloud, view: View) -> dict[str, np.ndarray]:
         """Render one view; returns the depth order, the float32 keys, and the images with the certificate."""
-        splats = Setup(resident.cloud, view, self.features)
+        splats = ProjectedSplats(resident.cloud, view, self.features)
         images = self.render_view(resident, view).arrays_of(0)
         return {"order": splats.order, "keys": splats.key, **images}
 
@@ -153,7 +153,7 @@ class ReferencePipeline(Pipeline):
         self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray, widest: int
     ) -> dict[str, np.ndarray]:
         """Sample buffers (k, ...) at grid positions x, y (k,)."""
-        splats = Setup(resident.cloud, view, self.features)
+        splats = ProjectedSplats(resident.cloud, view, self.features)
         if len(x) * len(splats.order) <= _BLOCK:
             return composite(splats, view, self.features, x, y)
         order, starts = _by_tile(view, x, y, widest)

@@ -10,7 +10,7 @@ from fidsplat.backends.reference.fragment_order import by_center, by_depth, by_l
 from fidsplat.backends.reference.fragments import fragments_of, shifted
 from fidsplat.backends.reference.optics import ray_lengths
 from fidsplat.backends.reference.post import background_at
-from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.reference.projection import ProjectedSplats
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
@@ -26,7 +26,7 @@ _EXACT_DEPTH = 5e-5
 
 
 def composite(
-    s: Setup, view: View, features: FeatureSet, x: np.ndarray, y: np.ndarray
+    s: ProjectedSplats, view: View, features: FeatureSet, x: np.ndarray, y: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Blend all splats at samples (k,) with grid positions x, y; returns the sample buffers."""
     f = fragments_of(s, view, x, y)

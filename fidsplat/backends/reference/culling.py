@@ -9,14 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from fidsplat.backends.reference.optics import ROUND, Samples, away_of, samples_of
-from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.reference.projection import ProjectedSplats
 from fidsplat.backends.view import View
 
 _SPARE = 1.001
 """relative padding of intervals; far more than their rounding in float64"""
 
 
-def may_contribute(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def may_contribute(s: ProjectedSplats, view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """(n,) bool: whether each splat may contribute to any sample (k,) at grid positions x, y. The first splat
     of a visible coplanar group always counts, as it determines the layer's position in the order."""
     samples = samples_of(view, x, y)

@@ -15,7 +15,7 @@ import numpy as np
 
 from fidsplat.backends.reference.fragments import HALF_RHO_OF_RANGE, Fragments, cover, shifted
 from fidsplat.backends.reference.optics import ROUND
-from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.reference.projection import ProjectedSplats
 from fidsplat.backends.view import View
 
 _ROUND = ROUND
@@ -46,7 +46,7 @@ class Span:
         return cls(low, high, z_low, z_high, *fronts)
 
 
-def span_of(s: Setup, view: View, f: Fragments) -> Span:
+def span_of(s: ProjectedSplats, view: View, f: Fragments) -> Span:
     """Intervals of fragments that are computed in float32."""
     terms = [s.forms[:, :, c] for c in range(3)]
     e_u, e_v, e_d = (
@@ -128,7 +128,7 @@ _Pair = tuple[np.ndarray, np.ndarray]
 """lowest and highest value, (k, n) or (n,)"""
 
 
-def _of_mirrored_depth(s: Setup, d: _Pair, q: _Pair, dz: _Pair, circle: _Pair) -> _Pair:
+def _of_mirrored_depth(s: ProjectedSplats, d: _Pair, q: _Pair, dz: _Pair, circle: _Pair) -> _Pair:
     """Depth bounds (k, n) of fragments outside the circle rho = C (docs/correctness.md, "The depth of a
     fragment"): pz + circle (dz - pz d) 2 d / q, from bounds of the factors. circle: C / 2."""
     d = np.maximum(d[0], 0.0), np.maximum(d[1], 0.0)
@@ -141,7 +141,7 @@ def _of_mirrored_depth(s: Setup, d: _Pair, q: _Pair, dz: _Pair, circle: _Pair) -
     return np.where(np.isnan(low), -np.inf, low - off), np.where(np.isnan(high), np.inf, high + off)
 
 
-def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np.ndarray:
+def _rounding(s: ProjectedSplats, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np.ndarray:
     """Rounding error bounds (k, n) of affine forms (k, n) with factors (3, n)."""
     total = np.abs(form)
     for away, term in zip(f.away, terms, strict=True):
@@ -149,7 +149,7 @@ def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np
     return s.round * total
 
 
-def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.ndarray) -> np.ndarray:
+def of_color(s: ProjectedSplats, view: View, span: Span, before: np.ndarray, moved: np.ndarray) -> np.ndarray:
     """Error bound (k,) of colour and alpha. moved (k, m): error bound of each fragment's own colour."""
     bound = (before * (span.high - span.low)).sum(1)
     t_low = span.front_low * (1 - span.high) * (1 - STOP)

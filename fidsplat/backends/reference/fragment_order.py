@@ -9,7 +9,7 @@ import numpy as np
 from fidsplat.backends.reference import error_bounds
 from fidsplat.backends.reference.error_bounds import Span
 from fidsplat.backends.reference.fragments import Fragments, optical_depth
-from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.reference.projection import ProjectedSplats
 
 COPLANAR_BIAS = 2.0**-16
 """fraction of its depth by which a coplanar layer is sorted nearer: more than rounding errors, but
@@ -71,12 +71,12 @@ _COLUMNS = (
 """fields of OrderedFragments with m values per sample"""
 
 
-def by_center(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
+def by_center(s: ProjectedSplats, f: Fragments, span: Span) -> OrderedFragments:
     # colours and normals are stored once, not for each sample
     return replace(_plain(s, f, span, slice(None)), colors=s.colors, normal=s.normal)
 
 
-def by_depth(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
+def by_depth(s: ProjectedSplats, f: Fragments, span: Span) -> OrderedFragments:
     """Fragments, and a layer for each coplanar group, sorted by their depths at each sample. Ties: layers
     first, then the splats' order. Fragments that do not contribute are left out."""
     columns, depth_bias, tie_order = _with_layers(s, f, span)
@@ -88,7 +88,7 @@ def by_depth(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
     return ordered
 
 
-def by_layers(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
+def by_layers(s: ProjectedSplats, f: Fragments, span: Span) -> OrderedFragments:
     """Fragments in the order of the splats' centres, and layers of coplanar groups by depth at each sample,
     behind nearer fragments and in front of the others. Fragments that do not contribute are left out."""
     columns, depth_bias, tie_order = _with_layers(s, f, span)
@@ -107,7 +107,9 @@ def by_layers(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
     return ordered
 
 
-def _with_layers(s: Setup, f: Fragments, span: Span) -> tuple[OrderedFragments, np.ndarray, np.ndarray]:
+def _with_layers(
+    s: ProjectedSplats, f: Fragments, span: Span
+) -> tuple[OrderedFragments, np.ndarray, np.ndarray]:
     """Fragments (k, n) of splats without a group, then layers (k, p); the depth bias of each [m]; and the
     order of ties (n + p,), negative for layers."""
     groups = np.full(f.alpha.shape[1], -1) if s.coplanar_groups is None else s.coplanar_groups
@@ -125,7 +127,7 @@ def _rank(may: np.ndarray, tie_order: np.ndarray, key: np.ndarray) -> np.ndarray
     return rank[:, : may.sum(1).max(initial=0)]
 
 
-def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray | slice) -> OrderedFragments:
+def _plain(s: ProjectedSplats, f: Fragments, span: Span, splats: np.ndarray | slice) -> OrderedFragments:
     ids = np.arange(f.alpha.shape[1])[splats]
     k, m = len(f.alpha), len(ids)
     nothing = np.zeros((k, m))
@@ -148,7 +150,7 @@ def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray | slice) -> Or
     )
 
 
-def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> OrderedFragments:
+def _layer(s: ProjectedSplats, f: Fragments, span: Span, splats: np.ndarray) -> OrderedFragments:
     """Layer (k, 1) of the splats (indices) of a coplanar group."""
     alpha, z, z_low, z_high = (each[:, splats] for each in (f.alpha, f.z, span.z_low, span.z_high))
     low, high = span.low[:, splats], span.high[:, splats]

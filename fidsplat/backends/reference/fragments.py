@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.backends.reference.optics import away_of, edges_of, samples_of
-from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.reference.projection import ProjectedSplats
 from fidsplat.backends.view import View
 
 _NO_EDGES = np.zeros((4, 0))
@@ -41,7 +41,7 @@ class Fragments:
     edge_terms: np.ndarray
 
 
-def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragments:
+def fragments_of(s: ProjectedSplats, view: View, x: np.ndarray, y: np.ndarray) -> Fragments:
     """The fragments of samples (k,) at grid positions x, y."""
     samples = samples_of(view, x, y)
     edges, edge_terms = edges_of(view, s.forms, x, y) if s.box.any() else (_NO_EDGES, _NO_EDGES)

@@ -16,7 +16,7 @@ from fidsplat.backends.reference.gradients_scene import (
     to_camera,
     to_camera_backward,
 )
-from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.reference.projection import ProjectedSplats
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
@@ -49,14 +49,14 @@ class FrozenFrame:
     def __init__(self, cloud: Any, view: View, features: FeatureSet) -> None:
         self.parameters = Parameters.of(cloud, view)
         self._view, self._features = view, features
-        self._setup = Setup(cloud, view, features)
+        self._projected = ProjectedSplats(cloud, view, features)
         self._blocks: list[tuple[np.ndarray, np.ndarray, Decisions]] = []
         rows, columns = np.mgrid[0 : view.height, 0 : view.width]
         x, y = columns.ravel() + 0.5, rows.ravel() + 0.5
-        step = max(1, _BLOCK // max(1, len(self._setup.order)))
+        step = max(1, _BLOCK // max(1, len(self._projected.order)))
         for k in range(0, len(x), step):
             at = x[k : k + step], y[k : k + step]
-            self._blocks.append((*at, decide(self._setup, view, *at)))
+            self._blocks.append((*at, decide(self._projected, view, *at)))
 
     def images(self, parameters: Parameters) -> dict[str, np.ndarray]:
         """Render output images (float64) with other parameters, under the frozen decisions."""

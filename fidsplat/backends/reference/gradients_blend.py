@@ -17,7 +17,7 @@ from fidsplat.backends.reference.blend import (
 from fidsplat.backends.reference.fragments import HALF_RHO_OF_RANGE, ellipsoid_forms, fragments_of
 from fidsplat.backends.reference.gradients_scene import CameraSplats
 from fidsplat.backends.reference.gradients_shapes import shapes_of
-from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.reference.projection import ProjectedSplats
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
@@ -46,7 +46,7 @@ class Decisions:
     """(k,): whether the coverage suffices for depths and normals"""
 
 
-def decide(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
+def decide(s: ProjectedSplats, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
     """The decisions of the forward pass at samples (k,) at grid positions x, y."""
     f = fragments_of(s, view, x, y)
     _, live, final = transmittance(f.alpha, view.transmittance_stop, s.exclusive)

@@ -1,7 +1,7 @@
 """Weights and depths of splats along rays, with their derivatives: disks, and 3D Gaussians exact and by EWA.
 
-The formulas differ from the formulas of setup.py and devices, so that a comparison finds mistakes in either:
-ray-plane intersection, maximum of a Gaussian along a ray, inverse of a projected covariance.
+The formulas differ from the formulas of projection.py and devices, so that a comparison finds mistakes in
+either: ray-plane intersection, maximum of a Gaussian along a ray, inverse of a projected covariance.
 """
 
 from __future__ import annotations

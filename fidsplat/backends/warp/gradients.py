@@ -178,7 +178,7 @@ class _Backward:
 
     def _allocate_results(self) -> dict[str, Any]:
         """Allocate the results; each call overwrites them."""
-        wp, count, terms = self._wp, self._count, max(self._made.sh_terms, 1)
+        wp, count, terms = self._wp, self._count, max(self._made.sh_coefficients, 1)
         kinds = {
             "grad_means": wp.vec3,
             "grad_quats": wp.vec4,
@@ -189,7 +189,7 @@ class _Backward:
         found = {name.removeprefix("grad_"): self._take(name, count, dtype) for name, dtype in kinds.items()}
         self._given.setdefault("grad_thickness", self._given["grad_opacities"])  # not written for disks
         colors = self._take("grad_colors", count * terms, wp.vec3)
-        if self._made.sh_terms:
+        if self._made.sh_coefficients:
             found["sh"] = colors.reshape((count, terms))
         else:
             found["colors"] = colors

@@ -197,7 +197,7 @@ class GradientKernels:
         features, needs, shape = program.features, program.needs, program.shape
         rendered = {"rgb", *features.outputs}
         self.losses = tuple(name for name in GRADIENT_OUTPUTS if name in rendered)
-        self.sh_terms = (features.sh_degree + 1) ** 2 if "color_sh" in needs.effects else 0
+        self.sh_coefficients = (features.sh_degree + 1) ** 2 if "color_sh" in needs.effects else 0
         effects, outputs = needs.among(_SAMPLE), needs.blending
         backward, names = kernels("blend_backward"), kernels("fragment_backward").moments_of(effects, outputs)
         grouped, block = shape.schedule == "group", program.tile_area
@@ -205,7 +205,7 @@ class GradientKernels:
             self.blend = backward.make_blend_backward(effects, outputs, self.losses, grouped, block)
             self.slots = backward.make_slots("lowpass_screen" in effects)
             made = kernels("project_backward").make_project_backward
-            self.project = made(needs.among(_PROJECT), outputs, names, self.sh_terms)
+            self.project = made(needs.among(_PROJECT), outputs, names, self.sh_coefficients)
             self.sums = kernels("column_sums")
             program.compile(self.blend.kernel, block)
             for kernel in (self.slots, self.project, self.sums.add_rows):

@@ -33,7 +33,7 @@ def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> n
         **{"per_pixel": 1.0 / view.samples**2, "rotation": stack.rotation[0]},
         **{"translation": stack.translation[0], "eye": stack.eye[0], **stack.numbers},
         # filled below
-        **{"per_focal_x": 0.0, "per_focal_y": 0.0, "per_near": 0.0, "ray": 0.0, "ray_step": 0.0},
+        **{"per_focal_x": 0.0, "per_focal_y": 0.0, "per_near": 0.0, "ray": 0.0, "max_ray_derivative": 0.0},
     }
     filled: Any = np.zeros(len(stack), _record())
     for name in filled.dtype.names:
@@ -45,7 +45,7 @@ def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> n
         own = (filled["focal_x"], filled["focal_y"], filled["center_x"], filled["center_y"])
         filled["ray"] = np.stack(own, axis=1)
     if sloped and view.raster:
-        filled["ray_step"] = view.raster.max_ray_derivative
+        filled["max_ray_derivative"] = view.raster.max_ray_derivative
     return filled
 
 

@@ -1,5 +1,5 @@
 // Edges of boxes (part/box_cover.cl) for lenses with one ray per sample: curves, approximated by lines within a sample. Gradients of the
-// forms use the ray's derivatives with respect to the sample's position, from the buffer `ray_slopes`: 6 channels dX/dx, dY/dx, dZ/dx, dX/dy,
+// forms use the ray's derivatives with respect to the sample's position, from the buffer `ray_derivatives`: 6 channels dX/dx, dY/dx, dZ/dx, dX/dy,
 // dY/dy, dZ/dy.
 //@ footprint_functions
 // Ramp of a form over one sample: 1 half a sample inside of the edge, 0 half a sample outside.
@@ -29,24 +29,24 @@ static inline vfloat along_ray(wide x, wide y, wide z, vfloat to_x, vfloat to_y,
         c.inside = VMASK(c.cover > 0.0f) & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
     }
 //@ ray_intersect_arguments
-                              , SLOPE(0), SLOPE(1), SLOPE(2), SLOPE(3), SLOPE(4), SLOPE(5)
+                              , RAY_DERIVATIVE(0), RAY_DERIVATIVE(1), RAY_DERIVATIVE(2), RAY_DERIVATIVE(3), RAY_DERIVATIVE(4), RAY_DERIVATIVE(5)
 //@ lanes_start
-#define SLOPE(k) BLOCK_LOAD(ray_slopes + (k) * ray_plane + (y0 + TOP(block)) * ray_stride + x0 + LEFT(block), ray_stride)
+#define RAY_DERIVATIVE(k) BLOCK_LOAD(ray_derivatives + (k) * ray_plane + (y0 + TOP(block)) * ray_stride + x0 + LEFT(block), ray_stride)
 //@ group_start
-    float pixel_slopes[6][ROWS];
+    float pixel_ray_derivatives[6][ROWS];
     for (int row = 0; row < ROWS; row++)
-        for (int k = 0; k < 6; k++) pixel_slopes[k][row] = ray_slopes[k * ray_plane + (py + row) * ray_stride + px];
-#define SLOPE(k) pixel_slopes[k][row]
+        for (int k = 0; k < 6; k++) pixel_ray_derivatives[k][row] = ray_derivatives[k * ray_plane + (py + row) * ray_stride + px];
+#define RAY_DERIVATIVE(k) pixel_ray_derivatives[k][row]
 //@ footprint_spread
     // A partly covered sample is at |u| <= 1 + |grad F| / 2 D for the forms F = D -+ n_u, likewise for v. With
-    // |grad F| <= |F| ray_step (|F| of its three factors) and D >= su sv |offset| / |P|, the point P on the plane is at most
+    // |grad F| <= |F| max_ray_derivative (|F| of its three factors) and D >= su sv |offset| / |P|, the point P on the plane is at most
     // |p| + |u| su + |v| sv away: a linear inequality whose solution is a larger box. Where it has no solution, near the plane's
     // horizon, the bounds are the complete plane.
     real3_ box_a = a, box_b = b;
     real box_reach = reach;
     if (BOX_HERE) {
         real3_ of_u = cross3(b, p), of_v = cross3(p, a);
-        real half_step = REAL(0.5) * ray_step[0] / (su * sv * fabs(offset)), far_off = sqrt(dot3(p, p));
+        real half_step = REAL(0.5) * max_ray_derivative[0] / (su * sv * fabs(offset)), far_off = sqrt(dot3(p, p));
         real wider_u = half_step * (su * sv + sqrt(dot3(of_u, of_u))), wider_v = half_step * (su * sv + sqrt(dot3(of_v, of_v)));
         real share = wider_u * su + wider_v * sv;
         bool bounded = share < REAL(0.9);

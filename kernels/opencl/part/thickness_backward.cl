@@ -5,7 +5,7 @@
     , global const float *thickness
 //@ footprint_arguments
             , thickness
-//@ footprint_set_up
+//@ footprint_projection
     const real3_ unit_normal = cross3(unit_a, unit_b);
     const real sw = THICK_HERE ? THICKNESS_HERE : 0;
     const real3_ c = scaled(sw, unit_normal);

@@ -1,18 +1,18 @@
-// Frustum culling before projection, with stream compaction, for large clouds on GPUs: groups of GROUP_SPLATS splats that are neighbours in
+// Frustum culling before projection, with stream compaction, for large clouds on GPUs: groups of CULLING_GROUP splats that are neighbours in
 // Morton order are culled by a bounding sphere. `unculled` holds the groups that pass, in any order. Only their splats have records and keys.
 //@ functions
-#define GROUP_SPLATS 32
+#define CULLING_GROUP 32
 #define CULL_ITEMS 256
 //@ unculled
-    if (i / GROUP_SPLATS >= counters[COUNTER_VISIBLE]) return;
-    i = unculled[i / GROUP_SPLATS] * GROUP_SPLATS + i % GROUP_SPLATS;
+    if (i / CULLING_GROUP >= counters[COUNTER_VISIBLE]) return;
+    i = unculled[i / CULLING_GROUP] * CULLING_GROUP + i % CULLING_GROUP;
 //@ pair_order_parameters
                               , global const uint *unculled, global const int *splat_ids
 //@ pair_order_arguments
                               , unculled, splat_ids
 //@ pair_order
-#define GROUP_SPLATS 32
-#define CLOUD_INDEX(pair) splat_ids[unculled[(uint)(pair) / GROUP_SPLATS] * GROUP_SPLATS + (uint)(pair) % GROUP_SPLATS]
+#define CULLING_GROUP 32
+#define CLOUD_INDEX(pair) splat_ids[unculled[(uint)(pair) / CULLING_GROUP] * CULLING_GROUP + (uint)(pair) % CULLING_GROUP]
 // Splats of equal depth are sorted by their index in the cloud.
 static inline bool pair_before(ulong a, ulong b
 //@@ pair_order_parameters

@@ -27,17 +27,17 @@ static inline Intersection intersect_at(const Splat *s, int px, int py, const Bl
 typedef struct {            // a splat at a pixel, before transmittance is known
     wide opacity, grad_weight;
     int mask;
-} FragmentTerms;
+} FragmentValues;
 
-static inline FragmentTerms fragment_terms(const Splat *s, int px, int py, const PixelGradient *gradient, const BlendConstants *constants) {
+static inline FragmentValues fragment_values(const Splat *s, int px, int py, const PixelGradient *gradient, const BlendConstants *constants) {
     wide x, y, nu_x, nv_x, half_r2, screen;
     Intersection c = intersect_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
-    FragmentTerms terms;
-    terms.mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
-    terms.opacity = fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->opacity_ceiling);
+    FragmentValues values;
+    values.mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
+    values.opacity = fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->opacity_ceiling);
     const Geometry g = geometry_of(s, c, nu_x, nv_x, y, screen);
-    terms.grad_weight = fragment_by_weight(s, gradient, &g);
-    return terms;
+    values.grad_weight = fragment_by_weight(s, gradient, &g);
+    return values;
 }
 
 // Attenuates a pixel by the splat; returns the opacity there.
@@ -117,11 +117,11 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
         for (uint k = 0; k <= listed; k += UNROLL) {
             // evaluated in parallel, since they do not depend on transmittance; attenuation is sequential
             uint which[UNROLL];
-            FragmentTerms terms[UNROLL][ROWS];
+            FragmentValues values[UNROLL][ROWS];
             for (int next = 0; next < UNROLL; next++) {
                 which[next] = k + next < listed ? cell_splats[cell][k + next] : 0;
                 const Splat s = copy_of(&staged[which[next]]);
-                for (int row = 0; row < ROWS; row++) terms[next][row] = fragment_terms(&s, px, py + row, &gradients[row], &constants);
+                for (int row = 0; row < ROWS; row++) values[next][row] = fragment_values(&s, px, py + row, &gradients[row], &constants);
             }
             for (int next = 0; next < UNROLL; next++) {
                 // completed chunks
@@ -135,8 +135,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
                 if (k + next >= listed) break;
                 for (int row = 0; row < ROWS; row++) {
                     wide transmittance = pixels[row].t;
-                    wide composited = attenuate(&pixels[row], terms[next][row].opacity, terms[next][row].mask, &constants);
-                    grad_weights[row] = FMA(transmittance * composited, terms[next][row].grad_weight, grad_weights[row]);
+                    wide composited = attenuate(&pixels[row], values[next][row].opacity, values[next][row].mask, &constants);
+                    grad_weights[row] = FMA(transmittance * composited, values[next][row].grad_weight, grad_weights[row]);
                 }
             }
         }

@@ -1,5 +1,5 @@
 // Perspective with OpenCV's distortion: radial k1 to k6, tangential p1, p2, thin prism s1 to s4. Splats are bounded in the
-// undistorted pinhole image, which is the chart of the ray map.
+// undistorted pinhole image, whose coordinates the inverse lookup table has (part/inverse_lens_lut.cl).
 //@ camera
 // Projects (x, y) = (X / Z, Y / Z) [samples]. Returns false beyond the radius where the distortion folds back.
 static inline bool lens_image(global const View *view, real x, real y, real *image_x, real *image_y) {
@@ -13,7 +13,7 @@ static inline bool lens_image(global const View *view, real x, real y, real *ima
     return q < view->lens_fold;
 }
 //@ camera_box
-    bounds = mapped_bounds(view->map, ray_map, bounds.ex - bounds.hx, bounds.ex + bounds.hx,
+    bounds = lens_lut_bounds(view->lens_lut, inverse_lens_lut, bounds.ex - bounds.hx, bounds.ex + bounds.hx,
                            bounds.ey - bounds.hy, bounds.ey + bounds.hy);
     if (!(pz >= near && lens_image(view, p.x / pz, p.y / pz, &center_x, &center_y))) center_x = center_y = NAN;   // no low-pass disc
 //@ camera_derivative_functions

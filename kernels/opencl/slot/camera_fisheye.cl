@@ -1,6 +1,6 @@
 // Kannala-Brandt fisheye, as in OpenCV: a ray at angle t from the axis is at distance
-// t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the image centre. Depths are distances along the ray. The chart of the ray map is the
-// stereographic projection (X, Y) / (|r| + Z), in which arcs of great circles are arcs of circles of radius 1 or more.
+// t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the image centre. Depths are distances along the ray. The coordinates of the inverse
+// lookup table (part/inverse_lens_lut.cl) are the stereographic projection (X, Y) / (|r| + Z), in which arcs of great circles are arcs of circles of radius 1 or more.
 //@ camera
 // Projects a point [samples]. Returns false outside of the field of view.
 static inline bool lens_image(global const View *view, real3_ p, real *image_x, real *image_y) {
@@ -13,13 +13,13 @@ static inline bool lens_image(global const View *view, real3_ p, real *image_x, 
     return angle <= view->lens_limit;
 }
 
-// Chart coordinates of eight points.
-static inline void chart_of(float8 x, float8 y, float8 z, float8 *chart_x, float8 *chart_y) {
+// Lookup table coordinates of eight points.
+static inline void lut_coordinates_of(float8 x, float8 y, float8 z, float8 *lut_x, float8 *lut_y) {
     float8 across = x * x + y * y, length = sqrt(across + z * z);
     // 1 / (|r| + Z) = (|r| - Z) / (X^2 + Y^2), whichever does not cancel
     float8 scale = select(length - z, (float8)(1.0f), z > 0) / select(across, length + z, z > 0);
-    *chart_x = x * scale;
-    *chart_y = y * scale;
+    *lut_x = x * scale;
+    *lut_y = y * scale;
 }
 
 static inline float lowest_of(float8 x, float8 y) {
@@ -27,10 +27,10 @@ static inline float lowest_of(float8 x, float8 y) {
     return fmin(fmin(four.x, four.y), fmin(four.z, four.w));
 }
 
-// Box of the disk in the chart: the corners of a polygon around it, padded by the sagitta of the arcs between them. The complete
-// chart where an arc may be long or the disk may contain the pole of the chart, direction -z. Corners are vectors of float: CPUs
+// Box of the disk in these coordinates: the corners of a polygon around it, padded by the sagitta of the arcs between them. The complete
+// plane where an arc may be long or the disk may contain the pole of the projection, direction -z. Corners are vectors of float: CPUs
 // compute eight at once.
-static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real away, float *box) {
+static inline void lut_box(real3_ a, real3_ b, real3_ p, real radius, real away, float *box) {
     real around = radius / POLYGON_INNER;
     real3_ u = {a.x * around, a.y * around, a.z * around}, v = {b.x * around, b.y * around, b.z * around};
     // radius of the sphere around the polygon; squares are compared, so that no rounding is in the wrong direction
@@ -42,8 +42,8 @@ static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real awa
     float8 dx = cosine * (float)u.x + sine * (float)v.x, dy = cosine * (float)u.y + sine * (float)v.y,
            dz = cosine * (float)u.z + sine * (float)v.z, x0, y0, x1, y1;
     float x = (float)p.x, y = (float)p.y, z = (float)p.z;
-    chart_of(x + dx, y + dy, z + dz, &x0, &y0);
-    chart_of(x - dx, y - dy, z - dz, &x1, &y1);
+    lut_coordinates_of(x + dx, y + dy, z + dz, &x0, &y0);
+    lut_coordinates_of(x - dx, y - dy, z - dz, &x1, &y1);
     float low_x = lowest_of(x0, x1), high_x = -lowest_of(-x0, -x1), low_y = lowest_of(y0, y1), high_y = -lowest_of(-y0, -y1);
     float8 x2 = (float8)(x0.s1, x0.s23, x0.s4567, x1.s0) - x0, y2 = (float8)(y0.s1, y0.s23, y0.s4567, y1.s0) - y0;
     float8 x3 = (float8)(x1.s1, x1.s23, x1.s4567, x0.s0) - x1, y3 = (float8)(y1.s1, y1.s23, y1.s4567, y0.s0) - y1;
@@ -63,9 +63,9 @@ static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real awa
     reach = radius * sqrt(fmax(dot3(a, a), dot3(b, b)));
 //@ camera_bounds
     real center_x, center_y;
-    float chart[4];
-    chart_box(a, b, p, radius, pz, chart);
-    Bounds bounds = mapped_bounds(view->map, ray_map, chart[0], chart[1], chart[2], chart[3]);
+    float lut_bounds[4];
+    lut_box(a, b, p, radius, pz, lut_bounds);
+    Bounds bounds = lens_lut_bounds(view->lens_lut, inverse_lens_lut, lut_bounds[0], lut_bounds[1], lut_bounds[2], lut_bounds[3]);
     // no low-pass disc; rays of a table have no image
     if (view->lens_limit < 0 || !(pz >= near && lens_image(view, p, &center_x, &center_y))) center_x = center_y = NAN;
 //@ camera_derivative

@@ -25,7 +25,7 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
     real determinant = view->focal_x * view->focal_y * su * sv * offset;
     k0.z = determinant;
 //@ camera_facing
-    facing = fabs(offset) > (SETUP_FP64 ? REAL(1e-13) : REAL(1e-6)) ? scale : 0;
+    facing = fabs(offset) > (PROJECTION_FP64 ? REAL(1e-13) : REAL(1e-6)) ? scale : 0;
 //@ project
     record.z0 = (wide)((a.z * k0.x + b.z * k0.y + pz * k0.z) * facing);
     record.zx = (wide)((a.z * kx.x + b.z * kx.y) * facing);

@@ -38,7 +38,7 @@
         // beyond the near plane projects into the contour's section at `near`.
         real3_ along_x = {a.x, b.x, third.x}, along_y = {a.y, b.y, third.y}, along_z = {a.z, b.z, third.z};
         real zz = dot3(along_z, along_z), ahead = near - pz * REAL(0.5);
-        real extent2 = REAL(0.25) / inverse_m2 * (1 + (SETUP_FP64 ? REAL(1e-12) : REAL(1e-4))) - ahead * ahead / zz;
+        real extent2 = REAL(0.25) / inverse_m2 * (1 + (PROJECTION_FP64 ? REAL(1e-12) : REAL(1e-4))) - ahead * ahead / zz;
         if (!(extent2 > 0)) return;
         real3_ across_x = cross3(along_x, along_z), across_y = cross3(along_y, along_z);
         real half_x = sqrt(extent2 * dot3(across_x, across_x) / zz), half_y = sqrt(extent2 * dot3(across_y, across_y) / zz);

@@ -1,7 +1,7 @@
 // Real spherical harmonics of degree SH_DEGREE, in the convention of gsplat and the 2DGS authors:
 // colour = max(0, 1/2 + sum_k Y_k(direction) f_k), direction = normalised(centre - camera) in the world frame.
 //@ functions
-#define SH_TERMS ((SH_DEGREE + 1) * (SH_DEGREE + 1))
+#define SH_COEFFICIENTS ((SH_DEGREE + 1) * (SH_DEGREE + 1))
 static inline void sh_basis(real3_ d, wide *y) {
     wide x = (wide)d.x, yy = (wide)d.y, z = (wide)d.z;
     y[0] = WIDE(0.28209479177387814);
@@ -33,12 +33,12 @@ static inline void sh_basis(real3_ d, wide *y) {
     real length = sqrt(dot3(ray, ray));
     real inverse = length > 0 ? 1 / length : 0;
     ray.x *= inverse; ray.y *= inverse; ray.z *= inverse;
-    wide basis[SH_TERMS];
+    wide basis[SH_COEFFICIENTS];
     sh_basis(ray, basis);
     wide rgb[3] = {0.5f, 0.5f, 0.5f};
-    for (int k = 0; k < SH_TERMS; k++)
+    for (int k = 0; k < SH_COEFFICIENTS; k++)
         for (int c = 0; c < 3; c++)
-            rgb[c] = FMA(basis[k], (wide)sh[((size_t)i * SH_TERMS + k) * 3 + c], rgb[c]);
+            rgb[c] = FMA(basis[k], (wide)sh[((size_t)i * SH_COEFFICIENTS + k) * 3 + c], rgb[c]);
     record.r = fmax(rgb[0], WIDE(0.0));
     record.g = fmax(rgb[1], WIDE(0.0));
     record.b = fmax(rgb[2], WIDE(0.0));

@@ -1,8 +1,8 @@
 // Spherical harmonics: gradients with respect to the coefficients and, through the direction, the centre and the camera's position.
 //@ functions
-#define PLAIN 0
-#define CLOUD_TERMS sh
-#define BY_TERMS grad_sh
+#define IS_RGB 0
+#define CLOUD_COEFFICIENTS sh
+#define GRAD_COEFFICIENTS grad_sh
 // Gradient of sum_k by[k] Y_k with respect to the direction.
 static inline real3_ sh_basis_backward(real3_ d, const wide *by) {
     wide x = (wide)d.x, y = (wide)d.y, z = (wide)d.z, grad_x = 0.0f, grad_y = 0.0f, grad_z = 0.0f;
@@ -43,9 +43,9 @@ static inline real3_ sh_basis_backward(real3_ d, const wide *by) {
         splat_grad.color[0] = s.r > 0.0f ? (float)total.r : 0.0f;
         splat_grad.color[1] = s.g > 0.0f ? (float)total.g : 0.0f;
         splat_grad.color[2] = s.b > 0.0f ? (float)total.b : 0.0f;
-        wide grad_basis[SH_TERMS];
-        for (int k = 0; k < SH_TERMS; k++) {
-            global const float *term = terms + ((size_t)i * row + k) * 3;
+        wide grad_basis[SH_COEFFICIENTS];
+        for (int k = 0; k < SH_COEFFICIENTS; k++) {
+            global const float *term = coefficients + ((size_t)i * row + k) * 3;
             grad_basis[k] = splat_grad.color[0] * term[0] + splat_grad.color[1] * term[1] + splat_grad.color[2] * term[2];
         }
         real3_ slope = sh_basis_backward(ray, grad_basis);

@@ -1,6 +1,6 @@
 // 3D Gaussians as in 3DGS (EWA splatting, Zwicker et al. 2001; Kerbl et al. 2023): the projected covariance by the Jacobian at the
 // centre, widened by 0.3 square pixels, and the centre's depth, with the constants of gsplat. The projection equals that of a
-// disk that faces the camera, so that only the setup has code for it.
+// disk that faces the camera, so that only the projection has code for it.
 //@ functions
 typedef struct {            // widened covariance of the projection: its Cholesky factor, and the determinants before and after
     real3_ crossed;

@@ -1,6 +1,6 @@
 // Backward pass of the EWA projection: from the facing disk to the axes of the Gaussian, whose scaled images are the rows `across`
 // and `down`, and to the centre, which the Jacobian depends on.
-//@ ellipsoid_set_up
+//@ ellipsoid_projection
     const real3_ depths = {a.z, b.z, c.z};
     const real spread = REAL(0.3) / view->filter;
     real3_ across, down;

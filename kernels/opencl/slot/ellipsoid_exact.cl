@@ -57,7 +57,7 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
         reach = radius * sqrt(a.z * a.z + b.z * b.z + third.z * third.z);
 //@@ camera_ellipsoid_reach
         // clamped for a camera inside of the ellipsoid; the margin exceeds rounding
-        radius /= sqrt(fmax(1 - radius * radius * inverse_m2 - (SETUP_FP64 ? REAL(1e-15) : REAL(1e-6)), REAL(1e-12)));
+        radius /= sqrt(fmax(1 - radius * radius * inverse_m2 - (PROJECTION_FP64 ? REAL(1e-15) : REAL(1e-6)), REAL(1e-12)));
     }
 //@ camera_box
     if (THICK_HERE && pz - reach < near) {
@@ -69,8 +69,8 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
         // the disk's test does not account for fragments of the ellipsoid that `near` removes
         if (THICK_HERE && pz >= near && pz - reach < near) record.lowpass_x = (wide)(center_x - anchor_x);
 //@ footprint_intersect
-    if (s->bulge > 0.0f) {
-        vfloat squared = FMA((vfloat)s->bulge, c.q, c.d * c.d);      // D^2 (1 + rho_disk / m^2)
+    if (s->ellipsoid_term > 0.0f) {
+        vfloat squared = FMA((vfloat)s->ellipsoid_term, c.q, c.d * c.d);      // D^2 (1 + rho_disk / m^2)
         c.inside = VMASK(c.q <= half_r2 * squared) & VMASK(c.d > 0.0f) & VMASK(squared <= s->d_near * c.d);
         // expressed as a fragment of a disk: rho / 2 = q / d^2, depth = z_numerator / d
         vfloat inverse = RECIPROCAL(c.d);
@@ -78,7 +78,7 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
         c.q = c.q * c.d * inverse;
     }
 //@ footprint_conic
-    // q <= h (D^2 + bulge q); near 1 the rounding of the difference exceeds CONIC_SLACK
-    if (s->bulge > 0.0f) conic_h = (float)s->bulge * conic_h < 0.95f ? conic_h / (1.0f - (float)s->bulge * conic_h) : INFINITY;
+    // q <= h (D^2 + ellipsoid_term q); near 1 the rounding of the difference exceeds CONIC_SLACK
+    if (s->ellipsoid_term > 0.0f) conic_h = (float)s->ellipsoid_term * conic_h < 0.95f ? conic_h / (1.0f - (float)s->ellipsoid_term * conic_h) : INFINITY;
 //@ project
-    record.bulge = (wide)(2 * inverse_m2);
+    record.ellipsoid_term = (wide)(2 * inverse_m2);

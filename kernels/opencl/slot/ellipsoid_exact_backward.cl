@@ -1,28 +1,28 @@
-// Backward pass of exact 3D Gaussians. With `bulge` b and h = q / (D^2 + b q), D and q of the disk: the sums of blend_backward.cl
+// Backward pass of exact 3D Gaussians. With `ellipsoid_term` b and h = q / (D^2 + b q), D and q of the disk: the sums of blend_backward.cl
 // are the gradients with respect to n_u, n_v and D of h, which is the rho / 2 of the fragment.
 //@ geometry
     vfloat slant;           // h d: finite for the thinnest needles, whose h overflows
 //@ geometry_make
     g.slant = c.q * g.inverse_d;
 //@ sums
-    vfloat bulge;
+    vfloat ellipsoid_term;
 //@ fragment_backward
-    sums->bulge = FMA(VSELECT((vfloat)0.0f, grad_log, g->on_plane), VSELECT((vfloat)0.0f, g->half_rho * g->half_rho, g->on_plane), sums->bulge);
+    sums->ellipsoid_term = FMA(VSELECT((vfloat)0.0f, grad_log, g->on_plane), VSELECT((vfloat)0.0f, g->half_rho * g->half_rho, g->on_plane), sums->ellipsoid_term);
 //@ record_gradients
-    STORE_SUM(bulge, sums->bulge);
+    STORE_SUM(ellipsoid_term, sums->ellipsoid_term);
 //@ footprint_add_depth
     {
         // grad_d: gradient with respect to d = D (1 + t); grad_q: twice that with respect to q (1 + t); with t = b q / D^2 = b h / (1 - b h)
         vint ahead = VMASK(g->inverse_d > 0.0f);
         vfloat inverse_d = VSELECT((vfloat)0.0f, g->inverse_d, ahead), hd = VSELECT((vfloat)0.0f, g->slant, ahead);
-        vfloat bh = s->bulge * inverse_d * hd, rest = max(1.0f - bh, (vfloat)1e-6f), t = bh / rest;
-        vfloat grad_both = 2.0f * FMA(grad_q, t, grad_d * s->bulge * inverse_d / rest);
+        vfloat bh = s->ellipsoid_term * inverse_d * hd, rest = max(1.0f - bh, (vfloat)1e-6f), t = bh / rest;
+        vfloat grad_both = 2.0f * FMA(grad_q, t, grad_d * s->ellipsoid_term * inverse_d / rest);
         *grad_nu = FMA(grad_both, g->nu, *grad_nu);
         *grad_nv = FMA(grad_both, g->nv, *grad_nv);
-        sums->bulge = FMA(hd, FMA(0.5f * hd, grad_q, grad_d), sums->bulge);
+        sums->ellipsoid_term = FMA(hd, FMA(0.5f * hd, grad_q, grad_d), sums->ellipsoid_term);
         grad_d = FMA(-t, FMA(hd, grad_q, grad_d), grad_d);
     }
-//@ ellipsoid_set_up
+//@ ellipsoid_projection
     const real lengths[3] = {su, sv, sw};
     if (THICK_HERE) {
         real3_ plane;
@@ -44,7 +44,7 @@
         e1[i0] = along; e1[i1] = -back * k1; e1[i2] = -back * k2;
         e2[i0] = 0; e2[i1] = k2; e2[i2] = -k1;
         real inverse_m = min_length / m, grad_e1 = -dot3(p, grad_a) * inverse_m, grad_e2 = -dot3(p, grad_b) * inverse_m;
-        real grad_m2 = -4 * total.bulge * inverse_m * inverse_m;      // the bulge is 2 / m^2
+        real grad_m2 = -4 * total.ellipsoid_term * inverse_m * inverse_m;      // the ellipsoid_term is 2 / m^2
         real3_ grad_axes[3];
         for (int k = 0; k < 3; k++) {
             real grad_y = (grad_e1 * e1[k] + grad_e2 * e2[k] + grad_m2 * (g[k] / m)) * inverse_m / lengths[k];  // by y_k, over lengths[k]

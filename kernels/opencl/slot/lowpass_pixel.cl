@@ -3,7 +3,7 @@
 // around the sample's ray with standard deviation s samples across and a share k of the depth along it; unbounded along the ray, it
 // would overlap an edge-on plane far beyond where the derivative at the centre is valid. With G the 3 x 2 derivative by (u, v),
 // at the centre, of the sample's position and of s / k times the logarithm of depth, its covariance in (u, v) is s^2 (G^T G)^-1.
-// The filtered splat is a 2D Gaussian in the same plane, so that only the setup has code for it. For parallel rays the last row
+// The filtered splat is a 2D Gaussian in the same plane, so that only the projection has code for it. For parallel rays the last row
 // of G is 0.
 //@ functions
 //@@ camera_derivative_functions

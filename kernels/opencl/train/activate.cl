@@ -12,14 +12,14 @@ kernel void activate(
     activated_opacities[i] = sigmoid(logits[i]);
 }
 
-// Index space: one work-item per splat and rendered coefficient of a channel. Reads: sh, of `stored_terms` coefficients. Writes: the first
-// `rendered_terms` of them, packed; at degree 0, if `as_rgb`, the RGB colours.
+// Index space: one work-item per splat and rendered coefficient of a channel. Reads: sh, of `stored_coefficients` coefficients. Writes: the first
+// `rendered_coefficients` of them, packed; at degree 0, if `as_rgb`, the RGB colours.
 kernel void activate_sh(
 //@@ arguments activate_sh
 ) {
     uint k = get_global_id(0);
-    if (k >= count * 3 * rendered_terms) return;
-    float value = sh[k / (3 * rendered_terms) * 3 * stored_terms + k % (3 * rendered_terms)];
+    if (k >= count * 3 * rendered_coefficients) return;
+    float value = sh[k / (3 * rendered_coefficients) * 3 * stored_coefficients + k % (3 * rendered_coefficients)];
     activated_sh[k] = as_rgb ? plain_color(value) : value;
 }
 

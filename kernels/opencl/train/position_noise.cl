@@ -1,5 +1,5 @@
 // Position noise of MCMC densification: random steps of means, with the covariance of the splat. Counter-based random numbers: Philox 4x32-10 of
-// the splat's index, the iteration and the purpose, keyed by the seed. NumPy reference: fidsplat/train/random_numbers.py.
+// the splat's index, the iteration and the random stream, keyed by the seed. NumPy reference: fidsplat/train/random_numbers.py.
 
 static inline uint4 philox(uint4 c, uint k0, uint k1) {
     for (int round = 0; round < 10; round++) {
@@ -17,7 +17,7 @@ kernel void add_position_noise(
 ) {
     size_t i = get_global_id(0);
     if (i >= count) return;
-    uint4 counter = {(uint)i, iteration, purpose, 0};
+    uint4 counter = {(uint)i, iteration, random_stream, 0};
     float4 u = (convert_float4(philox(counter, seed_low, seed_high)) + 0.5f) * 2.3283064e-10f;
     // clamped: log(1) is 0, and log(0) infinite
     float2 radius = sqrt(-2.0f * log(clamp(u.xy, 1.2e-10f, 0.99999994f))), angle = 6.2831853f * u.zw;

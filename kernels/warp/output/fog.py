@@ -36,7 +36,7 @@ def store(pixel: Any, at: int, samples: Any):
 
 @wp.func
 def background_share(grid: PixelGrid, samples: Any) -> float:
-    """Share of the background in a pixel, as the fog has the background colour."""
+    """SplatRange of the background in a pixel, as the fog has the background colour."""
     fogged = float(0.0)
     for k in range(grid.count):
         fogged += samples.fogged[sample_at(grid, k)]

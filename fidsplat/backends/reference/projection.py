@@ -15,7 +15,7 @@ from fidsplat.splats.cloud import SplatCloud, sh_basis
 from fidsplat.splats.rotations import quaternion_to_matrix
 
 
-class Setup:
+class ProjectedSplats:
     """Camera-space splats that are not culled; float64 arrays (n, ...) in depth order."""
 
     def __init__(self, cloud: SplatCloud, view: View, features: FeatureSet) -> None:
@@ -126,7 +126,7 @@ class Setup:
         """dense index of the group whose layer a splat is part of, -1 for none, or None without layers"""
         self.coplanar = groups[order] >= 0
 
-    def subset(self, mask: np.ndarray) -> Setup:
+    def subset(self, mask: np.ndarray) -> ProjectedSplats:
         """The splats of a mask (n,) bool, in the same order."""
         if mask.all():
             return self
@@ -164,9 +164,9 @@ _OF_SPLATS = (
         "coplanar",
     ),
 )
-"""arrays (n, ...) of a Setup"""
+"""arrays (n, ...) of a ProjectedSplats"""
 _OF_COORDINATES = ("forms", "anchors")
-"""arrays (3, n, ...) of a Setup"""
+"""arrays (3, n, ...) of a ProjectedSplats"""
 
 
 def _shapes(

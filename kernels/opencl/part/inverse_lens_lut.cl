@@ -1,12 +1,12 @@
-// Image bounds of a region of ray directions, for lenses. The lens's chart (two coordinates of a direction) is divided into a grid of
-// cells. For each cell `ray_map` stores the first and last column and row of the samples whose rays are inside; coarser grids, each of
+// Inverse lookup table of a lens: image bounds of a region of ray directions. Two coordinates of a direction, which each lens defines
+// (its file says which), are divided into a grid of cells. For each cell `inverse_lens_lut` stores the first and last column and row of the samples whose rays are inside; coarser grids, each of
 // half the resolution, follow. The bounds are valid for arbitrary rays.
 //@ camera
-// Bounds of the samples whose rays are in [x0, x1] x [y0, y1] of the chart; empty if there are none. numbers: low corner, cells per
+// Bounds of the samples whose rays are in [x0, x1] x [y0, y1] of the table; empty if there are none. numbers: low corner, cells per
 // unit along x and y, cells per side, first row of this image in the map.
-static inline Bounds mapped_bounds(global const real *numbers, global const short4 *map, real x0, real x1, real y0, real y1) {
+static inline Bounds lens_lut_bounds(global const real *numbers, global const short4 *map, real x0, real x1, real y0, real y1) {
     real cells = numbers[4];
-    // margin of 0.02 cells for the rounding of the chart
+    // margin of 0.02 cells for the rounding of the coordinates
     real from_x = (x0 - numbers[0]) * numbers[2] - REAL(0.02), to_x = (x1 - numbers[0]) * numbers[2] + REAL(0.02);
     real from_y = (y0 - numbers[1]) * numbers[3] - REAL(0.02), to_y = (y1 - numbers[1]) * numbers[3] + REAL(0.02);
     short4 box = (short4)(32767, -1, 32767, -1);

@@ -37,16 +37,16 @@ static inline real3_ rotate_to_world(global const View *view, real3_ v) {
 
 typedef struct {            // gradients with respect to the parameters of one splat
     float mean[3], quat[4], scale[2], opacity;
-    float color[3], basis[SH_TERMS];    // by coefficient k of the colour: basis[k] times `color`
+    float color[3], basis[SH_COEFFICIENTS];    // by coefficient k of the colour: basis[k] times `color`
     float screen;
     real grad_camera[10];     // contribution to the gradient of the pose, of fx, fy, cx and cy
 //@@ footprint_gradient
 } SplatGradient;
 
-// Gradients of splat i; zero if it is culled. terms: SH coefficients, `row` per splat.
+// Gradients of splat i; zero if it is culled. coefficients: of the spherical harmonics, `row` per splat and channel.
 static inline SplatGradient splat_gradient(
     uint i, global const View *view, global const float *means, global const float *quats, global const float *scales,
-    global const float *opacities, global const float *terms, uint row, global const Splat *splats, global const uint *keys,
+    global const float *opacities, global const float *coefficients, uint row, global const Splat *splats, global const uint *keys,
     global const uint2 *windows, uint big_capacity, global const Bounds *big_bounds, int width, int height,
     global const uint *gradient_offsets, global const float *record_gradients
 //@@ footprint_parameters
@@ -72,8 +72,8 @@ static inline SplatGradient splat_gradient(
     real pz = p.z, su = fmax(scales[2 * i], MIN_SCALE), sv = fmax(scales[2 * i + 1], MIN_SCALE);
     real3_ a = scaled(su, unit_a), b = scaled(sv, unit_b);
     real offset = dot3(cross3(unit_a, unit_b), p);
-//@@ footprint_set_up
-//@@ ellipsoid_set_up
+//@@ footprint_projection
+//@@ ellipsoid_projection
 
     // the forms, as in project.cl and the camera's file
     real x_offset = view->center_x - (splats[i].ax + REAL(0.5)), y_offset = view->center_y - (splats[i].ay + REAL(0.5));
@@ -83,7 +83,7 @@ static inline SplatGradient splat_gradient(
     real steepest = fmax(fmax(fabs(kx.x), fabs(ky.x)), fmax(fabs(kx.y), fabs(ky.y)));
 //@@ camera_steepest
     real scale = (offset < 0 ? -1 : 1) / steepest, n_scale = scale * REAL(0.70710678118654752440);
-    real facing = fabs(offset) > (SETUP_FP64 ? REAL(1e-13) : REAL(1e-6)) * sqrt(dot3(p, p)) ? scale : 0;
+    real facing = fabs(offset) > (PROJECTION_FP64 ? REAL(1e-13) : REAL(1e-6)) * sqrt(dot3(p, p)) ? scale : 0;
 
     real3_ grad_k0 = {n_scale * total.nu0, n_scale * total.nv0, facing * total.d0};
     real3_ grad_kx = {n_scale * total.nux, n_scale * total.nvx, facing * total.dx};
