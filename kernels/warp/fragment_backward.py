@@ -139,9 +139,9 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         low_pass: float,
     ):
         """Depth of a fragment, and its derivatives with respect to z_numerator; z_center; D at constant
-        z_numerator - z_center D; q; `low_pass`, rho / 2 of the low-pass disc; and
-        the ellipsoid_term of a 3D Gaussian. Beyond a circle, which may be the disc's, depth is z_center + circle (z_numerator - z_center D) D / q.
-        A depth that rounding moves out of the splat's range has the derivatives of the centre's depth. For a
+        z_numerator - z_center D; q; `low_pass`, rho / 2 of the low-pass disc; and the
+        ellipsoid_term of a 3D Gaussian. Beyond a circle, which may be the disc's, depth is
+        z_center + circle (z_numerator - z_center D) D / q. A depth that rounding moves out of the splat's range has the derivatives of the centre's depth. For a
         3D Gaussian, D and q in `c` are D and q of its disk times 1 + t, t = ellipsoid_term q / D^2."""
         place = index * each
         center = line_of(lines, place + zc_line)[zc_lane]

@@ -47,8 +47,8 @@ def make_optics(camera: str, real) -> SimpleNamespace:
     """Make functions of a lens.
 
     image(p, view, lens): image coordinates of a point, and whether it is in the field of view. anchor(x, y,
-    imaged, p, view, lens): the ray to which a splat's forms are relative. Bounds in samples: lut_bounds(x0, x1,
-    y0, y1, lens) of a box of the lookup table, enclose(a, b, p, radius, view, lens) of a disk.
+    imaged, p, view, lens): the ray to which a splat's forms are relative. Bounds in samples: lut_bounds(x0,
+    x1, y0, y1, lens) of a box of the lookup table, enclose(a, b, p, radius, view, lens) of a disk.
     """
     Lens = make_lens(camera)
     vec2, vec3 = wp.types.vector(2, real), wp.types.vector(3, real)

@@ -43,8 +43,8 @@ def make_project(
     """Make the projection kernel for the effects and outputs that affect the records of projected splats.
 
     Args:
-        sh_coefficients: SH coefficients per colour channel, 0 for plain colours. every_bounds: write the bounds of
-        all visible splats; otherwise only of splats whose tiles exceed the bit mask `windows`.
+        sh_coefficients: SH coefficients per colour channel, 0 for plain colours. every_bounds: write the
+        bounds of all visible splats; otherwise only of splats whose tiles exceed the bit mask `windows`.
     """
     layout = Layout(effects, outputs)
     lines_each = layout.lines

@@ -235,7 +235,8 @@ def make_project_backward(
             if thickness[i] > 0.0:
                 grad_axes, grad_sizes, grad_p, grad_camera = solid_backward(
                     wp.matrix_from_rows(unit_a, unit_b, unit_normal), sizes, p, grad_a, grad_b, grad_p,
-                    wp.vec4d(grad_fx, grad_fy, grad_cx, grad_cy), grad_log, total[ellipsoid_term], grad_facet, view,
+                    wp.vec4d(grad_fx, grad_fy, grad_cx, grad_cy), grad_log, total[ellipsoid_term], grad_facet,
+                    view,
                 )  # fmt: skip
                 grad_fx, grad_fy, grad_cx, grad_cy = (
                     grad_camera[0],

@@ -140,8 +140,7 @@ def test_what_makes_no_lens(make, words):
 
 @pytest.mark.parametrize("lens", [BrownConrady(-0.3, 0.1, p1=0.01), Fisheye(0.1)], ids=lambda lens: lens.kind)
 def test_the_map_knows_every_sample(lens):
-    """any rectangle of the lookup table: the boxes of the cells that it meets hold all samples whose rays lie in
-    it."""
+    """In any rectangle of the lookup table, the cells' boxes hold all samples whose rays are in it."""
     raster = RayRaster(lens, 90, 70, 60.0, 60.0, 45.0, 35.0)
     boxes, (low_x, low_y, scale_x, scale_y, cells) = raster.bounds_pyramid
     x, y = raster.lut_coordinates(raster.rays)

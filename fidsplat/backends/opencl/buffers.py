@@ -184,8 +184,8 @@ class BufferPool:
 
 
 class RayBuffers:
-    """Buffers of the lenses in use: rays of the samples, and the inverse lookup table (LUT) from ray directions
-    to samples (part/inverse_lens_lut.cl)."""
+    """Buffers of the lenses in use: rays of the samples, and the inverse lookup table (LUT) from ray
+    directions to samples (part/inverse_lens_lut.cl)."""
 
     def __init__(self, pool: BufferPool, queue: cl.CommandQueue) -> None:
         self._pool, self._queue = pool, queue

@@ -175,7 +175,7 @@ LAYOUTS: dict[str, Layout] = {
         view=(
             member(
                 "real lens_lut[6]",
-                "grid of `inverse_lens_lut`: lowest corner x, y, cells per unit of x, y, cells per side, first row",
+                "grid of `inverse_lens_lut`: low corner x, y, cells per unit of x, y, cells per side, first row",
             ),
         ),
         project=args("in short4 inverse_lens_lut  // columns and rows of the samples in a cell of rays"),
