@@ -16,10 +16,10 @@ class Source(SceneInput):
     """Print the OpenCL program of a scene, assembled from the files of kernels/opencl.
 
     The program contains only the features that the scene requests: compare two scenes, or two sets of
-    outputs, with diff. #line directives name the file and line of each section; "layout.py: NAME" is a
-    declaration of fidsplat/backends/opencl/layout.py (structs and kernel arguments) with the additions of
-    effects. The compiler receives this text without comments but with the same lines, so its messages name
-    these lines.
+    outputs, with diff. #line directives name the file and line of each section; "kernel_interface.py: NAME"
+    is a declaration of fidsplat/backends/opencl/kernel_interface.py (structs and kernel arguments) with the
+    additions of effects. The compiler receives this text without comments but with the same lines, so its
+    messages name these lines.
 
     No device is opened and no OpenCL is needed, unless --device selects a device, whose vector width and tile
     size are then used.

@@ -15,7 +15,7 @@ from .common import STRICT, View, first_sample, locate_tile, reread, store_line
 from .intersection import make_intersection
 from .pixel import make_pixel
 from .rays import SLOPES
-from .records import Layout
+from .records import RecordLayout
 from .splat import make_splat
 from .staging import STAGED, alone, make_staging
 
@@ -41,7 +41,7 @@ def make_blend(
     splats, intersection = make_splat(effects, outputs), make_intersection(effects, outputs)
     each = samples_each(effects)
     threads, items, pair = area // each, _CELL // each, each == 2
-    staging = make_staging(Layout(effects, outputs), area // _CELL, items)
+    staging = make_staging(RecordLayout(effects, outputs), area // _CELL, items)
     touched = make_cells(effects, outputs)
     pool, stage, mark, listed, place_in = (
         *(staging.pool, staging.stage, staging.mark),

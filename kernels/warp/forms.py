@@ -16,13 +16,13 @@ from .boxes import make_boxes
 from .common import View
 from .ellipsoids import EWA, EXACT
 from .lens import LENSES, make_lens, make_optics
-from .records import BOXES, Layout
+from .records import BOXES, RecordLayout
 
 
 @cache
 def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
     """Make the function that fills a record for these effects and outputs."""
-    layout = Layout(effects, outputs)
+    layout = RecordLayout(effects, outputs)
     vec3 = wp.types.vector(3, real)
     words = wp.types.vector(4 * layout.lines, wp.float32)
     sqrt_half, edge_on = real(math.sqrt(0.5)), real(1e-13 if real is wp.float64 else 1e-6)

@@ -17,7 +17,7 @@ from .common import View, fma, line_of, of_bits, struct_of
 from .ellipsoids import EXACT
 from .intersection import HALF_RHO_OF_RANGE, make_intersection
 from .output.distortion import INVERSE_DEPTH, SPREAD_NEAR
-from .records import Layout
+from .records import RecordLayout
 from .splat import make_splat
 
 _FORMS = ("nu0", "nux", "nuy", "nv0", "nvx", "nvy", "d0", "dx", "dy", "log_opacity", "r", "g", "b")
@@ -52,7 +52,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
     names = moments_of(effects, outputs)
     at = {name: place for place, name in enumerate(names)}
     Moments = wp.types.vector(len(names), wp.float32)
-    layout = Layout(effects, outputs)
+    layout = RecordLayout(effects, outputs)
     each = layout.lines
     z_line, z_lane = layout.place("z_numerator")
     zc_line, zc_lane = layout.place("z_center")
@@ -141,8 +141,9 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         """Depth of a fragment, and its derivatives with respect to z_numerator; z_center; D at constant
         z_numerator - z_center D; q; `low_pass`, rho / 2 of the low-pass disc; and the
         ellipsoid_term of a 3D Gaussian. Beyond a circle, which may be the disc's, depth is
-        z_center + circle (z_numerator - z_center D) D / q. A depth that rounding moves out of the splat's range has the derivatives of the centre's depth. For a
-        3D Gaussian, D and q in `c` are D and q of its disk times 1 + t, t = ellipsoid_term q / D^2."""
+        z_center + circle (z_numerator - z_center D) D / q. A depth that rounding moves out of the splat's
+        range has the derivatives of the centre's depth. For a 3D Gaussian, D and q in `c` are D and q of its
+        disk times 1 + t, t = ellipsoid_term q / D^2."""
         place = index * each
         center = line_of(lines, place + zc_line)[zc_lane]
         reach = line_of(lines, place + zr_line)[zr_lane]

@@ -11,7 +11,7 @@ from .common import View, fma, line_of, struct_of
 from .ellipsoids import EXACT, FACING
 from .fast import fast_exp
 from .rays import SLOPES
-from .records import BOXES, Layout
+from .records import BOXES, RecordLayout
 from .splat import make_splat
 
 HALF_RHO_OF_RANGE = wp.constant(wp.float32(math.log(255.0)))
@@ -24,7 +24,7 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
     without boxes behind a lens), is_box, opacity_of and depth_of.
     """
     Splat = make_splat(effects, outputs).Splat
-    layout = Layout(effects, outputs)
+    layout = RecordLayout(effects, outputs)
     each = layout.lines
     screen, bent, parallel, all_boxes = (
         name in effects for name in ("lowpass_screen", "rays", "camera_orthographic", "footprint_box")

@@ -17,7 +17,7 @@ from .coplanar import make_layer
 from .intersection import make_intersection
 from .k_buffer import make_k_buffer, make_k_buffer_struct
 from .rays import make_rays
-from .records import BOXES, Layout
+from .records import BOXES, RecordLayout
 from .splat import make_splat
 
 
@@ -29,7 +29,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
     Splat, intersection = make_splat(effects, outputs).Splat, make_intersection(effects, outputs)
     Intersection, is_box = intersection.Intersection, intersection.is_box
     opacity_of, depth_of = intersection.opacity_of, intersection.depth_of
-    layout = Layout(effects, outputs)
+    layout = RecordLayout(effects, outputs)
     each = layout.lines
     exclusive, has_depth, k_buffered, layered, bent = (
         name in effects
@@ -273,7 +273,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
     )
 
 
-def make_reader(layout: Layout, names: tuple[str, ...]):
+def make_reader(layout: RecordLayout, names: tuple[str, ...]):
     """Make the function (lines, at) that reads these numbers of the record at line `at` as a vector."""
     places = [layout.place(name) for name in names]
     vector = wp.types.vector(max(len(names), 1), wp.float32)

@@ -16,7 +16,7 @@ from .fast import make_log
 from .forms import make_forms
 from .lens import LENSES, make_lens, make_optics
 from .lowpass import make_filter
-from .records import Layout
+from .records import RecordLayout
 from .slopes import make_slopes
 from .splat_pose import make_splat_pose
 from .tile_lists import count_tiles
@@ -46,7 +46,7 @@ def make_project(
         sh_coefficients: SH coefficients per colour channel, 0 for plain colours. every_bounds: write the
         bounds of all visible splats; otherwise only of splats whose tiles exceed the bit mask `windows`.
     """
-    layout = Layout(effects, outputs)
+    layout = RecordLayout(effects, outputs)
     lines_each = layout.lines
     has_depth, screen, filtered, k_buffered, layers = (
         name in effects

@@ -17,7 +17,7 @@ from .common import CULLED, STRICT, View, line_of
 from .ellipsoids import EWA, EXACT, make_ellipsoids
 from .ellipsoids_backward import make_ellipsoids_backward
 from .project import SMALLEST_SCALE
-from .records import Layout
+from .records import RecordLayout
 
 TEN = wp.types.vector(10, wp.float64)
 """gradient with respect to a motion after world_to_camera: rotation vector [1 / rad], translation [1 / m];
@@ -72,7 +72,7 @@ def make_project_backward(
 ):
     """Make the kernel of the backward pass of the projection. effects, outputs: of the record. names: names
     of the moments. sh_coefficients: SH coefficients per colour, 0 for plain colours."""
-    layout = Layout(effects, outputs)
+    layout = RecordLayout(effects, outputs)
     each, fields = layout.lines, len(names)
     at = {name: place for place, name in enumerate(names)}
     Moments, Totals = (wp.types.vector(fields, real) for real in (wp.float32, wp.float64))

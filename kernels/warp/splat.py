@@ -7,7 +7,7 @@ import warp as wp
 
 from .common import View, line_of, of_bits, struct_of
 from .ellipsoids import EXACT
-from .records import BOXES, Layout
+from .records import BOXES, RecordLayout
 
 
 @cache
@@ -15,7 +15,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     """Make Splat; reading(line), which makes readers from a function that loads lines of records; and read,
     for the splat lists[k] in global memory.
     """
-    layout = Layout(effects, outputs)
+    layout = RecordLayout(effects, outputs)
     each = layout.lines
     screen, bent, parallel = (name in effects for name in ("lowpass_screen", "rays", "camera_orthographic"))
     edged = not bent and any(name in effects for name in BOXES)

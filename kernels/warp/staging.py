@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .common import with_numbers
-from .records import Layout
+from .records import RecordLayout
 
 STAGED = 128
 """splats of a batch"""
@@ -120,7 +120,7 @@ def alone() -> bool:
     ...
 
 
-def make_staging(layout: Layout, cells: int, items: int) -> SimpleNamespace:
+def make_staging(layout: RecordLayout, cells: int, items: int) -> SimpleNamespace:
     """Make functions that stage batches of records in shared memory: pool; stage, mark and listed, called for
     each batch; place and line.
 

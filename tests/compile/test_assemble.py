@@ -12,7 +12,7 @@ from traits import Traits
 import fidsplat as fs
 from fidsplat.backends.opencl import assemble as assembly
 from fidsplat.backends.opencl.assemble import assemble
-from fidsplat.backends.opencl.effect_layouts import LAYOUTS
+from fidsplat.backends.opencl.effect_code import EFFECT_CODE
 from fidsplat.backends.opencl.kernel_config import cpu_config, gpu_config
 from fidsplat.capture.quality import ELLIPSOID
 from fidsplat.effects import OUTPUTS, select
@@ -60,7 +60,7 @@ def test_an_output_adds_its_own_text_only(output):
     remaining = iter(output_lines)
     for line in base_lines:
         assert line in remaining, f"{output} removed or moved: {line}"
-    needed = {output, *LAYOUTS[output].parts}
+    needed = {output, *EFFECT_CODE[output].parts}
     others = [
         other
         for other in FURTHER

@@ -9,7 +9,7 @@ from traits import Traits
 
 import fidsplat as fs
 from fidsplat.backends.opencl.assemble import assemble
-from fidsplat.backends.opencl.effect_layouts import LAYOUTS
+from fidsplat.backends.opencl.effect_code import EFFECT_CODE
 from fidsplat.effects import select
 
 BACKEND = "opencl"
@@ -83,7 +83,8 @@ def test_record_sizes_of_lenses():
         "orthographic": 96,
     }
     assert not any(
-        LAYOUTS[name].splat for name in ("shutter_exposure", "motion_groups", "inverse_lens_lut", "polygon")
+        EFFECT_CODE[name].splat
+        for name in ("shutter_exposure", "motion_groups", "inverse_lens_lut", "polygon")
     )
 
 

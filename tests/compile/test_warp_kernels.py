@@ -184,7 +184,7 @@ def test_derivatives_read_records_where_they_lie(tmp_path):
 
 
 def test_a_record_grows_by_the_requested_fields():
-    layout = runtime.kernels("records").Layout
+    layout = runtime.kernels("records").RecordLayout
     assert layout(()).lines == 5
     assert layout(("lowpass_screen",)).names[-2:] == ["lowpass_x", "lowpass_y"]
     assert layout(RECORD, NORMAL).lines == 7

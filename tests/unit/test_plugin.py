@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.opencl.effect_layouts import LAYOUTS
+from fidsplat.backends.opencl.effect_code import EFFECT_CODE
 from fidsplat.cli import main
 from fidsplat.effects import CATALOGUE, IMAGES, OUTPUTS, extensions, select
 from fidsplat.markers import Kind, kinds, marker
@@ -48,7 +48,7 @@ def installed(tmp_path_factory):
 @pytest.fixture
 def plugin(installed, monkeypatch):
     """The package is importable; its registrations are removed afterwards."""
-    registries = (kinds._kinds, CATALOGUE, IMAGES, OUTPUTS, LAYOUTS, extensions.EXTENSIONS)
+    registries = (kinds._kinds, CATALOGUE, IMAGES, OUTPUTS, EFFECT_CODE, extensions.EXTENSIONS)
     before = [dict(registry) for registry in registries]
     monkeypatch.syspath_prepend(str(installed))
     load_plugins.cache_clear()

@@ -7,7 +7,7 @@ step, for example.
 
 A line `//@@ name` in a stage's file is a hook: it is replaced by the sections `//@ name` of the chosen
 effects' files, or by an empty line. `//@@ struct NAME` and `//@@ arguments KERNEL` are replaced by
-declarations of layout.py. `#line` directives give the file and line of each line.
+declarations of kernel_interface.py. `#line` directives give the file and line of each line.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ import numpy as np
 from fidsplat.backends import alignment
 from fidsplat.backends.opencl.declare import (
     Argument,
-    Layout,
+    EffectCode,
     Member,
     Record,
     SampleBuffer,
     Scalars,
     output_argument,
 )
-from fidsplat.backends.opencl.effect_layouts import LAYOUTS, extension_layout
+from fidsplat.backends.opencl.effect_code import EFFECT_CODE, extension_code
 from fidsplat.backends.opencl.kernel_config import KernelConfig
-from fidsplat.backends.opencl.layout import (
+from fidsplat.backends.opencl.kernel_interface import (
     BOUNDS,
     GROUP_KERNELS,
     KERNELS,
@@ -100,7 +100,7 @@ _EFFECT_ARGUMENTS = {
     },
     **{"blend_checkpoints": "blend_backward", "blend_backward": "blend_backward"},
 }
-"""fields of `Layout` with the arguments that effects add to these kernels"""
+"""fields of `EffectCode` with the arguments that effects add to these kernels"""
 
 
 @dataclass(frozen=True)
@@ -162,36 +162,36 @@ class KernelSource:
         return any(declared.name == argument for declared in self.arguments.get(kernel, ()))
 
 
-def layouts_of(features: FeatureSet) -> dict[str, Layout]:
-    """Layouts of all effects and of the parts that they require, in the order of their text."""
+def effect_code_of(features: FeatureSet) -> dict[str, EffectCode]:
+    """Code of all effects and of the parts that they require, by name, in the order of their text."""
     chosen = [*features.effects, *features.outputs, *features.post_steps]
-    for name in EXTENSIONS.keys() & {*chosen} - LAYOUTS.keys():
-        LAYOUTS[name] = extension_layout(EXTENSIONS[name])
+    for name in EXTENSIONS.keys() & {*chosen} - EFFECT_CODE.keys():
+        EFFECT_CODE[name] = extension_code(EXTENSIONS[name])
     parts: set[str] = set()
     pending = chosen.copy()
     while pending:
-        needed = list(LAYOUTS[pending.pop()].parts)
+        needed = list(EFFECT_CODE[pending.pop()].parts)
         for effect in chosen:
             for k, part in enumerate(needed):
-                needed[k] = dict(LAYOUTS[part].replaced_by).get(effect, part)
+                needed[k] = dict(EFFECT_CODE[part].replaced_by).get(effect, part)
         pending += set(needed) - parts
         parts.update(needed)
     names = (*features.effects, *sorted(parts), *features.outputs, *features.post_steps)
-    return {name: LAYOUTS[name] for name in names}
+    return {name: EFFECT_CODE[name] for name in names}
 
 
 def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
     """Assemble the source of a feature set. Raises DeviceError if a file fills an unknown hook."""
-    layouts = layouts_of(features)
+    effects = effect_code_of(features)
     # blend and resolve are fused if a pixel has one sample and one pose, and no other kernel adds to it
     separate = {"rays", "shutter_exposure", "shutter_rows"}
-    fused = features.samples == 1 and "background_constant" in layouts and separate.isdisjoint(layouts)
-    files = [layout.file for layout in layouts.values() if layout.file]
+    fused = features.samples == 1 and "background_constant" in effects and separate.isdisjoint(effects)
+    files = [effect.file for effect in effects.values() if effect.file]
     files += [*_dialect(config, _scalars(features), features.effects), "part/resolve_pixel.cl"]
-    if "blend_half" not in layouts:
+    if "blend_half" not in effects:
         files.append("part/blend_float.cl")
     if config.splats_per_item > 1 or config.culls_first:
-        files += _frustum_parts(layouts)
+        files += _frustum_parts(effects)
     if config.culls_first:
         files.append("part/unculled_splats.cl")
     if fused:
@@ -199,23 +199,23 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
     if config.binning == "bin_first":
         files.append("list/tiled.cl")
     # depth keys per tile need bounds of a splat's depth in a tile, which only the pinhole has
-    keys_by_tile = {"compose_pixel", "camera_pinhole"} <= layouts.keys() and config.binning != "sort_first"
+    keys_by_tile = {"compose_pixel", "camera_pinhole"} <= effects.keys() and config.binning != "sort_first"
     if keys_by_tile:
-        layouts["tile_keys"] = LAYOUTS["tile_keys"]
+        effects["tile_keys"] = EFFECT_CODE["tile_keys"]
         files.append("part/tile_keys.cl")
-    if "compose_pixel" in layouts:
+    if "compose_pixel" in effects:
         files.append(f"part/k_buffer_{config.schedule}.cl")
     elif config.schedule == "lanes":
         files.append("part/tile_loop_lanes.cl")
-    if not layouts.keys().isdisjoint({"compose_pixel", "coplanar_layers"}):
+    if not effects.keys().isdisjoint({"compose_pixel", "coplanar_layers"}):
         # several k-buffer passes over a tile's list; each needs a splat's minimum depth in the block or tile
         files += ["part/passes.cl", f"part/passes_{config.schedule}.cl"]
         files.append("part/blocks_nearest.cl" if config.schedule == "lanes" else "part/tile_nearest.cl")
-    if "termination_depths" in layouts:  # after all passes through a list
-        order = "_pixel" if "compose_pixel" in layouts else ""
+    if "termination_depths" in effects:  # after all passes through a list
+        order = "_pixel" if "compose_pixel" in effects else ""
         files += ["part/termination_depth_pixel.cl"] if order else []
         files.append(f"part/termination_depth{order}_{config.schedule}.cl")
-    if "external_depth" in layouts:  # after all passes
+    if "external_depth" in effects:  # after all passes
         files.append("part/external_depth_end.cl")
     stages = {
         "lists": (
@@ -232,28 +232,28 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
         ],
     }
     _refuse_unknown_hooks(files)
-    declared = Declarations(_scalars(features), layouts, features.images, fused, kernels_of(config))
+    declared = Declarations(_scalars(features), effects, features.images, fused, kernels_of(config))
     return Assembler(files, declared, build_constants(features, config)).source(stages)
 
 
-def _frustum_parts(layouts: Collection[str]) -> list[str]:
+def _frustum_parts(effects: Collection[str]) -> list[str]:
     """The file with the test of bounding spheres; none for lenses, and for mixtures of disks and 3D
     Gaussians, whose bounds are computed in another way."""
-    if "camera_pinhole" not in layouts:
+    if "camera_pinhole" not in effects:
         return []
-    if "ellipsoids_only" in layouts:
+    if "ellipsoids_only" in effects:
         return ["part/cull_frustum_ewa.cl"]
     filters = {"lowpass_screen": "", "lowpass_pixel": "_pixel"}
-    thin = "thickness" not in layouts
-    return [f"part/cull_frustum{suffix}.cl" for name, suffix in filters.items() if thin and name in layouts]
+    thin = "thickness" not in effects
+    return [f"part/cull_frustum{suffix}.cl" for name, suffix in filters.items() if thin and name in effects]
 
 
 def culls_before_projection(features: FeatureSet) -> bool:
     """Whether groups of splats in Morton order can be culled by bounding spheres. Not with the k-buffer,
     which breaks ties by cloud order, nor with motion, where splats of a group may have different poses."""
-    layouts = layouts_of(features)
+    effects = effect_code_of(features)
     excluded = {"compose_pixel", "motion_groups", "shutter_rows"}
-    return excluded.isdisjoint(layouts) and bool(_frustum_parts(layouts))
+    return excluded.isdisjoint(effects) and bool(_frustum_parts(effects))
 
 
 def assemble_gradients(features: FeatureSet, config: KernelConfig) -> KernelSource:
@@ -269,17 +269,17 @@ def assemble_step(features: FeatureSet, config: KernelConfig, camera: bool = Fal
 def _assemble_backward(
     name: str, stages: Sequence[str], features: FeatureSet, config: KernelConfig, parts: Sequence[str] = ()
 ) -> KernelSource:
-    layouts = layouts_of(features) | {part: LAYOUTS[part] for part in parts}
+    effects = effect_code_of(features) | {part: EFFECT_CODE[part] for part in parts}
     # the backward pass needs the forward text of effects, but only the derivatives of outputs
-    files = [layout.file for layout in layouts_of(replace(features, outputs=(), post_steps=())).values()]
+    files = [effect.file for effect in effect_code_of(replace(features, outputs=(), post_steps=())).values()]
     files += _dialect(config, _scalars(features), features.effects)
-    files += [layout.backward_file for layout in layouts.values()]
-    files += [LAYOUTS[part].file for part in parts]
+    files += [effect.backward_file for effect in effects.values()]
+    files += [EFFECT_CODE[part].file for part in parts]
     kernels = kernels_of(config)
-    declared = Declarations(_scalars(features), layouts, kernels=kernels)
+    declared = Declarations(_scalars(features), effects, kernels=kernels)
     backward = {"BACK_ITEMS": backward_items(features, config), "CHUNK": backward_chunk(features, config)}
     if stages is _STEP:
-        backward["AXES"] = 3 if "thickness" in layouts else 2
+        backward["AXES"] = 3 if "thickness" in effects else 2
     assembler = Assembler(files, declared, build_constants(features, config) | backward)
     return assembler.source({name: [stage.format(config.schedule) for stage in stages]})
 
@@ -419,7 +419,7 @@ class Assembler:
     def _fill(self, hook: str, subject: str) -> Iterator[str]:
         if hook in self._used:
             self._used[hook].append(subject)
-            yield f'#line 1 "layout.py: {subject}"\n{self._declared.text(hook, subject)}'
+            yield f'#line 1 "kernel_interface.py: {subject}"\n{self._declared.text(hook, subject)}'
         for file, by_hook in self._sections.items():
             for first, lines in by_hook.get(hook, ()):
                 yield f"#line {first} {_line_file(file)}\n{self._expand(file, first, lines)}"
@@ -437,12 +437,12 @@ class Assembler:
 
 
 class Declarations:
-    """The declarations of layout.py merged with those of the chosen effects."""
+    """The declarations of kernel_interface.py merged with those of the chosen effects."""
 
     def __init__(
         self,
         scalars: Scalars,
-        layouts: Mapping[str, Layout] | None = None,
+        effects: Mapping[str, EffectCode] | None = None,
         outputs: Sequence[Output] = (),
         fused: bool = False,
         kernels: Mapping[str, tuple[Argument, ...]] = KERNELS,
@@ -454,16 +454,16 @@ class Declarations:
         """fields of `Splat` that all splats share, and their values"""
         self.packed: dict[str, str] = {}
         """packed fields of `Splat`, with the expressions that read them"""
-        self._layouts = list((layouts or {}).values())
+        self._effects = list((effects or {}).values())
         self._outputs, self._fused, self._kernels = outputs, fused, kernels
         view, splat, bounds, record_gradient = VIEW, SPLAT, BOUNDS, RECORD_GRADIENT
-        for layout in self._layouts:
-            self.sample_buffers += layout.sample_buffers
-            self.constants |= dict(layout.constant)
-            self.packed |= dict(layout.packed)
-            view, splat = view.with_members(layout.view), splat.with_members(layout.splat)
-            bounds = bounds.with_members(layout.bounds)
-            record_gradient = record_gradient.with_members(layout.record_gradient)
+        for effect in self._effects:
+            self.sample_buffers += effect.sample_buffers
+            self.constants |= dict(effect.constant)
+            self.packed |= dict(effect.packed)
+            view, splat = view.with_members(effect.view), splat.with_members(effect.splat)
+            bounds = bounds.with_members(effect.bounds)
+            record_gradient = record_gradient.with_members(effect.record_gradient)
         # as many padding fields as in `RecordGradient`
         alignment = record_gradient.alignment // 4 * scalars.dtype("real").itemsize
         fields = tuple(chain.from_iterable(member.names for member in record_gradient.members))
@@ -475,8 +475,8 @@ class Declarations:
         """A kernel's own arguments, then the arguments of effects in effect order, each name once."""
         merged = {argument.name: argument for argument in self._kernels[kernel]}
         if field := _EFFECT_ARGUMENTS.get(kernel):
-            for layout in self._layouts:
-                for argument in getattr(layout, field):
+            for effect in self._effects:
+                for argument in getattr(effect, field):
                     merged[argument.name] = argument
         if kernel in ("blend", "resolve"):
             access = "out" if kernel == "blend" else "in"
@@ -540,7 +540,7 @@ def _refuse_unknown_hooks(files: list[str]) -> None:
     """Raise DeviceError if a file fills a hook that neither a stage nor an effect has."""
     stages = [stage.format(schedule) for stage in _FRAME for schedule in ("lanes", "group")]
     hook_files = {f"{stage}.cl" for stage in chain(stages, *_LISTS.values())}
-    hook_files |= {layout.file for layout in LAYOUTS.values() if layout.file}
+    hook_files |= {effect.file for effect in EFFECT_CODE.values() if effect.file}
     hook_files |= {f"part/{path.name}" for path in (kernels_folder() / "opencl/part").glob("*.cl")}
     known = set(chain.from_iterable(map(_hooks, hook_files)))
     for file in files:

@@ -170,14 +170,14 @@ class SampleBuffer:
 
 
 @dataclass(frozen=True)
-class Layout:
-    """Declaration of an effect (feature option), output or shared part: its kernel file, and its additions to
+class EffectCode:
+    """Kernel code of an effect, of an output, or of a part that several share: its file, and its additions to
     records and kernel arguments."""
 
     file: str = ""
     """file below kernels/opencl/; empty: none"""
     parts: tuple[str, ...] = ()
-    """names of other required layouts: parts, or outputs whose samples it reads"""
+    """names of other code that it requires: parts, or outputs whose samples it reads"""
     splat: tuple[Member, ...] = ()
     constant: tuple[tuple[str, str], ...] = ()
     """(field of `Splat`, value): fields that are equal for all splats and become constants in the kernels"""
@@ -194,12 +194,12 @@ class Layout:
     backward_file: str = ""
     """file of its derivatives below kernels/opencl/; empty: none"""
     record_gradient: tuple[Member, ...] = ()
-    """fields of `RecordGradient` (layout.py)"""
+    """fields of `RecordGradient` (kernel_interface.py)"""
     blend_backward: tuple[Argument, ...] = ()
     project_backward: tuple[Argument, ...] = ()
     project_step: tuple[Argument, ...] = ()
     replaced_by: tuple[tuple[str, str], ...] = ()
-    """(effect, part): with that effect, the part replaces this layout"""
+    """(effect, part): with that effect, the part replaces this one"""
 
 
 def output_argument(output: Output) -> Argument:

@@ -14,7 +14,7 @@ from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.counts import Capacity, Counts
 from fidsplat.backends.opencl.declare import Argument
 from fidsplat.backends.opencl.kernel_config import KernelConfig
-from fidsplat.backends.opencl.layout import RAW
+from fidsplat.backends.opencl.kernel_interface import RAW
 from fidsplat.backends.opencl.memory_plan import MemoryPlan
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.uniforms import projection_arrays, scalar_arguments

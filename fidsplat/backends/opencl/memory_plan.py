@@ -16,7 +16,7 @@ from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.assemble import KernelSource
 from fidsplat.backends.opencl.buffers import RayBuffers
 from fidsplat.backends.opencl.kernel_config import KernelConfig
-from fidsplat.backends.opencl.layout import RAW
+from fidsplat.backends.opencl.kernel_interface import RAW
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View

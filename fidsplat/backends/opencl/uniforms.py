@@ -47,7 +47,7 @@ def projection_arrays(views: ViewBatch, source: KernelSource, row: int, end: int
 
 
 def view_records(views: ViewBatch, row: int, end: int, record: np.dtype) -> np.ndarray:
-    """Structs `View` (layout.py), (moving groups + 1, views), for rows of samples [row, end)."""
+    """Structs `View` (kernel_interface.py), (moving groups + 1, views), for rows of samples [row, end)."""
     real = record[0].base  # all members have one type
     if len(views) == 1:
         numbers = _numbers(views.view, row, end, record)

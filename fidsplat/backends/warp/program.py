@@ -142,7 +142,7 @@ class Program:
 
     def _make_blend(self, needs: _Needs) -> None:
         buffers, blending = kernels("buffers"), needs.blending
-        self.layout = kernels("records").Layout(needs.among(_RECORD), blending)
+        self.layout = kernels("records").RecordLayout(needs.among(_RECORD), blending)
         boxes = not needs.effects.isdisjoint(kernels("records").BOXES)
         self.sloped = boxes and "rays" in needs.effects
         """whether blending reads the derivatives of a lens's rays"""

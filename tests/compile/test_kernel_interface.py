@@ -1,4 +1,4 @@
-"""Declarations of layout.py compared with the compiled kernels; effects from outside of the tree."""
+"""Declarations of kernel_interface.py against compiled kernels; effects from outside of the tree."""
 
 import re
 import subprocess
@@ -12,9 +12,9 @@ from agreement import random_splats
 from combined import LENSES, all_effects, combination
 
 import fidsplat as fs
-from fidsplat.backends.opencl.assemble import KernelSource, assemble, layouts_of
-from fidsplat.backends.opencl.declare import Layout, SampleBuffer, member, uniforms
-from fidsplat.backends.opencl.effect_layouts import LAYOUTS
+from fidsplat.backends.opencl.assemble import KernelSource, assemble, effect_code_of
+from fidsplat.backends.opencl.declare import EffectCode, SampleBuffer, member, uniforms
+from fidsplat.backends.opencl.effect_code import EFFECT_CODE
 from fidsplat.backends.opencl.kernel_config import cpu_config, gpu_config
 from fidsplat.backends.opencl.program import build
 from fidsplat.cli import main
@@ -102,9 +102,9 @@ def test_kernels_have_the_declared_arguments(renderer, shape):
 
 
 def test_every_effect_has_a_layout_with_the_parts_of_its_output():
-    assert set(CATALOGUE) <= set(LAYOUTS)
+    assert set(CATALOGUE) <= set(EFFECT_CODE)
     for name, effect in CATALOGUE.items():
-        assert set(effect.needs) <= set(LAYOUTS[name].parts), name
+        assert set(effect.needs) <= set(EFFECT_CODE[name].parts), name
 
 
 TOY_OUTPUT = """// nearest (h, w): depth [m] of the nearest fragment; 0 where there is none.
@@ -158,14 +158,14 @@ def toys(monkeypatch, tmp_path):
     monkeypatch.setitem(CATALOGUE, "nearest", Effect("nearest", output))
     monkeypatch.setitem(OUTPUTS, "nearest", output)
     monkeypatch.setitem(CATALOGUE, "negative", Effect("negative"))
-    nearest = Layout(
+    nearest = EffectCode(
         str(tmp_path / "nearest.cl"),
         parts=("ray_depth",),
         sample_buffers=(SampleBuffer("float", "nearest_raw"),),
     )
-    monkeypatch.setitem(LAYOUTS, "nearest", nearest)
-    negative = Layout(str(tmp_path / "negative.cl"), resolve=uniforms("negative", "float white"))
-    monkeypatch.setitem(LAYOUTS, "negative", negative)
+    monkeypatch.setitem(EFFECT_CODE, "nearest", nearest)
+    negative = EffectCode(str(tmp_path / "negative.cl"), resolve=uniforms("negative", "float white"))
+    monkeypatch.setitem(EFFECT_CODE, "negative", negative)
     return tmp_path
 
 
@@ -218,14 +218,14 @@ def test_effects_from_outside_do_not_change_other_texts(request):
     before = [assemble(features, cpu_config()).digest for features in requested]
     request.getfixturevalue("toys")
     assert [assemble(features, cpu_config()).digest for features in requested] == before
-    assert "nearest" not in layouts_of(requested[0])
+    assert "nearest" not in effect_code_of(requested[0])
 
 
 def test_compiler_errors_name_the_kernel_file_and_line(renderer, toys):
     (toys / "wrong.cl").write_text("// wrong\n//@ resolve_end\n    nearest_out[out] = no_such_name;\n")
-    layout = Layout(str(toys / "wrong.cl"), splat=(member("int wrong"),))
+    layout = EffectCode(str(toys / "wrong.cl"), splat=(member("int wrong"),))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(LAYOUTS, "nearest", layout)
+        patch.setitem(EFFECT_CODE, "nearest", layout)
         features = select(random_splats(3, seed=1), fs.Capture(outputs=("nearest",)))
         with pytest.raises(fs.DeviceError, match=r"wrong\.cl:3:\d+: .*no_such_name"):
             _ = renderer.backend.pipeline(features).program

@@ -1,21 +1,21 @@
-"""OpenCL declarations of effects and outputs: their additions to structs and kernel arguments.
+"""Kernel code of effects and outputs: their files, and additions to structs and kernel arguments.
 
 Buffers are (channels, rows, columns) of the padded sample grid, unless a note has another shape.
 """
 
 from __future__ import annotations
 
-from fidsplat.backends.opencl.declare import Layout, SampleBuffer, args, member, uniforms
-from fidsplat.backends.opencl.layout import RAY_UNIFORMS
+from fidsplat.backends.opencl.declare import EffectCode, SampleBuffer, args, member, uniforms
+from fidsplat.backends.opencl.kernel_interface import RAY_UNIFORMS
 from fidsplat.effects.extensions import Extension
 
 _RAYS = args("in float rays  // 3 channels X, Y, Z; NaN outside the field of view")
 _OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
 
-LAYOUTS: dict[str, Layout] = {
-    # feature options: one of each kind
-    "camera_pinhole": Layout("slot/camera_pinhole.cl", parts=("chord", "conic", "perspective")),
-    "camera_brown_conrady": Layout(
+EFFECT_CODE: dict[str, EffectCode] = {
+    # effects: one of each kind
+    "camera_pinhole": EffectCode("slot/camera_pinhole.cl", parts=("chord", "conic", "perspective")),
+    "camera_brown_conrady": EffectCode(
         "slot/camera_brown_conrady.cl",
         parts=("perspective", "inverse_lens_lut", "rays"),
         view=(
@@ -23,24 +23,24 @@ LAYOUTS: dict[str, Layout] = {
             member("real lens_fold", "squared radius where the polynomial stops being monotonic"),
         ),
     ),
-    "camera_fisheye": Layout(
+    "camera_fisheye": EffectCode(
         "slot/camera_fisheye.cl",
         parts=("polygon", "inverse_lens_lut", "rays"),
         view=(member("real lens[4]", "k1 to k4"), member("real lens_limit", "half field of view [rad]")),
     ),
-    "camera_equirectangular": Layout("slot/camera_equirectangular.cl", parts=("polygon", "rays")),
-    "camera_orthographic": Layout(
+    "camera_equirectangular": EffectCode("slot/camera_equirectangular.cl", parts=("polygon", "rays")),
+    "camera_orthographic": EffectCode(
         "slot/camera_orthographic.cl",
         parts=("chord", "conic"),
         splat=(member("wide z0 zx zy", "depth * D = z0 + zx x + zy y"), member("wide z_near")),
     ),
-    "color_rgb": Layout(
+    "color_rgb": EffectCode(
         "slot/color_rgb.cl",
         project=args("cloud float colors  // (n, 3)"),
         backward_file="slot/color_rgb_backward.cl",
         project_backward=args("out float grad_colors  // (n, 3)"),
     ),
-    "color_sh": Layout(
+    "color_sh": EffectCode(
         "slot/color_sh.cl",
         project=args("cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)"),
         backward_file="slot/color_sh_backward.cl",
@@ -48,9 +48,9 @@ LAYOUTS: dict[str, Layout] = {
             "cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)", "out float grad_sh  // the same shape"
         ),
     ),
-    "lowpass_none": Layout("slot/lowpass_none.cl", backward_file="slot/lowpass_none_backward.cl"),
-    "lowpass_pixel": Layout("slot/lowpass_pixel.cl", parts=("lowpass_none",)),
-    "lowpass_screen": Layout(
+    "lowpass_none": EffectCode("slot/lowpass_none.cl", backward_file="slot/lowpass_none_backward.cl"),
+    "lowpass_pixel": EffectCode("slot/lowpass_pixel.cl", parts=("lowpass_none",)),
+    "lowpass_screen": EffectCode(
         "slot/lowpass_screen.cl",
         splat=(
             member(
@@ -65,27 +65,27 @@ LAYOUTS: dict[str, Layout] = {
         record_gradient=(member("float lowpass_x lowpass_y", "with respect to the centre of the low-pass"),),
     ),
     # whether the fragment that crosses the early-termination threshold is composited
-    "stop_inclusive": Layout(),
-    "stop_exclusive": Layout("slot/stop_exclusive.cl", backward_file="slot/stop_exclusive_backward.cl"),
+    "stop_inclusive": EffectCode(),
+    "stop_exclusive": EffectCode("slot/stop_exclusive.cl", backward_file="slot/stop_exclusive_backward.cl"),
     # compositing order: of splats by their centres, or of fragments per pixel
-    "compose_ordered": Layout("slot/compose_ordered.cl"),
-    "compose_pixel": Layout(
+    "compose_ordered": EffectCode("slot/compose_ordered.cl"),
+    "compose_pixel": EffectCode(
         "slot/compose_pixel.cl",
         parts=("ray_depth",),
         splat=(member("wide nearest", "minimum depth of the splat's fragments"),),
     ),
-    "compose_coplanar": Layout(parts=("compose_ordered", "coplanar_layers")),
-    "compose_coplanar_pixel": Layout(parts=("compose_pixel", "coplanar_layers")),
+    "compose_coplanar": EffectCode(parts=("compose_ordered", "coplanar_layers")),
+    "compose_coplanar_pixel": EffectCode(parts=("compose_pixel", "coplanar_layers")),
     # a box is a splat with a hard-edged, rectangular footprint
-    "footprint_gaussian": Layout(),
-    "footprint_box": Layout("slot/footprint_box.cl", parts=("box_edges",)),
-    "footprint_mixed": Layout(
+    "footprint_gaussian": EffectCode(),
+    "footprint_box": EffectCode("slot/footprint_box.cl", parts=("box_edges",)),
+    "footprint_mixed": EffectCode(
         "slot/footprint_mixed.cl",
         parts=("box_edges",),
         splat=(member("int box"),),
         project=args("cloud int boxes  // (n) 1: box, 0: Gaussian"),
     ),
-    "ellipsoid_exact": Layout(
+    "ellipsoid_exact": EffectCode(
         "slot/ellipsoid_exact.cl",
         parts=("thickness",),
         splat=(
@@ -97,7 +97,7 @@ LAYOUTS: dict[str, Layout] = {
         backward_file="slot/ellipsoid_exact_backward.cl",
         record_gradient=(member("float ellipsoid_term"),),
     ),
-    "ellipsoid_ewa": Layout(
+    "ellipsoid_ewa": EffectCode(
         "slot/ellipsoid_ewa.cl",
         parts=("thickness",),
         view=(
@@ -107,27 +107,27 @@ LAYOUTS: dict[str, Layout] = {
         ),
         backward_file="slot/ellipsoid_ewa_backward.cl",
     ),
-    "ellipsoid_ewa_antialiased": Layout(
+    "ellipsoid_ewa_antialiased": EffectCode(
         "slot/ellipsoid_ewa_antialiased.cl",
         parts=("ellipsoid_ewa",),
         backward_file="slot/ellipsoid_ewa_antialiased_backward.cl",
     ),
-    "ellipsoids_only": Layout(
+    "ellipsoids_only": EffectCode(
         "slot/ellipsoids_only.cl",
         constant=(
             *(("nuy", "WIDE(0.0)"), ("d0", "WIDE(1.0)"), ("dx", "WIDE(0.0)"), ("dy", "WIDE(0.0)")),
             ("d_near", "INFINITY"),
         ),
     ),
-    "background_constant": Layout(),
-    "background_gradient": Layout(
+    "background_constant": EffectCode(),
+    "background_gradient": EffectCode(
         "slot/background_gradient.cl",
         parts=("world_ray",),
         composite_background=uniforms(
             "gradient", "float sky_r sky_g sky_b", "float ground_r ground_g ground_b", "float up_x up_y up_z"
         ),
     ),
-    "background_panorama": Layout(
+    "background_panorama": EffectCode(
         "slot/background_panorama.cl",
         parts=("world_ray",),
         composite_background=args(
@@ -135,14 +135,14 @@ LAYOUTS: dict[str, Layout] = {
             "array float panorama  // (panorama_height, panorama_width, 3)",
         ),
     ),
-    "arithmetic_precise": Layout("slot/arithmetic_precise.cl"),
-    "arithmetic_fast": Layout("slot/arithmetic_fast.cl"),
-    "arithmetic_approximate": Layout("slot/arithmetic_fast.cl"),  # without a dialect
-    "motion_groups": Layout(
+    "arithmetic_precise": EffectCode("slot/arithmetic_precise.cl"),
+    "arithmetic_fast": EffectCode("slot/arithmetic_fast.cl"),
+    "arithmetic_approximate": EffectCode("slot/arithmetic_fast.cl"),  # without a dialect
+    "motion_groups": EffectCode(
         "slot/motion_groups.cl",
         project=args("cloud int labels  // (n)", "in int moving  // number of groups, then their labels"),
     ),
-    "external_depth": Layout(
+    "external_depth": EffectCode(
         "slot/external_depth.cl",
         parts=("ray_depth",),
         blend=args(
@@ -150,47 +150,47 @@ LAYOUTS: dict[str, Layout] = {
             "array int external_label  // (h, w)",
         ),
     ),
-    "shutter_exposure": Layout("slot/shutter_exposure.cl"),
-    "shutter_rows": Layout("slot/shutter_rows.cl"),
-    "blend_double": Layout(),
-    "blend_half": Layout(
+    "shutter_exposure": EffectCode("slot/shutter_exposure.cl"),
+    "shutter_rows": EffectCode("slot/shutter_rows.cl"),
+    "blend_double": EffectCode(),
+    "blend_half": EffectCode(
         "slot/blend_half.cl",
         splat=(member("uint rg b1", "two float16 each: (r, g) and (b, -1)"),),
         packed=(("r", "WORDS_LOW({}rg)"), ("g", "WORDS_HIGH({}rg)"), ("b", "WORDS_LOW({}b1)")),
     ),
-    "termination_depths": Layout(
+    "termination_depths": EffectCode(
         blend=args(
             "in uint keys",
             "out uint termination_depths  // of each tile: depth key at which blending stopped",
         )
     ),
     # parts that several effects share
-    "chord": Layout("part/chord.cl"),  # columns of an ellipse in a range of rows
-    "conic": Layout("part/conic.cl", replaced_by=(("ellipsoids_only", "conic_facing"),)),
-    "conic_facing": Layout("part/conic_facing.cl"),  # disks that face the camera
-    "perspective": Layout("part/perspective.cl"),
-    "polygon": Layout("part/polygon.cl"),  # bounds of a disk by a circumscribed polygon
-    "inverse_lens_lut": Layout(
+    "chord": EffectCode("part/chord.cl"),  # columns of an ellipse in a range of rows
+    "conic": EffectCode("part/conic.cl", replaced_by=(("ellipsoids_only", "conic_facing"),)),
+    "conic_facing": EffectCode("part/conic_facing.cl"),  # disks that face the camera
+    "perspective": EffectCode("part/perspective.cl"),
+    "polygon": EffectCode("part/polygon.cl"),  # bounds of a disk by a circumscribed polygon
+    "inverse_lens_lut": EffectCode(
         "part/inverse_lens_lut.cl",
         view=(
             member(
                 "real lens_lut[6]",
-                "grid of `inverse_lens_lut`: low corner x, y, cells per unit of x, y, cells per side, first row",
+                "`inverse_lens_lut`: low corner x, y, cells per unit along x, y, cells per side; first row",
             ),
         ),
         project=args("in short4 inverse_lens_lut  // columns and rows of the samples in a cell of rays"),
     ),
-    "rays": Layout(
+    "rays": EffectCode(
         "part/rays.cl",
         splat=(
-            member("wide nuz nvz dz", "n_u = nu0 + nux X + nuy Y + nuz Z, likewise n_v, D (layout.py)"),
+            member("wide nuz nvz dz", "n_u = nu0 + nux X + nuy Y + nuz Z, likewise n_v, D (SPLAT)"),
             member("wide ray_x ray_y ray_z", "X, Y, Z are relative to this ray"),
         ),
         project=_RAYS,
         blend=_RAYS,
         composite_background=_RAYS,
     ),
-    "thickness": Layout(
+    "thickness": EffectCode(
         "part/thickness.cl",
         project=args("cloud float thickness  // (n) [m]; 0: a disk"),
         backward_file="part/thickness_backward.cl",
@@ -199,12 +199,12 @@ LAYOUTS: dict[str, Layout] = {
         ),
         project_step=args("out float activated_thickness"),
     ),
-    "step_camera": Layout(
+    "step_camera": EffectCode(
         "train/step_camera.cl",
         project_step=args("out real camera_sums  // (work-groups, 10) with respect to the camera"),
     ),
-    "box_cover": Layout("part/box_cover.cl"),
-    "box_edges": Layout(
+    "box_cover": EffectCode("part/box_cover.cl"),
+    "box_edges": EffectCode(
         "part/box_edges.cl",
         parts=("box_cover",),
         splat=(
@@ -215,7 +215,7 @@ LAYOUTS: dict[str, Layout] = {
         ),
         replaced_by=tuple((camera, "rays_box") for camera in _OWN_RAYS),
     ),
-    "rays_box": Layout(
+    "rays_box": EffectCode(
         "part/rays_box.cl",
         parts=("box_cover",),
         project=args(
@@ -223,7 +223,7 @@ LAYOUTS: dict[str, Layout] = {
         ),
         blend=args("in float ray_derivatives  // 6 channels dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy"),
     ),
-    "ray_depth": Layout(
+    "ray_depth": EffectCode(
         "part/ray_depth.cl",
         splat=(
             member("wide z_numerator", "depth = z_numerator / D"),
@@ -232,40 +232,42 @@ LAYOUTS: dict[str, Layout] = {
         backward_file="part/ray_depth_backward.cl",
         record_gradient=(member("float z_numerator z_center"),),
     ),
-    "coplanar_layers": Layout(
+    "coplanar_layers": EffectCode(
         "part/coplanar_layers.cl",
         parts=("ray_depth",),
         splat=(member("int group", "coplanar group, -1: none"),),
         project=args("cloud int coplanar_groups  // (n) index of the splat's group; -1: none"),
     ),
-    "tile_keys": Layout("part/tile_keys.cl", emit=args("in Splat splats")),
-    "coverage": Layout("part/coverage.cl"),  # minimum alpha of masks
-    "ray": Layout(resolve=RAY_UNIFORMS),
-    "row_rotation": Layout("part/row_rotation.cl", resolve=args("array float row_rotations  // (h, 3, 3)")),
+    "tile_keys": EffectCode("part/tile_keys.cl", emit=args("in Splat splats")),
+    "coverage": EffectCode("part/coverage.cl"),  # minimum alpha of masks
+    "ray": EffectCode(resolve=RAY_UNIFORMS),
+    "row_rotation": EffectCode(
+        "part/row_rotation.cl", resolve=args("array float row_rotations  // (h, 3, 3)")
+    ),
     # rays of fisheyes and panoramas have a length of 1
-    "ray_length": Layout("part/ray_length.cl", replaced_by=(("camera_brown_conrady", "rays_length"),)),
-    "rays_length": Layout("part/rays_length.cl"),
-    "sample_length": Layout(
+    "ray_length": EffectCode("part/ray_length.cl", replaced_by=(("camera_brown_conrady", "rays_length"),)),
+    "rays_length": EffectCode("part/rays_length.cl"),
+    "sample_length": EffectCode(
         "part/sample_length.cl",
         parts=("ray", "ray_length"),
         replaced_by=(("camera_brown_conrady", "rays_sample_length"),),
     ),
-    "rays_sample_length": Layout("part/rays_sample_length.cl", parts=("rays_length",), resolve=_RAYS),
-    "world_ray": Layout("part/world_ray.cl"),
+    "rays_sample_length": EffectCode("part/rays_sample_length.cl", parts=("rays_length",), resolve=_RAYS),
+    "world_ray": EffectCode("part/world_ray.cl"),
     # outputs
-    "alpha": Layout(
+    "alpha": EffectCode(
         "output/alpha.cl",
         backward_file="output/alpha_backward.cl",
         blend_backward=args("in float grad_alpha  // (h, w)"),
     ),
-    "depth": Layout(
+    "depth": EffectCode(
         "output/depth.cl",
         parts=("ray_depth", "coverage"),
         sample_buffers=(SampleBuffer("float", "depth_raw", 2, "sum w z, sum w"),),
         backward_file="output/depth_backward.cl",
         blend_backward=args("in float depth_raw  // 2 channels", "in float grad_depth  // (h, w)"),
     ),
-    "distortion": Layout(
+    "distortion": EffectCode(
         "output/distortion.cl",
         parts=("ray_depth",),
         sample_buffers=(
@@ -274,21 +276,21 @@ LAYOUTS: dict[str, Layout] = {
         backward_file="output/distortion_backward.cl",
         blend_backward=args("in float distortion_raw  // 4 channels", "in float grad_distortion  // (h, w)"),
     ),
-    "depth_median": Layout(
+    "depth_median": EffectCode(
         "output/depth_median.cl",
         parts=("ray_depth", "coverage"),
         sample_buffers=(SampleBuffer("float", "depth_median_raw"),),
     ),
-    "depth_first": Layout(
+    "depth_first": EffectCode(
         "output/depth_first.cl",
         parts=("ray_depth",),
         blend=uniforms("first_hit_transmittance", "float first_hit_transmittance"),
         sample_buffers=(SampleBuffer("float", "depth_first_raw"),),
     ),
-    "distance": Layout("output/distance.cl", parts=("depth", "sample_length")),
-    "distance_median": Layout("output/distance_median.cl", parts=("depth_median", "sample_length")),
-    "distance_first": Layout("output/distance_first.cl", parts=("depth_first", "sample_length")),
-    "normal": Layout(
+    "distance": EffectCode("output/distance.cl", parts=("depth", "sample_length")),
+    "distance_median": EffectCode("output/distance_median.cl", parts=("depth_median", "sample_length")),
+    "distance_first": EffectCode("output/distance_first.cl", parts=("depth_first", "sample_length")),
+    "normal": EffectCode(
         "output/normal.cl",
         parts=("coverage",),
         splat=(member("wide nx ny nz"),),
@@ -297,33 +299,33 @@ LAYOUTS: dict[str, Layout] = {
         record_gradient=(member("float nx ny nz"),),
         blend_backward=args("in float normal_raw  // 3 channels", "in float grad_normal  // (h, w, 3)"),
     ),
-    "normal_world": Layout("output/normal_world.cl", parts=("normal", "row_rotation")),
-    "label": Layout(
+    "normal_world": EffectCode("output/normal_world.cl", parts=("normal", "row_rotation")),
+    "label": EffectCode(
         "output/label.cl",
         parts=("coverage",),
         splat=(member("int label"),),
         project=args("cloud int labels  // (n)"),
         sample_buffers=(SampleBuffer("float", "label_raw"), SampleBuffer("int", "label_id_raw")),
     ),
-    "splat_id": Layout(
+    "splat_id": EffectCode(
         "output/splat_id.cl",
         parts=("coverage",),
         splat=(member("int splat_id"),),
         project=args("cloud int splat_ids  // (n)"),
         sample_buffers=(SampleBuffer("float", "splat_id_raw"), SampleBuffer("int", "splat_id_index_raw")),
     ),
-    "overdraw": Layout("output/overdraw.cl", sample_buffers=(SampleBuffer("int", "overdraw_raw"),)),
-    "rounding": Layout("output/rounding.cl", sample_buffers=(SampleBuffer("float", "rounding_raw"),)),
-    "blended": Layout("output/blended.cl", sample_buffers=(SampleBuffer("int", "blended_raw"),)),
+    "overdraw": EffectCode("output/overdraw.cl", sample_buffers=(SampleBuffer("int", "overdraw_raw"),)),
+    "rounding": EffectCode("output/rounding.cl", sample_buffers=(SampleBuffer("float", "rounding_raw"),)),
+    "blended": EffectCode("output/blended.cl", sample_buffers=(SampleBuffer("int", "blended_raw"),)),
     # effects on the resolved rgb
-    "fog": Layout(
+    "fog": EffectCode(
         "output/fog.cl",
         parts=("ray_depth", "ray_length"),
         blend=args(uniforms("fog_density", "float fog_density"), RAY_UNIFORMS),
         sample_buffers=(SampleBuffer("float", "fog_raw", averaged=True),),
     ),
-    "decode_srgb": Layout("post/decode_srgb.cl"),
-    "veiling_glare": Layout(
+    "decode_srgb": EffectCode("post/decode_srgb.cl"),
+    "veiling_glare": EffectCode(
         "post/veiling_glare.cl",
         resolve=uniforms(
             "veiling_glare",
@@ -331,8 +333,8 @@ LAYOUTS: dict[str, Layout] = {
             note="value = glare_rest * value + glare; glare_rest: 1 - veiling glare",
         ),
     ),
-    "exposure": Layout("post/exposure.cl", resolve=uniforms("exposure", "float exposure")),
-    "vignetting": Layout(
+    "exposure": EffectCode("post/exposure.cl", resolve=uniforms("exposure", "float exposure")),
+    "vignetting": EffectCode(
         "post/vignetting.cl",
         resolve=args(
             uniforms(
@@ -343,7 +345,7 @@ LAYOUTS: dict[str, Layout] = {
             uniforms("vignetting", "float vignette_a vignette_b vignette_c"),
         ),
     ),
-    "noise": Layout(
+    "noise": EffectCode(
         "post/noise.cl",
         resolve=uniforms(
             "noise",
@@ -352,29 +354,29 @@ LAYOUTS: dict[str, Layout] = {
             note="variances: of shot noise at value 1, of read noise at every value",
         ),
     ),
-    "saturation": Layout("post/saturation.cl", resolve=uniforms("saturation", "float saturation")),
-    "white_balance": Layout(
+    "saturation": EffectCode("post/saturation.cl", resolve=uniforms("saturation", "float saturation")),
+    "white_balance": EffectCode(
         "post/white_balance.cl", resolve=uniforms("white_balance", "float balance_r balance_g balance_b")
     ),
-    "gain": Layout("post/gain.cl", resolve=uniforms("gain", "float gain")),
-    "response_gamma": Layout(
+    "gain": EffectCode("post/gain.cl", resolve=uniforms("gain", "float gain")),
+    "response_gamma": EffectCode(
         "post/response_gamma.cl", resolve=uniforms("inverse_gamma", "float inverse_gamma")
     ),
-    "response_srgb": Layout("post/response_srgb.cl"),
-    "response_table": Layout(
+    "response_srgb": EffectCode("post/response_srgb.cl"),
+    "response_table": EffectCode(
         "post/response_table.cl",
         resolve=args(
             uniforms("response_count", "int response_count"), "array float response  // (response_count)"
         ),
     ),
-    "quantise": Layout("post/quantise.cl", resolve=uniforms("quantise_steps", "float quantise_steps")),
+    "quantise": EffectCode("post/quantise.cl", resolve=uniforms("quantise_steps", "float quantise_steps")),
 }
-"""declaration of each feature option, output and sensor effect, and of the parts that several share"""
+"""code of each effect, output and sensor step, and of the parts that several share"""
 
 
-def extension_layout(extension: Extension) -> Layout:
-    """Declaration of an output or a sensor step of another package."""
-    return Layout(
+def extension_code(extension: Extension) -> EffectCode:
+    """Code of an output or a sensor step of another package."""
+    return EffectCode(
         str(extension.opencl),
         parts=extension.parts,
         sample_buffers=tuple(SampleBuffer("float", name) for name in extension.samples),
