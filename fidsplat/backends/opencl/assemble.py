@@ -326,7 +326,7 @@ def assemble_alignment(items: int) -> KernelSource:
 def assemble_alignment_step(float64: bool) -> KernelSource:
     """Assemble the kernel of a step of Levenberg-Marquardt, for views in float64 or float32."""
     low, high = alignment.GAINS
-    numbers = {"SETUP_FP64": int(float64), "MIN_GAIN": f"{low}f", "MAX_GAIN": f"{high}f"}
+    numbers = {"PROJECTION_FP64": int(float64), "MIN_GAIN": f"{low}f", "MAX_GAIN": f"{high}f"}
     declared = Declarations(Scalars("double" if float64 else "float", "float"))
     return Assembler((), declared, numbers).source({"alignment": ("prelude", "alignment_step")})
 
