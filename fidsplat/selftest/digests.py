@@ -234,7 +234,8 @@ def stages_of(data: Mapping[str, np.ndarray], spec: FrameSpec, backend: Backend)
     fields = {name: records[name] if records.dtype.names else records[:, k] for k, name in enumerate(names)}
     height, width = spec.camera.height * spec.quality.samples, spec.camera.width * spec.quality.samples
     forms = {name: fields[name][visible].astype(np.float32) for name in _FORMS if name in fields}
-    return {**forms, "keys": keys, "samples": data["raw"][:, :height, :width]}
+    samples = {"samples": data["raw"][:, :height, :width]} if "raw" in data else {}
+    return {**forms, "keys": keys, **samples}
 
 
 def _sha256(*arrays: np.ndarray) -> str:

@@ -24,7 +24,7 @@ FURTHER = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
 SHARED_FILES = {
     *("prelude", "math", "bounds", "project", "splat", "blend", "part/conic", "part/perspective"),
-    *("part/resolve_fused", "part/resolve_pixel", "slot/arithmetic_fast", "slot/camera_pinhole"),
+    *("part/resolve_pixel", "slot/arithmetic_fast", "slot/camera_pinhole"),
     "part/blend_float",
     *("slot/color_rgb", "slot/compose_ordered"),
 }
@@ -32,10 +32,14 @@ SHARED_FILES = {
 SCHEDULE_FILES = {
     "lanes": {
         *("scan", "sort", "bin", "pack", "part/tile_loop_lanes"),
+        "part/resolve_fused_lanes",
         "schedule/lanes",
         "schedule/lanes_cells",
     },
-    "group": {*("list/tiled", "tile_lists", "part/chord"), "schedule/group", "schedule/group_cells"},
+    "group": {
+        *("list/tiled", "tile_lists", "part/chord", "part/resolve_fused_group"),
+        *("schedule/group", "schedule/group_cells"),
+    },
 }
 LOWPASS_FILES = {"none": {"slot/lowpass_none"}, "screen": {"slot/lowpass_screen"}}
 
@@ -187,7 +191,7 @@ TAKEN = {
         "sort_scatter": (10, 7, 0),
     },
     "group": {
-        "blend": (19, 7, 15508),
+        "blend": (18, 6, 15508),
         "emit": (17, 8, 18708),
         "project": (14, 12, 0),
         "sort_tiles": (6, 4, 20556),

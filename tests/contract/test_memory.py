@@ -121,7 +121,7 @@ def test_nothing_is_written_beyond_the_capacity_of_lists(opencl, monkeypatch, ma
             monkeypatch.setattr(tiling, "pair_capacity", capacity)
             return bands(*given)
 
-        monkeypatch.setattr(tiling, "pair_capacity", lambda workspace: 100)
+        monkeypatch.setattr(tiling, "pair_capacity", lambda workspace, config: 100)
         monkeypatch.setattr(tiling, "unsorted_bands", first_looked_at)
     collected = []
 

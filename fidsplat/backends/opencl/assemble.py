@@ -187,15 +187,14 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
     separate = {"rays", "shutter_exposure", "shutter_rows"}
     fused = features.samples == 1 and "background_constant" in effects and separate.isdisjoint(effects)
     files = [effect.file for effect in effects.values() if effect.file]
-    files += [*_dialect(config, _scalars(features), features.effects), "part/resolve_pixel.cl"]
+    files += _dialect(config, _scalars(features), features.effects)
+    files += [*([f"part/resolve_fused_{config.schedule}.cl"] if fused else []), "part/resolve_pixel.cl"]
     if "blend_half" not in effects:
         files.append("part/blend_float.cl")
     if config.splats_per_item > 1 or config.culls_first:
         files += _frustum_parts(effects)
     if config.culls_first:
         files.append("part/unculled_splats.cl")
-    if fused:
-        files.append("part/resolve_fused.cl")
     if config.binning == "bin_first":
         files.append("list/tiled.cl")
     # depth keys per tile need bounds of a splat's depth in a tile, which only the pinhole has
@@ -489,6 +488,8 @@ class Declarations:
             for argument in self.arguments("resolve"):
                 if argument.name != "stride":
                     merged.setdefault(argument.name, argument)
+            if GROUP_KERNELS.keys() <= self._kernels.keys():
+                del merged["raw"]  # in registers (part/resolve_fused_group.cl)
         return tuple(merged.values())
 
     def text(self, hook: str, subject: str) -> str:

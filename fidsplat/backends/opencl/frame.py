@@ -44,7 +44,8 @@ def render(frame: DeviceFrame) -> None:
 def allocate_samples(frame: DeviceFrame) -> None:
     """Bind the buffers that the blend stage writes."""
     for samples in frame.sample_buffers:
-        frame.scratch(samples.name, 4 * frame.numbers["channel_stride"] * samples.channels)
+        if frame.source.has_argument("blend", samples.name):
+            frame.scratch(samples.name, 4 * frame.numbers["channel_stride"] * samples.channels)
     if frame.source.has_argument("blend", "termination_depths"):
         depths = frame.acquire("termination_depths", 4 * frame.tiles)
         if frame.view.band is not None:
@@ -76,7 +77,7 @@ def render_bin_first(frame: DeviceFrame) -> None:
     lists if they exceeded it."""
     frame.upload_view(0, frame.rows)
     frame.acquire("counts", 4 * COUNTS)
-    capacity = tiling.pair_capacity(frame.workspace)
+    capacity = tiling.pair_capacity(frame.workspace, frame.config)
     if frame.pair_limit:
         capacity = min(capacity, frame.pair_limit)
     tiling.project_and_count(frame)

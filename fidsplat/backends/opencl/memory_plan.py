@@ -72,9 +72,9 @@ class MemoryPlanner:
         self._device, self._source, self._config = device, source, config
         self._has_ray_slopes = source.has_argument("blend", "ray_derivatives")
         self._has_camera_uniforms = not _CAMERA_UNIFORMS.isdisjoint(source.uniform_groups)
-        self._channels = RAW.channels
-        for samples in source.sample_buffers:
-            self._channels += samples.channels
+        self._channels = 0
+        for samples in (RAW, *source.sample_buffers):
+            self._channels += samples.channels if source.has_argument("blend", samples.name) else 0
         resolve_rays = source.has_argument("resolve", "rays")
         self._one_by_one = (
             bool(source.view_arrays) or resolve_rays or "composite_background" in source.arguments

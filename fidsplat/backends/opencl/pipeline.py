@@ -164,7 +164,7 @@ class OpenCLPipeline(Pipeline):
             plan = self._planner.frame(resident, view)
             buffers = self._buffer_key(resident, view, plan)
             workspace.pool.trim(buffers, workspace.memory_budget - plan.total, resident.capacity)
-            if plan.chunk or not tiling.pair_capacity(workspace):
+            if plan.chunk or not tiling.pair_capacity(workspace, self.config):
                 return self.render_complete(resident, view)
             resident.cached_frames.pop(key, None)  # after an interrupt the recording may be incomplete
             commands = CommandList(self.program) if recorded is None else recorded.commands
@@ -184,7 +184,7 @@ class OpenCLPipeline(Pipeline):
         """Replay a cached frame for another view; None if its buffers are too small or were replaced."""
         workspace, recorded, waits = self.workspace, cached.recorded, self.config.binning == "sort_first"
         workspace.pool.trim(cached.buffer_key, workspace.memory_budget - cached.plan.total, resident.capacity)
-        if not waits and not tiling.pair_capacity(workspace):
+        if not waits and not tiling.pair_capacity(workspace, self.config):
             return None
         queue = workspace.switch_to(workspace.queue if waits else workspace.replay_queue)
         if recorded is not None and recorded.set_view(view, queue):
@@ -285,15 +285,16 @@ class OpenCLPipeline(Pipeline):
     def render_intermediates(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Render one view; returns the buffers between the stages: keys (n,) uint32; starts (tiles + 1,)
         uint32; lists (pairs,) uint32, of the last band; records (n,) of the struct `Splat`; raw (4, rows,
-        columns) float32: r, g, b, transmittance; output images by name."""
+        columns) float32: r, g, b, transmittance, unless they stay in registers; output images by name."""
         with self.workspace.rendering():
             frame = self._render_frame(resident, view, MemoryPlan(0, resident.count, 0))
-        images = self.images_of(frame)
-        return {
+        images, raw = self.images_of(frame), {}
+        if self.source.has_argument("blend", "raw"):
+            raw["raw"] = frame.read("raw", np.float32, (4, frame.rows, frame.stride))
+        return raw | {
             "keys": frame.read("keys", np.uint32, (resident.count,)),
             "starts": frame.read("starts", np.uint32, (frame.tiles + 1,)),
             "lists": frame.read("lists", np.uint32, (images.stats["pairs"],)),
             "records": frame.read("splats", self.source.records["Splat"], (resident.count,)),
-            "raw": frame.read("raw", np.float32, (4, frame.rows, frame.stride)),
             **{output.name: images.read(output.name, 0) for output in self.features.images},
         }

@@ -19,6 +19,7 @@ import pyopencl as cl
 from fidsplat.backends.bands import split_by_cost
 from fidsplat.backends.opencl.counts import BIG, COUNTERS, PAIRS, VISIBLE, Counts, enlarged
 from fidsplat.backends.opencl.device_frame import DeviceFrame
+from fidsplat.backends.opencl.kernel_config import KernelConfig
 from fidsplat.backends.opencl.memory_plan import KEY_BYTES, MIN_BIG, WINDOW_BYTES
 from fidsplat.backends.opencl.morton_order import CULLING_GROUP
 from fidsplat.backends.opencl.workspace import Workspace
@@ -34,6 +35,8 @@ _START_TILES, _MAX_START_GROUPS = 512, 32
 """tiles per work-group of the kernel `tile_starts`, and maximum number of work-groups: each reads all list
 lengths"""
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
+_LISTS = ("lists", "windows")
+"""scratch buffer of the lists; those of large clouds replace the tile windows, which only `emit` reads"""
 
 
 class TileBand(NamedTuple):
@@ -251,9 +254,10 @@ def split_rows(frame: DeviceFrame, top: int, end: int, count: int) -> list[tuple
 # on GPUs: append to tile lists, then sort each list
 
 
-def pair_capacity(workspace: Workspace) -> int:
+def pair_capacity(workspace: Workspace, config: KernelConfig) -> int:
     pool = workspace.pool
-    return min(pool.size("lists") // 4, pool.size("pairs") // 8, workspace.pair_budget)
+    lists = pool.size(_LISTS[config.culls_first])
+    return min(lists // 4, pool.size("pairs") // 8, workspace.pair_budget)
 
 
 def project_and_count(frame: DeviceFrame, big: int = 0) -> None:
@@ -281,7 +285,8 @@ def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
 
 def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band: bool) -> None:
     frame.scratch("pairs", 8 * capacity)
-    frame.scratch("lists", 4 * capacity)
+    shared = frame.config.culls_first and not frame.in_bands
+    frame.bind("lists", frame.pool.scratch(_LISTS[shared], 4 * capacity))
     count, views, groups = frame.projected, frame.views, _big_groups(frame)
     arguments = {
         "band_first": band.first,

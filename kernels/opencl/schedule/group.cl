@@ -94,7 +94,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     for (int row = 0; row < ROWS; row++) {
         size_t at = (top + py + row) * stride + px;
         Pixel *pixel = &pixels[row];
-        PIXEL_STORE_BASE(pixel, raw, channel_stride, at);
+        STORE_BASE(pixel, at);
 //@@ store
 //@@ pixel_stored
     }

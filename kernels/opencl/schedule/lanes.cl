@@ -61,7 +61,7 @@ kernel void blend(
     for (int block = 0; block < BLOCKS; block++) {
         size_t at = (top + y0 + TOP(block)) * stride + x0 + LEFT(block);
         Pixel *pixel = &pixels[empty ? 0 : block];
-        PIXEL_STORE_BASE(pixel, raw, channel_stride, at);
+        STORE_BASE(pixel, at);
 //@@ store
     }
 //@@ tile_stored

@@ -1,10 +1,4 @@
 // Resolve fused into blend, for one sample per pixel: saves a launch.
-//@ pixel_stored
-        if (px < width && py + row < height) {
-            const int x = px, y = py + row;
-            const size_t first = at;
-//@@ resolve_pixel
-        }
 //@ tile_stored
     // resolved at once, while the samples are in the cache
     for (int y = y0; y < min(y0 + TILE_H, height); y++)
