@@ -73,6 +73,7 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Intersection c, vin
     vfloat inverse_d = INVERSE_D(c);
     vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, inverse_d, screen), constants->opacity_ceiling);
 //@@ footprint_opacity
+//@@ without_layers
     const Attributes attributes = fragment_attributes(s, c, inverse_d);
 //@@ occlude
 //@@ layers

@@ -74,7 +74,7 @@ EFFECT_CODE: dict[str, EffectCode] = {
         parts=("ray_depth",),
         splat=(member("wide nearest", "minimum depth of the splat's fragments"),),
     ),
-    "compose_coplanar": EffectCode(parts=("compose_ordered", "coplanar_layers")),
+    "compose_coplanar": EffectCode("slot/compose_coplanar.cl", parts=("compose_ordered", "coplanar_layers")),
     "compose_coplanar_pixel": EffectCode(parts=("compose_pixel", "coplanar_layers")),
     # a box is a splat with a hard-edged, rectangular footprint
     "footprint_gaussian": EffectCode(),
