@@ -41,7 +41,7 @@ def main() -> None:
         ("disturbed poses, refined", off, True),
     )[2 if words.refined_only else 0 :]:
         trainer = Trainer(dataset, renderer, iterations=words.iterations, max_splats=words.max_splats,
-                          refine_poses=refine, **changes)  # fmt: skip
+                          refine_poses=refine, **(changes if refine else {}))  # fmt: skip
         begun = time.process_time()
         trainer.run()
         took = 1e3 * (time.process_time() - begun) / words.iterations

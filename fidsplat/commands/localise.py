@@ -107,8 +107,16 @@ class Localise:
         ]
         heads = ("image", "found", "position [m]", "deviation [mm]", "[deg]", "inliers", "start")
         table = (f"Poses in {self.scene}", heads, [_row(result) for result in facts])
+        absent = sum(not result["found"] for result in facts)
+        notes = []
+        if absent:
+            notes.append(
+                f"{absent} of {len(facts)} photographs without a pose: no initial pose, or less than 60 % of "
+                "the textured blocks match; check the camera's size, intrinsics and lens, and the splats"
+            )
         device = renderer.device.title
-        return report(self.json, {"device": device, "images": facts, "files": files}, *files, table=table)
+        values = {"device": device, "images": facts, "files": files}
+        return report(self.json, values, *notes, *files, table=table)
 
 
 def _row(facts: dict[str, Any]) -> tuple[str, ...]:

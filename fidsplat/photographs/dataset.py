@@ -24,7 +24,9 @@ from fidsplat.util.progress import Progress
 from fidsplat.vision.undistort import undistort_masked
 
 SPLATS = "splats.ply"
-"""file of the trained splats, which the scene file names"""
+"""file of the trained splats, which the scene files name"""
+PHOTOGRAPHS = "photographs.toml"
+"""scene file with the camera of the photographs and its lens, to localise other photographs"""
 _QUALITY = 95
 
 
@@ -113,10 +115,12 @@ def write_model(
     colors: np.ndarray,
     tags: Sequence[PlacedMarker],
     visible: Sequence[Sequence[str]],
+    photographed: Camera,
 ) -> Path:
     """Write COLMAP's model of the undistorted images, without points in the boxes of tags, dataset.json with
-    these boxes, and scene.toml with the tags; returns the scene file.
+    these boxes, and scene files with the tags; returns that of the undistorted images.
 
+    photographed: camera of a photograph.
     visible: for each tag the names of the photographs in which it was detected.
     """
     boxes = [box_of(tag) for tag in tags]
@@ -129,8 +133,8 @@ def write_model(
     save_colmap(
         folder / "sparse" / "0", [_image_name(name) for name in names], cameras, points[free], colors[free]
     )
-    file = folder / "scene.toml"
-    Scene(camera=cameras[0], markers=tuple(tags)).save(file)
-    with atomic_write(file) as stream:
-        stream.write(file.read_bytes() + f'\n[[splats]]\nfile = "{SPLATS}"\n'.encode())
+    for file, camera in (folder / PHOTOGRAPHS, photographed), (folder / "scene.toml", cameras[0]):
+        Scene(camera=camera, markers=tuple(tags)).save(file)
+        with atomic_write(file) as stream:
+            stream.write(file.read_bytes() + f'\n[[splats]]\nfile = "{SPLATS}"\n'.encode())
     return file

@@ -122,7 +122,7 @@ def photographs_to_scene(
     used = () if adjustment is None else adjustment.used
     visible = [[model.names[view.image] for view in used if view.tag == tag.marker.spec] for tag in placed]
     points = frame.points(model.points)
-    scene = write_model(folder, model.names, small, points, model.colors, placed, visible)
+    scene = write_model(folder, model.names, small, points, model.colors, placed, visible, cameras[0])
     missing = unregistered(database, model.names)
     count = sum(map(len, groups))
     metric = adjustment is not None or picks is not None

@@ -100,14 +100,21 @@ def test_photographs_become_a_metric_data_set(captured, capsys):
     np.testing.assert_allclose(markers[1].pose[:3, :3], [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
     np.testing.assert_allclose(markers[1].pose[:3, 3], 0, atol=1e-12)
     np.testing.assert_allclose(markers[0].pose[:3, 3], (-0.7, 0, 0.2), atol=0.01)
+    # other photographs are localised with the lens of these
+    photographed = fs.Scene.load(without_splats(out, "photographs.toml")).camera
+    assert (photographed.width, photographed.height) == (320, 240)
+    assert photographed.lens is not None
+    assert (
+        abs(photographed.project([[-0.7, 0, 0.2]]) - loaded["view_0.png"].project([[-0.7, 0, 0.2]])).max() < 2
+    )
     black, white = markers[0].marker.inks
     assert max(black) < 0.1 < 0.9 < min(white)
 
 
-def without_splats(folder):
+def without_splats(folder, name="scene.toml"):
     """The scene before training, in a file that names no splats."""
     file = folder / "tags.toml"
-    file.write_text((folder / "scene.toml").read_text().partition("[[splats]]")[0])
+    file.write_text((folder / name).read_text().partition("[[splats]]")[0])
     return file
 
 

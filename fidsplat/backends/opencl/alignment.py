@@ -122,10 +122,14 @@ class OpenCLAlignment(AlignmentKernels):
         """Submit a frame of a pyramid level without waiting; None on CPUs, and for frames whose command list
         depends on the pose."""
         replayed = self._replayed
-        if replayed is None or not replayed.is_bound(stage):
+        size = self._stages[stage].camera.width, self._stages[stage].camera.height
+        if replayed is None or not replayed.is_bound(size):
             camera = self._stages[stage].camera.with_pose(pose)
-            self._replayed = replayed = _Replayed.of(self._workspace, stage, *self._scene.prepared(camera))
-            if replayed is None or not perturbed:
+            self._replayed = replayed = _Replayed.of(self._workspace, *self._scene.prepared(camera))
+            if replayed is None:
+                return None
+            replayed.size = size
+            if not perturbed:
                 return replayed
         replayed.set_pose(pose)
         replayed.submit(perturbed)
@@ -299,34 +303,31 @@ class OpenCLAlignment(AlignmentKernels):
 class _Replayed:
     """Frames of a pyramid level at other poses, by one command list."""
 
-    def __init__(
-        self, workspace: Workspace, stage: int, frame: DeviceFrame, images: Any, origin: Any
-    ) -> None:
-        self._workspace, self._stage, self.frame, self._images = workspace, stage, frame, images
+    def __init__(self, workspace: Workspace, frame: DeviceFrame, images: Any, origin: Any) -> None:
+        self._workspace, self.frame, self._images = workspace, frame, images
         arrays = projection_arrays(frame.batch, frame.source, 0, frame.rows)
         self._origin, self.record = origin, arrays["view"].copy()
         # not known to the pool any more, since `align_step` writes it
         self.view = workspace.pool.scratch("view", self.record.nbytes)
         self._buffers = [{f"{name}_out": frame.acquired[f"{name}_out"] for name in ("rgb", "depth")}]
         self._rotation = frame.source.uniform_groups.get("rotation", {})
-        self._generation, self._number = workspace.pool.generation, workspace.frames
+        self._generation, self._number, self.size = workspace.pool.generation, workspace.frames, (0, 0)
 
     @classmethod
     def of(
-        cls, workspace: Workspace, stage: int, pipeline: Any, resident: Any, view: View, origin: Any
+        cls, workspace: Workspace, pipeline: Any, resident: Any, view: View, origin: Any
     ) -> _Replayed | None:
         """Render the view; None if its command list cannot be replayed at other poses."""
         plain = not (view.groups or view.sub_frames or view.parallel) and resident.count
         if pipeline.config.binning == "sort_first" or not plain or not pipeline.fits(resident, view):
             return None
         frame = pipeline.replay_complete(resident, view, 0)
-        return None if frame.waits else cls(workspace, stage, frame, pipeline.images_of(frame), origin)
+        return None if frame.waits else cls(workspace, frame, pipeline.images_of(frame), origin)
 
-    def is_bound(self, stage: int) -> bool:
-        """Whether no other frame has overwritten the buffers of the command list."""
-        workspace = self._workspace
-        bound = self._generation, self._number, self._stage
-        return bound == (workspace.pool.generation, workspace.frames, stage)
+    def is_bound(self, size: tuple[int, int]) -> bool:
+        """Whether frames have this size, and no other frame has overwritten the command list's buffers."""
+        bound = self._generation, self._number, self.size
+        return bound == (self._workspace.pool.generation, self._workspace.frames, size)
 
     def set_pose(self, pose: np.ndarray) -> None:
         rotation, record = pose[:3, :3], self.record.copy()
