@@ -42,7 +42,7 @@ static inline Attributes fragment_attributes(const Splat *s, Intersection c, vfl
 }
 
 // Composites a fragment in front of all later fragments, where `mask` is set and the pixel is not terminated.
-static inline void composite(Pixel *pixel, const Attributes *attributes, vfloat opacity, vint mask, const BlendConstants *constants) {
+static inline void composite(Pixel *pixel, const Attributes *attributes, vfloat alpha, vint mask, const BlendConstants *constants) {
     vint live = mask & VMASK(pixel->t > constants->transmittance_stop);
 //@@ stop
 //@@ color_composite
@@ -71,8 +71,8 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Intersection c, vin
 //@@ blend_parameters
 ) {
     vfloat inverse_d = INVERSE_D(c);
-    vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, inverse_d, screen), constants->opacity_ceiling);
-//@@ footprint_opacity
+    vfloat alpha = fragment_alpha(s, fragment_half_rho(s, c, inverse_d, screen), constants->opacity_ceiling);
+//@@ footprint_alpha
 //@@ without_layers
     const Attributes attributes = fragment_attributes(s, c, inverse_d);
 //@@ occlude

@@ -33,11 +33,11 @@ static inline vfloat pixel_transmittance(const Pixel *pixel) {
 //@@ fragment_half_rho
 //@@ fragment_branch
 
-// Composited opacity of a fragment; attenuates the pixel's transmittance by it.
-static inline vfloat attenuate(Pixel *pixel, vfloat opacity, vint mask, const BlendConstants *constants) {
+// Composited alpha of a fragment; attenuates the pixel's transmittance by it.
+static inline vfloat attenuate(Pixel *pixel, vfloat alpha, vint mask, const BlendConstants *constants) {
     vint live = mask & VMASK(pixel->t > constants->transmittance_stop);
 //@@ stop
-    vfloat composited = VSELECT((vfloat)0.0f, opacity, live);
+    vfloat composited = VSELECT((vfloat)0.0f, alpha, live);
     pixel->t = pixel->t - pixel->t * composited;
     return composited;
 }
@@ -98,14 +98,14 @@ static inline vfloat fragment_by_weight(const Splat *s, const PixelGradient *gra
     return grad_weight;
 }
 
-// dL / d ln(opacity) of a fragment with this weight, unless the opacity ceiling applies.
-static inline vfloat backward_opacity(PixelGradient *gradient, vfloat grad_weight, vfloat weight, vfloat opacity) {
+// dL / d ln(alpha) of a fragment with this weight; also dL / d ln(opacity), unless the opacity ceiling applies.
+static inline vfloat backward_alpha(PixelGradient *gradient, vfloat grad_weight, vfloat weight, vfloat alpha) {
     vfloat gain = grad_weight - gradient->behind;
-    gradient->behind = FMA(opacity, gain, gradient->behind);
+    gradient->behind = FMA(alpha, gain, gradient->behind);
     return weight * gain;
 }
 
-// Adds the gradients of a fragment. grad_log: with respect to ln(opacity); (x, y): position relative to the anchor.
+// Adds the gradients of a fragment. grad_log: with respect to ln(alpha); (x, y): sample relative to the splat's anchor pixel (splat.cl).
 static inline void add_fragment(Sums *sums, const Splat *s, const PixelGradient *gradient, const Geometry *g, vfloat weight, vfloat grad_log,
                                 vfloat screen, vfloat x, vfloat y, const BlendConstants *constants) {
     sums->r = FMA(weight, gradient->r, sums->r);

@@ -37,7 +37,7 @@ static inline Intersection intersect_row(const Splat *s, vfloat nu_x, vfloat nv_
 }
 
 //@@ intersect_functions
-// Opacity (the paper's alpha) of a fragment at half the squared distance, rho / 2.
-static inline vfloat fragment_opacity(const Splat *s, vfloat half_rho, wide opacity_ceiling) {
+// Alpha of a fragment: the splat's opacity times exp(-rho / 2), at most the opacity ceiling.
+static inline vfloat fragment_alpha(const Splat *s, vfloat half_rho, wide opacity_ceiling) {
     return VMIN(EXP(s->log_opacity - half_rho), (vfloat)opacity_ceiling);
 }

@@ -8,7 +8,7 @@
 //@ attribute_values
     attributes.blended = 1;
 //@ layer_accumulate
-    layer->mean.blended += VSELECT((vint)0, (vint)1, VMASK(opacity > 0.0f));
+    layer->mean.blended += VSELECT((vint)0, (vint)1, VMASK(alpha > 0.0f));
 //@ composite
     pixel->blended += live & attributes->blended;
 //@ store

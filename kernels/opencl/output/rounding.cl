@@ -1,7 +1,7 @@
 // rounding (h, w): upper bound of the float32 rounding error in rgb, per unit of colour, for frames without a transmittance stop;
 // part of the output `error` (derivation: fidsplat/render/certified_error.py). Interval arithmetic on the affine forms of the
-// ray-splat intersection, as in fidsplat/backends/reference/error_bounds.py, bounds a fragment's opacity by `low` and `high`. The
-// colour changes by at most the transmittance times the larger of high - opacity and opacity - low. The bound includes fragments that
+// ray-splat intersection, as in fidsplat/backends/reference/error_bounds.py, bounds a fragment's alpha by `low` and `high`. The
+// colour changes by at most the transmittance times the larger of high - alpha and alpha - low. The bound includes fragments that
 // rounding may discard (at the near plane, at the horizon of the splat's plane, at the edge of the footprint), so all listed fragments
 // are evaluated. Each blended fragment adds 1.5 UNIT for the rounding of transmittance and colour sum (step 4 of the derivation).
 //@ state
@@ -15,9 +15,9 @@
 
 static inline vfloat squared(vfloat x) { return x * x; }
 
-// Relative rounding of an opacity at half rho `h`: of ln(opacity), rho (a root, a division and a square by OpenCL's bounds), their
+// Relative rounding of an alpha at half rho `h`: of ln(opacity), rho (a root, a division and a square by OpenCL's bounds), their
 // difference, and the exponential.
-static inline vfloat opacity_rounding(const Splat *s, vfloat h) {
+static inline vfloat alpha_rounding(const Splat *s, vfloat h) {
     return UNIT * (16.0f + 2.0f * fabs((vfloat)s->log_opacity) + 32.0f * fmin(h, (vfloat)100.0f));
 }
 
@@ -38,12 +38,12 @@ static inline void add_rounding(Pixel *pixel, const Splat *s, Intersection c, vf
         furthest = fmin(furthest, squared(away + off_lowpass));
     }
 #endif
-    vfloat high = fmin(fragment_opacity(s, nearest, 1.0f) * (1.0f + opacity_rounding(s, nearest)), (vfloat)1.0f);
-    vfloat low = fragment_opacity(s, furthest, 1.0f) * (1.0f - opacity_rounding(s, furthest));
-    vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->opacity_ceiling);
-    opacity = VSELECT((vfloat)0.0f, opacity, mask);
+    vfloat high = fmin(fragment_alpha(s, nearest, 1.0f) * (1.0f + alpha_rounding(s, nearest)), (vfloat)1.0f);
+    vfloat low = fragment_alpha(s, furthest, 1.0f) * (1.0f - alpha_rounding(s, furthest));
+    vfloat alpha = fragment_alpha(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->opacity_ceiling);
+    alpha = VSELECT((vfloat)0.0f, alpha, mask);
     vint blended = mask & VMASK(pixel->t > 0.0f);
-    pixel->rounding += pixel->t * fmax(high - opacity, opacity - low) + VSELECT((vfloat)0.0f, (vfloat)(1.5f * UNIT), blended);
+    pixel->rounding += pixel->t * fmax(high - alpha, alpha - low) + VSELECT((vfloat)0.0f, (vfloat)(1.5f * UNIT), blended);
 }
 //@ mask
 #if LANES == 1

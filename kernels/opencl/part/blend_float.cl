@@ -7,9 +7,9 @@
     pixel->b = 0.0f;
 //@ color_composite
 #if LANES == 1
-    vfloat weight = pixel->t * VSELECT((vfloat)0.0f, opacity, live);
+    vfloat weight = pixel->t * VSELECT((vfloat)0.0f, alpha, live);
 #else
-    vfloat full_weight = pixel->t * opacity, weight = VSELECT((vfloat)0.0f, full_weight, live);
+    vfloat full_weight = pixel->t * alpha, weight = VSELECT((vfloat)0.0f, full_weight, live);
 #endif
     pixel->r = FMA(weight, attributes->r, pixel->r);
     pixel->g = FMA(weight, attributes->g, pixel->g);

@@ -21,10 +21,10 @@
         if (BOX_HERE) bounds.pr = -1.0f;
 //@ footprint_lowpass
         if (BOX_HERE) record.lowpass_x = record.lowpass_y = 1e18f;
-//@ footprint_opacity
-    if (IS_BOX(s)) opacity = VMIN(EXP((vfloat)s->log_opacity), (vfloat)constants->opacity_ceiling) * c.cover;
+//@ footprint_alpha
+    if (IS_BOX(s)) alpha = VMIN(EXP((vfloat)s->log_opacity), (vfloat)constants->opacity_ceiling) * c.cover;
 //@ footprint_tau
-    // in a layer, boxes add up opacities, where Gaussians add up optical depths
-    if (IS_BOX(s)) tau = opacity;
+    // in a layer, boxes add up alphas, where Gaussians add up optical depths
+    if (IS_BOX(s)) tau = alpha;
 //@ footprint_layer
-    if (IS_BOX(s)) layer->opacity = fmin(layer->optical_depth, (vfloat)1.0f);
+    if (IS_BOX(s)) layer->alpha = fmin(layer->optical_depth, (vfloat)1.0f);

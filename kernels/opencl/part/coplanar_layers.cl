@@ -1,6 +1,6 @@
 // Compositing with coplanar groups: splats of one group have no order, and form one layer per pixel. The layer is the limit of
 // cutting the splats into thin sheets and shuffling them, which is independent of order: optical depths
-// tau = -ln(1 - opacity) add up, and colour, outputs and depth are means weighted by tau. A marker then does not change when its
+// tau = -ln(1 - alpha) add up, and colour, outputs and depth are means weighted by tau. A marker then does not change when its
 // splats are reordered, or when camera rotation reorders the depths of their centres.
 //
 // Splats of groups are the first ones of a tile's list, group after group. A pass through the list finds at each pixel the nearest layer
@@ -39,7 +39,7 @@
 #define IN_LAYER(s) ((s)->group >= 0)
 typedef struct {
     int group;                  // -1: no layer
-    vfloat opacity;             // 1 - the product of transmittances, accumulated directly to stay exact for faint layers
+    vfloat alpha;             // 1 - the product of transmittances, accumulated directly to stay exact for faint layers
     vfloat optical_depth;       // sum over its fragments
     Attributes mean;                  // of its fragments, weighted by optical depth
 //@@ layer_fields
@@ -48,7 +48,7 @@ typedef struct {
 typedef struct {
     Layer current;                 // layer that still accumulates fragments
     AttributeFields next;       // nearest layer of this pass; its depth is infinite if there is none
-    vfloat next_z, next_opacity;
+    vfloat next_z, next_alpha;
     vint next_group;
     vfloat from;                // depth and group of the layer of the previous pass; infinite if there was none
     vint from_group;
@@ -128,12 +128,12 @@ static inline void layers_start(Pixel *pixel, Layers *layers) {
 }
 
 // Adds a fragment where `mask` is set.
-static inline void layer_add(Layer *layer, const Splat *s, const Attributes *attributes, vfloat opacity, vint mask) {
-    opacity = VSELECT((vfloat)0.0f, opacity, mask);
-    // clamped to the optical depth at which float32 transmittance is 0; below 1e-3, where 1 - opacity rounds, by its series to 3e-7
-    vfloat tau = VSELECT(-LOG(fmax(1.0f - opacity, (vfloat)0x1p-24f)), FMA(0.5f * opacity, opacity, opacity), VMASK(opacity < 1e-3f));
+static inline void layer_add(Layer *layer, const Splat *s, const Attributes *attributes, vfloat alpha, vint mask) {
+    alpha = VSELECT((vfloat)0.0f, alpha, mask);
+    // clamped to the optical depth at which float32 transmittance is 0; below 1e-3, where 1 - alpha rounds, by its series to 3e-7
+    vfloat tau = VSELECT(-LOG(fmax(1.0f - alpha, (vfloat)0x1p-24f)), FMA(0.5f * alpha, alpha, alpha), VMASK(alpha < 1e-3f));
 //@@ footprint_tau
-    layer->opacity = FMA(opacity, 1.0f - layer->opacity, layer->opacity);
+    layer->alpha = FMA(alpha, 1.0f - layer->alpha, layer->alpha);
     layer->optical_depth += tau;
 //@@ footprint_layer
     vfloat share = VSELECT((vfloat)0.0f, tau / layer->optical_depth, VMASK(tau > 0.0f));
@@ -152,7 +152,7 @@ static inline void layer_close(Layers *layers) {
     vint nearest = VMASK(layers->current.optical_depth > 0.0f) & VMASK(z < layers->next_z);
     nearest &= VMASK(z > layers->from) | (VMASK(z == layers->from) & VMASK(layers->current.group > layers->from_group));
     layers->next_z = VSELECT(layers->next_z, z, nearest);
-    layers->next_opacity = VSELECT(layers->next_opacity, layers->current.opacity, nearest);
+    layers->next_alpha = VSELECT(layers->next_alpha, layers->current.alpha, nearest);
     layers->next_group = VSELECT(layers->next_group, (vint)layers->current.group, nearest);
 #if LANES == 1
     if (nearest) layers->next = own;
@@ -187,7 +187,7 @@ static inline const float *blocks_until(Pixel *pixels, const BlendConstants *con
             layers->current.group = s->group;
         }
         if (s->group >= 0) {
-            layer_add(&layers->current, s, &attributes, opacity, mask);
+            layer_add(&layers->current, s, &attributes, alpha, mask);
             return;
         }
         mask &= VMASK(attributes.z >= layers->from) & VMASK(attributes.z < layers->next_z);
@@ -200,7 +200,7 @@ static inline const float *blocks_until(Pixel *pixels, const BlendConstants *con
         Layers *layers = pixel->layers;
         layer_close(layers);
         const vint passed = ~repeats, ready = passed & VMASK(layers->next_z < INFINITY);
-        composite(pixel, &layers->next.attributes, layers->next_opacity, ready, constants);
+        composite(pixel, &layers->next.attributes, layers->next_alpha, ready, constants);
         layers->from = VSELECT(layers->from, layers->next_z, passed);
         layers->from_group = VSELECT(layers->from_group, layers->next_group, passed);
         layers->next_z = INFINITY;

@@ -11,11 +11,11 @@
 #define IN_REGISTERS (K_BUFFER_SIZE < 3 ? K_BUFFER_SIZE : 3)
 #define QUEUE_CAPACITY (K_BUFFER_SIZE - IN_REGISTERS)
 typedef struct {                    // in memory: an index that is not constant moves a complete struct out of registers
-    wide z[QUEUE_CAPACITY + 1], opacity[QUEUE_CAPACITY + 1];    // ring buffer, sorted by depth
+    wide z[QUEUE_CAPACITY + 1], alpha[QUEUE_CAPACITY + 1];    // ring buffer, sorted by depth
     uint splat[QUEUE_CAPACITY + 1];
 } Queue;
 typedef struct {
-    wide z[IN_REGISTERS], opacity[IN_REGISTERS];
+    wide z[IN_REGISTERS], alpha[IN_REGISTERS];
     uint splat[IN_REGISTERS];
     Queue *queue;
     uint head, count;               // of the queue
@@ -51,13 +51,13 @@ static inline bool precedes(global const Splat *splats, uint splat, uint other) 
     return nearest < than || (nearest == than && splat < other);
 }
 
-static inline void k_buffer_composite(Pixel *pixel, wide z, wide opacity, uint splat, global const Splat *splats,
+static inline void k_buffer_composite(Pixel *pixel, wide z, wide alpha, uint splat, global const Splat *splats,
                                      const BlendConstants *constants) {
     const Splat s = splats[splat];
     const Intersection nowhere = {1.0f};
     Attributes attributes = fragment_attributes(&s, nowhere, 1.0f);
     attributes.z = z;
-    composite(pixel, &attributes, opacity, VMASK(true), constants);
+    composite(pixel, &attributes, alpha, VMASK(true), constants);
 }
 
 // Index of the queue's k-th entry in the ring buffer.
@@ -74,12 +74,12 @@ static inline void k_buffer_flush(Pixel *pixel, wide nearest, global const Splat
         uint at = k_buffer->head;
         k_buffer->head = queue_index(k_buffer, 1);
         k_buffer->count--;
-        k_buffer_composite(pixel, queue->z[at], queue->opacity[at], queue->splat[at], splats, constants);
+        k_buffer_composite(pixel, queue->z[at], queue->alpha[at], queue->splat[at], splats, constants);
     }
 }
 
 // Enqueues a fragment that is not behind those in registers. If the queue is full, the farthest fragment of all is dropped.
-static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide opacity, uint splat, global const Splat *splats) {
+static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide alpha, uint splat, global const Splat *splats) {
     KBuffer *k_buffer = &pixel->k_buffer;
     Queue *queue = k_buffer->queue;
     if (k_buffer->count == QUEUE_CAPACITY) {
@@ -90,13 +90,13 @@ static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide opacity, uint spl
 #pragma unroll
         for (int k = IN_REGISTERS - 1; k > 0; k--) {
             k_buffer->z[k] = k_buffer->z[k - 1];
-            k_buffer->opacity[k] = k_buffer->opacity[k - 1];
+            k_buffer->alpha[k] = k_buffer->alpha[k - 1];
             k_buffer->splat[k] = k_buffer->splat[k - 1];
         }
         uint last = queue_index(k_buffer, k_buffer->count - 1);
         bool further = QUEUE_CAPACITY > 0 && !IN_FRONT(queue->z[last], queue->splat[last], z, splat);
         k_buffer->z[0] = further ? queue->z[last] : z;
-        k_buffer->opacity[0] = further ? queue->opacity[last] : opacity;
+        k_buffer->alpha[0] = further ? queue->alpha[last] : alpha;
         k_buffer->splat[0] = further ? queue->splat[last] : splat;
         if (!further) return;
         k_buffer->count--;
@@ -106,17 +106,17 @@ static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide opacity, uint spl
         uint before = queue_index(k_buffer, k - 1);
         if (IN_FRONT(queue->z[before], queue->splat[before], z, splat)) break;
         queue->z[at] = queue->z[before];
-        queue->opacity[at] = queue->opacity[before];
+        queue->alpha[at] = queue->alpha[before];
         queue->splat[at] = queue->splat[before];
         at = before;
     }
     queue->z[at] = z;
-    queue->opacity[at] = opacity;
+    queue->alpha[at] = alpha;
     queue->splat[at] = splat;
 }
 
 // Inserts a fragment; no later fragment is nearer than `nearest`.
-static inline void k_buffer_push(Pixel *pixel, wide nearest, wide z, wide opacity, uint splat, global const Splat *splats,
+static inline void k_buffer_push(Pixel *pixel, wide nearest, wide z, wide alpha, uint splat, global const Splat *splats,
                                 const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
     // the new fragment may be nearer than queued ones
@@ -125,32 +125,32 @@ static inline void k_buffer_push(Pixel *pixel, wide nearest, wide z, wide opacit
 #pragma unroll
     for (int k = 0; k < IN_REGISTERS; k++) in_front[k] = IN_FRONT(k_buffer->z[k], k_buffer->splat[k], z, splat);
     bool first = !in_front[0];
-    wide first_z = first ? z : k_buffer->z[0], first_opacity = first ? opacity : k_buffer->opacity[0];
+    wide first_z = first ? z : k_buffer->z[0], first_alpha = first ? alpha : k_buffer->alpha[0];
     uint first_splat = first ? splat : k_buffer->splat[0];
 #pragma unroll
     for (int k = 0; k < IN_REGISTERS; k++) {
         int from = min(k + 1, IN_REGISTERS - 1);
         bool moves = k + 1 < IN_REGISTERS && in_front[from], here = in_front[k];
-        k_buffer->opacity[k] = moves ? k_buffer->opacity[from] : here ? opacity : k_buffer->opacity[k];
+        k_buffer->alpha[k] = moves ? k_buffer->alpha[from] : here ? alpha : k_buffer->alpha[k];
         k_buffer->splat[k] = moves ? k_buffer->splat[from] : here ? splat : k_buffer->splat[k];
         k_buffer->z[k] = moves ? k_buffer->z[from] : here ? z : k_buffer->z[k];
     }
     if (first_splat == NO_SPLAT) return;
     if (k_buffer->count == 0 && BEFORE_NEXT(first_z, nearest))
-        k_buffer_composite(pixel, first_z, first_opacity, first_splat, splats, constants);
+        k_buffer_composite(pixel, first_z, first_alpha, first_splat, splats, constants);
     else
-        k_buffer_enqueue(pixel, first_z, first_opacity, first_splat, splats);
+        k_buffer_enqueue(pixel, first_z, first_alpha, first_splat, splats);
 }
 
 // Inserts a fragment of a splat, none of whose fragments is nearer than `nearest`. position: index that gives its position in the list.
-static inline void k_buffer_insert(Pixel *pixel, wide nearest, wide z, wide opacity, const Attributes *attributes, uint splat, uint position,
+static inline void k_buffer_insert(Pixel *pixel, wide nearest, wide z, wide alpha, const Attributes *attributes, uint splat, uint position,
                                 int mask, global const Splat *splats, const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
     if (k_buffer->bounded) {
         if (z > k_buffer->until || (z == k_buffer->until && !precedes(splats, position, k_buffer->until_splat))) return;
         if (z < k_buffer->from || (z == k_buffer->from && precedes(splats, position, k_buffer->from_splat))) return;
     }
-    k_buffer_push(pixel, nearest, z, opacity, splat, splats, constants);
+    k_buffer_push(pixel, nearest, z, alpha, splat, splats, constants);
 }
 //@ k_buffer_finish
     KBuffer *k_buffer = &pixel->k_buffer;
@@ -158,7 +158,7 @@ static inline void k_buffer_insert(Pixel *pixel, wide nearest, wide z, wide opac
 #pragma unroll
     for (int k = 0; k < IN_REGISTERS; k++)
         if (k_buffer->splat[k] != NO_SPLAT)
-            k_buffer_composite(pixel, k_buffer->z[k], k_buffer->opacity[k], k_buffer->splat[k], splats, constants);
+            k_buffer_composite(pixel, k_buffer->z[k], k_buffer->alpha[k], k_buffer->splat[k], splats, constants);
     k_buffer_clear(k_buffer);
     k_buffer->from = k_buffer->until;
     k_buffer->from_splat = k_buffer->until_splat;

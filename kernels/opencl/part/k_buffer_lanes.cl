@@ -20,7 +20,7 @@
 #define EMPTY_Z INFINITY            // depth of an empty lane of the queue
 #define NO_FRAGMENT (-INFINITY)            // depth of an empty lane of `farthest`
 typedef struct {                    // one fragment per lane
-    vfloat z, opacity;
+    vfloat z, alpha;
     vint position;                     // position of its splat in the list
     AttributeFields data;
 } Entry;
@@ -195,7 +195,7 @@ static inline void k_buffer_flush(Pixel *pixel, vfloat nearest, const BlendConst
         const Entry *entry = &queue->entries[queue->order[left]];
         vint waits = VMASK(entry->z < EMPTY_Z), ready = waits & VMASK(entry->z < nearest);
         if (VANY(waits & ~ready)) break;
-        composite(pixel, &entry->data.attributes, entry->opacity, ready, constants);
+        composite(pixel, &entry->data.attributes, entry->alpha, ready, constants);
     }
     if (left == 0) return;
     uchar free[K_BUFFER_SIZE];
@@ -213,7 +213,7 @@ static inline void swap_lanes(vfloat *one, vfloat *other, vint mask) {
 
 static inline void swap_entries(Entry *one, Entry *other, vint mask) {
     swap_lanes(&one->z, &other->z, mask);
-    swap_lanes(&one->opacity, &other->opacity, mask);
+    swap_lanes(&one->alpha, &other->alpha, mask);
     vint position = one->position;
     one->position = VSELECT(position, other->position, mask);
     other->position = VSELECT(other->position, position, mask);
@@ -250,7 +250,7 @@ static inline void k_buffer_enqueue(KBuffer *k_buffer, Entry *own) {
 }
 
 // Inserts a fragment of the splat at `position` in the list; no later fragment is nearer than `nearest`.
-static inline void k_buffer_insert(Pixel *pixel, vfloat nearest, vfloat z, vfloat opacity, const Attributes *attributes,
+static inline void k_buffer_insert(Pixel *pixel, vfloat nearest, vfloat z, vfloat alpha, const Attributes *attributes,
                                    uint splat, uint position, vint mask, global const Splat *splats,
                                    const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
@@ -261,12 +261,12 @@ static inline void k_buffer_insert(Pixel *pixel, vfloat nearest, vfloat z, vfloa
         mask &= VMASK(z > queue->from) | (VMASK(z == queue->from) & VMASK(here >= queue->from_position));
         if (!VANY(mask)) return;
     }
-    Entry own = {VSELECT((vfloat)NO_FRAGMENT, z, mask), opacity, here};
+    Entry own = {VSELECT((vfloat)NO_FRAGMENT, z, mask), alpha, here};
     own.data.attributes = *attributes;
     swap_entries(&own, &k_buffer->farthest, mask & ~entry_before(&own, &k_buffer->farthest));
     vint leaves = VMASK(own.z > NO_FRAGMENT);
     if (queue->count == 0 && !VANY(VMASK(own.z >= nearest)))
-        composite(pixel, &own.data.attributes, own.opacity, leaves, constants);
+        composite(pixel, &own.data.attributes, own.alpha, leaves, constants);
     else {
         if (VANY(leaves)) k_buffer_enqueue(k_buffer, &own);
         k_buffer_flush(pixel, nearest, constants);
@@ -275,7 +275,7 @@ static inline void k_buffer_insert(Pixel *pixel, vfloat nearest, vfloat z, vfloa
 //@ k_buffer_finish
     k_buffer_flush(pixel, INFINITY, constants);
     Entry *farthest = &pixel->k_buffer.farthest;
-    composite(pixel, &farthest->data.attributes, farthest->opacity, VMASK(farthest->z > NO_FRAGMENT), constants);
+    composite(pixel, &farthest->data.attributes, farthest->alpha, VMASK(farthest->z > NO_FRAGMENT), constants);
     farthest->z = NO_FRAGMENT;
     Queue *queue = pixel->k_buffer.queue;
     queue->from = queue->until;

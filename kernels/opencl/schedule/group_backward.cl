@@ -25,7 +25,7 @@ static inline Intersection intersect_at(const Splat *s, int px, int py, const Bl
 }
 
 typedef struct {            // a splat at a pixel, before transmittance is known
-    wide opacity, grad_weight;
+    wide alpha, grad_weight;
     int mask;
 } FragmentValues;
 
@@ -34,19 +34,19 @@ static inline FragmentValues fragment_values(const Splat *s, int px, int py, con
     Intersection c = intersect_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     FragmentValues values;
     values.mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
-    values.opacity = fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->opacity_ceiling);
+    values.alpha = fragment_alpha(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->opacity_ceiling);
     const Geometry g = geometry_of(s, c, nu_x, nv_x, y, screen);
     values.grad_weight = fragment_by_weight(s, gradient, &g);
     return values;
 }
 
-// Attenuates a pixel by the splat; returns the opacity there.
+// Attenuates a pixel by the splat; returns the alpha there.
 static inline wide forward_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants) {
     wide x, y, nu_x, nv_x, half_r2, screen;
     Intersection c = intersect_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     int mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
     if (!VANY(mask)) return 0.0f;
-    return attenuate(pixel, fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->opacity_ceiling), mask, constants);
+    return attenuate(pixel, fragment_alpha(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->opacity_ceiling), mask, constants);
 }
 
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
@@ -135,7 +135,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
                 if (k + next >= listed) break;
                 for (int row = 0; row < ROWS; row++) {
                     wide transmittance = pixels[row].t;
-                    wide composited = attenuate(&pixels[row], values[next][row].opacity, values[next][row].mask, &constants);
+                    wide composited = attenuate(&pixels[row], values[next][row].alpha, values[next][row].mask, &constants);
                     grad_weights[row] = FMA(transmittance * composited, values[next][row].grad_weight, grad_weights[row]);
                 }
             }
@@ -195,7 +195,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
 ) {
     local Staged staged[CHUNK];
     local float scratch[SCRATCH];
-    local float2 *fragments = (local float2 *)scratch;      // [splat][pixel]: transmittance, opacity; then weight, gradient of ln(opacity)
+    local float2 *fragments = (local float2 *)scratch;      // [splat][pixel]: transmittance, alpha; then weight, gradient of ln(opacity)
     local PixelGradient shared[PIXELS];
     local uint offsets[CHUNK], within[PATCHES];               // bits: splats whose bounds overlap a patch
     const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter, log_ceiling};
@@ -257,12 +257,12 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
         const Splat s = copy_of(&staged[which]);
         for (int k = 0; k < PIXELS_PER_ITEM; k++) {
             int y = y0 + top + 4 * k;
-            wide transmittance = 0.0f, opacity = 0.0f;
+            wide transmittance = 0.0f, alpha = 0.0f;
             if (pixels[k].t > transmittance_stop && px >= s.x0 && px < s.x1 && y >= s.y0 && y < s.y1) {
                 transmittance = pixels[k].t;
-                opacity = forward_fragment(&s, px, y, &pixels[k], &constants);
+                alpha = forward_fragment(&s, px, y, &pixels[k], &constants);
             }
-            fragments[which * STRIDE + (top + 4 * k) * TILE_W + column] = (float2)(transmittance, opacity);
+            fragments[which * STRIDE + (top + 4 * k) * TILE_W + column] = (float2)(transmittance, alpha);
         }
     }
     // each work-item reads only what it wrote, but without a barrier NVIDIA's compiler (driver 580) moved the read before the write
@@ -278,7 +278,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
                 Intersection c = intersect_at(&s, px, y0 + top + 4 * k, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
                 fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
                 const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
-                *at = (float2)(weight, backward_opacity(&gradients[k], fragment_by_weight(&s, &gradients[k], &g), weight, here.y));
+                *at = (float2)(weight, backward_alpha(&gradients[k], fragment_by_weight(&s, &gradients[k], &g), weight, here.y));
             } else
                 (*at).x = 0.0f;
         }

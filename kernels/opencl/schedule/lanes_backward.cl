@@ -12,7 +12,7 @@
 #define CHECKPOINT_FLOATS (TILE_W * TILE_H + LANES)        // of a checkpoint: transmittance of each pixel, and the index of the first splat
 
 typedef struct {            // fragments in the order of compositing, block by block
-    vfloat transmittance[TAPE_FRAGMENTS], opacity[TAPE_FRAGMENTS];
+    vfloat transmittance[TAPE_FRAGMENTS], alpha[TAPE_FRAGMENTS];
     uint blocks[TAPE_SPLATS];      // per splat, as bits: blocks with fragments
     uint offsets[TAPE_SPLATS];
     uint length;            // number of blocks
@@ -62,9 +62,9 @@ static inline uint forward_splat(const Splat *s, const Tile *tile, Pixel *pixels
         const Block b = block_of(s, tile, &at, block);
         if (UNLIKELY(!VANY(b.mask))) continue;
         vfloat half_rho = fragment_half_rho(s, b.intersection, INVERSE_D(b.intersection), b.screen);
-        vfloat opacity = fragment_opacity(s, half_rho, constants->opacity_ceiling);
+        vfloat alpha = fragment_alpha(s, half_rho, constants->opacity_ceiling);
         tape->transmittance[length] = pixels[block].t;
-        tape->opacity[length++] = attenuate(&pixels[block], opacity, b.mask, constants);
+        tape->alpha[length++] = attenuate(&pixels[block], alpha, b.mask, constants);
         contributing |= 1u << block;
         if (UNLIKELY(!VANY(VMASK(pixel_transmittance(&pixels[block]) > constants->transmittance_stop)))) alive &= ~(1u << block);
     }
@@ -84,8 +84,8 @@ static inline void backward_splat(const Splat *s, const Tile *tile, global Tape 
         int block = 31 - clz((int)(blocks & -blocks));
         const Block b = block_of(s, tile, &corner, block);
         const Geometry g = geometry_of(s, b.intersection, b.nu_x, b.nv_x, b.y, b.screen);
-        vfloat opacity = tape->opacity[at], weight = tape->transmittance[at] * opacity;
-        vfloat grad_log = backward_opacity(&gradients[block], fragment_by_weight(s, &gradients[block], &g), weight, opacity);
+        vfloat alpha = tape->alpha[at], weight = tape->transmittance[at] * alpha;
+        vfloat grad_log = backward_alpha(&gradients[block], fragment_by_weight(s, &gradients[block], &g), weight, alpha);
         add_fragment(&sums, s, &gradients[block], &g, weight, grad_log, b.screen, b.x, b.y, constants);
     }
     const Parts m = record_gradient_of(&sums, constants);

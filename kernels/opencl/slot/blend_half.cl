@@ -86,7 +86,7 @@ static inline float within_half(float color) { return clamp(color, -65504.0f, 65
     pixel->rg = HALF_PAIR((vfloat)0.0f, (vfloat)0.0f);
     pixel->bt = HALF_PAIR((vfloat)0.0f, (vfloat)1.0f);
 //@ color_composite
-    vfloat visible = VSELECT((vfloat)0.0f, opacity, live);
+    vfloat visible = VSELECT((vfloat)0.0f, alpha, live);
     half_pair weights = HALF_BY_HIGH(HALF_PAIR(visible, visible), pixel->bt);
     vfloat weight = HALF_LOW(weights);
     pixel->rg = HALF_FMA(weights, COLOR_RG(attributes), pixel->rg);

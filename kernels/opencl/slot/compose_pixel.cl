@@ -25,4 +25,4 @@
 //@ blend_parameters
                                , global const Splat *splats, uint splat, uint position, vfloat next_nearest
 //@ compose
-    k_buffer_insert(pixel, next_nearest, attributes.z, opacity, &attributes, splat, position, mask, splats, constants);
+    k_buffer_insert(pixel, next_nearest, attributes.z, alpha, &attributes, splat, position, mask, splats, constants);

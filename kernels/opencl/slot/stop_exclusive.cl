@@ -6,7 +6,7 @@
     pixel->finished = 0;
 //@ stop
     live &= ~pixel->finished;
-    vint drop = live & VMASK(pixel->t * (1.0f - opacity) <= constants->transmittance_stop);
+    vint drop = live & VMASK(pixel->t * (1.0f - alpha) <= constants->transmittance_stop);
     pixel->finished |= drop;
     live &= ~drop;
 //@ transmits
