@@ -54,7 +54,9 @@ CONSTANTS = (
     Constant("blending stops at T = 1/256", "our `fast`", ABLATION, "transmittance_stop 1/256"),
     Constant("stop at 1e-4 without the last fragment", "3DGS, 2DGS, gsplat", ABLATION, "stop_rule exclusive"),
     Constant("alpha is clamped to 0.99", "3DGS, 2DGS, gsplat", ABLATION, "opacity_ceiling 0.99"),
-    Constant("projection in float32", "3DGS, 2DGS, gsplat, our `fast`", ABLATION, "setup_precision float32"),
+    Constant(
+        "projection in float32", "3DGS, 2DGS, gsplat, our `fast`", ABLATION, "projection_precision float32"
+    ),
     Constant("exponentials by polynomials", "our `standard`, `fast`", ABLATION, "arithmetic fast"),
     Constant("exponentials by GPU instructions", "3DGS, gsplat, HiGS", ABLATION, "arithmetic approximate"),
     Constant("colours and transmittance in float16", "HiGS", ABLATION, "blend_precision float16"),

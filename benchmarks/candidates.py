@@ -32,13 +32,13 @@ from fidsplat.util.timing import Timer, frame_timer, time_interleaved
 CUTOFFS = (0.03, 0.015, 2 / 255, 1 / 255, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 1e-7)
 STOPS = (0.05, 0.015, 4e-3, 1e-3, 1e-4, 1e-6)
 MODIFIERS = (
-    {"setup_precision": "float32"},
+    {"projection_precision": "float32"},
     {"arithmetic": "fast"},
-    {"setup_precision": "float32", "arithmetic": "fast"},
+    {"projection_precision": "float32", "arithmetic": "fast"},
 )
 OF_GPUS = tuple(
     {**setup, **more}
-    for setup in ({}, {"setup_precision": "float32"})
+    for setup in ({}, {"projection_precision": "float32"})
     for more in ({"arithmetic": "approximate"}, {"blend_precision": "float16"})
 )
 """further modifiers, which are not faster on CPUs"""

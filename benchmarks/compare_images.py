@@ -31,8 +31,9 @@ OUTPUTS = (
 WIDTH, HEIGHT = 93, 61
 MIB = 1 << 20
 REFUSED = "refused"
-# Earlier commits use other names: `Shutter.exposure`, `SplatCloud.with_planes`.
+# Earlier commits use other names: `Shutter.exposure`, `SplatCloud.with_planes`, `Quality.setup_precision`.
 _EXPOSURE_TIME = "exposure_time" if "exposure_time" in fs.Shutter.__dataclass_fields__ else "exposure"
+_PROJECTION = "projection" if "projection_precision" in fs.Quality.__dataclass_fields__ else "setup"
 
 
 def cloud(seed: int, count: int = 1500, degree: int | None = None, largest: float = 0.25) -> fs.SplatCloud:
@@ -102,10 +103,12 @@ def frames() -> dict[str, dict[str, Any]]:
             "scene": grouped,
         }
     for words in (
-        *("setup_precision=float32", "arithmetic=precise", "arithmetic=approximate"),
+        *("arithmetic=precise", "arithmetic=approximate"),
         *("blend_precision=float16", "blend_precision=float64"),
     ):
         found[words] = {"camera": pinhole, "quality": words, "outputs": OUTPUTS}
+    single = f"{_PROJECTION}_precision=float32"
+    found["projection in float32"] = {"camera": pinhole, "quality": single, "outputs": OUTPUTS}
     found |= {f"sensor {words}": {"camera": pinhole, "sensor": one} for words, one in _sensors().items()}
     for k in range(12):
         largest = 0.05 * (k + 1)

@@ -92,7 +92,7 @@ _FIXED = {
         "planes", quality={"stop_rule": "exclusive", "transmittance_stop": 1e-2, "order": "centre"}
     ),
     "2 x 2 samples": Switch("samples", quality={"samples": 2}),
-    "set-up in float32": Switch("set-up", quality={"setup_precision": "float32"}),
+    "set-up in float32": Switch("set-up", quality={"projection_precision": "float32"}),
     "fast arithmetic": Switch("arithmetic", quality={"arithmetic": "fast"}),
     "precise arithmetic": Switch("arithmetic", quality={"arithmetic": "precise"}),
     "fog": Switch("background", arguments={"fog": fs.Fog(0.2, (0.6, 0.65, 0.7))}),

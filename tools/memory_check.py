@@ -194,7 +194,7 @@ def frames(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
         yield f"{name}: spherical harmonics of degree 3", task(shape, harmonic, small)
         yield (
             f"{name}: set-up in float32",
-            task(shape, crowded, small, quality=fs.Quality(setup_precision="float32")),
+            task(shape, crowded, small, quality=fs.Quality(projection_precision="float32")),
         )
         yield f"{name}: centres 1e7 and more pixels off", task(shape, far, small)
         yield f"{name}: 37 x 3 pixels", task(shape, around, wide)

@@ -6,7 +6,7 @@
 Requires CUDA with a compiler. gsplat renders with its constants (opacity ceiling 0.999, exclusive stop), and
 the fastest number of cameras per call of CAMERAS by `rasterization_2dgs`, with colours and the outputs that
 it always computes, median depth included (mean depth takes longer); it has no labels. fidsplat renders the
-outputs of the row as in benchmarks/batches.py, the same with gsplat's constants and a float32 set-up, and
+outputs of the row as in benchmarks/batches.py, the same with gsplat's constants and a float32 projection, and
 gsplat's outputs with these. gsplat's images are discarded after each call, fidsplat's are retained. Times are
 from the first call until the GPU is done.
 """
@@ -83,7 +83,7 @@ def peer(cloud: fs.SplatCloud, capture: fs.Capture, poses: np.ndarray) -> Callab
 
 def captures_of(capture: fs.Capture) -> list[fs.Capture]:
     """Captures of fidsplat's measurements."""
-    same = capture.with_(quality=SAME.with_(setup_precision="float32"))
+    same = capture.with_(quality=SAME.with_(projection_precision="float32"))
     return [capture, same, same.with_(outputs=ITS_OUTPUTS)]
 
 
@@ -141,7 +141,8 @@ def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
     records = []
     for timer, taken in zip(ours, captures, strict=True):
         own = record(f"fidsplat {fs.__version__}", timer, taken.outputs)
-        own["constants"] = "its, float32" if taken.quality.setup_precision == "float32" else "batches.py's"
+        single = taken.quality.projection_precision == "float32"
+        own["constants"] = "its, float32" if single else "batches.py's"
         records += [own, its | {"times_ours": its["us_per_view"] / own["us_per_view"]}]
     return records
 

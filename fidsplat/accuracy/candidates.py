@@ -20,7 +20,7 @@ MARGIN = 1.5
 DEFAULTS: dict[str, Any] = {
     "alpha_cutoff": 1.0 / 255.0,
     "transmittance_stop": 1e-4,
-    "setup_precision": "float64",
+    "projection_precision": "float64",
     "arithmetic": "precise",
     "blend_precision": "float32",
 }

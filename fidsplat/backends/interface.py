@@ -276,7 +276,7 @@ class GradientPipeline(ABC):
 
         Returns:
             Device arrays, bit-identical on every run and valid until the next call: `means` (n, 3), `quats`
-            (n, 4), `scales` (n, 2), `opacities` (n,), `colors` (n, 3) or `sh` (n, k, 3); `screen` (n,), the
+            (n, 4), `scales` (n, 2), `opacities` (n,), `colors` (n, 3) or `sh` (n, k, 3); `grad2d` (n,), the
             norm of the gradient with respect to the projected centre in units of half images (dL_dmean2D of
             2DGS trainers); `background` (3,); `pose` (6,), rotation vector [1 / rad] and translation [1 / m]
             of a motion after world_to_camera, in camera axes; `intrinsics` (4,): fx, fy, cx, cy [1 / px].

@@ -13,7 +13,7 @@ LOWPASS = ("screen", "pixel", "none")
 STOP_RULES = ("inclusive", "exclusive")
 ELLIPSOID = ("exact", "ewa", "ewa_antialiased")
 ORDERS = ("auto", "pixel", "centre")
-SETUP_PRECISIONS = ("float64", "float32")
+PROJECTION_PRECISIONS = ("float64", "float32")
 ARITHMETIC = ("precise", "fast", "approximate")
 BLEND_PRECISIONS = ("float32", "float16", "float64")
 MAX_SAMPLES = 8
@@ -135,7 +135,7 @@ class Quality:
     """Accumulated opacity of the surface in depth_first and distance_first, in (0, 1): the first fragment or
     layer after which the transmittance is at most 1 - first_hit."""
 
-    setup_precision: str = "float64"
+    projection_precision: str = "float64"
     """Arithmetic of the per-splat projection. `float32` shifts small and grazing splats
     (docs/correctness.md) and saves time on devices with slow float64. Devices without float64 always use
     it."""
@@ -152,7 +152,7 @@ class Quality:
     approximate arithmetic: faster on NVIDIA's GPUs, slower on others; n fragments with colours up to 1 change
     a pixel by at most (n + 3) / 2048. `float64` computes intersection, weight and blending in float64, for
     reference images: many times slower, always with precise arithmetic; requires a device with float64 and
-    `setup_precision="float64"`."""
+    `projection_precision="float64"`."""
 
     marker: MarkerQuality = field(default_factory=MarkerQuality)
     """Conversion of markers to splats."""
@@ -175,15 +175,16 @@ class Quality:
             ("lowpass", LOWPASS),
             ("ellipsoid", ELLIPSOID),
             ("order", ORDERS),
-            ("setup_precision", SETUP_PRECISIONS),
+            ("projection_precision", PROJECTION_PRECISIONS),
             ("arithmetic", ARITHMETIC),
             ("blend_precision", BLEND_PRECISIONS),
         ):
             _one_of(f"quality: {name}", getattr(self, name), choices)
         instance("quality: marker", self.marker, MarkerQuality, "an fs.MarkerQuality")
-        if self.blend_precision == "float64" and self.setup_precision != "float64":
+        if self.blend_precision == "float64" and self.projection_precision != "float64":
             raise InputError(
-                "quality: setup_precision must be 'float64' with blend_precision='float64', got 'float32'"
+                "quality: projection_precision must be 'float64' with blend_precision='float64', got "
+                "'float32'; leave it out"
             )
         if self.stop_rule == "exclusive" and self.order != "centre":
             raise InputError(
@@ -281,7 +282,7 @@ _PARITY = Quality(
 # the self-test; fast arithmetic is faster on CPUs and at most 1 % slower on GPUs
 PRESETS: dict[str, Quality] = {
     "standard": Quality(),
-    "fast": Quality(alpha_cutoff=2.0 / 255.0, transmittance_stop=1.0 / 256.0, setup_precision="float32"),
+    "fast": Quality(alpha_cutoff=2.0 / 255.0, transmittance_stop=1.0 / 256.0, projection_precision="float32"),
     "reference": Quality(alpha_cutoff=1e-6, transmittance_stop=0.0, arithmetic="precise"),
     "gsplat": _PARITY,
     "surfel": _PARITY,

@@ -1,6 +1,6 @@
 """Declarations of all effects and output images by name. Backends map the names to kernel code.
 
-A frame has exactly one camera, color, lowpass, stop, compose, footprint, background and arithmetic effect, at
+A frame has exactly one camera, color, lowpass, stop, order, footprint, background and arithmetic effect, at
 most one ellipsoid effect, and any number of outputs and of steps after blending.
 """
 
@@ -68,8 +68,8 @@ _ID: dict[str, Any] = {"dtype": "int32", "display": "label", "discontinuous": Tr
 _WITHOUT_OUTPUT = (
     *("camera_pinhole", "camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
     *("camera_orthographic", "color_rgb", "color_sh", "lowpass_none", "lowpass_pixel", "lowpass_screen"),
-    *("stop_inclusive", "stop_exclusive", "compose_ordered", "compose_pixel", "compose_coplanar"),
-    "compose_coplanar_pixel",
+    *("stop_inclusive", "stop_exclusive", "order_centre", "order_pixel", "order_coplanar"),
+    "order_coplanar_pixel",
     *("footprint_gaussian", "footprint_box", "footprint_mixed"),
     *("ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased", "ellipsoids_only"),
     *("background_constant", "background_gradient", "background_panorama"),

@@ -12,7 +12,7 @@ DIFFERENTIABLE = frozenset(
     (
         *("camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen"),
         *("ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased", "ellipsoids_only"),
-        *("stop_inclusive", "stop_exclusive", "compose_ordered", "footprint_gaussian"),
+        *("stop_inclusive", "stop_exclusive", "order_centre", "footprint_gaussian"),
         *("background_constant", "arithmetic_precise", "arithmetic_fast", "arithmetic_approximate"),
     )
 )
@@ -22,7 +22,7 @@ GRADIENT_OUTPUTS = ("rgb", "alpha", "depth", "normal", "distortion")
 _REMEDIES = {
     "camera": "a pinhole camera",
     "lowpass": "lowpass='screen' or 'none'",
-    "compose": "order='centre'",
+    "order": "order='centre'",
     "footprint": "a cloud without boxes",
     "background": "a background of one colour",
     "external": "a capture without an external depth image",

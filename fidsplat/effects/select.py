@@ -25,12 +25,12 @@ class FeatureSet:
 
     effects: tuple[str, ...]
     """One effect of each kind in a fixed order: camera, color, ellipsoid (optional), lowpass, stop, external
-    depth (optional), compose, footprint, background, arithmetic; then optional effects."""
+    depth (optional), order, footprint, background, arithmetic; then optional effects."""
     outputs: tuple[str, ...]
     """Sorted names of the outputs other than rgb."""
     sh_degree: int
     samples: int
-    setup_precision: str
+    projection_precision: str
     post_steps: tuple[str, ...] = ()
     """Steps that change rgb after blending, in order: fog, then sensor steps."""
 
@@ -109,7 +109,7 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
         outputs=tuple(sorted({*capture.outputs} - {"rgb", *DERIVED_OUTPUTS})),
         sh_degree=sh_degree,
         samples=quality.samples,
-        setup_precision=quality.setup_precision,
+        projection_precision=quality.projection_precision,
         post_steps=(*(("fog",) if capture.has_fog else ()), *capture.sensor.steps),
     )
 
@@ -140,9 +140,9 @@ def _compositing(cloud: CloudTraits, order: str, equal_depths: bool) -> str:
     groups. equal_depths: whether all fragments of a splat have the depth of its centre; both orders are equal
     then, and the effect without a k-buffer suffices."""
     if cloud.has_coplanar_groups:
-        orders = {"centre": "compose_ordered", "auto": "compose_coplanar", "pixel": "compose_coplanar_pixel"}
+        orders = {"centre": "order_centre", "auto": "order_coplanar", "pixel": "order_coplanar_pixel"}
         return orders[order]
-    return "compose_pixel" if order == "pixel" and not equal_depths else "compose_ordered"
+    return "order_pixel" if order == "pixel" and not equal_depths else "order_centre"
 
 
 def _ellipsoid(cloud: CloudTraits, quality: Quality, lens: Lens | None) -> str:

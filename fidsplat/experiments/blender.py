@@ -47,7 +47,7 @@ def check_images(folder: Path, view: str, seed: int, samples: int | None = None)
     try:
         settings = from_json(read_text(file))
     except ValueError as error:
-        raise InputError(f"cannot read {file}: {error}") from error
+        raise InputError(f"cannot read {file}: {error}; render into another folder") from error
     for name, expected in (("seed", seed), ("samples", samples)):
         if expected is not None and settings.get(name) != expected:
             raise InputError(
@@ -105,7 +105,10 @@ def _call(command: list[str]) -> None:
     done = interrupts.run(command)
     if done.returncode:
         lines = (done.stderr or done.stdout).strip().splitlines() or ["no message"]
-        raise DeviceError(f"installing Blender failed at '{' '.join(command[1:4])}': {lines[-1]}")
+        raise DeviceError(
+            f"installing Blender failed at '{' '.join(command[1:4])}': {lines[-1]}; check the network and "
+            "the free disk space, then run the command again"
+        )
 
 
 def marker_job(category: Category, index: int, seed: int, folder: Path, view: str, training: bool) -> dict:
@@ -211,4 +214,6 @@ def run_worker(
                     process.wait()
         if status:
             lines = log.read_text("utf-8", "replace").strip().splitlines() or ["no message"]
-            raise DeviceError(f"Blender stopped with status {status}: {lines[-1]}")
+            raise DeviceError(
+                f"Blender stopped with status {status}: {lines[-1]}; run the command again to render the rest"
+            )

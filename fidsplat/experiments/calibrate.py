@@ -133,7 +133,7 @@ def errors_by_count(settings: CalibrationSettings, views: list[BoardView]) -> It
     rng, true = np.random.default_rng(settings.seed), parameters(settings.truth)
     counts = [count for count in COUNTS if count < len(views)] + [len(views)]
     for count in counts:
-        projection, each = [], []
+        projection, deviations = [], []
         for _ in range(1 if count == len(views) else DRAWS):
             chosen = rng.choice(len(views), count, replace=False)
             try:
@@ -142,10 +142,10 @@ def errors_by_count(settings: CalibrationSettings, views: list[BoardView]) -> It
                 projection.append(math.inf)
                 continue
             projection.append(float(np.sqrt((projection_errors(calibrated, settings.truth) ** 2).mean())))
-            each.append([abs(value - true[name]) for name, value in parameters(calibrated).items()])
+            deviations.append([abs(value - true[name]) for name, value in parameters(calibrated).items()])
         # the median without interpolation, since failures are infinite
         low, middle, high = np.percentile(projection, (25, 50, 75), method="nearest").tolist()
-        errors = np.median(each, axis=0).tolist() if each else [math.inf] * len(true)
+        errors = np.median(deviations, axis=0).tolist() if deviations else [math.inf] * len(true)
         yield {
             "views": count,
             "projection_px": middle,

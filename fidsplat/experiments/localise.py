@@ -270,7 +270,7 @@ class Drive:
     def _tags_with_spacing(self, spacing: float) -> set[int]:
         """Ids of tags with at least this distance from each other on each side of a bench."""
         ids, last = set(), {}
-        for number, tag in sorted(self.tags.items(), key=lambda each: each[1].pose[0, 3]):
+        for number, tag in sorted(self.tags.items(), key=lambda item: item[1].pose[0, 3]):
             x, side = tag.pose[0, 3], round(tag.pose[1, 3], 3)
             if x >= last.get(side, -math.inf) + spacing:
                 ids.add(number)

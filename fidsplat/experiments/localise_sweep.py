@@ -82,7 +82,7 @@ def drive_sweep(
         """Log the measurements of a variant; returns the function that estimates poses."""
         name = key["variant"]
         variant = VARIANTS[name]
-        first = next(each for each in VARIANTS if VARIANTS[each].rendering == variant.rendering)
+        first = next(other for other in VARIANTS if VARIANTS[other].rendering == variant.rendering)
         log = log_of(variant.rendering, first)
         return partial(_estimate, out / _tum(name), drive, variant, run_at(variant.speed), log)
 

@@ -162,7 +162,7 @@ def plan_tags(
     poses = survey.candidate_poses()
     tag = survey.tag
     sightings = survey.sightings([PlacedMarker(tag, pose) for pose in poses])
-    visible = [k for k, one in enumerate(sightings) if len(one.poses)]
+    visible = [k for k, sighting in enumerate(sightings) if len(sighting.poses)]
     if not visible:
         raise InputError(
             "the trajectory must have a flat surface of a tag's size in view below 70 degrees, got none; "
@@ -227,10 +227,12 @@ class Survey:
             self.report("rendering depth", 0.3 * (k + 1) / count)
         self.tag = marker(f"apriltag:{settings.family}:0", settings.size)
         self.up = scene_up(scene)
-        self.path = np.array([one.camera_to_world for one in self.cameras])
+        self.path = np.array([camera.camera_to_world for camera in self.cameras])
         drift = settings.drift[0], math.radians(settings.drift[1])
         self.covariance = odometry_covariance(self.path, *drift, up=self.up if settings.planar else None)
-        existing = [one for one in scene.markers if one.motion is None and one.marker.kind in TAGS]
+        existing = [
+            placed for placed in scene.markers if placed.motion is None and placed.marker.kind in TAGS
+        ]
         self.covariance = self.with_tags(existing)
 
     def candidate_poses(self) -> np.ndarray:
@@ -240,13 +242,15 @@ class Survey:
         for n, k in enumerate(every):
             surfaces = surface_candidates(self._depths[k], _depth_camera(self.cameras[k]), self.tag, self.up)
             candidates += [
-                one for one in surfaces if not settings.walls or abs(one[0].normal @ self.up) < STEEP
+                (surface, pose)
+                for surface, pose in surfaces
+                if not settings.walls or abs(surface.normal @ self.up) < STEEP
             ]
             self.report("searching surfaces", 0.3 + 0.4 * (n + 1) / len(every))
         poses = suppress_nearby(candidates, self.tag)
-        for one in self._scene.markers:  # markers are flat surfaces too
-            distances = np.linalg.norm(poses[:, :3, 3] - one.pose[:3, 3], axis=1)
-            poses = poses[distances > self.tag.radius + one.marker.radius]
+        for placed in self._scene.markers:  # markers are flat surfaces too
+            distances = np.linalg.norm(poses[:, :3, 3] - placed.pose[:3, 3], axis=1)
+            poses = poses[distances > self.tag.radius + placed.marker.radius]
         return poses
 
     def remedy(self, poses: np.ndarray) -> str:
@@ -329,8 +333,8 @@ def suppress_nearby(candidates: Sequence[tuple[Surface, np.ndarray]], tag: Marke
     chosen: list[np.ndarray] = []
     for k in order:
         pose = candidates[k][1]
-        near = [other for other in chosen if np.linalg.norm(other[:3, 3] - pose[:3, 3]) < tag.size]
-        if not any(other[:3, 2] @ pose[:3, 2] > 0.8 for other in near):
+        near = [place for place in chosen if np.linalg.norm(place[:3, 3] - pose[:3, 3]) < tag.size]
+        if not any(place[:3, 2] @ pose[:3, 2] > 0.8 for place in near):
             chosen.append(pose)
     return np.array(chosen).reshape(-1, 4, 4)
 
@@ -367,24 +371,25 @@ def sightings_of(
         rays = camera.position - middles
         distances = np.linalg.norm(rays, axis=1)
         facing = (rays * normals).sum(1) / np.maximum(distances, 1e-9) >= INCIDENCE
-        some = np.flatnonzero(facing)
-        if not len(some):
+        visible = np.flatnonzero(facing)
+        if not len(visible):
             continue
-        pixels = camera.project(samples[some].reshape(-1, 3)).reshape(len(some), -1, 2)
-        code = camera.project(corners[some].reshape(-1, 3)).reshape(-1, 4, 2)
+        pixels = camera.project(samples[visible].reshape(-1, 3)).reshape(len(visible), -1, 2)
+        code = camera.project(corners[visible].reshape(-1, 3)).reshape(-1, 4, 2)
         with np.errstate(invalid="ignore"):
             inside = ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all((1, 2))
             edge = np.linalg.norm(np.roll(code, -1, axis=1) - code, axis=2).min(1)
-        readable = np.flatnonzero(inside & (edge >= MODULE * sides[some]))
-        readable = readable[_visible(camera, depth, samples[some[readable]])]
-        some = some[readable]
-        if not len(some):
+        readable = np.flatnonzero(inside & (edge >= MODULE * sides[visible]))
+        readable = readable[_visible(camera, depth, samples[visible[readable]])]
+        visible = visible[readable]
+        if not len(visible):
             continue
         moved = None
         if exposed is not None:
-            begin, end = (one.project(corners[some].reshape(-1, 3)) for one in exposed[k])
+            begin, end = (camera_at.project(corners[visible].reshape(-1, 3)) for camera_at in exposed[k])
             moved = np.nan_to_num(end - begin).reshape(-1, 4, 2)
-        for tag, information in zip(some, tag_information(camera, corners[some], noise, moved), strict=True):
+        matrices = tag_information(camera, corners[visible], noise, moved)
+        for tag, information in zip(visible, matrices, strict=True):
             poses[tag].append(k)
             known[tag].append(information)
     return [

@@ -57,7 +57,7 @@ def _edges(grid: np.ndarray, contrast: float, paper: float) -> tuple[np.ndarray,
     for jumps, swapped in ((across, False), (down, True)):
         # runs along each line: columns of `jumps` are lines
         all_runs = runs(jumps.T)
-        line, first, last, size = (each[all_runs[3] != 0] for each in all_runs)
+        line, first, last, size = (column[all_runs[3] != 0] for column in all_runs)
         a, b = np.stack([line, first], 1), np.stack([line, last], 1)
         # the right side of a segment that points down is the left side of one that points right
         parts.append((a[:, ::-1], b[:, ::-1], -size) if swapped else (a, b, size))

@@ -145,7 +145,7 @@ def _record(settings: PlantSettings, folder: Path) -> None:
     try:
         before = from_json(read_text(file)) if file.exists() else recorded
     except ValueError as error:
-        raise InputError(f"cannot read {file}: {error}") from error
+        raise InputError(f"cannot read {file}: {error}; give another folder") from error
     if before != recorded:
         raise InputError(
             f"plants in {folder} must be of the settings {recorded}, got {before}; give another folder"

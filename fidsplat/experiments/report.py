@@ -196,10 +196,10 @@ def _localisation(rows: Table) -> Table:
     for (category, distance), group in rows.groupby(["category", "distance_m"]):
         row = {"marker, distance": f"{CATEGORIES[str(category)].title}, {distance:g} m"}
         for method in methods:
-            one = group[group["method"] == method]
-            read, every = one["read"].sum(), one["amount"].sum()
-            missed = f" ({read}/{every})" if read < every else ""
-            row[method] = number(one["position_mm"].median()) + missed if read else "not read"
+            selected = group[group["method"] == method]
+            read, amount = selected["read"].sum(), selected["amount"].sum()
+            missed = f" ({read}/{amount})" if read < amount else ""
+            row[method] = number(selected["position_mm"].median()) + missed if read else "not read"
         table.append(row)
     return pd.DataFrame(table)
 

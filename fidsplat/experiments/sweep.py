@@ -204,7 +204,7 @@ def read_records(file: Path) -> list[Record]:
     try:
         text = read_text(file)
     except UnicodeDecodeError as error:
-        raise InputError(f"cannot read {file}: {error}") from error
+        raise InputError(f"cannot read {file}: {error}; remove it, and measure again") from error
     records: list[Record] = []
     run: dict[str, Any] | None = None
     for number, line in enumerate(text.split("\n")[:-1], 1):

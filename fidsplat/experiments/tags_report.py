@@ -82,10 +82,10 @@ def breaks_of(rates: Table) -> Table:
             row = {"cause": f"{CAUSES[cause].title} [{CAUSES[cause].unit}]"}
             row |= {"to": CAUSES[cause].text(1.0), "family": family.rpartition(":")[2]}
             for detector in _detectors(rates):
-                each = selected[(selected["family"] == family) & (selected["detector"] == detector)]
-                severity = breaking_severity(each["severity"].tolist(), each["rate"].tolist())
+                measured = selected[(selected["family"] == family) & (selected["detector"] == detector)]
+                severity = breaking_severity(measured["severity"].tolist(), measured["rate"].tolist())
                 row[detector] = NEVER if severity is None else CAUSES[cause].text(severity)
-                row[detector] = row[detector] if len(each) else NOTHING
+                row[detector] = row[detector] if len(measured) else NOTHING
             table.append(row)
     return pd.DataFrame(table)
 

@@ -137,7 +137,10 @@ def load_splats(path: str | os.PathLike[str], progress: Progress | None = None) 
         known = format_of(file)
         return load_ply(file, progress) if known.load is load_ply else known.load(file)
     except InputError as error:
-        raise InputError(f"{error}{remedy_for(file)}") from error
+        message, remedy = str(error), remedy_for(file)
+        if not remedy and ";" not in message and file.is_file():
+            remedy = "; export the splats again, or copy the file again"
+        raise InputError(message + remedy) from error
 
 
 def save_splats(cloud: SplatCloud, path: str | os.PathLike[str]) -> None:

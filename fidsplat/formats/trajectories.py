@@ -297,7 +297,9 @@ def load_cameras(path: str | os.PathLike[str]) -> dict[str, Camera]:
         transforms = from_json(read_text(files[0]))
         names = [str(frame["file_path"]) for frame in transforms["frames"]]
     except (ValueError, TypeError, KeyError) as error:
-        raise InputError(f"cannot read {files[0]} as a transforms.json: {error}") from None
+        raise InputError(
+            f"cannot read {files[0]} as a transforms.json: {error}; export the data set again"
+        ) from None
     cameras = {}
     for number, name in enumerate(names):
         with error_prefix(f"{files[0]}: {name}"):

@@ -175,8 +175,8 @@ def localise(
             )["rgb"]
 
         best = most_similar(pixels, camera, candidates, render_all, TRIED)
-        tried = [align(pixels, mask, one, rendered, coarse=True) for one in best]
-        starts = [min(tried, key=lambda one: one.noise).camera]
+        tried = [align(pixels, mask, start, rendered, coarse=True) for start in best]
+        starts = [min(tried, key=lambda alignment: alignment.noise).camera]
     alignment = align(pixels, mask, starts[0], rendered, max_side=max_side)
     return Localisation(alignment.camera, alignment.covariance, alignment.inliers, alignment.noise, source)
 

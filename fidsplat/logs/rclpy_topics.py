@@ -51,7 +51,9 @@ class RclpyTopics:
         if topic not in self._received:
             messages = self._received[topic]
             # rclpy inspects the signature, which a built-in method lacks
-            self._node.create_subscription(_class(kind), topic, lambda one: messages.append(one), DEPTH)
+            self._node.create_subscription(
+                _class(kind), topic, lambda message: messages.append(message), DEPTH
+            )
         for _ in range(DEPTH):
             self._executor.spin_once(timeout_sec=0)
         new_messages = list(self._received[topic])

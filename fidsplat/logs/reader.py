@@ -113,7 +113,7 @@ def _as_input_error(file: Path) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # errors of five packages that read, decompress and decode
-        raise InputError(f"cannot read {file} as a log: {error}") from None
+        raise InputError(f"cannot read {file} as a log: {error}; record or copy it again") from None
 
 
 def detections_of(message: Any) -> list[Detection]:

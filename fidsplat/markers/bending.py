@@ -91,13 +91,13 @@ def _halves(
     length = boxes[:, 2:] - boxes[:, :2]
     straight = by_axis.max(1) < straight_below
     axis = np.where(straight, length[:, 1] > length[:, 0], by_axis[:, 1] > by_axis[:, 0]).astype(int)
-    each = np.arange(len(boxes))
+    rows = np.arange(len(boxes))
     if whole:
-        axis = np.where(length[each, axis] > 1, axis, 1 - axis)
-    middle = (boxes[each, axis] + boxes[each, axis + 2]) / 2
+        axis = np.where(length[rows, axis] > 1, axis, 1 - axis)
+    middle = (boxes[rows, axis] + boxes[rows, axis + 2]) / 2
     middle = np.floor(middle) if whole else middle
     first, second = boxes.copy(), boxes.copy()
-    first[each, axis + 2] = second[each, axis] = middle
+    first[rows, axis + 2] = second[rows, axis] = middle
     if angles is not None:  # pieces rotate about their own centres
         first, second = (_rotated(piece, boxes, angles) for piece in (first, second))
     return np.concatenate([first, second])

@@ -294,7 +294,7 @@ def marker(
     parsed, bits = bits_of(parsed)
     quiet = _quiet_zone(spec, parsed, bits, quiet_zone)
     grid = np.pad(bits, quiet)
-    each = 1 if chosen.mixture == "exact" else min(len(template.gaussians) for template in templates)
+    min_splats = 1 if chosen.mixture == "exact" else min(len(template.gaussians) for template in templates)
     inks = None if black is None and white is None else _inks(parsed, black, white)
     palette = np.array(parsed.colors or (inks or _INKS)[::-1], np.float32)
     surface, old = shape_of(shape), wear_of(wear)
@@ -307,7 +307,7 @@ def marker(
     if chosen.mixture == "facets":
         refuse_more(spec, count_facets(grid.shape), max_splats)
     elif len(palette) == 2 and grid.max() <= 1:
-        refuse_more(spec, minimum_rectangles(grid) * each, max_splats, "at least ")
+        refuse_more(spec, minimum_rectangles(grid) * min_splats, max_splats, "at least ")
     progress("components", 0.0)
     labels, components = label_components(grid)
     progress("rectangles", 0.0)

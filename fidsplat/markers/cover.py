@@ -133,9 +133,9 @@ def _sides(region: shapely.MultiPolygon) -> tuple[np.ndarray, _Sides]:
     gentle = turn <= SHARP
     sides = [_Sides(start, stop, normal, np.where(gentle, turn, 0))]
     for part in (0, np.pi / 2):
-        some = ~gentle & (turn > part)
-        rest = np.minimum(turn[some] - part, np.pi / 2)
-        sides.append(_Sides(stop[some], stop[some], normal[some] - part, rest))
+        sharp = ~gentle & (turn > part)
+        rest = np.minimum(turn[sharp] - part, np.pi / 2)
+        sides.append(_Sides(stop[sharp], stop[sharp], normal[sharp] - part, rest))
     return np.stack([start, stop], 1), _Sides(*(np.concatenate(parts) for parts in zip(*sides, strict=True)))
 
 

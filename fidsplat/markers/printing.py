@@ -214,10 +214,10 @@ def grow(grid: np.ndarray, rectangles: np.ndarray, growth: float) -> np.ndarray:
             moving = np.flatnonzero((left > 0) & (padded[corner[:, 1], corner[:, 0]] == color))
             while len(moving):
                 side = axis[moving] + end
-                each = np.arange(len(moving))
+                rows = np.arange(len(moving))
                 strip = cells[moving]
-                strip[each, axis[moving] + 2 - end] = strip[each, side]
-                strip[each, side] += way
+                strip[rows, axis[moving] + 2 - end] = strip[rows, side]
+                strip[rows, side] += way
                 x0, y0, x1, y1 = strip.T
                 c = color[moving]
                 area = sums[c, y1, x1] - sums[c, y0, x1] - sums[c, y1, x0] + sums[c, y0, x0]

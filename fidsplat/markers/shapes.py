@@ -102,7 +102,7 @@ def visible(
         over = shapely.union_all(geometries[above[above > number]], grid_size=GRID)
         # a shape that only touches the sheet or another shape leaves lines, which further cuts reject
         parts[value].append(_polygons(shapely.difference(painted, over, grid_size=GRID) & sheet))
-    visible = [_polygons(shapely.union_all(some, grid_size=GRID)) for some in parts]
+    visible = [_polygons(shapely.union_all(shapes_of_color, grid_size=GRID)) for shapes_of_color in parts]
     visible[0] = _polygons(shapely.difference(sheet, shapely.union_all(visible[1:]), grid_size=GRID))
     return tuple(visible)
 

@@ -64,7 +64,7 @@ class SheetShape:
 
     def __post_init__(self) -> None:
         python_scalars(self)
-        for name in [each.name for each in fields(self) if each.type == "float"]:
+        for name in [entry.name for entry in fields(self) if entry.type == "float"]:
             number(f"shape: {name}", getattr(self, name), *self.limits.get(name, ()))
         if self.deviation is not None:
             number("shape: deviation", self.deviation, "a positive length in metres, or None", 1e-9)

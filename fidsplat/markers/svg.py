@@ -121,9 +121,9 @@ def _root(path: Path) -> ElementTree.Element:
     try:
         root = ElementTree.fromstring(read_input(path, MAX_BYTES))
     except ElementTree.ParseError as error:
-        raise InputError(f"cannot read {path} as SVG: {error}") from None
+        raise InputError(f"cannot read {path} as SVG: {error}; export it again as SVG") from None
     if _tag(root) != "svg":
-        raise InputError(f"cannot read {path} as SVG: it begins with <{_tag(root)}>")
+        raise InputError(f"cannot read {path} as SVG: it begins with <{_tag(root)}>; export it as SVG")
     return root
 
 

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from fidsplat.render.certified_error import ErrorImage
 
 SceneIndices = Callable[[], np.ndarray] | None
-"""function that returns the scene index, (n,) int32, of each splat of a cloud that is assembled from resident
-chunks; None: the cloud is the complete scene"""
+"""function that returns the scene index, (n,) int32, of each splat of a cloud that is assembled from chunks
+of a store (a scene on disk); None: the cloud is the complete scene"""
 
 
 class ImageMapping(Mapping[str, np.ndarray]):

@@ -1,8 +1,8 @@
 """The output `error`: a certified upper bound of |rgb - ideal| per pixel, for the largest channel.
 
 The ideal is the image without approximations: no alpha cut-off, no early termination (transmittance stop), no
-maximum alpha (opacity ceiling), exact arithmetic. It has the low-pass filter, compositing order, samples per
-pixel and near plane of the requested quality.
+clamp of alpha (opacity ceiling, gsplat's 0.99), exact arithmetic. It has the low-pass filter, compositing
+order, samples per pixel and near plane of the requested quality.
 
 The renderer renders twice: rgb with the requested quality, and a reference image Q, which approximates the
 ideal. Q has no stop and no ceiling, and the cut-off e = `MAX_OMITTED` / n, with n the number of splats. Then
@@ -17,10 +17,11 @@ where the first term is measured, for any requested quality, and the second is b
    of Q and R the range of the colours.
 2. A fragment that Q omits has an alpha below e. There are at most n per pixel: n e R = `MAX_OMITTED` R. The
    radius of a footprint grows with sqrt(ln(1 / e)), so that Q has about twice the fragments of the default.
-3. Interval arithmetic over the rounding of the ray-splat intersection bounds the alpha of a fragment of Q,
-   also where rounding decides whether the fragment exists (at the near plane, at the horizon of the splat's
-   plane, and at the edge of the footprint). Kernels add up T_k times the distance to the farther end of the
-   interval: the output `rounding` (kernels/opencl/output/rounding.cl).
+3. Interval arithmetic over the rounding of the ray-splat intersection returns an interval that contains the
+   exact alpha of a fragment of Q, also where rounding decides whether the fragment exists: at the near plane,
+   where the ray is parallel to the splat's plane, and at the edge of the footprint. Kernels sum T_k times the
+   distance of alpha from the farther end of its interval: the internal output `rounding`
+   (kernels/opencl/output/rounding.cl).
 4. Rounding T changes the colour behind a fragment by at most 2^-24 T C. Rounding the colour sum changes it by
    at most 2^-24 (1 - T) C. C is the largest absolute colour. Both together change it by at most 2^-24 C per
    fragment. Rounding the products T alpha and T alpha c adds at most 2^-24 C each for all fragments of a
@@ -62,25 +63,29 @@ _UNIT_ROUNDOFF = 2.0**-24
 _BOUNDED = frozenset(
     (
         *("camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "stop_inclusive"),
-        *("compose_ordered", "footprint_gaussian", "background_constant", "motion_groups"),
+        *("order_centre", "footprint_gaussian", "background_constant", "motion_groups"),
         *("ellipsoid_ewa", "ellipsoid_ewa_antialiased", "ellipsoids_only"),
         *("arithmetic_precise", "arithmetic_fast"),
     )
 )
-"""effects whose float32 rounding is bounded by the kernels; stop_*: whether the fragment that crosses the
-transmittance stop is composited, compose_*: compositing order, per splat or per pixel"""
+"""effects (features of a frame, declared in fidsplat/effects/catalogue.py) whose float32 rounding the kernels
+bound; stop_*: whether the fragment that crosses the transmittance stop is composited, order_*: whether
+fragments are composited by the depth of their splat's centre or by their own depth"""
 
 _REMEDIES = {
     "camera": ("a distorted or non-pinhole camera", "a pinhole camera"),
     "ellipsoid_exact": ("3D Gaussians with ellipsoid='exact'", "ellipsoid='ewa'"),
     "lowpass_pixel": ("lowpass='pixel'", "lowpass='screen'"),
     "external_depth": ("an external depth image", "a capture without external_depth"),
-    "compose_coplanar": (
+    "order_coplanar": (
         "coplanar groups (of markers, or given by coplanar_groups) with order='pixel'",
         "order='centre'",
     ),
-    "compose_pixel": ("order='pixel'", "order='centre'"),
-    "footprint": ("box splats (markers with mixture='exact')", "markers with mixture='fitted'"),
+    "order_pixel": ("order='pixel'", "order='centre'"),
+    "footprint": (
+        "box splats (hard-edged rectangles, of markers with mixture='exact')",
+        "markers with mixture='fitted'",
+    ),
     "background": ("a gradient or panorama background", "a background of one colour"),
     "shutter": (
         "a shutter with an exposure time or a readout",
@@ -107,7 +112,7 @@ def ideal_quality(quality: Quality, cutoff: float) -> Quality:
         transmittance_stop=0.0,
         opacity_ceiling=1.0,
         stop_rule="inclusive",
-        setup_precision="float64",
+        projection_precision="float64",
     )
 
 
@@ -153,8 +158,8 @@ def error_reference(data: Any, capture: Capture, backend: Backend) -> ErrorRefer
     _refuse_unbounded(capture)
     if not isinstance(data, ResidentData):
         raise InputError(
-            "splats must be in memory for the output 'error', got a store; render store.cloud() if "
-            "it fits into memory, or leave out the output 'error'"
+            "splats must be in memory for the output 'error', got a store (a scene in chunks on disk); "
+            "render store.cloud() if it fits into memory, or leave out the output 'error'"
         )
     quality = ideal_quality(capture.quality, cutoff_of(data.count))
     features, view = _prepared(data, capture, quality, backend)

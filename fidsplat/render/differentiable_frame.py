@@ -53,7 +53,7 @@ class DifferentiableFrame(Frame):
             w x y z, not normalised; `scales` (n, 2) [1/m]; `opacities` (n,); `colors` (n, 3) or `sh`
             (n, k, 3); `thickness` (n,) [1/m], the third scale, if there are 3D Gaussians, 0 for disks. Also
             `background` (3,); `pose` (6,), a rotation vector [1/rad] and a translation [1/m] applied after
-            `world_to_camera`, in camera axes; `screen` (n,), the densification statistic of 2DGS trainers:
+            `world_to_camera`, in camera axes; `grad2d` (n,), the densification statistic of 2DGS trainers:
             the norm of the derivative with respect to the projected centre, in half image sizes. Splats that
             are not rendered have zeros.
 

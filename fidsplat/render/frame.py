@@ -132,8 +132,8 @@ class FrameBatch(ImageMapping):
     (views, h, w, channels), which are copied from the device on first use.
 
     Names, types and units are those of Frame. Masked views are -1 in `label` and `splat_id`, and 0 in all
-    other outputs. View i is bit-identical to `Renderer.render` of that view, except for stores with
-    `detail_error` (`Renderer.render_batch`).
+    other outputs. View i is bit-identical to `Renderer.render` of that view, except for scenes on disk with
+    `detail_error` above 0 (`Renderer.render_batch`).
     """
 
     _noun = "batch"

@@ -1,6 +1,6 @@
 """Lighting of markers: colours of their splats from the light of the scene. Panoramas measure the radiance
-around a marker, and shadow maps the visibility of explicit lights. Box splats (hard-edged rectangles) are
-split where the light changes.
+around a marker, and shadow maps the visibility of `Scene.lights`. Box splats (the hard-edged rectangles of
+which markers consist) are split where the light changes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ PANORAMA_QUALITY = "fast,lowpass=none,samples=2"
 """quality of panoramas; a low-pass filter would enlarge small splats to the size of their coarse pixels"""
 _DARK = 1e-6
 """radiance below which a panorama is black"""
-_CHUNK = 256
+_POINTS_AT_ONCE = 256
 """points whose reflections are computed at once, which bounds memory"""
 _MAX_NORMAL_ANGLE = 0.03
 """maximum angle [rad] between normals of a bent marker that share reflections"""
@@ -101,14 +101,14 @@ class _Environment:
         black = _rebuilt(self.scene.cloud(), rows, colors=np.zeros((len(rows), 3), np.float32))
         return self.renderer.upload(black), float(min(distances.max(), 1e3))
 
-    def panoramas(self, points: np.ndarray, rows: int, near: float, **parts: Any) -> list[Any]:
-        """Render panoramas at points (k, 3), in the axes of the world."""
+    def panoramas(self, points: np.ndarray, rows: int, near: float, **fields: Any) -> list[Any]:
+        """Render panoramas at points (k, 3), in the axes of the world. fields: of the capture."""
         cameras = []
         for point in points:
             pose = np.eye(4)
             pose[:3, 3] = -point
             cameras.append(Camera.equirectangular(2 * rows, rows, pose, near=near))
-        base = self.scene.capture.with_(quality=PANORAMA_QUALITY, **parts)
+        base = self.scene.capture.with_(quality=PANORAMA_QUALITY, **fields)
         captures = [base.with_(camera=camera) for camera in cameras]
         return list(self.renderer.render_views(self.resident, captures))
 
@@ -263,13 +263,13 @@ def _field(
     def radiance_at(grid_positions: np.ndarray) -> np.ndarray:
         nearest = np.array([np.argmin(((positions - grid) ** 2).sum(axis=1)) for grid in grid_positions])
         local_points = points.local[nearest].copy()
-        local_points[:, :2] = grid_positions  # grid points between splats are on the marker's sheet
+        local_points[:, :2] = grid_positions  # a grid point between splats has the z of the nearest one
         panorama_points = local_points @ placed.pose[:3, :3].T + placed.pose[:3, 3]
         panorama_points = panorama_points + max(surface.clearance, 1e-6) * surface.normals[nearest]
-        parts: dict[str, Any] = {"outputs": ("rgb", "alpha")}
+        fields: dict[str, Any] = {"outputs": ("rgb", "alpha")}
         if lighting.ambient is not None:
-            parts["background"] = (0.0, 0.0, 0.0)
-        frames = environment.panoramas(panorama_points, lighting.rows, 1e-4, **parts)
+            fields["background"] = (0.0, 0.0, 0.0)
+        frames = environment.panoramas(panorama_points, lighting.rows, 1e-4, **fields)
         panoramas = []
         for frame in frames:
             radiance = to_light(frame["rgb"], lighting.response).reshape(-1, 3)
@@ -369,8 +369,8 @@ def _reflection_to_camera(
     else:
         viewers = unit(camera.position - surface.points)
     reflected = _highlights(surface.points, surface.normals, viewers[:, None], brdf, incoming.points)[:, 0]
-    for start in range(0, len(viewers) if incoming.field.radiance.any() else 0, _CHUNK):
-        rows = slice(start, start + _CHUNK)
+    for start in range(0, len(viewers) if incoming.field.radiance.any() else 0, _POINTS_AT_ONCE):
+        rows = slice(start, start + _POINTS_AT_ONCE)
         directions, weights = brdf.sample(viewers[rows, None], surface.normals[rows])
         radiance = incoming.field.incoming_radiance(directions[:, 0], points.local[rows, :2])
         reflected[rows] += np.einsum("nk,nkc->nc", weights[:, 0], radiance)
@@ -416,8 +416,8 @@ def _harmonics_of_parts(
         directions, weights = brdf.sample(views[None], normal[None])
         transmitted = 1 - fresnel(views @ normal, brdf.reflectance)
         reflected = incoming.field.reflected(directions[0], weights[0])
-        for start in range(0, len(members), _CHUNK):
-            rows = members[start : start + _CHUNK]
+        for start in range(0, len(members), _POINTS_AT_ONCE):
+            rows = members[start : start + _POINTS_AT_ONCE]
             lights = [(point, visible[rows]) for point, visible in incoming.points]
             viewers = np.broadcast_to(views, (len(rows), *views.shape))
             total = _highlights(positions[rows], normals[rows], viewers, brdf, lights)

@@ -51,7 +51,7 @@ def save_output(
 
 
 def load_output(file: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Read an output image (h, w) that `save_output` wrote as .npy. Raises InputError if it is damaged."""
+    """Read an output image (h, w) that `save_output` wrote as .npy. Raises InputError for an invalid file."""
     try:
         image = load_npy(file)
         if image.shape != shape or image.dtype.kind not in "fi":

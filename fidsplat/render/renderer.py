@@ -104,8 +104,8 @@ class Renderer:
         check_process(self._pid, "Renderer")
         capture = scene.capture if isinstance(scene, Scene) else _DEFAULT_CAPTURE
         scene = self.lit(scene) if isinstance(scene, Scene) else scene
-        stored = Scene(stores=(scene,)) if isinstance(scene, Store) else scene
-        cloud = stored.splats if isinstance(stored, Scene) else stored
+        scene = Scene(stores=(scene,)) if isinstance(scene, Store) else scene
+        cloud = scene.splats if isinstance(scene, Scene) else scene
         if isinstance(cloud, ChunkedSplats):
             return ResidentCloud(self.backend, DeviceChunkCache(cloud, self.backend), capture)
         if not isinstance(cloud, SplatCloud):
@@ -203,7 +203,8 @@ class Renderer:
         ```
 
         Args:
-            scene: disks with colours or spherical harmonics; no store.
+            scene: disks and 3D Gaussians with colours or spherical harmonics; no store (a scene in chunks on
+                disk).
             capture, outputs, quality, **fields: as in `render`. Outputs are some of `rgb`, `alpha`, `depth`
                 and `normal`; docs/gradients.md lists the supported effects.
             distortion: render the image `distortion` (h, w) too: sum over pairs of a pixel's splats of
@@ -326,8 +327,8 @@ class Renderer:
     ) -> FrameBatch:
         """Render many views of one cloud at once. View i is bit-identical to `render` of that view.
 
-        Exception: with stores and `Quality.detail_error` above 0, all views use the finest level of detail
-        that any of them needs.
+        Exception: with stores (scenes in chunks on disk) and `Quality.detail_error` above 0, all views use
+        the finest level of detail that any of them needs.
 
         Args:
             scene: splats to render; a ResidentCloud is not uploaded again.
@@ -416,8 +417,8 @@ class Renderer:
         features, view = prepare(resident.all_splats, capture)
         if band is not None:
             view = _restricted(view, band)
-        bounded = "error" in capture.outputs
-        reference = error_reference(resident.data, capture, self.backend) if bounded else None
+        with_error = "error" in capture.outputs
+        reference = error_reference(resident.data, capture, self.backend) if with_error else None
         with self._lock:  # scratch buffers and kernel arguments belong to one frame at a time
             config, data = self.backend.frame_config(view), resident.data
             pipeline = self.backend.pipeline(features, config)

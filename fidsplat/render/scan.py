@@ -30,16 +30,19 @@ if TYPE_CHECKING:
     from fidsplat.scenes import Scene
     from fidsplat.splats.cloud import SplatCloud
 
-_REFLECTIVITY = 0.1  # reflectivity for which `Lidar.detection_range` is stated
-_ODDS_AT_RANGE = 9  # odds of a detection at that range: a probability of 90 %
-# the odds are proportional to signal^4: a third of the signal is detected with a probability of 10 %
-# minimum alpha of a fragment; fainter ones hardly change the distance at which alpha reaches `Lidar.opacity`
+_REFLECTIVITY = 0.1
+"""reflectivity of the surface that is detected at `Lidar.detection_range`"""
+_ODDS_AT_RANGE = 9
+"""odds of a detection at that range, a probability of 90 %; odds are proportional to signal^4, so that a
+third of the signal is detected with a probability of 10 %"""
 _ALPHA_CUTOFF = 1e-3
+"""minimum alpha of a fragment; fainter ones hardly change the distance at which the accumulated opacity
+reaches `Lidar.opacity`"""
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A LiDAR scan: arrays of beams in the order of firing; r = `Lidar.returns` per beam."""
+    """A LiDAR scan: arrays of beams in the order of firing, with r = len(lidar.returns) returns per beam."""
 
     lidar: Lidar
     start: float
@@ -73,8 +76,8 @@ class Scan:
     def pose_index(self) -> np.ndarray:
         """(beams,) index of the pose of each beam."""
         moving = len(self.poses) > 1
-        pixels = self.lidar.camera(self.start, moving).width * self.lidar.rows_per_band(moving)
-        return self.lidar.pixels(self.start, moving)[:, 0] // pixels
+        band_pixels = self.lidar.camera(self.start, moving).width * self.lidar.rows_per_band(moving)
+        return self.lidar.pixels(self.start, moving)[:, 0] // band_pixels
 
     @cached_property
     def points(self) -> np.ndarray:
@@ -183,7 +186,7 @@ def scan_batch(
     start: float | None = None,
     label: bool = False,
 ) -> list[Scan]:
-    """Scan a scene from many poses in one submission; scan i has the noise of `seed` + i.
+    """Scan a scene from many poses in one submission; scan i has the noise of `scan(..., index=i)`.
 
     Args:
         poses: (v, 7) world from lidar: x y z and a quaternion w x y z.
@@ -225,7 +228,7 @@ class ScanRequest:
 
     lidar: Lidar
     base: Capture
-    """capture of the scene"""
+    """camera and settings of the scene"""
     motion: Motion
     start: float
     label: bool

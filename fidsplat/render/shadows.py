@@ -161,16 +161,16 @@ def visibility(
 def _camera(point: LightPoint, surface: ReceiverPoints, extent: float) -> Camera:
     """Camera of a shadow map, at the light's point; for a sun, beyond all splats."""
     middle, radius = surface.middle, surface.radius
-    inner = int(np.clip(np.ceil(2 * radius / surface.pitch), 8, MAX_PIXELS))
-    side = inner + 2 * _MARGIN
+    marker_side = int(np.clip(np.ceil(2 * radius / surface.pitch), 8, MAX_PIXELS))  # pixels
+    side = marker_side + 2 * _MARGIN
     if isinstance(point.light, Sun):
         pose = look_at_matrix(
             middle - (extent + 2 * radius) * point.position, middle, perpendicular(point.position)[0]
         )
-        return Camera.orthographic(side, side, 2 * radius * side / inner, pose, near=1e-6)
+        return Camera.orthographic(side, side, 2 * radius * side / marker_side, pose, near=1e-6)
     distance = float(np.linalg.norm(middle - point.position))
     tangent = min(radius / np.sqrt(max(distance**2 - radius**2, 1e-12)), _MAX_TANGENT)
-    focal = inner / (2 * tangent)
+    focal = marker_side / (2 * tangent)
     pose = look_at_matrix(point.position, middle, perpendicular(unit(middle - point.position))[0])
     return Camera.pinhole(side, side, focal, focal, side / 2, side / 2, pose, near=min(1e-3, distance / 10))
 
@@ -179,7 +179,7 @@ def _depth_image(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Depth (h, w) of a surface: the plane through points (m, 3), plus their distances from it."""
     pixels = camera.project(points)
     z = (points - camera.position) @ camera.world_to_camera[2, :3]
-    inverse = not isinstance(camera.lens, Orthographic)
+    inverse = not isinstance(camera.lens, Orthographic)  # 1 / z of a plane is affine in the pixel
     value = 1 / np.maximum(z, 1e-9) if inverse else z
     inside = np.isfinite(pixels).all(axis=1)
     pixels, value = pixels[inside], value[inside]

@@ -108,9 +108,9 @@ def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = 
     height, width = patch.shape
     focal = {"fx": camera.fx / step, "fy": camera.fy / step}
     center = {"cx": in_patch(camera.cx, left), "cy": in_patch(camera.cy, top)}
-    window = replace(camera, width=width, height=height, **focal, **center)
+    patch_camera = replace(camera, width=width, height=height, **focal, **center)
     patch_pixel = in_patch(pixel[0], left), in_patch(pixel[1], top)
-    return _fit_patch(patch, window, patch_pixel, pixels / step, metres)
+    return _fit_patch(patch, patch_camera, patch_pixel, pixels / step, metres)
 
 
 def median_depth_capture(capture: Capture, *outputs: str) -> Capture:

@@ -163,17 +163,17 @@ class DistanceField:
 
 def _append_faces(value: np.ndarray, first: np.ndarray, quads: list[np.ndarray]) -> None:
     """Append the cells (n, 4) around each voxel edge that the surface crosses, as counter-clockwise faces."""
-    own = value[:, :BLOCK_SIDE, :BLOCK_SIDE, :BLOCK_SIDE]
+    values = value[:, :BLOCK_SIDE, :BLOCK_SIDE, :BLOCK_SIDE]
     for axis in range(3):
         step = np.eye(3, dtype=int)[axis]
-        other = value[_cells_from(tuple(step))]
+        next_values = value[_cells_from(tuple(step))]  # of the neighbours along the axis
         with np.errstate(invalid="ignore"):
-            crosses = np.isfinite(own) & np.isfinite(other) & ((own < 0) != (other < 0))
+            crosses = np.isfinite(values) & np.isfinite(next_values) & ((values < 0) != (next_values < 0))
         block, *position = np.nonzero(crosses)
         cell = first[block] + np.stack(position, 1)
         u, v = np.eye(3, dtype=np.int64)[(axis + 1) % 3], np.eye(3, dtype=np.int64)[(axis + 2) % 3]
         around = _key(np.stack([cell, cell - u, cell - u - v, cell - v], 1))
-        outwards = (own[crosses] < 0)[:, None]
+        outwards = (values[crosses] < 0)[:, None]
         quads.append(np.where(outwards, around, around[:, ::-1]))
 
 

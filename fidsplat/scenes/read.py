@@ -102,12 +102,12 @@ def read_scene(
     on_disk = [table for table in tables if table.text("file").lower().endswith(SUFFIX)]
     load = cache(lambda name: load_splats(file.parent / name, progress))
     splats, markers, total = [], [], 0
-    for one in tables:
-        if one not in on_disk:
-            splats.append(_splats(one, load))
+    for table in tables:
+        if table not in on_disk:
+            splats.append(_splats(table, load))
             total = _checked_total(file, total, splats[-1][0])
-    for one in top.tables("markers", MARKERS):
-        markers.append(_marker(one, file.parent, marker_quality, progress))
+    for table in top.tables("markers", MARKERS):
+        markers.append(_marker(table, file.parent, marker_quality, progress))
         total = _checked_total(file, total, markers[-1].marker.cloud)
     return dict(
         clouds=tuple(cloud for cloud, _ in splats),
@@ -142,11 +142,13 @@ def _parse(file: Path) -> dict:
             f"{file} is not a scene file: it is not text in UTF-8; load_splats reads splats"
         ) from None
     except RecursionError:
-        raise InputError(f"{file} is not a scene file: its lists are nested too deeply") from None
+        raise InputError(
+            f"{file} is not a scene file: its lists are nested too deeply; docs/scene-files.md has the format"
+        ) from None
     except InputError:
         raise
     except ValueError as error:  # TOMLDecodeError, or int() of a number of thousands of digits
-        raise InputError(f"{file} is not a scene file in TOML: {error}") from None
+        raise InputError(f"{file} is not a scene file in TOML: {error}; correct this line") from None
 
 
 def _camera(table: Table, first: np.ndarray | None) -> Camera:

@@ -26,5 +26,5 @@ def sampled(cloud: SplatCloud | Store) -> SplatCloud:
     chunks = np.flatnonzero(np.tile(cloud.nodes["level"] == 0, cloud.instances))
     if not len(chunks):
         return SplatCloud.empty()
-    some = chunks[np.linspace(0, len(chunks) - 1, min(len(chunks), CHUNKS)).astype(int)]
-    return PartialCloud.of(concatenated([cloud.load(int(number)) for number in some]), cloud)
+    sample = chunks[np.linspace(0, len(chunks) - 1, min(len(chunks), CHUNKS)).astype(int)]
+    return PartialCloud.of(concatenated([cloud.load(int(number)) for number in sample]), cloud)

@@ -204,8 +204,8 @@ class Digest:
     @classmethod
     def of(cls, images: Mapping[str, np.ndarray]) -> Digest:
         """Digests of the images of `OUTPUTS`."""
-        each = {name: _sha256(images[name])[:8] for name in OUTPUTS}
-        return cls(_sha256(*(images[name] for name in OUTPUTS)), each)
+        outputs = {name: _sha256(images[name])[:8] for name in OUTPUTS}
+        return cls(_sha256(*(images[name] for name in OUTPUTS)), outputs)
 
     def differing(self, other: Digest) -> list[str]:
         """Names of the outputs whose digests differ."""

@@ -65,8 +65,8 @@ def grazing_errors(renderer: Renderer, tilt: float, sigma: int, quality: Quality
     spec = FrameSpec(cloud, view, quality, ("rgb", "alpha"))
     alpha = render(renderer, spec)["alpha"]
     covered = np.nonzero(alpha > 0)
-    some = generator.permutation(len(covered[0]))[:4000]
-    covered = covered[0][some], covered[1][some]
+    sampled = generator.permutation(len(covered[0]))[:4000]
+    covered = covered[0][sampled], covered[1][sampled]
     truth = reference_images(spec, covered)["alpha"]
     errors = np.abs(alpha[covered] - truth)[truth > 0.004]
     return errors

@@ -31,13 +31,13 @@ def case_table(result: CheckResult) -> Table:
 
 
 def _case_row(letter: str, results: list[CaseResult]) -> tuple[str, ...]:
-    cells = [f"{letter} {GROUPS[letter]}", str(len(results)), str(sum(one.frames for one in results))]
+    cells = [f"{letter} {GROUPS[letter]}", str(len(results)), str(sum(case.frames for case in results))]
     for outputs in (("rgb", "alpha"), ("depth",)):
-        for errors in ("largest", "uncertified"):
-            maxima = [getattr(one, errors) for one in results]
-            values = [one[name] for one in maxima for name in outputs if name in one]
+        for kind in ("largest", "uncertified"):
+            maxima = [getattr(case, kind) for case in results]
+            values = [errors[name] for errors in maxima for name in outputs if name in errors]
             cells.append(f"{max(values, key=rank_of):.0e}" if values else "-")
-    return (*cells, "ok" if all(one.passed for one in results) else "failed")
+    return (*cells, "ok" if all(case.passed for case in results) else "failed")
 
 
 def digest_table(seeds: Iterable[int], differing: Mapping[int, Sequence[str]], device: str) -> Table:

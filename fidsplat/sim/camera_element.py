@@ -59,7 +59,7 @@ def parse(path: str | os.PathLike[str]) -> tuple[ElementTree.Element, ElementPat
     except InputError:
         raise
     except (ElementTree.ParseError, LookupError, ValueError) as error:  # or an unknown encoding
-        raise InputError(f"cannot read {file} as XML: {error}") from None
+        raise InputError(f"cannot read {file} as XML: {error}; correct the file") from None
     for element in root.iter():
         if "ros.org/wiki/xacro" in str(element.tag):
             raise InputError(

@@ -123,7 +123,7 @@ class ActiveStereo(DepthCamera):
         nearest = max(self.near, camera.fx * self.baseline / self.max_disparity)
         middle = _projector(camera, self.baseline / 2, nearest)
         cameras = (camera, _shifted(camera, self.baseline), middle)
-        views = [_view(renderer, scene, each) for each in cameras]
+        views = [_view(renderer, scene, view_camera) for view_camera in cameras]
         dots = rng.integers(0, 2, (1024, 1024))  # the device's pattern; each frame has another one
         lights = [self._light(views[i], cameras[i], middle, views[2].depth, dots) for i in (0, 1)]
         middle_half = lights[0][tuple(slice(n // 4, n - n // 4) for n in lights[0].shape)]

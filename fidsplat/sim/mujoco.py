@@ -91,10 +91,10 @@ class MujocoRig(SimulatorRig):
     def poses(self, data: Any) -> tuple[np.ndarray, np.ndarray]:
         """Poses of bodies (env, body, 7) and of cameras (env, camera, 7), OpenCV axes. data: as in
         `render`."""
-        many = data if isinstance(data, list | tuple) else [data]
-        if not many:
+        environments = data if isinstance(data, list | tuple) else [data]
+        if not environments:
             raise InputError("data must have at least one MjData, got an empty list")
-        parts = [_arrays_of(each, *self._counts) for each in many]
+        parts = [_arrays_of(environment, *self._counts) for environment in environments]
         position, rotation, at, axes = (np.concatenate([part[k] for part in parts]) for k in range(4))
         bodies = np.concatenate([position, rotation], -1)[:, self._body_ids]
         camera_rotation = quaternion_multiply(

@@ -339,10 +339,10 @@ class RigImages(Mapping):
                         f"the camera {camera!r} must render {name!r}, got {', '.join(batch)}; add it to "
                         "its outputs"
                     )
-            each = [batch[name] for batch in self._batches.values()]
+            images = [batch[name] for batch in self._batches.values()]
             # images of a single camera are not copied: for thousands of environments this would take longer
             # than rendering
-            stacked = each[0][:, None] if len(each) == 1 else np.stack(each, axis=1)
+            stacked = images[0][:, None] if len(images) == 1 else np.stack(images, axis=1)
             stacked.flags.writeable = False
             self._arrays[name] = stacked
         return self._arrays[name]

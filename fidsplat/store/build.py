@@ -68,8 +68,8 @@ def build_store(
     settings = settings_with(BuildSettings, settings, changes)
     progress = progress or no_progress
     if is_streamed(inputs):
-        one = inputs if isinstance(inputs, (str, os.PathLike)) else inputs[0]
-        import_streamed(path_of(cast("str", one)), folder, progress)
+        source = inputs if isinstance(inputs, (str, os.PathLike)) else inputs[0]
+        import_streamed(path_of(cast("str", source)), folder, progress)
         return folder
     plan = plan_build(open_sources(inputs), settings)
     with staged(folder) as part:

@@ -112,8 +112,8 @@ class ChunkedSplats:
         qualities; 0: exact. Raises InputError if a store's levels of detail were not measured."""
         if not all(quality.detail_error for quality in qualities):
             return 0.0
-        each = ([store.cell_sizes(quality) for quality in qualities] for store in self.stores)
-        return tuple(tuple(np.min(sizes, axis=0).tolist()) for sizes in each)
+        sizes_by_store = ([store.cell_sizes(quality) for quality in qualities] for store in self.stores)
+        return tuple(tuple(np.min(sizes, axis=0).tolist()) for sizes in sizes_by_store)
 
     # index: boxes, counts and subchunks of nodes
 
@@ -125,10 +125,11 @@ class ChunkedSplats:
     @cached_property
     def pinned(self) -> NodeMasks:
         """Masks of chunks with coplanar groups, which are part of every frame."""
-        each = ((store, store.nodes) for store in self.stores)
         return tuple(
-            np.tile((nodes["level"] == 0) & (nodes["first"] >= store.header.pinned), store.instances)
-            for store, nodes in each
+            np.tile(
+                (store.nodes["level"] == 0) & (store.nodes["first"] >= store.header.pinned), store.instances
+            )
+            for store in self.stores
         )
 
     def boxes(self, number: int, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
@@ -139,13 +140,13 @@ class ChunkedSplats:
 
     def subchunks(self, masks: NodeMasks) -> list[Subchunks]:
         """Subchunks of selected nodes, for each store."""
-        every = zip(self._subchunk_tables, masks, strict=True)
-        return [table.of(np.flatnonzero(mask)) for table, mask in every]
+        tables = zip(self._subchunk_tables, masks, strict=True)
+        return [table.of(np.flatnonzero(mask)) for table, mask in tables]
 
     @cached_property
     def _subchunk_tables(self) -> list[SubchunkTable]:
-        each = zip(self.stores, self.pinned, strict=True)
-        return [SubchunkTable(store, store.origin - self.origin, pinned) for store, pinned in each]
+        pairs = zip(self.stores, self.pinned, strict=True)
+        return [SubchunkTable(store, store.origin - self.origin, pinned) for store, pinned in pairs]
 
     # splats of a selection
 

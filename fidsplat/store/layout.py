@@ -125,7 +125,9 @@ def read_header(folder: Path) -> Header:
         content = from_json(read_input(file))
     except InputError as error:
         if not file.exists():
-            raise InputError(f"{folder} is not a store: it has no {HEADER}") from None
+            raise InputError(
+                f"{folder} is not a store: it has no {HEADER}; build one by `fidsplat store build`"
+            ) from None
         raise error
     except ValueError:
         raise InputError(f"{file} is damaged: it is not JSON; build the store again") from None
@@ -140,7 +142,7 @@ def read_header(folder: Path) -> Header:
     try:
         if content.get("crc") != header_crc(content):
             raise ValueError("its checksum differs")
-        known: dict[str, Any] = {each.name: content[each.name] for each in fields(Header)}
+        known: dict[str, Any] = {field.name: content[field.name] for field in fields(Header)}
         known |= {name: tuple(known[name]) for name in ("sources", "origin")}
         header = Header(**known)
         _check(header)

@@ -56,11 +56,12 @@ class SubchunkTable:
         """The subchunks of nodes (k,), by number."""
         store = self._store
         instances, own_nodes = np.divmod(numbers, max(len(store.nodes), 1))
-        each = [self._boxes(node) for node in own_nodes.tolist()]
-        counts = np.array([len(max_sigma) for _, _, max_sigma in each], np.int64)
+        boxes = [self._boxes(node) for node in own_nodes.tolist()]
+        counts = np.array([len(max_sigma) for _, _, max_sigma in boxes], np.int64)
         nodes, instance = np.repeat(numbers, counts), np.repeat(instances, counts)
-        low, high = (np.concatenate([np.empty((0, 3)), *(one[corner] for one in each)]) for corner in (0, 1))
-        max_sigma = np.concatenate([np.empty(0), *(one[2] for one in each)])
+        low = np.concatenate([np.empty((0, 3)), *(low for low, _, _ in boxes)])
+        high = np.concatenate([np.empty((0, 3)), *(high for _, high, _ in boxes)])
+        max_sigma = np.concatenate([np.empty(0), *(max_sigma for _, _, max_sigma in boxes)])
         if store.poses is not None:
             low, high = store.instance_boxes(low, high, instance)
         first = ROWS * (np.arange(len(nodes)) - np.repeat(np.cumsum(counts) - counts, counts))

@@ -17,7 +17,7 @@ from fidsplat.store.chunked_splats import ChunkedSplats, NodeMasks
 from fidsplat.streaming.frustum_culling import PADDING, Boxes, CameraBoxes, Extent, ewa_extent
 
 _DEPTH_RANGE = 3.33
-"""standard deviations within which the depth of a splat's fragments varies (slot/compose_pixel.cl)"""
+"""standard deviations within which the depth of a splat's fragments varies (slot/order_pixel.cl)"""
 
 
 def is_supported(view: View, features: FeatureSet) -> bool:
@@ -29,7 +29,7 @@ def min_sort_keys(view: View, features: FeatureSet, boxes: Boxes) -> np.ndarray:
     """Lower bound (n,) of the sort keys, which are depths [m], of the splats in each box."""
     extent = _extent(view, features)
     assert extent is not None  # the caller has checked `is_supported`
-    if not {"compose_ordered", "compose_coplanar"}.isdisjoint(features.names):
+    if not {"order_centre", "order_coplanar"}.isdisjoint(features.names):
         return CameraBoxes(view, *boxes(0.0)).nearest(view)
     return extent.nearest(view, CameraBoxes(view, *boxes(extent.depth_radius)))
 

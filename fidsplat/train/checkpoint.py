@@ -95,7 +95,9 @@ def splats_of(file: Path) -> tuple[SplatCloud, tuple[float, float, float]]:
         axes = 3 if facts["settings"]["primitive"] == "3d" else 2
         splats = Splats.of(_group(arrays, "values", len(arrays["values.means"]), degree, axes))
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise InputError(f"cannot read {file} as a checkpoint of `fidsplat train`: {error}") from error
+        raise InputError(
+            f"cannot read {file} as a checkpoint of `fidsplat train`: {error}; remove it to start again"
+        ) from error
     values, (red, green, blue) = splats.values, background.tolist()
     with np.errstate(over="ignore"):  # the cloud drops splats whose scales overflow
         shapes = values["means"], values["quats"], splats.scales, splats.opacities

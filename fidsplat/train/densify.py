@@ -1,7 +1,7 @@
 """Densification of 3DGS and 2DGS (Kerbl et al. 2023, section 5.2): clone, split and prune splats.
 
-A splat with a large mean screen gradient is cloned or split. Other splats keep their order and new ones are
-appended, so that a run is reproducible.
+A splat with a large mean screen-space gradient is cloned or split. Other splats keep their order and new ones
+are appended, so that a run is reproducible.
 """
 
 from __future__ import annotations

@@ -97,7 +97,7 @@ class DeviceModel:
         return pipeline.backward_per_tile(images, gradients)
 
     def accumulate_statistics(self, by_tiles: Any, camera: Camera, origin: np.ndarray) -> None:
-        """Add screen gradients and visibility to the densification statistics."""
+        """Add screen-space gradients and visibility to the densification statistics."""
         self._kernels.accumulate_statistics(by_tiles, camera, origin)
 
     def step(

@@ -90,9 +90,9 @@ class HostModel:
         return pipeline.backward(images, gradients)
 
     def accumulate_statistics(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
-        """Add screen gradients and visibility to the densification statistics."""
+        """Add screen-space gradients and visibility to the densification statistics."""
         splats = self._splats
-        splats.gradient_sums += on_host(gradients["screen"])
+        splats.gradient_sums += on_host(gradients["grad2d"])
         splats.visible_counts += visible(splats, camera, origin)
 
     def step(

@@ -44,7 +44,7 @@ class Splats:
     second: Arrays
     """Adam's second moments"""
     gradient_sums: np.ndarray
-    """(n,) sums of screen gradients since the last densification"""
+    """(n,) sums of screen-space gradients since the last densification"""
     visible_counts: np.ndarray
     """(n,) number of frames since then in which the splat was visible"""
 

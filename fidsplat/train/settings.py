@@ -50,8 +50,8 @@ class TrainSettings:
     primitive: str = "2d"
     """`2d`: disks, as 2DGS; `3d`: 3D Gaussians, as 3DGS, in the projection of `quality`"""
     strategy: str = "default"
-    """`default`: clone, split and prune by screen gradients, as 2DGS; `mcmc`: relocation of dead splats,
-    growth up to `max_splats`, and noise"""
+    """`default`: clone, split and prune by screen-space gradients, as 2DGS; `mcmc`: relocation of dead
+    splats, growth up to `max_splats`, and noise"""
     max_splats: int = 1_000_000
     """maximum number of splats; the default strategy then clones and splits those of the largest gradients"""
     quality: str = "surfel"
@@ -123,7 +123,7 @@ class TrainSettings:
     densify_every: int = 100
     """iterations between densifications"""
     gradient_threshold: float = 2e-4
-    """mean screen gradient, in half images, above which a splat is cloned or split"""
+    """mean screen-space gradient, in half images, above which a splat is cloned or split"""
     dense_share: float = 0.01
     """scale, relative to the scene extent, up to which splats are cloned; larger ones are split"""
     prune_opacity: float = 0.05

@@ -67,7 +67,9 @@ def _table(file: Path) -> dict[str, Any]:
     except InputError:
         raise
     except ValueError as error:
-        raise InputError(f"cannot read {file} as a transforms.json: {error}") from None
+        raise InputError(
+            f"cannot read {file} as a transforms.json: {error}; export the data set again"
+        ) from None
     return table
 
 

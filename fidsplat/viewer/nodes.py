@@ -56,9 +56,9 @@ class Nodes:
         for node in self._frusta:
             node.remove()
         poses = list(poses)
-        some = poses[:: max(1, -(-len(poses) // _MANY))]
+        shown = poses[:: max(1, -(-len(poses) // _MANY))]
         self._frusta = [
-            self._frustum(f"/keyframes/{k}", camera, pose, _KEYFRAME, 0.05) for k, pose in enumerate(some)
+            self._frustum(f"/keyframes/{k}", camera, pose, _KEYFRAME, 0.05) for k, pose in enumerate(shown)
         ]
 
     def show_gizmo(

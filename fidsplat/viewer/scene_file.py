@@ -123,7 +123,7 @@ def with_marker(text: str, block: str, name: str) -> str:
         InputError: the file declares its markers in another way; the message names it.
     """
     new = f"{text.rstrip()}\n\n{block}" if text.strip() else block
-    before, table, after = (_parsed(one) for one in (text, block, new))
+    before, table, after = (_parsed(content) for content in (text, block, new))
     if before is None or after != before | {"markers": [*before.get("markers", ()), *table["markers"]]}:
         lines = ", ".join(line for line in block.splitlines()[1:] if line)
         raise InputError(f"{name}: markers must be [[markers]] tables; write there yourself: {lines}")

@@ -158,5 +158,8 @@ def _npm(words: list[str]) -> str:
         )
     done = interrupts.run([program, *words])
     if done.returncode != 0:
-        raise InputError(f"npm cannot download playcanvas {VERSION}: {done.stderr.strip()[-300:]}")
+        raise InputError(
+            f"npm cannot download playcanvas {VERSION}: {done.stderr.strip()[-300:]}; check the network, or "
+            f"set {ENGINE} to the path of its playcanvas.min.js"
+        )
     return done.stdout

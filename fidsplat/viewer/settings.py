@@ -160,7 +160,7 @@ class Settings:
         coarse = quality.with_(
             alpha_cutoff=max(quality.alpha_cutoff, _MOVING.alpha_cutoff),
             transmittance_stop=max(quality.transmittance_stop, _MOVING.transmittance_stop),
-            setup_precision=_MOVING.setup_precision,
+            projection_precision=_MOVING.projection_precision,
             arithmetic=_MOVING.arithmetic,
             blend_precision=_MOVING.blend_precision,
             samples=1,

@@ -60,5 +60,5 @@ def choose_frames(sharpness: np.ndarray, motion: np.ndarray, count: int) -> list
     parts = min(count, max(FEW, parts)) if parts >= 3 else 1
     part = np.minimum((path / max(path[-1], 1e-9) * parts).astype(int), parts - 1)
     return sorted(
-        int(max(np.flatnonzero(part == each), key=lambda i: sharpness[i])) for each in np.unique(part)
+        int(max(np.flatnonzero(part == number), key=lambda i: sharpness[i])) for number in np.unique(part)
     )

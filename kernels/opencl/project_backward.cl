@@ -19,7 +19,7 @@ kernel __attribute__((reqd_work_group_size(POSE_ITEMS, 1, 1))) void project_back
         for (int k = 0; k < 4; k++) grad_quats[4 * i + k] = splat_grad.quat[k];
         for (int k = 0; k < 2; k++) grad_scales[2 * i + k] = splat_grad.scale[k];
         grad_opacities[i] = splat_grad.opacity;
-        screen[i] = splat_grad.screen;
+        grad2d[i] = splat_grad.grad2d;
 //@@ footprint_results
         global float *grad_terms = GRAD_COEFFICIENTS + (size_t)i * SH_COEFFICIENTS * 3;
         for (int k = 0; k < SH_COEFFICIENTS; k++)

@@ -38,7 +38,7 @@ static inline real3_ rotate_to_world(global const View *view, real3_ v) {
 typedef struct {            // gradients with respect to the parameters of one splat
     float mean[3], quat[4], scale[2], opacity;
     float color[3], basis[SH_COEFFICIENTS];    // by coefficient k of the colour: basis[k] times `color`
-    float screen;
+    float grad2d;
     real grad_camera[10];     // contribution to the gradient of the pose, of fx, fy, cx and cy
 //@@ footprint_gradient
 } SplatGradient;
@@ -102,7 +102,7 @@ static inline SplatGradient splat_gradient(
     splat_grad.grad_camera[9] = dot3(grad_tv, tw);
     // by the projected centre, in half images
     real across_x = grad_tu.z * view->width, across_y = grad_tv.z * view->height;
-    splat_grad.screen = (float)(REAL(0.5) * pz * sqrt(across_x * across_x + across_y * across_y));
+    splat_grad.grad2d = (float)(REAL(0.5) * pz * sqrt(across_x * across_x + across_y * across_y));
 //@@ disk_backward
 //@@ ellipsoid_backward
     real grad_su = dot3(grad_a, unit_a), grad_sv = dot3(grad_b, unit_b);

@@ -25,7 +25,7 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
             , activated_thickness
 #endif
         );
-        if (add_statistics) gradient_sums[i] += splat_grad.screen;
+        if (add_statistics) gradient_sums[i] += splat_grad.grad2d;
         for (int k = 0; k < 3; k++) grad_means[3 * item + k] = splat_grad.mean[k];
         for (int k = 0; k < 2; k++) grad_scales[AXES * item + k] = splat_grad.scale[k];
 #if AXES == 3

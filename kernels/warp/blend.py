@@ -28,7 +28,7 @@ def samples_each(effects: tuple[str, ...]) -> int:
     """Samples per thread on a GPU: two in a column, for which a record is read once; one with a lens, a
     k-buffer or coplanar layers.
     """
-    return 2 if {"rays", "compose_pixel", "compose_coplanar"}.isdisjoint(effects) else 1
+    return 2 if {"rays", "order_pixel", "order_coplanar"}.isdisjoint(effects) else 1
 
 
 @cache
@@ -67,7 +67,7 @@ def make_blend(
     bent, curved, layered = (
         "rays" in effects,
         intersect_derivatives is not None,
-        "compose_coplanar" in effects,
+        "order_coplanar" in effects,
     )
 
     @wp.func

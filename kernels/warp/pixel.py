@@ -32,8 +32,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
     layout = RecordLayout(effects, outputs)
     each = layout.lines
     exclusive, has_depth, k_buffered, layered, bent = (
-        name in effects
-        for name in ("stop_exclusive", "ray_depth", "compose_pixel", "compose_coplanar", "rays")
+        name in effects for name in ("stop_exclusive", "ray_depth", "order_pixel", "order_coplanar", "rays")
     )
     boxes, opaque = any(name in effects for name in BOXES), "external_depth" in effects
     rays = make_rays(bent, "rays_length" in effects, bent and boxes, opaque)

@@ -50,7 +50,7 @@ def make_project(
     lines_each = layout.lines
     has_depth, screen, filtered, k_buffered, layers = (
         name in effects
-        for name in ("ray_depth", "lowpass_screen", "lowpass_pixel", "compose_pixel", "compose_coplanar")
+        for name in ("ray_depth", "lowpass_screen", "lowpass_pixel", "order_pixel", "order_coplanar")
     )
     recorded = output.having(outputs, "project")
     projects = output.functions(recorded, "project")

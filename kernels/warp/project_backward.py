@@ -107,7 +107,7 @@ def make_project_backward(
         grad_thickness: wp.array(dtype=wp.float32),  # for clouds with 3D Gaussians
         grad_opacities: wp.array(dtype=wp.float32),
         grad_colors: wp.array(dtype=wp.vec3),
-        screen: wp.array(
+        grad2d: wp.array(
             dtype=wp.float32
         ),  # norm of the gradient with respect to the projected centre, in half images
         grad_cameras: wp.array(dtype=TEN),
@@ -120,7 +120,7 @@ def make_project_backward(
         if wp.static(has_gaussians):
             grad_thickness[i] = 0.0
         grad_opacities[i] = 0.0
-        screen[i] = 0.0
+        grad2d[i] = 0.0
         grad_cameras[i] = TEN()
         for k in range(terms):
             grad_colors[i * terms + k] = wp.vec3()
@@ -217,7 +217,7 @@ def make_project_backward(
         # with respect to the projected centre, in half images
         across = wp.float64(view.width) * grad_p[0] * per_x
         down = wp.float64(view.height) * grad_p[1] * per_y
-        screen[i] = float(_HALF * p[2] * wp.sqrt(across * across + down * down))
+        grad2d[i] = float(_HALF * p[2] * wp.sqrt(across * across + down * down))
         # images depend on fx x + cx z and fy y + cy z of a, b and p
         grad_fx = per_x * (grad_a[0] * a[0] + grad_b[0] * b[0] + grad_p[0] * p[0])
         grad_fy = per_y * (grad_a[1] * a[1] + grad_b[1] * b[1] + grad_p[1] * p[1])
@@ -251,7 +251,7 @@ def make_project_backward(
                 if wp.static(exact):
                     across = wp.float64(view.width) * grad_p[0] * per_x
                     down = wp.float64(view.height) * grad_p[1] * per_y
-                    screen[i] = float(_HALF * p[2] * wp.sqrt(across * across + down * down))
+                    grad2d[i] = float(_HALF * p[2] * wp.sqrt(across * across + down * down))
         grad_scales[i] = wp.vec2(
             wp.where(size[0] >= SMALLEST_SCALE, float(grad_su), 0.0),
             wp.where(size[1] >= SMALLEST_SCALE, float(grad_sv), 0.0),

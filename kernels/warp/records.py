@@ -21,7 +21,7 @@ _WHOLE = {
 _EXTRA = {
     "lowpass_screen": ("lowpass_x", "lowpass_y"),
     "ray_depth": ("z_numerator", "z_center", "z_reach"),
-    "compose_pixel": ("nearest",),
+    "order_pixel": ("nearest",),
     "ellipsoid_exact": ("ellipsoid_term",),
 }
 

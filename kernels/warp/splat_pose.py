@@ -15,7 +15,7 @@ from .records import BOXES
 def make_splat_pose(effects: tuple[str, ...], real) -> SimpleNamespace:
     """Make pose, tangents, depth_range, and the struct Moving of moving groups."""
     moves, k_buffered, layers = (
-        name in effects for name in ("motion_groups", "compose_pixel", "compose_coplanar")
+        name in effects for name in ("motion_groups", "order_pixel", "order_coplanar")
     )
     screen = "lowpass_screen" in effects
     boxes_too = any(name in effects for name in BOXES)

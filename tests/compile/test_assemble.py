@@ -26,7 +26,7 @@ SHARED_FILES = {
     *("prelude", "math", "bounds", "project", "splat", "blend", "part/conic", "part/perspective"),
     *("part/resolve_pixel", "slot/arithmetic_fast", "slot/camera_pinhole"),
     "part/blend_float",
-    *("slot/color_rgb", "slot/compose_ordered"),
+    *("slot/color_rgb", "slot/order_centre"),
 }
 """kernel files of a scene without effects, on all devices"""
 SCHEDULE_FILES = {

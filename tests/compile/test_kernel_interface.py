@@ -62,7 +62,7 @@ def offsets_on(backend, source: KernelSource) -> dict[str, dict[str, int]]:
 def test_records_have_equal_layouts_on_host_and_device(renderer, name):
     requested = combination(SETS[name])
     if not renderer.device.float64:
-        pytest.skip("records of a device without float64 are those of `setup_precision` float32")
+        pytest.skip("records of a device without float64 are those of `projection_precision` float32")
     features = requested.features()
     if name == "double":
         quality = requested.capture.quality.with_(blend_precision="float64")

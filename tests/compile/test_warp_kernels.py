@@ -9,7 +9,7 @@ from fidsplat.backends.warp import runtime
 from fidsplat.effects import OUTPUTS
 
 wp = pytest.importorskip("warp")
-RECORD = ("lowpass_screen", "ray_depth", "compose_pixel", "compose_coplanar")
+RECORD = ("lowpass_screen", "ray_depth", "order_pixel", "order_coplanar")
 MIXED = (*RECORD, "footprint_mixed")
 NORMAL = ("normal",)
 OF_BOXES = ("edges", "cover")

@@ -266,12 +266,12 @@ def test_refusals_name_what_was_requested(cloud, parts, effect, remedy):
     capture = fs.Capture(SMALL, OUTPUTS).with_(**parts)
     with pytest.raises(InputError, match=f"on warp:cpu, got {effect}.*; render with .*{remedy}") as caught:
         fs.Renderer("warp:cpu").render(clouds[cloud](), capture)
-    assert not re.search("compose_|footprint_|lowpass_|camera_|ellipsoid_|shutter_|slot", str(caught.value))
+    assert not re.search("order_|footprint_|lowpass_|camera_|ellipsoid_|shutter_|slot", str(caught.value))
 
 
 def test_every_effect_without_a_bound_has_words():
     """Effects of the catalogue that a scene may request, outputs and steps of sensors left out."""
-    kinds = ("camera", "color", "ellipsoid", "lowpass", "compose", "footprint", "background", "shutter")
+    kinds = ("camera", "color", "ellipsoid", "lowpass", "order", "footprint", "background", "shutter")
     names = {name for name in CATALOGUE if name.startswith(kinds)} | {"external_depth", "blend_double"}
     words = {name: certified_error._remedy_of(name)[0] for name in names - certified_error._BOUNDED}
     assert {name for name, message in words.items() if message == name} == set()

@@ -65,7 +65,7 @@ def test_images_follow_their_scenes(renderer, kind, name, way):
     lens = LENSES[name]
     if kind == "ewa" and name in ("brown_conrady", "fisheye"):
         pytest.skip("through lenses 3D Gaussians are exact")
-    quality = fs.Quality(ellipsoid="exact" if kind == "exact" else "ewa", setup_precision="float64")
+    quality = fs.Quality(ellipsoid="exact" if kind == "exact" else "ewa", projection_precision="float64")
     parts, images = arrays(kind != "disks"), {}
     for each in ("as it is", way):
         frame = renderer.render(cloud(parts, each), camera(each, lens), ALL_OUTPUTS, quality=quality)

@@ -57,7 +57,7 @@ NUMBERS = {
     ("transmittance_stop", "1/512"): (0.9, 0.02),
     ("transmittance_stop", "0"): (1.2, 0.02),
     ("opacity_ceiling", "0.99"): (1.0, 0.03),
-    ("setup_precision", "float32"): (1.01, 0.02),
+    ("projection_precision", "float32"): (1.01, 0.02),
     ("arithmetic", "fast"): (1.0, 0.002),
     ("lowpass", "none"): (0.7, 0.5),
     (ABLATION, "exact"): (2.0, 1e-6),
@@ -106,7 +106,7 @@ def write(folder, records: list[Record]) -> None:
         (("transmittance_stop", "1/512"), "faster"),
         (("transmittance_stop", "0"), "slower"),
         (("opacity_ceiling", "0.99"), "dominated"),
-        (("setup_precision", "float32"), "no difference"),
+        (("projection_precision", "float32"), "no difference"),
         (("arithmetic", "fast"), "more accurate"),
     ],
 )

@@ -30,7 +30,7 @@ def test_the_catalogue_is_complete():
 
 def test_case_b1_detects_a_float32_setup(renderer):
     """Errors are more than ten times larger."""
-    single = QUALITY.with_(setup_precision="float32")
+    single = QUALITY.with_(projection_precision="float32")
     error = grazing_errors(renderer, 85.0, 3, single).max()
     assert error > 1e-4
     if renderer.device.float64:

@@ -116,15 +116,15 @@ GROUP = fs.Motion(None, {1: lambda time: np.eye(4)})
     [
         (Traits(sh_degree=0), {}, "color_rgb", "color_sh"),
         (Traits(sh_degree=1), {}, "color_sh", "color_rgb"),
-        (Traits(), {}, "compose_ordered", "compose_pixel"),
-        (OF_PLANES, {}, "compose_coplanar", "compose_ordered"),
-        (OF_PLANES, {"quality": ORDERED}, "compose_ordered", "compose_coplanar"),
-        (OF_PLANES, {"quality": BY_PIXEL}, "compose_coplanar_pixel", "compose_coplanar"),
-        (Traits(), {"quality": BY_PIXEL}, "compose_pixel", "compose_ordered"),
-        (THICK, {"quality": BY_PIXEL}, "compose_ordered", "compose_pixel"),  # of one depth each
-        (Traits(ellipsoids="some"), {"quality": BY_PIXEL}, "compose_pixel", "compose_ordered"),
-        (THICK, {"quality": BY_PIXEL.with_(ellipsoid="exact")}, "compose_pixel", "compose_ordered"),
-        (THICK, {"quality": BY_PIXEL.with_(blend_precision="float64")}, "compose_pixel", "compose_ordered"),
+        (Traits(), {}, "order_centre", "order_pixel"),
+        (OF_PLANES, {}, "order_coplanar", "order_centre"),
+        (OF_PLANES, {"quality": ORDERED}, "order_centre", "order_coplanar"),
+        (OF_PLANES, {"quality": BY_PIXEL}, "order_coplanar_pixel", "order_coplanar"),
+        (Traits(), {"quality": BY_PIXEL}, "order_pixel", "order_centre"),
+        (THICK, {"quality": BY_PIXEL}, "order_centre", "order_pixel"),  # of one depth each
+        (Traits(ellipsoids="some"), {"quality": BY_PIXEL}, "order_pixel", "order_centre"),
+        (THICK, {"quality": BY_PIXEL.with_(ellipsoid="exact")}, "order_pixel", "order_centre"),
+        (THICK, {"quality": BY_PIXEL.with_(blend_precision="float64")}, "order_pixel", "order_centre"),
         (THICK, {}, "ellipsoid_ewa", "ellipsoid_exact"),
         (THICK, {"camera": PANORAMIC}, "ellipsoid_exact", "ellipsoid_ewa"),  # 3DGS has no such lens
         (OF_BOXES, {}, "lowpass_none", "lowpass_screen"),  # they are filtered by themselves

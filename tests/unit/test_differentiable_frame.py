@@ -88,7 +88,7 @@ def test_gradients_are_named_arrays_in_the_shapes_of_the_cloud():
     np.testing.assert_array_equal(frame["depth"], renderer.render(cloud, CAMERA, OUTPUTS)["depth"])
     gradients = frame.backward({"rgb": ONES, "distortion": ONES[..., 0]})
     shapes = {"means": (6, 3), "quats": (6, 4), "scales": (6, 2), "opacities": (6,), "sh": (6, 4, 3)}
-    shapes |= {"background": (3,), "pose": (6,), "intrinsics": (4,), "screen": (6,)}
+    shapes |= {"background": (3,), "pose": (6,), "intrinsics": (4,), "grad2d": (6,)}
     assert {name: (array.shape, array.dtype) for name, array in gradients.items()} == {
         name: (shape, np.float32) for name, shape in shapes.items()
     }

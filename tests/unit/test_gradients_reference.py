@@ -156,7 +156,7 @@ def test_the_screen_statistic_is_the_derivative_by_the_centres_place():
     gradients = FrozenFrame(cloud, view, features).backward({"rgb": np.ones((view.height, view.width, 3))})
     z, (x, y, _) = cloud.means[:, 2].astype(float), gradients["means"].T
     across = 0.5 * z * np.hypot(view.width * x / view.focal_x, view.height * y / view.focal_y)
-    assert np.allclose(gradients["screen"], across)
+    assert np.allclose(gradients["grad2d"], across)
     assert across.max() > 0
 
 
@@ -165,7 +165,7 @@ def test_what_has_no_gradient_is_refused_by_name():
     backend = ReferenceBackend()
     cases = {
         "lowpass_pixel": fs.Capture(CAMERA, quality=fs.Quality(lowpass="pixel")),
-        "compose_pixel": fs.Capture(CAMERA, quality=fs.Quality(order="pixel")),
+        "order_pixel": fs.Capture(CAMERA, quality=fs.Quality(order="pixel")),
         "samples must be 1": fs.Capture(CAMERA, quality=fs.Quality(samples=2)),
         "exposure": fs.Capture(CAMERA, sensor=fs.Sensor(exposure=2.0)),
         "camera_equirectangular": fs.Capture(fs.Camera.equirectangular(32, 16)),

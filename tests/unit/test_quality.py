@@ -40,7 +40,7 @@ def test_samples_are_whole_numbers(value):
 
 def test_blending_in_float64_refuses_what_would_undo_it():
     with pytest.raises(fs.InputError, match="blend_precision='float64'"):
-        fs.Quality(blend_precision="float64", setup_precision="float32")
+        fs.Quality(blend_precision="float64", projection_precision="float32")
 
 
 @pytest.mark.parametrize(

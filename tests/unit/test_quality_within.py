@@ -253,7 +253,7 @@ def test_a_device_without_a_setting(renderer, held_out, monkeypatch):
     draw = fs.Renderer.render
 
     def lacking(self, cloud, capture=None, outputs=None, quality=None, **more):
-        if fs.Quality.of(quality).setup_precision == "float32":
+        if fs.Quality.of(quality).projection_precision == "float32":
             raise fs.DeviceError("no projection in float32")
         return draw(self, cloud, capture, outputs, quality, **more)
 
@@ -261,7 +261,7 @@ def test_a_device_without_a_setting(renderer, held_out, monkeypatch):
     scene, want = held_out[2]
     for choice in (choose(3e-3, device=renderer), within(renderer, scene, 3e-3)):
         assert error_of(renderer, scene, choice.quality, want) <= 3e-3
-        assert (choice.quality.setup_precision, choice.quality.arithmetic) == ("float64", "fast")
+        assert (choice.quality.projection_precision, choice.quality.arithmetic) == ("float64", "fast")
     with pytest.raises(InputError, match="error must be at least"):
         within(renderer, scene, 1e-12)
 

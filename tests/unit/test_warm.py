@@ -41,8 +41,8 @@ def test_a_recipe_compiles_what_its_words_say(renderer, recipe):
 
     features = select(cloud, fs.Capture(outputs=recipe.outputs, quality=recipe.quality))
     # a device without float64 has these in float32
-    expected = replace(features, setup_precision="")
-    compiled = [replace(key[0], setup_precision="") for key in renderer.backend._pipelines]
+    expected = replace(features, projection_precision="")
+    compiled = [replace(key[0], projection_precision="") for key in renderer.backend._pipelines]
     assert expected in compiled
 
 

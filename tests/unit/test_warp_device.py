@@ -92,7 +92,7 @@ def test_nothing_is_said_on_stdout_or_stderr():
 
 
 def test_an_effect_that_warp_lacks_is_an_error_that_names_both(renderer):
-    effects = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
+    effects = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "order_centre")
     features = FeatureSet(effects, ("overdraw",), 0, 1, "float64")
     with pytest.raises(
         fs.DeviceError, match=rf"{renderer.device.name} .* has no overdraw; use an OpenCL device"
@@ -329,7 +329,7 @@ def test_debug_builds_are_launched_by_one_thread(monkeypatch):
 def test_warp_pipelines_share_kernels_that_mean_the_same():
     """A stage is compiled once for all feature sets that it cannot tell apart."""
     backend = warp_device.open_device("cpu")
-    effects = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
+    effects = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "order_centre")
     one, two = (
         backend.pipeline(FeatureSet(effects, outputs, 0, n, "float64"))
         for outputs, n in (((), 1), (("alpha",), 2))

@@ -69,7 +69,7 @@ def apply(v: float, x: int, y: int, channel: int, s: Any) -> float:
 
 STEP = Step(apply=apply)
 '''
-EFFECTS = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
+EFFECTS = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "order_centre")
 CAMERA = fs.Camera.pinhole(25, 17, 20.0, 20.0, 12.5, 8.5)
 
 

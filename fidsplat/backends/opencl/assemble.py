@@ -198,20 +198,20 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
     if config.binning == "bin_first":
         files.append("list/tiled.cl")
     # depth keys per tile need bounds of a splat's depth in a tile, which only the pinhole has
-    keys_by_tile = {"compose_pixel", "camera_pinhole"} <= effects.keys() and config.binning != "sort_first"
+    keys_by_tile = {"order_pixel", "camera_pinhole"} <= effects.keys() and config.binning != "sort_first"
     if keys_by_tile:
         effects["tile_keys"] = EFFECT_CODE["tile_keys"]
         files.append("part/tile_keys.cl")
-    if "compose_pixel" in effects:
+    if "order_pixel" in effects:
         files.append(f"part/k_buffer_{config.schedule}.cl")
     elif config.schedule == "lanes":
         files.append("part/tile_loop_lanes.cl")
-    if not effects.keys().isdisjoint({"compose_pixel", "coplanar_layers"}):
+    if not effects.keys().isdisjoint({"order_pixel", "coplanar_layers"}):
         # several k-buffer passes over a tile's list; each needs a splat's minimum depth in the block or tile
         files += ["part/passes.cl", f"part/passes_{config.schedule}.cl"]
         files.append("part/blocks_nearest.cl" if config.schedule == "lanes" else "part/tile_nearest.cl")
     if "termination_depths" in effects:  # after all passes through a list
-        order = "_pixel" if "compose_pixel" in effects else ""
+        order = "_pixel" if "order_pixel" in effects else ""
         files += ["part/termination_depth_pixel.cl"] if order else []
         files.append(f"part/termination_depth{order}_{config.schedule}.cl")
     if "external_depth" in effects:  # after all passes
@@ -251,7 +251,7 @@ def culls_before_projection(features: FeatureSet) -> bool:
     """Whether groups of splats in Morton order can be culled by bounding spheres. Not with the k-buffer,
     which breaks ties by cloud order, nor with motion, where splats of a group may have different poses."""
     effects = effect_code_of(features)
-    excluded = {"compose_pixel", "motion_groups", "shutter_rows"}
+    excluded = {"order_pixel", "motion_groups", "shutter_rows"}
     return excluded.isdisjoint(effects) and bool(_frustum_parts(effects))
 
 
@@ -356,7 +356,7 @@ def backward_chunk(features: FeatureSet, config: KernelConfig) -> int:
 
 
 def _scalars(features: FeatureSet) -> Scalars:
-    real = "double" if features.setup_precision == "float64" else "float"
+    real = "double" if features.projection_precision == "float64" else "float"
     return Scalars(real, "double" if "blend_double" in features.effects else "float")
 
 
@@ -370,7 +370,7 @@ def build_constants(features: FeatureSet, config: KernelConfig) -> dict[str, int
         "RADIX_BITS": config.radix_bits,
         "SAMPLES": features.samples,
         "SCAN_ITEMS": config.scan_items,
-        "PROJECTION_FP64": int(features.setup_precision == "float64"),
+        "PROJECTION_FP64": int(features.projection_precision == "float64"),
         "SH_DEGREE": features.sh_degree,
         "TILE_H": config.tile_height,
         "TILE_W": config.tile_width,

@@ -180,8 +180,8 @@ class OpenCLBackend(Workspace, Backend):
             return self._alignment
 
     def _key(self, features: FeatureSet, config: KernelConfig | None) -> tuple[FeatureSet, KernelConfig]:
-        if not self.info.float64 and features.setup_precision != "float32":
-            features = replace(features, setup_precision="float32")
+        if not self.info.float64 and features.projection_precision != "float32":
+            features = replace(features, projection_precision="float32")
         return features, config or config_for(features, self.config)
 
     def source(self, features: FeatureSet) -> KernelSource:

@@ -68,14 +68,14 @@ EFFECT_CODE: dict[str, EffectCode] = {
     "stop_inclusive": EffectCode(),
     "stop_exclusive": EffectCode("slot/stop_exclusive.cl", backward_file="slot/stop_exclusive_backward.cl"),
     # compositing order: of splats by their centres, or of fragments per pixel
-    "compose_ordered": EffectCode("slot/compose_ordered.cl"),
-    "compose_pixel": EffectCode(
-        "slot/compose_pixel.cl",
+    "order_centre": EffectCode("slot/order_centre.cl"),
+    "order_pixel": EffectCode(
+        "slot/order_pixel.cl",
         parts=("ray_depth",),
         splat=(member("wide nearest", "minimum depth of the splat's fragments"),),
     ),
-    "compose_coplanar": EffectCode("slot/compose_coplanar.cl", parts=("compose_ordered", "coplanar_layers")),
-    "compose_coplanar_pixel": EffectCode(parts=("compose_pixel", "coplanar_layers")),
+    "order_coplanar": EffectCode("slot/order_coplanar.cl", parts=("order_centre", "coplanar_layers")),
+    "order_coplanar_pixel": EffectCode(parts=("order_pixel", "coplanar_layers")),
     # a box is a splat with a hard-edged, rectangular footprint
     "footprint_gaussian": EffectCode(),
     "footprint_box": EffectCode("slot/footprint_box.cl", parts=("box_edges",)),

@@ -313,7 +313,7 @@ class TileGradients:
         count, features = frame.resident.count, self.pipeline.features
         shapes: dict[str, tuple[int, ...]] = {
             **{"means": (count, 3), "quats": (count, 4), "scales": (count, 2), "opacities": (count,)},
-            **{"screen": (count,)},
+            **{"grad2d": (count,)},
             **{name: (k,) for name, k in _SUMS.items()},
         }
         if "color_sh" in features.effects:
@@ -324,7 +324,7 @@ class TileGradients:
             shapes["thickness"] = (count,)
         results = {}
         for name, shape in shapes.items():
-            argument = name if name == "screen" else f"grad_{name}"
+            argument = name if name == "grad2d" else f"grad_{name}"
             results[name] = frame.pool.array(frame.queue, argument, shape)
             frame.named[argument] = results[name].data  # pyright: ignore[reportArgumentType]
         return results

@@ -89,7 +89,7 @@ def config_for(features: FeatureSet, config: KernelConfig) -> KernelConfig:
     if config.schedule == "group" or "camera_pinhole" not in features.effects:
         # the projection through lenses has loops and branches that compilers do not vectorise
         config = replace(config, splats_per_item=1)
-    if not {"compose_pixel", "compose_coplanar_pixel"}.isdisjoint(features.effects):
+    if not {"order_pixel", "order_coplanar_pixel"}.isdisjoint(features.effects):
         # the k-buffer needs the registers of a second pixel
         config = replace(config, rows=1)
     return config

@@ -239,7 +239,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float grad_quats  // (n, 4)",
         "out float grad_scales  // (n, 2)",
         "out float grad_opacities  // (n)",
-        "out float screen  // (n)",
+        "out float grad2d  // (n)",
         "out real camera_sums  // (work-groups, 10) with respect to the camera",
     ),
     "project_step": args(

@@ -341,7 +341,7 @@ class OpenCLTraining:
         return results
 
     def accumulate_statistics(self, gradients: Any, camera: Camera, origin: np.ndarray) -> None:
-        """Add a frame's screen gradients to the statistics. gradients: result of `backward_per_tile`."""
+        """Add a frame's `grad2d` to the statistics. gradients: result of `backward_per_tile`."""
         self._step(gradients, dict.fromkeys(_STEP_NUMBERS, 0.0) | {"update": 0, "sparse": 0}, camera, origin)
 
     def step(

@@ -68,7 +68,7 @@ class FrozenFrame:
         return {name: image.reshape(height, width, *image.shape[1:]) for name, image in whole.items()}
 
     def backward(self, gradients: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Gradients with respect to the parameters, and `screen`, from gradients with respect to the
+        """Gradients with respect to the parameters, and `grad2d`, from gradients with respect to the
         images."""
         view, parameters = self._view, self.parameters
         flat = {}
@@ -94,10 +94,10 @@ class FrozenFrame:
         if "ellipsoid_exact" not in self._features.effects:
             across = np.where(splats.scales[:, 2:] > 0, 0.0, across)
         grad_center = splat_grads.center + across
-        screen = 0.5 * np.sign(z) * np.hypot(view.width * grad_center[:, 0], view.height * grad_center[:, 1])
+        grad2d = 0.5 * np.sign(z) * np.hypot(view.width * grad_center[:, 0], view.height * grad_center[:, 1])
         return {
             **to_camera_backward(parameters, view, splats, splat_grads),
-            **{"background": grad_background, "screen": screen},
+            **{"background": grad_background, "grad2d": grad2d},
         }
 
     def _blend(self, parameters: Parameters) -> Iterator[tuple[Blend, Decisions]]:

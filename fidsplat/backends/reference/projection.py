@@ -61,9 +61,9 @@ class ProjectedSplats:
         z_extent = np.where(box, box_reach, z_extent)
         reach = np.where(box, box_reach, radius * reach)
         visible = (half_r2 > 0) & (depth + reach >= view.near) & (depth - reach <= view.far)
-        self.by_depth = not {"compose_pixel", "compose_coplanar_pixel"}.isdisjoint(features.effects)
+        self.by_depth = not {"order_pixel", "order_coplanar_pixel"}.isdisjoint(features.effects)
         """whether fragments are composited by their own depth"""
-        layered = not {"compose_coplanar", "compose_coplanar_pixel"}.isdisjoint(features.effects)
+        layered = not {"order_coplanar", "order_coplanar_pixel"}.isdisjoint(features.effects)
         groups = group_index(cloud) if layered else np.full(len(cloud), -1, np.int32)
         # depths must not depend on the cut-off
         radius = np.where(groups >= 0, _PLANE_RADIUS, np.where(box, 1.0, _RANGE_RADIUS))

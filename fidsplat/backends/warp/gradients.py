@@ -184,7 +184,7 @@ class _Backward:
             "grad_quats": wp.vec4,
             "grad_scales": wp.vec2,
             "grad_opacities": wp.float32,
-            "screen": wp.float32,
+            "grad2d": wp.float32,
         } | ({"grad_thickness": wp.float32} if self._frame.resident.ellipsoids != "none" else {})
         found = {name.removeprefix("grad_"): self._take(name, count, dtype) for name, dtype in kinds.items()}
         self._given.setdefault("grad_thickness", self._given["grad_opacities"])  # not written for disks

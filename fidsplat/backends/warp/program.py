@@ -21,7 +21,7 @@ EFFECTS = frozenset(
     | {"camera_brown_conrady", "camera_fisheye", "camera_equirectangular"}
     | {"lowpass_none", "lowpass_screen", "lowpass_pixel", "stop_inclusive", "stop_exclusive"}
     | {"ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased"}
-    | {"compose_ordered", "compose_pixel", "compose_coplanar", "compose_coplanar_pixel"}
+    | {"order_centre", "order_pixel", "order_coplanar", "order_coplanar_pixel"}
     | {"footprint_gaussian", "footprint_box", "footprint_mixed"}
     | {"background_constant", "background_gradient", "background_panorama"}
     | {"arithmetic_precise", "arithmetic_fast", "arithmetic_approximate"}
@@ -34,7 +34,7 @@ _SETTINGS = {"blend_half": "blend_precision='float16'", "blend_double": "blend_p
 # effects on which each stage depends; feature sets with the same ones share its kernels
 _RECORD = (
     *("lowpass_screen", "rays", "camera_orthographic", "ray_depth"),
-    *("compose_pixel", "compose_coplanar", "footprint_box", "footprint_mixed", "ellipsoid_exact"),
+    *("order_pixel", "order_coplanar", "footprint_box", "footprint_mixed", "ellipsoid_exact"),
 )
 _PROJECT = (
     *(*_RECORD, "lowpass_pixel", "motion_groups", "ellipsoid_ewa", "ellipsoid_ewa_antialiased"),
@@ -86,9 +86,9 @@ class _Needs:
             effects.add("rays_length")
         if "arithmetic_approximate" in effects:
             effects.add("arithmetic_fast")
-        if "compose_coplanar_pixel" in effects:
-            effects |= {"compose_coplanar", "compose_pixel"}
-        with_depth = {"compose_pixel", "compose_coplanar", "external_depth"}
+        if "order_coplanar_pixel" in effects:
+            effects |= {"order_coplanar", "order_pixel"}
+        with_depth = {"order_pixel", "order_coplanar", "external_depth"}
         if not effects.isdisjoint(with_depth) or output.having(outputs, "depth"):
             effects.add("ray_depth")
         steps = tuple(name for name in features.post_steps if name in kernels("post").known())
@@ -134,7 +134,7 @@ class Program:
             needs.among(_PROJECT),
             kernels("output").having(needs.outputs, "record"),
             (features.sh_degree + 1) ** 2 if "color_sh" in needs.effects else 0,
-            features.setup_precision,
+            features.projection_precision,
             self.shape.schedule == "tiles",
         )
         self.lists = kernels("tile_lists")

@@ -104,9 +104,9 @@ def user_scenes(
         captures = {name: scene.capture}
     else:
         poses = len(path)
-        some = sorted({round(k) for k in np.linspace(0, poses - 1, min(poses, most_views))})
-        flight = Flight(scene, path, np.asarray(path.times)[some], scene.capture)
-        captures = {f"{name}@{k}": capture for k, capture in zip(some, flight.captures, strict=True)}
+        selected = sorted({round(k) for k in np.linspace(0, poses - 1, min(poses, most_views))})
+        flight = Flight(scene, path, np.asarray(path.times)[selected], scene.capture)
+        captures = {f"{name}@{k}": capture for k, capture in zip(selected, flight.captures, strict=True)}
     return {
         view: BenchScene(
             about if view == name else f"{about}, pose {view.rpartition('@')[2]}",

@@ -53,12 +53,12 @@ def recipes() -> list[Recipe]:
         *((-1, kinds) for kinds in ((MARKER,), (MARKER, DISKS), (DISKS,))),
         *((3, kinds) for kinds in ((CAPTURE,), (MARKER, CAPTURE))),
     ]
-    some = [Recipe(*scene, outputs) for outputs in _OUTPUTS for scene in common]
+    frequent = [Recipe(*scene, outputs) for outputs in _OUTPUTS for scene in common]
     demo = Recipe(-1, (MARKER, DISKS, CAPTURE), _OUTPUTS[-1])
     sharp = [Recipe(-1, (MARKER, DISKS), ("rgb",), _SHARP), Recipe(3, (MARKER, CAPTURE), ("rgb",), _SHARP)]
     degrees = [Recipe(degree, (CAPTURE,), ("rgb",)) for degree in (1, 2)]
     flat = [Recipe(3, kinds, ("rgb",)) for kinds in ((DISKS,), (MARKER, DISKS))]
-    return [*some, demo, *sharp, *degrees, *flat]
+    return [*frequent, demo, *sharp, *degrees, *flat]
 
 
 def warm(renderer: Renderer, recipes: list[Recipe]) -> Iterator[tuple[Recipe, float]]:

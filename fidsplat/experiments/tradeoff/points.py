@@ -38,7 +38,7 @@ _VALUES: dict[str, tuple[Any, ...]] = {
     "ellipsoid": ELLIPSOID,
     "lowpass": ("pixel", "none"),
     "samples": (2, 3),
-    "setup_precision": ("float32",),
+    "projection_precision": ("float32",),
     "arithmetic": ("fast", "approximate"),
     "blend_precision": ("float16", "float64"),
 }
@@ -61,7 +61,7 @@ _MARKER_QUALITIES = (
 )
 _QUICK_MARKER_QUALITIES = (MarkerQuality("paper"), MarkerQuality("exact"))
 _COMBINED_CUTOFFS, _COMBINED_STOPS = (1e-4, 1 / 4096, 1 / 2048, 1 / 1024, 1 / 255), (1e-4, 1e-3, 1 / 512)
-_FAST, _FASTEST = {"arithmetic": "fast"}, {"arithmetic": "fast", "setup_precision": "float32"}
+_FAST, _FASTEST = {"arithmetic": "fast"}, {"arithmetic": "fast", "projection_precision": "float32"}
 _FASTEST_STOP = 1e-3
 
 _ABLATIONS: tuple[dict[str, Any], ...] = (
@@ -72,7 +72,7 @@ _ABLATIONS: tuple[dict[str, Any], ...] = (
     {"opacity_ceiling": 0.99},
     {"stop_rule": "exclusive", "transmittance_stop": 1e-4, "order": "centre"},
     {"lowpass": "none"},
-    {"setup_precision": "float32"},
+    {"projection_precision": "float32"},
     {"arithmetic": "fast"},
     {"arithmetic": "approximate"},
     {"blend_precision": "float16"},
@@ -219,7 +219,7 @@ def _marker_points(quick: bool) -> Iterator[Point]:
 def _combinations(quick: bool) -> Iterator[Point]:
     """Combinations of cut-off and stop, in precise and fast arithmetic, some with a float32 projection."""
     cutoffs = _COMBINED_CUTOFFS[1::2] if quick else _COMBINED_CUTOFFS
-    for more, text in (({}, ""), (_FAST, ", fast"), (_FASTEST, ", fast, float32 set-up")):
+    for more, text in (({}, ""), (_FAST, ", fast"), (_FASTEST, ", fast, float32 projection")):
         stops = (_FASTEST_STOP,) if quick or more is _FASTEST else _COMBINED_STOPS
         for cutoff in cutoffs:
             for stop in stops:

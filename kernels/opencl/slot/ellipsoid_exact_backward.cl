@@ -60,5 +60,5 @@
     if (THICK_HERE) {
         across_x = grad_p.x / view->focal_x * view->width;
         across_y = grad_p.y / view->focal_y * view->height;
-        splat_grad.screen = (float)(REAL(0.5) * pz * sqrt(across_x * across_x + across_y * across_y));
+        splat_grad.grad2d = (float)(REAL(0.5) * pz * sqrt(across_x * across_x + across_y * across_y));
     }
