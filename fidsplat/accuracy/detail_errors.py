@@ -49,7 +49,7 @@ def measure_detail(
     settings = settings_with(DetailSettings, settings, changes)
     if store.poses is not None:
         raise InputError(
-            f"store must be a store without instances, got {store.path}; pass the store of its splats, "
+            f"store must contain splats, got {store.path}, which contains instances of another store; pass "
             f"{store.header.store}"
         )
     if not len(store) or not store.nodes["level"].any():

@@ -191,7 +191,7 @@ def _option_names() -> Iterator[None]:
 
 
 def _file_names(out: str | None, source: Path) -> Callable[[str, str], Path]:
-    """Function from output and suffix to a file in a writable folder."""
+    """Function that returns the file of an output name and a suffix, in a writable folder."""
     if not source.name:
         raise InputError(f"the source must be a scene file (.toml) or a splat file, got the folder {source}")
     if out == "":

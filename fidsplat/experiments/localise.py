@@ -393,7 +393,8 @@ def recorded(path: str | os.PathLike[str], truth: Run) -> tuple[Run, list[list[D
 def write_log(
     drive: Drive, name: str, renderer: Renderer, path: str, overwrite: bool, source: str = ""
 ) -> Iterator[np.ndarray]:
-    """Write the drive of a variant as a log with images and estimated poses (/odom); yields the images.
+    """Render the drive in a variant of the experiment, and write a log with its images and estimated poses
+    (/odom); yields the images.
 
     Raises:
         InputError: the variant has no images, or the log cannot be written.

@@ -39,7 +39,7 @@ def plane_image(
     start, stop, jump = _edges(grid, light - dark, light - background)
     offset = np.array([grid.shape[1], grid.shape[0]]) / 2
     begin, end = (_project((points - offset) * module, camera) for points in (start, stop))
-    # seen from behind, right and left are swapped
+    # from behind the plane, right and left are swapped
     side = np.sign(np.linalg.det(camera.world_to_camera[:3, [0, 1, 3]]))
     return background + _accumulate(begin, end, jump * side, (camera.height, camera.width))
 

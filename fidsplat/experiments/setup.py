@@ -80,8 +80,7 @@ class Protocol:
     """pixels per module in a frontal view; None: the plane is always `PLANE` wide"""
 
     def module(self, cells: int) -> float:
-        """Edge in metres of a module of a marker with ``cells`` modules per side, including the quiet
-        zone."""
+        """Edge [m] of a module of a marker that has `cells` modules per side, quiet zone included."""
         if self.module_px is None:
             return PLANE / cells
         return self.module_px * self.distance / self.camera(0.0).fx
@@ -117,7 +116,7 @@ _VIEWS = (
 def training_cameras(views: int = COLLECTIONS[-1]) -> list[Camera]:
     """Cameras of a training set of 3, 5, 9 or 17 views. Raises InputError for another number."""
     if views not in COLLECTIONS:
-        raise InputError(f"number of training views must be 3, 5, 9 or 17, got {views}")
+        raise InputError(f"the number of training views must be 3, 5, 9 or 17, got {views}")
     return [_around(tilt, azimuth) for tilt, azimuth in _VIEWS[:views]]
 
 

@@ -1,4 +1,4 @@
-"""Resumable sweeps over points, with shards that can be merged.
+"""Resumable sweeps over points (combinations of parameters), with shards that can be merged.
 
 Results are JSON lines. A line {"run": ...} contains facts of a run (`fidsplat.util.provenance.run_facts`)
 that apply to the following lines {"key": ..., "result": ...}.
@@ -79,7 +79,7 @@ class Results:
         self._last_run = next((record.run for record in reversed(self.done.values())), None)
 
     def left(self, points: Iterable[Key]) -> list[Key]:
-        """Missing points, in the order of `points`."""
+        """Points without a result, in the order of `points`."""
         return [key for key in points if name_of(key) not in self.done]
 
     def append(self, key: Key, result: dict[str, Any]) -> Record:
@@ -262,7 +262,9 @@ def merge(files: Sequence[Path], target: Path) -> Merged:
     repeated = 0
     for file in files:
         if not file.is_file():
-            raise InputError(f"results of shards must be .jsonl files, got {file}, which does not exist")
+            raise InputError(
+                f"results of shards must be .jsonl files that exist, got {file}; run the missing shard"
+            )
         for record in read_records(file):
             repeated += record.name in records
             records.setdefault(record.name, record)

@@ -262,12 +262,12 @@ def _lens(view: MarkerView, k1: float) -> MarkerView:
 
 
 def _blur(view: MarkerView, pixels: float) -> MarkerView:
-    """Move the camera during the exposure, so that the marker moves by pixels."""
+    """Move the camera during the exposure, so that the image of the marker moves by this number of pixels."""
     return view.moving(pixels, Shutter(exposure_time=1.0, sub_poses=max(2, math.ceil(pixels / 2))))
 
 
 def _rolling(view: MarkerView, pixels: float) -> MarkerView:
-    """Move the camera during the readout of the rows, so that the marker moves by pixels per frame."""
+    """Move the camera during the readout, so that the image of the marker moves by these pixels per frame."""
     return view.moving(pixels, Shutter(readout=1.0, rows_per_band=6))
 
 
@@ -296,7 +296,8 @@ def _covered(view: MarkerView, fraction: float) -> MarkerView:
     """Cover a fraction of the code by a dark leaf, from a random side."""
     size, rng = view.placed.marker.size, view.rng
     angle = math.pi / 2 * int(rng.integers(4)) + rng.uniform(-0.2, 0.2)
-    middle = size * (0.5 - fraction + 1.0)  # the leaf is two edges wide and ends at the fraction
+    # the leaf is as long as two edges of the code; its end covers the fraction
+    middle = size * (0.5 - fraction + 1.0)
     position = (middle * math.cos(angle), middle * math.sin(angle), -0.02 * size)
     quaternion = [math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)]
     leaf = SplatCloud([position], [quaternion], [(size, 0.8 * size)], [1.0], colors=[_COVER])

@@ -192,7 +192,7 @@ def save_sog_folder(cloud: SplatCloud, path: Path) -> None:
 
 
 def sog_parts(cloud: SplatCloud) -> dict[str, bytes]:
-    """Files of a scene of version 2 by name."""
+    """Contents of the files of SOG version 2, by file name: meta.json and images."""
     refuse_boxes(cloud, "a SOG file")
     if not len(cloud):
         raise InputError("a cloud in a SOG file must have at least one splat, got none")

@@ -334,7 +334,7 @@ def _covariance(sums: AlignmentSums, inverse: np.ndarray) -> np.ndarray:
 
 
 def _scores(sums: AlignmentSums) -> np.ndarray:
-    """Scores (blocks, 6 + 2 c)."""
+    """Scores (blocks, 6 + 2 c): gradients of the loss of each block, by pose, gain and offset of channels."""
     scores = np.zeros((len(sums.block_rhs), 6 + 2 * sums.block_rhs.shape[1]))
     for channel in range(sums.block_rhs.shape[1]):
         scores[:, _parameters(channel)] += sums.block_rhs[:, channel]

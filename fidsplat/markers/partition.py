@@ -58,7 +58,8 @@ def interior_runs(grid: np.ndarray, concave: np.ndarray, cuts: np.ndarray | None
     cuts: (h+1, w+1) bool, vertices at which a run ends because a vertical chord passes through them.
     """
     h, w = grid.shape
-    edge = np.zeros((h + 1, w), np.int8)  # 0: boundary, 1 or 2: interior to a light or a dark component
+    # edge above each module: 0 between a light and a dark one, 1 between light ones, 2 between dark ones
+    edge = np.zeros((h + 1, w), np.int8)
     edge[1:-1] = np.where(grid[:-1] == grid[1:], grid[1:] + 1, 0)
     ends = np.ones((h + 1, w + 1), bool)
     ends[:, 1:-1] = edge[:, :-1] != edge[:, 1:]

@@ -50,10 +50,11 @@ def identity() -> tuple[str, str]:
 
 
 class RayEngine:
-    """`Engine` of a Ray cluster.
+    """Engine (`fidsplat.remote.queue`) that processes items on the workers of a Ray cluster.
 
     Args:
-        make: called by each worker; the result has a `title`, which must be equal on all workers.
+        make: called once by each worker; returns the function that processes an item. The function has the
+            attribute `title`, which must be equal on all workers.
         workers: number of workers; None for one per GPU of the cluster, else one per machine.
     """
 

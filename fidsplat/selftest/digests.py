@@ -100,8 +100,8 @@ class _Source:
     def number(self, low: float, high: float) -> float:
         return float(self.uniform(low, high))
 
-    def whole(self, low: int, high: int, *shape: int) -> np.ndarray:
-        """Whole numbers from `low` to `high`, excluded."""
+    def integers(self, low: int, high: int, *shape: int) -> np.ndarray:
+        """Random integers in [low, high)."""
         return np.minimum(np.floor(self.uniform(low, high, *shape)), high - 1).astype(np.int64)
 
 
@@ -113,7 +113,7 @@ def kind_of(seed: int) -> Kind:
 def scene_of(seed: int) -> FrameSpec:
     """The frame of a seed: 20 to 400 splats, 30 x 20 to 110 x 80 pixels, a random pose."""
     kind, source = kind_of(seed), _Source(seed)
-    count = int(source.whole(20, 400))
+    count = int(source.integers(20, 400))
     camera = _camera(kind.lens, source)
     around = kind.lens in ("fisheye", "equirectangular")
     means = source.uniform(-1.0, 1.0, count, 3) * [2.2, 1.6, 2.5]
@@ -141,7 +141,7 @@ def scene_of(seed: int) -> FrameSpec:
             at = source.uniform(-1.0, 1.0, len(means[members]), 2)
             means[members] = means[3 * group] + at[:, :1] * axes[0] + at[:, 1:] * axes[1]
     cloud = SplatCloud(
-        means, quats, scales, opacities, labels=source.whole(0, 9, count), origin=np.zeros(3), **colors
+        means, quats, scales, opacities, labels=source.integers(0, 9, count), origin=np.zeros(3), **colors
     )
     if kind.splats in ("boxes", "disks and boxes"):
         cloud = cloud.with_boxes(np.arange(count) % 9 < 5 if kind.splats == "disks and boxes" else True)
@@ -170,7 +170,7 @@ def _axes(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _camera(lens: str, source: _Source) -> Camera:
-    width, height = int(source.whole(30, 110)), int(source.whole(20, 80))
+    width, height = int(source.integers(30, 110)), int(source.integers(20, 80))
     pose, position = np.eye(4), source.uniform(-1.0, 1.0, 3)
     pose[:3, :3] = rotation = _axes(source.uniform(-1.0, 1.0, 4))
     pose[:3, 3] = -(rotation * position).sum(axis=1)

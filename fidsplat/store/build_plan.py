@@ -91,7 +91,7 @@ class BuildPlan:
 
     @property
     def rows(self) -> int:
-        """Number of rows of all inputs."""
+        """Number of splats in the files of all inputs."""
         return sum(source.rows.count for source in self.sources)
 
     @cached_property

@@ -27,7 +27,8 @@ CellSizes = float | tuple[tuple[float, ...], ...]
 """projected size [samples] below which cells are merged: one number, or one for each level of each store"""
 
 NodeMasks = tuple[np.ndarray, ...]
-"""mask (instances * nodes,) bool of the selected nodes of each store"""
+"""mask (instances * nodes,) bool of the selected nodes of each store; a node is a chunk of splats, or of merged
+splats of a level of detail"""
 
 
 @dataclass(frozen=True)
@@ -132,10 +133,10 @@ class ChunkedSplats:
             for store in self.stores
         )
 
-    def boxes(self, number: int, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
+    def bounding_boxes(self, number: int, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
         """Corners (instances * nodes, 3) [m] of boxes around a store's nodes, relative to the origin."""
         store = self.stores[number]
-        low, high = store.boxes(sigmas)
+        low, high = store.bounding_boxes(sigmas)
         return low + (store.origin - self.origin), high + (store.origin - self.origin)
 
     def subchunks(self, masks: NodeMasks) -> list[Subchunks]:

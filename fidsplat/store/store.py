@@ -182,7 +182,7 @@ class Store(Summarised):
     def bounds(self, sigmas: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
         """Axis-aligned box (min (3,), max (3,)) float64, world, around all splats to `sigmas` standard
         deviations. Raises InputError for an empty store."""
-        low, high = self.boxes(sigmas)
+        low, high = self.bounding_boxes(sigmas)
         leaves = np.tile(self.nodes["level"] == 0, self.instances)
         if not leaves.any():
             raise InputError("the store must have at least one splat to have bounds, got none")
@@ -217,7 +217,7 @@ class Store(Summarised):
 
     # nodes of all instances: node i of instance p has the number p * len(nodes) + i
 
-    def boxes(self, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
+    def bounding_boxes(self, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
         """Minimum and maximum corners, (instances * nodes, 3) float64 [m] relative to the origin, of boxes
         around the splats of each node to `sigmas` standard deviations."""
         sigmas = checked_number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
@@ -234,7 +234,7 @@ class Store(Summarised):
         low, high = _rounded(middles, half @ np.swapaxes(np.abs(rotations), 1, 2))
         return low.reshape(-1, 3), high.reshape(-1, 3)
 
-    def instance_boxes(
+    def instance_bounding_boxes(
         self, low: np.ndarray, high: np.ndarray, instances: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Boxes of the other store, given by corners (k, 3), each moved to the pose of an instance (k,)."""

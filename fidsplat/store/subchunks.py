@@ -35,7 +35,7 @@ class Subchunks:
         """The subchunks that a mask (k,) bool selects."""
         return Subchunks(*(getattr(self, field.name)[which] for field in fields(self)))
 
-    def boxes(self, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
+    def bounding_boxes(self, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
         """Minimum and maximum corners (k, 3) of boxes around splats to `sigmas` standard deviations."""
         around = sigmas * self.max_sigma[:, None]
         return self.low - around, self.high + around
@@ -63,7 +63,7 @@ class SubchunkTable:
         high = np.concatenate([np.empty((0, 3)), *(high for _, high, _ in boxes)])
         max_sigma = np.concatenate([np.empty(0), *(max_sigma for _, _, max_sigma in boxes)])
         if store.poses is not None:
-            low, high = store.instance_boxes(low, high, instance)
+            low, high = store.instance_bounding_boxes(low, high, instance)
         first = ROWS * (np.arange(len(nodes)) - np.repeat(np.cumsum(counts) - counts, counts))
         rows = np.minimum(store.counts(nodes) - first, ROWS)
         return Subchunks(

@@ -52,7 +52,7 @@ class Band:
     rows: tuple[int, int]
     """pixels [first, end)"""
     subset: NodeMasks | None = None
-    """nodes from which the band is rendered; None: all visible nodes"""
+    """nodes (chunks, also of levels of detail) from which the band is rendered; None: all visible ones"""
     subchunks: tuple[tuple[Subchunks, np.ndarray], ...] | None = None
     """subchunks of these nodes, and a mask (k,) bool of those from which it is rendered; None: all"""
 
@@ -62,7 +62,7 @@ class Band:
         return Band(scene, view, features, cell_sizes, (first // view.samples, end // view.samples))
 
     def with_rows(self, first: int, end: int) -> Band:
-        """The band of other rows, rendered from all its visible nodes."""
+        """A band of other rows of the same view, rendered from all nodes that are visible in it."""
         return replace(self, rows=(first, end), subset=None, subchunks=None)
 
     def with_nodes(self, nodes: NodeMasks) -> Band:
@@ -99,15 +99,19 @@ class Band:
         """(rows, columns) bool: tiles to which subchunks can contribute."""
         tiles = np.zeros(termination.depths.shape, bool)
         for part in subchunks:
-            tiles |= contributing_tiles(self.view, self.features, part.boxes, part.max_sigma, termination)
+            tiles |= contributing_tiles(
+                self.view, self.features, part.bounding_boxes, part.max_sigma, termination
+            )
         return tiles
 
     def _can_contribute(self, subchunks: Subchunks, termination: TerminationDepths) -> np.ndarray:
         """(k,) bool: subchunks that are pinned, or in the frustum and not occluded."""
         if not len(subchunks.nodes):
             return np.zeros(0, bool)
-        visible = in_frustum(self.view, self.features, subchunks.boxes, subchunks.max_sigma)
-        visible &= ~occluded(self.view, self.features, subchunks.boxes, subchunks.max_sigma, termination)
+        visible = in_frustum(self.view, self.features, subchunks.bounding_boxes, subchunks.max_sigma)
+        visible &= ~occluded(
+            self.view, self.features, subchunks.bounding_boxes, subchunks.max_sigma, termination
+        )
         return visible | subchunks.pinned
 
     @cached_property

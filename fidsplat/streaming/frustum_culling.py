@@ -1,7 +1,8 @@
-"""Frustum culling of boxes of splats, and bounds of their projected size.
+"""Frustum culling of bounding boxes, and bounds of their projected size.
 
-The test is conservative for every camera model, low-pass and shutter: a culled box contains no splat that
-contributes to the frame. It applies the criteria of `project.cl` to all splats that a box can contain.
+A box contains the splats of a chunk of a store (scene on disk), or of a part of a chunk. The test is
+conservative for every camera model, low-pass and shutter: a culled box contains no splat that contributes to
+the frame. It applies the criteria of `project.cl` to all splats that a box can contain.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from fidsplat.cameras.raster import RayRaster
 from fidsplat.effects import FeatureSet
 from fidsplat.store.merge import MAX_OPACITY
 
-Boxes = Callable[[float], tuple[np.ndarray, np.ndarray]]
+BoundingBoxes = Callable[[float], tuple[np.ndarray, np.ndarray]]
 """function of a number of standard deviations that returns the minimum and maximum corners (n, 3) float64 [m]
-of boxes around the splats to that extent"""
+of bounding boxes of the splats to that extent"""
 
 PADDING = 1.01
 """factor that enlarges the extent of splats, for rounding errors"""
@@ -32,7 +33,7 @@ _ROUNDING = 1e-5
 """relative error of a coordinate that projection in float32 computes"""
 
 
-def in_frustum(view: View, features: FeatureSet, boxes: Boxes, max_sigma: np.ndarray) -> np.ndarray:
+def in_frustum(view: View, features: FeatureSet, boxes: BoundingBoxes, max_sigma: np.ndarray) -> np.ndarray:
     """Frustum culling: mask (n,) of the boxes whose splats may contribute to the frame, at any pose of the
     shutter and of moving groups.
 
@@ -121,7 +122,9 @@ def ewa_extent(view: View, features: FeatureSet, radius: float, max_sigma: np.nd
     return max(view.focal_x, view.focal_y) * slope * radius * max_sigma
 
 
-def _in_frustum_of_pose(view: View, features: FeatureSet, boxes: Boxes, max_sigma: np.ndarray) -> np.ndarray:
+def _in_frustum_of_pose(
+    view: View, features: FeatureSet, boxes: BoundingBoxes, max_sigma: np.ndarray
+) -> np.ndarray:
     extent = Extent.of(view, features)
     if extent is None:
         # the low-pass filter does not change splats whose centre is behind the near plane
@@ -161,7 +164,7 @@ def _in_frustum_of_pose(view: View, features: FeatureSet, boxes: Boxes, max_sigm
 
 
 class CameraBoxes:
-    """Boxes in the camera's frame."""
+    """Bounding boxes in the camera's frame."""
 
     def __init__(self, view: View, low: np.ndarray, high: np.ndarray) -> None:
         middle, half = (low + high) / 2, (high - low) / 2
@@ -258,7 +261,7 @@ def _slopes(raster: RayRaster) -> tuple[np.ndarray, np.ndarray]:
     return np.nanmin(slopes, axis=(0, 1)), np.nanmax(slopes, axis=(0, 1))
 
 
-def projected_sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
+def projected_sizes(view: View, boxes: BoundingBoxes, edges: np.ndarray) -> np.ndarray:
     """Upper bound (n,) on the projected size [samples] of lengths (n,) [m] anywhere in each box, at all poses
     of the shutter and moving groups; infinite where a box contains the camera."""
     if view.sub_frames:

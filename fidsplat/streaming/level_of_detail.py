@@ -35,7 +35,7 @@ def _visible_nodes(
     scene: ChunkedSplats, number: int, views: Sequence[View], features: FeatureSet, cell_sizes: np.ndarray
 ) -> np.ndarray:
     """Mask (instances * nodes,) of the visible nodes of one store. cell_sizes: (levels + 1,) samples."""
-    store, boxes = scene.stores[number], partial(scene.boxes, number)
+    store, boxes = scene.stores[number], partial(scene.bounding_boxes, number)
     if not len(store.nodes):
         return np.zeros(0, bool)
     nodes, instances = store.nodes, store.instances

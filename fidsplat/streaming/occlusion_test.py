@@ -14,7 +14,7 @@ from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.store.chunked_splats import ChunkedSplats, NodeMasks
-from fidsplat.streaming.frustum_culling import PADDING, Boxes, CameraBoxes, Extent, ewa_extent
+from fidsplat.streaming.frustum_culling import PADDING, BoundingBoxes, CameraBoxes, Extent, ewa_extent
 
 _DEPTH_RANGE = 3.33
 """standard deviations within which the depth of a splat's fragments varies (slot/order_pixel.cl)"""
@@ -25,7 +25,7 @@ def is_supported(view: View, features: FeatureSet) -> bool:
     return not (view.sub_frames or view.groups) and _extent(view, features) is not None
 
 
-def min_sort_keys(view: View, features: FeatureSet, boxes: Boxes) -> np.ndarray:
+def min_sort_keys(view: View, features: FeatureSet, boxes: BoundingBoxes) -> np.ndarray:
     """Lower bound (n,) of the sort keys, which are depths [m], of the splats in each box."""
     extent = _extent(view, features)
     assert extent is not None  # the caller has checked `is_supported`
@@ -35,7 +35,11 @@ def min_sort_keys(view: View, features: FeatureSet, boxes: Boxes) -> np.ndarray:
 
 
 def occluded(
-    view: View, features: FeatureSet, boxes: Boxes, max_sigma: np.ndarray, termination: TerminationDepths
+    view: View,
+    features: FeatureSet,
+    boxes: BoundingBoxes,
+    max_sigma: np.ndarray,
+    termination: TerminationDepths,
 ) -> np.ndarray:
     """Mask (n,) of the boxes whose splats cannot contribute to a frame with these termination depths."""
     keys = min_sort_keys(view, features, boxes)
@@ -44,7 +48,11 @@ def occluded(
 
 
 def contributing_tiles(
-    view: View, features: FeatureSet, boxes: Boxes, max_sigma: np.ndarray, termination: TerminationDepths
+    view: View,
+    features: FeatureSet,
+    boxes: BoundingBoxes,
+    max_sigma: np.ndarray,
+    termination: TerminationDepths,
 ) -> np.ndarray:
     """Mask (rows, columns) of the tiles to which splats of the boxes can contribute."""
     tiles = np.zeros(termination.depths.shape, bool)
@@ -58,7 +66,7 @@ def contributing_tiles(
 def node_sort_keys(scene: ChunkedSplats, view: View, features: FeatureSet) -> tuple[np.ndarray, ...]:
     """Lower bounds (instances * nodes,) of the sort keys [m] of each store's nodes."""
     numbers = range(len(scene.stores))
-    return tuple(min_sort_keys(view, features, partial(scene.boxes, number)) for number in numbers)
+    return tuple(min_sort_keys(view, features, partial(scene.bounding_boxes, number)) for number in numbers)
 
 
 def occluded_nodes(
@@ -68,12 +76,18 @@ def occluded_nodes(
     masks = []
     for number, (store, pinned) in enumerate(zip(scene.stores, scene.pinned, strict=True)):
         max_sigma = np.tile(store.nodes["reach"].astype(np.float64), store.instances)
-        masks.append(occluded(view, features, partial(scene.boxes, number), max_sigma, termination) & ~pinned)
+        masks.append(
+            occluded(view, features, partial(scene.bounding_boxes, number), max_sigma, termination) & ~pinned
+        )
     return tuple(masks)
 
 
 def _tile_spans(
-    view: View, features: FeatureSet, boxes: Boxes, max_sigma: np.ndarray, termination: TerminationDepths
+    view: View,
+    features: FeatureSet,
+    boxes: BoundingBoxes,
+    max_sigma: np.ndarray,
+    termination: TerminationDepths,
 ) -> tuple[np.ndarray, ...]:
     """Rows [top, bottom) and columns [left, right) of the tiles that boxes can touch, (n,) int64 each."""
     columns = termination.depths.shape[1]
@@ -96,7 +110,7 @@ def _extent(view: View, features: FeatureSet) -> Extent | None:
 
 
 def _projected_extent(
-    view: View, features: FeatureSet, boxes: Boxes, max_sigma: np.ndarray
+    view: View, features: FeatureSet, boxes: BoundingBoxes, max_sigma: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bounds on the x and y of each box's splats on the image of a pinhole camera, (n, 2) samples each;
     infinite where a box contains the camera."""

@@ -100,7 +100,8 @@ def refine(
     seed = whole_number("the seed", seed, 0, 2**63 - 1)
     if marker.regions is not None:
         raise InputError(
-            f"marker must be a marker of modules, got {marker.spec} with edges across its modules"
+            f"marker must consist of square modules, got the drawing {marker.spec}, with edges across its "
+            "modules; give a tag, a QR code or an image"
         )
     if marker.shape is not None or marker.wear is not None:
         raise InputError(f"marker must be flat and not worn, got {marker.spec}; leave out shape and wear")

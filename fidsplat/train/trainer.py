@@ -420,7 +420,7 @@ class Trainer:
             self._surface_captures[number] = replace(self._surface_captures[number], camera=camera)
 
     def _steps(self) -> Iterator[Step]:
-        """Yield the unreported steps, and remove them."""
+        """Yield the finished steps that were not reported yet."""
         while self._unreported:
             iteration, view, loss = self._unreported.popleft()
             count = int(self._state.history["counts"][iteration - 1])

@@ -196,7 +196,9 @@ def optical_flow(
         raise invalid("label", "an image of the size of depth, or None", label)
     points = points_of(depth, before)
     if motions and label is None:
-        raise InputError("label must be an image with motions, got None; render with the output 'label'")
+        raise InputError(
+            "label must be given for the motions of groups, got None; render with the output 'label'"
+        )
     for value, motion in (motions or {}).items():
         motion = pose_matrix(motion, f"the motion of label {value}")
         check_similarity(motion, f"the motion of label {value}", rigid=True)

@@ -83,7 +83,7 @@ def test_a_refined_marker_has_its_size(renderer):
 def test_what_cannot_be_refined_is_reported(renderer, tmp_path):
     drawing = tmp_path / "slant.svg"
     drawing.write_text('<svg viewBox="0 0 10 10"><path d="M1 1 L9 2 L5 9 Z" fill="#f00"/></svg>')
-    with pytest.raises(InputError, match="edges across its modules"):
+    with pytest.raises(InputError, match="with edges across its modules; give"):
         refine(fs.marker(f"svg-10:{drawing}"), renderer)
     with pytest.raises(InputError, match=r"iterations must be .* got 0"):
         refine(made(), renderer, 0)

@@ -48,7 +48,7 @@ def test_neighbours_in_space_are_near_in_order(store):
 
 @pytest.mark.parametrize("sigmas", [0.0, 2.0, 5.0, 9.0])
 def test_boxes_contain_their_splats(store, sigmas):
-    low, high = store.boxes(sigmas)
+    low, high = store.bounding_boxes(sigmas)
     for number in range(len(store.nodes)):
         part = store.load(number)
         reach = sigmas * np.maximum(part["scales"].max(axis=1), part["thickness"])[:, None]
@@ -288,7 +288,7 @@ def test_an_instanced_store_repeats_the_splats(store, files, tmp_path):
     assert np.array_equal(cloud.means[: len(flat)], flat.cloud().means)
     assert cloud.means[len(flat) :] == pytest.approx(moved.means, abs=1e-5)
     assert np.abs((cloud.quats[len(flat) :] * moved.quats).sum(axis=1)) == pytest.approx(1, abs=1e-6)
-    low, high = street.boxes(FAR)
+    low, high = street.bounding_boxes(FAR)
     for number in range(2 * len(flat.nodes)):
         part, one = street.load(number), number % len(flat.nodes)
         reach = FAR * np.maximum(part["scales"].max(axis=1), part["thickness"])[:, None]

@@ -243,7 +243,7 @@ def test_errors_of_other_content_are_ignored(tmp_path):
 
 def test_stores_without_detail_are_refused(store, renderer, tmp_path):
     placed = fs.Store(fs.place_store(store, tmp_path / "p.fss", [np.eye(4)]))
-    with pytest.raises(fs.InputError, match="must be a store without instances"):
+    with pytest.raises(fs.InputError, match=r"must contain splats, got .* instances of another store; pass"):
         measure_detail(placed, renderer)
     with pytest.raises(fs.InputError, match=r"views must be .* got 0"):
         measure_detail(store, renderer, views=0)

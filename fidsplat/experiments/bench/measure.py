@@ -165,7 +165,7 @@ class Bench:
         self._report(scene)
         if entry.capture is None:
             time_interleaved(timers, repeats, tick=self._tick)
-        else:  # frames may take any time
+        else:  # frames of the user's scenes may be slow: fewer rounds, within a time limit
             few = min(MIN_ROUNDS, repeats)
             time_interleaved(timers, repeats, min_rounds=few, seconds=SECONDS, warm_up=1, tick=self._tick)
 
@@ -187,7 +187,7 @@ class SceneRun:
         self.camera = camera = middle_camera(self.capture)
         self.image = np.zeros((camera.height, camera.width, 3), np.float32)
         """rendered image (h, w, 3)"""
-        timer = Timer(self._complete, catch_errors=True, parts=lambda frame: frame.timings)
+        timer = Timer(self._timed, catch_errors=True, parts=lambda frame: frame.timings)
         self.result = Result(scene, self.renderer.device, camera.width, camera.height, timer, rates)
         try:
             self.resident = self.renderer.upload(cloud)
@@ -205,7 +205,7 @@ class SceneRun:
     def render(self) -> Frame:
         return self.renderer.render(self.resident, self.capture)
 
-    def _complete(self) -> Frame:
+    def _timed(self) -> Frame:
         """Render a frame and wait for the device."""
         begun = time.perf_counter()
         frame = self.render()
