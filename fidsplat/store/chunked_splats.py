@@ -27,8 +27,8 @@ CellSizes = float | tuple[tuple[float, ...], ...]
 """projected size [samples] below which cells are merged: one number, or one for each level of each store"""
 
 NodeMasks = tuple[np.ndarray, ...]
-"""mask (instances * nodes,) bool of the selected nodes of each store; a node is a chunk of splats, or of merged
-splats of a level of detail"""
+"""mask (instances * nodes,) bool of the selected nodes of each store; a node is a chunk of splats, or of
+merged splats of a level of detail"""
 
 
 @dataclass(frozen=True)
