@@ -174,7 +174,7 @@ def test_markers_are_composited_by_depth_in_float64(reference):
     assert off.max() > 1e-3
     assert (frame["error"] >= off - 2e-7).all()  # `want` is float32
     assert frame["error"].max() < 1.1 * off.max()
-    with pytest.raises(InputError, match=r"'error' must.* on warp:cpu, got coplanar groups .*order='centre'"):
+    with pytest.raises(InputError, match=r"'error' must.* on warp:cpu, got .*coplanar groups .*order='centre'"):
         fs.Renderer("warp:cpu").render(cloud, camera, OUTPUTS)
 
 
@@ -296,7 +296,7 @@ def test_batches_and_stores_are_refused(renderer, tmp_path):
     fs.build_store([tmp_path / "few.ply"], tmp_path / "few.fss")
     store = fs.Store(tmp_path / "few.fss")
     with pytest.raises(
-        InputError, match=r"splats must be in memory for the output 'error', got a store; render store\.cloud"
+        InputError, match=r"splats must be in memory for the output 'error', got a store .*; render store\.cloud"
     ):
         renderer.render(store, SMALL, OUTPUTS)
 
