@@ -77,7 +77,7 @@ class Convert:
         from fidsplat.formats.spz import save_spz
         from fidsplat.store.layout import SUFFIX
 
-        existing(self.source)  # before complaints about the target
+        existing(self.source)  # a missing source is reported before an unsuitable target
         if self.mesh.mesh:
             return self._mesh()
         if Path(self.source).suffix == SUFFIX and Path(self.target).name == META:

@@ -77,7 +77,7 @@ class Placing:
             "position": pose[:3, 3],
             "quaternion": matrix_to_quaternion(pose[:3, :3]),
             "normal": surface.normal,
-            "inlier_share": surface.inlier_share,
+            "inlier_fraction": surface.inlier_fraction,
             "roughness_m": surface.roughness,
             "radius_m": surface.radius,
             "appended": self.append,
@@ -226,7 +226,10 @@ class Marker:
         lines = []
         if placing:
             facts["placed"], block = self.placing.placed(marker, self.device)
-            percent, roughness = 100 * facts["placed"]["inlier_share"], 1e3 * facts["placed"]["roughness_m"]
+            percent, roughness = (
+                100 * facts["placed"]["inlier_fraction"],
+                1e3 * facts["placed"]["roughness_m"],
+            )
             rows.append(("surface", f"{percent:.0f} % of the patch in one plane, {roughness:.2g} mm RMS"))
             appended = f"appended to {self.placing.scene}"
             lines = [appended if self.placing.append else f"\n{block.rstrip()}"]

@@ -165,8 +165,8 @@ def plan_tags(
     visible = [k for k, sighting in enumerate(sightings) if len(sighting.poses)]
     if not visible:
         raise InputError(
-            "the trajectory must have a flat surface of a tag's size in view below 70 degrees, got none; "
-            + survey.remedy(poses)
+            "a flat surface of a tag's size must be in view from the trajectory, at an incidence below 70 "
+            "degrees, got none; " + survey.remedy(poses)
         )
     sightings, poses = [sightings[k] for k in visible], poses[visible]
     conflicts = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2) < 2.2 * tag.radius
@@ -320,7 +320,7 @@ def surface_candidates(
                 surface = surface_of(depth, camera, (x, y), radius)
             except InputError:
                 continue
-            if surface.inlier_share >= MIN_INLIERS and surface.roughness <= FLAT * tag.size:
+            if surface.inlier_fraction >= MIN_INLIERS and surface.roughness <= FLAT * tag.size:
                 candidates.append((surface, surface.pose([up, -view[1, :3], view[2, :3]])))
     return candidates
 
@@ -328,7 +328,7 @@ def surface_candidates(
 def suppress_nearby(candidates: Sequence[tuple[Surface, np.ndarray]], tag: Marker) -> np.ndarray:
     """Poses (n, 4, 4) of candidates; of nearby ones only that with the largest inlier fraction remains."""
     order = sorted(
-        range(len(candidates)), key=lambda k: (-candidates[k][0].inlier_share, candidates[k][0].roughness)
+        range(len(candidates)), key=lambda k: (-candidates[k][0].inlier_fraction, candidates[k][0].roughness)
     )
     chosen: list[np.ndarray] = []
     for k in order:

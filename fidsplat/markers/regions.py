@@ -24,7 +24,7 @@ def label_components(grid: np.ndarray) -> tuple[np.ndarray, int]:
     dark, light = (
         cv2.connectedComponents((grid == value).astype(np.uint8), connectivity=4)[1] for value in (1, 0)
     )
-    # one number for each component: positive for those of ones, negative for those of zeros
+    # one number per component: positive for dark components, negative for light ones
     _, first, labels = np.unique(dark - light, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int32)
     rank[np.argsort(first)] = np.arange(len(first))

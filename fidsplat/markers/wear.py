@@ -107,8 +107,8 @@ class Sheet(NamedTuple):
     """(3,) RGB of the paper"""
 
     @property
-    def at(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (h, 1) down and (1, w) right of the cells' centres, in modules."""
+    def positions(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions of the cells' centres in modules: y (h, 1) and x (1, w)."""
         h, w = self.present.shape
         return (np.arange(h)[:, None] + 0.5) / self.cells, (np.arange(w)[None] + 0.5) / self.cells
 
@@ -276,7 +276,7 @@ def _soiled(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
 
 def _folded(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
     """A corner folded over the front, which shows the back of the sheet."""
-    (y, x), (h, w) = sheet.at, sheet.size
+    (y, x), (h, w) = sheet.positions, sheet.size
     bottom, right = rng.integers(0, 2, 2)
     legs = FOLD * severity * min(h, w) * np.array([1.0, rng.uniform(0.6, 1.0)])
     down, in_ = (h - y if bottom else y), (w - x if right else x)  # from the corner
@@ -292,7 +292,7 @@ def _folded(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
 
 def _torn(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
     """A part torn off from a corner along a ragged line, with a rim of bare paper."""
-    (y, x), (h, w) = sheet.at, sheet.size
+    (y, x), (h, w) = sheet.positions, sheet.size
     bottom, right = rng.integers(0, 2, 2)
     angle = rng.uniform(0.15, 0.35) * math.pi
     down, in_ = (h - y if bottom else y), (w - x if right else x)
@@ -308,7 +308,7 @@ def _torn(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
 
 def _covered(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
     """An opaque object over one side."""
-    (y, x), angle = sheet.at, rng.uniform(0, 2 * math.pi)
+    (y, x), angle = sheet.positions, rng.uniform(0, 2 * math.pi)
     rank = _ranks(sheet, math.cos(angle) * x + math.sin(angle) * y)
     color = sheet.color.copy()
     color[rank < severity] = COVER
@@ -336,7 +336,7 @@ def _around(
     modules."""
     low = np.maximum(np.floor((middle - reach) * sheet.cells), 0).astype(int)
     high = np.maximum(np.ceil((middle + reach) * sheet.cells), 0).astype(int)
-    near, (y, x) = (slice(low[0], high[0]), slice(low[1], high[1])), sheet.at
+    near, (y, x) = (slice(low[0], high[0]), slice(low[1], high[1])), sheet.positions
     return near, y[near[0]] - middle[0], x[:, near[1]] - middle[1]
 
 
@@ -344,7 +344,7 @@ def _noise(sheet: Sheet, wide: float, rng: np.random.Generator) -> np.ndarray:
     """Value noise (h, w), 0 to 1: random values on a lattice of some modules, smoothly interpolated."""
     h, w = sheet.size
     lattice = rng.random((math.ceil(h / wide) + 1, math.ceil(w / wide) + 1))
-    (i, a), (j, b) = ((np.floor(at / wide).astype(int), at / wide % 1) for at in sheet.at)
+    (i, a), (j, b) = ((np.floor(at / wide).astype(int), at / wide % 1) for at in sheet.positions)
     a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
     above, below = ((1 - b) * lattice[k, j] + b * lattice[k, j + 1] for k in (i, i + 1))
     return (1 - a) * above + a * below

@@ -162,7 +162,9 @@ def ray_engine(address: str, make: Make, workers: int | None = None) -> Iterator
         try:
             engine = RayEngine(make, workers)
         except WorkerLost as error:
-            raise FidsplatError(f"a worker died while it started: {error}") from error
+            raise FidsplatError(
+                f"a worker died while it started: {error}; check that fidsplat works on its machine"
+            ) from error
         try:
             yield engine
         finally:

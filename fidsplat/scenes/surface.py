@@ -34,7 +34,7 @@ class Surface:
     """(3,) float64, intersection of the ray and the plane in the world [m]"""
     normal: np.ndarray
     """(3,) float64 unit vector in the world, towards the camera"""
-    inlier_share: float
+    inlier_fraction: float
     """fraction of inliers among the pixels of the patch, 0.5 to 1"""
     roughness: float
     """RMS distance of the inliers from the plane [m]"""

@@ -301,8 +301,8 @@ class _Build:
 
 
 def _groups(nodes: np.ndarray, level: int, pinned: int) -> list[np.ndarray]:
-    """Indices of the nodes of a level, in groups that become nodes of the next level; without rows from
-    `pinned` on, which are not merged."""
+    """Groups of node indices of a level; each group is merged to a node of the next level. Chunks of coplanar
+    groups, whose rows begin at `pinned`, are not merged."""
     below = np.flatnonzero((nodes["level"] == level) & ((level > 0) | (nodes["first"] < pinned)))
     return np.array_split(below, -(-len(below) // REDUCTION)) if len(below) else []
 

@@ -63,8 +63,8 @@ def place_store(
         )
     if source.has_coplanar_groups:
         raise InputError(
-            f"an instanced store must be without coplanar groups, got {source.path}; put its markers into a "
-            "scene file"
+            f"a store to be instanced must have no coplanar groups (markers), got {source.path}; build it "
+            "without markers, and put these into a scene file"
         )
     try:
         matrices = np.stack([real_array("a pose", pose_matrix(pose, "a pose")) for pose in poses])

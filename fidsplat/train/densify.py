@@ -68,7 +68,7 @@ def densification(
     )
     chosen = _within_limit(mean, mean >= settings.gradient_threshold, settings.max_splats - len(splats))
     sizes = _largest_scales(splats.scales)
-    large = sizes > settings.dense_share * extent
+    large = sizes > settings.dense_fraction * extent
     clones, splits = np.flatnonzero(chosen & ~large), np.flatnonzero(chosen & large)
     unsplit = np.ones(len(splats), bool)
     unsplit[splits] = False

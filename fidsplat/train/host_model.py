@@ -33,7 +33,7 @@ class HostModel:
         self._splats: Splats
 
     def load(self, splats: Splats) -> None:
-        """Use splats, which are updated in place."""
+        """Start from these splats; training updates their arrays in place."""
         self._splats = splats
 
     def read(self) -> Splats:

@@ -124,7 +124,7 @@ class TrainSettings:
     """iterations between densifications"""
     gradient_threshold: float = 2e-4
     """mean screen-space gradient, in half images, above which a splat is cloned or split"""
-    dense_share: float = 0.01
+    dense_fraction: float = 0.01
     """scale, relative to the scene extent, up to which splats are cloned; larger ones are split"""
     prune_opacity: float = 0.05
     """splats of lower opacity are pruned; 3DGS has 0.005"""

@@ -194,7 +194,7 @@ def alignment(cameras: Sequence[Camera], targets: Sequence[Camera]) -> np.ndarra
 
 
 def moved(camera: Camera, matrix: np.ndarray) -> Camera:
-    """The camera after a similarity (4, 4) of the world."""
+    """The camera after a similarity transform (4, 4) of the world, without the scale."""
     pose = np.eye(4)
     pose[:3, :3] = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3])) @ camera.world_to_camera[:3, :3].T
     pose[:3, 3] = matrix[:3, :3] @ camera.position + matrix[:3, 3]

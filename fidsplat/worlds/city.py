@@ -53,7 +53,7 @@ class City:
 
     @property
     def source(self) -> Source:
-        """Input of `build_store`."""
+        """The city as an input of `build_store`, generated while the store is built."""
         widths = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": (), "colors": (3,)}
         columns = {name: (width, np.float32) for name, width in widths.items()}
         rows = Rows(Path(f"city of {self.splats:,}"), self.splats, columns, self._fill)

@@ -241,7 +241,7 @@ def test_devices_are_side_by_side_in_one_chart(tmp_path):
     assert comments.count("gsplat") == 2
     write(tmp_path / "other", plain_records("r100k_720p", **GPU))
     with pytest.raises(
-        fs.InputError, match="measurements of one common scene, got A processor, A card without one"
+        fs.InputError, match="measurements of one common scene, got none of A processor, A card"
     ):
         plot.write_plot([tmp_path / "cpu", tmp_path / "other"], tmp_path / "none.svg")
     assert not (tmp_path / "none.svg").exists()

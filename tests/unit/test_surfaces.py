@@ -69,7 +69,7 @@ def test_a_wall_behind_leaves(wall, renderer, lens, radius):
         assert abs((surface.position - AT) @ NORMAL) < 1e-5
         assert angle(surface.normal, NORMAL) < 0.02
         np.testing.assert_allclose(view.project(surface.position[None])[0], pixel, atol=1e-6)
-        assert 0.5 <= surface.inlier_share <= 1
+        assert 0.5 <= surface.inlier_fraction <= 1
         assert surface.roughness < 1e-5
         if radius is not None:
             assert surface.radius == pytest.approx(radius, rel=0.15)
@@ -87,7 +87,7 @@ def test_shares_count_the_leaves(wall, renderer):
     of_wall = np.abs(depth - plane_depth) < 0.01
     inside = (x - pixel[0]) ** 2 + (y - pixel[1]) ** 2 <= 20.0**2
     assert 0.55 < of_wall[inside].mean() < 0.95
-    assert surface.inlier_share == pytest.approx(of_wall[inside].mean(), abs=0.01)
+    assert surface.inlier_fraction == pytest.approx(of_wall[inside].mean(), abs=0.01)
     assert angle(surface.normal, NORMAL) < 0.02
 
 

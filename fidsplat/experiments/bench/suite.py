@@ -415,11 +415,11 @@ class Suite:
             )
         metered: set[str] = set()
         for measurement in measurements:
-            # energy is measured for the first setting of each renderer
-            first = measurement.process.name not in metered and scene.x is None
+            # energy is measured only for the first setting of each renderer
+            with_energy = measurement.process.name not in metered and scene.x is None
             metered.add(measurement.process.name)
             try:
-                measurement.finish(self._effort.burst if first else 0.0)
+                measurement.finish(self._effort.burst if with_energy else 0.0)
                 self.found["results"].append(rounded(measurement.result))
             except AdapterError as error:
                 self._failed(measurement.process.name)

@@ -44,7 +44,7 @@ def write_plot(folders: Sequence[Path], file: Path) -> None:
             return
     titles = ", ".join(device.title for device in devices)
     raise InputError(
-        f"the devices to plot must have measurements of one common scene, got {titles} without one; measure "
+        f"devices of a chart must have measurements of one common scene, got none of {titles}; measure "
         "a scene on all of them"
     )
 
