@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -56,6 +57,11 @@ class Estimate(NamedTuple):
 
 class RenderedScene(Protocol):
     """A scene on a device."""
+
+    @property
+    def key(self) -> tuple[Any, Any]:
+        """Resident cloud and capture, which are the same objects for equal frames."""
+        ...
 
     def render(self, camera: Camera) -> Any:
         """Frame with rgb and depth of a camera."""
@@ -156,6 +162,15 @@ class AlignmentKernels(ABC):
         blocks: bool = False,
     ) -> AlignmentSums:
         """Sums of a stage for a frame. blocks: whether to sum each block too."""
+
+    def derivatives(
+        self, stage: int, frame: Any, fit: AlignmentFit, motions: Sequence[tuple[np.ndarray, float, int]]
+    ) -> list[np.ndarray]:
+        """`AlignmentSums.rhs` of each motion: pose after it, size and axis of `PerturbedFrame`."""
+        perturbed = (
+            PerturbedFrame(self.frame(stage, pose, True), size, axis) for pose, size, axis in motions
+        )
+        return [self.sums(stage, frame, fit, perturbed=each).rhs for each in perturbed]
 
     def minimise(
         self, stage: int, at: Estimate, steps: int, settled: float, damping: float

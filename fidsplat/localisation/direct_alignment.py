@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,6 @@ from fidsplat.backends.alignment import (
     AlignmentSums,
     CoarseToFineStage,
     Estimate,
-    PerturbedFrame,
 )
 from fidsplat.cameras import Camera
 from fidsplat.cameras.pose_offset import offset_pose
@@ -95,7 +95,18 @@ def stages_of(camera: Camera, mask: np.ndarray | None = None) -> list[tuple[Coar
     """Stages from coarse to fine for a camera, with maximum numbers of steps of `_minimise`. The first is
     blurred more, for a larger basin of convergence; the last is not blurred, so that it has the noise of the
     image."""
-    short, ignored = min(camera.width, camera.height), _ignored(mask, camera)
+    if mask is None and camera.lens is None:
+        return _plain_stages(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return _stages(camera, _ignored(mask, camera))
+
+
+@lru_cache(maxsize=8)
+def _plain_stages(*intrinsics: Any) -> list[tuple[CoarseToFineStage, int]]:
+    return _stages(Camera.pinhole(*intrinsics), None)
+
+
+def _stages(camera: Camera, ignored: np.ndarray | None) -> list[tuple[CoarseToFineStage, int]]:
+    short = min(camera.width, camera.height)
     shrinks = [2**k for k in range(MAX_LEVELS) if k == 0 or short >> k >= MIN_SIDE]
     coarsest = shrinks[-1]
     finer = [(shrink, 0.7, 8 if shrink > 2 else 5) for shrink in reversed(shrinks[:-1] or [1])]
@@ -180,9 +191,9 @@ class _Stage:
     kernels: AlignmentKernels
     image_noise: float = 0.0
 
-    def frame(self, pose: np.ndarray, perturbed: bool = False) -> Any:
+    def frame(self, pose: np.ndarray) -> Any:
         """The scene at a pose (4, 4)."""
-        return self.kernels.frame(self.number, pose, perturbed)
+        return self.kernels.frame(self.number, pose)
 
     def sums(self, frame: Any, at: Estimate, noise: float = 0.0, **options: Any) -> AlignmentSums:
         """Sums over the pixels of the stage."""
@@ -294,13 +305,15 @@ def _bread(at: Estimate, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.n
     columns = np.concatenate([np.zeros((channels, 8, 6)), sums.matrix[:, :, 6:]], axis=2)
     angle_step = _DIFFERENCE / max(stage.camera.fx, stage.camera.fy)
     pinhole = stage.camera.lens is None
-    for axis in (0, 1, 3, 4) if pinhole else range(6):
+    axes, motions = (0, 1, 3, 4) if pinhole else range(6), []
+    for axis in axes:
         motion = np.zeros(6)
         motion[axis] = size = (
             angle_step if axis < 3 else angle_step / max(math.sqrt(sums.inverse_depth), 1e-3)
         )
-        other = stage.frame(offset_pose(at.pose, motion), perturbed=True)
-        rhs = stage.sums(frame, at, sums.noise, perturbed=PerturbedFrame(other, size, axis % 3)).rhs
+        motions.append((offset_pose(at.pose, motion), size, axis % 3))
+    fit = at.fit._replace(noise=sums.noise)
+    for axis, rhs in zip(axes, stage.kernels.derivatives(stage.number, frame, fit, motions), strict=True):
         columns[:, :, axis] = rhs[:, :, 0]
         if pinhole:
             columns[:, :, axis // 3 * 3 + 2] += rhs[:, :, 1]

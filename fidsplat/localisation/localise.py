@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -146,7 +147,7 @@ def localise(
         )
     if mask is not None and (np.shape(mask) != pixels.shape[:2] or np.asarray(mask).dtype != bool):
         raise invalid("mask", f"an array {pixels.shape[:2]} of bool, False for ignored pixels", mask)
-    capture = capture.with_(outputs=("rgb", "depth"), motion=Motion(), shutter=Shutter(), sensor=Sensor())
+    capture = _plain(capture)
     uploaded = (
         resident
         if resident is not None
@@ -179,6 +180,12 @@ def localise(
         starts = [min(tried, key=lambda alignment: alignment.noise).camera]
     alignment = align(pixels, mask, starts[0], rendered, max_side=max_side)
     return Localisation(alignment.camera, alignment.covariance, alignment.inliers, alignment.noise, source)
+
+
+@lru_cache(maxsize=8)
+def _plain(capture: Capture) -> Capture:
+    """The capture without sensor and motion; the same object for the same capture."""
+    return capture.with_(outputs=("rgb", "depth"), motion=Motion(), shutter=Shutter(), sensor=Sensor())
 
 
 def _pixels(image: Any) -> np.ndarray:

@@ -42,6 +42,11 @@ class Source:
     resident: ResidentCloud
     capture: Capture
 
+    @property
+    def key(self) -> tuple[Any, Any]:
+        """Resident cloud and capture, which are the same objects for equal frames."""
+        return self.resident.data, self.capture
+
     def render(self, camera: Camera) -> Frame:
         """Frame with rgb and depth of a camera."""
         return self.renderer.render(self.resident, self.capture.with_(camera=camera))

@@ -2,8 +2,8 @@
 #define CHANNEL_ROWS 10
 #define SIZE 12   // unknowns of three channels: pose (6), then gain and offset of each channel
 
-// Layout of `state`: the estimate at the last accepted pose, with its normal equations.
-enum { SETTLED, COST, DAMPING, NOISE, INVERSE_DEPTH, EXPOSED, GAIN, OFFSET = GAIN + 3, GAINS = OFFSET + 3, OFFSETS = GAINS + 3,
+// Layout of `state`: pose and exposure of the next frame; the estimate at the last accepted pose, with its normal equations.
+enum { SETTLED, NOISE, NEXT_POSE, NEXT_FIT = NEXT_POSE + 12, COST = NEXT_FIT + 6, DAMPING, INVERSE_DEPTH, EXPOSED, GAIN, OFFSET = GAIN + 3, GAINS = OFFSET + 3, OFFSETS = GAINS + 3,
        RIGHT = OFFSETS + 3, MATRIX = RIGHT + SIZE };
 
 // Exposure changes of a channel that equalise mean and standard deviation of the blurred images. m: the channel's sums.
@@ -99,11 +99,14 @@ kernel void align_step(
         state[EXPOSED] = 1.0f;
         state[COST] = INFINITY;
         state[DAMPING] *= 10.0f;
-        return;
+    } else {
+        fit[6] = state[NOISE];
+        solve(state, 6 + 2 * channels, step);
+        move(pose, step, view);
+        float turn = step[0] * step[0] + step[1] * step[1] + step[2] * step[2];
+        float shift = step[3] * step[3] + step[4] * step[4] + step[5] * step[5];
+        state[SETTLED] = focal * sqrt(turn + shift * state[INVERSE_DEPTH]) < settled;
     }
-    fit[6] = state[NOISE];
-    solve(state, 6 + 2 * channels, step);
-    move(pose, step, view);
-    float turn = step[0] * step[0] + step[1] * step[1] + step[2] * step[2], shift = step[3] * step[3] + step[4] * step[4] + step[5] * step[5];
-    state[SETTLED] = focal * sqrt(turn + shift * state[INVERSE_DEPTH]) < settled;
+    for (int k = 0; k < 12; k++) state[NEXT_POSE + k] = view[k];
+    for (int k = 0; k < 6; k++) state[NEXT_FIT + k] = fit[k];
 }

@@ -273,6 +273,25 @@ def test_steps_on_the_device_agree_with_numpy(room, monkeypatch, far, sky):
     assert sky == (pose_difference(scene.camera.with_pose(device.pose), scene.camera)[0] < 5)
 
 
+def test_a_gpu_replays_renders_with_the_result_of_a_cpu(renderer, room, monkeypatch):
+    """The first image enlarges the buffers, the third replays the command lists after another frame."""
+    scene, _, _ = room
+    capture = scene.capture.with_(background=fs.Gradient((0.2, 0.4, 0.9), (0.5, 0.4, 0.3)))
+    scene = fs.Scene([*scene.clouds], scene.camera, background=capture.background)
+    image = renderer.render(scene)["rgb"] + np.random.default_rng(0).normal(0, 0.02, (48, 64, 3))
+    start = offset_camera(scene.camera, START)
+    expected = fs.localise(image, scene, start, renderer=renderer)
+    gpu = fs.Renderer("opencl")
+    monkeypatch.setattr(gpu.backend, "config", gpu.backend.configs("binning")["bin_first"])
+    monkeypatch.setattr(gpu.backend, "_alignment", None)
+    resident = gpu.upload(scene)
+    for _ in range(3):
+        actual = fs.localise(image, scene, start, renderer=gpu, resident=resident)
+        assert pose_difference(actual.camera, expected.camera)[0] < 2e-3
+        np.testing.assert_allclose(actual.covariance, expected.covariance, rtol=0.02, atol=1e-9)
+        gpu.render(resident, outputs=("rgb", "depth"))
+
+
 def test_a_store_is_localised_in(renderer, room, tmp_path):
     """Frames of a store are on the host, and so are the sums."""
     scene, _, _ = room

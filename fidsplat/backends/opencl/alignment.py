@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from types import SimpleNamespace
+from collections.abc import Sequence
 from typing import Any, TypeAlias
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pyopencl as cl
@@ -23,6 +24,7 @@ from fidsplat.backends.alignment import (
 )
 from fidsplat.backends.opencl.assemble import assemble_alignment, assemble_alignment_step
 from fidsplat.backends.opencl.command_list import CommandList
+from fidsplat.backends.opencl.counts import Counts
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.uniforms import projection_arrays
@@ -35,10 +37,13 @@ _GROUPS = {1: 32, 32: 256}
 """maximum number of work-groups of a sum, by the size of a work-group"""
 _SUMS = 249
 """numbers that a work-group writes"""
-_STATE = 174
+_STATE = 192
 """numbers of `state` in alignment_step.cl, of which the first are read"""
-_SETTLED, _NOISE = 0, 3
+_SETTLED, _NOISE, _POSE, _COST = 0, 1, 2, 20
 _INCOMPLETE = 2
+"""value of `state[SETTLED]` if a frame exceeded its buffers"""
+_MAX_REPLAYS = 16
+"""maximum number of cached command lists of a cloud"""
 _ZERO = np.zeros(1, np.uint32)
 _Image: TypeAlias = tuple[cl.Buffer, tuple[int, ...]]
 
@@ -49,11 +54,12 @@ class OpenCLAlignment(AlignmentKernels):
         self._workspace = workspace
         self._items = 1 if workspace.config.schedule == "lanes" else 32
         self._program = Program(workspace, assemble_alignment(self._items))
-        self._commands, self._loop = CommandList(self._program), CommandList(self._program)
-        self._steps: dict[type, CommandList] = {}
-        """command list of `align_step` by the type of a view's numbers"""
+        self._commands = CommandList(self._program)
+        self._steps: dict[bool, Program] = {}
+        """program of `align_step`; whether the numbers of a view are float64"""
+        self._lists: dict[tuple[int, bool], tuple[CommandList, CommandList]] = {}
+        self._replays: WeakKeyDictionary[Any, dict[Any, _Replayed]] = WeakKeyDictionary()
         self._levels: list[dict[str, Any]] = []
-        self._replayed: _Replayed | None = None
         self._uploads: deque[cl.Event | None] = deque(maxlen=16)
         """keeps arrays alive until the device has read them"""
 
@@ -61,7 +67,7 @@ class OpenCLAlignment(AlignmentKernels):
         self, image: np.ndarray, stages: list[CoarseToFineStage], max_pixels: int, scene: RenderedScene
     ) -> list[int]:
         with self._workspace.lock, self._workspace.device_errors("localising"):
-            self._levels, self._stages, self._scene, self._replayed = [], stages, scene, None
+            self._levels, self._stages, self._scene = [], stages, scene
             histograms = self._scratch("textures", 4 * BINS * len(stages))
             cl.enqueue_fill_buffer(self._queue, histograms, np.zeros(1, np.uint32), 0, 4 * BINS * len(stages))
             source = full = self._upload("image", image), image.shape
@@ -114,23 +120,25 @@ class OpenCLAlignment(AlignmentKernels):
     def frame(self, stage: int, pose: np.ndarray, perturbed: bool = False) -> Any:
         with self._workspace.rendering():
             replayed = self._replay(stage, pose, perturbed)
-            if replayed is not None and replayed.frame.count_pairs() is not None:
-                return replayed.images(perturbed)
+            if replayed is not None and replayed.is_complete():
+                return replayed.images[perturbed]
         return super().frame(stage, pose)
 
     def _replay(self, stage: int, pose: np.ndarray, perturbed: bool = False) -> _Replayed | None:
-        """Submit a frame of a pyramid level without waiting; None on CPUs, and for frames whose command list
-        depends on the pose."""
-        replayed = self._replayed
-        size = self._stages[stage].camera.width, self._stages[stage].camera.height
-        if replayed is None or not replayed.is_bound(size):
-            camera = self._stages[stage].camera.with_pose(pose)
-            self._replayed = replayed = _Replayed.of(self._workspace, *self._scene.prepared(camera))
+        """Submit a frame of a pyramid level without waiting; None on CPUs, and for clouds with moving groups
+        or in chunks."""
+        camera, (resident, capture) = self._stages[stage].camera, self._scene.key
+        sizes = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+        key = capture, *sizes, camera.near, camera.far, camera.lens
+        replays = self._replays.setdefault(resident, {})
+        replayed = replays.get(key)
+        if replayed is None or not replayed.bind():
+            if len(replays) >= _MAX_REPLAYS:
+                replays.clear()
+            replayed = _Replayed.of(self._workspace, *self._scene.prepared(camera.with_pose(pose)))
             if replayed is None:
                 return None
-            replayed.size = size
-            if not perturbed:
-                return replayed
+            replays[key] = replayed
         replayed.set_pose(pose)
         replayed.submit(perturbed)
         return replayed
@@ -160,56 +168,95 @@ class OpenCLAlignment(AlignmentKernels):
             cl.enqueue_copy(self._queue, packed, args["result"])
         return _unpacked(packed, channels, blocks, perturbed is not None)
 
+    def derivatives(
+        self, stage: int, frame: Any, fit: AlignmentFit, motions: Sequence[tuple[np.ndarray, float, int]]
+    ) -> list[np.ndarray]:
+        workspace, level = self._workspace, self._levels[stage]
+        with workspace.rendering():
+            if isinstance(frame, _ReplayedImages):
+                groups, totals = self._groups(level, False), []
+                args = self._sum_arguments(level, frame, fit, groups)
+                cl.enqueue_fill_buffer(self._queue, args["counts"], _ZERO, 0, 4 * BINS)
+                self._upload_fit(fit)
+                self._by_groups("align_errors", self._rows(level["height"]), args)
+                for number, (pose, size, axis) in enumerate(motions):
+                    replayed = self._replay(stage, pose, True)
+                    if replayed is None:
+                        break
+                    image = replayed.images[True].buffer("rgb")
+                    args["perturbed"] = self._blurred(image, args, "perturbed frame", 3)
+                    args |= {"has_perturbed": 1, "step": size, "axis": axis}
+                    self._by_groups("align_sums", groups, args)
+                    totals.append(self._scratch(f"totals {number}", 4 * (_SUMS + 1)))
+                    counts = {"counts": self._scratch("unused", 4 * BINS)}  # keeps the histogram
+                    self._launch(
+                        *("align_totals", (256,), (256,)),
+                        args | counts | replayed.arguments(groups, totals[-1]),
+                    )
+                packed = np.empty((len(totals), _SUMS + 1), np.float32)
+                for row, buffer in zip(packed, totals, strict=True):
+                    cl.enqueue_copy(self._queue, row, buffer)
+                if len(totals) == len(motions) and not packed[:, _SUMS].any():
+                    return [_unpacked(row[None, :_SUMS], len(fit.gain), False, True).rhs for row in packed]
+        return super().derivatives(stage, frame, fit, motions)
+
     def minimise(
         self, stage: int, at: Estimate, steps: int, settled: float, damping: float
     ) -> Estimate | None:
-        workspace, channels = self._workspace, len(at.fit.gain)
-        with workspace.rendering():
+        channels = len(at.fit.gain)
+        with self._workspace.rendering():
             replayed = self._replay(stage, at.pose)
             if replayed is None:
                 return None
-            args, real = self._levels[stage], replayed.record.dtype.type
-            groups = self._groups(args, False)
             state = np.zeros(_STATE, np.float32)
-            state[1:6] = np.inf, 10 * damping, 0, 0, at.noise > 0
-            buffers = {"state": self._scratch("state", 4 * _STATE), "fit": self._upload_fit(at.fit)}
-            self._upload("state", state)
-            self._loop.clear()
-            args = self._sum_arguments(args, replayed.images(), at.fit, groups, self._loop)
-            totals = self._scratch("totals", 4 * (_SUMS + 1))
-            args |= {"groups": groups, "totals": totals, "frame_counts": replayed.frame.buffers.counts}
-            capacity = replayed.frame.capacity
-            args |= {"big_capacity": capacity.big, "pair_capacity": capacity.pairs}
-            cl.enqueue_fill_buffer(self._queue, args["counts"], _ZERO, 0, 4 * BINS)
-            self._by_groups("align_errors", self._rows(args["height"]), args, self._loop)
-            self._by_groups("align_sums", groups, args, self._loop)
-            self._launch("align_totals", (256,), (256,), args, self._loop)
-            if real not in self._steps:
-                self._steps[real] = CommandList(
-                    Program(workspace, assemble_alignment_step(real is np.float64))
-                )
-            step = self._steps[real]
-            args |= buffers | {"view": replayed.view, "settled": settled, "channels": channels}
-            args |= {"focal": max(args["focal_x"], args["focal_y"]), "pose": self._scratch("pose", 8 * 15)}
-            step.clear()
-            self._launch("align_step", (1,), (1,), args, step)
-            found = np.empty(6, np.float32)
+            state[_COST : _COST + 4] = np.inf, 10 * damping, 0, at.noise > 0
+            buffer = self._upload("state", state)
+            self._upload_fit(at.fit)
+            lists = self._step_lists(stage, replayed, at.fit, settled)
+            found = np.empty(_COST, np.float32)
             for number in range(steps + (not at.noise)):  # the first sums may be for the exposure
                 if number:
-                    replayed.follow()
+                    replayed.set_rotation(found[_POSE : _POSE + 9])
                     replayed.submit()
-                    self._loop.submit(self._queue)
-                    step.submit(self._queue)
-                cl.enqueue_copy(self._queue, found, buffers["state"])
+                for commands in lists:
+                    commands.submit(self._queue)
+                cl.enqueue_copy(self._queue, found, buffer)
                 if found[_SETTLED]:
                     break
-            if found[_SETTLED] == _INCOMPLETE:
-                return None
-            fit = np.empty(7, np.float32)
-            cl.enqueue_copy(self._queue, fit, buffers["fit"])
-            exposure = fit[:6].reshape(2, 3)[:, :channels].astype(float)
-            fitted = at.fit._replace(gain=exposure[0], offset=exposure[1])
-            return Estimate(replayed.pose(), fitted, float(found[_NOISE]))
+        if found[_SETTLED] == _INCOMPLETE:
+            return None
+        gain, offset = found[_POSE + 12 :].reshape(2, 3)[:, :channels].astype(float)
+        pose = replayed.world_to_camera(found[_POSE : _POSE + 12])
+        return Estimate(pose, at.fit._replace(gain=gain, offset=offset), float(found[_NOISE]))
+
+    def _step_lists(
+        self, stage: int, replayed: _Replayed, fit: AlignmentFit, settled: float
+    ) -> tuple[CommandList, CommandList]:
+        """Command lists of the sums of a frame, and of a step."""
+        level, double = self._levels[stage], replayed.record.dtype == np.float64
+        if double not in self._steps:
+            self._steps[double] = Program(self._workspace, assemble_alignment_step(double))
+        if (stage, double) not in self._lists:
+            self._lists[stage, double] = CommandList(self._program), CommandList(self._steps[double])
+        sums, step = lists = self._lists[stage, double]
+        key = self._workspace.pool.generation, replayed, settled, level | {"min_bin": 0}
+        if sums.key == key:
+            sums.set({"min_bin": level["min_bin"]})
+            return lists
+        sums.clear()
+        step.clear()
+        groups = self._groups(level, False)
+        args = self._sum_arguments(level, replayed.images[0], fit, groups, sums)
+        args |= replayed.arguments(groups, self._scratch("totals", 4 * (_SUMS + 1)))
+        args |= {"state": self._scratch("state", 4 * _STATE), "settled": settled}
+        args |= {"focal": max(args["focal_x"], args["focal_y"]), "pose": self._scratch("pose", 8 * 15)}
+        self._launch("align_errors", *self._size(self._rows(level["height"])), args, sums)
+        self._launch("align_sums", *self._size(groups), args, sums)
+        self._launch("align_totals", (256,), (256,), args, sums)
+        self._launch("align_step", (1,), (1,), args, step)
+        cl.enqueue_fill_buffer(self._queue, args["counts"], _ZERO, 0, 4 * BINS)  # each frame leaves zeros
+        sums.key = self._workspace.pool.generation, replayed, settled, level | {"min_bin": 0}
+        return lists
 
     def _groups(self, args: dict[str, Any], blocks: bool) -> int:
         """Number of work-groups of the sums; with `blocks` one for each block."""
@@ -269,10 +316,11 @@ class OpenCLAlignment(AlignmentKernels):
             image = result
         return image
 
-    def _by_groups(
-        self, kernel: str, groups: int, args: dict[str, Any], commands: CommandList | None = None
-    ) -> None:
-        self._launch(kernel, (groups * self._items,), (self._items,), args, commands)
+    def _by_groups(self, kernel: str, groups: int, args: dict[str, Any]) -> None:
+        self._launch(kernel, *self._size(groups), args)
+
+    def _size(self, groups: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        return (groups * self._items,), (self._items,)
 
     def _launch(
         self,
@@ -282,12 +330,14 @@ class OpenCLAlignment(AlignmentKernels):
         args: dict[str, Any],
         commands: CommandList | None = None,
     ) -> None:
-        """Submit a kernel. commands: list that also records it."""
-        if commands is None:
-            commands = self._commands
-            commands.clear()
-        values = [args[argument.name] for argument in commands.program.source.arguments[kernel]]
-        commands.launch(self._queue, kernel, size, group, values)
+        """Submit a kernel; with `commands` record it instead."""
+        own = commands or self._commands
+        values = [args[argument.name] for argument in own.program.source.arguments[kernel]]
+        if commands is not None:
+            commands.record(kernel, size, group, values)
+            return
+        own.clear()
+        own.launch(self._queue, kernel, size, group, values)
 
     def _scratch(self, name: str, size: int) -> cl.Buffer:
         return self._workspace.pool.scratch(f"alignment: {name}", size)
@@ -300,78 +350,110 @@ class OpenCLAlignment(AlignmentKernels):
         return buffer
 
 
-class _Replayed:
-    """Frames of a pyramid level at other poses, by one command list."""
+class _ReplayedImages:
+    """Images of a replayed frame, as `Frame.images`. owner: releases their buffers."""
 
-    def __init__(self, workspace: Workspace, frame: DeviceFrame, images: Any, origin: Any) -> None:
-        self._workspace, self.frame, self._images = workspace, frame, images
+    def __init__(self, named: dict[str, cl.Buffer], owner: Any = None) -> None:
+        self.named, self.images, self._owner = named, self, owner
+
+    def buffer(self, name: str) -> cl.Buffer:
+        return self.named[f"{name}_out"]
+
+
+class _Replayed:
+    """Frames of a pyramid level at any pose, by one command list."""
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        frame: DeviceFrame,
+        owner: Any,
+        origin: np.ndarray,
+        perturbed: dict[str, cl.Buffer],
+    ) -> None:
+        """owner: releases the frame's images. perturbed: buffers of the images of `PerturbedFrame`."""
+        pool = workspace.pool
+        self._workspace, self._recorded, self._origin = workspace, frame.recorded, origin
         arrays = projection_arrays(frame.batch, frame.source, 0, frame.rows)
-        self._origin, self.record = origin, arrays["view"].copy()
-        # not known to the pool any more, since `align_step` writes it
-        self.view = workspace.pool.scratch("view", self.record.nbytes)
-        self._buffers = [{f"{name}_out": frame.acquired[f"{name}_out"] for name in ("rgb", "depth")}]
+        self._template, self.record = frame.view, arrays["view"]
         self._rotation = frame.source.uniform_groups.get("rotation", {})
-        self._generation, self._number, self.size = workspace.pool.generation, workspace.frames, (0, 0)
+        self._counts = frame.acquired["counts"]
+        own = {f"{name}_out": frame.acquired[f"{name}_out"] for name in ("rgb", "depth")}
+        self.images = _ReplayedImages(own, owner), _ReplayedImages(perturbed)
+        self._generation, self._number = pool.generation, -1
+        self.view = pool.scratch("view", self.record.nbytes)
 
     @classmethod
     def of(
-        cls, workspace: Workspace, pipeline: Any, resident: Any, view: View, origin: Any
+        cls, workspace: Workspace, pipeline: Any, resident: Any, view: View, origin: np.ndarray
     ) -> _Replayed | None:
-        """Render the view; None if its command list cannot be replayed at other poses."""
+        """Frames with the size and effects of a view; None if they cannot be replayed."""
         plain = not (view.groups or view.sub_frames or view.parallel) and resident.count
         if pipeline.config.binning == "sort_first" or not plain or not pipeline.fits(resident, view):
             return None
+        pixels = (view.width // view.samples) * (view.height // view.samples)
+        scratch = {
+            f"{output.name}_out": workspace.pool.scratch(
+                f"perturbed {output.name}", 4 * pixels * output.channels
+            )
+            for output in pipeline.outputs.values()
+        }
         frame = pipeline.replay_complete(resident, view, 0)
-        return None if frame.waits else cls(workspace, frame, pipeline.images_of(frame), origin)
+        owner = pipeline.images_of(frame)
+        replayed = None if frame.recorded is None else cls(workspace, frame, owner, origin, scratch)
+        return replayed if replayed is not None and replayed.bind() else None
 
-    def is_bound(self, size: tuple[int, int]) -> bool:
-        """Whether frames have this size, and no other frame has overwritten the command list's buffers."""
-        bound = self._generation, self._number, self.size
-        return bound == (self._workspace.pool.generation, self._workspace.frames, size)
+    def bind(self) -> bool:
+        """Restore the buffers that other frames have overwritten; False if a buffer was replaced."""
+        workspace = self._workspace
+        if workspace.pool.generation is not self._generation:
+            return False
+        if workspace.frames != self._number:
+            if not self._recorded.set_view(self._template, self._queue):
+                return False
+            # not known to the pool any more, since `align_step` writes it
+            self.view = workspace.pool.scratch("view", self.record.nbytes)
+            self._recorded.commands.set({"counts": self._counts})
+        return True
+
+    def arguments(self, groups: int, totals: cl.Buffer) -> dict[str, Any]:
+        """Arguments of `align_totals` and `align_step`."""
+        capacity = self._recorded.capacity
+        return {
+            **{"groups": groups, "totals": totals, "frame_counts": self._counts, "view": self.view},
+            **{"big_capacity": capacity.big, "pair_capacity": capacity.pairs},
+        }
 
     def set_pose(self, pose: np.ndarray) -> None:
         rotation, record = pose[:3, :3], self.record.copy()
         eye = -rotation.T @ pose[:3, 3] - self._origin
-        record[:15] = *rotation.ravel(), *(-rotation @ eye), *eye
+        record[:9], record[9:12], record[12:15] = rotation.ravel(), -rotation @ eye, eye
         self._upload = cl.enqueue_copy(self._queue, self.view, record, is_blocking=False)
-        self._set_rotation(record)
+        self.set_rotation(record)
 
-    def _set_rotation(self, record: np.ndarray) -> None:
-        """Set the kernel arguments that depend on the pose, as of a sky."""
-        self.frame.commands.set({name: float(record[index]) for index, name in self._rotation.items()})
-
-    def follow(self) -> None:
-        """Set the kernel arguments for the pose that `align_step` has written."""
+    def set_rotation(self, rotation: np.ndarray) -> None:
+        """Set the kernel arguments that depend on the rotation (9,), as of a sky."""
         if self._rotation:
-            self._set_rotation(self._written())
+            values = rotation.tolist()
+            self._recorded.commands.set({name: values[index] for index, name in self._rotation.items()})
 
     def submit(self, perturbed: bool = False) -> None:
-        """Render the current pose. perturbed: into other images than usual."""
-        if perturbed and len(self._buffers) == 1:
-            pool = self._workspace.pool
-            self._buffers.append(
-                {name: pool.scratch(f"perturbed {name}", own.size) for name, own in self._buffers[0].items()}
-            )
-        self.frame.commands.set(self._buffers[perturbed])
+        commands = self._recorded.commands
+        commands.set(self.images[perturbed].named)
         self._workspace.frames = self._number = self._workspace.frames + 1
-        self.frame.events = self.frame.commands.submit(self._queue)
-        self.frame.counted = self.frame.events[-1]
+        self._events = commands.submit(self._queue)
 
-    def images(self, perturbed: bool = False) -> Any:
-        return SimpleNamespace(
-            images=SimpleNamespace(buffer=lambda name: self._buffers[perturbed][f"{name}_out"])
-        )
+    def is_complete(self) -> bool:
+        """Whether the lists of the last frame were large enough; waits for its counts."""
+        self._queue.flush()
+        counted = self._events[self._recorded.counted_launches - 1]
+        return self._recorded.capacity.holds(Counts.read(self._workspace.side_queue, self._counts, [counted]))
 
-    def _written(self) -> np.ndarray:
-        record = np.empty_like(self.record)
-        cl.enqueue_copy(self._queue, record, self.view)
-        return record
-
-    def pose(self) -> np.ndarray:
-        """The pose (4, 4) that `align_step` has written."""
-        record, pose = self._written(), np.eye(4)
-        pose[:3, :3] = nearest_rotation(record[:9].reshape(3, 3).astype(float))
-        pose[:3, 3] = record[9:12] - pose[:3, :3] @ self._origin
+    def world_to_camera(self, numbers: np.ndarray) -> np.ndarray:
+        """(4, 4) pose from a view's rotation and translation."""
+        pose = np.eye(4)
+        pose[:3, :3] = nearest_rotation(numbers[:9].reshape(3, 3).astype(float))
+        pose[:3, 3] = numbers[9:12] - pose[:3, :3] @ self._origin
         return pose
 
     @property

@@ -153,6 +153,8 @@ class DeviceFrame:
         """number of launches after which the counts are complete"""
         self.counted: cl.Event | None = None
         """event after which the pairs are counted, if the host did not wait"""
+        self.recorded: Any = None
+        """the RecordedFrame that replays it, if there is one"""
         self.in_bands = False
         """whether the lists exceeded the pair budget, so that the frame was rendered in bands of tiles"""
         self.pairs = 0

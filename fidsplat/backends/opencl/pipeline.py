@@ -160,6 +160,7 @@ class OpenCLPipeline(Pipeline):
                     *(ViewBatch.single(view), cached.plan, queue, pair_limit),
                 )
                 recorded.render(frame)
+                frame.recorded = recorded
                 return frame
             plan = self._planner.frame(resident, view)
             buffers = self._buffer_key(resident, view, plan)
@@ -169,7 +170,8 @@ class OpenCLPipeline(Pipeline):
             resident.cached_frames.pop(key, None)  # after an interrupt the recording may be incomplete
             commands = CommandList(self.program) if recorded is None else recorded.commands
             frame = self._render_frame(resident, view, plan, commands, queue, pair_limit)
-            resident.cached_frames[key] = CachedFrame(plan, buffers, None, RecordedFrame(frame))
+            frame.recorded = recorded = RecordedFrame(frame)
+            resident.cached_frames[key] = CachedFrame(plan, buffers, None, recorded)
             return frame
 
     def images_of(self, frame: DeviceFrame) -> OpenCLImages:

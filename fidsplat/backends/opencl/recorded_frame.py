@@ -44,7 +44,7 @@ class RecordedFrame:
         if frame.waits:
             pairs = min(frame.pool.size("lists") // 4, frame.workspace.pair_budget)
             self.capacity, self._counter_bytes = Capacity(self.capacity.big, pairs), 4 * COUNTERS
-        self._counted_launches = frame.counted_launches
+        self.counted_launches = frame.counted_launches
         self._stages = self.commands.stages
         self._source = frame.source
         self._view, self._arrays = frame.view, frame.arrays
@@ -87,14 +87,14 @@ class RecordedFrame:
             return Rendered(queue, acquired, stats, events, stages)
         counters = pool.scratch("counters", self._counter_bytes)
         cl.enqueue_fill_buffer(queue, counters, _ZERO, 0, self._counter_bytes)
-        events = commands.submit(queue, 0, self._counted_launches)
+        events = commands.submit(queue, 0, self.counted_launches)
         words = np.empty((1, COUNTERS), np.uint32)
         cl.enqueue_copy(queue, words, counters)
         counts = Counts.of_counters(words)
         if not (self.capacity.holds(counts) or self._enlarge_lists(counts)):
             pool.release(acquired.items())
             return None
-        events += commands.submit(queue, self._counted_launches)
+        events += commands.submit(queue, self.counted_launches)
         queue.flush()
         return Rendered(queue, acquired, partial(counts.stats, splats), events, self._stages)
 
@@ -118,7 +118,7 @@ class RecordedFrame:
         frame.named |= frame.acquired
         frame.numbers["big_capacity"], frame.pairs = self.capacity.big, self.capacity.pairs
         frame.events, frame.stages = events, self._stages.copy()
-        frame.counted, frame.stats = events[self._counted_launches - 1], rendered.stats
+        frame.counted, frame.stats = events[self.counted_launches - 1], rendered.stats
 
     def _cache_view(self, view: View) -> tuple[View, dict[str, np.ndarray], dict[str, Any]]:
         arrays = projection_arrays(ViewBatch.single(view), self._source, 0, self._rows)
