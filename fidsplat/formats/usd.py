@@ -132,7 +132,7 @@ def _check_layers(pxr: Any, source: str) -> None:
 
 
 def _read(pxr: Any, name: str) -> dict[str, Any]:
-    """Arrays of each field of Gaussians; the names end with the index of the field."""
+    """Arrays of all particle fields of the file; each name ends with the index of its field."""
     stage = pxr.Usd.Stage.Open(name, pxr.Usd.Stage.LoadAll)
     prims = [prim for prim in stage.Traverse() if prim.GetTypeName() in _KINDS]
     if not prims:

@@ -196,9 +196,10 @@ def parse_scale(text: str) -> tuple[Pick, Pick, float]:
 
 
 def scale_of(model: Model, first: Pick, second: Pick, metres: float) -> float:
-    """Metres for each unit of the model, by the features nearest to two picks.
+    """Metres per unit of the model, from the distance of two features. first, second: pixels of photographs
+    near these features.
 
-    Raises InputError for an unknown photograph, or a pick without a feature nearby.
+    Raises InputError for an unknown photograph, or a pixel without a feature nearby.
     """
     distance = float(np.linalg.norm(_picked(model, first) - _picked(model, second)))
     if not distance > 0:

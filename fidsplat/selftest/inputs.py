@@ -191,7 +191,7 @@ SIZES = (
 
 
 def sized(width: int, height: int) -> Camera:
-    """A camera with the crowd in view, for images of any size."""
+    """Camera for images of any size, with the splats of `crowd` in view."""
     focal = 0.8 * max(width, height)
     return Camera.pinhole(width, height, focal, focal, width / 2, height / 2)
 

@@ -84,7 +84,7 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
     if m.shape != (4, 4):
         raise InputError(f"{name} must be a 4x4 matrix, got shape {m.shape}")
     if not (np.isfinite(m).all() and (np.abs(m[:3, 3]) <= LARGEST).all()):
-        raise InputError(f"{name} must be finite, and move by at most {LARGEST:g} metres, got other values")
+        raise InputError(f"{name} must be finite, and move by at most {LARGEST:g} metres, got {m.tolist()}")
     if not np.array_equal(m[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(f"{name} must have the last row (0, 0, 0, 1), got {tuple(m[3].tolist())}")
     linear = m[:3, :3]

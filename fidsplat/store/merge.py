@@ -54,7 +54,8 @@ def _runs(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _split_edges(keys: np.ndarray, splats: dict[str, np.ndarray]) -> np.ndarray:
-    """New cell keys (n,), with different keys for bright and dark splats of cells with an edge."""
+    """Split grid cells whose splats differ in brightness by more than `EDGE` (RMS): cell keys (n,), with
+    different keys for the bright and the dark splats of such a cell."""
     colors = splats["colors"] if "colors" in splats else C0 * splats["sh"][:, 0]
     order, starts = _runs(keys)
     light = colors.astype(np.float64).mean(axis=1)[order]

@@ -1,4 +1,5 @@
-"""Occlusion test of boxes of splats against the termination depths of a frame's tiles.
+"""Occlusion test of bounding boxes of splats against the termination depths of a frame's tiles, at which
+blending of a tile stops.
 
 A box is occluded if its lowest sort key is above the termination depth of every tile that it can touch.
 """
@@ -72,7 +73,8 @@ def node_sort_keys(scene: ChunkedSplats, view: View, features: FeatureSet) -> tu
 def occluded_nodes(
     scene: ChunkedSplats, view: View, features: FeatureSet, termination: TerminationDepths
 ) -> NodeMasks:
-    """Masks of the nodes that are occluded in a frame with these termination depths, except pinned ones."""
+    """Masks of the nodes that are occluded in a frame with these termination depths. Pinned nodes, which have
+    coplanar groups, never are."""
     masks = []
     for number, (store, pinned) in enumerate(zip(scene.stores, scene.pinned, strict=True)):
         max_sigma = np.tile(store.nodes["reach"].astype(np.float64), store.instances)

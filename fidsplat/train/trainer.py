@@ -316,7 +316,8 @@ class Trainer:
         return both[psnr[1] > psnr[0]]
 
     def _advance(self, late: bool) -> None:
-        """Run one iteration. late: whether its loss may be read after later iterations."""
+        """Run one iteration. late: whether the host may read its loss after later iterations have been
+        submitted."""
         interrupts.check()
         state, settings = self._state, self.settings
         if self._failure is not None:

@@ -171,7 +171,7 @@ def target_names(scene: Scene, splat_files: Sequence[SplatFile]) -> list[str]:
 
 
 def find_target(scene: Scene, splat_files: Sequence[SplatFile], name: str) -> GizmoTarget | None:
-    """The target with a name of `target_names`; None if the scene no longer has it."""
+    """The marker or splat file with a name of `target_names`; None if the scene no longer contains it."""
     number = int(name.removeprefix(_FILE).partition(":")[0]) - 1
     if not name.startswith(_FILE):
         if number not in range(len(scene.markers)):

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from fidsplat.backends.interface import Rates
 
 # bytes read per splat: position, scales and opacity for culling; rotation and colour if visible
-_DECIDE, _ROTATION, _COLOR = 12 + 8 + 4, 16, 12
+_CULLING, _ROTATION, _COLOR = 12 + 8 + 4, 16, 12
 RECORD = 64  # bytes of intersection and colour of a splat, as in splat.cl
 WINDOW = 8  # bytes of the tile range of a splat
 _KEY, _INDEX = 4, 4
 # operations that a multiply-add unit executes once per cycle
-_DECIDE_FMA, _SET_UP_FMA, _SET_UP_DIVISIONS = 20, 160, 4
+_CULLING_FMA, _PROJECTION_FMA, _PROJECTION_DIVISIONS = 20, 160, 4
 FRAGMENT_FMA = 30  # exp and division are counted separately
 
 
@@ -57,9 +57,9 @@ def roofline_work(counts: Counts) -> dict[str, Work]:
     n, visible, colors = counts.splats, counts.visible, 1 + counts.sh_coefficients
     return {
         "project": Work(
-            bytes=n * _DECIDE + visible * (_ROTATION + _COLOR * colors + RECORD + WINDOW + _KEY),
-            fma=n * _DECIDE_FMA + visible * (_SET_UP_FMA + 3 * counts.sh_coefficients),
-            division=visible * _SET_UP_DIVISIONS,
+            bytes=n * _CULLING + visible * (_ROTATION + _COLOR * colors + RECORD + WINDOW + _KEY),
+            fma=n * _CULLING_FMA + visible * (_PROJECTION_FMA + 3 * counts.sh_coefficients),
+            division=visible * _PROJECTION_DIVISIONS,
         ),
         "sort": Work(bytes=visible * (_KEY + _INDEX)),
         "bin": Work(bytes=visible * (_INDEX + WINDOW) + counts.pairs * _INDEX),
