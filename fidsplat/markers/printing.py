@@ -209,9 +209,8 @@ def grow(grid: np.ndarray, rectangles: np.ndarray, growth: float) -> np.ndarray:
     for axis in (first, 1 - first):
         for end, way in ((0, -1), (2, 1)):
             left = target[every, axis]
-            corner = cells[
-                :, :2
-            ].copy()  # most rectangles do not grow, as the first cell of the next row has another colour
+            # a test of one cell of the next strip excludes most rectangles
+            corner = cells[:, :2].copy()
             corner[every, axis] = cells[every, axis + end] - (end == 0)
             moving = np.flatnonzero((left > 0) & (padded[corner[:, 1], corner[:, 0]] == color))
             while len(moving):

@@ -95,8 +95,8 @@ def _views(file: Path, table: dict, progress: Progress, label: str, masks: Masks
 def _divided(
     file: Path, table: dict, views: list[TrainingView]
 ) -> tuple[list[TrainingView], list[TrainingView]]:
-    """Divide views into training views and held-out views by the file's `train_filenames`, `val_filenames` and
-    `test_filenames`."""
+    """Training views and held-out views, by `train_filenames`, `val_filenames` and `test_filenames` of the
+    file."""
     known, named = {PurePath(view.name) for view in views}, {}
     for split in ("train", "val", "test"):
         names = table.get(f"{split}_filenames") or []
