@@ -341,9 +341,10 @@ def train_all(options: argparse.Namespace, truth: dict) -> None:
         )
         found = fs.localise(view.image, resident, start, mask=view.mask, renderer=renderer)
         at = moved(start.with_pose(found.pose), matrix)
-        offs.append(pose_error(at.camera_to_world, exact.camera.camera_to_world))
-    millimetres, degrees = np.median(np.array(offs) * (1000, 180 / math.pi), axis=0)
-    print(f"localisation of {len(offs)} held-out photographs: {millimetres:.3g} mm, {degrees:.3g} degrees")
+        offs.append((*pose_error(at.camera_to_world, exact.camera.camera_to_world), found.inliers))
+    for distance, angle, inliers in offs:
+        text = f"{1000 * distance:.3g} mm, {math.degrees(angle):.3g} degrees, {100 * inliers:.0f} % of blocks"
+        print(f"localisation of a held-out photograph: {text}")
 
 
 def _without_splats(scene: Path) -> Path:

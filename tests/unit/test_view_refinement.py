@@ -12,6 +12,7 @@ from fidsplat.cameras.pose_offset import offset_camera
 from fidsplat.images.files import to_uint8, write_png
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.train import Dataset, Trainer, TrainingView, load_dataset
+from fidsplat.train.scores import score_view
 from fidsplat.train.settings import TrainSettings
 from fidsplat.train.view_refinement import ViewRefinement, alignment, camera_intrinsics, moved
 from fidsplat.vision.pose import pose_error
@@ -86,6 +87,12 @@ def test_poses_return_to_the_truth(renderer, cloud, original, disturbed):
     before, after = errors(disturbed.views, original), errors(trainer.views, reference)
     assert (before > (0.02, 0.008)).all()
     assert (after < (0.002, 0.001)).all()
+    psnr = []
+    for splats, views in ((cloud, disturbed.views), (trained, trainer.views)):
+        cameras = [view.camera for view in views]
+        frames = renderer.render_views(splats, cameras, quality="surfel", background=BACKGROUND)
+        psnr.append(np.mean([score_view(v, f["rgb"]).psnr for v, f in zip(views, frames, strict=True)]))
+    assert psnr[0] < 30 < 50 < psnr[1]
     changes = trainer.pose_changes()
     expected = [
         pose_error(a.camera.camera_to_world, b.camera.camera_to_world)
