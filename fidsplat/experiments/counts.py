@@ -17,9 +17,9 @@ FULL_REPEATS, QUICK_REPEATS = 15, 3
 def measure_counts(point: dict, seed: int) -> dict:
     """Sizes of a marker and times of its construction.
 
-    Returns dark and light (including the quiet zone) numbers of `cells`, `runs` (of one colour in each row)
-    and `rectangles` of the minimum partition, `components`, `gaussians` by mixture and partition, and
-    `seconds` by mixture: one number per repeat, from text to splats, after a warm-up.
+    Returns the numbers of dark and of light (quiet zone included) `cells`, `runs` (of one colour in a row),
+    `rectangles` (minimum partition) and `components`; `gaussians` by mixture and partition; and `seconds` by
+    mixture: times from text to splats after a warm-up, one for each repeat.
     """
     spec = CATEGORIES[point["category"]].spec(point["index"], seed)
     plain = marker(spec)

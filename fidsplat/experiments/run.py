@@ -76,7 +76,7 @@ def _points(name: str, options: Any) -> list[Key]:
     categories, count = chosen_categories(options.category), options.marker_count
     if name == counts.NAME:
         repeats = counts.QUICK_REPEATS if options.quick else counts.FULL_REPEATS
-        count = MARKERS if options.markers is None else count  # all five markers take only a second
+        count = MARKERS if options.markers is None else count  # also in a quick run: it takes a second
         return [{**marker, "repeats": repeats} for marker in _markers(categories, count)]
     if name == views.NAME:
         number = QUICK_VIEWS if options.quick else TEST_VIEWS

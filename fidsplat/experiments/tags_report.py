@@ -224,7 +224,7 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
     fraction, square = hits / count, NORMAL**2 / count
     middle = (fraction + square / 2) / (1 + square)
     half = NORMAL / (1 + square) * math.sqrt(fraction * (1 - fraction) / count + square / (4 * count))
-    # exact ends if there are no hits or only hits
+    # without rounding errors at the ends 0 and 1
     return 0.0 if hits == 0 else middle - half, 1.0 if hits == count else middle + half
 
 

@@ -396,8 +396,8 @@ class _Sheet(NamedTuple):
 
     @property
     def _deviation(self) -> float:
-        """Deviation of the pieces; copies of pieces at the borders of coplanar groups are farther by `GAP`
-        times this deviation."""
+        """Largest distance [m] of the pieces from the surface, except for copies of pieces at the borders of
+        coplanar groups, which are offset by `GAP` times this distance."""
         requested = None if self.surface is None else self.surface.deviation
         return (self.size / FINE if requested is None else requested) / (1 + GAP)
 

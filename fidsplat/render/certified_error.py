@@ -191,9 +191,9 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
         return replace(features, outputs=("rounding",)), view
     float32_rays = any(name.startswith("background_") for name in unbounded)
     with suppress(InputError):
-        double = prepare(data, replace(capture, quality=quality.with_(blend_precision="float64")))
-        if not float32_rays and not backend.unsupported(double[0]):
-            return double
+        in_float64 = prepare(data, replace(capture, quality=quality.with_(blend_precision="float64")))
+        if not float32_rays and not backend.unsupported(in_float64[0]):
+            return in_float64
     alternatives = dict(_remedy_of(name) for name in unbounded or ["blend_double"])
     options, remedies = (" and ".join(words) for words in (alternatives, alternatives.values()))
     raise InputError(

@@ -400,8 +400,8 @@ class Renderer:
         if capture.external_depth is None and camera.width > METERING_WIDTH:
             height = max(1, round(camera.height * METERING_WIDTH / camera.width))
             camera = camera.with_size(METERING_WIDTH, height)
-        plain = capture.with_(camera=camera, outputs=("rgb",), sensor=Sensor())
-        colors = self._render(resident, plain)["rgb"]
+        without_sensor = capture.with_(camera=camera, outputs=("rgb",), sensor=Sensor())
+        colors = self._render(resident, without_sensor)["rgb"]
         return capture.with_(sensor=capture.sensor.metered(np.asarray(colors)))
 
     def _render(

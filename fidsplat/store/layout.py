@@ -132,7 +132,7 @@ def read_header(folder: Path) -> Header:
     except ValueError:
         raise InputError(f"{file} is damaged: it is not JSON; build the store again") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise InputError(f"{folder} is not a store: its {HEADER} has another format")
+        raise InputError(f"{folder} is not a store: its {HEADER} has another format; build the store again")
     version = content.get("version")
     if version != VERSION:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Response curve of a camera, from linear light to colours, and its inverse; values above 1 are kept."""
+"""Response curve of a camera, from linear light to colours, and its inverse; values above 1 are not clamped."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class Nodes:
     def show(self, scene: Scene, overlay: bool) -> None:
         """Show outlines and names of the scene's markers, and its camera.
 
-        overlay: False hides them, as for lenses other than the page's, whose images they would not match.
+        overlay: False hides them, for images of lenses, which the page's pinhole overlay would not match.
         """
         for node in self._shown:
             node.remove()
