@@ -193,7 +193,7 @@ def compared(device: DeviceResults, point: Row, other: Row) -> str:
 def cheapest_within(device: DeviceResults, scenes: Iterable[str], bound: float) -> list[Row]:
     """Rows of the fastest setting with errors of at most a bound on all scenes; [] if there is none.
 
-    Settings are compared by the product of their times; errors within certificates do not count.
+    Settings are compared by the product of their times; errors within error bounds do not count.
     """
     scenes = list(scenes)
     rows: Table = pd.concat([device.same_definition(scene) for scene in scenes])

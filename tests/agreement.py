@@ -65,7 +65,7 @@ def against_reference(renderer, image):
 
 
 def reference_pixels(cloud, camera, outputs, quality, background=(0.0, 0.0, 0.0), pixels=None):
-    """Reference images with the certificate: all pixels, or at `pixels` = (rows, columns)."""
+    """Reference images with the error bound: all pixels, or at `pixels` = (rows, columns)."""
     return reference_images(FrameSpec(cloud, camera, Quality.of(quality), tuple(outputs), background), pixels)
 
 

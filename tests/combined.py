@@ -116,7 +116,7 @@ SWITCHES = {
     **{f"output {name}": Switch(f"output {name}", output=name) for name in OUTPUTS if name != "rgb"},
 }
 COARSE = ("set-up",)
-"""kinds for which the reference has no certificate"""
+"""kinds for which the reference has no error bound"""
 LENSES = [name for name, switch in SWITCHES.items() if switch.kind == "lens"]
 
 
@@ -180,7 +180,7 @@ def combination(names: Iterable[str]) -> Combination:
 
 
 def assert_renders(renderer: fs.Renderer, names: Iterable[str]) -> None:
-    """It builds, it renders, and all its images are the reference's within tolerance and certificate."""
+    """It builds, it renders, and all its images are the reference's within tolerance and error bound."""
     requested = combination(names)
     frame = renderer.render(requested.cloud, requested.capture)
     view = view_of(requested.capture, requested.cloud.origin)

@@ -11,7 +11,7 @@ from rich.progress import Progress
 
 import fidsplat as fs
 
-pytest_plugins = ["certificates", "optimisation"]
+pytest_plugins = ["error_bounds", "optimisation"]
 # other processes make an example slow, not the code
 hypothesis.settings.register_profile("tests", deadline=None)
 hypothesis.settings.load_profile("tests")

@@ -121,7 +121,7 @@ def run_frames() -> int:
 
 
 def frames(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
-    """Titles, and functions that render a frame and return its largest error beyond the certificates, in rgb
+    """Titles, and functions that render a frame and return its largest error beyond the error bounds, in rgb
     and alpha.
 
     Few splats and few pixels in small tiles: tile lists of 0 to 90 splats, tiles cut by the image border, and
@@ -160,7 +160,7 @@ def frames(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
             for name in {"rgb", "alpha"} & set(rendered):
                 error = np.abs(rendered[name] - truth[name])
                 error = error.max(-1) if error.ndim > 2 else error
-                worst = max(worst, float((error - truth["certificate"]).max()))
+                worst = max(worst, float((error - truth["error_bound"]).max()))
             return worst if all(np.isfinite(image).all() for image in rendered.values()) else float("nan")
 
         return work

@@ -90,7 +90,7 @@ class Choice:
     certified: float | None = None
     """largest value of the output `error`, if it was rendered (`certify`)"""
     remark: str = ""
-    """class of scenes of a promise, or why there is no certificate"""
+    """class of scenes of a promise, or why there is no error bound"""
 
     def as_dict(self) -> dict[str, Any]:
         """All fields except the quality, for JSON."""

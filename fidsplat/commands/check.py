@@ -161,6 +161,6 @@ def _print_fuzz(state: "FuzzState", renderer: "Renderer", where: "Console") -> N
     print_lines(
         where,
         f"{state.splats:,} splats in {state.scenes:,} scenes, {state.pixels:,} pixels, "
-        f"{state.risky / max(state.pixels, 1):.2%} with certificates above 0.05; {state.seconds:.0f} s\n"
+        f"{state.risky / max(state.pixels, 1):.2%} with error bounds above 0.05; {state.seconds:.0f} s\n"
         f"failing seeds: {' '.join(map(str, state.failing)) or 'none'}",
     )

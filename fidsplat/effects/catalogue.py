@@ -26,7 +26,7 @@ class Output:
     color and normal"""
     tolerance: float = 0.0
     """largest error of a device that tests allow, in addition to the reference's error bound of a pixel
-    (`NAME_certificate`)"""
+    (`error_bound_NAME`)"""
     relative: bool = False
     """whether the tolerance is relative to the value"""
     discontinuous: bool = False

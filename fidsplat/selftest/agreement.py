@@ -1,6 +1,6 @@
-"""Comparison of a device's images with the float64 reference, with an error bound (certificate) per pixel.
+"""Comparison of a device's images with the float64 reference, with an error bound per pixel.
 
-The tolerance of an output is declared in fidsplat/effects/catalogue.py. The reference adds a certificate per
+The tolerance of an output is declared in fidsplat/effects/catalogue.py. The reference adds an error bound per
 pixel: the change that float32 rounding may cause there, because a decision is at its threshold or a splat is
 thinner than the rounding of its distance (docs/correctness.md). Outputs that jump at a decision, such as
 labels, may differ only in pixels that the reference marks.
@@ -31,7 +31,7 @@ COLOR_TOLERANCE = declared_output("rgb").tolerance
 DEPTH_TOLERANCE = declared_output("depth").tolerance
 """relative slack for the rounding of the comparison"""
 RARE = 1e-3
-"""maximum fraction of pixels with a certificate above `RISKY`"""
+"""maximum fraction of pixels with an error bound above `RISKY`"""
 RISKY = 0.05
 CATALOGUED = Quality(alpha_cutoff=1 / 255)
 """alpha cut-off of the catalogue's cases; the fuzzer and the contract tests use the presets"""
@@ -71,16 +71,16 @@ class Difference:
 
     output: str
     error: float
-    """largest error, including pixels with a certificate"""
+    """largest error, including pixels with an error bound"""
     excess: float
-    """largest error beyond certificate and tolerance; at most 0 if the device agrees"""
+    """largest error beyond error bound and tolerance; at most 0 if the device agrees"""
     risky: float
-    """fraction of pixels whose certificate exceeds `RISKY`"""
+    """fraction of pixels whose error bound exceeds `RISKY`"""
     finite: bool
 
     @property
-    def uncertified(self) -> float:
-        """Largest part of an error that exceeds the error bound of its pixel (the certificate)."""
+    def beyond_bound(self) -> float:
+        """Largest part of an error that exceeds the error bound of its pixel."""
         return self.excess + tolerance_of(self.output)
 
     @property
@@ -90,7 +90,7 @@ class Difference:
 
 
 def tolerance_of(name: str) -> float:
-    """Allowed error of an output beyond its certificate; 0 (fraction of pixels) if discontinuous."""
+    """Allowed error of an output beyond its error bound; 0 (fraction of pixels) if discontinuous."""
     output = declared_output(name)
     return 0.0 if output.discontinuous else output.tolerance
 
@@ -102,7 +102,7 @@ def render(renderer: Renderer, spec: FrameSpec) -> Frame:
 def reference_images(
     spec: FrameSpec, pixels: tuple[np.ndarray, np.ndarray] | None = None
 ) -> dict[str, np.ndarray]:
-    """Images of the reference with `alpha` and `certificate`: all pixels, or (k, ...) at (rows, columns)."""
+    """Images of the reference with `alpha` and `error_bound`: all pixels, or (k, ...) at (rows, columns)."""
     reference = ReferenceBackend()
     features, view = spec.prepared("alpha")
     pipeline, resident = reference.pipeline(features), reference.upload(spec.cloud)
@@ -113,7 +113,7 @@ def reference_images(
 
 def compare(images: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], outputs) -> list[Difference]:
     """Compare images of a device with those of `reference_images`, for each of `outputs`."""
-    risky = float((truth["certificate"] > RISKY).mean())
+    risky = float((truth["error_bound"] > RISKY).mean())
     differences = []
     for name in outputs:
         errors = _flips if declared_output(name).discontinuous else _errors
@@ -124,28 +124,28 @@ def compare(images: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], o
 
 
 def _errors(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tuple[float, float]:
-    """Largest error of a continuous output, and largest error beyond the certificate."""
-    want, certified = truth[name], _certificate(name, truth)
+    """Largest error of a continuous output, and largest error beyond the error bound."""
+    want, certified = truth[name], _error_bound(name, truth)
     error = np.abs(image - want)
-    if error.ndim > truth["certificate"].ndim:
+    if error.ndim > truth["error_bound"].ndim:
         error = error.max(-1)
     # parallel rays have negative depths behind the camera's plane
     size = np.maximum(np.abs(want), 1e-30) if declared_output(name).relative else 1.0
     return float((error / size).max(initial=0.0)), float(((error - certified) / size).max(initial=0.0))
 
 
-def _certificate(name: str, truth: Mapping[str, np.ndarray]) -> np.ndarray:
+def _error_bound(name: str, truth: Mapping[str, np.ndarray]) -> np.ndarray:
     """Change of an output that float32 may cause in each pixel."""
     if name not in ("rgb", "alpha"):
-        return truth[f"certificate_{name}"]
+        return truth[f"error_bound_{name}"]
     brightest = max(1.0, float(np.abs(truth["rgb"]).max(initial=1.0)))
-    in_colors = truth["certificate"] * brightest
-    return truth.get("certificate_rgb", in_colors) if name == "rgb" else in_colors
+    in_colors = truth["error_bound"] * brightest
+    return truth.get("error_bound_rgb", in_colors) if name == "rgb" else in_colors
 
 
 def _flips(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tuple[float, float]:
     """Fraction of pixels in which a discontinuous output differs, and fraction that differs without a
-    certificate."""
+    error bound."""
     output, want = declared_output(name), truth[name]
     limit = output.tolerance * want if output.relative else truth.get(f"{name}_bound", output.tolerance)
     differs = np.abs(image - want) > limit

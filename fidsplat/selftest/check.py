@@ -25,7 +25,7 @@ class Worst:
     device: np.ndarray
     """(h, w, 3) rgb"""
     reference: np.ndarray
-    certificate: np.ndarray
+    error_bound: np.ndarray
     """(h, w)"""
     rank: tuple[bool, float]
     """sort key: whether the frame fails, and its largest error"""
@@ -37,10 +37,10 @@ class CaseResult:
 
     case: Case
     frames: int = 0
-    uncertified: dict[str, float] = field(default_factory=dict)
-    """output -> largest error beyond the certificate"""
+    beyond_bound: dict[str, float] = field(default_factory=dict)
+    """output -> largest error beyond the error bound"""
     largest: dict[str, float] = field(default_factory=dict)
-    """output -> largest error, including pixels with a certificate"""
+    """output -> largest error, including pixels with an error bound"""
     findings: list[Finding] = field(default_factory=list)
     wrong: list[str] = field(default_factory=list)
     """failures as messages"""
@@ -102,7 +102,7 @@ class CheckResult:
                     "trigger": result.case.trigger,
                     "passed": result.passed,
                     "frames": result.frames,
-                    "uncertified_error": result.uncertified,
+                    "error_beyond_bound": result.beyond_bound,
                     "largest_error": result.largest,
                     "findings": [asdict(found) | {"holds": found.holds} for found in result.findings],
                     "seconds": result.seconds,
@@ -157,7 +157,7 @@ def _compared(renderer: Renderer, spec: FrameSpec, result: CaseResult, worst: Wo
     frame, truth = render(renderer, spec), reference_images(spec)
     for difference in compare(frame, truth, spec.outputs):
         name = difference.output
-        raise_to(result.uncertified, name, difference.uncertified)
+        raise_to(result.beyond_bound, name, difference.beyond_bound)
         raise_to(result.largest, name, difference.error)
         if not difference.agrees:
             result.wrong.append(_in_words(result.frames, difference))
@@ -166,25 +166,25 @@ def _compared(renderer: Renderer, spec: FrameSpec, result: CaseResult, worst: Wo
         visible = "rgb" in spec.outputs and (name in ("rgb", "alpha") or rank[0])
         if visible and (worst is None or rank > worst.rank):
             words = f"{result.case.name}, frame {result.frames}, {name}: error {difference.error:.0e}"
-            words += f", uncertified {difference.uncertified:.0e}"
+            words += f", beyond the bound {difference.beyond_bound:.0e}"
             rgb = np.array(frame["rgb"], dtype=np.float64)
-            worst = Worst(words, rgb, truth["rgb"], truth["certificate"], rank)
+            worst = Worst(words, rgb, truth["rgb"], truth["error_bound"], rank)
     return worst
 
 
 def worst_image(worst: Worst) -> np.ndarray:
     """Contact sheet (h, w, 3) uint8: the device's image, the reference image, their difference, its bound.
 
-    The bound (certificate) is the difference that rounding explains. Difference and bound are each scaled by
+    The bound is the difference that rounding explains. Difference and bound are each scaled by
     a power of ten.
     """
     from fidsplat.images.files import to_uint8
     from fidsplat.images.visualize import contact_sheet, write
 
     difference = np.abs(worst.device - worst.reference)
-    certificate = np.repeat(worst.certificate[:, :, None], 3, axis=2)
+    error_bound = np.repeat(worst.error_bound[:, :, None], 3, axis=2)
     panels = [("device", worst.device), ("reference, float64", worst.reference)]
-    for name, plane in (("difference", difference), ("allowed by rounding", certificate)):
+    for name, plane in (("difference", difference), ("allowed by rounding", error_bound)):
         peak = float(np.nan_to_num(plane, posinf=1.0).max(initial=0.0))
         factor = 10.0 ** np.clip(np.floor(-np.log10(peak)), 0, 9) if peak > 0 else 1.0
         panels.append((f"{name} x {factor:.0e}, at most {peak:.1e}", plane * factor))
@@ -192,7 +192,7 @@ def worst_image(worst: Worst) -> np.ndarray:
     shown = [(name, to_uint8(plane).repeat(times, axis=0).repeat(times, axis=1)) for name, plane in panels]
     sheet = contact_sheet([shown[:2], shown[2:]], width=times * worst.device.shape[1])
     verdict = "FAILS: beyond rounding" if worst.rank[0] else "Agrees: the difference is due to rounding"
-    lines = (f"Case {worst.title}", f"{verdict} and decisions that rounding can flip (the certificate).")
+    lines = (f"Case {worst.title}", f"{verdict} and decisions that rounding can flip (the error bound).")
     caption = np.full((24 * len(lines) + 8, sheet.shape[1], 3), sheet[0, 0], np.uint8)
     for row, line in enumerate(lines):
         write(caption, line, (8, 24 * row + 18), size=0.45)
@@ -205,10 +205,10 @@ def _in_words(number: int, difference: Difference) -> str:
         return f"{image} has values that are not finite"
     if difference.excess > 0:
         return (
-            f"{image} has an error of {difference.uncertified:.1e} beyond its certificate, above "
+            f"{image} has an error of {difference.beyond_bound:.1e} beyond its error bound, above "
             f"{tolerance_of(difference.output):.0e}"
         )
-    return f"{image}: {difference.risky:.1%} of the pixels have certificates above 0.05"
+    return f"{image}: {difference.risky:.1%} of the pixels have error bounds above 0.05"
 
 
 def raise_to(largest: dict[str, float], name: str, value: float) -> None:

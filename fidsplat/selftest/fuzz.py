@@ -157,18 +157,18 @@ class FuzzState:
     splats: int = 0
     pixels: int = 0
     risky: int = 0
-    """pixels whose certificate exceeds 0.05"""
-    uncertified: dict[str, tuple[float, int]] = field(default_factory=dict)
-    """output -> largest error beyond the certificate, and its seed"""
+    """pixels whose error bound exceeds 0.05"""
+    beyond_bound: dict[str, tuple[float, int]] = field(default_factory=dict)
+    """output -> largest error beyond the error bound, and its seed"""
     largest: dict[str, tuple[float, int]] = field(default_factory=dict)
-    """output -> largest error, including pixels with a certificate, and its seed"""
+    """output -> largest error, including pixels with an error bound, and its seed"""
     failing: list[int] = field(default_factory=list)
-    """seeds with an error beyond tolerance and certificate, or a non-finite value"""
+    """seeds with an error beyond tolerance and error bound, or a non-finite value"""
     seconds: float = 0.0
 
     @property
     def passed(self) -> bool:
-        """Whether no seed fails and few pixels have large certificates."""
+        """Whether no seed fails and few pixels have large error bounds."""
         return not self.failing and self.risky <= RARE * self.pixels
 
     def add(self, seed: int, renderer: Renderer) -> None:
@@ -179,7 +179,7 @@ class FuzzState:
         for difference in compare(render(renderer, spec), truth, ALL_OUTPUTS):
             name = difference.output
             failed |= not (difference.finite and difference.excess <= 0)
-            errors = (self.uncertified, difference.uncertified), (self.largest, difference.error)
+            errors = (self.beyond_bound, difference.beyond_bound), (self.largest, difference.error)
             for record, value in errors:
                 value = float("inf") if np.isnan(value) else value
                 if name not in record or value > record[name][0]:
@@ -187,8 +187,8 @@ class FuzzState:
         if failed:
             self.failing.append(seed)
         self.scenes, self.splats = seed + 1, self.splats + len(spec.cloud)
-        self.pixels += truth["certificate"].size
-        self.risky += int((truth["certificate"] > RISKY).sum())
+        self.pixels += truth["error_bound"].size
+        self.risky += int((truth["error_bound"] > RISKY).sum())
 
 
 def fuzz_run(renderer: Renderer, splats: int, file: Path | None = None) -> Iterator[FuzzState]:
@@ -222,7 +222,7 @@ def _load(file: Path | None, key: str) -> FuzzState:
         values = from_json(read_text(file)) if file is not None else {}
         if values.get("key") != key:
             return FuzzState(key)
-        for name in ("uncertified", "largest"):
+        for name in ("beyond_bound", "largest"):
             values[name] = {output: (float(pair[0]), int(pair[1])) for output, pair in values[name].items()}
         return FuzzState(**values)
     except (OSError, ValueError, TypeError, KeyError, AttributeError):  # missing, or another file

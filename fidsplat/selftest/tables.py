@@ -25,7 +25,7 @@ def arithmetic_table(facts: Arithmetic, device: str) -> Table:
 
 def case_table(result: CheckResult) -> Table:
     """Largest errors of each group of hard cases, next to their bounds."""
-    heads = ("group", "cases", "images", "colour", "uncertified", "depth", "uncertified", "verdict")
+    heads = ("group", "cases", "images", "colour", "beyond bound", "depth", "beyond bound", "verdict")
     bounds = ("bound", "", "", "", f"{COLOR_TOLERANCE:.0e}", "", f"{DEPTH_TOLERANCE:.0e}", "")
     return "Largest errors", heads, [bounds, *(_case_row(*group) for group in result.groups.items())]
 
@@ -33,7 +33,7 @@ def case_table(result: CheckResult) -> Table:
 def _case_row(letter: str, results: list[CaseResult]) -> tuple[str, ...]:
     cells = [f"{letter} {GROUPS[letter]}", str(len(results)), str(sum(case.frames for case in results))]
     for outputs in (("rgb", "alpha"), ("depth",)):
-        for kind in ("largest", "uncertified"):
+        for kind in ("largest", "beyond_bound"):
             maxima = [getattr(case, kind) for case in results]
             values = [errors[name] for errors in maxima for name in outputs if name in errors]
             cells.append(f"{max(values, key=rank_of):.0e}" if values else "-")
@@ -67,7 +67,7 @@ def fuzz_table(state: FuzzState, device: str) -> Table:
     rows = [
         (name, *(cell for error, seed in pair for cell in (f"{error:.1e}", str(seed))))
         for name in state.largest
-        for pair in [(state.uncertified[name], state.largest[name])]
+        for pair in [(state.beyond_bound[name], state.largest[name])]
     ]
-    heads = ("output", "error beyond the certificate", "seed", "error", "seed")
+    heads = ("output", "error beyond the bound", "seed", "error", "seed")
     return f"Largest errors of random scenes on {device}", heads, rows

@@ -1,4 +1,4 @@
-"""Response curve of a camera, from linear light to colours, and its inverse; values above 1 are not clamped."""
+"""Response curve of a camera, from linear light to colours, and its inverse, without a clamp at 1."""
 
 from __future__ import annotations
 

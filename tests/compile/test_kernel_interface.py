@@ -186,7 +186,7 @@ def test_an_output_is_compared_listed_and_written_as_it_is_declared(toys, tmp_pa
     expected = {
         "nearest": np.array([[1.0, 2.0, 0.0]]),
         "nearest_may_flip": np.array([[False, True, False]]),
-        "certificate": np.zeros((1, 3)),
+        "error_bound": np.zeros((1, 3)),
         "rgb": np.zeros((1, 3, 3)),
     }
     within, flipped, off = (

@@ -82,7 +82,7 @@ def test_fast_preset_is_as_accurate_as_its_constants(renderer):
     cloud = random_splats(200, seed=0, depth=(0.5, 6.0))
     frame = renderer.render(cloud, CAMERA, quality=quality)
     expected = reference_pixels(cloud, CAMERA, ("rgb",), quality)
-    excess = np.abs(frame["rgb"] - expected["rgb"]).max(2) - expected["certificate"]
+    excess = np.abs(frame["rgb"] - expected["rgb"]).max(2) - expected["error_bound"]
     assert np.quantile(excess, 0.999) < 0.1 / 255
     assert excess.max() < 2.0 / 255
 
@@ -159,7 +159,7 @@ def test_a_hundred_thousand_splats_at_720p(renderer):
     psnr = -10 * math.log10(float((error**2).mean()))
     print(f"r100k_720p: {psnr:.1f} dB, largest error {error.max():.1e}")
     assert psnr > 50
-    assert (error <= 2e-5 + expected["certificate"]).all()
+    assert (error <= 2e-5 + expected["error_bound"]).all()
 
 
 def coplanar_cloud(seed, count=60, planes=2):

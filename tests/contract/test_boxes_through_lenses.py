@@ -160,5 +160,5 @@ def test_boxes_through_lenses_in_single_precision(renderer, name):
     cloud = random_splats(100, 0, depth=(0.5, 6.0)).with_boxes()
     frame = renderer.render(cloud, CAMERAS[name], ALL_OUTPUTS, "fast")
     expected = reference_pixels(cloud, CAMERAS[name], ("rgb",), "fast")
-    excess = np.abs(frame["rgb"] - expected["rgb"]).max(2) - expected["certificate"]
+    excess = np.abs(frame["rgb"] - expected["rgb"]).max(2) - expected["error_bound"]
     assert np.quantile(excess, 0.995) < 0.1 / 255

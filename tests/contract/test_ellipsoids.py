@@ -175,8 +175,8 @@ def test_random_hard_scenes(renderer, seeds):
         image = thick_scene_of(seed)
         actual = against_reference(renderer, image)
         assert all(one.finite and one.excess <= 0 for one in actual), (seed, actual)
-        worst = {one.output: max(one.uncertified, worst.get(one.output, 0)) for one in actual}
+        worst = {one.output: max(one.beyond_bound, worst.get(one.output, 0)) for one in actual}
         size = image.camera.width * image.camera.height
         splats, pixels, risky = splats + len(image.cloud), pixels + size, risky + actual[0].risky * size
-    print(f"{splats} splats, {pixels} pixels, {risky:.0f} with large certificates, beyond them {worst}")
+    print(f"{splats} splats, {pixels} pixels, {risky:.0f} with large error bounds, beyond them {worst}")
     assert risky <= RARE * pixels

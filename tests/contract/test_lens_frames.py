@@ -60,7 +60,7 @@ def test_near_and_far_planes_amid_the_splats(renderer, name):
 
 @pytest.mark.parametrize("name", ["pinhole", "distortion", "fisheye 200", "panorama", "parallel"])
 def test_depths_of_a_tilted_wall_are_right_to_a_hundred_thousandth(renderer, name):
-    """Without a certificate: nothing is hard here."""
+    """Without an error bound: nothing is hard here."""
     camera = CAMERAS.get(name, camera_with_lens(None))
     center = np.linalg.inv(camera.world_to_camera) @ (0.1, -0.2, 3.0, 1.0)
     quaternion = (0.9, 0.25, -0.2, 0.1)
@@ -270,6 +270,6 @@ def test_lenses_in_single_precision(renderer, name):
     cloud = random_splats(200, 0, depth=(0.5, 6.0))
     frame = renderer.render(cloud, CAMERAS[name], quality="fast")
     expected = reference_pixels(cloud, CAMERAS[name], ("rgb",), "fast")
-    excess = np.abs(frame["rgb"] - expected["rgb"]).max(2) - expected["certificate"]
+    excess = np.abs(frame["rgb"] - expected["rgb"]).max(2) - expected["error_bound"]
     assert np.quantile(excess, 0.999) < 0.1 / 255
     assert excess.max() < 2.0 / 255

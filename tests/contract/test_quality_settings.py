@@ -40,7 +40,7 @@ def opencl(renderer):
     ids=["around", "dense", "sh", "planes"],
 )
 def test_blending_in_double_has_only_the_rounding_of_the_output(opencl, cloud, samples):
-    """No certificate here: what float32 might change, double does not. A sample buffer is rounded when it
+    """No error bound here: what float32 might change, double does not. A sample buffer is rounded when it
     is written, and the sum of the samples and the background once more each."""
     if not opencl.device.float64:
         pytest.skip("the device has no float64")

@@ -160,7 +160,7 @@ def test_errors_are_those_of_the_cut_off():
     # just outside the radius alpha is just below the cut-off
     assert 0.09 < result["maximum"] < 0.1
     assert result["rmse"] == pytest.approx(np.sqrt(((rendered(renderer, scene, cut) - exact) ** 2).mean()))
-    # no pixel's decision hangs on rounding, so certificates take nothing away
+    # no pixel's decision hangs on rounding, so error bounds take nothing away
     assert result["maximum_sure"] == pytest.approx(result["maximum"], abs=1e-4)
     assert session_module.compare_image(exact.astype(np.float32), exact, scene, EXACT)["rmse"] < 1e-6
 
@@ -172,21 +172,21 @@ def test_a_certified_flip_is_not_an_error():
         session_module.FrameSpec(scene.cloud, scene.camera, quality, ("rgb",)),
         tuple(part.ravel() for part in np.mgrid[0:48, 0:64]),
     )
-    certificate = reference["certificate"].reshape(48, 64)
+    error_bound = reference["error_bound"].reshape(48, 64)
     off = np.zeros((48, 64))
-    row, column = np.unravel_index(np.argmax(certificate), off.shape)
-    off[row, column] = certificate[row, column]
-    assert session_module.beyond_certificates(off, scene, quality) == pytest.approx(0.0, abs=1e-12)
+    row, column = np.unravel_index(np.argmax(error_bound), off.shape)
+    off[row, column] = error_bound[row, column]
+    assert session_module.beyond_error_bounds(off, scene, quality) == pytest.approx(0.0, abs=1e-12)
     # an error that nothing certifies stays
     off[24, 32] = 0.3
-    assert certificate[24, 32] < 1e-3
-    assert session_module.beyond_certificates(off, scene, quality) == pytest.approx(0.3, abs=1e-3)
+    assert error_bound[24, 32] < 1e-3
+    assert session_module.beyond_error_bounds(off, scene, quality) == pytest.approx(0.3, abs=1e-3)
     assert rendered(renderer, scene, quality)[24, 32].max() > 0.9
 
 
-def test_many_splats_have_no_certificates(monkeypatch):
+def test_many_splats_have_no_error_bounds(monkeypatch):
     monkeypatch.setattr(session_module, "_PAIRS", 5)
-    assert session_module.beyond_certificates(np.zeros((48, 64)), faint_rim(), BASE) is None
+    assert session_module.beyond_error_bounds(np.zeros((48, 64)), faint_rim(), BASE) is None
 
 
 def test_a_marker_is_compared_with_the_printed_texture(session):

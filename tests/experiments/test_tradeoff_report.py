@@ -152,7 +152,7 @@ def test_the_cheapest_invisible_error_is_the_cheapest_on_all_scenes():
     records = plain_records("hard") + plain_records("r100k_720p")
     chosen = report.cheapest_within(device(records), ("hard", "r100k_720p"), report.INVISIBLE)
     assert [point["value"] for point in chosen] == ["1/1024", "1/1024"]
-    # beyond its certificates another is invisible too, on one of the scenes
+    # beyond its error bounds another is invisible too, on one of the scenes
     for each in records:
         if each.key["value"] == "fast" and each.key["scene"] == "hard":
             each.result["maximum_sure"] = 0.001

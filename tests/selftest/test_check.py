@@ -56,8 +56,8 @@ def test_a_good_device_passes(renderer):
     assert messages == ["arithmetic", "A1: a good case"]
     (only,) = result.groups["A"]
     assert (only.frames, only.passed) == (1, True)
-    assert set(only.largest) == set(only.uncertified) == {"rgb", "alpha", "depth"}
-    assert only.uncertified["rgb"] <= 2e-5
+    assert set(only.largest) == set(only.beyond_bound) == {"rgb", "alpha", "depth"}
+    assert only.beyond_bound["rgb"] <= 2e-5
     assert result.worst is not None
     image = check.worst_image(result.worst)
     assert image.dtype == np.uint8
@@ -101,14 +101,14 @@ def test_a_device_that_fails_fails_its_case_only(renderer):
     assert result.cases[1].passed
 
 
-def test_certificates_are_small_where_nothing_is_hard():
-    """In an ordinary scene certificates are below the tolerance in every pixel, and nothing may flip."""
+def test_error_bounds_are_small_where_nothing_is_hard():
+    """In an ordinary scene error bounds are below the tolerance in every pixel, and nothing may flip."""
     cloud = random_splats(300, seed=20, depth=(1.0, 6.0), scale=(0.01, 0.3))
     expected = check.reference_images(FrameSpec(cloud, camera(), outputs=ALL_OUTPUTS))
     assert expected["alpha"].max() > 0.9
-    assert expected["certificate"].max() < 1e-5
-    assert np.median(expected["certificate"]) < 2e-6
-    # but where 1/255 is covered, the rim of every output but colour: a decision, which has its certificate
+    assert expected["error_bound"].max() < 1e-5
+    assert np.median(expected["error_bound"]) < 2e-6
+    # but where 1/255 is covered, the rim of every output but colour: a decision, which has its error bound
     rim = np.abs(expected["alpha"] - 1 / 255) < 6e-5
     assert rim.mean() < 1e-3
     assert not expected["label_may_flip"][~rim].any()
@@ -116,7 +116,7 @@ def test_certificates_are_small_where_nothing_is_hard():
     assert expected["depth_median_may_flip"].mean() < 5e-4
 
 
-def test_certificates_cover_decisions_within_float32_rounding():
+def test_error_bounds_cover_decisions_within_float32_rounding():
     # a needle 1e-4 px wide across the image, through pixel centres; a splat at the cut-off; a tie
     needle = splats([[0.00625, 0.00625, 1]], rotation((0, 0, 1), 45), (0.4, 1.25e-6))
     faint = splats([[0.00625, 0.00625, 1]], (1, 0, 0, 0), 0.2, np.float32(1 / 255) * (1 + 1e-6))
@@ -125,10 +125,10 @@ def test_certificates_cover_decisions_within_float32_rounding():
         check.reference_images(FrameSpec(cloud, camera(), outputs=ALL_OUTPUTS))
         for cloud in (needle, faint, tie)
     ]
-    assert truths[0]["certificate"].max() > 1e-3
-    assert 0.003 < truths[1]["certificate"].max() < 0.005
+    assert truths[0]["error_bound"].max() > 1e-3
+    assert 0.003 < truths[1]["error_bound"].max() < 0.005
     assert truths[2]["label_may_flip"].any()
-    assert all(expected["certificate"][0, 0] < 1e-5 for expected in truths)
+    assert all(expected["error_bound"][0, 0] < 1e-5 for expected in truths)
 
 
 def test_too_many_uncertain_pixels_fail(renderer, monkeypatch):
@@ -136,11 +136,11 @@ def test_too_many_uncertain_pixels_fail(renderer, monkeypatch):
 
     def uncertain(spec):
         expected = reference_images(spec)
-        return expected | {"certificate": expected["certificate"] + 0.06}
+        return expected | {"error_bound": expected["error_bound"] + 0.06}
 
     monkeypatch.setattr(check, "reference_images", uncertain)
     failures = check.run_check(renderer, [GOOD]).failures
-    assert "certificates above 0.05" in failures[0]
+    assert "error bounds above 0.05" in failures[0]
 
 
 def test_arithmetic(renderer, reference):

@@ -16,7 +16,7 @@ def test_a_number_of_splats(renderer, splats):
     assert state.passed
     assert state.splats >= splats
     assert set(state.largest) == {"rgb", "alpha", "depth", "depth_median", "normal", "label"}
-    assert state.uncertified["rgb"][0] <= 2e-5
+    assert state.beyond_bound["rgb"][0] <= 2e-5
 
 
 @pytest.mark.parametrize("seed", [12, 45, 68, 94, 174, 194, 223, 229, 248])
@@ -109,7 +109,7 @@ def test_an_invalid_state_file_is_replaced(renderer, tmp_path, content):
 
 def test_a_failing_seed_is_reported(renderer, monkeypatch):
     class Wrong(dict):
-        """Images with a small error where the certificate is small."""
+        """Images with a small error where the error bound is small."""
 
     def wrong(one, spec):
         frame = render(one, spec)
@@ -121,4 +121,4 @@ def test_a_failing_seed_is_reported(renderer, monkeypatch):
     state.add(3, renderer)
     assert state.failing == [3]
     assert not state.passed
-    assert state.uncertified["alpha"][1] == 3
+    assert state.beyond_bound["alpha"][1] == 3

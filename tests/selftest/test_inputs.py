@@ -21,7 +21,7 @@ def test_the_largest_grids_at_a_few_pixels(renderer, width, height):
     for name in ("rgb", "alpha"):
         error = np.abs(frame[name][pixels] - expected[name])
         error = error.max(-1) if error.ndim > 1 else error
-        assert (error <= COLOR_TOLERANCE + expected["certificate"]).all(), name
+        assert (error <= COLOR_TOLERANCE + expected["error_bound"]).all(), name
 
 
 def opencl(renderer):

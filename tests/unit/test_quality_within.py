@@ -134,7 +134,7 @@ def test_a_choice_is_refined_until_certified(renderer):
         certify(coarse(renderer), 1e-3, 1e-6, scene, scene.capture, renderer)
 
 
-def test_a_choice_without_a_certificate_has_a_remark(renderer):
+def test_a_choice_without_an_error_bound_has_a_remark(renderer):
     scene = fs.Scene([layers(3, 0.5)], camera=SMALL, fog=fs.Fog(0.1))
     choice = certify(coarse(renderer), 1e-3, None, scene, scene.capture, renderer)
     assert choice.certified is None

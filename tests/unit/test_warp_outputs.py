@@ -134,8 +134,8 @@ def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch, tmp_path):
     files = save_output("strongest", toys["strongest"], lambda name, suffix: tmp_path / f"{name}{suffix}")
     assert [file.name for file in files] == ["strongest.png"]
     expected = {name: toys[name].astype(float) for name in ("rgb", "strongest")}
-    expected |= {"certificate": np.zeros(toys["strongest"].shape)}
-    expected |= {"certificate_strongest": np.zeros(toys["strongest"].shape)}
+    expected |= {"error_bound": np.zeros(toys["strongest"].shape)}
+    expected |= {"error_bound_strongest": np.zeros(toys["strongest"].shape)}
     for error, agrees in ((0.9e-3, True), (1.1e-3, False)):
         [difference] = compare({"strongest": toys["strongest"] + error}, expected, ("strongest",))
         assert difference.agrees == agrees

@@ -124,7 +124,7 @@ class ReferencePipeline(Pipeline):
         return HostImages(images, {"reference": took}, {"splats": count, "visible": count, "pairs": 0})
 
     def render_intermediates(self, resident: ReferenceCloud, view: View) -> dict[str, np.ndarray]:
-        """Render one view; returns the depth order, the float32 keys, and the images with the certificate."""
+        """Render one view; returns the depth order, the float32 keys, and the images with the error bound."""
         splats = ProjectedSplats(resident.cloud, view, self.features)
         images = self.render_view(resident, view).arrays_of(0)
         return {"order": splats.order, "keys": splats.key, **images}
@@ -137,7 +137,7 @@ class ReferencePipeline(Pipeline):
         columns: np.ndarray,
         widest: int = _WIDEST,
     ) -> dict[str, np.ndarray]:
-        """Render single pixels (row, column): outputs (k,) or (k, 3) float64, and `certificate` (k,). widest:
+        """Render single pixels (row, column): outputs (k,) or (k, 3) float64, and `error_bound` (k,). widest:
         maximum side in samples of the tiles for which splats are culled together."""
         n = view.samples
         sub_rows, sub_columns = np.mgrid[0:n, 0:n]
@@ -172,7 +172,7 @@ class ReferencePipeline(Pipeline):
         self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray, widest: int
     ) -> dict[str, np.ndarray]:
         """Combine the samples of several sub-frames: colour, fog and transmittance are averaged; other
-        outputs and `certificate_middle` are from the middle sub-frame."""
+        outputs and `error_bound_middle` are from the middle sub-frame."""
         out: dict[str, np.ndarray] = {}
         rows_of = [
             (y > sub_frame.top) & (y < sub_frame.top + sub_frame.view.height) for sub_frame in view.sub_frames
@@ -180,10 +180,10 @@ class ReferencePipeline(Pipeline):
         self._progress.total = sum(int(members.sum()) for members in rows_of)
         for sub_frame, members in zip(view.sub_frames, rows_of, strict=True):
             samples = self._samples(resident, sub_frame.view, x[members], y[members] - sub_frame.top, widest)
-            samples["certificate_middle"] = samples["certificate"]
+            samples["error_bound_middle"] = samples["error_bound"]
             for name, values in samples.items():
                 plane = out.setdefault(name, np.zeros((len(x), *values.shape[1:]), values.dtype))
-                if name in ("rgb", "t", "fogged", "certificate", "behind_bound"):
+                if name in ("rgb", "t", "fogged", "error_bound", "behind_bound"):
                     plane[members] += sub_frame.weight * values
                 elif sub_frame.middle:
                     plane[members] = values

@@ -47,10 +47,10 @@ def composite(
     out = {
         "rgb": _sum(weight, ordered.colors),
         "t": final,
-        "certificate": error_bounds.of_color(s, view, span, before, ordered.moved) + ordered.reordered,
+        "error_bound": error_bounds.of_color(s, view, span, before, ordered.moved) + ordered.reordered,
     }
     out["covered"] = 1 - final >= MIN_ALPHA
-    out["covered_may_flip"] = np.abs(1 - final - MIN_ALPHA) <= out["certificate"] + error_bounds.STOP
+    out["covered_may_flip"] = np.abs(1 - final - MIN_ALPHA) <= out["error_bound"] + error_bounds.STOP
     if "fog" in features.post_steps:
         reach = -view.fog_density * ray_lengths(x, y, view)[:, None]
         left = np.exp(reach * z)
@@ -58,7 +58,7 @@ def composite(
         out["fogged"] = (weight * (1 - left)).sum(1)
         with np.errstate(invalid="ignore"):
             moved = np.abs(np.exp(reach * np.maximum(span.z_low, 0)) - np.exp(reach * span.z_high))
-        out["certificate"] += (weight * moved).sum(1)
+        out["error_bound"] += (weight * moved).sum(1)
     if view.environment_map is not None:
         behind, moved = background_at(view, x, y)
         out["rgb"] = out["rgb"] + final[:, None] * behind

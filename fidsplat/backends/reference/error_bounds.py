@@ -1,9 +1,9 @@
-"""Error bounds (certificates) of the reference's outputs for rendering in float32.
+"""Error bounds of the reference's outputs for rendering in float32.
 
 A device evaluates the affine forms n_u, n_v, D of a pixel in float32, relative to the pixel nearest to the
 splat's centre. Interval arithmetic over their rounding yields an interval of each fragment's opacity. It is
 wide near a threshold (cut-off, near plane, horizon) and for splats that are thinner than the rounding error
-of their distance. The certificate of a pixel is the sum of the possible changes of its fragments, to first
+of their distance. The error bound of a pixel is the sum of the possible changes of its fragments, to first
 order.
 """
 

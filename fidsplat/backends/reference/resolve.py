@@ -18,24 +18,24 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
     """Images of pixels (k, ...) from their sample buffers (k, n * n, ...), which include grid positions `x`,
     `y`.
 
-    The result includes certificates, upper bounds of the error in float32: `certificate` of alpha, and of rgb
-    per unit of colour; `certificate_depth`, `certificate_distance` [m]; `certificate_normal` of unit vectors;
+    The result includes error bounds, upper bounds of the error in float32: `error_bound` of alpha, and of rgb
+    per unit of colour; `error_bound_depth`, `error_bound_distance` [m]; `error_bound_normal` of unit vectors;
     `label_may_flip` and so on (bool); `blended_bound` in splats.
     """
-    t, bound = samples["t"].mean(1), samples["certificate"]
+    t, bound = samples["t"].mean(1), samples["error_bound"]
     center_x, center_y = samples["x"].mean(1), samples["y"].mean(1)
-    out = {"rgb": samples["rgb"].mean(1) + t[:, None] * view.background, "certificate": bound.mean(1)}
+    out = {"rgb": samples["rgb"].mean(1) + t[:, None] * view.background, "error_bound": bound.mean(1)}
     if "fogged" in samples:
         out["rgb"] += samples["fogged"].mean(1)[:, None] * view.background
     if features.post_steps or view.environment_map is not None:
         steps = tuple(step for step in features.post_steps if step != "fog")
         most = max(1.0, float(np.abs(out["rgb"]).max(initial=1.0)), float(np.abs(view.background).max()))
-        unsure = out["certificate"] * max(most, max_value(view.environment_map))
+        unsure = out["error_bound"] * max(most, max_value(view.environment_map))
         if view.environment_map is not None:
             unsure = unsure + samples["behind_bound"].mean(1)
         columns, rows = (np.floor(center / view.samples).astype(int) for center in (center_x, center_y))
-        out["rgb"], out["certificate_rgb"] = apply_sensor(out["rgb"], unsure, steps, view, columns, rows)
-    bound = samples.get("certificate_middle", bound)  # the other outputs are from one sub-frame
+        out["rgb"], out["error_bound_rgb"] = apply_sensor(out["rgb"], unsure, steps, view, columns, rows)
+    bound = samples.get("error_bound_middle", bound)  # the other outputs are from one sub-frame
     if "alpha" in features.names:
         out["alpha"] = 1 - t
     if "distortion" in features.names:
@@ -57,7 +57,7 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
             moved = bound_covered * np.where(bound_covered > 0, np.maximum(spread, 0), 0)
             moved += (off * along).sum(1)
             minimum = weight.sum(1) - bound_covered
-            out[f"certificate_{name}"] = _where_covered(_ratio(moved, minimum, math.inf), covered, unsure)
+            out[f"error_bound_{name}"] = _where_covered(_ratio(moved, minimum, math.inf), covered, unsure)
     for name, along in (("depth_median", "distance_median"), ("depth_first", "distance_first")):
         if name in features.names:
             place = _median if name == "depth_median" else _nearest
@@ -71,10 +71,10 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
         out["normal_world"] = np.einsum("ki,kij->kj", out["normal"], rotations)
         moved = 2 * bound_covered + _ROUND * (1 - samples["t"]).sum(1)
         moved += np.where(covered, samples["normal_moved"], 0.0).sum(1)
-        out["certificate_normal"] = _where_covered(
+        out["error_bound_normal"] = _where_covered(
             _ratio(moved, length - bound_covered, math.inf), covered, unsure
         )
-        out["certificate_normal_world"] = out["certificate_normal"]
+        out["error_bound_normal_world"] = out["error_bound_normal"]
     for name in sorted({"label", "splat_id"} & features.names):
         heaviest = np.argmax(samples["heaviest"], axis=1)
         weights = np.sort(samples["heaviest"], axis=1)

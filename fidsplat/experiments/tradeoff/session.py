@@ -131,14 +131,14 @@ def time_point(session: Session, view: str, quality: Quality, effort: Effort) ->
 
 _PAIRS = 2_000_000
 """maximum number of pixels times splats of the reference renderer per image"""
-_MAX_CERTIFICATES, _MIN_CERTIFICATES = 64, 12
-"""maximum number of pixels with certificates, and minimum number for which certificates are computed"""
+_MAX_BOUNDED_PIXELS, _MIN_BOUNDED_PIXELS = 64, 12
+"""maximum number of pixels with error bounds, and minimum number for which error bounds are computed"""
 
 
 def compare_image(image: np.ndarray, reference: np.ndarray, scene: TradeScene, quality: Quality) -> dict:
     """Errors of rgb (h, w, 3) relative to a reference image with the same image definition.
 
-    Returns `maximum`, `rmse`, `maximum_sure` (`beyond_certificates`), and for markers the result of
+    Returns `maximum`, `rmse`, `maximum_sure` (`beyond_error_bounds`), and for markers the result of
     `compare_marker`.
     """
     differences = errors(image, reference)
@@ -146,15 +146,15 @@ def compare_image(image: np.ndarray, reference: np.ndarray, scene: TradeScene, q
     result = {
         "maximum": differences.maximum,
         "rmse": differences.rmse,
-        "maximum_sure": beyond_certificates(difference, scene, quality),
+        "maximum_sure": beyond_error_bounds(difference, scene, quality),
     }
     return result if scene.marker is None else result | compare_marker(image, scene)
 
 
-def beyond_certificates(difference: np.ndarray, scene: TradeScene, quality: Quality) -> float | None:
-    """Maximum error over all pixels that float32 certificates do not explain.
+def beyond_error_bounds(difference: np.ndarray, scene: TradeScene, quality: Quality) -> float | None:
+    """Maximum error over all pixels that float32 error bounds do not explain.
 
-    A certificate bounds the change of a pixel by decisions of `quality` within rounding of their thresholds.
+    The error bound of a pixel limits its change by decisions of `quality` within rounding of thresholds.
     It is subtracted from the error of the pixels with the largest errors. None if the scene has too many
     splats or the device `reference` cannot render it.
 
@@ -162,22 +162,22 @@ def beyond_certificates(difference: np.ndarray, scene: TradeScene, quality: Qual
         difference: (h, w) largest error of each pixel over the channels.
     """
     size = difference.size
-    count = min(_MAX_CERTIFICATES, _PAIRS // max(1, len(scene.cloud) * quality.samples**2), size)
-    if count < min(_MIN_CERTIFICATES, size):
+    count = min(_MAX_BOUNDED_PIXELS, _PAIRS // max(1, len(scene.cloud) * quality.samples**2), size)
+    if count < min(_MIN_BOUNDED_PIXELS, size):
         return None
     worst = np.argsort(difference, axis=None)[::-1][: count + 1]
     rows, columns = np.unravel_index(worst[:count], difference.shape)
-    # certificates describe float32, the reference renderer is float64
+    # error bounds describe float32, the reference renderer is float64
     plain = quality.with_(arithmetic="precise", blend_precision="float32")
     frame = FrameSpec(scene.cloud, scene.camera, plain, ("rgb",), scene.background)
     try:
-        certified = reference_images(frame, (rows, columns))["certificate"]
+        certified = reference_images(frame, (rows, columns))["error_bound"]
     except FidsplatError:
         return None
-    # certificates are relative to the brightest colour
+    # error bounds are relative to the brightest colour
     brightest = max(1.0, 0.0 if scene.cloud.colors is None else float(np.abs(scene.cloud.colors).max()))
-    uncertified = [difference.flat[worst[:count]] - certified * brightest, difference.flat[worst[count:]]]
-    return max(float(np.concatenate(uncertified).max()), 0.0)
+    beyond_bound = [difference.flat[worst[:count]] - certified * brightest, difference.flat[worst[count:]]]
+    return max(float(np.concatenate(beyond_bound).max()), 0.0)
 
 
 def compare_marker(image: np.ndarray, scene: TradeScene) -> dict:

@@ -1,7 +1,7 @@
-"""`pytest --certificates=FILE`: counts of pixels that the reference does not determine, over all images
+"""`pytest --error-bounds=FILE`: counts of pixels that the reference does not determine, over all images
 that a run compares.
 
-A certificate says what float32 may change in a pixel's colour (fidsplat/backends/reference/error_bounds.py):
+An error bound says what float32 may change in a pixel's colour (fidsplat/backends/reference/error_bounds.py):
 where it is large, a test sees little there. A plugin of pytest, which conftest.py names.
 """
 
@@ -23,12 +23,12 @@ _found = defaultdict(lambda: np.zeros(2 + len(THRESHOLDS), int))
 
 
 def pytest_addoption(parser):
-    words = "count the certificates of all pictures that are compared, and print their distribution"
-    parser.addoption("--certificates", metavar="FILE", type=Path, help=words)
+    words = "count the error bounds of all pictures that are compared, and print their distribution"
+    parser.addoption("--error-bounds", metavar="FILE", type=Path, help=words)
 
 
 def pytest_configure(config):
-    file = config.getoption("--certificates")
+    file = config.getoption("--error-bounds")
     if file is None:
         return
     if not hasattr(config, "workerinput"):  # in the first process alone
@@ -41,7 +41,7 @@ def counting(pixels):
 
     def counted(self, resident, view, rows, columns, **how):
         images = pixels(self, resident, view, rows, columns, **how)
-        bound = images["certificate"]
+        bound = images["error_bound"]
         above = [np.count_nonzero(bound > threshold) for threshold in THRESHOLDS]
         _found[os.environ.get("PYTEST_CURRENT_TEST", "").split("::")[0]] += [1, bound.size, *above]
         return images
@@ -50,14 +50,14 @@ def counting(pixels):
 
 
 def pytest_sessionfinish(session):
-    file = session.config.getoption("--certificates")
+    file = session.config.getoption("--error-bounds")
     if file is not None and _found:
         with file.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps({name: counts.tolist() for name, counts in _found.items()}) + "\n")
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    file = config.getoption("--certificates")
+    file = config.getoption("--error-bounds")
     if file is not None:
         terminalreporter.write_line(table(file))
 
@@ -74,7 +74,7 @@ def table(file):
     widest = sorted(files, key=lambda name: files[name][3] / max(files[name][1], 1), reverse=True)[:FILES]
     heads = "".join(f" above {threshold:g} |" for threshold in THRESHOLDS)
     rows = [
-        f"| certificates | pictures | pixels |{heads}",
+        f"| error bounds | pictures | pixels |{heads}",
         "|---|" + "---|" * (2 + len(THRESHOLDS)),
         *(_row(name, folders[name]) for name in sorted(folders)),
         *(_row(name, files[name]) for name in widest),

@@ -1,4 +1,4 @@
-"""The reference leaves few pixels undetermined: certificates excuse no errors of a device in any scene."""
+"""The reference leaves few pixels undetermined: error bounds excuse no errors of a device in any scene."""
 
 import numpy as np
 import pytest
@@ -24,20 +24,20 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_certificates_leave_little_open(name):
+def test_error_bounds_leave_little_open(name):
     """Nine of ten pixels have the tolerance of colours alone; at most one in forty has a decision that
     rounding may change (median depth, heaviest label)."""
     expected = reference_images(FrameSpec(*SCENES[name], fs.Quality(), tuple(OUTPUTS)))
-    bound = expected["certificate"]
+    bound = expected["error_bound"]
     assert np.median(bound) < 1e-5
     assert (bound > 2e-5).mean() < 0.1
     assert (bound > 1e-3).mean() < RARE
     assert bound.max() < RISKY
     visible = expected["depth"] != 0
-    depth = expected["certificate_depth"][visible] / np.abs(expected["depth"][visible])
+    depth = expected["error_bound_depth"][visible] / np.abs(expected["depth"][visible])
     assert np.median(depth) < 2e-5
     assert (depth > 1e-3).mean() < 0.02
-    assert (expected["certificate_normal"] > 1e-3).mean() < 0.03
+    assert (expected["error_bound_normal"] > 1e-3).mean() < 0.03
     for output in OUTPUTS:
         if f"{output}_may_flip" in expected:
             assert expected[f"{output}_may_flip"].mean() < 0.025, output
@@ -50,8 +50,8 @@ def test_one_wrong_pixel_is_named(output):
     images = {name: expected[name].astype(OUTPUTS[name].dtype) for name in OUTPUTS}
     assert all(difference.agrees for difference in compare(images, expected, OUTPUTS))
     sure = (
-        (expected["certificate"] < 1e-5)
-        & (expected["certificate_normal"] < 2e-4)
+        (expected["error_bound"] < 1e-5)
+        & (expected["error_bound_normal"] < 2e-4)
         & (expected["depth_first"] > 0)
     )
     for name in OUTPUTS:
