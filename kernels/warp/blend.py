@@ -14,7 +14,7 @@ from .cells import CELL_H, CELL_W, make_cells
 from .common import STRICT, View, first_sample, locate_tile, reread, store_line
 from .intersection import make_intersection
 from .pixel import make_pixel
-from .rays import SLOPES
+from .rays import RAY_DERIVATIVES
 from .records import RecordLayout
 from .splat import make_splat
 from .staging import STAGED, alone, make_staging
@@ -42,10 +42,10 @@ def make_blend(
     each = samples_each(effects)
     threads, items, pair = area // each, _CELL // each, each == 2
     staging = make_staging(RecordLayout(effects, outputs), area // _CELL, items)
-    touched = make_cells(effects, outputs)
-    pool, stage, mark, listed, place_in = (
-        *(staging.pool, staging.stage, staging.mark),
-        *(staging.listed, staging.place),
+    overlapping_cells = make_cells(effects, outputs)
+    shared_memory, stage, mark_cells, list_cell, cell_splat = (
+        *(staging.shared_memory, staging.stage, staging.mark_cells),
+        *(staging.list_cell, staging.cell_splat),
     )
     staged = splats.reading(staging.line)
     load, box_of, read = staged.load, staged.box_of, splats.read
@@ -57,14 +57,14 @@ def make_blend(
     Splat, Rays, Pixel = splats.Splat, pixels.Rays, pixels.Pixel
     start, unfinished = pixels.start, pixels.unfinished
     blend_one, end_pass, cover, finish = pixels.blend, pixels.end, pixels.cover, pixels.finish
-    repeats, opaque, branchless = end_pass is not None, cover is not None, pixels.branchless
+    repeats, has_external_depth, branchless = end_pass is not None, cover is not None, pixels.branchless
     limits = make_bounds("lowpass_screen" in effects)
     Samples = make_samples(tuple(sample_fields(outputs).items()))
     stores, words = output.functions(outputs, "store"), output.digest(outputs)
-    Intersection, opacity_of = intersection.Intersection, intersection.opacity_of
-    asking = bool(output.having(outputs, "fragment"))
+    Intersection, alpha_of = intersection.Intersection, intersection.alpha_of
+    has_fragment_functions = bool(output.having(outputs, "fragment"))
     fragments, screen = output.functions(outputs, "fragment"), "lowpass_screen" in effects
-    bent, curved, layered = (
+    has_lens, has_ray_derivatives, has_layers = (
         "rays" in effects,
         intersect_derivatives is not None,
         "order_coplanar" in effects,
@@ -100,22 +100,30 @@ def make_blend(
         return exist
 
     @wp.func
-    def observe(pixel: Pixel, s: Splat, c: Intersection, x: float, y: float, view: View):
+    def call_fragment_functions(pixel: Pixel, s: Splat, c: Intersection, x: float, y: float, view: View):
         """Call the `fragment` functions of outputs for a listed splat before it is composited."""
-        p, disc, opacity = pixel, float(wp.inf), float(0.0)
+        p, disc, alpha = pixel, float(wp.inf), float(0.0)
         if wp.static(screen):
             disc = c.screen
         if c.contributes:
-            opacity = opacity_of(s, c, 1.0 / c.d, view)
+            alpha = alpha_of(s, c, 1.0 / c.d, view)
         for k in range(wp.static(len(fragments))):
-            p = wp.static(fragments[k])(p, s, c, x, y, disc, opacity, view)
+            p = wp.static(fragments[k])(p, s, c, x, y, disc, alpha, view)
         return p
 
     @wp.func
-    def intersect(s: Splat, column: wp.vec3, ray: wp.vec3, slopes: SLOPES, x: float, y: float, view: View):
-        if wp.static(curved):
-            return intersect_derivatives(s, ray, slopes, x, y, view)
-        elif wp.static(bent):
+    def intersect(
+        s: Splat,
+        column: wp.vec3,
+        ray: wp.vec3,
+        ray_derivatives: RAY_DERIVATIVES,
+        x: float,
+        y: float,
+        view: View,
+    ):
+        if wp.static(has_ray_derivatives):
+            return intersect_derivatives(s, ray, ray_derivatives, x, y, view)
+        elif wp.static(has_lens):
             return intersect_ray(s, ray, x, y, view)
         else:
             return cross(s, column[0], column[1], column[2], x, y, view)
@@ -126,26 +134,26 @@ def make_blend(
         s: Splat,
         column: wp.vec3,  # terms of the three forms that depend on the column only
         ray: wp.vec3,
-        slopes: SLOPES,
+        ray_derivatives: RAY_DERIVATIVES,
         x: float,  # position relative to the anchor
         y: float,
-        place: int,
+        position: int,
         lines: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         coplanar_groups: wp.array(dtype=wp.int32),
         view: View,
     ):
-        """Blend the splat at `place` in the list."""
+        """Blend the splat at `position` in the list."""
         p = pixel
         if wp.static(branchless):
-            c = intersect(s, column, ray, slopes, x, y, view)
-            p = blend_one(p, s, c, place, lines, lists, coplanar_groups, view)
+            c = intersect(s, column, ray, ray_derivatives, x, y, view)
+            p = blend_one(p, s, c, position, lines, lists, coplanar_groups, view)
         elif unfinished(p, view):
-            c = intersect(s, column, ray, slopes, x, y, view)
-            if wp.static(asking):
-                p = observe(p, s, c, x, y, view)
+            c = intersect(s, column, ray, ray_derivatives, x, y, view)
+            if wp.static(has_fragment_functions):
+                p = call_fragment_functions(p, s, c, x, y, view)
             if c.contributes:
-                p = blend_one(p, s, c, place, lines, lists, coplanar_groups, view)
+                p = blend_one(p, s, c, position, lines, lists, coplanar_groups, view)
         return p
 
     # 768 threads at once: at most 80 registers, enough for two samples without other outputs
@@ -180,20 +188,20 @@ def make_blend(
         y0 = top + cell_y * CELL_H + own / CELL_W * each
         p = new_sample(x0, y0, number, rays, view)
         end = starts[tile + 1]
-        if wp.static(layered):
+        if wp.static(has_layers):
             p.layers.exist = has_groups(starts[tile], end, lists, coplanar_groups, view)
         alive = unfinished(p, view)
         if wp.static(pair):
             q = new_sample(x0, y0 + 1, number, rays, view)
             alive = alive or unfinished(q, view)
-        ray, slopes = wp.vec3(), SLOPES()
-        if wp.static(bent):
+        ray, ray_derivatives = wp.vec3(), RAY_DERIVATIVES()
+        if wp.static(has_lens):
             if p.t > 0.0:
                 ray = rays.rays[y0 * view.width + x0]
-        if wp.static(curved):
+        if wp.static(has_ray_derivatives):
             if p.t > 0.0:
-                slopes = rays.slopes[y0 * view.width + x0]
-        records = pool()
+                ray_derivatives = rays.ray_derivatives[y0 * view.width + x0]
+        records = shared_memory()
         again = bool(True)
         while again:
             k = starts[tile]
@@ -209,30 +217,43 @@ def make_blend(
                         cells = _NONE
                         if which < length:
                             s = load(records, lines, lists, k, which, view)
-                            cells = touched(
+                            cells = overlapping_cells(
                                 s, box_of(records, lines, lists, k, which), left, top, group, view
                             )
-                        mark(records, word, group, cells)
+                        mark_cells(records, word, group, cells)
                     word += wp.static(threads // 32)
                 view = views[reread(number)]
-                count = listed(records, length, cell)
+                count = list_cell(records, length, cell)
                 if not alive:
                     count = 0
                 for n in range(count):
-                    which = place_in(records, cell, n)
+                    which = cell_splat(records, cell, n)
                     s = load(records, lines, lists, k, which, view)
                     if alone():
                         box = box_of(records, lines, lists, k, which)
-                        cells = touched(s, box, left, top, cell / 32, view)
+                        cells = overlapping_cells(s, box, left, top, cell / 32, view)
                         if (cells >> wp.uint32(cell % 32) & _ONE) == _NONE:
                             continue
                     x, y = float(x0) - s.d[3], float(y0) - s.c[0]
                     column = wp.vec3(column_of(s.u, x), column_of(s.v, x), column_of(s.d, x))
                     at = k + which
-                    p = blend_splat(p, s, column, ray, slopes, x, y, at, lines, lists, coplanar_groups, view)
+                    p = blend_splat(
+                        p, s, column, ray, ray_derivatives, x, y, at, lines, lists, coplanar_groups, view
+                    )
                     if wp.static(pair):
                         q = blend_splat(
-                            q, s, column, ray, slopes, x, y + 1.0, at, lines, lists, coplanar_groups, view
+                            q,
+                            s,
+                            column,
+                            ray,
+                            ray_derivatives,
+                            x,
+                            y + 1.0,
+                            at,
+                            lines,
+                            lists,
+                            coplanar_groups,
+                            view,
                         )
                 alive = unfinished(p, view)
                 if wp.static(pair):
@@ -246,11 +267,11 @@ def make_blend(
         number, tile_column, tile_row = locate_tile(tile, views)
         view = views[reread(number)]
         at = first_sample(number, view) + y0 * view.tiles_x * view.tile_w + x0
-        if wp.static(opaque):
+        if wp.static(has_external_depth):
             p = cover(p, x0, y0, number, rays, view)
         store(finish(p), at, samples)
         if wp.static(pair):
-            if wp.static(opaque):
+            if wp.static(has_external_depth):
                 q = cover(q, x0, y0 + 1, number, rays, view)
             store(finish(q), at + view.tiles_x * view.tile_w, samples)
 
@@ -275,11 +296,11 @@ def make_blend(
         y0 = tile_row * view.tile_h
         end = starts[tile + 1]
         exist = int(0)
-        if wp.static(layered):
+        if wp.static(has_layers):
             exist = has_groups(starts[tile], end, lists, coplanar_groups, view)
         for k in range(view.tile_w * view.tile_h):
             p = start(x0 + k % view.tile_w, y0 + k / view.tile_w, number, rays, view)
-            if wp.static(layered):
+            if wp.static(has_layers):
                 p.layers.exist = exist
             state[state_first + k] = p
         x_end = wp.min(x0 + view.tile_w, view.width)
@@ -302,17 +323,17 @@ def make_blend(
                     u, v, d = column_of(s.u, x), column_of(s.v, x), column_of(s.d, x)
                     for row in range(top, bottom):
                         y = float(row) - s.c[0]
-                        if wp.static(curved):
+                        if wp.static(has_ray_derivatives):
                             at = row * view.width + column
-                            c = intersect_derivatives(s, rays.rays[at], rays.slopes[at], x, y, view)
-                        elif wp.static(bent):
+                            c = intersect_derivatives(s, rays.rays[at], rays.ray_derivatives[at], x, y, view)
+                        elif wp.static(has_lens):
                             c = intersect_ray(s, rays.rays[row * view.width + column], x, y, view)
                         else:
                             c = cross(s, u, v, d, x, y, view)
-                        if wp.static(asking):
+                        if wp.static(has_fragment_functions):
                             at = state_first + (row - y0) * view.tile_w + column - x0
                             if unfinished(state[at], view):
-                                state[at] = observe(state[at], s, c, x, y, view)
+                                state[at] = call_fragment_functions(state[at], s, c, x, y, view)
                         if c.contributes:
                             at = state_first + (row - y0) * view.tile_w + column - x0
                             p = state[at]
@@ -335,7 +356,7 @@ def make_blend(
         for down in range(view.tile_h):
             for across in range(view.tile_w):
                 p = state[state_first + down * view.tile_w + across]
-                if wp.static(opaque):
+                if wp.static(has_external_depth):
                     p = cover(p, x0 + across, y0 + down, number, rays, view)
                 at = corner + down * stride + across
                 store(finish(p), at, samples)

@@ -1,9 +1,9 @@
 """Backward pass of blending (fragment_backward.py has the formulas).
 
 The list of each tile is evaluated forward again, for the transmittance in front of every CHUNK splats, then
-backward, a chunk at a time. For each splat, the sums over the tile's samples are stored in a slot of this
-(splat, tile) pair. There are no atomics, so sums have a fixed order and results are bit-identical on every
-run.
+backward, a chunk at a time. For each splat, the sums over the tile's samples are stored at the gradient
+buffer offset of this (splat, tile) pair. There are no atomics, so sums have a fixed order and results are
+bit-identical on every run.
 
 On a GPU a block of threads processes a tile, one sample per thread; sums are computed over a warp by shuffles
 and over the warps in shared memory. On a CPU a thread processes a tile, splat by splat within its bounding
@@ -40,7 +40,7 @@ _ANY_OF_WARP = """
     return open;
 #endif
 """
-_POOL = """
+_SHARED_MEMORY = """
 #if defined(__CUDA_ARCH__)
     __shared__ float parts[CHUNK * WARPS * FIELDS];
     return static_cast<wp::uint64>(__cvta_generic_to_shared(parts));
@@ -48,11 +48,11 @@ _POOL = """
     return 0;
 #endif
 """
-# on the CPU the threads of a block run one after another, and add to the slot in a fixed order
+# on the CPU the threads of a block run one after another, and add to the sums in a fixed order
 _SUM_OVER_WARP = """
 #if defined(__CUDA_ARCH__)
-    float* parts = reinterpret_cast<float*>(__cvta_shared_to_generic(pool));
-    parts += (place * WARPS + threadIdx.x / 32) * FIELDS;
+    float* parts = reinterpret_cast<float*>(__cvta_shared_to_generic(shared_memory));
+    parts += (position * WARPS + threadIdx.x / 32) * FIELDS;
     const int lane = threadIdx.x & 31;
     if (!__any_sync(0xffffffffu, contributes)) {
         if (lane < FIELDS) parts[lane] = 0.0f;
@@ -64,18 +64,19 @@ _SUM_OVER_WARP = """
         if (lane == 0) parts[field] = sum;
     }
 #else
-    if (contributes) for (int field = 0; field < FIELDS; field++) moments.data[slot][field] += values[field];
+    if (contributes)
+        for (int field = 0; field < FIELDS; field++) gradient_sums.data[offset][field] += values[field];
 #endif
 """
 _SUM_OVER_BLOCK = """
 #if defined(__CUDA_ARCH__)
-    const float* parts = reinterpret_cast<const float*>(__cvta_shared_to_generic(pool));
+    const float* parts = reinterpret_cast<const float*>(__cvta_shared_to_generic(shared_memory));
     __syncthreads();
     for (int cell = threadIdx.x; cell < count * FIELDS; cell += blockDim.x) {
-        const int place = cell / FIELDS, field = cell % FIELDS;
+        const int position = cell / FIELDS, field = cell % FIELDS;
         float sum = 0.0f;
-        for (int warp = 0; warp < WARPS; warp++) sum += parts[(place * WARPS + warp) * FIELDS + field];
-        moments.data[slots.data[first + place]][field] = sum;
+        for (int warp = 0; warp < WARPS; warp++) sum += parts[(position * WARPS + warp) * FIELDS + field];
+        gradient_sums.data[gradient_offsets.data[first + position]][field] = sum;
     }
     __syncthreads();
 #endif
@@ -83,16 +84,16 @@ _SUM_OVER_BLOCK = """
 
 
 @cache
-def make_slots(screen: bool):
-    """Make the kernel that computes the slot for the sums of each (splat, tile) pair. screen: see
+def make_gradient_offsets(screen: bool):
+    """Make the kernel that computes the gradient buffer offset of each (splat, tile) pair. screen: see
     `make_bounds`.
 
-    A splat has a slot per tile, in the order of the tiles, after the slots of preceding splats.
+    A splat has an offset per tile, in the order of the tiles, after the offsets of preceding splats.
     """
     limits = make_bounds(screen)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
-    def find_slots(
+    def find_gradient_offsets(
         first: int,
         views: wp.array(dtype=View),  # (1)
         tiles: int,
@@ -102,7 +103,7 @@ def make_slots(screen: bool):
         bounds: wp.array(dtype=Bounds),
         counts: wp.array(dtype=wp.int32),
         ends_by_index: wp.array(dtype=wp.int32),  # inclusive sums
-        slots: wp.array(dtype=wp.int32),  # (pairs) out
+        gradient_offsets: wp.array(dtype=wp.int32),  # (pairs) out
     ):
         view = views[0]
         k = first + wp.tid()
@@ -121,22 +122,32 @@ def make_slots(screen: bool):
         while bits != NONE and window_tile(corner, lowest(bits), view) != tile:
             bits = bits & (bits - ONE)
             rank += 1
-        slots[k] = ends_by_index[index] - counts[index] + rank
+        gradient_offsets[k] = ends_by_index[index] - counts[index] + rank
 
-    return find_slots
+    return find_gradient_offsets
 
 
 @cache
 def make_blend_backward(
-    effects: tuple[str, ...], outputs: tuple[str, ...], losses: tuple[str, ...], on_gpu: bool, threads: int
+    effects: tuple[str, ...],
+    outputs: tuple[str, ...],
+    gradient_outputs: tuple[str, ...],
+    on_gpu: bool,
+    threads: int,
 ) -> SimpleNamespace:
-    """Make the kernel of the backward pass, and the structs By (inputs), Loss (state of a sample) and Moments
-    (results). effects, outputs, on_gpu, threads: see `make_blend`. losses: outputs with gradients."""
-    made = make_fragments(effects, outputs, losses)
-    By, Samples, Loss, Moments = made.By, made.Samples, made.Loss, made.Moments
-    read, box_of, loss_at = made.read, made.box_of, made.loss_at
-    opacity_at, back = made.opacity_at, made.back
-    numbers = {"CHUNK": CHUNK, "WARPS": max(threads // 32, 1), "FIELDS": wp.types.type_size(Moments)}
+    """Make the kernel of the backward pass, and the structs ImageGradients (inputs), PixelGradient (state of
+    a sample) and GradientSums (results). effects, outputs, on_gpu, threads: see `make_blend`.
+    gradient_outputs: outputs with gradients."""
+    made = make_fragments(effects, outputs, gradient_outputs)
+    ImageGradients, Samples, PixelGradient, GradientSums = (
+        made.ImageGradients,
+        made.Samples,
+        made.PixelGradient,
+        made.GradientSums,
+    )
+    read, box_of, pixel_gradient_at = made.read, made.box_of, made.pixel_gradient_at
+    alpha_at, fragment_gradient = made.alpha_at, made.fragment_gradient
+    numbers = {"CHUNK": CHUNK, "WARPS": max(threads // 32, 1), "FIELDS": wp.types.type_size(GradientSums)}
 
     @wp.func_native(with_numbers(_ANY_OF_BLOCK, numbers))
     def any_of_block(open: bool) -> bool:
@@ -148,32 +159,32 @@ def make_blend_backward(
         """Whether `open` is true in any thread of the warp."""
         ...
 
-    @wp.func_native(with_numbers(_POOL, numbers))
-    def pool() -> wp.uint64:
+    @wp.func_native(with_numbers(_SHARED_MEMORY, numbers))
+    def shared_memory() -> wp.uint64:
         """Address in shared memory of the partial sums of each warp."""
         ...
 
     @wp.func_native(with_numbers(_SUM_OVER_WARP, numbers))
     def sum_over_warp(
-        pool: wp.uint64,
-        place: int,
+        shared_memory: wp.uint64,
+        position: int,
         contributes: bool,
-        values: Moments,
-        moments: wp.array(dtype=Moments),
-        slot: int,
+        values: GradientSums,
+        gradient_sums: wp.array(dtype=GradientSums),
+        offset: int,
     ):
         """Sum the values of a fragment over the warp; other threads add 0."""
         ...
 
     @wp.func_native(with_numbers(_SUM_OVER_BLOCK, numbers))
     def sum_over_block(
-        pool: wp.uint64,
+        shared_memory: wp.uint64,
         first: int,
         count: int,
-        moments: wp.array(dtype=Moments),
-        slots: wp.array(dtype=wp.int32),
+        gradient_sums: wp.array(dtype=GradientSums),
+        gradient_offsets: wp.array(dtype=wp.int32),
     ):
-        """Sum the sums of all warps for `count` splats of the list into the slots of the splats; a
+        """Sum the sums of all warps for `count` splats of the list into the splats' sums; a
         barrier."""
         ...
 
@@ -181,11 +192,11 @@ def make_blend_backward(
     options = {"module": "unique", "module_options": STRICT, "enable_backward": False}
 
     @wp.func
-    def transmittance_behind(light: float, opacity: float) -> float:
-        """Transmittance behind a fragment; 0 behind a fragment that terminates the sample (opacity -1)."""
-        if opacity < 0.0:
+    def transmittance_behind(transmittance: float, alpha: float) -> float:
+        """Transmittance behind a fragment; 0 behind a fragment that terminates the sample (alpha -1)."""
+        if alpha < 0.0:
             return 0.0
-        return light - light * opacity
+        return transmittance - transmittance * alpha
 
     @wp.kernel(launch_bounds=threads, **options)
     def blend_backward_gpu(
@@ -196,13 +207,13 @@ def make_blend_backward(
         lines: wp.array(dtype=wp.vec4),
         starts: wp.array(dtype=wp.int32),
         lists: wp.array(dtype=wp.int32),
-        slots: wp.array(dtype=wp.int32),
-        by: By,
+        gradient_offsets: wp.array(dtype=wp.int32),
+        image_gradients: ImageGradients,
         samples: Samples,
         checkpoints: wp.array(
             dtype=wp.float32
         ),  # scratch: transmittance in front of every CHUNK splats of a tile
-        moments: wp.array(dtype=Moments),  # out, zeroed by the caller
+        gradient_sums: wp.array(dtype=GradientSums),  # out, zeroed by the caller
     ):
         view = views[0]
         thread = wp.tid()
@@ -213,56 +224,60 @@ def make_blend_backward(
         left = (tile % view.tiles_x) * view.tile_w + (block % across) * BLOCK_W
         top = (tile / view.tiles_x) * view.tile_h + (block / across) * BLOCK_H
         x, y = left + lane % BLOCK_W, top + lane / BLOCK_W
-        loss = loss_at(x, y, by, samples, background, view)
-        light = float(1.0)
+        pixel_gradient = pixel_gradient_at(x, y, image_gradients, samples, background, view)
+        transmittance = float(1.0)
         if x >= view.width or y >= view.height:
-            light = 0.0
+            transmittance = 0.0
         start, end = starts[tile], starts[tile + 1]
         own = (start / CHUNK + tile) * threads + item
 
         chunks = int(0)
-        while start + chunks * CHUNK < end and any_of_block(light > view.transmittance_stop):
+        while start + chunks * CHUNK < end and any_of_block(transmittance > view.transmittance_stop):
             first = start + chunks * CHUNK
-            checkpoints[own + chunks * threads] = light
-            for place in range(wp.min(CHUNK, end - first)):
-                box = box_of(lines, lists[first + place])
+            checkpoints[own + chunks * threads] = transmittance
+            for position in range(wp.min(CHUNK, end - first)):
+                box = box_of(lines, lists[first + position])
                 if box[0] < left + BLOCK_W and box[1] > left and box[2] < top + BLOCK_H and box[3] > top:
-                    s = read(lines, lists, first + place, view)
-                    light = transmittance_behind(light, opacity_at(s, x, y, light, view))
+                    s = read(lines, lists, first + position, view)
+                    transmittance = transmittance_behind(
+                        transmittance, alpha_at(s, x, y, transmittance, view)
+                    )
             chunks += 1
 
-        parts = pool()
+        parts = shared_memory()
         while chunks > 0:
             chunks -= 1
             first = start + chunks * CHUNK
             count = wp.min(CHUNK, end - first)
-            light = checkpoints[own + chunks * threads]
-            lights, opacities = chunk_of(), chunk_of()
-            for place in range(count):
-                lights[place] = light
-                box = box_of(lines, lists[first + place])
+            transmittance = checkpoints[own + chunks * threads]
+            transmittances, alphas = chunk_of(), chunk_of()
+            for position in range(count):
+                transmittances[position] = transmittance
+                box = box_of(lines, lists[first + position])
                 if box[0] < left + BLOCK_W and box[1] > left and box[2] < top + BLOCK_H and box[3] > top:
-                    s = read(lines, lists, first + place, view)
-                    opacity = opacity_at(s, x, y, light, view)
-                    light = transmittance_behind(light, opacity)
-                    opacities[place] = opacity
-            place = count
-            while place > 0:
-                place -= 1
-                contributes = opacities[place] > 0.0
-                values = Moments()
+                    s = read(lines, lists, first + position, view)
+                    alpha = alpha_at(s, x, y, transmittance, view)
+                    transmittance = transmittance_behind(transmittance, alpha)
+                    alphas[position] = alpha
+            position = count
+            while position > 0:
+                position -= 1
+                contributes = alphas[position] > 0.0
+                values = GradientSums()
                 if any_of_warp(contributes):
-                    s = read(lines, lists, first + place, view)
+                    s = read(lines, lists, first + position, view)
                     if contributes:
-                        values, loss = back(
-                            s, lists[first + place], x, y, lights[place], opacities[place], loss, log_ceiling,
-                            lines, view,
+                        values, pixel_gradient = fragment_gradient(
+                            s, lists[first + position], x, y, transmittances[position], alphas[position],
+                            pixel_gradient, log_ceiling, lines, view,
                         )  # fmt: skip
-                sum_over_warp(parts, place, contributes, values, moments, slots[first + place])
-            sum_over_block(parts, first, count, moments, slots)
+                sum_over_warp(
+                    parts, position, contributes, values, gradient_sums, gradient_offsets[first + position]
+                )
+            sum_over_block(parts, first, count, gradient_sums, gradient_offsets)
 
     @wp.func
-    def reach(lines: wp.array(dtype=wp.vec4), index: int, x0: int, y0: int, view: View) -> wp.vec4i:
+    def clipped_box(lines: wp.array(dtype=wp.vec4), index: int, x0: int, y0: int, view: View) -> wp.vec4i:
         """Box of the tile's samples that the splat may overlap, relative to the tile's first sample (x0,
         y0)."""
         box = box_of(lines, index)
@@ -276,31 +291,31 @@ def make_blend_backward(
     @wp.func
     def attenuate(
         k: int,
-        place: int,
+        position: int,
         alive: int,
         x0: int,
         y0: int,
         state_first: int,
         lines: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
-        lights: wp.array(dtype=wp.float32),
+        transmittances: wp.array(dtype=wp.float32),
         fragments: wp.array(dtype=wp.vec2),
         view: View,
     ) -> int:
         """Attenuate the samples of a tile by the splat lists[k], and store its fragments; returns the number
         of samples that are not terminated."""
         s = read(lines, lists, k, view)
-        area = reach(lines, lists[k], x0, y0, view)
+        area = clipped_box(lines, lists[k], x0, y0, view)
         left = alive
         for row in range(area[2], area[3]):
             for column in range(area[0], area[1]):
                 at = state_first + row * view.tile_w + column
-                light = lights[at]
-                opacity = opacity_at(s, x0 + column, y0 + row, light, view)
-                fragments[at * CHUNK + place] = wp.vec2(light, opacity)
-                if opacity != 0.0:
-                    lights[at] = transmittance_behind(light, opacity)
-                    if not (lights[at] > view.transmittance_stop):
+                transmittance = transmittances[at]
+                alpha = alpha_at(s, x0 + column, y0 + row, transmittance, view)
+                fragments[at * CHUNK + position] = wp.vec2(transmittance, alpha)
+                if alpha != 0.0:
+                    transmittances[at] = transmittance_behind(transmittance, alpha)
+                    if not (transmittances[at] > view.transmittance_stop):
                         left -= 1
         return left
 
@@ -313,14 +328,16 @@ def make_blend_backward(
         lines: wp.array(dtype=wp.vec4),
         starts: wp.array(dtype=wp.int32),
         lists: wp.array(dtype=wp.int32),
-        slots: wp.array(dtype=wp.int32),
-        by: By,
+        gradient_offsets: wp.array(dtype=wp.int32),
+        image_gradients: ImageGradients,
         samples: Samples,
         checkpoints: wp.array(dtype=wp.float32),
-        moments: wp.array(dtype=Moments),  # out, zeroed by the caller
-        lights: wp.array(dtype=wp.float32),  # scratch of one tile from `state_first` on, as in blend_cpu
-        losses: wp.array(dtype=Loss),  # scratch, as `lights`
-        fragments: wp.array(dtype=wp.vec2),  # scratch, CHUNK per sample: transmittance and opacity
+        gradient_sums: wp.array(dtype=GradientSums),  # out, zeroed by the caller
+        transmittances: wp.array(
+            dtype=wp.float32
+        ),  # scratch of one tile from `state_first` on, as in blend_cpu
+        pixel_gradients: wp.array(dtype=PixelGradient),  # scratch, as `transmittances`
+        fragments: wp.array(dtype=wp.vec2),  # scratch, CHUNK per sample: transmittance and alpha
         state_first: int,
     ):
         view = views[0]
@@ -331,21 +348,23 @@ def make_blend_backward(
         alive = int(0)
         for k in range(area):
             x, y = x0 + k % view.tile_w, y0 + k / view.tile_w
-            losses[state_first + k] = loss_at(x, y, by, samples, background, view)
-            lights[state_first + k] = 0.0
+            pixel_gradients[state_first + k] = pixel_gradient_at(
+                x, y, image_gradients, samples, background, view
+            )
+            transmittances[state_first + k] = 0.0
             if x < view.width and y < view.height:
-                lights[state_first + k] = 1.0
+                transmittances[state_first + k] = 1.0
                 alive += 1
         start, end = starts[tile], starts[tile + 1]
         own = (start / CHUNK + tile) * area
         processed = start
         while processed < end and alive > 0:
-            chunk, place = (processed - start) / CHUNK, (processed - start) % CHUNK
-            if place == 0:
+            chunk, position = (processed - start) / CHUNK, (processed - start) % CHUNK
+            if position == 0:
                 for k in range(area):
-                    checkpoints[own + chunk * area + k] = lights[state_first + k]
+                    checkpoints[own + chunk * area + k] = transmittances[state_first + k]
             alive = attenuate(
-                processed, place, alive, x0, y0, state_first, lines, lists, lights, fragments, view
+                processed, position, alive, x0, y0, state_first, lines, lists, transmittances, fragments, view
             )
             processed += 1
 
@@ -355,29 +374,42 @@ def make_blend_backward(
             first = start + chunk * CHUNK
             if processed < processed_end:
                 for k in range(area):
-                    lights[state_first + k] = checkpoints[own + chunk * area + k]
-                for place in range(CHUNK):
+                    transmittances[state_first + k] = checkpoints[own + chunk * area + k]
+                for position in range(CHUNK):
                     attenuate(
-                        first + place, place, 0, x0, y0, state_first, lines, lists, lights, fragments, view
+                        first + position,
+                        position,
+                        0,
+                        x0,
+                        y0,
+                        state_first,
+                        lines,
+                        lists,
+                        transmittances,
+                        fragments,
+                        view,
                     )
             while processed > first:
                 processed -= 1
                 s = read(lines, lists, processed, view)
-                touched = reach(lines, lists[processed], x0, y0, view)
-                total = Moments()
+                touched = clipped_box(lines, lists[processed], x0, y0, view)
+                total = GradientSums()
                 for row in range(touched[2], touched[3]):
                     for column in range(touched[0], touched[1]):
                         at = state_first + row * view.tile_w + column
                         fragment = fragments[at * CHUNK + processed - first]
                         if fragment[1] > 0.0:
-                            values, loss = back(
+                            values, pixel_gradient = fragment_gradient(
                                 s, lists[processed], x0 + column, y0 + row, fragment[0], fragment[1],
-                                losses[at], log_ceiling, lines, view,
+                                pixel_gradients[at], log_ceiling, lines, view,
                             )  # fmt: skip
-                            losses[at] = loss
+                            pixel_gradients[at] = pixel_gradient
                             total += values
-                moments[slots[processed]] = total
+                gradient_sums[gradient_offsets[processed]] = total
 
     return SimpleNamespace(
-        kernel=blend_backward_gpu if on_gpu else blend_backward_cpu, By=By, Loss=Loss, Moments=Moments
+        kernel=blend_backward_gpu if on_gpu else blend_backward_cpu,
+        ImageGradients=ImageGradients,
+        PixelGradient=PixelGradient,
+        GradientSums=GradientSums,
     )

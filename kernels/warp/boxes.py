@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .common import View, fma
-from .rays import SLOPES
+from .rays import RAY_DERIVATIVES
 
 SQRT2 = wp.constant(wp.float32(2.0**0.5))
 LINES = wp.constant(10)
@@ -39,18 +39,22 @@ def ramp(form: float, by_x: float, by_y: float) -> float:
 
 
 @wp.func
-def along_ray(form: wp.vec3, slopes: SLOPES, k: int) -> float:
+def along_ray(form: wp.vec3, ray_derivatives: RAY_DERIVATIVES, k: int) -> float:
     """Derivative of a form, with factors of a ray's X, Y, Z, with respect to the sample's column (k = 0) or
     row (1)."""
-    return fma(form[2], slopes[k, 2], fma(form[1], slopes[k, 1], form[0] * slopes[k, 0]))
+    return fma(
+        form[2], ray_derivatives[k, 2], fma(form[1], ray_derivatives[k, 1], form[0] * ray_derivatives[k, 0])
+    )
 
 
 @wp.func
-def between_curves(d: float, n: float, of_d: wp.vec3, of_n: wp.vec3, slopes: SLOPES) -> float:
-    """`between` behind a lens. of_d, of_n: factors of a ray's X, Y, Z in D and n. slopes: derivatives of the
-    ray."""
-    d_x, d_y = along_ray(of_d, slopes, 0), along_ray(of_d, slopes, 1)
-    n_x, n_y = along_ray(of_n, slopes, 0), along_ray(of_n, slopes, 1)
+def between_curves(
+    d: float, n: float, of_d: wp.vec3, of_n: wp.vec3, ray_derivatives: RAY_DERIVATIVES
+) -> float:
+    """`between` behind a lens. of_d, of_n: factors of a ray's X, Y, Z in D and n. ray_derivatives:
+    derivatives of the ray."""
+    d_x, d_y = along_ray(of_d, ray_derivatives, 0), along_ray(of_d, ray_derivatives, 1)
+    n_x, n_y = along_ray(of_n, ray_derivatives, 0), along_ray(of_n, ray_derivatives, 1)
     low = ramp(fma(SQRT2, n, d), fma(SQRT2, n_x, d_x), fma(SQRT2, n_y, d_y))
     high = ramp(fma(-SQRT2, n, d), fma(-SQRT2, n_x, d_x), fma(-SQRT2, n_y, d_y))
     return wp.max(low + high - 1.0, 0.0)

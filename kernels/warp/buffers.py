@@ -15,9 +15,9 @@ def sample_fields(outputs: tuple[str, ...]) -> dict[str, type]:
     return {"color": wp.vec4} | output.fields(outputs, "samples")
 
 
-def light_of(outputs: tuple[str, ...]) -> frozenset[str]:
+def averaged_of(outputs: tuple[str, ...]) -> frozenset[str]:
     """Names of sample buffers that are averaged over the poses of a shutter."""
-    return frozenset({"color"} | output.fields(output.having(outputs, "light"), "samples").keys())
+    return frozenset({"color"} | output.fields(output.having(outputs, "averaged"), "samples").keys())
 
 
 @cache

@@ -15,7 +15,7 @@ from .common import fma, fma3, struct_of
 from .fast import fast_log
 
 FAINT = wp.constant(1e-3)
-"""opacity below which the optical depth is computed by a series (to 3e-7), as 1 - opacity is rounded"""
+"""alpha below which the optical depth is computed by a series (to 3e-7), as 1 - alpha is rounded"""
 DARKEST = wp.constant(wp.float32(2.0**-24))
 """minimum transmittance, so that the optical depth of an opaque fragment is finite"""
 
@@ -33,7 +33,7 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
     # tau: optical depth; mean: weighted by optical depths, for boxes by opacities
     fields = {
         "group": wp.int32,
-        "opacity": wp.float32,
+        "alpha": wp.float32,
         "tau": wp.float32,
         "mean": Attributes,
     }
@@ -115,21 +115,21 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
         return after
 
     @wp.func
-    def accumulate(layer: Layer, attributes: Attributes, opacity: float):
-        """Add a fragment to a layer: optical depths -ln(1 - opacity) add up."""
+    def accumulate(layer: Layer, attributes: Attributes, alpha: float):
+        """Add a fragment to a layer: optical depths -ln(1 - alpha) add up."""
         # an opaque fragment has the optical depth at which float32 transmittance is 0
-        tau = -log(wp.max(1.0 - opacity, DARKEST))
-        if opacity < FAINT:
-            tau = fma(0.5 * opacity, opacity, opacity)
+        tau = -log(wp.max(1.0 - alpha, DARKEST))
+        if alpha < FAINT:
+            tau = fma(0.5 * alpha, alpha, alpha)
         after = with_fragment(layer, attributes, tau)
-        after.opacity = fma(opacity, 1.0 - layer.opacity, layer.opacity)
+        after.alpha = fma(alpha, 1.0 - layer.alpha, layer.alpha)
         return after
 
     @wp.func
-    def accumulate_box(layer: Layer, attributes: Attributes, opacity: float):
-        """Add a box to a layer: boxes do not overlap, so that their opacities add up."""
-        after = with_fragment(layer, attributes, opacity)
-        after.opacity = wp.min(after.tau, 1.0)
+    def accumulate_box(layer: Layer, attributes: Attributes, alpha: float):
+        """Add a box to a layer: boxes do not overlap, so that their alphas add up."""
+        after = with_fragment(layer, attributes, alpha)
+        after.alpha = wp.min(after.tau, 1.0)
         return after
 
     @wp.func

@@ -32,9 +32,9 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
     )
     ewa = any(name in effects for name in EWA)
     camera = next((name for name in effects if name in LENSES), None)
-    bent = camera is not None
-    edged = not bent and any(name in effects for name in BOXES)
-    flagged = bent and "footprint_mixed" in effects
+    has_lens = camera is not None
+    edged = not has_lens and any(name in effects for name in BOXES)
+    flagged = has_lens and "footprint_mixed" in effects
     """whether records have edges of boxes; whether they have a flag for boxes"""
     of_box, optics = make_boxes(real), make_optics(camera, real) if camera else None
     Lens = make_lens(camera)
@@ -76,7 +76,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
         anchor_x, anchor_y = real(ax) + half, real(ay) + half
         k0, kx, ky, kz = vec3(), vec3(), vec3(), vec3()  # n_u, n_v, D: at the anchor, per x, per y, per z
         determinant = zero
-        if wp.static(bent):
+        if wp.static(has_lens):
             # forms of a ray, not of a sample
             anchor = optics.anchor(int(ax), int(ay), in_front, p, view, lens)
             of_u, of_v, of_d = wp.cross(b, p), wp.cross(p, a), unit_normal * su * sv
@@ -96,7 +96,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
             if wp.static(parallel):
                 k0 = vec3(k0[0], k0[1], determinant)
         steepest = wp.max(wp.max(wp.abs(kx[0]), wp.abs(ky[0])), wp.max(wp.abs(kx[1]), wp.abs(ky[1])))
-        if wp.static(bent):
+        if wp.static(has_lens):
             steepest = wp.max(steepest, wp.max(wp.abs(kz[0]), wp.abs(kz[1])))
         if wp.static(ewa):
             if thick:
@@ -146,7 +146,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
             record[at_plane + 1] = float((a[2] * kx[0] + b[2] * kx[1]) * facing)
             record[at_plane + 2] = float((a[2] * ky[0] + b[2] * ky[1]) * facing)
             record[at_plane + 3] = float(view.near)
-        if wp.static(bent):
+        if wp.static(has_lens):
             record[at_ray] = float(kz[0] * n_scale)
             record[at_ray + 1] = float(kz[1] * n_scale)
             record[at_ray + 2] = float(kz[2] * facing)

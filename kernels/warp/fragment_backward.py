@@ -23,9 +23,9 @@ from .splat import make_splat
 _FORMS = ("nu0", "nux", "nuy", "nv0", "nvx", "nvy", "d0", "dx", "dy", "log_opacity", "r", "g", "b")
 
 
-def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of the sums (moments) that a fragment adds to for its splat: derivatives of the loss with respect
-    to each form and z_numerator, times 1, x and y relative to the anchor; with respect to ln(opacity), the
+def gradient_sum_names(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of the sums that a fragment adds to for its splat: derivatives of the loss with respect to each
+    form and z_numerator, times 1, x and y relative to the anchor; with respect to ln(opacity), the
     colour, and other numbers of the record. The derivative with respect to D is at constant z_numerator -
     z_center D, to avoid cancellation with that of z_numerator; `make_project_backward` adds the rest in
     float64."""
@@ -38,37 +38,42 @@ def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str,
 
 
 @cache
-def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: tuple[str, ...]):
-    """Make the structs By (derivatives with respect to the images named in `losses`), Samples, Splat, Loss
-    and Moments, and the functions read, loss_at, opacity_at and back. effects, outputs: as for blending.
+def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_outputs: tuple[str, ...]):
+    """Make the structs ImageGradients (derivatives with respect to the images named in `gradient_outputs`),
+    Samples, Splat, PixelGradient and GradientSums, and the functions read, pixel_gradient_at, alpha_at and
+    fragment_gradient. effects, outputs: as for blending.
     """
     splats, intersection = make_splat(effects, outputs), make_intersection(effects, outputs)
     Splat, Intersection = splats.Splat, intersection.Intersection
-    cross, column_of, opacity_of = intersection.cross, intersection.column, intersection.opacity_of
+    cross, column_of, alpha_of = intersection.cross, intersection.column, intersection.alpha_of
     screen, exclusive, has_depth, thick = (
         name in effects for name in ("lowpass_screen", "stop_exclusive", "ray_depth", EXACT)
     )
-    alpha, depth, normal, distortion = (name in losses for name in ("alpha", "depth", "normal", "distortion"))
-    names = moments_of(effects, outputs)
-    at = {name: place for place, name in enumerate(names)}
-    Moments = wp.types.vector(len(names), wp.float32)
+    has_alpha, depth, normal, distortion = (
+        name in gradient_outputs for name in ("alpha", "depth", "normal", "distortion")
+    )
+    names = gradient_sum_names(effects, outputs)
+    at = {name: position for position, name in enumerate(names)}
+    GradientSums = wp.types.vector(len(names), wp.float32)
     layout = RecordLayout(effects, outputs)
     each = layout.lines
-    z_line, z_lane = layout.place("z_numerator")
-    zc_line, zc_lane = layout.place("z_center")
-    zr_line, zr_lane = layout.place("z_reach")
-    normals = [layout.place(name) for name in ("nx", "ny", "nz")]
-    box_line, box_lane = layout.place("columns")
-    rows_line, rows_lane = layout.place("rows")
+    z_line, z_lane = layout.position("z_numerator")
+    zc_line, zc_lane = layout.position("z_center")
+    zr_line, zr_lane = layout.position("z_reach")
+    normals = [layout.position(name) for name in ("nx", "ny", "nz")]
+    box_line, box_lane = layout.position("columns")
+    rows_line, rows_lane = layout.position("rows")
     Samples = make_samples(tuple(sample_fields(outputs).items()))
-    arrays = {name: wp.array(dtype=wp.float32) for name in losses}
-    By = struct_of("By", "Derivatives of a loss with respect to the images, (h w channels) each.", arrays)
-    fields = {"light": wp.vec3, "behind": wp.float32}
+    arrays = {name: wp.array(dtype=wp.float32) for name in gradient_outputs}
+    ImageGradients = struct_of(
+        "ImageGradients", "Derivatives of a loss with respect to the images, (h w channels) each.", arrays
+    )
+    fields = {"grad_rgb": wp.vec3, "behind": wp.float32}
     fields |= {"depth": wp.float32, "depth_weight": wp.float32} if depth else {}
     fields |= {"normal": wp.vec3} if normal else {}
     fields |= {"distortion": wp.float32, "spread": wp.vec4} if distortion else {}
-    Loss = struct_of(
-        "Loss",
+    PixelGradient = struct_of(
+        "PixelGradient",
         "Derivatives of a pixel: with respect to its outputs, and to the transmittance behind.",
         fields,
     )
@@ -81,53 +86,61 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         return wp.vec4i(left, end, top, bottom)
 
     @wp.func
-    def loss_at(x: int, y: int, by: By, samples: Samples, background: wp.vec3, view: View):
+    def pixel_gradient_at(
+        x: int, y: int, image_gradients: ImageGradients, samples: Samples, background: wp.vec3, view: View
+    ):
         """Loss gradients of a pixel; zeros outside of the image."""
-        loss = Loss()
+        pixel_gradient = PixelGradient()
         if x < view.width and y < view.height:
             pixel = y * view.width + x
-            place = y * view.tiles_x * view.tile_w + x
-            loss.light = wp.vec3(by.rgb[3 * pixel], by.rgb[3 * pixel + 1], by.rgb[3 * pixel + 2])
-            loss.behind = wp.dot(loss.light, background)
-            if wp.static(alpha):
-                loss.behind -= by.alpha[pixel]
+            position = y * view.tiles_x * view.tile_w + x
+            pixel_gradient.grad_rgb = wp.vec3(
+                image_gradients.rgb[3 * pixel],
+                image_gradients.rgb[3 * pixel + 1],
+                image_gradients.rgb[3 * pixel + 2],
+            )
+            pixel_gradient.behind = wp.dot(pixel_gradient.grad_rgb, background)
+            if wp.static(has_alpha):
+                pixel_gradient.behind -= image_gradients.alpha[pixel]
             if wp.static(depth):
                 # sum w z / sum w
-                sums = samples.depth[place]
+                sums = samples.depth[position]
                 if sums[1] > 0.0:
-                    loss.depth = by.depth[pixel] / sums[1]
-                    loss.depth_weight = -loss.depth * (sums[0] / sums[1])
+                    pixel_gradient.depth = image_gradients.depth[pixel] / sums[1]
+                    pixel_gradient.depth_weight = -pixel_gradient.depth * (sums[0] / sums[1])
             if wp.static(normal):
                 # the direction of sum w n
-                length = wp.length(samples.normal[place])
+                length = wp.length(samples.normal[position])
                 if length > 0.0:
-                    unit = samples.normal[place] / length
+                    unit = samples.normal[position] / length
                     grad_unit = wp.vec3(
-                        by.normal[3 * pixel], by.normal[3 * pixel + 1], by.normal[3 * pixel + 2]
+                        image_gradients.normal[3 * pixel],
+                        image_gradients.normal[3 * pixel + 1],
+                        image_gradients.normal[3 * pixel + 2],
                     )
-                    loss.normal = (grad_unit - wp.dot(grad_unit, unit) * unit) / length
+                    pixel_gradient.normal = (grad_unit - wp.dot(grad_unit, unit) * unit) / length
             if wp.static(distortion):
-                loss.distortion = by.distortion[pixel]
-                loss.spread = samples.distortion[place]
-        return loss
+                pixel_gradient.distortion = image_gradients.distortion[pixel]
+                pixel_gradient.spread = samples.distortion[position]
+        return pixel_gradient
 
     @wp.func
     def crossed(s: Splat, x: float, y: float, view: View):
         return cross(s, column_of(s.u, x), column_of(s.v, x), column_of(s.d, x), x, y, view)
 
     @wp.func
-    def opacity_at(s: Splat, column: int, row: int, light: float, view: View) -> float:
-        """Opacity of a splat at a sample with transmittance `light`, with the decisions of the forward pass:
-        0 if it is not blended, -1 if it terminates the sample without being blended."""
-        opacity = float(0.0)
-        if light > view.transmittance_stop:
+    def alpha_at(s: Splat, column: int, row: int, transmittance: float, view: View) -> float:
+        """Alpha of a splat at a sample, with the decisions of the forward pass: 0 if it is not blended, -1 if
+        it terminates the sample without being blended."""
+        alpha = float(0.0)
+        if transmittance > view.transmittance_stop:
             c = crossed(s, float(column) - s.d[3], float(row) - s.c[0], view)
             if c.contributes:
-                opacity = opacity_of(s, c, 1.0 / c.d, view)
+                alpha = alpha_of(s, c, 1.0 / c.d, view)
                 if wp.static(exclusive):
-                    if light * (1.0 - opacity) <= view.transmittance_stop:
-                        opacity = -1.0
-        return opacity
+                    if transmittance * (1.0 - alpha) <= view.transmittance_stop:
+                        alpha = -1.0
+        return alpha
 
     @wp.func
     def depth_at(
@@ -144,10 +157,10 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         z_center + circle (z_numerator - z_center D) D / q. A depth that rounding moves out of the splat's
         range has the derivatives of the centre's depth. For a 3D Gaussian, D and q in `c` are D and q of its
         disk times 1 + t, t = ellipsoid_term q / D^2."""
-        place = index * each
-        center = line_of(lines, place + zc_line)[zc_lane]
-        reach = line_of(lines, place + zr_line)[zr_lane]
-        numerator = line_of(lines, place + z_line)[z_lane]
+        position = index * each
+        center = line_of(lines, position + zc_line)[zc_lane]
+        reach = line_of(lines, position + zr_line)[zr_lane]
+        numerator = line_of(lines, position + z_line)[z_lane]
         z, grad_record, grad_dot = center, wp.vec3(0.0, 1.0, 0.0), wp.vec2()
         ahead = c.d > 0.0 and c.d <= s.v[3]
         circle = wp.max(low_pass, HALF_RHO_OF_RANGE)
@@ -177,21 +190,21 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         return z, grad_record, grad_dot, grad_bulge
 
     @wp.func
-    def back(
+    def fragment_gradient(
         s: Splat,
         index: int,
         column: int,
         row: int,
-        light: float,
-        opacity: float,
-        before: Loss,
+        transmittance: float,
+        alpha: float,
+        before: PixelGradient,
         log_ceiling: float,
         lines: wp.array(dtype=wp.vec4),
         view: View,
     ):
         """Contribution of a fragment to the derivatives with respect to its record, and the state of the
-        pixel in front of it. light: transmittance in front of the fragment."""
-        loss = before
+        pixel in front of it. transmittance: in front of the fragment."""
+        pixel_gradient = before
         x, y = float(column) - s.d[3], float(row) - s.c[0]
         c = crossed(s, x, y, view)
         nu, nv = fma(s.u[2], y, column_of(s.u, x)), fma(s.v[2], y, column_of(s.v, x))
@@ -199,16 +212,16 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         if c.d > 0.0:
             inverse_d = 1.0 / c.d
         half_rho = c.q * inverse_d * inverse_d
-        decides = half_rho
+        min_half_rho = half_rho
         on_plane = c.inside
         if wp.static(screen):
             on_plane = c.inside and half_rho <= c.screen
             if not on_plane:
-                decides = c.screen
+                min_half_rho = c.screen
 
-        weight = light * opacity
+        weight = transmittance * alpha
         color = wp.vec3(s.c[1], s.c[2], s.c[3])
-        worth = wp.dot(loss.light, color)
+        grad_weight = wp.dot(pixel_gradient.grad_rgb, color)
         z, grad_record, grad_dot_depth, grad_bulge = float(0.0), wp.vec3(), wp.vec2(), float(0.0)
         grad_z = float(0.0)
         if wp.static(has_depth):
@@ -217,29 +230,33 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
                 low_pass = c.screen
             z, grad_record, grad_dot_depth, grad_bulge = depth_at(lines, index, s, c, inverse_d, low_pass)
         if wp.static(depth):
-            worth += fma(loss.depth, z, loss.depth_weight)
-            grad_z += weight * loss.depth
+            grad_weight += fma(pixel_gradient.depth, z, pixel_gradient.depth_weight)
+            grad_z += weight * pixel_gradient.depth
         if wp.static(normal):
             facing = wp.vec3(
                 line_of(lines, index * each + wp.static(normals[0][0]))[wp.static(normals[0][1])],
                 line_of(lines, index * each + wp.static(normals[1][0]))[wp.static(normals[1][1])],
                 line_of(lines, index * each + wp.static(normals[2][0]))[wp.static(normals[2][1])],
             )
-            worth += wp.dot(loss.normal, facing)
+            grad_weight += wp.dot(pixel_gradient.normal, facing)
         if wp.static(distortion):
             # dL / dw = g (sum w m^2 + W m^2 - 2 m sum w m), dL / dm = 2 g w (W m - sum w m)
-            spread = loss.spread
+            spread = pixel_gradient.spread
             if z > 0.0:
                 nearer = INVERSE_DEPTH / wp.max(z, SPREAD_NEAR) - spread[0]
-                worth += loss.distortion * fma(fma(spread[1], nearer, -2.0 * spread[2]), nearer, spread[3])
+                grad_weight += pixel_gradient.distortion * fma(
+                    fma(spread[1], nearer, -2.0 * spread[2]), nearer, spread[3]
+                )
             if z > SPREAD_NEAR:
                 inverse_z = 1.0 / z
                 outward = fma(spread[1], fma(INVERSE_DEPTH, inverse_z, -spread[0]), -spread[2])
-                grad_z -= 2.0 * INVERSE_DEPTH * weight * loss.distortion * outward * inverse_z * inverse_z
-        gain = worth - loss.behind
-        loss.behind = fma(opacity, gain, loss.behind)
+                grad_z -= (
+                    2.0 * INVERSE_DEPTH * weight * pixel_gradient.distortion * outward * inverse_z * inverse_z
+                )
+        gain = grad_weight - pixel_gradient.behind
+        pixel_gradient.behind = fma(alpha, gain, pixel_gradient.behind)
         grad_log = weight * gain
-        if not (s.u[3] - decides <= log_ceiling):
+        if not (s.u[3] - min_half_rho <= log_ceiling):
             grad_log = 0.0  # clamped to the maximum alpha
 
         grad_nu, grad_nv, grad_d = float(0.0), float(0.0), float(0.0)
@@ -248,7 +265,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
             grad_nu = -plane * nu * inverse_d
             grad_nv = -plane * nv * inverse_d
             grad_d = plane * half_rho
-        m = Moments()
+        m = GradientSums()
         if wp.static(has_depth):
             numerator = grad_z * grad_record[0]
             m[wp.static(at.get("z_numerator", 0))] = numerator
@@ -267,7 +284,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
             m[wp.static(at.get("lowpass_y", 0))] = grad_dot * (y - s.lowpass_y)
         if wp.static(normal):
             for k in range(3):
-                m[wp.static(at.get("nx", 0)) + k] = weight * loss.normal[k]
+                m[wp.static(at.get("nx", 0)) + k] = weight * pixel_gradient.normal[k]
         if wp.static(thick):
             if on_plane:
                 grad_bulge = fma(grad_log, half_rho * half_rho, grad_z * grad_bulge)
@@ -284,20 +301,20 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         m[7] = grad_d * x
         m[8] = grad_d * y
         m[9] = grad_log
-        m[10] = weight * loss.light[0]
-        m[11] = weight * loss.light[1]
-        m[12] = weight * loss.light[2]
-        return m, loss
+        m[10] = weight * pixel_gradient.grad_rgb[0]
+        m[11] = weight * pixel_gradient.grad_rgb[1]
+        m[12] = weight * pixel_gradient.grad_rgb[2]
+        return m, pixel_gradient
 
     return SimpleNamespace(
-        By=By,
+        ImageGradients=ImageGradients,
         Samples=Samples,
         Splat=Splat,
-        Loss=Loss,
-        Moments=Moments,
+        PixelGradient=PixelGradient,
+        GradientSums=GradientSums,
         read=splats.read,
         box_of=box_of,
-        loss_at=loss_at,
-        opacity_at=opacity_at,
-        back=back,
+        pixel_gradient_at=pixel_gradient_at,
+        alpha_at=alpha_at,
+        fragment_gradient=fragment_gradient,
     )

@@ -1,4 +1,4 @@
-"""Intersection of a sample's ray with a splat, and the opacity and depth of the fragment."""
+"""Intersection of a sample's ray with a splat, and the alpha and depth of the fragment."""
 
 import math
 from functools import cache
@@ -10,7 +10,7 @@ from .boxes import between, between_curves
 from .common import View, fma, line_of, struct_of
 from .ellipsoids import EXACT, FACING
 from .fast import fast_exp
-from .rays import SLOPES
+from .rays import RAY_DERIVATIVES
 from .records import BOXES, RecordLayout
 from .splat import make_splat
 
@@ -21,17 +21,20 @@ HALF_RHO_OF_RANGE = wp.constant(wp.float32(math.log(255.0)))
 @cache
 def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
     """Make the struct Intersection and functions column, cross, intersect_ray, intersect_derivatives (None
-    without boxes behind a lens), is_box, opacity_of and depth_of.
+    without boxes behind a lens), is_box, alpha_of and depth_of.
     """
     Splat = make_splat(effects, outputs).Splat
     layout = RecordLayout(effects, outputs)
     each = layout.lines
-    screen, bent, parallel, all_boxes = (
+    screen, has_lens, parallel, all_boxes = (
         name in effects for name in ("lowpass_screen", "rays", "camera_orthographic", "footprint_box")
     )
     thick, facing = EXACT in effects, FACING in effects and not parallel
     boxes = any(name in effects for name in BOXES)
-    curved, edged = boxes and bent, boxes and not bent  # edges from each sample's ray, or from a record
+    curved, edged = (
+        boxes and has_lens,
+        boxes and not has_lens,
+    )  # edges from each sample's ray, or from a record
     exp = fast_exp if "arithmetic_fast" in effects else wp.exp
     # q / d^2 is rho / 2; inside: the ray intersects the disk within R and beyond the near plane
     fields = {"d": wp.float32, "q": wp.float32, "inside": wp.bool, "contributes": wp.bool}
@@ -41,9 +44,9 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
     # cover: coverage of the sample by a box
     fields |= {"cover": wp.float32} if boxes else {}
     Intersection = struct_of("Intersection", "Where the ray of a sample meets a splat.", fields)
-    z_line, z_lane = layout.place("z_numerator")
-    zc_line, zc_lane = layout.place("z_center")
-    zr_line, zr_lane = layout.place("z_reach")
+    z_line, z_lane = layout.position("z_numerator")
+    zc_line, zc_lane = layout.position("z_center")
+    zr_line, zr_lane = layout.position("z_reach")
 
     @wp.func
     def column(form: wp.vec4, x: float) -> float:
@@ -97,13 +100,17 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
         return c
 
     @wp.func
-    def intersect_derivatives(s: Splat, ray: wp.vec3, slopes: SLOPES, x: float, y: float, view: View):
-        """Intersection of a ray with a splat or a box. slopes: derivatives of the ray, for edges of boxes."""
+    def intersect_derivatives(
+        s: Splat, ray: wp.vec3, ray_derivatives: RAY_DERIVATIVES, x: float, y: float, view: View
+    ):
+        """Intersection of a ray with a splat or a box. ray_derivatives: for edges of boxes."""
         c = intersect_ray(s, ray, x, y, view)
         if is_box(s):
             n, of_d = forms_of(s, ray), wp.vec3(s.d[1], s.d[2], s.w[2])
-            across = between_curves(n[2], n[0], of_d, wp.vec3(s.u[1], s.u[2], s.w[0]), slopes)
-            c.cover = across * between_curves(n[2], n[1], of_d, wp.vec3(s.v[1], s.v[2], s.w[1]), slopes)
+            across = between_curves(n[2], n[0], of_d, wp.vec3(s.u[1], s.u[2], s.w[0]), ray_derivatives)
+            c.cover = across * between_curves(
+                n[2], n[1], of_d, wp.vec3(s.v[1], s.v[2], s.w[1]), ray_derivatives
+            )
             c.inside = c.cover > 0.0 and c.d > 0.0 and c.d <= s.v[3]
             c.contributes = c.inside
         return c
@@ -142,7 +149,7 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
         return c
 
     @wp.func
-    def opacity_of(s: Splat, c: Intersection, inverse_d: float, view: View) -> float:
+    def alpha_of(s: Splat, c: Intersection, inverse_d: float, view: View) -> float:
         if wp.static(boxes):
             if is_box(s):
                 return wp.min(exp(s.u[3]), view.opacity_ceiling) * c.cover
@@ -194,6 +201,6 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
         intersect_derivatives=intersect_derivatives if curved else None,
         is_box=is_box,
         facing=facing,
-        opacity_of=opacity_of,
+        alpha_of=alpha_of,
         depth_of=depth_of,
     )

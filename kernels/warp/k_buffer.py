@@ -22,8 +22,8 @@ def make_k_buffer_struct(size: int):
     fields = {
         # sorted by depth, empty entries first
         "z": wp.types.vector(size, wp.float32),
-        "opacity": wp.types.vector(size, wp.float32),
-        "place": wp.types.vector(size, wp.int32),
+        "alpha": wp.types.vector(size, wp.float32),
+        "position": wp.types.vector(size, wp.int32),
         # range of this pass: depths, and list positions for equal depths
         "after_z": wp.float32,
         "after": wp.int32,
@@ -34,7 +34,7 @@ def make_k_buffer_struct(size: int):
 
 
 def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace:
-    """Make functions of a Pixel with a `k_buffer`: start; take, for a fragment; end, for the end of the list.
+    """Make functions of a Pixel with a `k_buffer`: start; insert, for a fragment; end, after the list.
 
     attributes_of(lines, index, z): attributes of a splat's fragment at depth z.
     """
@@ -45,7 +45,7 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
         p = pixel
         for k in range(wp.static(size)):
             p.k_buffer.z[k] = -wp.inf
-            p.k_buffer.place[k] = _EMPTY
+            p.k_buffer.position[k] = _EMPTY
         p.k_buffer.after_z = -wp.inf
         p.k_buffer.until_z = wp.inf
         return p
@@ -54,50 +54,52 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
     def composite_at(
         pixel: Pixel,
         z: float,
-        opacity: float,
-        place: int,
+        alpha: float,
+        position: int,
         lines: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         view: View,
     ):
         """Composite a buffered fragment."""
         p = pixel
-        if place != _EMPTY:
-            p = composite(p, attributes_of(lines, lists[place], z), opacity, view)
+        if position != _EMPTY:
+            p = composite(p, attributes_of(lines, lists[position], z), alpha, view)
         return p
 
     @wp.func
-    def drop_from(pixel: Pixel, z: float, place: int):
+    def drop_from(pixel: Pixel, z: float, position: int):
         """Drop entries at or behind a depth and list position, for the next pass."""
         p = pixel
         p.k_buffer.until_z = z
-        p.k_buffer.until = place
+        p.k_buffer.until = position
         more = bool(True)
         while more:
-            more = p.k_buffer.z[last] > z or (p.k_buffer.z[last] == z and p.k_buffer.place[last] >= place)
+            more = p.k_buffer.z[last] > z or (
+                p.k_buffer.z[last] == z and p.k_buffer.position[last] >= position
+            )
             if more:
                 for k in range(wp.static(last)):
                     p.k_buffer.z[last - k] = p.k_buffer.z[last - k - 1]
-                    p.k_buffer.opacity[last - k] = p.k_buffer.opacity[last - k - 1]
-                    p.k_buffer.place[last - k] = p.k_buffer.place[last - k - 1]
+                    p.k_buffer.alpha[last - k] = p.k_buffer.alpha[last - k - 1]
+                    p.k_buffer.position[last - k] = p.k_buffer.position[last - k - 1]
                 p.k_buffer.z[0] = -wp.inf
-                p.k_buffer.place[0] = _EMPTY
+                p.k_buffer.position[0] = _EMPTY
         return p
 
     @wp.func
-    def is_taken(p: Pixel, z: float, place: int) -> bool:
+    def in_this_pass(p: Pixel, z: float, position: int) -> bool:
         """Whether a fragment belongs to this pass."""
-        if z > p.k_buffer.until_z or (z == p.k_buffer.until_z and place >= p.k_buffer.until):
+        if z > p.k_buffer.until_z or (z == p.k_buffer.until_z and position >= p.k_buffer.until):
             return False
-        return z > p.k_buffer.after_z or (z == p.k_buffer.after_z and place >= p.k_buffer.after)
+        return z > p.k_buffer.after_z or (z == p.k_buffer.after_z and position >= p.k_buffer.after)
 
     @wp.func
-    def put(
+    def insert_sorted(
         pixel: Pixel,
         nearest: float,
         z: float,
-        opacity: float,
-        place: int,
+        alpha: float,
+        position: int,
         lines: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         view: View,
@@ -108,41 +110,41 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
         p = pixel
         if p.k_buffer.z[0] > nearest and z > nearest:
             if p.k_buffer.z[last] <= z:
-                return drop_from(p, z, place)
-            p = drop_from(p, p.k_buffer.z[last], int(p.k_buffer.place[last]))
-        first_z, first_opacity = float(p.k_buffer.z[0]), float(p.k_buffer.opacity[0])
-        first_place = int(p.k_buffer.place[0])
+                return drop_from(p, z, position)
+            p = drop_from(p, p.k_buffer.z[last], int(p.k_buffer.position[last]))
+        first_z, first_alpha = float(p.k_buffer.z[0]), float(p.k_buffer.alpha[0])
+        first_position = int(p.k_buffer.position[0])
         if z < first_z:
-            return composite_at(p, z, opacity, place, lines, lists, view)
+            return composite_at(p, z, alpha, position, lines, lists, view)
         for k in range(wp.static(last)):
             if p.k_buffer.z[k + 1] <= z:
                 p.k_buffer.z[k] = p.k_buffer.z[k + 1]
-                p.k_buffer.opacity[k] = p.k_buffer.opacity[k + 1]
-                p.k_buffer.place[k] = p.k_buffer.place[k + 1]
+                p.k_buffer.alpha[k] = p.k_buffer.alpha[k + 1]
+                p.k_buffer.position[k] = p.k_buffer.position[k + 1]
             elif p.k_buffer.z[k] <= z:
                 p.k_buffer.z[k] = z
-                p.k_buffer.opacity[k] = opacity
-                p.k_buffer.place[k] = place
+                p.k_buffer.alpha[k] = alpha
+                p.k_buffer.position[k] = position
         if p.k_buffer.z[last] <= z:
             p.k_buffer.z[last] = z
-            p.k_buffer.opacity[last] = opacity
-            p.k_buffer.place[last] = place
-        return composite_at(p, first_z, first_opacity, first_place, lines, lists, view)
+            p.k_buffer.alpha[last] = alpha
+            p.k_buffer.position[last] = position
+        return composite_at(p, first_z, first_alpha, first_position, lines, lists, view)
 
     @wp.func
-    def take(
+    def insert(
         pixel: Pixel,
         nearest: float,
         z: float,
-        opacity: float,
-        place: int,
+        alpha: float,
+        position: int,
         lines: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         view: View,
     ):
-        """Insert a fragment of the splat at `place` in the list, whose fragments are beyond `nearest`."""
-        if is_taken(pixel, z, place):
-            return put(pixel, nearest, z, opacity, place, lines, lists, view)
+        """Insert a fragment of the splat at `position` in the list, whose fragments are beyond `nearest`."""
+        if in_this_pass(pixel, z, position):
+            return insert_sorted(pixel, nearest, z, alpha, position, lines, lists, view)
         return pixel
 
     @wp.func
@@ -156,11 +158,11 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
         """Composite all entries up to depth `nearest`."""
         p = pixel
         for k in range(wp.static(size)):
-            place = int(p.k_buffer.place[k])
-            if p.k_buffer.z[k] <= nearest and place != _EMPTY:
-                p = composite_at(p, p.k_buffer.z[k], p.k_buffer.opacity[k], place, lines, lists, view)
+            position = int(p.k_buffer.position[k])
+            if p.k_buffer.z[k] <= nearest and position != _EMPTY:
+                p = composite_at(p, p.k_buffer.z[k], p.k_buffer.alpha[k], position, lines, lists, view)
                 p.k_buffer.z[k] = -wp.inf
-                p.k_buffer.place[k] = _EMPTY
+                p.k_buffer.position[k] = _EMPTY
         return p
 
     @wp.func
@@ -178,4 +180,4 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
         p.k_buffer.until = 0
         return p
 
-    return SimpleNamespace(start=start, take=take, end=end)
+    return SimpleNamespace(start=start, insert=insert, end=end)

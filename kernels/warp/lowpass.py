@@ -10,7 +10,7 @@ def make_filter(real):
     """Make widened(a, b, by_x, by_y, by_depth), the low-pass filter of a Gaussian with scaled tangents a, b.
 
     by_x, by_y, by_depth: gradients with respect to the point, at the centre, of the sample's column, of its
-    row and of the logarithm of the depth (slopes.py).
+    row and of the logarithm of the depth (projection_derivatives.py).
 
     The footprint of a sample is a Gaussian around its ray, with a standard deviation of s = 1/2 samples
     across the ray and of an eighth of the depth along it. G, 3 x 2, is the derivative of column, row and

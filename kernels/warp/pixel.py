@@ -28,14 +28,14 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
     """
     Splat, intersection = make_splat(effects, outputs).Splat, make_intersection(effects, outputs)
     Intersection, is_box = intersection.Intersection, intersection.is_box
-    opacity_of, depth_of = intersection.opacity_of, intersection.depth_of
+    alpha_of, depth_of = intersection.alpha_of, intersection.depth_of
     layout = RecordLayout(effects, outputs)
     each = layout.lines
-    exclusive, has_depth, k_buffered, layered, bent = (
+    exclusive, has_depth, k_buffered, layered, has_lens = (
         name in effects for name in ("stop_exclusive", "ray_depth", "order_pixel", "order_coplanar", "rays")
     )
-    boxes, opaque = any(name in effects for name in BOXES), "external_depth" in effects
-    rays = make_rays(bent, "rays_length" in effects, bent and boxes, opaque)
+    boxes, has_external_depth = any(name in effects for name in BOXES), "external_depth" in effects
+    rays = make_rays(has_lens, "rays_length" in effects, has_lens and boxes, has_external_depth)
     Rays, length_of = rays.Rays, rays.length_of
     starts, attribute_readers, composites, covers, clears = (
         output.functions(outputs, part)
@@ -59,7 +59,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
     )
     fields = {"t": wp.float32, "r": wp.float32, "g": wp.float32, "b": wp.float32}
     fields |= {"finished": wp.int32} if exclusive else {}
-    fields |= {"opaque_z": wp.float32} if opaque else {}
+    fields |= {"opaque_z": wp.float32} if has_external_depth else {}
     fields |= output.fields(outputs, "state")
     fields |= {"k_buffer": make_k_buffer_struct(k_buffer_size)} if k_buffered else {}
     fields |= {"layers": layer.Layers} if layer else {}
@@ -87,7 +87,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         length = float(1.0)
         if wp.static(measured):
             length = length_of(x, y, rays, view)
-        if wp.static(opaque):
+        if wp.static(has_external_depth):
             p.opaque_z = wp.inf
             # tiles extend beyond the image
             if x < view.width and y < view.height:
@@ -123,16 +123,16 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         return attributes
 
     @wp.func
-    def composite(pixel: Pixel, attributes: Attributes, opacity: float, view: View):
+    def composite(pixel: Pixel, attributes: Attributes, alpha: float, view: View):
         """Composite a fragment or layer in front of all later fragments, unless the pixel is terminated."""
         p = pixel
         if wp.static(not branchless):
             if not (p.t > view.transmittance_stop):
                 return p
-        weight = p.t * opacity
+        weight = p.t * alpha
         if wp.static(exclusive):
             # parity with gsplat and the 2DGS authors: the fragment that would terminate the pixel is dropped
-            if p.t * (1.0 - opacity) <= view.transmittance_stop:
+            if p.t * (1.0 - alpha) <= view.transmittance_stop:
                 p.finished = 1
                 if wp.static(not branchless):
                     return p
@@ -148,14 +148,14 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
     @wp.func
     def stored_attributes(lines: wp.array(dtype=wp.vec4), index: int, z: float):
         """Attributes of a fragment with the stored colour of its splat."""
-        c = line_of(lines, index * each + wp.static(layout.place("r")[0]))
+        c = line_of(lines, index * each + wp.static(layout.position("r")[0]))
         return attributes_at(wp.vec3(c[1], c[2], c[3]), z, lines, index)
 
     @wp.func
     def nearest_of(lines: wp.array(dtype=wp.vec4), index: int) -> float:
         """Lower bound of the depths of a splat's fragments."""
-        return line_of(lines, index * each + wp.static(layout.place("nearest")[0]))[
-            wp.static(layout.place("nearest")[1])
+        return line_of(lines, index * each + wp.static(layout.position("nearest")[0]))[
+            wp.static(layout.position("nearest")[1])
         ]
 
     k_buffer = make_k_buffer(Pixel, composite, stored_attributes, k_buffer_size) if k_buffered else None
@@ -166,52 +166,52 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         pixel: Pixel,
         s: Splat,
         c: Intersection,
-        place: int,
+        position: int,
         lines: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         coplanar_groups: wp.array(dtype=wp.int32),
         view: View,
     ):
-        """Blend a fragment of the splat at `place` in the list. The pixel is unfinished and the fragment
+        """Blend a fragment of the splat at `position` in the list. The pixel is unfinished and the fragment
         contributes, unless `branchless`.
         """
-        index = lists[place]
+        index = lists[position]
         inverse_d = float(1.0)
         if wp.static(not intersection.facing):
             inverse_d = reciprocal(c.d)
-        opacity = opacity_of(s, c, inverse_d, view)
+        alpha = alpha_of(s, c, inverse_d, view)
         if wp.static(branchless):
-            opacity = wp.where(c.contributes and unfinished(pixel, view), opacity, 0.0)
+            alpha = wp.where(c.contributes and unfinished(pixel, view), alpha, 0.0)
         z, group = float(0.0), int(-1)
         if wp.static(layered):
             if pixel.layers.exist != 0:
                 group = coplanar_groups[index % view.splats]
         if wp.static(has_depth):
             z = depth_of(lines, index, s, c, inverse_d, group >= 0)
-        if wp.static(opaque):
+        if wp.static(has_external_depth):
             if not (z < pixel.opaque_z):
                 return pixel
         color = wp.vec3(s.c[1], s.c[2], s.c[3])
         p = pixel
         if wp.static(layered):
             if p.layers.exist != 0:
-                if not (opacity > 0.0):
+                if not (alpha > 0.0):
                     return p  # without optical depth the mean of a layer would be 0 / 0
                 p.layers = select(p.layers, group)
                 if group >= 0:
                     attributes = attributes_at(color, z, lines, index)
                     if wp.static(boxes):
                         if is_box(s):
-                            p.layers.current = layer.accumulate_box(p.layers.current, attributes, opacity)
+                            p.layers.current = layer.accumulate_box(p.layers.current, attributes, alpha)
                             return p
-                    p.layers.current = layer.accumulate(p.layers.current, attributes, opacity)
+                    p.layers.current = layer.accumulate(p.layers.current, attributes, alpha)
                     return p
                 if not admits(p.layers, z):
                     return p
         if wp.static(k_buffered):
-            return k_buffer.take(p, nearest_of(lines, index), z, opacity, place, lines, lists, view)
+            return k_buffer.insert(p, nearest_of(lines, index), z, alpha, position, lines, lists, view)
         else:
-            return composite(p, attributes_at(color, z, lines, index), opacity, view)
+            return composite(p, attributes_at(color, z, lines, index), alpha, view)
 
     @wp.func
     def end(pixel: Pixel, lines: wp.array(dtype=wp.vec4), lists: wp.array(dtype=wp.int32), view: View):
@@ -225,7 +225,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
             p.layers = close_layers(p.layers)
             if not dropped:
                 if p.layers.next_z < wp.inf:
-                    p = composite(p, p.layers.next.mean, p.layers.next.opacity, view)
+                    p = composite(p, p.layers.next.mean, p.layers.next.alpha, view)
                     if wp.static(k_buffered):
                         p.k_buffer.after_z = -wp.inf
                 p.layers = passed(p.layers)
@@ -266,7 +266,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         unfinished=unfinished,
         blend=blend,
         end=end if k_buffered or layered else None,
-        cover=cover if opaque else None,
+        cover=cover if has_external_depth else None,
         finish=finish,
         branchless=branchless,
     )
@@ -274,7 +274,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
 
 def make_reader(layout: RecordLayout, names: tuple[str, ...]):
     """Make the function (lines, at) that reads these numbers of the record at line `at` as a vector."""
-    places = [layout.place(name) for name in names]
+    places = [layout.position(name) for name in names]
     vector = wp.types.vector(max(len(names), 1), wp.float32)
 
     @wp.func

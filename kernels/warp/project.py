@@ -16,8 +16,8 @@ from .fast import make_log
 from .forms import make_forms
 from .lens import LENSES, make_lens, make_optics
 from .lowpass import make_filter
+from .projection_derivatives import make_projection_derivatives
 from .records import RecordLayout
-from .slopes import make_slopes
 from .splat_pose import make_splat_pose
 from .tile_lists import count_tiles
 
@@ -72,11 +72,11 @@ def make_project(
     camera = next((name for name in effects if name in LENSES), None)
     parallel = "camera_orthographic" in effects
     ray_depths = camera in ("camera_fisheye", "camera_equirectangular")  # depths are distances
-    mapped, bent = camera == "camera_brown_conrady", camera is not None
-    edged = boxes_too and not bent  # straight edges, which records contain
+    mapped, has_lens = camera == "camera_brown_conrady", camera is not None
+    edged = boxes_too and not has_lens  # straight edges, which records contain
     optics = make_optics(camera, real) if camera else None
     Lens, forms = make_lens(camera), make_forms(effects, outputs, real)
-    slopes_at = make_slopes("camera_orthographic" if parallel else camera, real)
+    derivatives_at = make_projection_derivatives("camera_orthographic" if parallel else camera, real)
     at_depth, at_nearest, at_box = (layout.word(name) for name in ("z_numerator", "nearest", "columns"))
 
     @wp.func
@@ -177,7 +177,7 @@ def make_project(
                 itself = wp.static(drawn_ewa)
         if wp.static(filtered):
             if depth >= near and not itself:
-                by_x, by_y, by_depth, here = slopes_at(p, view, lens)
+                by_x, by_y, by_depth, here = derivatives_at(p, view, lens)
                 if here:
                     wide = widened(a, b, by_x, by_y, by_depth)
                     log_opacity -= float(half * ln(wide[3]))
@@ -213,7 +213,7 @@ def make_project(
         center_x, center_y = zero, zero
         if wp.static(parallel):
             center_x, center_y = fx * p[0] + cx, fy * p[1] + cy
-        elif wp.static(not bent):
+        elif wp.static(not has_lens):
             center_x = wp.clamp(fx * p[0] / near + cx, zero, real(view.width))
             center_y = wp.clamp(fy * p[1] / near + cy, zero, real(view.height))
             if in_front:
@@ -243,14 +243,14 @@ def make_project(
                 box = bounds_of(a, b, p, rim, rim_reach, center_x, center_y, view, lens)
         else:
             box = bounds_of(a, b, p, rim, rim_reach, center_x, center_y, view, lens)
-        if wp.static(exact and not parallel and not bent):
+        if wp.static(exact and not parallel and not has_lens):
             if thick and p[2] - reach < near:
                 box = ellipsoid.clipped(box, a, b, p, third, inverse_m2, view)
         if wp.static(mapped):
             x0, x1 = real(box.x - box.half_x), real(box.x + box.half_x)
             y0, y1 = real(box.y - box.half_y), real(box.y + box.half_y)
             box = optics.lut_bounds(x0, x1, y0, y1, lens)
-        if wp.static(bent):
+        if wp.static(has_lens):
             if in_front:
                 center_x, center_y, in_front = optics.image(p, view, lens)
         if wp.static(screen):

@@ -71,16 +71,16 @@ def make_project_backward(
     effects: tuple[str, ...], outputs: tuple[str, ...], names: tuple[str, ...], sh_coefficients: int
 ):
     """Make the kernel of the backward pass of the projection. effects, outputs: of the record. names: names
-    of the moments. sh_coefficients: SH coefficients per colour, 0 for plain colours."""
+    of the sums. sh_coefficients: SH coefficients per colour, 0 for plain colours."""
     layout = RecordLayout(effects, outputs)
     each, fields = layout.lines, len(names)
-    at = {name: place for place, name in enumerate(names)}
-    Moments, Totals = (wp.types.vector(fields, real) for real in (wp.float32, wp.float64))
+    at = {name: position for position, name in enumerate(names)}
+    GradientSums, Totals = (wp.types.vector(fields, real) for real in (wp.float32, wp.float64))
     screen_filter, has_depth, normal = (name in at for name in ("lowpass_x", "z_center", "nx"))
     exact, ewa = EXACT in effects, any(name in effects for name in EWA)
     has_gaussians = exact or ewa
     ellipsoid, solid_backward = make_ellipsoids(effects, wp.float64), make_ellipsoids_backward(effects)
-    zc_line, zc_lane = layout.place("z_center")
+    zc_line, zc_lane = layout.position("z_center")
     terms = max(sh_coefficients, 1)
     lowpass_x, z_numerator, nx, ellipsoid_term = (
         at.get(name, 0) for name in ("lowpass_x", "z_numerator", "nx", "ellipsoid_term")
@@ -100,7 +100,7 @@ def make_project_backward(
         keys: wp.array(dtype=wp.uint32),
         counts: wp.array(dtype=wp.int32),
         ends_by_index: wp.array(dtype=wp.int32),
-        moments: wp.array(dtype=Moments),  # by slot
+        gradient_sums: wp.array(dtype=GradientSums),  # by gradient buffer offset
         grad_means: wp.array(dtype=wp.vec3),  # out, as all arrays below; 0 for culled splats
         grad_quats: wp.array(dtype=wp.vec4),
         grad_scales: wp.array(dtype=wp.vec2),
@@ -127,8 +127,8 @@ def make_project_backward(
         if keys[i] == CULLED:
             return
         total = Totals()
-        for slot in range(ends_by_index[i] - counts[i], ends_by_index[i]):
-            values = moments[slot]
+        for offset in range(ends_by_index[i] - counts[i], ends_by_index[i]):
+            values = gradient_sums[offset]
             for field in range(wp.static(fields)):
                 total[field] = total[field] + wp.float64(values[field])
 

@@ -7,37 +7,40 @@ import warp as wp
 
 from .common import View, fma, struct_of
 
-SLOPES = wp.types.matrix((2, 3), wp.float32)
+RAY_DERIVATIVES = wp.types.matrix((2, 3), wp.float32)
 """derivatives of a ray with respect to the sample's column, and to its row"""
 
 
 @cache
-def struct_of_rays(bent: bool, sloped: bool = False, opaque: bool = False):
-    """Make the struct Rays: with the rays of a lens if `bent`, their derivatives if `sloped`, and an external
-    depth image if `opaque`.
+def struct_of_rays(has_lens: bool, has_ray_derivatives: bool = False, has_external_depth: bool = False):
+    """Make the struct Rays: with the rays of a lens, their derivatives, and an external depth image, if
+    requested.
     """
     fields = {}
-    if bent:  # X, Y, Z of each sample, row by row; NaN outside of the field of view
+    if has_lens:  # X, Y, Z of each sample, row by row; NaN outside of the field of view
         fields |= {"rays": wp.array(dtype=wp.vec3)}
-        fields |= {"slopes": wp.array(dtype=SLOPES)} if sloped else {}
-    if opaque:  # of each pixel, one image or one per view; depth is infinite without a surface
+        fields |= {"ray_derivatives": wp.array(dtype=RAY_DERIVATIVES)} if has_ray_derivatives else {}
+    if has_external_depth:  # of each pixel, one image or one per view; depth is infinite without a surface
         fields |= {"external_depth": wp.array(dtype=wp.float32), "external_rgb": wp.array(dtype=wp.vec3)}
     return struct_of("Rays", "The samples' rays, and an external depth image.", fields)
 
 
 @cache
 def make_rays(
-    bent: bool, stretched: bool = False, sloped: bool = False, opaque: bool = False
+    has_lens: bool,
+    has_ray_lengths: bool = False,
+    has_ray_derivatives: bool = False,
+    has_external_depth: bool = False,
 ) -> SimpleNamespace:
     """Make the struct Rays of samples and its functions.
 
     ray_of(column, row, rays, view): the ray, NaN outside of the field of view. length_of(column, row, rays,
     view): the factor from depths to distances, 1 outside of the field of view.
 
-    bent: read rays from the buffer of a lens. stretched: read their lengths too; otherwise compute them from
-    the view. sloped, opaque: see `struct_of_rays`.
+    has_lens: read rays from the buffer of a lens. has_ray_lengths: read their lengths too; otherwise from
+    the view. Others: see `struct_of_rays`.
     """
-    Rays = struct_of_rays(bent, sloped, opaque)
+    Rays = struct_of_rays(has_lens, has_ray_derivatives, has_external_depth)
 
     @wp.func
     def ray_in(column: int, row: int, view: View) -> wp.vec3:
@@ -47,7 +50,7 @@ def make_rays(
 
     @wp.func
     def ray_of(column: int, row: int, rays: Rays, view: View) -> wp.vec3:
-        if wp.static(bent):
+        if wp.static(has_lens):
             return rays.rays[row * view.width + column]
         else:
             return ray_in(column, row, view)
@@ -59,7 +62,7 @@ def make_rays(
 
     @wp.func
     def length_of(column: int, row: int, rays: Rays, view: View) -> float:
-        if wp.static(stretched):
+        if wp.static(has_ray_lengths):
             length = float(1.0)
             # tiles extend beyond the image
             if column < view.width and row < view.height:

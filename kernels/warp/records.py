@@ -50,7 +50,7 @@ class RecordLayout:
         self.names = [*_FORMS, *whole, "columns", "rows", *extra]
         self.lines = -(-len(self.names) // 4)
 
-    def place(self, name: str) -> tuple[int, int]:
+    def position(self, name: str) -> tuple[int, int]:
         """Line and lane of a number; (0, 0) for a number that the record lacks, which no kernel reads."""
         return divmod(self.word(name), 4)
 

@@ -13,13 +13,13 @@ from .rays import make_rays
 
 @cache
 def make_resolve(
-    images: tuple[tuple[str, type], ...], outputs: tuple[str, ...], stretched: bool, samples: int
+    images: tuple[tuple[str, type], ...], outputs: tuple[str, ...], has_ray_lengths: bool, samples: int
 ):
-    """Make the resolve kernel for output images and outputs, with samples x samples per pixel. stretched:
-    whether ray lengths are read from the buffer of a lens.
+    """Make the resolve kernel for output images and outputs, with samples x samples per pixel.
+    has_ray_lengths: whether ray lengths are read from the buffer of a lens.
     """
     Samples, Images = make_samples(tuple(sample_fields(outputs).items())), make_images(images, outputs)
-    rays = make_rays(stretched, stretched)
+    rays = make_rays(has_ray_lengths, has_ray_lengths)
     Rays, length_of = rays.Rays, rays.length_of
     asked = {name for name, _ in images}
     own = [name for name in outputs if name in asked]
@@ -44,15 +44,15 @@ def make_resolve(
         samples: Samples,
         out: Images,
     ):
-        place = wp.tid() + first_pixel
+        position = wp.tid() + first_pixel
         view = views[0]
         width = view.width / n
         pixels = width * (view.height / n)
-        number = place / pixels
+        number = position / pixels
         view = views[number]
         grid = PixelGrid()
-        here = place - number * pixels
-        grid.here = place
+        here = position - number * pixels
+        grid.here = position
         grid.pixel = batch_indices[number] * pixels + here
         own_row = here / width
         grid.row = number * (view.height / n) + own_row

@@ -26,9 +26,9 @@ def make_sensor(steps: tuple[str, ...]):
         batch_indices: wp.array(dtype=wp.int32),  # (views) index of each view in the images
         rgb: wp.array(dtype=wp.float32),  # (images h w 3) in and out
     ):
-        place = wp.tid() + first
-        here = place % pixels
-        at = batch_indices[place / pixels] * pixels + here
+        position = wp.tid() + first
+        here = position % pixels
+        at = batch_indices[position / pixels] * pixels + here
         for channel in range(3):
             v = rgb[3 * at + channel]
             for k in range(wp.static(len(applied))):

@@ -8,22 +8,22 @@ from .common import STRICT
 
 
 @cache
-def make_expose(dtype):
+def make_accumulate(dtype):
     """Make the kernel that adds a sub-frame's weighted sample buffer to the frame's buffer."""
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
-    def expose(
+    def accumulate(
         first: int,  # sample of thread 0
         weight: float,
-        fresh: int,  # 1: overwrite the buffer, for the first sub-frame
+        first_sub_frame: int,  # 1: overwrite the buffer, for the first sub-frame
         start: int,  # the frame's first sample in these rows
         raw: wp.array(dtype=dtype),
-        exposed: wp.array(dtype=dtype),  # in and out
+        accumulated: wp.array(dtype=dtype),  # in and out
     ):
         at = wp.tid() + first
-        light = weight * raw[at]
-        if fresh == 0:
-            light = exposed[start + at] + light
-        exposed[start + at] = light
+        value = weight * raw[at]
+        if first_sub_frame == 0:
+            value = accumulated[start + at] + value
+        accumulated[start + at] = value
 
-    return expose
+    return accumulate

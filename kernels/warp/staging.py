@@ -17,7 +17,7 @@ STAGED = 128
 """splats of a batch"""
 
 
-_POOL = """
+_SHARED_MEMORY = """
 #if defined(__CUDA_ARCH__)
     // records; 16 bytes for each cell, a bit for each splat that can touch it; its list, a byte for each
     __shared__ float4 staged[SPLATS * LINES + CELLS + (CELLS * STRIDE + 15) / 16];
@@ -30,7 +30,7 @@ _STAGE = """
 #if defined(__CUDA_ARCH__)
     // all that was staged before is read by then
     if (!__syncthreads_or(open)) return false;
-    float4* staged = reinterpret_cast<float4*>(__cvta_shared_to_generic(pool));
+    float4* staged = reinterpret_cast<float4*>(__cvta_shared_to_generic(shared_memory));
     const float4* from = reinterpret_cast<const float4*>(lines.data);
     // line by line, so that neighbours in the block read neighbours in memory
     for (int k = threadIdx.x; k < length * LINES; k += blockDim.x)
@@ -41,9 +41,9 @@ _STAGE = """
     return open;
 #endif
 """
-_MARK = """
+_MARK_CELLS = """
 #if defined(__CUDA_ARCH__)
-    float4* staged = reinterpret_cast<float4*>(__cvta_shared_to_generic(pool));
+    float4* staged = reinterpret_cast<float4*>(__cvta_shared_to_generic(shared_memory));
     unsigned int* touched = reinterpret_cast<unsigned int*>(staged + SPLATS * LINES);
     const unsigned int lane = threadIdx.x & 31;
     // 32 splats by 32 cells, turned: in each step squares of bits change places across the diagonal
@@ -57,12 +57,13 @@ _MARK = """
     if (cell < CELLS) touched[4 * cell + word] = bits;
 #endif
 """
-_LISTED = """
+_LIST_CELL = """
 #if defined(__CUDA_ARCH__)
     // all are marked by then
     __syncthreads();
-    const uint4* touched = reinterpret_cast<const uint4*>(__cvta_shared_to_generic(pool)) + SPLATS * LINES;
-    unsigned char* list = reinterpret_cast<unsigned char*>(__cvta_shared_to_generic(pool))
+    const uint4* touched =
+        reinterpret_cast<const uint4*>(__cvta_shared_to_generic(shared_memory)) + SPLATS * LINES;
+    unsigned char* list = reinterpret_cast<unsigned char*>(__cvta_shared_to_generic(shared_memory))
                           + 16 * (SPLATS * LINES + CELLS) + cell * STRIDE;
     const uint4 bits = touched[cell];
     // words that a longer batch has left
@@ -88,9 +89,9 @@ _LISTED = """
     return length;
 #endif
 """
-_PLACE = """
+_CELL_SPLAT = """
 #if defined(__CUDA_ARCH__)
-    return (reinterpret_cast<const unsigned char*>(__cvta_shared_to_generic(pool))
+    return (reinterpret_cast<const unsigned char*>(__cvta_shared_to_generic(shared_memory))
             + 16 * (SPLATS * LINES + CELLS))[cell * STRIDE + k];
 #else
     return k;
@@ -98,7 +99,7 @@ _PLACE = """
 """
 _LINE = """
 #if defined(__CUDA_ARCH__)
-    const float4* staged = reinterpret_cast<const float4*>(__cvta_shared_to_generic(pool));
+    const float4* staged = reinterpret_cast<const float4*>(__cvta_shared_to_generic(shared_memory));
     const float4 quad = staged[which * LINES + line];
     return wp::vec_t<4, wp::float32>(quad.x, quad.y, quad.z, quad.w);
 #else
@@ -121,22 +122,22 @@ def alone() -> bool:
 
 
 def make_staging(layout: RecordLayout, cells: int, items: int) -> SimpleNamespace:
-    """Make functions that stage batches of records in shared memory: pool; stage, mark and listed, called for
-    each batch; place and line.
+    """Make functions that stage batches of records in shared memory: shared_memory; stage, mark_cells and
+    list_cell, called for each batch; cell_splat and line.
 
     layout: layout of the records. cells: cells per tile. items: threads of a warp per cell.
     """
     # padded, so that words of a list are in different banks
     numbers = {"SPLATS": STAGED, "LINES": layout.lines, "CELLS": cells, "ITEMS": items, "STRIDE": STAGED + 4}
 
-    @wp.func_native(with_numbers(_POOL, numbers))
-    def pool() -> wp.uint64:
+    @wp.func_native(with_numbers(_SHARED_MEMORY, numbers))
+    def shared_memory() -> wp.uint64:
         """Address of the block's shared memory."""
         ...
 
     @wp.func_native(with_numbers(_STAGE, numbers))
     def stage(
-        pool: wp.uint64,
+        shared_memory: wp.uint64,
         lines: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         first: int,
@@ -150,26 +151,26 @@ def make_staging(layout: RecordLayout, cells: int, items: int) -> SimpleNamespac
         """
         ...
 
-    @wp.func_native(with_numbers(_MARK, numbers))
-    def mark(pool: wp.uint64, word: int, group: int, cells: wp.uint32):
+    @wp.func_native(with_numbers(_MARK_CELLS, numbers))
+    def mark_cells(shared_memory: wp.uint64, word: int, group: int, cells: wp.uint32):
         """Store the cells 32 group to 32 group + 31 that a staged splat may overlap, as bits, for splats 32
         word to 32 word + 31, one per thread of a warp.
         """
         ...
 
-    @wp.func_native(with_numbers(_LISTED, numbers))
-    def listed(pool: wp.uint64, length: int, cell: int) -> int:
-        """Number of splats of the batch that may overlap the thread's cell; call it after `mark`."""
+    @wp.func_native(with_numbers(_LIST_CELL, numbers))
+    def list_cell(shared_memory: wp.uint64, length: int, cell: int) -> int:
+        """Number of splats of the batch that may overlap the thread's cell; call it after `mark_cells`."""
         ...
 
-    @wp.func_native(with_numbers(_PLACE, numbers))
-    def place(pool: wp.uint64, cell: int, k: int) -> int:
+    @wp.func_native(with_numbers(_CELL_SPLAT, numbers))
+    def cell_splat(shared_memory: wp.uint64, cell: int, k: int) -> int:
         """Index in the batch of the k-th splat in the list of a cell."""
         ...
 
     @wp.func_native(with_numbers(_LINE, numbers))
     def line(
-        pool: wp.uint64,
+        shared_memory: wp.uint64,
         lines: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         first: int,
@@ -179,4 +180,11 @@ def make_staging(layout: RecordLayout, cells: int, items: int) -> SimpleNamespac
         """A line of the record of the staged splat `which`."""
         ...
 
-    return SimpleNamespace(pool=pool, stage=stage, mark=mark, listed=listed, place=place, line=line)
+    return SimpleNamespace(
+        shared_memory=shared_memory,
+        stage=stage,
+        mark_cells=mark_cells,
+        list_cell=list_cell,
+        cell_splat=cell_splat,
+        line=line,
+    )

@@ -30,7 +30,19 @@ _SORT = {"BLOCK": BLOCK, "BUCKETS": 1024, "LIMIT": 128, "LOCAL": 2048, "INDEXED"
 """LIMIT: maximum pairs of a bucket. LOCAL, INDEXED: pairs, and 16-bit indices of pairs, that fit shared
 memory. DEPTHS: lowest key of a depth; those of coplanar groups are below"""
 
-_SHARES = """
+# Inclusive prefix sum of a number of each thread over its warp.
+_WARP_PREFIX_SUM = """
+#if defined(__CUDA_ARCH__)
+    auto warp_prefix_sum = [](int sum) {
+        for (int step = 1; step < 32; step *= 2) {
+            const int before = __shfl_up_sync(0xffffffffu, sum, step);
+            if ((threadIdx.x & 31) >= step) sum += before;
+        }
+        return sum;
+    };
+#endif
+"""
+_THREADS_SHARE_TILE = """
 #if defined(__CUDA_ARCH__)
     const unsigned int active = __activemask(), same = __match_any_sync(active, tile);
     return __any_sync(active, (same & (same - 1)) != 0);
@@ -61,7 +73,7 @@ _COUNT_VISIBLE = """
     __atomic_fetch_add(counters.data + VISIBLE, 1, __ATOMIC_RELAXED);
 #endif
 """
-_POOL = """
+_SHARED_MEMORY = """
 #if defined(__CUDA_ARCH__)
     __shared__ int ends[BLOCK + BLOCK / 32];
     return static_cast<wp::uint64>(__cvta_generic_to_shared(ends));
@@ -69,15 +81,11 @@ _POOL = """
     return 0;
 #endif
 """
-_SHARE = """
+_BLOCK_PREFIX_SUM = """
 #if defined(__CUDA_ARCH__)
-    int* ends = static_cast<int*>(__cvta_shared_to_generic(pool));
+    int* ends = static_cast<int*>(__cvta_shared_to_generic(shared_memory));
     const int lane = threadIdx.x & 31, warp = threadIdx.x / 32;
-    int sum = count;
-    for (int step = 1; step < 32; step *= 2) {
-        const int before = __shfl_up_sync(0xffffffffu, sum, step);
-        if (lane >= step) sum += before;
-    }
+    int sum = warp_prefix_sum(count);
     __syncthreads();  // the earlier entries have been processed
     if (lane == 31) ends[BLOCK + warp] = sum;
     __syncthreads();
@@ -91,7 +99,7 @@ _SHARE = """
 """
 _OWNER = """
 #if defined(__CUDA_ARCH__)
-    const int* ends = static_cast<const int*>(__cvta_shared_to_generic(pool));
+    const int* ends = static_cast<const int*>(__cvta_shared_to_generic(shared_memory));
     int owner = 0;
     for (int step = BLOCK / 2; step > 0; step /= 2)
         if (ends[owner + step - 1] <= entry) owner += step;
@@ -102,7 +110,7 @@ _OWNER = """
 """
 _FIRST_ENTRY = """
 #if defined(__CUDA_ARCH__)
-    return owner > 0 ? static_cast<const int*>(__cvta_shared_to_generic(pool))[owner - 1] : 0;
+    return owner > 0 ? static_cast<const int*>(__cvta_shared_to_generic(shared_memory))[owner - 1] : 0;
 #else
     return 0;
 #endif
@@ -116,11 +124,8 @@ _START = """
     __shared__ int sums[32], classes[1024];
     const int item = threadIdx.x, lane = item & 31, warp = item / 32;
     auto class_of = [](int length) { return 1023 - min(length / 4, 1023); };
-    auto scan = [&](int sum) {  // inclusive sums over the block
-        for (int step = 1; step < 32; step *= 2) {
-            const int before = __shfl_up_sync(0xffffffffu, sum, step);
-            if (lane >= step) sum += before;
-        }
+    auto block_prefix_sum = [&](int sum) {  // inclusive
+        sum = warp_prefix_sum(sum);
         __syncthreads();
         if (lane == 31) sums[warp] = sum;
         __syncthreads();
@@ -141,12 +146,12 @@ _START = """
     for (int other = 0; other < 32; other++) total += totals_of_warps[other];
     const bool fits = total <= capacity;
     const int tiles_of_class = classes[item];
-    classes[item] = scan(tiles_of_class) - tiles_of_class;
-    const int visible = scan(item < VISIBLE ? counters.data[VISIBLE + item] : 0);
+    classes[item] = block_prefix_sum(tiles_of_class) - tiles_of_class;
+    const int visible = block_prefix_sum(item < VISIBLE ? counters.data[VISIBLE + item] : 0);
     int position = 0;
     for (int round = first; round < end; round += 1024) {
         const int tile = round + item, length = tile < end ? lengths[tile] : 0;
-        const int after = position + scan(length);
+        const int after = position + block_prefix_sum(length);
         if (tile < end) {
             cursors.data[tile] = after - length;
             starts.data[tile] = fits ? after - length : 0;
@@ -236,11 +241,7 @@ _SORT_LIST = """
             overfull = overfull || lengths[n] > LIMIT;
             own += lengths[n];
         }
-        int sum = own;
-        for (int step = 1; step < 32; step *= 2) {
-            const int before = __shfl_up_sync(0xffffffffu, sum, step);
-            if (lane >= step) sum += before;
-        }
+        int sum = warp_prefix_sum(own);
         if (lane == 31) sums[warp] = sum;
         overfull = __syncthreads_or(overfull);
         for (int before = 0; before < warp; before++) sum += sums[before];
@@ -317,8 +318,8 @@ _SORT_LIST = """
 """
 
 
-@wp.func_native(_SHARES)
-def shares(tile: int) -> bool:
+@wp.func_native(_THREADS_SHARE_TILE)
+def threads_share_tile(tile: int) -> bool:
     """Whether several active threads of the warp have the same tile."""
     ...
 
@@ -337,33 +338,33 @@ def count_visible(counters: wp.array(dtype=wp.int32)):
     ...
 
 
-@wp.func_native(with_numbers(_POOL, _NUMBERS))
-def pool() -> wp.uint64:
+@wp.func_native(with_numbers(_SHARED_MEMORY, _NUMBERS))
+def shared_memory() -> wp.uint64:
     """Address of the block's shared memory, for the functions below."""
     ...
 
 
-@wp.func_native(with_numbers(_SHARE, _NUMBERS))
-def share(pool: wp.uint64, count: int) -> int:
-    """Number the entries of all threads of the block, `count` of each, thread after thread; returns their
-    sum. A barrier.
+@wp.func_native(with_numbers(_WARP_PREFIX_SUM + _BLOCK_PREFIX_SUM, _NUMBERS))
+def block_prefix_sum(shared_memory: wp.uint64, count: int) -> int:
+    """Inclusive prefix sum, in shared memory, of the number of entries of each thread of the block; returns
+    the total. A barrier.
     """
     ...
 
 
 @wp.func_native(with_numbers(_OWNER, _NUMBERS))
-def owner_of(pool: wp.uint64, entry: int) -> int:
-    """Thread of an entry."""
+def owner_of(shared_memory: wp.uint64, entry: int) -> int:
+    """Thread whose entry has this number: a binary search in the prefix sum."""
     ...
 
 
 @wp.func_native(_FIRST_ENTRY)
-def first_entry(pool: wp.uint64, owner: int) -> int:
+def first_entry(shared_memory: wp.uint64, owner: int) -> int:
     """Number of entries of all threads before `owner`."""
     ...
 
 
-@wp.func_native(with_numbers(_START, _NUMBERS))
+@wp.func_native(with_numbers(_WARP_PREFIX_SUM + _START, _NUMBERS))
 def start(
     counters: wp.array(dtype=wp.int32),
     first: int,
@@ -378,7 +379,7 @@ def start(
     ...
 
 
-@wp.func_native(with_numbers(_SORT_LIST, _SORT))
+@wp.func_native(with_numbers(_WARP_PREFIX_SUM + _SORT_LIST, _SORT))
 def sort_list(pairs: wp.array(dtype=wp.uint64), lists: wp.array(dtype=wp.int32), start: int, length: int):
     """Sort pairs[start : start + length] into `lists`."""
     ...
@@ -440,8 +441,8 @@ def list_windows(
         if keys[i] != CULLED:
             corner, bits = window_of(windows[i])
             count = population(bits)
-    entries = pool()
-    total = share(entries, count)
+    entries = shared_memory()
+    total = block_prefix_sum(entries, count)
     entry, shared = int(item), bool(False)
     while entry < total:
         owner = owner_of(entries, entry)
@@ -449,7 +450,7 @@ def list_windows(
         corner, bits = window_of(windows[index])
         tile = window_tile(corner, nth_bit(bits, entry - first_entry(entries, owner)), view)
         if entry < step:
-            shared = shares(tile)
+            shared = threads_share_tile(tile)
         list_pair(tile, keys[index], index, shared, band_first, band_end, cursors, 0, capacity, pairs)
         entry += step
 
@@ -505,7 +506,7 @@ def count_tiles(
     if rest == NONE:
         big[increment(counters, 0, True)] = index
         return
-    shared = shares(window_tile(corner, lowest(rest), view))
+    shared = threads_share_tile(window_tile(corner, lowest(rest), view))
     while rest != NONE:
         increment(counters, COUNTERS + window_tile(corner, lowest(rest), view), shared)
         rest = rest & (rest - ONE)
@@ -540,14 +541,14 @@ def make_list_big(screen: bool):
         count = counters[0]
         each = wp.clamp((count + blocks - 1) / blocks, 1, wp.min(SHARED_SPLATS, step))
         group = first + wp.tid() / step
-        entries = pool()
+        entries = shared_memory()
         while group < count:
             cells = int(0)
             # splats of a group are not neighbours in the list, since large ones often are
             if item < each and group + item * blocks < count:
                 left, top, columns, rows = limits.tile_rectangle(bounds[big[group + item * blocks]], view)
                 cells = columns * rows
-            total = share(entries, cells)
+            total = block_prefix_sum(entries, cells)
             entry = int(item)
             while entry < total:
                 owner = owner_of(entries, entry)

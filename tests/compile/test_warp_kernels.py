@@ -85,14 +85,14 @@ def blending_back(*effects):
 
 def projecting_back(terms, *effects):
     effects = (*OF_GRADIENTS[0], *effects)
-    names = made("fragment_backward.moments_of", effects, OF_GRADIENTS[1])
+    names = made("fragment_backward.gradient_sum_names", effects, OF_GRADIENTS[1])
     return made("project_backward.make_project_backward", effects, NORMAL, names, terms)
 
 
-def resolving(stretched, samples):
+def resolving(has_ray_lengths, samples):
     """The kernel for all outputs."""
     images = tuple((output.name, getattr(wp, output.dtype)) for output in OUTPUTS.values())
-    return made("resolve.make_resolve", images, everything(), stretched, samples)
+    return made("resolve.make_resolve", images, everything(), has_ray_lengths, samples)
 
 
 LONG = pytest.mark.exhaustive
@@ -130,14 +130,18 @@ def started():
         pytest.param(lambda: blending("lowpass_screen", "stop_exclusive", outputs=()), id="blend-exclusive"),
         pytest.param(lambda: projecting_back(16, "ellipsoid_exact"), id="project-backward-exact"),
         pytest.param(lambda: projecting_back(0, "ellipsoid_ewa_antialiased"), id="project-backward-ewa"),
-        pytest.param(lambda: made("blend_backward.make_slots", True), id="slots"),
+        pytest.param(lambda: made("blend_backward.make_gradient_offsets", True), id="gradient_offsets"),
         pytest.param(lambda: made("column_sums.add_rows"), id="sums"),
         pytest.param(lambda: resolving(False, 3), id="resolve"),
-        pytest.param(lambda: resolving(True, 1), id="resolve-stretched"),
-        pytest.param(lambda: made("background.make_backdrop", "gradient", False), id="backdrop-gradient"),
-        pytest.param(lambda: made("background.make_backdrop", "panorama", True), id="backdrop-panorama"),
+        pytest.param(lambda: resolving(True, 1), id="resolve-ray-lengths"),
+        pytest.param(
+            lambda: made("background.make_composite_background", "gradient", False), id="background-gradient"
+        ),
+        pytest.param(
+            lambda: made("background.make_composite_background", "panorama", True), id="background-panorama"
+        ),
         pytest.param(lambda: made("sensor.make_sensor", STEPS)[0], id="sensor"),
-        pytest.param(lambda: made("shutter.make_expose", wp.vec4), id="expose"),
+        pytest.param(lambda: made("shutter.make_accumulate", wp.vec4), id="accumulate"),
         pytest.param(lambda: made("tile_lists.make_list_big", True), id="list_big"),
         pytest.param(lambda: made("tile_lists.sort_lists"), id="list_windows, sort_lists"),
         pytest.param(lambda: made("tile_lists.start_lists"), id="start_lists"),
@@ -188,10 +192,10 @@ def test_a_record_grows_by_the_requested_fields():
     assert layout(()).lines == 5
     assert layout(("lowpass_screen",)).names[-2:] == ["lowpass_x", "lowpass_y"]
     assert layout(RECORD, NORMAL).lines == 7
-    assert layout(RECORD, NORMAL).place("nz") == (6, 2)
-    assert layout(()).place("nz") == (0, 0)
+    assert layout(RECORD, NORMAL).position("nz") == (6, 2)
+    assert layout(()).position("nz") == (0, 0)
     assert layout(("lowpass_screen", "footprint_mixed")).lines == 6
-    assert layout(("footprint_box",)).place("edge_u0") == (4, 0), "a line of their own"
+    assert layout(("footprint_box",)).position("edge_u0") == (4, 0), "a line of their own"
     assert layout(("rays", "footprint_box")).names == layout(("rays",)).names, "edges are curves"
     assert "boxed" in layout(("rays", "footprint_mixed")).names
 

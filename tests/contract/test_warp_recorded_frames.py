@@ -12,8 +12,8 @@ import fidsplat as fs
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.warp import memory_plan, runtime
 from fidsplat.backends.warp.frame import DeviceFrame
+from fidsplat.backends.warp.kernel_config import KernelConfig
 from fidsplat.backends.warp.pipeline import RecordedFrame
-from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.capture.views import views_of
 
 BACKEND = "warp"
@@ -306,7 +306,7 @@ def test_views_together_in_blocks_of_threads(renderer):
     backend = renderer.backend
     resident, captures = backend.upload(CLOUD), [CAPTURE.with_(camera=camera) for camera in CROSSING[:3]]
     features, views = prepare_batch(resident, views_of(captures, None, None, None))
-    pipeline = backend.pipeline(features, WarpShape("group", 8, 8))
+    pipeline = backend.pipeline(features, KernelConfig("group", 8, 8))
     full_frame = pipeline.render(resident, views).read("rgb")
     before, backend.pair_budget = backend.pair_budget, 4000
     try:

@@ -12,11 +12,11 @@ from fidsplat.backends.interface import Backend, DeviceInfo
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.command_list import LaunchCache
 from fidsplat.backends.warp.gradients import WarpGradients
+from fidsplat.backends.warp.kernel_config import KernelConfig, config_for, other_configs
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.probe import WarpProbe
 from fidsplat.backends.warp.program import Program, unsupported
 from fidsplat.backends.warp.resident import Resident
-from fidsplat.backends.warp.shapes import WarpShape, other_shapes, shape_for
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
@@ -57,12 +57,12 @@ class WarpBackend(Workspace, Backend):
     def __init__(self, device: Any) -> None:
         self.info = _describe(device)
         super().__init__(device, self.info.name, self.info.memory_bytes // 10 * 9)
-        self.config = shape_for(device)
+        self.config = config_for(device)
         # debug builds of Warp's CPU kernels share a pointer among threads, and crash (warp/native/tile.h)
         single = device.is_cuda or runtime.load().config.mode == "debug"
         self._launches = LaunchCache(device, 1 if single else self.info.compute_units)
-        self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
-        self._gradients: dict[tuple[FeatureSet, WarpShape], WarpGradients] = {}
+        self._pipelines: dict[tuple[FeatureSet, KernelConfig], WarpPipeline] = {}
+        self._gradients: dict[tuple[FeatureSet, KernelConfig], WarpGradients] = {}
 
     def limit_memory(self, budget: int) -> None:
         """Limit a frame and its cloud to `budget` bytes: longer lists are split into bands of tiles, a larger
@@ -78,14 +78,14 @@ class WarpBackend(Workspace, Backend):
     def unsupported(self, features: FeatureSet) -> str:
         return unsupported(features, self.info.name)
 
-    def pipeline(self, features: FeatureSet, config: WarpShape | None = None) -> WarpPipeline:
+    def pipeline(self, features: FeatureSet, config: KernelConfig | None = None) -> WarpPipeline:
         key = (features, config or self.config)
         if key not in self._pipelines:
             program = Program(self.device, self.info.name, *key)
             self._pipelines[key] = WarpPipeline(program, self, self._launches)
         return self._pipelines[key]
 
-    def differentiate(self, features: FeatureSet, config: WarpShape | None = None) -> WarpGradients:
+    def differentiate(self, features: FeatureSet, config: KernelConfig | None = None) -> WarpGradients:
         check_differentiable(features)
         key = (features, config or self.config)
         if key not in self._gradients:
@@ -95,8 +95,8 @@ class WarpBackend(Workspace, Backend):
     def probe(self) -> WarpProbe:
         return WarpProbe(self)
 
-    def configs(self, kind: str) -> dict[str, WarpShape]:
-        return other_shapes(self.config, kind)
+    def configs(self, kind: str) -> dict[str, KernelConfig]:
+        return other_configs(self.config, kind)
 
 
 def _describe(device: Any) -> DeviceInfo:

@@ -21,7 +21,7 @@ from fidsplat.backends.warp.memory_plan import MemoryPlanner
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load
-from fidsplat.backends.warp.uniforms import array_of, lens_of, moving_of, rays_of, surroundings_of, uniforms
+from fidsplat.backends.warp.uniforms import array_of, environment_of, lens_of, moving_of, rays_of, uniforms
 from fidsplat.backends.warp.workspace import ArrayPool
 from fidsplat.util.errors import DeviceError
 
@@ -46,7 +46,7 @@ class DeviceFrame:
         program: Program,
         planner: MemoryPlanner,
         resident: Resident,
-        stack: ViewBatch,
+        batch: ViewBatch,
         launcher: Launcher,
         reserved: int = 0,
         capacity: int | None = None,
@@ -61,36 +61,39 @@ class DeviceFrame:
         self.reserved, self.capacity = reserved, capacity
         self.inputs = inputs or self.pool
         self.wp = load()
-        view, shape = stack.view, program.shape
-        columns, rows = -(-view.width // shape.tile_width), -(-view.height // shape.tile_height)
-        self.views, self.splats = len(stack), len(stack) * resident.count
+        view, config = batch.view, program.config
+        columns, rows = -(-view.width // config.tile_width), -(-view.height // config.tile_height)
+        self.views, self.splats = len(batch), len(batch) * resident.count
         self.tiles = self.views * rows * columns
-        self.grid = rows * shape.tile_height, columns * shape.tile_width
+        self.grid = rows * config.tile_height, columns * config.tile_width
         """rows and columns of samples of a view"""
         self.named: dict[str, Any] = {}
         """arrays and structs by the names of the kernels' parameters"""
         self.bands = 0
         """number of bands of tiles in which the frame was rendered"""
         self.stats: dict[str, int] = {"splats": resident.count, "visible": 0, "pairs": 0}
-        self.set_views(stack)
+        self.set_views(batch)
 
-    def set_views(self, stack: ViewBatch) -> None:
+    def set_views(self, batch: ViewBatch) -> None:
         """Fill the input arrays and structs for other views with the same size and effects."""
-        program, inputs, view = self.program, self.inputs, stack.view
-        self.stack, self.view = stack, view
+        program, inputs, view = self.program, self.inputs, batch.view
+        self.batch, self.view = batch, view
         if view.sub_frames:
             return  # each sub-frame fills its own inputs
         self._fill_views()
         self.named["lens"] = lens_of(view, self.workspace)
-        self.named["moving"] = moving_of(self.resident, stack, inputs)
-        given = {"sloped": program.sloped, "opaque": program.opaque}
+        self.named["moving"] = moving_of(self.resident, batch, inputs)
+        given = {
+            "has_ray_derivatives": program.has_ray_derivatives,
+            "has_external_depth": program.has_external_depth,
+        }
         self._rays = rays_of(view, self.workspace, inputs, **given)
-        if program.backdrop:
-            self.named["surroundings"] = surroundings_of(view, self.workspace)
+        if program.composite_background:
+            self.named["environment"] = environment_of(view, self.workspace)
 
     def _fill_views(self) -> None:
         program, count = self.program, self.resident.count
-        numbers = uniforms(self.stack, program.shape, count, program.sloped)
+        numbers = uniforms(self.batch, program.config, count, program.has_ray_derivatives)
         self.named["views"] = self.inputs.filled("views", numbers, kernels("common").View)
 
     def render(self) -> None:
@@ -99,27 +102,27 @@ class DeviceFrame:
 
     def _render_exposure(self) -> Any:
         """Run all stages except resolve for each sub-frame, and accumulate their samples."""
-        exposed = self._samples("exposed")
+        accumulated = self._samples("accumulated")
         reserved = self.reserved + self.planner.sample_bytes(self.view)
         for sub_frame in self.view.sub_frames:
-            stack = ViewBatch.single(sub_frame.view)
-            part = DeviceFrame(self.program, self.planner, self.resident, stack, self.launcher, reserved)
+            batch = ViewBatch.single(sub_frame.view)
+            part = DeviceFrame(self.program, self.planner, self.resident, batch, self.launcher, reserved)
             samples = part._render_pose()
-            self.launcher.stage("expose")
-            self._accumulate(sub_frame, samples, exposed)
+            self.launcher.stage("accumulate")
+            self._accumulate(sub_frame, samples, accumulated)
             self.stats = {name: max(value, part.stats[name]) for name, value in self.stats.items()}
         self._fill_views()  # sub-frames have overwritten the inputs
-        return exposed
+        return accumulated
 
-    def _accumulate(self, sub_frame: SubFrame, samples: Any, exposed: Any) -> None:
+    def _accumulate(self, sub_frame: SubFrame, samples: Any, accumulated: Any) -> None:
         """Add the samples of a sub-frame: colours are averaged, other buffers are from the middle pose."""
         start, count = sub_frame.top * self.grid[1], sub_frame.view.height * self.grid[1]
         for name in self.program.sample_fields:
-            source, target = getattr(samples, name), getattr(exposed, name)
-            if name in self.program.expose:
-                given = {"weight": sub_frame.weight, "fresh": int(sub_frame.first), "start": start}
+            source, target = getattr(samples, name), getattr(accumulated, name)
+            if name in self.program.accumulate:
+                given = {"weight": sub_frame.weight, "first_sub_frame": int(sub_frame.first), "start": start}
                 self.launcher.launch(
-                    self.program.expose[name], count, {**given, "raw": source, "exposed": target}
+                    self.program.accumulate[name], count, {**given, "raw": source, "accumulated": target}
                 )
             elif sub_frame.middle:
                 self.wp.copy(target, source, dest_offset=start, count=count)
@@ -142,13 +145,13 @@ class DeviceFrame:
             self.launcher.launch_blocks(self.program.lists.sort_lists, first, end, self.named)
             self.launcher.stage("blend")
             self._blend(first, end, samples)
-        if program.backdrop:
+        if program.composite_background:
             # set here, as sub-frames may have other directions
             self.launcher.stage("resolve")
             # rays without derivatives: another struct type than for blending
             rays = rays_of(self.view, self.workspace, self.inputs)
             count = self.views * self.view.width * self.view.height
-            self._launch(program.backdrop, count, rays=rays, color=samples.color)
+            self._launch(program.composite_background, count, rays=rays, color=samples.color)
         self.stats |= {"visible": visible, "pairs": pairs}
         return samples
 
@@ -194,7 +197,7 @@ class DeviceFrame:
 
     def _bands(self, pairs: int) -> Iterator[tuple[int, int, int]]:
         """Split the tiles into ranges (first, end, pairs) whose lists fit the budgets; usually one."""
-        limit = self.planner.max_pairs(self.resident, self.stack, self.reserved)
+        limit = self.planner.max_pairs(self.resident, self.batch, self.reserved)
         if pairs <= limit:
             return iter([(0, self.tiles, pairs)])
         lengths = self.named["counters"].numpy()[self.program.lists.COUNTERS :]
@@ -203,7 +206,7 @@ class DeviceFrame:
     def fits(self, capacity: int) -> bool:
         """Whether a frame with this number of pairs fits the budgets in one band."""
         try:
-            return capacity <= self.planner.max_pairs(self.resident, self.stack, self.reserved)
+            return capacity <= self.planner.max_pairs(self.resident, self.batch, self.reserved)
         except DeviceError:
             return False
 
@@ -227,12 +230,12 @@ class DeviceFrame:
         return samples
 
     def _blend(self, first: int, end: int, samples: Any) -> None:
-        program, shape = self.program, self.program.shape
+        program, config = self.program, self.program.config
         # a placeholder, which kernels do not read
         groups = self.resident.arrays.get("coplanar_groups", self.named["lists"])
         given = {**self.named, "rays": self._rays, "samples": samples, "coplanar_groups": groups}
-        area = shape.tile_width * shape.tile_height
-        if shape.schedule == "group":
+        area = config.tile_width * config.tile_height
+        if config.schedule == "group":
             count = (end - first) * program.blend_block
             self.launcher.launch_undivided(
                 program.blend, count, given | {"band_first": first}, program.blend_block
@@ -253,7 +256,7 @@ class DeviceFrame:
         for name in program.cloud_arrays:
             setattr(out, name, self.resident.arrays[name])
         for name, dtype in program.view_arrays.items():
-            setattr(out, name, self.inputs.filled(name, array_of(self.stack, name), dtype))
+            setattr(out, name, self.inputs.filled(name, array_of(self.batch, name), dtype))
         given = {
             "views": self.named["views"],
             "batch_indices": into.indices,
@@ -261,7 +264,7 @@ class DeviceFrame:
             "out": out,
         }
         given["background"] = wp.vec3(*view.background)
-        given["rays"] = rays_of(view, self.workspace, self.inputs, bent=program.stretched)
+        given["rays"] = rays_of(view, self.workspace, self.inputs, has_lens=program.has_ray_lengths)
         launcher.launch(program.resolve, self.views * pixels, given)
         if program.sensor:
             settings = program.sensor.settings(view, self.inputs)

@@ -72,13 +72,13 @@ class _Backward:
         self._count, self._pairs = frame.resident.count, frame.stats["pairs"]
         # a placeholder, which kernels do not read if all splats are disks
         self._given = {**frame.named, "thickness": frame.resident.arrays["opacities"]}
-        self._given |= frame.resident.arrays | {"by": self._by(gradients)}
+        self._given |= frame.resident.arrays | {"image_gradients": self._image_gradients(gradients)}
         self._given |= {
             "samples": frame.samples,
             "color": frame.samples.color,
             "background": self._wp.vec3(*frame.view.background),
             "log_ceiling": math.log(frame.view.opacity_ceiling),
-            "grad_rgb": self._given["by"].rgb,
+            "grad_rgb": self._given["image_gradients"].rgb,
         }
 
     def results(self) -> dict[str, Any]:
@@ -89,7 +89,7 @@ class _Backward:
         self._launcher.stage("project backward")
         if self._pairs:
             self._launcher.launch(self._made.project, self._count, self._given)
-        else:  # no splat is visible, so there are no moments
+        else:  # no splat is visible, so there are no sums
             for array in (*found.values(), self._given["grad_cameras"]):
                 array.zero_()
         view = self._frame.view
@@ -104,30 +104,32 @@ class _Backward:
         return found
 
     def _blend(self) -> None:
-        """Sum gradient moments over the samples of each (splat, tile) pair."""
+        """Sum gradients over the samples of each (splat, tile) pair."""
         wp, frame, made, pairs = self._wp, self._frame, self._made, self._pairs
         if not pairs:
             return
-        self._take("slots", pairs, wp.int32)
+        self._take("gradient_offsets", pairs, wp.int32)
         ends = self._take("ends_by_index", self._count, wp.int32)
         wp.utils.array_scan(self._given["counts"], ends, inclusive=True)
         self._given["tiles"] = frame.tiles
-        self._launcher.launch(made.slots, pairs, self._given)
-        self._given["moments"] = moments = frame.pool.exact("moments", pairs, made.blend.Moments)
-        moments.zero_()
-        shape = frame.program.shape
-        area = shape.tile_width * shape.tile_height
+        self._launcher.launch(made.gradient_offsets, pairs, self._given)
+        self._given["gradient_sums"] = gradient_sums = frame.pool.exact(
+            "gradient_sums", pairs, made.blend.GradientSums
+        )
+        gradient_sums.zero_()
+        config = frame.program.config
+        area = config.tile_width * config.tile_height
         chunk = kernels("blend_backward").CHUNK
         checkpoints = area * (pairs // chunk + frame.tiles + 1)
         self._given["checkpoints"] = self._take("checkpoints", checkpoints, wp.float32)
         kernel, tiles = made.blend.kernel, frame.tiles
-        if shape.schedule == "group":
+        if config.schedule == "group":
             given = self._given | {"band_first": 0}
             self._launcher.launch_undivided(kernel, tiles * area, given, area)
             return
         states = self._launcher.parts * area
-        self._given["lights"] = self._take("lights", states, wp.float32)
-        self._given["losses"] = self._take("losses", states, made.blend.Loss)
+        self._given["transmittances"] = self._take("transmittances", states, wp.float32)
+        self._given["pixel_gradients"] = self._take("pixel_gradients", states, made.blend.PixelGradient)
         self._given["fragments"] = self._take("fragments", states * chunk, wp.vec2)
         self._launcher.launch_blocks(kernel, 0, tiles, self._given, area=area)
 
@@ -141,20 +143,20 @@ class _Backward:
             self._launcher.launch(made.add_rows, stride * columns, sizes)
         self._launcher.launch(made.as_single, columns, {"sums": total, "singles": result})
 
-    def _by(self, gradients: Mapping[str, Any]) -> Any:
+    def _image_gradients(self, gradients: Mapping[str, Any]) -> Any:
         """Struct of the gradients with respect to the images for the kernels; missing gradients are 0."""
-        by = self._made.blend.By()
-        for name in self._made.losses:
+        struct = self._made.blend.ImageGradients()
+        for name in self._made.gradient_outputs:
             view, given = self._frame.view, gradients.get(name)
             size = math.prod(gradient_shape(name, view))
             if given is None:
-                array = self._frame.pool.exact(f"by {name}", size, self._wp.float32)
+                array = self._frame.pool.exact(f"gradient of {name}", size, self._wp.float32)
                 array.zero_()
             else:
                 check_shape(name, _shape_of(given), view)
                 array = self._device_gradient(name, given)
-            setattr(by, name, array)
-        return by
+            setattr(struct, name, array)
+        return struct
 
     def _device_gradient(self, name: str, given: Any) -> Any:
         """A gradient as a flat device array; no copy if it is on the device."""
@@ -167,7 +169,9 @@ class _Backward:
                     f"the gradient of {name} must be detached, got {error}; detach it first"
                 ) from None
         if not isinstance(given, wp.array):
-            return pool.filled(f"by {name}", np.ascontiguousarray(given, np.float32).ravel(), wp.float32)
+            return pool.filled(
+                f"gradient of {name}", np.ascontiguousarray(given, np.float32).ravel(), wp.float32
+            )
         scalar = getattr(given.dtype, "_wp_scalar_type_", given.dtype)
         if scalar is not wp.float32 or not given.is_contiguous or given.device != pool.device:
             raise InputError(

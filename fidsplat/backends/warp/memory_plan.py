@@ -27,8 +27,8 @@ _MAX_NUMBERED = 1 << 30
 
 class MemoryPlanner:
     def __init__(self, program: Program, workspace: Workspace) -> None:
-        self.workspace, shape = workspace, program.shape
-        self._tile_width, self._tile_height = shape.tile_width, shape.tile_height
+        self.workspace, config = workspace, program.config
+        self._tile_width, self._tile_height = config.tile_width, config.tile_height
         sizes = map(load().types.type_size_in_bytes, program.sample_fields.values())
         self._sample_bytes = sum(sizes)
         self._lines = program.layout.lines
@@ -44,12 +44,12 @@ class MemoryPlanner:
         columns, rows = -(-view.width // self._tile_width), -(-view.height // self._tile_height)
         return rows * columns * self._tile_width * self._tile_height
 
-    def max_pairs(self, resident: Resident, stack: ViewBatch, reserved: int) -> int:
+    def max_pairs(self, resident: Resident, batch: ViewBatch, reserved: int) -> int:
         """Maximum number of (splat, tile) pairs in the lists at once. reserved: bytes of other arrays. Raises
         DeviceError if the rest of the frame exceeds the memory budget."""
         workspace = self.workspace
-        fixed = resident.memory_bytes + self._splat_bytes * len(stack) * resident.count
-        fixed += len(stack) * self.sample_bytes(stack.view) + reserved + memory_bytes(stack.view, workspace)
+        fixed = resident.memory_bytes + self._splat_bytes * len(batch) * resident.count
+        fixed += len(batch) * self.sample_bytes(batch.view) + reserved + memory_bytes(batch.view, workspace)
         pairs = (workspace.memory_budget - fixed) // _PAIR
         if pairs < 1:
             raise DeviceError(

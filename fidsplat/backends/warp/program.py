@@ -8,8 +8,8 @@ from typing import Any
 
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.command_list import BLOCK
+from fidsplat.backends.warp.kernel_config import KernelConfig
 from fidsplat.backends.warp.runtime import kernels, load, quiet
-from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.backends.warp.workspace import ArrayPool
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS
@@ -107,23 +107,23 @@ _MAKING = threading.RLock()
 class Program:
     """Compiled kernels of all stages, and their struct types."""
 
-    def __init__(self, device: Any, name: str, features: FeatureSet, shape: WarpShape) -> None:
+    def __init__(self, device: Any, name: str, features: FeatureSet, config: KernelConfig) -> None:
         """name: name of the device, for errors. Raises DeviceError for an effect that is not supported."""
         if why := unsupported(features, name):
             raise DeviceError(why)
-        self.device, self.shape, self.features, self._name = device, shape, features, name
+        self.device, self.config, self.features, self._name = device, config, features, name
         self.images = tuple(each for each in features.images if each.name in {"rgb", *features.outputs})
         self.project_block = kernels("project").BLOCK
-        self.tile_area = shape.tile_width * shape.tile_height
+        self.tile_area = config.tile_width * config.tile_height
         """samples"""
         self.needs = needs = _Needs.of(features)
         with _MAKING, quiet():
             self._make_lists(features, needs)
             self._make_blend(needs)
             self._make_resolve(features, needs)
-            made = (self.project, self.list_big, self.blend, self.resolve, *self.expose.values())
+            made = (self.project, self.list_big, self.blend, self.resolve, *self.accumulate.values())
             common = (self.lists.start_lists, self.lists.list_windows, self.lists.sort_lists)
-            further = (self.backdrop, self.sensor and self.sensor.kernel)
+            further = (self.composite_background, self.sensor and self.sensor.kernel)
             blocks = {self.blend: self.blend_block, self.project: self.project_block}
             blocks[self.lists.start_lists] = self.lists.START_BLOCK
             for kernel in (*made, *common, *filter(None, further)):
@@ -135,7 +135,7 @@ class Program:
             kernels("output").having(needs.outputs, "record"),
             (features.sh_degree + 1) ** 2 if "color_sh" in needs.effects else 0,
             features.projection_precision,
-            self.shape.schedule == "tiles",
+            self.config.schedule == "tiles",
         )
         self.lists = kernels("tile_lists")
         self.list_big = self.lists.make_list_big("lowpass_screen" in needs.effects)
@@ -144,38 +144,42 @@ class Program:
         buffers, blending = kernels("buffers"), needs.blending
         self.layout = kernels("records").RecordLayout(needs.among(_RECORD), blending)
         boxes = not needs.effects.isdisjoint(kernels("records").BOXES)
-        self.sloped = boxes and "rays" in needs.effects
+        self.has_ray_derivatives = boxes and "rays" in needs.effects
         """whether blending reads the derivatives of a lens's rays"""
-        self.opaque = "external_depth" in needs.effects
+        self.has_external_depth = "external_depth" in needs.effects
         """whether blending reads an external depth image"""
-        grouped = self.shape.schedule == "group"
+        grouped = self.config.schedule == "group"
         self.blend, self.state, self.blend_block = kernels("blend").make_blend(
-            needs.among(_SAMPLE), blending, grouped, self.tile_area, self.shape.k_buffer_size
+            needs.among(_SAMPLE), blending, grouped, self.tile_area, self.config.k_buffer_size
         )
         """the kernel, the struct of a sample, and the threads of a tile on a GPU"""
         self.sample_fields = buffers.sample_fields(blending)
         """element type of each sample buffer"""
         self.samples_type = buffers.make_samples(tuple(self.sample_fields.items()))
-        light = buffers.light_of(blending) if "shutter_exposure" in needs.effects else ()
-        self.expose = {name: kernels("shutter").make_expose(self.sample_fields[name]) for name in light}
+        averaged = buffers.averaged_of(blending) if "shutter_exposure" in needs.effects else ()
+        self.accumulate = {
+            name: kernels("shutter").make_accumulate(self.sample_fields[name]) for name in averaged
+        }
         """kernels that accumulate sample buffers of sub-frames, by the name of the buffer"""
 
     def _make_resolve(self, features: FeatureSet, needs: _Needs) -> None:
         output, behind = kernels("output"), kernels("background")
         kinds = [kind for kind in behind.KINDS if f"background_{kind}" in needs.effects]
-        self.backdrop = behind.make_backdrop(kinds[0], "rays" in needs.effects) if kinds else None
+        self.composite_background = (
+            behind.make_composite_background(kinds[0], "rays" in needs.effects) if kinds else None
+        )
         """kernel of the background; None for a constant background"""
         images = tuple((image.name, getattr(load(), image.dtype)) for image in self.images)
         self.images_type = kernels("buffers").make_images(images, needs.outputs)
         self.cloud_arrays = output.fields(needs.outputs, "cloud_arrays")
         self.view_arrays = output.fields(needs.outputs, "view_arrays")
         """element type of each additional array that the resolve stage reads"""
-        self.stretched = "camera_brown_conrady" in needs.effects and bool(
+        self.has_ray_lengths = "camera_brown_conrady" in needs.effects and bool(
             output.having(features.outputs, "length")
         )
         """whether the resolve stage reads the lengths of a lens's rays"""
         self.resolve = kernels("resolve").make_resolve(
-            images, needs.outputs, self.stretched, features.samples
+            images, needs.outputs, self.has_ray_lengths, features.samples
         )
         self.sensor = SensorKernel(needs.steps) if needs.steps else None
 
@@ -194,21 +198,24 @@ class GradientKernels:
     """The kernels of the backward pass, compiled on first use."""
 
     def __init__(self, program: Program) -> None:
-        features, needs, shape = program.features, program.needs, program.shape
+        features, needs, config = program.features, program.needs, program.config
         rendered = {"rgb", *features.outputs}
-        self.losses = tuple(name for name in GRADIENT_OUTPUTS if name in rendered)
+        self.gradient_outputs = tuple(name for name in GRADIENT_OUTPUTS if name in rendered)
         self.sh_coefficients = (features.sh_degree + 1) ** 2 if "color_sh" in needs.effects else 0
         effects, outputs = needs.among(_SAMPLE), needs.blending
-        backward, names = kernels("blend_backward"), kernels("fragment_backward").moments_of(effects, outputs)
-        grouped, block = shape.schedule == "group", program.tile_area
+        backward, names = (
+            kernels("blend_backward"),
+            kernels("fragment_backward").gradient_sum_names(effects, outputs),
+        )
+        grouped, block = config.schedule == "group", program.tile_area
         with _MAKING, quiet():
-            self.blend = backward.make_blend_backward(effects, outputs, self.losses, grouped, block)
-            self.slots = backward.make_slots("lowpass_screen" in effects)
+            self.blend = backward.make_blend_backward(effects, outputs, self.gradient_outputs, grouped, block)
+            self.gradient_offsets = backward.make_gradient_offsets("lowpass_screen" in effects)
             made = kernels("project_backward").make_project_backward
             self.project = made(needs.among(_PROJECT), outputs, names, self.sh_coefficients)
             self.sums = kernels("column_sums")
             program.compile(self.blend.kernel, block)
-            for kernel in (self.slots, self.project, self.sums.add_rows):
+            for kernel in (self.gradient_offsets, self.project, self.sums.add_rows):
                 program.compile(kernel)
 
 

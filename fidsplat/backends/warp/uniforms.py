@@ -9,9 +9,9 @@ import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.view import View
+from fidsplat.backends.warp.kernel_config import KernelConfig
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load
-from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.backends.warp.workspace import ArrayPool, Workspace, nbytes
 from fidsplat.cameras.lenses import camera_effect
 from fidsplat.cameras.raster import RayRaster
@@ -24,18 +24,18 @@ def _record() -> Any:
     return np.dtype(kernels("common").View.numpy_dtype())
 
 
-def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> np.ndarray:
-    """The structs `View` (views,). sloped: whether kernels read the derivatives of rays."""
-    view = stack.view
+def uniforms(batch: ViewBatch, config: KernelConfig, splats: int, has_ray_derivatives: bool) -> np.ndarray:
+    """The structs `View` (views,). has_ray_derivatives: whether kernels read the derivatives of rays."""
+    view = batch.view
     derived = {
-        **{"tile_w": shape.tile_width, "tile_h": shape.tile_height, "splats": splats},
-        **{"tiles_x": -(-view.width // shape.tile_width), "tiles_y": -(-view.height // shape.tile_height)},
-        **{"per_pixel": 1.0 / view.samples**2, "rotation": stack.rotation[0]},
-        **{"translation": stack.translation[0], "eye": stack.eye[0], **stack.numbers},
+        **{"tile_w": config.tile_width, "tile_h": config.tile_height, "splats": splats},
+        **{"tiles_x": -(-view.width // config.tile_width), "tiles_y": -(-view.height // config.tile_height)},
+        **{"per_pixel": 1.0 / view.samples**2, "rotation": batch.rotation[0]},
+        **{"translation": batch.translation[0], "eye": batch.eye[0], **batch.numbers},
         # filled below
         **{"per_focal_x": 0.0, "per_focal_y": 0.0, "per_near": 0.0, "ray": 0.0, "max_ray_derivative": 0.0},
     }
-    filled: Any = np.zeros(len(stack), _record())
+    filled: Any = np.zeros(len(batch), _record())
     for name in filled.dtype.names:
         filled[name] = derived[name] if name in derived else getattr(view, name)
     for name in ("focal_x", "focal_y", "near"):
@@ -44,7 +44,7 @@ def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> n
     if not (view.along_ray or view.parallel):  # otherwise depths are distances
         own = (filled["focal_x"], filled["focal_y"], filled["center_x"], filled["center_y"])
         filled["ray"] = np.stack(own, axis=1)
-    if sloped and view.raster:
+    if has_ray_derivatives and view.raster:
         filled["max_ray_derivative"] = view.raster.max_ray_derivative
     return filled
 
@@ -53,21 +53,23 @@ def rays_of(
     view: View,
     workspace: Workspace,
     inputs: ArrayPool,
-    bent: bool = True,
-    sloped: bool = False,
-    opaque: bool = False,
+    has_lens: bool = True,
+    has_ray_derivatives: bool = False,
+    has_external_depth: bool = False,
 ) -> Any:
     """The struct `Rays` of a view.
 
-    inputs: pool for the external depth image. bent: include the rays of a lens. sloped: include their
-    derivatives. opaque: include the external depth image.
+    inputs: pool for the external depth image. has_lens: include the rays of a lens. has_ray_derivatives:
+    include their derivatives. has_external_depth: include the external depth image.
     """
-    wp, raster = load(), view.raster if bent else None
-    kind = kernels("rays").struct_of_rays(raster is not None, raster is not None and sloped, opaque)
-    if raster is None and not opaque:
+    wp, raster = load(), view.raster if has_lens else None
+    kind = kernels("rays").struct_of_rays(
+        raster is not None, raster is not None and has_ray_derivatives, has_external_depth
+    )
+    if raster is None and not has_external_depth:
         return _empty(kind)
     rays = kind()
-    if opaque:
+    if has_external_depth:
         for name, dtype in (("external_depth", wp.float32), ("external_rgb", wp.vec3)):
             setattr(rays, name, inputs.filled(name, view.array(name), dtype))
     if raster is None:
@@ -75,20 +77,22 @@ def rays_of(
     arrays = _arrays(raster, workspace)
     first = raster.top * raster.width
     rays.rays = arrays["rays"][first:]
-    if sloped:
-        if "slopes" not in arrays:
-            slopes = (raster.full_raster or raster).ray_derivatives.reshape(-1, 2, 3)
-            arrays["slopes"] = _fresh("ray slopes", slopes, kernels("rays").SLOPES, workspace)
-        rays.slopes = arrays["slopes"][first:]
+    if has_ray_derivatives:
+        if "ray_derivatives" not in arrays:
+            ray_derivatives = (raster.full_raster or raster).ray_derivatives.reshape(-1, 2, 3)
+            arrays["ray_derivatives"] = _fresh(
+                "ray derivatives", ray_derivatives, kernels("rays").RAY_DERIVATIVES, workspace
+            )
+        rays.ray_derivatives = arrays["ray_derivatives"][first:]
     return rays
 
 
-def array_of(stack: ViewBatch, name: str) -> np.ndarray:
+def array_of(batch: ViewBatch, name: str) -> np.ndarray:
     """Array of an effect: one array for all views, or the arrays of the views concatenated."""
-    view = stack.view
-    if name != "row_rotations" or len(stack) == 1:
+    view = batch.view
+    if name != "row_rotations" or len(batch) == 1:
         return view.array(name)
-    return np.repeat(stack.rotation[0].astype(np.float32), view.height // view.samples, axis=0)
+    return np.repeat(batch.rotation[0].astype(np.float32), view.height // view.samples, axis=0)
 
 
 def lens_of(view: View, workspace: Workspace) -> Any:
@@ -108,17 +112,17 @@ def lens_of(view: View, workspace: Workspace) -> Any:
     return lens
 
 
-def moving_of(resident: Resident, stack: ViewBatch, inputs: ArrayPool) -> Any:
+def moving_of(resident: Resident, batch: ViewBatch, inputs: ArrayPool) -> Any:
     """Struct `Moving` of a frame; empty without moving groups. inputs: pool for its arrays."""
-    declared, groups = kernels("motion"), stack.view.groups
+    declared, groups = kernels("motion"), batch.view.groups
     kind = declared.make_motion(bool(groups)).Moving
     if not groups:
         return _empty(kind)
     cached = kind()
     labels = np.array([label for label, _ in groups], np.int32)
-    poses: Any = np.zeros((len(stack), len(groups)), declared.Pose.numpy_dtype())
+    poses: Any = np.zeros((len(batch), len(groups)), declared.Pose.numpy_dtype())
     for name in ("rotation", "translation", "eye"):
-        poses[name] = np.swapaxes(getattr(stack, name)[1:], 0, 1)
+        poses[name] = np.swapaxes(getattr(batch, name)[1:], 0, 1)
     cached.labels = resident.arrays["labels"]
     cached.groups = inputs.filled("groups", labels, load().int32)
     cached.poses = inputs.filled("poses", poses.ravel(), declared.Pose)
@@ -131,10 +135,10 @@ def _empty(kind: Any) -> Any:
     return kind()
 
 
-def surroundings_of(view: View, workspace: Workspace) -> Any:
+def environment_of(view: View, workspace: Workspace) -> Any:
     wp, behind = load(), view.environment_map
     kind = "gradient" if isinstance(behind, Gradient) else "panorama"
-    filled = kernels("background").struct_of_surroundings(kind)()
+    filled = kernels("background").struct_of_environment(kind)()
     if isinstance(behind, Gradient):
         numbers = view.uniforms_of("gradient")
         filled.top, filled.bottom, filled.up = (wp.vec3(*numbers[k : k + 3]) for k in (0, 3, 6))

@@ -55,9 +55,9 @@ class Output:
     """(pixel, length, view): sets other initial values; length: length of the sample's ray if `length`, else
     1"""
     fragment: Any = None
-    """(pixel, s, c, x, y, disc, opacity, view): called for every splat of the tile's list before it is
+    """(pixel, s, c, x, y, disc, alpha, view): called for every splat of the tile's list before it is
     composited, also if it does not contribute (c.contributes); x, y: position relative to the anchor; disc:
-    squared distance from the projected centre in pixels, infinite without a low-pass; opacity: 0 if the splat
+    squared distance from the projected centre in pixels, infinite without a low-pass; alpha: 0 if the splat
     does not contribute"""
     composite: Any = None
     """(pixel, attributes, weight, view): called for a fragment or layer before it attenuates `pixel.t`"""
@@ -69,7 +69,7 @@ class Output:
     """sample buffers between blending and resolving, by the type of an element"""
     store: Any = None
     """(pixel, at, samples): writes the sample buffers"""
-    light: bool = False
+    averaged: bool = False
     """whether these buffers are averaged over sub-frames, like colours; otherwise they are from one pose"""
 
     cloud_arrays: Mapping[str, Any] = field(default_factory=dict)

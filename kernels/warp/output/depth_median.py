@@ -13,7 +13,7 @@ from . import Output
 @wp.func
 def start(pixel: Any, length: float, view: View):
     p = pixel
-    p.median_light = 1.0
+    p.median_transmittance = 1.0
     return p
 
 
@@ -21,9 +21,9 @@ def start(pixel: Any, length: float, view: View):
 def composite(pixel: Any, attributes: Any, weight: float, view: View):
     p = pixel
     # a run of faint fragments is represented by its last fragment
-    if p.t > 0.5 and p.median_light - (p.t - weight) >= MIN_ALPHA:
+    if p.t > 0.5 and p.median_transmittance - (p.t - weight) >= MIN_ALPHA:
         p.depth_median = attributes.z
-        p.median_light = p.t - weight
+        p.median_transmittance = p.t - weight
     return p
 
 
@@ -36,24 +36,24 @@ def store(pixel: Any, at: int, samples: Any):
 def sorted_in(values: Any, count: int, value: float):
     """Insert a value into `count` sorted values."""
     after = values
-    place = count
-    while place > 0 and after[wp.max(place - 1, 0)] > value:
-        after[place] = after[place - 1]
-        place -= 1
-    after[place] = value
+    position = count
+    while position > 0 and after[wp.max(position - 1, 0)] > value:
+        after[position] = after[position - 1]
+        position -= 1
+    after[position] = value
     return after
 
 
 @wp.func
-def median_of(grid: PixelGrid, samples: Any, lengths: Any, stretched: bool) -> float:
-    """Lower median over the samples of a pixel with a median depth, along their rays if `stretched`; 0
+def median_of(grid: PixelGrid, samples: Any, lengths: Any, has_ray_lengths: bool) -> float:
+    """Lower median over the samples of a pixel with a median depth, along their rays if `has_ray_lengths`; 0
     without such samples."""
     medians = type(lengths)()
     hits = int(0)
     for k in range(grid.count):
         half = samples.depth_median[sample_at(grid, k)]
         if half > 0.0:
-            if stretched:
+            if has_ray_lengths:
                 half = half * lengths[k]
             medians = sorted_in(medians, hits, half)
             hits += 1
@@ -69,8 +69,8 @@ def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
 
 OUTPUT = Output(
     depth=True,
-    # median_light: transmittance behind the last represented fragment
-    state={"depth_median": wp.float32, "median_light": wp.float32},
+    # median_transmittance: transmittance behind the last represented fragment
+    state={"depth_median": wp.float32, "median_transmittance": wp.float32},
     start=start,
     composite=composite,
     samples={"depth_median": wp.float32},

@@ -52,6 +52,6 @@ OUTPUT = Output(
     composite=composite,
     samples={"fogged": wp.float32},
     store=store,
-    light=True,
+    averaged=True,
     background_share=background_share,
 )

@@ -21,13 +21,13 @@ def terms(form: wp.vec4, x: float, y: float) -> float:
 
 
 @wp.func
-def opacity_rounding(log_opacity: float, half_rho: float) -> float:
-    """Relative rounding error of an opacity: of ln(opacity), rho, their difference and the exponential."""
+def alpha_rounding(log_opacity: float, half_rho: float) -> float:
+    """Relative rounding error of an alpha: of ln(opacity), rho, their difference and the exponential."""
     return UNIT * (16.0 + 2.0 * wp.abs(log_opacity) + 32.0 * wp.min(half_rho, 100.0))
 
 
 @wp.func
-def fragment(pixel: Any, s: Any, c: Any, x: float, y: float, disc: float, opacity: float, view: View):
+def fragment(pixel: Any, s: Any, c: Any, x: float, y: float, disc: float, alpha: float, view: View):
     off = OF_FORM * (terms(s.u, x, y) + terms(s.v, x, y))
     off_d = OF_FORM * terms(s.d, x, y)
     d_low, d_high, root = c.d - off_d, c.d + off_d, wp.sqrt(c.q)
@@ -44,10 +44,10 @@ def fragment(pixel: Any, s: Any, c: Any, x: float, y: float, disc: float, opacit
         least, most = wp.max(away - off_dot, 0.0), away + off_dot
         nearest = wp.min(nearest, least * least)
         furthest = wp.min(furthest, most * most)
-    high = wp.min(fast_exp(s.u[3] - nearest) * (1.0 + opacity_rounding(s.u[3], nearest)), 1.0)
-    low = fast_exp(s.u[3] - furthest) * (1.0 - opacity_rounding(s.u[3], furthest))
+    high = wp.min(fast_exp(s.u[3] - nearest) * (1.0 + alpha_rounding(s.u[3], nearest)), 1.0)
+    low = fast_exp(s.u[3] - furthest) * (1.0 - alpha_rounding(s.u[3], furthest))
     p = pixel
-    p.rounding += p.t * wp.max(high - opacity, opacity - low)
+    p.rounding += p.t * wp.max(high - alpha, alpha - low)
     if c.contributes:
         p.rounding += 1.5 * UNIT
     return p

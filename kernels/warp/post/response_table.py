@@ -10,10 +10,10 @@ from . import Step
 
 @wp.func
 def apply(v: float, x: int, y: int, channel: int, s: Any) -> float:
-    place = wp.clamp(v, 0.0, 1.0) * float(s.points - 1)
-    below = wp.min(int(place), s.points - 2)
+    position = wp.clamp(v, 0.0, 1.0) * float(s.points - 1)
+    below = wp.min(int(position), s.points - 2)
     step = s.response[below + 1] - s.response[below]
-    return fma(place - float(below), step, s.response[below])
+    return fma(position - float(below), step, s.response[below])
 
 
 STEP = Step(

@@ -9,9 +9,9 @@ from .lens import LENSES, make_lens
 
 
 @cache
-def make_slopes(camera: str | None, real):
-    """Make slopes(p, view, lens): gradients, with respect to the point p, of its column and row [samples per
-    metre] and of the logarithm of its depth [1/m] (0 for parallel rays), and whether p is in the field of
+def make_projection_derivatives(camera: str | None, real):
+    """Make derivatives(p, view, lens): gradients, with respect to the point p, of its column and row [samples
+    per metre] and of the logarithm of its depth [1/m] (0 for parallel rays), and whether p is in the field of
     view. camera: a lens; None for a pinhole.
     """
     Lens = make_lens(camera if camera in LENSES else None)
@@ -20,7 +20,7 @@ def make_slopes(camera: str | None, real):
     polar = real(1e-6)  # relative distance from a panorama's axis below which a point is at a pole
 
     @wp.func
-    def slopes_pinhole(p: vec3, view: View, lens: Lens):
+    def derivatives_pinhole(p: vec3, view: View, lens: Lens):
         per_z = one / p[2]
         fx, fy = real(view.focal_x), real(view.focal_y)
         by_x = vec3(fx * per_z, zero, -fx * p[0] * per_z * per_z)
@@ -28,11 +28,11 @@ def make_slopes(camera: str | None, real):
         return by_x, by_y, vec3(zero, zero, per_z), True
 
     @wp.func
-    def slopes_parallel(p: vec3, view: View, lens: Lens):
+    def derivatives_parallel(p: vec3, view: View, lens: Lens):
         return vec3(real(view.focal_x), zero, zero), vec3(zero, real(view.focal_y), zero), vec3(), True
 
     @wp.func
-    def slopes_distorted(p: vec3, view: View, lens: Lens):
+    def derivatives_distorted(p: vec3, view: View, lens: Lens):
         """Derivatives of (x, y) radial(q) + ..., q = x^2 + y^2 in the undistorted image (lens.py)."""
         x, y = p[0] / p[2], p[1] / p[2]
         q = x * x + y * y
@@ -56,7 +56,7 @@ def make_slopes(camera: str | None, real):
         return real(view.focal_x) * grad_a, real(view.focal_y) * grad_b, by_depth, q < real(lens.limit)
 
     @wp.func
-    def slopes_fisheye(p: vec3, view: View, lens: Lens):
+    def derivatives_fisheye(p: vec3, view: View, lens: Lens):
         """Derivatives of a fisheye: radial, by the angle from the axis, and tangential."""
         across = wp.sqrt(p[0] * p[0] + p[1] * p[1])
         angle = wp.atan2(across, p[2])
@@ -75,7 +75,7 @@ def make_slopes(camera: str | None, real):
         return real(view.focal_x) * by_x, real(view.focal_y) * by_y, by_depth, angle <= real(lens.limit)
 
     @wp.func
-    def slopes_panorama(p: vec3, view: View, lens: Lens):
+    def derivatives_panorama(p: vec3, view: View, lens: Lens):
         """Derivatives of a panorama. At a pole, where longitude is discontinuous, derivatives at a
         neighbouring point towards z."""
         away2 = wp.dot(p, p)
@@ -90,9 +90,9 @@ def make_slopes(camera: str | None, real):
         return real(view.focal_x) * by_x, real(view.focal_y) * by_y, p / away2, True
 
     return {
-        None: slopes_pinhole,
-        "camera_orthographic": slopes_parallel,
-        "camera_brown_conrady": slopes_distorted,
-        "camera_fisheye": slopes_fisheye,
-        "camera_equirectangular": slopes_panorama,
+        None: derivatives_pinhole,
+        "camera_orthographic": derivatives_parallel,
+        "camera_brown_conrady": derivatives_distorted,
+        "camera_fisheye": derivatives_fisheye,
+        "camera_equirectangular": derivatives_panorama,
     }[camera]

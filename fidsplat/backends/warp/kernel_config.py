@@ -7,7 +7,7 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class WarpShape:
+class KernelConfig:
     schedule: str
     """`tiles`: a thread renders a tile (CPU); `group`: a block of threads renders a tile (CUDA)"""
     tile_width: int
@@ -19,14 +19,14 @@ class WarpShape:
     """number of blocks into which the sorts divide their input"""
 
 
-def shape_for(device: Any) -> WarpShape:
-    return WarpShape("group" if device.is_cuda else "tiles", 16, 16)
+def config_for(device: Any) -> KernelConfig:
+    return KernelConfig("group" if device.is_cuda else "tiles", 16, 16)
 
 
-def other_shapes(own: WarpShape, kind: str) -> dict[str, WarpShape]:
+def other_configs(own: KernelConfig, kind: str) -> dict[str, KernelConfig]:
     """Alternative build constants by name, for tests (`Backend.configs`)."""
     if kind == "schedule":
-        return {"groups": WarpShape("group", 8, 8)}
+        return {"groups": KernelConfig("group", 8, 8)}
     if kind == "binning":
         return {"sort_first": own}
     if kind in ("sorting", "arithmetic"):
@@ -35,4 +35,4 @@ def other_shapes(own: WarpShape, kind: str) -> dict[str, WarpShape]:
         return {}
     if kind == "k_buffer":
         return {f"own, k-buffer of {size}": replace(own, k_buffer_size=size) for size in (1, 3)}
-    return {f"{side} x {side}": WarpShape(own.schedule, side, side) for side in (8, 32)}
+    return {f"{side} x {side}": KernelConfig(own.schedule, side, side) for side in (8, 32)}
