@@ -28,7 +28,7 @@ PADDING = 1.01
 """factor that enlarges the extent of splats, for rounding errors"""
 _FILTER_ACROSS, _FILTER_ALONG = 0.5, 1 / 8
 """standard deviations of the filter of the low-pass `pixel`: across the ray in samples, and along it as a
-fraction of the depth (kernels/opencl/slot/lowpass_pixel.cl)"""
+fraction of the depth (kernels/opencl/effect/lowpass_pixel.cl)"""
 _ROUNDING = 1e-5
 """relative error of a coordinate that projection in float32 computes"""
 

@@ -18,7 +18,7 @@ from fidsplat.store.chunked_splats import ChunkedSplats, NodeMasks
 from fidsplat.streaming.frustum_culling import PADDING, BoundingBoxes, CameraBoxes, Extent, ewa_extent
 
 _DEPTH_RANGE = 3.33
-"""standard deviations within which the depth of a splat's fragments varies (slot/order_pixel.cl)"""
+"""standard deviations within which the depth of a splat's fragments varies (effect/order_pixel.cl)"""
 
 
 def is_supported(view: View, features: FeatureSet) -> bool:

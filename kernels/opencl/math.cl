@@ -122,7 +122,7 @@ static inline vfloat VMAX(vfloat a, vfloat b) { return VSELECT(b, a, a > b); }
 #define FAST_RECIPROCAL(x) (1.0f / (x))
 #endif
 //@@ arithmetic
-// EXP and LOG (slot/arithmetic_*.cl) of one number.
+// EXP and LOG (effect/arithmetic_*.cl) of one number.
 #if LANES == 1
 #define FIRST_LANE(v) (v)
 #else

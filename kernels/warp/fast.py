@@ -1,7 +1,7 @@
 """Exponentials and logarithms by sums and products, which all devices round equally. Blending uses them for
 `arithmetic="fast"`, the projection of splats always.
 
-Polynomials and error bounds are those of kernels/opencl/slot/arithmetic_fast.cl and math.cl; results are
+Polynomials and error bounds are those of kernels/opencl/effect/arithmetic_fast.cl and math.cl; results are
 bit-identical.
 """
 

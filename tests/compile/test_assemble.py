@@ -24,9 +24,9 @@ FURTHER = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
 SHARED_FILES = {
     *("prelude", "math", "bounds", "project", "splat", "blend", "part/conic", "part/perspective"),
-    *("part/resolve_pixel", "slot/arithmetic_fast", "slot/camera_pinhole"),
+    *("part/resolve_pixel", "effect/arithmetic_fast", "effect/camera_pinhole"),
     "part/blend_float",
-    *("slot/color_rgb", "slot/order_centre"),
+    *("effect/color_rgb", "effect/order_centre"),
 }
 """kernel files of a scene without effects, on all devices"""
 SCHEDULE_FILES = {
@@ -41,7 +41,7 @@ SCHEDULE_FILES = {
         *("schedule/group", "schedule/group_cells"),
     },
 }
-LOWPASS_FILES = {"none": {"slot/lowpass_none"}, "screen": {"slot/lowpass_screen"}}
+LOWPASS_FILES = {"none": {"effect/lowpass_none"}, "screen": {"effect/lowpass_screen"}}
 
 
 COLORS = Traits()

@@ -24,8 +24,8 @@ CAMERAS = {
 }
 
 LENS_FILES = {
-    *("slot/camera_brown_conrady", "slot/camera_fisheye", "slot/camera_equirectangular"),
-    *("slot/camera_orthographic", "slot/shutter_exposure", "slot/shutter_rows", "slot/motion_groups"),
+    *("effect/camera_brown_conrady", "effect/camera_fisheye", "effect/camera_equirectangular"),
+    *("effect/camera_orthographic", "effect/shutter_exposure", "effect/shutter_rows", "effect/motion_groups"),
     *(
         "part/rays",
         "part/inverse_lens_lut",

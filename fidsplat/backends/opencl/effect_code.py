@@ -14,9 +14,9 @@ _OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
 
 EFFECT_CODE: dict[str, EffectCode] = {
     # effects: one of each kind
-    "camera_pinhole": EffectCode("slot/camera_pinhole.cl", parts=("chord", "conic", "perspective")),
+    "camera_pinhole": EffectCode("effect/camera_pinhole.cl", parts=("chord", "conic", "perspective")),
     "camera_brown_conrady": EffectCode(
-        "slot/camera_brown_conrady.cl",
+        "effect/camera_brown_conrady.cl",
         parts=("perspective", "inverse_lens_lut", "rays"),
         view=(
             member("real lens[12]", "k1 to k6, p1, p2, s1 to s4"),
@@ -24,34 +24,34 @@ EFFECT_CODE: dict[str, EffectCode] = {
         ),
     ),
     "camera_fisheye": EffectCode(
-        "slot/camera_fisheye.cl",
+        "effect/camera_fisheye.cl",
         parts=("polygon", "inverse_lens_lut", "rays"),
         view=(member("real lens[4]", "k1 to k4"), member("real lens_limit", "half field of view [rad]")),
     ),
-    "camera_equirectangular": EffectCode("slot/camera_equirectangular.cl", parts=("polygon", "rays")),
+    "camera_equirectangular": EffectCode("effect/camera_equirectangular.cl", parts=("polygon", "rays")),
     "camera_orthographic": EffectCode(
-        "slot/camera_orthographic.cl",
+        "effect/camera_orthographic.cl",
         parts=("chord", "conic"),
         splat=(member("wide z0 zx zy", "depth * D = z0 + zx x + zy y"), member("wide z_near")),
     ),
     "color_rgb": EffectCode(
-        "slot/color_rgb.cl",
+        "effect/color_rgb.cl",
         project=args("cloud float colors  // (n, 3)"),
-        backward_file="slot/color_rgb_backward.cl",
+        backward_file="effect/color_rgb_backward.cl",
         project_backward=args("out float grad_colors  // (n, 3)"),
     ),
     "color_sh": EffectCode(
-        "slot/color_sh.cl",
+        "effect/color_sh.cl",
         project=args("cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)"),
-        backward_file="slot/color_sh_backward.cl",
+        backward_file="effect/color_sh_backward.cl",
         project_backward=args(
             "cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)", "out float grad_sh  // the same shape"
         ),
     ),
-    "lowpass_none": EffectCode("slot/lowpass_none.cl", backward_file="slot/lowpass_none_backward.cl"),
-    "lowpass_pixel": EffectCode("slot/lowpass_pixel.cl", parts=("lowpass_none",)),
+    "lowpass_none": EffectCode("effect/lowpass_none.cl", backward_file="effect/lowpass_none_backward.cl"),
+    "lowpass_pixel": EffectCode("effect/lowpass_pixel.cl", parts=("lowpass_none",)),
     "lowpass_screen": EffectCode(
-        "slot/lowpass_screen.cl",
+        "effect/lowpass_screen.cl",
         splat=(
             member(
                 "wide lowpass_x lowpass_y",
@@ -61,32 +61,32 @@ EFFECT_CODE: dict[str, EffectCode] = {
         bounds=(
             member("float px py pr", "the filter's support: centre and radius [samples]; radius < 0: none"),
         ),
-        backward_file="slot/lowpass_screen_backward.cl",
+        backward_file="effect/lowpass_screen_backward.cl",
         record_gradient=(member("float lowpass_x lowpass_y", "with respect to the centre of the low-pass"),),
     ),
     # whether the fragment that crosses the early-termination threshold is composited
     "stop_inclusive": EffectCode(),
-    "stop_exclusive": EffectCode("slot/stop_exclusive.cl", backward_file="slot/stop_exclusive_backward.cl"),
+    "stop_exclusive": EffectCode("effect/stop_exclusive.cl", backward_file="effect/stop_exclusive_backward.cl"),
     # compositing order: of splats by their centres, or of fragments per pixel
-    "order_centre": EffectCode("slot/order_centre.cl"),
+    "order_centre": EffectCode("effect/order_centre.cl"),
     "order_pixel": EffectCode(
-        "slot/order_pixel.cl",
+        "effect/order_pixel.cl",
         parts=("ray_depth",),
         splat=(member("wide nearest", "minimum depth of the splat's fragments"),),
     ),
-    "order_coplanar": EffectCode("slot/order_coplanar.cl", parts=("order_centre", "coplanar_layers")),
+    "order_coplanar": EffectCode("effect/order_coplanar.cl", parts=("order_centre", "coplanar_layers")),
     "order_coplanar_pixel": EffectCode(parts=("order_pixel", "coplanar_layers")),
     # a box is a splat with a hard-edged, rectangular footprint
     "footprint_gaussian": EffectCode(),
-    "footprint_box": EffectCode("slot/footprint_box.cl", parts=("box_edges",)),
+    "footprint_box": EffectCode("effect/footprint_box.cl", parts=("box_edges",)),
     "footprint_mixed": EffectCode(
-        "slot/footprint_mixed.cl",
+        "effect/footprint_mixed.cl",
         parts=("box_edges",),
         splat=(member("int box"),),
         project=args("cloud int boxes  // (n) 1: box, 0: Gaussian"),
     ),
     "ellipsoid_exact": EffectCode(
-        "slot/ellipsoid_exact.cl",
+        "effect/ellipsoid_exact.cl",
         parts=("thickness",),
         splat=(
             member(
@@ -94,26 +94,26 @@ EFFECT_CODE: dict[str, EffectCode] = {
                 "thickness term: 2 / m^2, m: Mahalanobis distance of the camera; 0: a disk",
             ),
         ),
-        backward_file="slot/ellipsoid_exact_backward.cl",
+        backward_file="effect/ellipsoid_exact_backward.cl",
         record_gradient=(member("float ellipsoid_term"),),
     ),
     "ellipsoid_ewa": EffectCode(
-        "slot/ellipsoid_ewa.cl",
+        "effect/ellipsoid_ewa.cl",
         parts=("thickness",),
         view=(
             member(
                 "real ewa_clamp[4]", "limits of -x, x, -y, y of the ray at which the projection is linearised"
             ),
         ),
-        backward_file="slot/ellipsoid_ewa_backward.cl",
+        backward_file="effect/ellipsoid_ewa_backward.cl",
     ),
     "ellipsoid_ewa_antialiased": EffectCode(
-        "slot/ellipsoid_ewa_antialiased.cl",
+        "effect/ellipsoid_ewa_antialiased.cl",
         parts=("ellipsoid_ewa",),
-        backward_file="slot/ellipsoid_ewa_antialiased_backward.cl",
+        backward_file="effect/ellipsoid_ewa_antialiased_backward.cl",
     ),
     "ellipsoids_only": EffectCode(
-        "slot/ellipsoids_only.cl",
+        "effect/ellipsoids_only.cl",
         constant=(
             *(("nuy", "WIDE(0.0)"), ("d0", "WIDE(1.0)"), ("dx", "WIDE(0.0)"), ("dy", "WIDE(0.0)")),
             ("d_near", "INFINITY"),
@@ -121,40 +121,40 @@ EFFECT_CODE: dict[str, EffectCode] = {
     ),
     "background_constant": EffectCode(),
     "background_gradient": EffectCode(
-        "slot/background_gradient.cl",
+        "effect/background_gradient.cl",
         parts=("world_ray",),
         composite_background=uniforms(
             "gradient", "float sky_r sky_g sky_b", "float ground_r ground_g ground_b", "float up_x up_y up_z"
         ),
     ),
     "background_panorama": EffectCode(
-        "slot/background_panorama.cl",
+        "effect/background_panorama.cl",
         parts=("world_ray",),
         composite_background=args(
             uniforms("panorama_size", "int panorama_width panorama_height"),
             "array float panorama  // (panorama_height, panorama_width, 3)",
         ),
     ),
-    "arithmetic_precise": EffectCode("slot/arithmetic_precise.cl"),
-    "arithmetic_fast": EffectCode("slot/arithmetic_fast.cl"),
-    "arithmetic_approximate": EffectCode("slot/arithmetic_fast.cl"),  # without a dialect
+    "arithmetic_precise": EffectCode("effect/arithmetic_precise.cl"),
+    "arithmetic_fast": EffectCode("effect/arithmetic_fast.cl"),
+    "arithmetic_approximate": EffectCode("effect/arithmetic_fast.cl"),  # without a dialect
     "motion_groups": EffectCode(
-        "slot/motion_groups.cl",
+        "effect/motion_groups.cl",
         project=args("cloud int labels  // (n)", "in int moving  // number of groups, then their labels"),
     ),
     "external_depth": EffectCode(
-        "slot/external_depth.cl",
+        "effect/external_depth.cl",
         parts=("ray_depth",),
         blend=args(
             "array float external_depth external_rgb  // (h, w) infinite where there is none, (h, w, 3)",
             "array int external_label  // (h, w)",
         ),
     ),
-    "shutter_exposure": EffectCode("slot/shutter_exposure.cl"),
-    "shutter_rows": EffectCode("slot/shutter_rows.cl"),
+    "shutter_exposure": EffectCode("effect/shutter_exposure.cl"),
+    "shutter_rows": EffectCode("effect/shutter_rows.cl"),
     "blend_double": EffectCode(),
     "blend_half": EffectCode(
-        "slot/blend_half.cl",
+        "effect/blend_half.cl",
         splat=(member("uint rg b1", "two float16 each: (r, g) and (b, -1)"),),
         packed=(("r", "WORDS_LOW({}rg)"), ("g", "WORDS_HIGH({}rg)"), ("b", "WORDS_LOW({}b1)")),
     ),

@@ -1,5 +1,5 @@
 // Results of the device's math functions in the types of the stages (vectors of LANES, `real`), which the host compares with exact
-// values. Compiled after prelude.cl and math.cl with the functions of slot/arithmetic_fast.cl.
+// values. Compiled after prelude.cl and math.cl with the functions of effect/arithmetic_fast.cl.
 
 // Index space: one work-item per LANES values.
 // Reads:  exponents, shares, above, below (each n; n a multiple of LANES). Writes: out, n floats of each:

@@ -1,4 +1,4 @@
-// Pairs of halves in a register of NVIDIA's GPUs (slot/blend_half.cl).
+// Pairs of halves in a register of NVIDIA's GPUs (effect/blend_half.cl).
 //@ dialect
 typedef uint half_pair;
 static inline half_pair ptx_half_pair(float low, float high) {

@@ -1,4 +1,4 @@
-// Per-pixel k-buffer for GPUs: sorts fragments by depth before compositing (slot/order_pixel.cl). The farthest IN_REGISTERS
+// Per-pixel k-buffer for GPUs: sorts fragments by depth before compositing (effect/order_pixel.cl). The farthest IN_REGISTERS
 // fragments are in registers, sorted by depth. A new fragment is inserted there, and the nearest is pushed out: it can nearly always be
 // composited, else it enters a queue in memory, which is short and mostly empty.
 //@ compose_types

@@ -1,4 +1,4 @@
-// k-buffer of a block of pixels for CPUs: sorts fragments by depth before compositing (slot/order_pixel.cl). An entry has one
+// k-buffer of a block of pixels for CPUs: sorts fragments by depth before compositing (effect/order_pixel.cl). An entry has one
 // fragment per pixel, each of any splat, with its attributes by value. The farthest fragment of each pixel is in `farthest`. A new
 // fragment replaces it or is pushed out; the fragment pushed out can nearly always be composited, else it enters a queue that is
 // sorted per pixel. All fragments take the same path, so branches are predictable.

@@ -1,5 +1,5 @@
 // Depth along z of a fragment: the ray-plane intersection, clamped to the depth range of the splat's visible part; the depth of the
-// centre where the ray does not intersect the plane beyond `near`. slot/lowpass_screen.cl has the depth of low-pass fragments.
+// centre where the ray does not intersect the plane beyond `near`. effect/lowpass_screen.cl has the depth of low-pass fragments.
 //@ intersection
 //@@ lowpass_intersection
 //@ mask

@@ -1,6 +1,6 @@
 // Termination depth of each tile for occlusion culling (fidsplat/backends/termination_depth.py), in pixel order: the largest depth at
 // which one of its pixels was terminated, as a sort key, or infinity if one was not. Fragments behind it cannot change the tile. The
-// margin covers the depth offset of coplanar layers (slot/order_coplanar.cl).
+// margin covers the depth offset of coplanar layers (effect/order_coplanar.cl).
 //@ state
     vfloat termination_depth;               // depth of the last composited fragment
 //@ start
