@@ -66,7 +66,9 @@ EFFECT_CODE: dict[str, EffectCode] = {
     ),
     # whether the fragment that crosses the early-termination threshold is composited
     "stop_inclusive": EffectCode(),
-    "stop_exclusive": EffectCode("effect/stop_exclusive.cl", backward_file="effect/stop_exclusive_backward.cl"),
+    "stop_exclusive": EffectCode(
+        "effect/stop_exclusive.cl", backward_file="effect/stop_exclusive_backward.cl"
+    ),
     # compositing order: of splats by their centres, or of fragments per pixel
     "order_centre": EffectCode("effect/order_centre.cl"),
     "order_pixel": EffectCode(

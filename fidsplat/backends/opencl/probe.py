@@ -107,7 +107,9 @@ class OpenCLProbe(Probe):
         self, exponents: np.ndarray, fractions: np.ndarray, dividends: np.ndarray, divisors: np.ndarray
     ) -> dict[str, np.ndarray]:
         workspace, n = self._workspace, len(exponents)
-        kernels = compile_test_kernels(workspace, "check/arithmetic.cl", effects=("effect/arithmetic_fast.cl",))
+        kernels = compile_test_kernels(
+            workspace, "check/arithmetic.cl", effects=("effect/arithmetic_fast.cl",)
+        )
 
         def run(kernel: str, items: int, made: np.ndarray, *given: Any) -> np.ndarray:
             values = [buffer_of(workspace, one) if isinstance(one, np.ndarray) else one for one in given]
