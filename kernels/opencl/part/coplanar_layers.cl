@@ -85,7 +85,7 @@ static inline Layer no_layer(void) {
             }
         }
 //@ group_start
-    local uint layer_depth;
+    local uint layer_depth, any_layer;
     Layers layers[ROWS];
     wide until = INFINITY;      // behind it no fragment belongs to this pass; infinite until all layers are complete
     bool complete = false;
@@ -98,14 +98,19 @@ static inline Layer no_layer(void) {
             until = INFINITY;
             complete = false;
         } else if (pixels[0].layers && !complete) {
-            if (item == 0) layer_depth = 0;
+            if (item == 0) layer_depth = any_layer = 0;
             barrier(CLK_LOCAL_MEM_FENCE);
             for (int row = 0; row < ROWS; row++)
-                if (px < width && py + row < height)
+                if (px < width && py + row < height) {
                     atomic_max(&layer_depth, sortable(convert_float_rtp(layers_until(&pixels[row], &constants))));
+                    if (pixels[row].layers->next_z < INFINITY) any_layer = 1;
+                }
             barrier(CLK_LOCAL_MEM_FENCE);
             until = key_depth(layer_depth);
             complete = true;
+            // conservative bounds list a group in tiles without its fragments
+            if (!any_layer && from == -INFINITY)
+                for (int row = 0; row < ROWS; row++) pixels[row].layers = 0;
         }
 //@ cells_parameters
                                  , wide until

@@ -121,9 +121,16 @@ static inline void k_buffer_push(Pixel *pixel, wide nearest, wide z, wide alpha,
     KBuffer *k_buffer = &pixel->k_buffer;
     // the new fragment may be nearer than queued ones
     k_buffer_flush(pixel, fmin(nearest, z), splats, constants);
-    bool in_front[IN_REGISTERS];        // of the new fragment
+    bool in_front[IN_REGISTERS], ties = false;      // of the new fragment
 #pragma unroll
-    for (int k = 0; k < IN_REGISTERS; k++) in_front[k] = IN_FRONT(k_buffer->z[k], k_buffer->splat[k], z, splat);
+    for (int k = 0; k < IN_REGISTERS; k++) {
+        in_front[k] = k_buffer->z[k] <= z;
+        ties |= k_buffer->z[k] == z;
+    }
+    if (ties) {         // one branch for all, since ties are rare
+#pragma unroll
+        for (int k = 0; k < IN_REGISTERS; k++) in_front[k] = IN_FRONT(k_buffer->z[k], k_buffer->splat[k], z, splat);
+    }
     bool first = !in_front[0];
     wide first_z = first ? z : k_buffer->z[0], first_alpha = first ? alpha : k_buffer->alpha[0];
     uint first_splat = first ? splat : k_buffer->splat[0];
@@ -168,7 +175,7 @@ static inline void k_buffer_insert(Pixel *pixel, wide nearest, wide z, wide alph
 //@ batch_open
             && staged[0].splat.nearest <= pixels[row].k_buffer.until      // else the buffer is full of nearer fragments
 //@ pass_from
-    from = pixel->k_buffer.from;
+    from = fmax(from, pixel->k_buffer.from);
 //@ layer_passed
         if (ready) k_buffer->from = -INFINITY;
 //@ blend_arguments
