@@ -31,7 +31,6 @@ from fidsplat.backends.opencl.uniforms import projection_arrays
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
 from fidsplat.cameras.raster import raster_of
-from fidsplat.splats.rotations import nearest_rotation
 
 _GROUPS = {1: 32, 32: 256}
 """maximum number of work-groups of a sum, by the size of a work-group"""
@@ -54,7 +53,7 @@ class OpenCLAlignment(AlignmentKernels):
         self._workspace = workspace
         self._items = 1 if workspace.config.schedule == "lanes" else 32
         self._program = Program(workspace, assemble_alignment(self._items))
-        self._commands = CommandList(self._program)
+        self._commands, self._pyramid = CommandList(self._program), CommandList(self._program)
         self._steps: dict[bool, Program] = {}
         """program of `align_step`; whether the numbers of a view are float64"""
         self._lists: dict[tuple[int, bool], tuple[CommandList, CommandList]] = {}
@@ -67,13 +66,19 @@ class OpenCLAlignment(AlignmentKernels):
         self, image: np.ndarray, stages: list[CoarseToFineStage], max_pixels: int, scene: RenderedScene
     ) -> list[int]:
         with self._workspace.lock, self._workspace.device_errors("localising"):
-            self._levels, self._stages, self._scene = [], stages, scene
+            self._scene = scene
             histograms = self._scratch("textures", 4 * BINS * len(stages))
-            cl.enqueue_fill_buffer(self._queue, histograms, np.zeros(1, np.uint32), 0, 4 * BINS * len(stages))
-            source = full = self._upload("image", image), image.shape
-            for number, level in reversed([*enumerate(stages)]):  # each level from the next finer one
-                args, source = self._prepared(number, level, source, full, histograms)
-                self._levels.insert(0, args)
+            full = self._upload("image", image), image.shape
+            key = self._workspace.pool.generation, image.shape, [id(level) for level in stages]
+            if self._pyramid.key != key:
+                self._pyramid.clear()
+                self._stages, self._levels, source = stages, [], full
+                for number, level in reversed([*enumerate(stages)]):  # each level from the next finer one
+                    args, source = self._prepared(number, level, source, full, histograms)
+                    self._levels.insert(0, args)
+                self._pyramid.key = self._workspace.pool.generation, *key[1:]
+            cl.enqueue_fill_buffer(self._queue, histograms, _ZERO, 0, 4 * BINS * len(stages))
+            self._pyramid.submit(self._queue)
             counts = np.empty((len(stages), BINS), np.uint32)
             cl.enqueue_copy(self._queue, counts, histograms)
         pixels = []
@@ -85,7 +90,10 @@ class OpenCLAlignment(AlignmentKernels):
     def _prepared(
         self, number: int, level: CoarseToFineStage, source: _Image, full: _Image, histograms: cl.Buffer
     ) -> tuple[dict[str, Any], _Image]:
-        """Kernel arguments of a pyramid level, and its image before blur. source: the next finer image."""
+        """Record the kernels of a level; returns their arguments, and the image before blur.
+
+        source: the next finer image.
+        """
         camera = level.camera
         finer, (full_height, full_width, channels) = source
         if full_width % camera.width or full_height % camera.height:
@@ -112,9 +120,10 @@ class OpenCLAlignment(AlignmentKernels):
         if (width, height) != (full_width, full_height):
             image = self._scratch(f"image {number}", channels * size)
             grid = -(-width // 64) * 64, height
-            self._launch("align_downsample", grid, (64, 1), {**args, "image": finer, "result": image})
-        args["image"] = self._blurred(image, args, f"image {number}", channels)
-        self._by_groups("align_texture", self._rows(height), args)
+            arguments = {**args, "image": finer, "result": image}
+            self._launch("align_downsample", grid, (64, 1), arguments, self._pyramid)
+        args["image"] = self._blurred(image, args, f"image {number}", channels, self._pyramid)
+        self._launch("align_texture", *self._size(self._rows(height)), args, self._pyramid)
         return args, (image, (height, width, channels))
 
     def frame(self, stage: int, pose: np.ndarray, perturbed: bool = False) -> Any:
@@ -376,7 +385,9 @@ class _Replayed:
         self._workspace, self._recorded, self._origin = workspace, frame.recorded, origin
         arrays = projection_arrays(frame.batch, frame.source, 0, frame.rows)
         self._template, self.record = frame.view, arrays["view"]
-        self._rotation = frame.source.uniform_groups.get("rotation", {})
+        rotation, commands = frame.source.uniform_groups.get("rotation", {}), frame.commands
+        self._rotation = [(at, index) for index, name in rotation.items() for at in commands.positions(name)]
+        """arguments that depend on the rotation, as of a sky, with indices of its numbers"""
         self._counts = frame.acquired["counts"]
         own = {f"{name}_out": frame.acquired[f"{name}_out"] for name in ("rgb", "depth")}
         self.images = _ReplayedImages(own, owner), _ReplayedImages(perturbed)
@@ -432,10 +443,11 @@ class _Replayed:
         self.set_rotation(record)
 
     def set_rotation(self, rotation: np.ndarray) -> None:
-        """Set the kernel arguments that depend on the rotation (9,), as of a sky."""
+        """Set the kernel arguments that depend on the rotation (9,)."""
         if self._rotation:
             values = rotation.tolist()
-            self._recorded.commands.set({name: values[index] for index, name in self._rotation.items()})
+            for (command, argument), index in self._rotation:
+                command.bind(argument, values[index])
 
     def submit(self, perturbed: bool = False) -> None:
         commands = self._recorded.commands
@@ -451,8 +463,8 @@ class _Replayed:
 
     def world_to_camera(self, numbers: np.ndarray) -> np.ndarray:
         """(4, 4) pose from a view's rotation and translation."""
-        pose = np.eye(4)
-        pose[:3, :3] = nearest_rotation(numbers[:9].reshape(3, 3).astype(float))
+        pose, rotation = np.eye(4), numbers[:9].reshape(3, 3).astype(float)
+        pose[:3, :3] = rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation)  # orthogonal in float64
         pose[:3, 3] = numbers[9:12] - pose[:3, :3] @ self._origin
         return pose
 

@@ -125,7 +125,7 @@ class CommandList:
         for name, value in values.items():
             argument = self._named.get(name)
             if argument is None:
-                argument = self._named[name] = _NamedArgument(self._positions(name))
+                argument = self._named[name] = _NamedArgument(self.positions(name))
             identity = token_of(value) if isinstance(value, cl.Buffer) else value
             if identity is argument.identity or (
                 type(identity) is type(argument.identity) and identity == argument.identity
@@ -143,7 +143,8 @@ class CommandList:
             for command in self._commands[first:end]
         ]
 
-    def _positions(self, name: str) -> list[tuple[Command, int]]:
+    def positions(self, name: str) -> list[tuple[Command, int]]:
+        """Commands with an argument of that name, and its index."""
         arguments = self.program.source.arguments
         return [
             (command, index)
