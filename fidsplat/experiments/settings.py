@@ -11,6 +11,7 @@ from fidsplat.experiments.angles import parse_tilts
 from fidsplat.experiments.blender import FULL_SAMPLES, VIEW_NAMES, check_images, marker_job
 from fidsplat.experiments.methods import IDEAL, method_names
 from fidsplat.experiments.setup import MARKERS, PROTOCOLS, SEED, chosen_categories
+from fidsplat.util.arguments import whole_number
 from fidsplat.util.errors import InputError, unknown
 
 
@@ -22,6 +23,9 @@ class FolderSettings:
     """Folder for results. By default fidsplat-experiments, with --quick fidsplat-experiments-quick."""
     seed: int = SEED
     """Seed of texts and views."""
+
+    def __post_init__(self) -> None:
+        whole_number("--seed", self.seed, 0, 2**63 - 1)
 
     @property
     def folder(self) -> Path:

@@ -197,7 +197,8 @@ def load_detector(text: str) -> Detector:
 
     def checked(grey: np.ndarray) -> list[tuple[str, np.ndarray]]:
         try:
-            return [(str(spec), np.reshape(quad, (4, 2))) for spec, quad in cast(Detector, function)(grey)]
+            found = cast(Detector, function)(grey.copy())  # a detector may write into its image
+            return [(str(spec), np.reshape(quad, (4, 2))) for spec, quad in found]
         except Exception as error:
             raise InputError(
                 f"--detector {text} must return pairs of a spec and corners (4, 2), got "

@@ -25,6 +25,8 @@ PRECISE = 1.0
 """maximum RMS error in pixels of the corners of a precise detection"""
 NEVER = "never"
 """cell of a detector that reads at least half of the views at all severities"""
+ALWAYS = "always"
+"""cell of a detector that reads less than half of the views without a cause"""
 _COLUMNS = 4
 """panels per row"""
 
@@ -84,8 +86,9 @@ def breaks_of(rates: Table) -> Table:
             for detector in _detectors(rates):
                 measured = selected[(selected["family"] == family) & (selected["detector"] == detector)]
                 severity = breaking_severity(measured["severity"].tolist(), measured["rate"].tolist())
-                row[detector] = NEVER if severity is None else CAUSES[cause].text(severity)
-                row[detector] = row[detector] if len(measured) else NOTHING
+                cell = CAUSES[cause].text(severity) if severity else ALWAYS
+                cell = NEVER if severity is None else cell
+                row[detector] = cell if len(measured) else NOTHING
             table.append(row)
     return pd.DataFrame(table)
 
