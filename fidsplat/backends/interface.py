@@ -69,7 +69,7 @@ class ResidentData(ABC):
     footprint: str
     ellipsoids: str
 
-    def copy_traits(self, cloud: PlacedTraits) -> None:
+    def copy_properties(self, cloud: PlacedTraits) -> None:
         """Copy the origin and the properties that select kernels from another cloud."""
         for name in ("origin", "sh_degree", "has_coplanar_groups", "footprint", "ellipsoids"):
             setattr(self, name, getattr(cloud, name))

@@ -20,7 +20,7 @@ FAR_EYE = 1e9
 """metres: distance of the eye from which view-dependent colours of a parallel projection are evaluated"""
 NO_CAMERA = "no camera: pass camera=fs.Camera... or give the scene a [camera] table"
 MAX_GRID = 32767
-"""Largest side of the sample grid: anchors and rows are stored in 16 bits."""
+"""largest side of the sample grid: kernels store rows and columns of samples in 16 bits"""
 _NO_SENSOR = Sensor()
 
 

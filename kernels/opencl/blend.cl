@@ -66,12 +66,12 @@ static inline vint pixel_unfinished(const Pixel *pixel, const BlendConstants *co
 
 //@@ compose_functions
 // Renders a fragment where `mask` is set: composites it, or inserts it into the k-buffer.
-static inline void pixel_blend(Pixel *pixel, const Splat *s, Intersection c, vint mask, vfloat screen,
+static inline void pixel_blend(Pixel *pixel, const Splat *s, Intersection c, vint mask, vfloat lowpass_half_rho,
                                const BlendConstants *constants
 //@@ blend_parameters
 ) {
     vfloat inverse_d = INVERSE_D(c);
-    vfloat alpha = fragment_alpha(s, fragment_half_rho(s, c, inverse_d, screen), constants->opacity_ceiling);
+    vfloat alpha = fragment_alpha(s, fragment_half_rho(s, c, inverse_d, lowpass_half_rho), constants->opacity_ceiling);
 //@@ footprint_alpha
 //@@ without_layers
     const Attributes attributes = fragment_attributes(s, c, inverse_d);

@@ -80,13 +80,13 @@ typedef struct {
 
 //@@ fragment_functions
 // Position of the fragment on the splat's plane, from the row's forms and the low-pass distance.
-static inline Geometry geometry_of(const Splat *s, Intersection c, vfloat nu_x, vfloat nv_x, vfloat y, vfloat screen) {
+static inline Geometry geometry_of(const Splat *s, Intersection c, vfloat nu_x, vfloat nv_x, vfloat y, vfloat lowpass_half_rho) {
     Geometry g;
     g.nu = FMA((vfloat)s->nuy, y, nu_x);
     g.nv = FMA((vfloat)s->nvy, y, nv_x);
     g.inverse_d = VSELECT((vfloat)0.0f, 1.0f / c.d, VMASK(c.d > 0.0f));
     g.half_rho = (c.q * g.inverse_d) * g.inverse_d;
-    g.on_plane = fragment_on_plane(s, c, g.half_rho, screen);
+    g.on_plane = fragment_on_plane(s, c, g.half_rho, lowpass_half_rho);
 //@@ geometry_make
     return g;
 }
@@ -107,11 +107,11 @@ static inline vfloat backward_alpha(PixelGradient *gradient, vfloat grad_weight,
 
 // Adds the gradients of a fragment. grad_log: with respect to ln(alpha); (x, y): sample relative to the splat's anchor pixel (splat.cl).
 static inline void add_fragment(Sums *sums, const Splat *s, const PixelGradient *gradient, const Geometry *g, vfloat weight, vfloat grad_log,
-                                vfloat screen, vfloat x, vfloat y, const BlendConstants *constants) {
+                                vfloat lowpass_half_rho, vfloat x, vfloat y, const BlendConstants *constants) {
     sums->r = FMA(weight, gradient->r, sums->r);
     sums->g = FMA(weight, gradient->g, sums->g);
     sums->b = FMA(weight, gradient->b, sums->b);
-    vfloat half_rho = VSELECT(screen, g->half_rho, g->on_plane);
+    vfloat half_rho = VSELECT(lowpass_half_rho, g->half_rho, g->on_plane);
     grad_log = VSELECT((vfloat)0.0f, grad_log, VMASK(s->log_opacity - half_rho <= constants->log_ceiling));
     sums->log_opacity += grad_log;
     vfloat plane = 2.0f * VSELECT((vfloat)0.0f, grad_log * g->inverse_d, g->on_plane);

@@ -4,7 +4,8 @@
 // intersects the splat's plane at (u, v) with (u, v, 1) D = (n_u, n_v, D) = Tu x Tv + x (Tv x Tw) + y (Tw x Tu):
 // numerators and denominator are affine in the pixel. They are stored relative to an integer anchor pixel near the
 // splat, so that x - anchor is exact and nothing cancels, with a common factor that makes D > 0 in front of the
-// camera, and with sqrt(1/2) in the numerators, so that (n_u^2 + n_v^2) / D^2 is rho / 2.
+// camera, and with sqrt(1/2) in the numerators, so that (n_u^2 + n_v^2) / D^2 is half of rho = u^2 + v^2, the squared distance
+// in standard deviations. half_r2: half of the squared cut-off radius, at which alpha is the alpha cut-off.
 
 //@@ struct View
 //@@ struct Splat

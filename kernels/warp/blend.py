@@ -63,7 +63,7 @@ def make_blend(
     stores, words = output.functions(outputs, "store"), output.digest(outputs)
     Intersection, alpha_of = intersection.Intersection, intersection.alpha_of
     has_fragment_functions = bool(output.having(outputs, "fragment"))
-    fragments, screen = output.functions(outputs, "fragment"), "lowpass_screen" in effects
+    fragments, has_lowpass_disc = output.functions(outputs, "fragment"), "lowpass_screen" in effects
     has_lens, has_ray_derivatives, has_layers = (
         "rays" in effects,
         intersect_derivatives is not None,
@@ -103,8 +103,8 @@ def make_blend(
     def call_fragment_functions(pixel: Pixel, s: Splat, c: Intersection, x: float, y: float, view: View):
         """Call the `fragment` functions of outputs for a listed splat before it is composited."""
         p, disc, alpha = pixel, float(wp.inf), float(0.0)
-        if wp.static(screen):
-            disc = c.screen
+        if wp.static(has_lowpass_disc):
+            disc = c.lowpass_half_rho
         if c.contributes:
             alpha = alpha_of(s, c, 1.0 / c.d, view)
         for k in range(wp.static(len(fragments))):

@@ -84,13 +84,13 @@ _SUM_OVER_BLOCK = """
 
 
 @cache
-def make_gradient_offsets(screen: bool):
-    """Make the kernel that computes the gradient buffer offset of each (splat, tile) pair. screen: see
-    `make_bounds`.
+def make_gradient_offsets(has_lowpass_disc: bool):
+    """Make the kernel that computes the gradient buffer offset of each (splat, tile) pair.
+    has_lowpass_disc: see `make_bounds`.
 
     A splat has an offset per tile, in the order of the tiles, after the offsets of preceding splats.
     """
-    limits = make_bounds(screen)
+    limits = make_bounds(has_lowpass_disc)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def find_gradient_offsets(

@@ -80,7 +80,7 @@ def window_tile(corner: int, bit: int, view: View) -> int:
 
 
 @cache
-def make_bounds(screen: bool) -> SimpleNamespace:
+def make_bounds(has_lowpass_disc: bool) -> SimpleNamespace:
     """Make functions of bounds with or without the low-pass disc: rows, span, tile rows, spans and
     rectangle, window bits, and `touched`."""
 
@@ -89,7 +89,7 @@ def make_bounds(screen: bool) -> SimpleNamespace:
         """Rows of samples [first, end) whose centres may be inside the bounds."""
         low = b.y - b.half_y
         high = b.y + b.half_y
-        if wp.static(screen):
+        if wp.static(has_lowpass_disc):
             if b.lowpass_r >= 0.0:
                 low = wp.min(low, b.lowpass_y - b.lowpass_r)
                 high = wp.max(high, b.lowpass_y + b.lowpass_r)
@@ -114,7 +114,7 @@ def make_bounds(screen: bool) -> SimpleNamespace:
             under = wp.sqrt(wp.max(1.0 - left * left * b.inverse_hy2, 0.0) + 4e-7)
             x1 = b.x + wp.min(fma(b.shear, right, b.half_width * over), b.half_x)
             x0 = b.x + wp.max(fma(b.shear, left, -b.half_width * under), -b.half_x)
-        if wp.static(screen):
+        if wp.static(has_lowpass_disc):
             low = wp.max(top - b.lowpass_y, -b.lowpass_r)
             high = wp.min(bottom - b.lowpass_y, b.lowpass_r)
             if low <= high:
@@ -147,7 +147,7 @@ def make_bounds(screen: bool) -> SimpleNamespace:
     def tile_rectangle(b: Bounds, view: View):
         """Rectangle that contains the tiles of `tile_span` in all rows: left, top, columns, rows."""
         low, high = b.x - b.half_x, b.x + b.half_x
-        if wp.static(screen):
+        if wp.static(has_lowpass_disc):
             if b.lowpass_r >= 0.0:
                 low = wp.min(low, b.lowpass_x - (b.lowpass_r + PAD))
                 high = wp.max(high, b.lowpass_x + (b.lowpass_r + PAD))

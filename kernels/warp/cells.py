@@ -53,7 +53,7 @@ def half_chord(c: Conic, y: float) -> float:
 def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
     """Make the function that returns the cells of a tile that a splat may overlap."""
     splats = make_splat(effects, outputs)
-    Splat, screen, thick = splats.Splat, "lowpass_screen" in effects, EXACT in effects
+    Splat, has_lowpass_disc, thick = splats.Splat, "lowpass_screen" in effects, EXACT in effects
     elliptic = "rays" not in effects and not any(name in effects for name in BOXES)
 
     @wp.func
@@ -138,7 +138,7 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
             low, high = -float(wp.inf), float(wp.inf)
             if wp.static(elliptic):
                 low, high = chord(c, y0, y1)
-                if wp.static(screen):
+                if wp.static(has_lowpass_disc):
                     away = wp.clamp(s.lowpass_y, y0, y1) - s.lowpass_y
                     rest = lowpass_square - away * away
                     if rest >= 0.0 and s.lowpass_x < _NO_DISC:

@@ -24,9 +24,9 @@ def make_ellipsoids_backward(effects: tuple[str, ...]):
         p: wp.vec3d,
         grad_a: wp.vec3d,
         grad_b: wp.vec3d,
-        grad_bulge: wp.float64,
+        grad_ellipsoid_term: wp.float64,
     ):
-        """Gradients with respect to the scaled axes, in rows, and the centre. grad_bulge: with respect to
+        """Gradients with respect to the scaled axes, in rows, and the centre. grad_ellipsoid_term: with respect to
         2 / m^2.
 
         The disk's tangents a, b and p / m are the images of unit vectors e1, e2, e3 under V, whose columns
@@ -54,7 +54,7 @@ def make_ellipsoids_backward(effects: tuple[str, ...]):
         e2[i1] = k2
         e2[i2] = -k1
         inverse_m = shortest / m
-        grad_m2 = -_FOUR * grad_bulge * inverse_m * inverse_m  # the ellipsoid_term is 2 / m^2
+        grad_m2 = -_FOUR * grad_ellipsoid_term * inverse_m * inverse_m  # the ellipsoid_term is 2 / m^2
         grad_y = grad_m2 / m * g - inverse_m * (wp.dot(p, grad_a) * e1 + wp.dot(p, grad_b) * e2)
         grad_y = inverse_m * wp.cw_div(grad_y, sizes)
         share = wp.cw_div(grad_y, sizes)
@@ -137,13 +137,13 @@ def make_ellipsoids_backward(effects: tuple[str, ...]):
         grad_p: wp.vec3d,
         grad_camera: wp.vec4d,  # with respect to fx, fy, cx, cy
         grad_log: wp.float64,
-        grad_bulge: wp.float64,
+        grad_ellipsoid_term: wp.float64,
         grad_facet: wp.vec3d,
         view: View,
     ):
         """Gradients with respect to the unit axes, in rows, their lengths, the centre, and fx, fy, cx, cy."""
         if wp.static(sharp):
-            grad_scaled, grad_center = exact(axes, sizes, p, grad_a, grad_b, grad_bulge)
+            grad_scaled, grad_center = exact(axes, sizes, p, grad_a, grad_b, grad_ellipsoid_term)
             grad_center += grad_p
         else:
             grad_scaled, grad_center, grad_camera = ewa(

@@ -27,7 +27,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
     words = wp.types.vector(4 * layout.lines, wp.float32)
     sqrt_half, edge_on = real(math.sqrt(0.5)), real(1e-13 if real is wp.float64 else 1e-6)
     one, two, half, zero = real(1.0), real(2.0), real(0.5), real(0.0)
-    has_depth, screen, parallel, exact = (
+    has_depth, has_lowpass_disc, parallel, exact = (
         name in effects for name in ("ray_depth", "lowpass_screen", "camera_orthographic", EXACT)
     )
     ewa = any(name in effects for name in EWA)
@@ -133,7 +133,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
                 record[at_edges + 3] = of_v[1]
         if wp.static(flagged):
             record[at_flag] = wp.where(boxed, 1.0, 0.0)
-        if wp.static(screen):
+        if wp.static(has_lowpass_disc):
             # far away without a low-pass disc
             record[at_lowpass] = wp.where(in_front and not itself, float(center_x - anchor_x), 1.0e18)
             record[at_lowpass + 1] = wp.where(in_front, float(center_y - anchor_y), 1.0e18)

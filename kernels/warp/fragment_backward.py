@@ -46,7 +46,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
     splats, intersection = make_splat(effects, outputs), make_intersection(effects, outputs)
     Splat, Intersection = splats.Splat, intersection.Intersection
     cross, column_of, alpha_of = intersection.cross, intersection.column, intersection.alpha_of
-    screen, exclusive, has_depth, thick = (
+    has_lowpass_disc, exclusive, has_depth, thick = (
         name in effects for name in ("lowpass_screen", "stop_exclusive", "ray_depth", EXACT)
     )
     has_alpha, depth, normal, distortion = (
@@ -149,10 +149,10 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
         s: Splat,
         c: Intersection,
         inverse_d: float,
-        low_pass: float,
+        lowpass_half_rho: float,
     ):
         """Depth of a fragment, and its derivatives with respect to z_numerator; z_center; D at constant
-        z_numerator - z_center D; q; `low_pass`, rho / 2 of the low-pass disc; and the
+        z_numerator - z_center D; q; `lowpass_half_rho`, rho / 2 of the low-pass disc; and the
         ellipsoid_term of a 3D Gaussian. Beyond a circle, which may be the disc's, depth is
         z_center + circle (z_numerator - z_center D) D / q. A depth that rounding moves out of the splat's
         range has the derivatives of the centre's depth. For a 3D Gaussian, D and q in `c` are D and q of its
@@ -163,7 +163,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
         numerator = line_of(lines, position + z_line)[z_lane]
         z, grad_record, grad_dot = center, wp.vec3(0.0, 1.0, 0.0), wp.vec2()
         ahead = c.d > 0.0 and c.d <= s.v[3]
-        circle = wp.max(low_pass, HALF_RHO_OF_RANGE)
+        circle = wp.max(lowpass_half_rho, HALF_RHO_OF_RANGE)
         if ahead and c.q * inverse_d * inverse_d <= circle:
             met = numerator * inverse_d
             z = wp.clamp(met, center - reach, center + reach)
@@ -173,8 +173,10 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
             beyond, taken = numerator - center * c.d, circle * c.d / c.q
             z = wp.clamp(fma(taken, beyond, center), center - reach, center + reach)
             grad_record = wp.vec3(taken, 1.0 - taken * c.d, circle / c.q * beyond)
-            grad_dot = wp.vec2(-taken * beyond / c.q, wp.where(circle == low_pass, beyond * c.d / c.q, 0.0))
-        grad_bulge = float(0.0)
+            grad_dot = wp.vec2(
+                -taken * beyond / c.q, wp.where(circle == lowpass_half_rho, beyond * c.d / c.q, 0.0)
+            )
+        grad_ellipsoid_term = float(0.0)
         if wp.static(thick):
             if s.ellipsoid_term > 0.0 and ahead:
                 slant = c.q * inverse_d  # q / D: finite for the thinnest needles, whose half_rho overflows
@@ -182,12 +184,12 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
                 rest = wp.max(1.0 - share, 1.0e-6)  # 1 / (1 + t)
                 t = share / rest
                 grad_d = grad_record[2] - center * grad_record[0]
-                grad_bulge = slant * fma(slant, grad_dot[0], grad_d)
+                grad_ellipsoid_term = slant * fma(slant, grad_dot[0], grad_d)
                 grad_record[2] = grad_record[2] - t * fma(2.0 * slant, grad_dot[0], grad_d)
                 grad_dot[0] = (
                     fma(2.0 * t, grad_dot[0], grad_dot[0]) + grad_d * s.ellipsoid_term * inverse_d / rest
                 )
-        return z, grad_record, grad_dot, grad_bulge
+        return z, grad_record, grad_dot, grad_ellipsoid_term
 
     @wp.func
     def fragment_gradient(
@@ -214,21 +216,23 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
         half_rho = c.q * inverse_d * inverse_d
         min_half_rho = half_rho
         on_plane = c.inside
-        if wp.static(screen):
-            on_plane = c.inside and half_rho <= c.screen
+        if wp.static(has_lowpass_disc):
+            on_plane = c.inside and half_rho <= c.lowpass_half_rho
             if not on_plane:
-                min_half_rho = c.screen
+                min_half_rho = c.lowpass_half_rho
 
         weight = transmittance * alpha
         color = wp.vec3(s.c[1], s.c[2], s.c[3])
         grad_weight = wp.dot(pixel_gradient.grad_rgb, color)
-        z, grad_record, grad_dot_depth, grad_bulge = float(0.0), wp.vec3(), wp.vec2(), float(0.0)
+        z, grad_record, grad_dot_depth, grad_ellipsoid_term = float(0.0), wp.vec3(), wp.vec2(), float(0.0)
         grad_z = float(0.0)
         if wp.static(has_depth):
-            low_pass = float(wp.inf)
-            if wp.static(screen):
-                low_pass = c.screen
-            z, grad_record, grad_dot_depth, grad_bulge = depth_at(lines, index, s, c, inverse_d, low_pass)
+            lowpass_half_rho = float(wp.inf)
+            if wp.static(has_lowpass_disc):
+                lowpass_half_rho = c.lowpass_half_rho
+            z, grad_record, grad_dot_depth, grad_ellipsoid_term = depth_at(
+                lines, index, s, c, inverse_d, lowpass_half_rho
+            )
         if wp.static(depth):
             grad_weight += fma(pixel_gradient.depth, z, pixel_gradient.depth_weight)
             grad_z += weight * pixel_gradient.depth
@@ -275,7 +279,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
             grad_d += grad_z * grad_record[2]
             grad_nu += 2.0 * grad_z * grad_dot_depth[0] * nu
             grad_nv += 2.0 * grad_z * grad_dot_depth[0] * nv
-        if wp.static(screen):
+        if wp.static(has_lowpass_disc):
             grad_dot = 2.0 * view.per_pixel * grad_log
             if on_plane:
                 grad_dot = 0.0
@@ -287,10 +291,10 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
                 m[wp.static(at.get("nx", 0)) + k] = weight * pixel_gradient.normal[k]
         if wp.static(thick):
             if on_plane:
-                grad_bulge = fma(grad_log, half_rho * half_rho, grad_z * grad_bulge)
+                grad_ellipsoid_term = fma(grad_log, half_rho * half_rho, grad_z * grad_ellipsoid_term)
             else:
-                grad_bulge *= grad_z
-            m[wp.static(at.get("ellipsoid_term", 0))] = grad_bulge
+                grad_ellipsoid_term *= grad_z
+            m[wp.static(at.get("ellipsoid_term", 0))] = grad_ellipsoid_term
         m[0] = grad_nu
         m[1] = grad_nu * x
         m[2] = grad_nu * y

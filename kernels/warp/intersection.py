@@ -26,7 +26,7 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
     Splat = make_splat(effects, outputs).Splat
     layout = RecordLayout(effects, outputs)
     each = layout.lines
-    screen, has_lens, parallel, all_boxes = (
+    has_lowpass_disc, has_lens, parallel, all_boxes = (
         name in effects for name in ("lowpass_screen", "rays", "camera_orthographic", "footprint_box")
     )
     thick, facing = EXACT in effects, FACING in effects and not parallel
@@ -38,8 +38,8 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
     exp = fast_exp if "arithmetic_fast" in effects else wp.exp
     # q / d^2 is rho / 2; inside: the ray intersects the disk within R and beyond the near plane
     fields = {"d": wp.float32, "q": wp.float32, "inside": wp.bool, "contributes": wp.bool}
-    # screen: squared distance from the projected centre in pixels, which is rho / 2 of the low-pass
-    fields |= {"screen": wp.float32} if screen else {}
+    # lowpass_half_rho: squared distance from the projected centre in pixels, rho / 2 of the low-pass
+    fields |= {"lowpass_half_rho": wp.float32} if has_lowpass_disc else {}
     fields |= {"z": wp.float32} if parallel else {}  # d times the depth
     # cover: coverage of the sample by a box
     fields |= {"cover": wp.float32} if boxes else {}
@@ -141,11 +141,11 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
                 c.cover = across * between(c.d, nv, wp.vec2(s.edges[2], s.edges[3]))
                 c.inside = c.cover > 0.0 and ahead
         c.contributes = c.inside
-        if wp.static(screen):
+        if wp.static(has_lowpass_disc):
             ex = x - s.lowpass_x
             ey = y - s.lowpass_y
-            c.screen = fma(ex, ex, ey * ey) * view.per_pixel
-            c.contributes = c.inside or c.screen <= s.half_r2
+            c.lowpass_half_rho = fma(ex, ex, ey * ey) * view.per_pixel
+            c.contributes = c.inside or c.lowpass_half_rho <= s.half_r2
         return c
 
     @wp.func
@@ -154,11 +154,11 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
             if is_box(s):
                 return wp.min(exp(s.u[3]), view.opacity_ceiling) * c.cover
         half_rho = c.q * inverse_d * inverse_d
-        if wp.static(screen):
+        if wp.static(has_lowpass_disc):
             if c.inside:
-                half_rho = wp.min(half_rho, c.screen)
+                half_rho = wp.min(half_rho, c.lowpass_half_rho)
             else:
-                half_rho = c.screen
+                half_rho = c.lowpass_half_rho
         return wp.min(exp(s.u[3] - half_rho), view.opacity_ceiling)
 
     @wp.func
@@ -185,10 +185,10 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
             depth_d = line_of(lines, at + z_line)[z_lane]
             beyond_near = c.d <= s.v[3]
         depth = depth_d * inverse_d
-        if wp.static(screen):
+        if wp.static(has_lowpass_disc):
             if not beyond_near:
                 return center
-            circle = wp.max(c.screen, HALF_RHO_OF_RANGE)
+            circle = wp.max(c.lowpass_half_rho, HALF_RHO_OF_RANGE)
             if not (printed or c.q * inverse_d * inverse_d <= circle):
                 depth = fma(circle * (depth_d - center * c.d), c.d / c.q, center)
         return wp.clamp(depth, center - reach, center + reach)

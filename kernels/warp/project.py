@@ -48,7 +48,7 @@ def make_project(
     """
     layout = RecordLayout(effects, outputs)
     lines_each = layout.lines
-    has_depth, screen, filtered, k_buffered, layers = (
+    has_depth, has_lowpass_disc, filtered, k_buffered, layers = (
         name in effects
         for name in ("ray_depth", "lowpass_screen", "lowpass_pixel", "order_pixel", "order_coplanar")
     )
@@ -65,7 +65,11 @@ def make_project(
     thick_too = exact or drawn_ewa
     surfaced = drawn_ewa and len(projects) > 0
     ellipsoid = make_ellipsoids(effects, real)
-    limits, color_of, widened = make_bounds(screen), make_color(sh_coefficients, real), make_filter(real)
+    limits, color_of, widened = (
+        make_bounds(has_lowpass_disc),
+        make_color(sh_coefficients, real),
+        make_filter(real),
+    )
     ln = make_log(real)
     splat_pose = make_splat_pose(effects, real)
     Moving = splat_pose.Moving
@@ -253,7 +257,7 @@ def make_project(
         if wp.static(has_lens):
             if in_front:
                 center_x, center_y, in_front = optics.image(p, view, lens)
-        if wp.static(screen):
+        if wp.static(has_lowpass_disc):
             if in_front:
                 box.lowpass_x = float(center_x)
                 box.lowpass_y = float(center_y)

@@ -17,7 +17,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     """
     layout = RecordLayout(effects, outputs)
     each = layout.lines
-    screen, has_lens, parallel = (
+    has_lowpass_disc, has_lens, parallel = (
         name in effects for name in ("lowpass_screen", "rays", "camera_orthographic")
     )
     edged = not has_lens and any(name in effects for name in BOXES)
@@ -25,7 +25,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     thick = EXACT in effects
     # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
     splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
-    splat |= {"lowpass_x": wp.float32, "lowpass_y": wp.float32} if screen else {}
+    splat |= {"lowpass_x": wp.float32, "lowpass_y": wp.float32} if has_lowpass_disc else {}
     splat |= {"edges": wp.vec4} if edged else {}
     splat |= {"boxed": wp.float32} if flagged else {}
     splat |= {"ellipsoid_term": wp.float32} if thick else {}
@@ -38,7 +38,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     lowpass_y_lane = layout.position("lowpass_y")[1]  # on the same line
     edge_line = layout.position("edge_u0")[0]
     boxed_line, boxed_lane = layout.position("boxed")
-    bulge_line, bulge_lane = layout.position("ellipsoid_term")
+    ellipsoid_line, ellipsoid_lane = layout.position("ellipsoid_term")
     box_line, box_lane = layout.position("columns")  # and rows
     ray_line, plane_line = layout.position("nuz")[0], layout.position("plane_z0")[0]
 
@@ -59,7 +59,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
             s.v = line(shared_memory, lines, lists, first, which, 1)
             s.d = line(shared_memory, lines, lists, first, which, 2)
             s.c = line(shared_memory, lines, lists, first, which, 3)
-            if wp.static(screen):
+            if wp.static(has_lowpass_disc):
                 disc = line(shared_memory, lines, lists, first, which, lowpass_line)
                 s.lowpass_x = disc[lowpass_lane]
                 s.lowpass_y = disc[lowpass_y_lane]
@@ -68,7 +68,9 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
             if wp.static(flagged):
                 s.boxed = line(shared_memory, lines, lists, first, which, boxed_line)[boxed_lane]
             if wp.static(thick):
-                s.ellipsoid_term = line(shared_memory, lines, lists, first, which, bulge_line)[bulge_lane]
+                s.ellipsoid_term = line(shared_memory, lines, lists, first, which, ellipsoid_line)[
+                    ellipsoid_lane
+                ]
             if wp.static(has_lens):
                 s.w = line(shared_memory, lines, lists, first, which, ray_line)
                 rest = line(shared_memory, lines, lists, first, which, ray_line + 1)

@@ -17,7 +17,7 @@ def make_splat_pose(effects: tuple[str, ...], real) -> SimpleNamespace:
     moves, k_buffered, layers = (
         name in effects for name in ("motion_groups", "order_pixel", "order_coplanar")
     )
-    screen = "lowpass_screen" in effects
+    has_lowpass_disc = "lowpass_screen" in effects
     boxes_too = any(name in effects for name in BOXES)
     vec3, mat33 = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
     half, one, two = real(0.5), real(1.0), real(2.0)
@@ -52,7 +52,7 @@ def make_splat_pose(effects: tuple[str, ...], real) -> SimpleNamespace:
         """Middle and half of the depth range of a splat's fragments. reach: half of the range within the
         cut-off. plane: coplanar group, -1 for none."""
         middle, found = depth, reach
-        if wp.static(screen):
+        if wp.static(has_lowpass_disc):
             # the low-pass disc, which does not depend on the cut-off
             if not boxed:
                 found = reach * wp.max(one, range_radius / radius)

@@ -513,9 +513,9 @@ def count_tiles(
 
 
 @cache
-def make_list_big(screen: bool):
+def make_list_big(has_lowpass_disc: bool):
     """Make the kernel list_big, with or without the low-pass disc in the bounds."""
-    limits = make_bounds(screen)
+    limits = make_bounds(has_lowpass_disc)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def list_big(

@@ -31,7 +31,7 @@ class Cloud(interface.ResidentData):
 
     def __init__(self, cloud):
         self.count = len(cloud)
-        self.copy_traits(cloud)
+        self.copy_properties(cloud)
 
 
 class Backend(interface.Backend):

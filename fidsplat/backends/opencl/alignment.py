@@ -409,7 +409,7 @@ class _Replayed:
             )
             for output in pipeline.outputs.values()
         }
-        frame = pipeline.replay_complete(resident, view, 0)
+        frame = pipeline.replay_undivided(resident, view, 0)
         owner = pipeline.images_of(frame)
         replayed = None if frame.recorded is None else cls(workspace, frame, owner, origin, scratch)
         return replayed if replayed is not None and replayed.bind() else None

@@ -276,7 +276,7 @@ def _assemble_backward(
     files += [EFFECT_CODE[part].file for part in parts]
     kernels = kernels_of(config)
     declared = Declarations(_scalars(features), effects, kernels=kernels)
-    backward = {"BACK_ITEMS": backward_items(features, config), "CHUNK": backward_chunk(features, config)}
+    backward = {"BACKWARD_ITEMS": backward_items(features, config), "CHUNK": backward_chunk(features, config)}
     if stages is _STEP:
         backward["AXES"] = 3 if "thickness" in effects else 2
     assembler = Assembler(files, declared, build_constants(features, config) | backward)

@@ -247,7 +247,7 @@ class GatheredChunks(Resident):
         self._first_id, self.buffer_key = first_id, cache.token
         self._ends = np.cumsum([chunk.count for chunk in chunks], dtype=np.int64)
         super().__init__(int(self._ends[-1]))
-        self.copy_traits(cache.scene.scene)
+        self.copy_properties(cache.scene.scene)
         self.capacity = rounded_up(self.count, 4)  # so that the next view reuses the buffers
         self._acquired: list[tuple[str, cl.Buffer]] = []
         weakref.finalize(self, workspace.pool.release, self._acquired)

@@ -90,9 +90,9 @@ class OpenCLGradients(GradientPipeline):
         pipeline = self._pipeline
         with pipeline.workspace.lock:
             if waits or not self._pair_limit:
-                frame = pipeline.render_complete(resident, view)
+                frame = pipeline.render_undivided(resident, view)
             else:
-                frame = pipeline.replay_complete(resident, view, self._pair_limit)
+                frame = pipeline.replay_undivided(resident, view, self._pair_limit)
             return OpenCLDifferentiable(frame, pipeline.images_of(frame))
 
     def backward(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:

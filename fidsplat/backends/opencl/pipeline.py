@@ -60,13 +60,13 @@ class OpenCLPipeline(Pipeline):
         source: KernelSource,
         features: FeatureSet,
         config: KernelConfig,
-        other: Callable[[FeatureSet, KernelConfig], OpenCLPipeline],
+        pipeline_for: Callable[[FeatureSet, KernelConfig], OpenCLPipeline],
     ) -> None:
-        """other: function that returns the pipeline with another config."""
+        """pipeline_for: function that returns the pipeline with another config."""
         self.workspace, self.source, self.features, self.config = workspace, source, features, config
         self.outputs = {output.name: output for output in features.images}
         self._planner = MemoryPlanner(workspace, source, features, config)
-        self._other = other
+        self._pipeline_for = pipeline_for
 
     @cached_property
     def program(self) -> Program:
@@ -90,7 +90,7 @@ class OpenCLPipeline(Pipeline):
             if resident.coherent and self.config.binning == "bin_first":
                 return self._with_binning("bin_local").render_view(resident, view)
             if resident.count >= MIN_CULLED and resident.sortable and self._culls:
-                culling = self._other(self.features, replace(self.config, culls_first=True))
+                culling = self._pipeline_for(self.features, replace(self.config, culls_first=True))
                 return culling.render_view(resident, view)
             plan = self._planner.frame(resident, view)
             if plan.chunk and self.config.binning != "sort_first":
@@ -129,11 +129,11 @@ class OpenCLPipeline(Pipeline):
         except DeviceError:  # too little memory even for a divided frame
             return False
 
-    def render_complete(self, resident: Resident, view: View) -> DeviceFrame:
-        """Render one frame; returns its buffers, which are valid until the next frame. Raises DeviceError if
-        it exceeds the memory budget without chunks and bands."""
+    def render_undivided(self, resident: Resident, view: View) -> DeviceFrame:
+        """Render one frame without chunks and bands; returns its buffers, valid until the next frame. Raises
+        DeviceError if it exceeds the memory budget."""
         if self._is_too_small_to_vectorise(resident):
-            return self._unvectorised.render_complete(resident, view)
+            return self._unvectorised.render_undivided(resident, view)
         with self.workspace.rendering():
             plan, frame = self._planner.frame(resident, view), None
             if not plan.chunk:
@@ -145,11 +145,11 @@ class OpenCLPipeline(Pipeline):
                 )
             return frame
 
-    def replay_complete(self, resident: Resident, view: View, pair_limit: int) -> DeviceFrame:
-        """Render one frame like `render_complete` without waiting for its counts (`DeviceFrame.count_pairs`
+    def replay_undivided(self, resident: Resident, view: View, pair_limit: int) -> DeviceFrame:
+        """Render one frame like `render_undivided` without waiting for its counts (`DeviceFrame.count_pairs`
         does), by a replay if possible. pair_limit: maximum capacity of the lists."""
         if self.config.binning == "sort_first" or not resident.count:
-            return self.render_complete(resident, view)
+            return self.render_undivided(resident, view)
         workspace, key = self.workspace, (*self._key(view), pair_limit)
         with workspace.rendering():
             cached, queue = resident.cached_frames.get(key), workspace.switch_to(workspace.queue)
@@ -166,7 +166,7 @@ class OpenCLPipeline(Pipeline):
             buffers = self._buffer_key(resident, view, plan)
             workspace.pool.trim(buffers, workspace.memory_budget - plan.total, resident.capacity)
             if plan.chunk or not tiling.pair_capacity(workspace, self.config):
-                return self.render_complete(resident, view)
+                return self.render_undivided(resident, view)
             resident.cached_frames.pop(key, None)  # after an interrupt the recording may be incomplete
             commands = CommandList(self.program) if recorded is None else recorded.commands
             frame = self._render_frame(resident, view, plan, commands, queue, pair_limit)
@@ -257,7 +257,7 @@ class OpenCLPipeline(Pipeline):
 
     def _with_binning(self, binning: str) -> OpenCLPipeline:
         """The pipeline with another tile-binning strategy."""
-        return self._other(self.features, replace(self.config, binning=binning, culls_first=False))
+        return self._pipeline_for(self.features, replace(self.config, binning=binning, culls_first=False))
 
     def _is_too_small_to_vectorise(self, resident: Resident) -> bool:
         """Whether compiling the vectorised projection would take longer than it saves, for a small cloud."""
@@ -273,7 +273,7 @@ class OpenCLPipeline(Pipeline):
     def _unvectorised(self) -> OpenCLPipeline:
         """The pipeline whose projection is not vectorised, for small clouds: compiling the vectorised
         projection takes longer than it saves."""
-        return self._other(self.features, replace(self.config, splats_per_item=1))
+        return self._pipeline_for(self.features, replace(self.config, splats_per_item=1))
 
     def _for_part(self, resident: Resident, plan: MemoryPlan, views: ViewBatch) -> OpenCLPipeline:
         """The pipeline with the fastest tile-binning strategy for a part of a batch."""

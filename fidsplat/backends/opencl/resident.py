@@ -75,7 +75,7 @@ class UploadedCloud(Resident):
 
     def __init__(self, workspace: Workspace, cloud: SplatCloud) -> None:
         super().__init__(len(cloud))
-        self.copy_traits(cloud)
+        self.copy_properties(cloud)
         self._workspace, self._arrays = workspace, kernel_arrays(cloud)
         self._order: MortonOrder | None = None
         total = self.count * self._bytes_of(self._arrays)

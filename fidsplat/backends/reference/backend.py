@@ -89,7 +89,7 @@ class ReferenceCloud(ResidentData):
     def __init__(self, cloud: SplatCloud) -> None:
         self.cloud, self.count = cloud, len(cloud)
         self.memory_bytes = 0  # nothing is copied to a device
-        self.copy_traits(cloud)
+        self.copy_properties(cloud)
 
     def color_range(self) -> tuple[float, float]:
         return color_range(self.cloud.plain_colors, self.cloud.sh)

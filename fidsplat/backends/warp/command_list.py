@@ -27,9 +27,9 @@ def _parameters(kernel: Any) -> tuple[str, ...]:
     return tuple(argument.label for argument in kernel.adj.args)
 
 
-def _arguments(kernel: Any, given: Mapping[str, Any], first: int = 0) -> list[Any]:
+def _arguments(kernel: Any, arguments: Mapping[str, Any], first: int = 0) -> list[Any]:
     """Arguments of a kernel in the order of its parameters, from parameter number `first` on."""
-    return [given[name] for name in _parameters(kernel)[first:]]
+    return [arguments[name] for name in _parameters(kernel)[first:]]
 
 
 class LaunchCache:
@@ -78,9 +78,9 @@ class Launcher:
         self._stream = None if self._workers else self._device.stream  # the caller may switch it later
         self._marks: list[tuple[str | None, Any]] = []
 
-    def launch(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
+    def launch(self, kernel: Any, count: int, arguments: Mapping[str, Any], block: int = BLOCK) -> None:
         """Launch `count` threads of a kernel whose first parameter is the index of its first thread."""
-        args = _arguments(kernel, given, 1)
+        args = _arguments(kernel, arguments, 1)
         parts = 1 if self._workers is None else min(self.parts, -(-count // _MIN_THREADS))
         if parts == 1:
             self._cache.launch(kernel, count, [0, *args], block)
@@ -88,22 +88,32 @@ class Launcher:
         cuts = [count * k // parts for k in range(parts + 1)]
         self._run(kernel, [(end - first, [first, *args]) for first, end in pairwise(cuts)])
 
-    def launch_undivided(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
-        """Launch `count` threads undivided on every device, with all arguments from `given`."""
-        self._cache.launch(kernel, count, _arguments(kernel, given), block)
+    def launch_undivided(
+        self, kernel: Any, count: int, arguments: Mapping[str, Any], block: int = BLOCK
+    ) -> None:
+        """Launch `count` threads undivided on every device, with all arguments from `arguments`."""
+        self._cache.launch(kernel, count, _arguments(kernel, arguments), block)
 
     def launch_blocks(
-        self, kernel: Any, first: int, end: int, given: Mapping[str, Any], block: int = BLOCK, area: int = 0
+        self,
+        kernel: Any,
+        first: int,
+        end: int,
+        arguments: Mapping[str, Any],
+        block: int = BLOCK,
+        area: int = 0,
     ) -> None:
         """Launch a block of threads on a GPU, or a thread on the CPU, for each number from first to end. The
         kernel's first parameter is the first number of a part of the launch. area: on the CPU, samples of
         state of a part, whose offset is the last parameter."""
         if self._workers is None:
-            self._cache.launch(kernel, (end - first) * block, [first, *_arguments(kernel, given, 1)], block)
+            self._cache.launch(
+                kernel, (end - first) * block, [first, *_arguments(kernel, arguments, 1)], block
+            )
             return
         parts = min(self.parts, -(-(end - first) // _MIN_TILES))
         cuts = [first + (end - first) * k // parts for k in range(parts + 1)]
-        args = _arguments(kernel, {**given, "state_first": 0}, 1)
+        args = _arguments(kernel, {**arguments, "state_first": 0}, 1)
         args = args[:-1] if area else args
         spans = enumerate(pairwise(cuts))
         self._run(kernel, [(b - a, [a, *args, *([k * area] if area else [])]) for k, (a, b) in spans])

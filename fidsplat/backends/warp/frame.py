@@ -83,11 +83,11 @@ class DeviceFrame:
         self._fill_views()
         self.named["lens"] = lens_of(view, self.workspace)
         self.named["moving"] = moving_of(self.resident, batch, inputs)
-        given = {
+        arguments = {
             "has_ray_derivatives": program.has_ray_derivatives,
             "has_external_depth": program.has_external_depth,
         }
-        self._rays = rays_of(view, self.workspace, inputs, **given)
+        self._rays = rays_of(view, self.workspace, inputs, **arguments)
         if program.composite_background:
             self.named["environment"] = environment_of(view, self.workspace)
 
@@ -120,9 +120,13 @@ class DeviceFrame:
         for name in self.program.sample_fields:
             source, target = getattr(samples, name), getattr(accumulated, name)
             if name in self.program.accumulate:
-                given = {"weight": sub_frame.weight, "first_sub_frame": int(sub_frame.first), "start": start}
+                arguments = {
+                    "weight": sub_frame.weight,
+                    "first_sub_frame": int(sub_frame.first),
+                    "start": start,
+                }
                 self.launcher.launch(
-                    self.program.accumulate[name], count, {**given, "raw": source, "accumulated": target}
+                    self.program.accumulate[name], count, {**arguments, "raw": source, "accumulated": target}
                 )
             elif sub_frame.middle:
                 self.wp.copy(target, source, dest_offset=start, count=count)
@@ -131,9 +135,9 @@ class DeviceFrame:
         """Run all stages except resolve for one pose; returns the sample buffers."""
         wp, n, program = self.wp, self.splats, self.program
         for name, size in {"starts": 1, "cursors": 0, "tile_order": 0}.items():
-            self._take(name, self.tiles + size, wp.int32)
-        self._take("bounds", n, kernels("bounds").Bounds)
-        self._take("lines", n * program.layout.lines, wp.vec4)
+            self._scratch(name, self.tiles + size, wp.int32)
+        self._scratch("bounds", n, kernels("bounds").Bounds)
+        self._scratch("lines", n * program.layout.lines, wp.vec4)
         self.launcher.stage("project")
         visible, pairs = self._project()
         samples = self._samples("raw")
@@ -161,13 +165,13 @@ class DeviceFrame:
         """Project, and count the pairs of each tile. Returns the numbers of visible splats and of pairs, or
         the capacity."""
         wp, n, first_tile = self.wp, self.splats, self.program.lists.COUNTERS
-        self._take("windows", n, wp.uint64)
-        self._take("keys", n, wp.uint32)
-        self._take("big", n, wp.int32)
-        self._take("pairs", 1, wp.uint64)
+        self._scratch("windows", n, wp.uint64)
+        self._scratch("keys", n, wp.uint32)
+        self._scratch("big", n, wp.int32)
+        self._scratch("pairs", 1, wp.uint64)
         counts = self._exact("counts", n, wp.int32)
         counters = self._exact("counters", first_tile + self.tiles, wp.int32)
-        totals = self._take("totals", 2, wp.int64)
+        totals = self._scratch("totals", 2, wp.int64)
         counters.zero_()
         # placeholders, which kernels do not read if all splats have one primitive
         cloud = {"boxes": counts, "coplanar_groups": counts, "thickness": self.resident.arrays["opacities"]}
@@ -182,17 +186,17 @@ class DeviceFrame:
         visible, pairs = self.launcher.read_back(totals, self.pool.host("totals", 2, wp.int64))
         return visible, pairs
 
-    def _list_big(self, given: dict[str, Any], first: int = 0, end: int | None = None) -> None:
+    def _list_big(self, arguments: dict[str, Any], first: int = 0, end: int | None = None) -> None:
         """Count or list the tiles of big splats."""
         blocks = 8 * self.pool.device.sm_count if self.pool.device.is_cuda else 64
         band = {"band_first": first, "band_end": self.tiles if end is None else end, "blocks": blocks}
-        self.launcher.launch_blocks(self.program.list_big, 0, blocks, self.named | band | given)
+        self.launcher.launch_blocks(self.program.list_big, 0, blocks, self.named | band | arguments)
 
     def _start_lists(self, first: int, end: int, capacity: int) -> None:
         """Compute the starts of the lists of a band of tiles."""
-        given, lists = {"band_end": end, "capacity": capacity}, self.program.lists
+        arguments, lists = {"band_end": end, "capacity": capacity}, self.program.lists
         self.launcher.launch_blocks(
-            lists.start_lists, first, first + 1, self.named | given, lists.START_BLOCK
+            lists.start_lists, first, first + 1, self.named | arguments, lists.START_BLOCK
         )
 
     def _bands(self, pairs: int) -> Iterator[tuple[int, int, int]]:
@@ -212,8 +216,8 @@ class DeviceFrame:
 
     def _bin(self, first: int, end: int, pairs: int, complete: bool) -> None:
         """Write the pairs of one band. complete: whether the band has all tiles."""
-        self._take("pairs", pairs, self.wp.uint64)
-        self._take("lists", pairs, self.wp.int32)
+        self._scratch("pairs", pairs, self.wp.uint64)
+        self._scratch("lists", pairs, self.wp.int32)
         if not complete:
             self._start_lists(first, end, pairs)
         band = {"band_first": first, "band_end": end, "capacity": pairs, "splats": self.splats}
@@ -226,23 +230,23 @@ class DeviceFrame:
         samples = self.program.samples_type()
         for name, dtype in self.program.sample_fields.items():
             size = self.views * self.grid[0] * self.grid[1]
-            setattr(samples, name, self._take(f"{kind} {name}", size, dtype))
+            setattr(samples, name, self._scratch(f"{kind} {name}", size, dtype))
         return samples
 
     def _blend(self, first: int, end: int, samples: Any) -> None:
         program, config = self.program, self.program.config
         # a placeholder, which kernels do not read
         groups = self.resident.arrays.get("coplanar_groups", self.named["lists"])
-        given = {**self.named, "rays": self._rays, "samples": samples, "coplanar_groups": groups}
+        arguments = {**self.named, "rays": self._rays, "samples": samples, "coplanar_groups": groups}
         area = config.tile_width * config.tile_height
         if config.schedule == "group":
             count = (end - first) * program.blend_block
             self.launcher.launch_undivided(
-                program.blend, count, given | {"band_first": first}, program.blend_block
+                program.blend, count, arguments | {"band_first": first}, program.blend_block
             )
             return
-        given["state"] = self._take("state", self.launcher.parts * area, program.state)
-        self.launcher.launch_blocks(program.blend, first, end, given, area=area)
+        arguments["state"] = self._scratch("state", self.launcher.parts * area, program.state)
+        self.launcher.launch_blocks(program.blend, first, end, arguments, area=area)
 
     def resolve(self, into: ImageArrays, launcher: Launcher) -> None:
         """Run the resolve stage: images from samples."""
@@ -257,28 +261,28 @@ class DeviceFrame:
             setattr(out, name, self.resident.arrays[name])
         for name, dtype in program.view_arrays.items():
             setattr(out, name, self.inputs.filled(name, array_of(self.batch, name), dtype))
-        given = {
+        arguments = {
             "views": self.named["views"],
             "batch_indices": into.indices,
             "samples": self.samples,
             "out": out,
         }
-        given["background"] = wp.vec3(*view.background)
-        given["rays"] = rays_of(view, self.workspace, self.inputs, has_lens=program.has_ray_lengths)
-        launcher.launch(program.resolve, self.views * pixels, given)
+        arguments["background"] = wp.vec3(*view.background)
+        arguments["rays"] = rays_of(view, self.workspace, self.inputs, has_lens=program.has_ray_lengths)
+        launcher.launch(program.resolve, self.views * pixels, arguments)
         if program.sensor:
             settings = program.sensor.settings(view, self.inputs)
-            given = {"settings": settings, "batch_indices": into.indices, "rgb": arrays["rgb"]}
+            arguments = {"settings": settings, "batch_indices": into.indices, "rgb": arrays["rgb"]}
             sizes = {"width": width, "pixels": pixels}
-            launcher.launch(program.sensor.kernel, self.views * pixels, given | sizes)
+            launcher.launch(program.sensor.kernel, self.views * pixels, arguments | sizes)
         launcher.stage(None)
 
     # helpers
 
-    def _launch(self, kernel: Any, count: int, block: int = BLOCK, **given: Any) -> None:
-        self.launcher.launch(kernel, count, {**self.named, **given}, block)
+    def _launch(self, kernel: Any, count: int, block: int = BLOCK, **arguments: Any) -> None:
+        self.launcher.launch(kernel, count, {**self.named, **arguments}, block)
 
-    def _take(self, name: str, size: int, dtype: Any) -> Any:
+    def _scratch(self, name: str, size: int, dtype: Any) -> Any:
         self.named[name] = array = self.pool.scratch(name, size, dtype)
         return array
 

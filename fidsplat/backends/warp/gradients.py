@@ -71,14 +71,14 @@ class _Backward:
         self._launcher: Launcher = frame.launcher
         self._count, self._pairs = frame.resident.count, frame.stats["pairs"]
         # a placeholder, which kernels do not read if all splats are disks
-        self._given = {**frame.named, "thickness": frame.resident.arrays["opacities"]}
-        self._given |= frame.resident.arrays | {"image_gradients": self._image_gradients(gradients)}
-        self._given |= {
+        self._arguments = {**frame.named, "thickness": frame.resident.arrays["opacities"]}
+        self._arguments |= frame.resident.arrays | {"image_gradients": self._image_gradients(gradients)}
+        self._arguments |= {
             "samples": frame.samples,
             "color": frame.samples.color,
             "background": self._wp.vec3(*frame.view.background),
             "log_ceiling": math.log(frame.view.opacity_ceiling),
-            "grad_rgb": self._given["image_gradients"].rgb,
+            "grad_rgb": self._arguments["image_gradients"].rgb,
         }
 
     def results(self) -> dict[str, Any]:
@@ -88,18 +88,20 @@ class _Backward:
         self._blend()
         self._launcher.stage("project backward")
         if self._pairs:
-            self._launcher.launch(self._made.project, self._count, self._given)
+            self._launcher.launch(self._made.project, self._count, self._arguments)
         else:  # no splat is visible, so there are no sums
-            for array in (*found.values(), self._given["grad_cameras"]):
+            for array in (*found.values(), self._arguments["grad_cameras"]):
                 array.zero_()
         view = self._frame.view
         pixels = view.width * view.height
-        parts = self._take("background parts", 3 * _SHARES, self._wp.float64)
+        parts = self._exact("background parts", 3 * _SHARES, self._wp.float64)
         sizes = {"pixels": pixels, "width": view.width, "stride": self._frame.grid[1], "threads": _SHARES}
-        given = self._given | sizes | {"parts": parts}
-        self._launcher.launch(self._made.sums.background_parts, _SHARES, given)
+        arguments = self._arguments | sizes | {"parts": parts}
+        self._launcher.launch(self._made.sums.background_parts, _SHARES, arguments)
         self._sum_rows(parts, _SHARES, 3, found["background"])
-        self._sum_rows(flat_of(self._given["grad_cameras"]), self._count, 10, self._given["grad_camera"])
+        self._sum_rows(
+            flat_of(self._arguments["grad_cameras"]), self._count, 10, self._arguments["grad_camera"]
+        )
         self._launcher.stage(None)
         return found
 
@@ -108,12 +110,12 @@ class _Backward:
         wp, frame, made, pairs = self._wp, self._frame, self._made, self._pairs
         if not pairs:
             return
-        self._take("gradient_offsets", pairs, wp.int32)
-        ends = self._take("ends_by_index", self._count, wp.int32)
-        wp.utils.array_scan(self._given["counts"], ends, inclusive=True)
-        self._given["tiles"] = frame.tiles
-        self._launcher.launch(made.gradient_offsets, pairs, self._given)
-        self._given["gradient_sums"] = gradient_sums = frame.pool.exact(
+        self._exact("gradient_offsets", pairs, wp.int32)
+        ends = self._exact("ends_by_index", self._count, wp.int32)
+        wp.utils.array_scan(self._arguments["counts"], ends, inclusive=True)
+        self._arguments["tiles"] = frame.tiles
+        self._launcher.launch(made.gradient_offsets, pairs, self._arguments)
+        self._arguments["gradient_sums"] = gradient_sums = frame.pool.exact(
             "gradient_sums", pairs, made.blend.GradientSums
         )
         gradient_sums.zero_()
@@ -121,22 +123,22 @@ class _Backward:
         area = config.tile_width * config.tile_height
         chunk = kernels("blend_backward").CHUNK
         checkpoints = area * (pairs // chunk + frame.tiles + 1)
-        self._given["checkpoints"] = self._take("checkpoints", checkpoints, wp.float32)
+        self._arguments["checkpoints"] = self._exact("checkpoints", checkpoints, wp.float32)
         kernel, tiles = made.blend.kernel, frame.tiles
         if config.schedule == "group":
-            given = self._given | {"band_first": 0}
-            self._launcher.launch_undivided(kernel, tiles * area, given, area)
+            arguments = self._arguments | {"band_first": 0}
+            self._launcher.launch_undivided(kernel, tiles * area, arguments, area)
             return
         states = self._launcher.parts * area
-        self._given["transmittances"] = self._take("transmittances", states, wp.float32)
-        self._given["pixel_gradients"] = self._take("pixel_gradients", states, made.blend.PixelGradient)
-        self._given["fragments"] = self._take("fragments", states * chunk, wp.vec2)
-        self._launcher.launch_blocks(kernel, 0, tiles, self._given, area=area)
+        self._arguments["transmittances"] = self._exact("transmittances", states, wp.float32)
+        self._arguments["pixel_gradients"] = self._exact("pixel_gradients", states, made.blend.PixelGradient)
+        self._arguments["fragments"] = self._exact("fragments", states * chunk, wp.vec2)
+        self._launcher.launch_blocks(kernel, 0, tiles, self._arguments, area=area)
 
     def _sum_rows(self, parts: Any, rows: int, columns: int, result: Any) -> None:
         """Sum all rows in a fixed order."""
-        sums = self._take("sums", columns * _SHARES, self._wp.float64)
-        total = self._take("total", columns, self._wp.float64)
+        sums = self._exact("sums", columns * _SHARES, self._wp.float64)
+        total = self._exact("total", columns, self._wp.float64)
         made = self._made.sums
         for given, length, stride, out in ((parts, rows, _SHARES, sums), (sums, _SHARES, 1, total)):
             sizes = {"rows": length, "columns": columns, "stride": stride, "parts": given, "sums": out}
@@ -190,21 +192,23 @@ class _Backward:
             "grad_opacities": wp.float32,
             "grad2d": wp.float32,
         } | ({"grad_thickness": wp.float32} if self._frame.resident.ellipsoids != "none" else {})
-        found = {name.removeprefix("grad_"): self._take(name, count, dtype) for name, dtype in kinds.items()}
-        self._given.setdefault("grad_thickness", self._given["grad_opacities"])  # not written for disks
-        colors = self._take("grad_colors", count * terms, wp.vec3)
+        found = {name.removeprefix("grad_"): self._exact(name, count, dtype) for name, dtype in kinds.items()}
+        self._arguments.setdefault(
+            "grad_thickness", self._arguments["grad_opacities"]
+        )  # not written for disks
+        colors = self._exact("grad_colors", count * terms, wp.vec3)
         if self._made.sh_coefficients:
             found["sh"] = colors.reshape((count, terms))
         else:
             found["colors"] = colors
-        self._take("grad_cameras", count, kernels("project_backward").TEN)
-        found["background"] = self._take("grad_background", 3, wp.float32)
-        grad_camera = self._take("grad_camera", 10, wp.float32)
+        self._exact("grad_cameras", count, kernels("project_backward").TEN)
+        found["background"] = self._exact("grad_background", 3, wp.float32)
+        grad_camera = self._exact("grad_camera", 10, wp.float32)
         found["pose"], found["intrinsics"] = grad_camera[:6], grad_camera[6:]
         return found
 
-    def _take(self, name: str, size: int, dtype: Any) -> Any:
-        self._given[name] = array = self._frame.pool.exact(name, size, dtype)
+    def _exact(self, name: str, size: int, dtype: Any) -> Any:
+        self._arguments[name] = array = self._frame.pool.exact(name, size, dtype)
         return array
 
 

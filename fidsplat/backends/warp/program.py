@@ -60,7 +60,7 @@ def unsupported(features: FeatureSet, name: str) -> str:
 
 
 @dataclass(frozen=True)
-class _Needs:
+class _Requirements:
     """Requirements of a feature set."""
 
     effects: frozenset[str]
@@ -73,7 +73,7 @@ class _Needs:
     """files of kernels/warp/post, in the order of the steps"""
 
     @classmethod
-    def of(cls, features: FeatureSet) -> _Needs:
+    def of(cls, features: FeatureSet) -> _Requirements:
         output = kernels("output")
         post_steps, effects = set(features.post_steps), set(features.effects)
         surface = {"surface_label"} if "external_depth" in effects and "label" in features.outputs else set()
@@ -116,11 +116,11 @@ class Program:
         self.project_block = kernels("project").BLOCK
         self.tile_area = config.tile_width * config.tile_height
         """samples"""
-        self.needs = needs = _Needs.of(features)
+        self.requirements = requirements = _Requirements.of(features)
         with _MAKING, quiet():
-            self._make_lists(features, needs)
-            self._make_blend(needs)
-            self._make_resolve(features, needs)
+            self._make_lists(features, requirements)
+            self._make_blend(requirements)
+            self._make_resolve(features, requirements)
             made = (self.project, self.list_big, self.blend, self.resolve, *self.accumulate.values())
             common = (self.lists.start_lists, self.lists.list_windows, self.lists.sort_lists)
             further = (self.composite_background, self.sensor and self.sensor.kernel)
@@ -129,59 +129,59 @@ class Program:
             for kernel in (*made, *common, *filter(None, further)):
                 self.compile(kernel, blocks.get(kernel, BLOCK))
 
-    def _make_lists(self, features: FeatureSet, needs: _Needs) -> None:
+    def _make_lists(self, features: FeatureSet, requirements: _Requirements) -> None:
         self.project = kernels("project").make_project(
-            needs.among(_PROJECT),
-            kernels("output").having(needs.outputs, "record"),
-            (features.sh_degree + 1) ** 2 if "color_sh" in needs.effects else 0,
+            requirements.among(_PROJECT),
+            kernels("output").having(requirements.outputs, "record"),
+            (features.sh_degree + 1) ** 2 if "color_sh" in requirements.effects else 0,
             features.projection_precision,
             self.config.schedule == "tiles",
         )
         self.lists = kernels("tile_lists")
-        self.list_big = self.lists.make_list_big("lowpass_screen" in needs.effects)
+        self.list_big = self.lists.make_list_big("lowpass_screen" in requirements.effects)
 
-    def _make_blend(self, needs: _Needs) -> None:
-        buffers, blending = kernels("buffers"), needs.blending
-        self.layout = kernels("records").RecordLayout(needs.among(_RECORD), blending)
-        boxes = not needs.effects.isdisjoint(kernels("records").BOXES)
-        self.has_ray_derivatives = boxes and "rays" in needs.effects
+    def _make_blend(self, requirements: _Requirements) -> None:
+        buffers, blending = kernels("buffers"), requirements.blending
+        self.layout = kernels("records").RecordLayout(requirements.among(_RECORD), blending)
+        boxes = not requirements.effects.isdisjoint(kernels("records").BOXES)
+        self.has_ray_derivatives = boxes and "rays" in requirements.effects
         """whether blending reads the derivatives of a lens's rays"""
-        self.has_external_depth = "external_depth" in needs.effects
+        self.has_external_depth = "external_depth" in requirements.effects
         """whether blending reads an external depth image"""
         grouped = self.config.schedule == "group"
         self.blend, self.state, self.blend_block = kernels("blend").make_blend(
-            needs.among(_SAMPLE), blending, grouped, self.tile_area, self.config.k_buffer_size
+            requirements.among(_SAMPLE), blending, grouped, self.tile_area, self.config.k_buffer_size
         )
         """the kernel, the struct of a sample, and the threads of a tile on a GPU"""
         self.sample_fields = buffers.sample_fields(blending)
         """element type of each sample buffer"""
         self.samples_type = buffers.make_samples(tuple(self.sample_fields.items()))
-        averaged = buffers.averaged_of(blending) if "shutter_exposure" in needs.effects else ()
+        averaged = buffers.averaged_of(blending) if "shutter_exposure" in requirements.effects else ()
         self.accumulate = {
             name: kernels("shutter").make_accumulate(self.sample_fields[name]) for name in averaged
         }
         """kernels that accumulate sample buffers of sub-frames, by the name of the buffer"""
 
-    def _make_resolve(self, features: FeatureSet, needs: _Needs) -> None:
+    def _make_resolve(self, features: FeatureSet, requirements: _Requirements) -> None:
         output, behind = kernels("output"), kernels("background")
-        kinds = [kind for kind in behind.KINDS if f"background_{kind}" in needs.effects]
+        kinds = [kind for kind in behind.KINDS if f"background_{kind}" in requirements.effects]
         self.composite_background = (
-            behind.make_composite_background(kinds[0], "rays" in needs.effects) if kinds else None
+            behind.make_composite_background(kinds[0], "rays" in requirements.effects) if kinds else None
         )
         """kernel of the background; None for a constant background"""
         images = tuple((image.name, getattr(load(), image.dtype)) for image in self.images)
-        self.images_type = kernels("buffers").make_images(images, needs.outputs)
-        self.cloud_arrays = output.fields(needs.outputs, "cloud_arrays")
-        self.view_arrays = output.fields(needs.outputs, "view_arrays")
+        self.images_type = kernels("buffers").make_images(images, requirements.outputs)
+        self.cloud_arrays = output.fields(requirements.outputs, "cloud_arrays")
+        self.view_arrays = output.fields(requirements.outputs, "view_arrays")
         """element type of each additional array that the resolve stage reads"""
-        self.has_ray_lengths = "camera_brown_conrady" in needs.effects and bool(
+        self.has_ray_lengths = "camera_brown_conrady" in requirements.effects and bool(
             output.having(features.outputs, "length")
         )
         """whether the resolve stage reads the lengths of a lens's rays"""
         self.resolve = kernels("resolve").make_resolve(
-            images, needs.outputs, self.has_ray_lengths, features.samples
+            images, requirements.outputs, self.has_ray_lengths, features.samples
         )
-        self.sensor = SensorKernel(needs.steps) if needs.steps else None
+        self.sensor = SensorKernel(requirements.steps) if requirements.steps else None
 
     def compile(self, kernel: Any, block: int = BLOCK) -> None:
         """Compile a kernel for the device. block: its threads on a GPU."""
@@ -198,11 +198,11 @@ class GradientKernels:
     """The kernels of the backward pass, compiled on first use."""
 
     def __init__(self, program: Program) -> None:
-        features, needs, config = program.features, program.needs, program.config
+        features, requirements, config = program.features, program.requirements, program.config
         rendered = {"rgb", *features.outputs}
         self.gradient_outputs = tuple(name for name in GRADIENT_OUTPUTS if name in rendered)
-        self.sh_coefficients = (features.sh_degree + 1) ** 2 if "color_sh" in needs.effects else 0
-        effects, outputs = needs.among(_SAMPLE), needs.blending
+        self.sh_coefficients = (features.sh_degree + 1) ** 2 if "color_sh" in requirements.effects else 0
+        effects, outputs = requirements.among(_SAMPLE), requirements.blending
         backward, names = (
             kernels("blend_backward"),
             kernels("fragment_backward").gradient_sum_names(effects, outputs),
@@ -212,7 +212,7 @@ class GradientKernels:
             self.blend = backward.make_blend_backward(effects, outputs, self.gradient_outputs, grouped, block)
             self.gradient_offsets = backward.make_gradient_offsets("lowpass_screen" in effects)
             made = kernels("project_backward").make_project_backward
-            self.project = made(needs.among(_PROJECT), outputs, names, self.sh_coefficients)
+            self.project = made(requirements.among(_PROJECT), outputs, names, self.sh_coefficients)
             self.sums = kernels("column_sums")
             program.compile(self.blend.kernel, block)
             for kernel in (self.gradient_offsets, self.project, self.sums.add_rows):

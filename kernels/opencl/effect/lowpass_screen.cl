@@ -50,30 +50,30 @@
 #endif
 
 static inline vint fragment_mask(const Splat *s, Intersection c, vfloat x, vfloat y, wide half_r2, wide filter,
-                                 vfloat *screen) {
-    *screen = 0.0f;
+                                 vfloat *lowpass_half_rho) {
+    *lowpass_half_rho = 0.0f;
     if (SKIPS_LOWPASS(s)) return c.inside;
     vfloat ex = x - s->lowpass_x;
     vfloat ey = y - s->lowpass_y;
-    *screen = FMA(ex, ex, ey * ey) * filter;
-    return c.inside | VMASK(*screen <= half_r2);
+    *lowpass_half_rho = FMA(ex, ex, ey * ey) * filter;
+    return c.inside | VMASK(*lowpass_half_rho <= half_r2);
 }
 //@ fragment_half_rho
-static inline vfloat fragment_half_rho(const Splat *s, Intersection c, vfloat inverse_d, vfloat screen) {
+static inline vfloat fragment_half_rho(const Splat *s, Intersection c, vfloat inverse_d, vfloat lowpass_half_rho) {
     vfloat half_rho = HALF_RHO(c, inverse_d);
-    return SKIPS_LOWPASS(s) ? half_rho : VSELECT(screen, VMIN(half_rho, screen), c.inside);
+    return SKIPS_LOWPASS(s) ? half_rho : VSELECT(lowpass_half_rho, VMIN(half_rho, lowpass_half_rho), c.inside);
 }
 //@ lowpass_intersection
-    vfloat screen;              // rho / 2 of the low-pass disc
+    vfloat lowpass_half_rho;              // rho / 2 of the low-pass disc
 //@ lowpass_mask
-            c.screen = screen;
+            c.lowpass_half_rho = lowpass_half_rho;
 //@ lowpass_attribute_depth
     // In the disc, the ray-plane intersection may be far outside of the splat. Beyond the circle rho = 2 ln 255, inside of which a splat
     // has at least 1/255 of its opacity, depths are reflected at the circle: the difference from the centre's depth is multiplied by
     // 2 ln 255 / rho and tends to 0 at the plane's horizon. Where the disc's rho is larger it defines the circle, which makes depth
     // continuous at the disc's border (docs/correctness.md).
     if (HAS_LOWPASS(s)) {
-        vfloat circle = VMAX(c.screen, (vfloat)WIDE(5.5412635451584261));
+        vfloat circle = VMAX(c.lowpass_half_rho, (vfloat)WIDE(5.5412635451584261));
         vint on_plane = VMASK((c.q * inverse_d) * inverse_d <= circle), beyond_near = VMASK(c.d <= s->d_near);
 //@@ camera_lowpass_depth
 //@@ coplanar_lowpass_depth

@@ -1,14 +1,14 @@
 // Backward pass of the low-pass `screen`: through the larger of the two weights, that of the plane or that of the disc.
 //@ fragment_branch
-static inline vint fragment_on_plane(const Splat *s, Intersection c, vfloat half_rho, vfloat screen) {
-    return HAS_LOWPASS(s) ? c.inside & VMASK(half_rho <= screen) : c.inside;
+static inline vint fragment_on_plane(const Splat *s, Intersection c, vfloat half_rho, vfloat lowpass_half_rho) {
+    return HAS_LOWPASS(s) ? c.inside & VMASK(half_rho <= lowpass_half_rho) : c.inside;
 }
 //@ lowpass_geometry
     vint lowpass;               // depth reflected at `circle`: z_center + circle (z_numerator - z_center D) D / q
     vfloat circle, q;
 //@ lowpass_geometry_make
     g.q = c.q;
-    g.circle = HAS_LOWPASS(s) ? max(screen, (vfloat)WIDE(5.5412635451584261)) : (vfloat)1e30f;
+    g.circle = HAS_LOWPASS(s) ? max(lowpass_half_rho, (vfloat)WIDE(5.5412635451584261)) : (vfloat)1e30f;
     vint ahead = VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
     flat = ahead & VMASK(g.half_rho <= g.circle);
     g.lowpass = ahead & ~flat;
@@ -18,7 +18,7 @@ static inline vint fragment_on_plane(const Splat *s, Intersection c, vfloat half
     vfloat per_q = 1.0f / g->q, grad_lowpass = VSELECT((vfloat)0.0f, grad_z * per_q, g->lowpass);
     vfloat scaled_d = g->circle * g->d;
     vfloat beyond = s->z_numerator - s->z_center * g->d;
-    vfloat grad_screen = VSELECT((vfloat)0.0f, grad_lowpass * beyond * g->d, VMASK(g->circle == screen));
+    vfloat grad_screen = VSELECT((vfloat)0.0f, grad_lowpass * beyond * g->d, VMASK(g->circle == lowpass_half_rho));
     grad_numerator = FMA(grad_lowpass, scaled_d, grad_numerator);
     grad_center = FMA(-grad_lowpass * scaled_d, g->d, grad_center);
     grad_d = FMA(grad_lowpass * g->circle, beyond - s->z_center * g->d, grad_d);

@@ -10,4 +10,4 @@
 //@ grad_weight
     grad_weight += FMA(gradient->depth, g->z, gradient->depth_weight);
 //@ fragment_backward
-    grad_d += add_depth(sums, s, g, weight * gradient->depth, screen, x, y, &grad_nu, &grad_nv);
+    grad_d += add_depth(sums, s, g, weight * gradient->depth, lowpass_half_rho, x, y, &grad_nu, &grad_nv);

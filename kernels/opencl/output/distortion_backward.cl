@@ -19,4 +19,4 @@
     vfloat inverse_z = 1.0f / VSELECT((vfloat)INFINITY, g->z, VMASK(g->z > SPREAD_NEAR));
     vfloat outward = FMA(gradient->spread_weight, FMA((vfloat)INVERSE_DEPTH, inverse_z, -gradient->spread_first), -gradient->spread_sum);
     grad_d += add_depth(sums, s, g, -2.0f * INVERSE_DEPTH * weight * gradient->distortion * outward * inverse_z * inverse_z,
-                      screen, x, y, &grad_nu, &grad_nv);
+                      lowpass_half_rho, x, y, &grad_nu, &grad_nv);

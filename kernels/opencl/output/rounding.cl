@@ -21,7 +21,7 @@ static inline vfloat alpha_rounding(const Splat *s, vfloat h) {
     return UNIT * (16.0f + 2.0f * fabs((vfloat)s->log_opacity) + 32.0f * fmin(h, (vfloat)100.0f));
 }
 
-static inline void add_rounding(Pixel *pixel, const Splat *s, Intersection c, vfloat x, vfloat y, vint mask, vfloat screen,
+static inline void add_rounding(Pixel *pixel, const Splat *s, Intersection c, vfloat x, vfloat y, vint mask, vfloat lowpass_half_rho,
                                 const BlendConstants *constants) {
     vfloat across = fabs(x), down = fabs(y);
     vfloat off = FORM_ROUNDING * (FORM_TERMS(s->nu0, s->nux, s->nuy) + FORM_TERMS(s->nv0, s->nvx, s->nvy));
@@ -32,7 +32,7 @@ static inline void add_rounding(Pixel *pixel, const Splat *s, Intersection c, vf
     vfloat furthest = VSELECT((vfloat)INFINITY, squared((root + off) / d_low), must);
 #ifdef HAS_LOWPASS
     if (HAS_LOWPASS(s)) {
-        vfloat away = sqrt(screen);
+        vfloat away = sqrt(lowpass_half_rho);
         vfloat off_lowpass = FORM_ROUNDING * (sqrt(constants->filter) * (1.0f + 2.0f * (across + down)) + 3.0f * away);
         nearest = fmin(nearest, squared(fmax(away - off_lowpass, (vfloat)0.0f)));
         furthest = fmin(furthest, squared(away + off_lowpass));
@@ -40,16 +40,16 @@ static inline void add_rounding(Pixel *pixel, const Splat *s, Intersection c, vf
 #endif
     vfloat high = fmin(fragment_alpha(s, nearest, 1.0f) * (1.0f + alpha_rounding(s, nearest)), (vfloat)1.0f);
     vfloat low = fragment_alpha(s, furthest, 1.0f) * (1.0f - alpha_rounding(s, furthest));
-    vfloat alpha = fragment_alpha(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->opacity_ceiling);
+    vfloat alpha = fragment_alpha(s, fragment_half_rho(s, c, INVERSE_D(c), lowpass_half_rho), constants->opacity_ceiling);
     alpha = VSELECT((vfloat)0.0f, alpha, mask);
     vint blended = mask & VMASK(pixel->t > 0.0f);
     pixel->rounding += pixel->t * fmax(high - alpha, alpha - low) + VSELECT((vfloat)0.0f, (vfloat)(1.5f * UNIT), blended);
 }
 //@ mask
 #if LANES == 1
-                add_rounding(&pixels[row], &s, c, x, y, mask, screen, &constants);
+                add_rounding(&pixels[row], &s, c, x, y, mask, lowpass_half_rho, &constants);
 #else
-            add_rounding(&pixel, &s, c, x, y, mask, screen, &constants);
+            add_rounding(&pixel, &s, c, x, y, mask, lowpass_half_rho, &constants);
 #endif
 //@ store
         BLOCK_STORE(pixel->rounding, rounding_raw + at, stride);

@@ -15,7 +15,7 @@
     vfloat z_numerator, z_center;
 //@ fragment_functions
 // Adds the gradient with respect to a fragment's depth at (x, y) from the anchor; returns the gradient with respect to D.
-static inline vfloat add_depth(Sums *sums, const Splat *s, const Geometry *g, vfloat grad_z, vfloat screen, vfloat x, vfloat y,
+static inline vfloat add_depth(Sums *sums, const Splat *s, const Geometry *g, vfloat grad_z, vfloat lowpass_half_rho, vfloat x, vfloat y,
                                vfloat *grad_nu, vfloat *grad_nv) {
     vfloat grad_numerator = VSELECT((vfloat)0.0f, grad_z * g->inverse_d, g->hit), grad_d = -grad_numerator * g->z;
     vfloat grad_center = VSELECT(grad_z, (vfloat)0.0f, g->hit), grad_q = 0.0f;     // grad_q n_u, grad_q n_v: gradients with respect to n_u, n_v

@@ -78,11 +78,11 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
                 wide y = (wide)(py + row - s.ay);
                 Intersection c = intersect_row(&s, nu_x, nv_x, d_x, y, half_r2);
 //@@ intersect
-                wide screen;
-                int mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
+                wide lowpass_half_rho;
+                int mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &lowpass_half_rho);
 //@@ mask
                 if (!COLOURS_ONLY && !VANY(mask & pixel_transmits(&pixels[row], &constants))) continue;
-                pixel_blend(&pixels[row], &s, c, mask, screen, &constants
+                pixel_blend(&pixels[row], &s, c, mask, lowpass_half_rho, &constants
 //@@ blend_arguments
                 );
             }

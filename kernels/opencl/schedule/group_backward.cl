@@ -30,23 +30,23 @@ typedef struct {            // a splat at a pixel, before transmittance is known
 } FragmentValues;
 
 static inline FragmentValues fragment_values(const Splat *s, int px, int py, const PixelGradient *gradient, const BlendConstants *constants) {
-    wide x, y, nu_x, nv_x, half_r2, screen;
+    wide x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
     Intersection c = intersect_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     FragmentValues values;
-    values.mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
-    values.alpha = fragment_alpha(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->opacity_ceiling);
-    const Geometry g = geometry_of(s, c, nu_x, nv_x, y, screen);
+    values.mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &lowpass_half_rho);
+    values.alpha = fragment_alpha(s, fragment_half_rho(s, c, INVERSE_D(c), lowpass_half_rho), constants->opacity_ceiling);
+    const Geometry g = geometry_of(s, c, nu_x, nv_x, y, lowpass_half_rho);
     values.grad_weight = fragment_by_weight(s, gradient, &g);
     return values;
 }
 
 // Attenuates a pixel by the splat; returns the alpha there.
 static inline wide forward_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants) {
-    wide x, y, nu_x, nv_x, half_r2, screen;
+    wide x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
     Intersection c = intersect_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
-    int mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
+    int mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &lowpass_half_rho);
     if (!VANY(mask)) return 0.0f;
-    return attenuate(pixel, fragment_alpha(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->opacity_ceiling), mask, constants);
+    return attenuate(pixel, fragment_alpha(s, fragment_half_rho(s, c, INVERSE_D(c), lowpass_half_rho), constants->opacity_ceiling), mask, constants);
 }
 
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
@@ -176,7 +176,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
 
 #undef GROUP
 #undef PARTS
-#define GROUP BACK_ITEMS
+#define GROUP BACKWARD_ITEMS
 #define PARTS (GROUP + 1)
 #define PIXELS_PER_ITEM (PIXELS / GROUP)                // pixels per work-item
 #define PATCH_W 8                            // of the 32 work-items of a warp
@@ -274,10 +274,10 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             float2 here = *at;
             if (here.y > 0.0f) {
                 const Splat s = staged[which].splat;
-                wide weight = here.x * here.y, x, y, nu_x, nv_x, half_r2, screen;
+                wide weight = here.x * here.y, x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
                 Intersection c = intersect_at(&s, px, y0 + top + 4 * k, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
-                fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
-                const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
+                fragment_mask(&s, c, x, y, half_r2, constants.filter, &lowpass_half_rho);
+                const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, lowpass_half_rho);
                 *at = (float2)(weight, backward_alpha(&gradients[k], fragment_by_weight(&s, &gradients[k], &g), weight, here.y));
             } else
                 (*at).x = 0.0f;
@@ -297,12 +297,12 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             uint at = row * TILE_W + column;
             float2 here = fragments[which * STRIDE + at];
             if (here.x == 0.0f) continue;
-            wide x, y, nu_x, nv_x, half_r2, screen;
+            wide x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
             Intersection c = intersect_at(&s, x0 + column, y0 + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
-            fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
-            const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
+            fragment_mask(&s, c, x, y, half_r2, constants.filter, &lowpass_half_rho);
+            const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, lowpass_half_rho);
             const PixelGradient gradient = shared[at];
-            add_fragment(&sums, &s, &gradient, &g, here.x, here.y, screen, x, y, &constants);
+            add_fragment(&sums, &s, &gradient, &g, here.x, here.y, lowpass_half_rho, x, y, &constants);
         }
     }
     const RecordGradient m = record_gradient_of(&sums, &constants);

@@ -43,11 +43,11 @@ kernel void blend(
             vfloat d_x = FMA((vfloat)s.dx, x, (vfloat)s.d0);
             Intersection c = intersect_row(&s, nu_x, nv_x, d_x, y, half_r2);
 //@@ intersect
-            vfloat screen;
-            vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
+            vfloat lowpass_half_rho;
+            vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &lowpass_half_rho);
 //@@ mask
 //@@ skip_fragment
-            pixel_blend(&pixel, &s, c, mask, screen, &constants
+            pixel_blend(&pixel, &s, c, mask, lowpass_half_rho, &constants
 //@@ blend_arguments
             );
             if (UNLIKELY(!VANY(pixel_unfinished(&pixel, &constants)))) {

@@ -29,7 +29,7 @@ typedef struct {            // pixels of a tile's first block, relative to a spl
 } BlockOrigin;
 
 typedef struct {            // a splat in a block: pixel positions relative to its anchor, and its forms
-    vfloat x, y, nu_x, nv_x, screen;
+    vfloat x, y, nu_x, nv_x, lowpass_half_rho;
     vint mask;
     Intersection intersection;
 } Block;
@@ -47,7 +47,7 @@ static inline Block block_of(const Splat *s, const Tile *tile, const BlockOrigin
     b.nu_x = FMA((vfloat)s->nux, b.x, (vfloat)s->nu0);
     b.nv_x = FMA((vfloat)s->nvx, b.x, (vfloat)s->nv0);
     b.intersection = intersect_row(s, b.nu_x, b.nv_x, FMA((vfloat)s->dx, b.x, (vfloat)s->d0), b.y, half_r2);
-    b.mask = fragment_mask(s, b.intersection, b.x, b.y, half_r2, tile->constants->filter, &b.screen);
+    b.mask = fragment_mask(s, b.intersection, b.x, b.y, half_r2, tile->constants->filter, &b.lowpass_half_rho);
     return b;
 }
 
@@ -61,7 +61,7 @@ static inline uint forward_splat(const Splat *s, const Tile *tile, Pixel *pixels
         int block = 31 - clz((int)(touched & -touched));
         const Block b = block_of(s, tile, &at, block);
         if (UNLIKELY(!VANY(b.mask))) continue;
-        vfloat half_rho = fragment_half_rho(s, b.intersection, INVERSE_D(b.intersection), b.screen);
+        vfloat half_rho = fragment_half_rho(s, b.intersection, INVERSE_D(b.intersection), b.lowpass_half_rho);
         vfloat alpha = fragment_alpha(s, half_rho, constants->opacity_ceiling);
         tape->transmittance[length] = pixels[block].t;
         tape->alpha[length++] = attenuate(&pixels[block], alpha, b.mask, constants);
@@ -83,10 +83,10 @@ static inline void backward_splat(const Splat *s, const Tile *tile, global Tape 
     for (; blocks != 0; blocks &= blocks - 1, at++) {
         int block = 31 - clz((int)(blocks & -blocks));
         const Block b = block_of(s, tile, &corner, block);
-        const Geometry g = geometry_of(s, b.intersection, b.nu_x, b.nv_x, b.y, b.screen);
+        const Geometry g = geometry_of(s, b.intersection, b.nu_x, b.nv_x, b.y, b.lowpass_half_rho);
         vfloat alpha = tape->alpha[at], weight = tape->transmittance[at] * alpha;
         vfloat grad_log = backward_alpha(&gradients[block], fragment_by_weight(s, &gradients[block], &g), weight, alpha);
-        add_fragment(&sums, s, &gradients[block], &g, weight, grad_log, b.screen, b.x, b.y, constants);
+        add_fragment(&sums, s, &gradients[block], &g, weight, grad_log, b.lowpass_half_rho, b.x, b.y, constants);
     }
     const Parts m = record_gradient_of(&sums, constants);
 #if LANES == 16
