@@ -26,8 +26,8 @@ def make_ellipsoids_backward(effects: tuple[str, ...]):
         grad_b: wp.vec3d,
         grad_ellipsoid_term: wp.float64,
     ):
-        """Gradients with respect to the scaled axes, in rows, and the centre. grad_ellipsoid_term: with respect to
-        2 / m^2.
+        """Gradients with respect to the scaled axes, in rows, and the centre. grad_ellipsoid_term: with
+        respect to 2 / m^2.
 
         The disk's tangents a, b and p / m are the images of unit vectors e1, e2, e3 under V, whose columns
         are the scaled axes; V^-1 p = m e3. The splat depends on a a^T + b b^T only, so that e1 and e2 rotate

@@ -38,7 +38,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
     """whether records have edges of boxes; whether they have a flag for boxes"""
     of_box, optics = make_boxes(real), make_optics(camera, real) if camera else None
     Lens = make_lens(camera)
-    at_lowpass, at_depth, at_edges, at_ray, at_plane, at_flag, at_bulge = (
+    at_lowpass, at_depth, at_edges, at_ray, at_plane, at_flag, at_ellipsoid_term = (
         layout.word(name)
         for name in ("lowpass_x", "z_numerator", "edge_u0", "nuz", "plane_z0", "boxed", "ellipsoid_term")
     )
@@ -138,7 +138,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
             record[at_lowpass] = wp.where(in_front and not itself, float(center_x - anchor_x), 1.0e18)
             record[at_lowpass + 1] = wp.where(in_front, float(center_y - anchor_y), 1.0e18)
         if wp.static(exact):
-            record[at_bulge] = float(two * inverse_m2)
+            record[at_ellipsoid_term] = float(two * inverse_m2)
         if wp.static(parallel):
             # D times the depth
             record[7] = wp.inf
