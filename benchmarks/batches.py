@@ -15,7 +15,7 @@ import numpy as np
 from measuring import PROGRESS, facts, keep, options, show
 
 import fidsplat as fs
-from fidsplat.capture.views import Views, pose_matrices
+from fidsplat.capture.views import CaptureBatch, pose_matrices
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.scenes.random_clouds import load_scene
 from fidsplat.splats.rotations import matrix_to_quaternion
@@ -82,7 +82,7 @@ def measure(renderer: fs.Renderer, name: str, repeats: int) -> dict:
         timer.run(timed=number > 1)
     batch = draw()
     some = np.linspace(0, row.views - 1, min(_ALONE, row.views)).astype(int)
-    captures = [Views((capture,), pose_matrices("poses", poses[[k]])).capture(0) for k in some]
+    captures = [CaptureBatch((capture,), pose_matrices("poses", poses[[k]])).capture(0) for k in some]
     single = Timer(lambda: [renderer.render(resident, each) for each in captures][-1].wait())
     for number in range(3):
         single.run(timed=number > 0)

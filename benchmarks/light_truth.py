@@ -33,7 +33,7 @@ from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.util.files import atomic_write, writable_folder
 from fidsplat.util.provenance import run_facts
-from fidsplat.util.response import to_colors, to_light
+from fidsplat.util.response import linear_light, to_colors
 from fidsplat.vision.readers import Target, attempt, readers
 
 SIZE = 0.2
@@ -366,7 +366,7 @@ def main() -> int:
         shown = [
             (f"{case.name}, {name}", to_uint8(image))
             for name, image in (
-                ("ours", to_colors(to_light(own[0], case.colors), "srgb")),
+                ("ours", to_colors(linear_light(own[0], case.colors), "srgb")),
                 ("Cycles", to_colors(truth[0], "linear" if case.emits else "srgb")),
             )
         ]
@@ -407,7 +407,7 @@ def compare(case: Case, own: list[np.ndarray], truth: list[np.ndarray]) -> dict[
         light = {"ours": own, "Cycles": truth}
         return {"views": len(own)} | {f"1/{k}": detection(case, light, k) for k in (1, 2, 3)}
     if case.shape is not None and not case.emits:
-        return smooth_errors([(to_light(a, "srgb"), b) for a, b in zip(own, truth, strict=True)])
+        return smooth_errors([(linear_light(a, "srgb"), b) for a, b in zip(own, truth, strict=True)])
     if case.shape is not None:
         apart = corner_distances(case, list(zip(own, shown, strict=True)))
         differ = [float(np.abs(a - b).mean()) for a, b in zip(own, shown, strict=True)]
@@ -417,7 +417,7 @@ def compare(case: Case, own: list[np.ndarray], truth: list[np.ndarray]) -> dict[
             "p95_px": float(np.percentile(apart, 95)),
             "mean_difference": float(np.mean(differ)),
         }
-    pairs = [(to_light(a, "srgb"), b) for a, b in zip(own, truth, strict=True)]
+    pairs = [(linear_light(a, "srgb"), b) for a, b in zip(own, truth, strict=True)]
     errors = radiance_errors(case, pairs)
     facts: dict[str, Any] = {
         name: {

@@ -33,7 +33,7 @@ from fidsplat.splats.rotations import nearest_rotation, quaternion_to_matrix, ri
 from fidsplat.train import Dataset, Trainer, TrainingView, load_dataset
 from fidsplat.train.masks import undistorted_view
 from fidsplat.train.view_refinement import alignment, moved
-from fidsplat.util.response import to_colors, to_light
+from fidsplat.util.response import linear_light, to_colors
 from fidsplat.vision.pose import pose_error
 from fidsplat.worlds.greenhouse import Greenhouse
 from fidsplat.worlds.plants import disks
@@ -163,7 +163,7 @@ def mesh_of(clouds, rng: np.random.Generator) -> dict:
         off = rng.uniform(0, 1, (len(cloud), 1)) * normal * np.sign(-normal @ (0, 1, -0.5))[:, None]
         corners.append((cloud.world_means()[:, None] + off[:, None] + ring).reshape(-1, 3))
         colors = cloud.colors if cloud.colors is not None else cloud.plain_colors
-        albedo.append(to_light(np.clip(colors, 0, 1), "srgb"))
+        albedo.append(linear_light(np.clip(colors, 0, 1), "srgb"))
     count = sum(map(len, corners))
     faces = np.arange(count).reshape(-1, 8).tolist()
     boxes = (

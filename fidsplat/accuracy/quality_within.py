@@ -253,7 +253,8 @@ def _best_of(
 ) -> Choice:
     """Search with base qualities of increasing `detail_error`; returns the choice with the lowest error.
 
-    Bases whose `detail_error` is above the lowest error found are not tried. first: return the first choice.
+    Bases whose `detail_error` is above the lowest error found are not tried. first: return the choice of the
+    first base for which the search succeeds.
     """
     best, refused = None, None
     for base in bases:

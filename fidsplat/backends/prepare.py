@@ -10,7 +10,7 @@ import numpy as np
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.view import FAR_EYE, SubFrame, View, rotated
 from fidsplat.capture.capture import Capture
-from fidsplat.capture.views import Views
+from fidsplat.capture.views import CaptureBatch
 from fidsplat.effects import FeatureSet, select
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.traits import PlacedTraits
@@ -35,7 +35,7 @@ def prepare(cloud: PlacedTraits, capture: Capture) -> _Prepared:
     return cached[cloud]
 
 
-def prepare_batch(cloud: PlacedTraits, views: Views) -> tuple[FeatureSet, ViewBatch]:
+def prepare_batch(cloud: PlacedTraits, views: CaptureBatch) -> tuple[FeatureSet, ViewBatch]:
     """The features that the views of a batch require, and the batch of rendered views. Raises InputError as
     `prepare`, and if the views have different effects."""
     rendered = views.active

@@ -11,7 +11,7 @@ import numpy as np
 
 from fidsplat.util.arguments import as_float, invalid, items, number, python_scalars, whole_number
 from fidsplat.util.errors import InputError
-from fidsplat.util.response import to_light
+from fidsplat.util.response import linear_light
 
 RESPONSES = ("linear", "srgb")
 BITS = (8, 16)
@@ -157,7 +157,7 @@ class Sensor:
         rendered without a sensor."""
         if not self.needs_metering:
             return self
-        mean = to_light(colors, self.decode).reshape(-1, 3).mean(axis=0)
+        mean = linear_light(colors, self.decode).reshape(-1, 3).mean(axis=0)
         glare = self.glare_light or tuple(mean.tolist())
         # scattering changes the mean only if glare_light is given
         mean = (1 - self.veiling_glare) * mean + self.veiling_glare * np.array(glare)

@@ -17,8 +17,8 @@ from fidsplat.util.errors import InputError
 
 
 @dataclass(frozen=True)
-class Views:
-    """The v views of a batch: captures, and poses that replace poses of the captures."""
+class CaptureBatch:
+    """Batch of v views: captures, and poses that replace poses of the captures."""
 
     captures: tuple[Capture, ...]
     """one for each view, or one for all"""
@@ -100,8 +100,10 @@ class Views:
                     )
 
 
-def views_of(captures: Iterable[Capture], poses: Any = None, groups: Any = None, mask: Any = None) -> Views:
-    """Validated views, from the arguments of `Renderer.render_batch`."""
+def capture_batch(
+    captures: Iterable[Capture], poses: Any = None, groups: Any = None, mask: Any = None
+) -> CaptureBatch:
+    """Validated batch of captures, from the arguments of `Renderer.render_batch`."""
     if groups is not None and not isinstance(groups, Mapping):
         raise InputError(f"groups must be {{label: poses (views, 7)}}, got {groups!r}")
     for label in groups or ():
@@ -113,7 +115,7 @@ def views_of(captures: Iterable[Capture], poses: Any = None, groups: Any = None,
         if mask.ndim != 1:
             raise InputError(f"mask must be (views,) bools, got the shape {mask.shape}")
     matrices = None if poses is None else pose_matrices("poses", poses)
-    views = Views(tuple(captures), matrices, moved or None, mask)
+    views = CaptureBatch(tuple(captures), matrices, moved or None, mask)
     views.check_sizes()
     return views
 

@@ -285,7 +285,7 @@ class Drive:
             yield k, [(code, self.tags[code.id]) for code in codes if code.id in self.tags], run.poses[k]
 
     def ideal_corners(self, run: Run, detections: list[list[Detection]]) -> list[list[Detection]]:
-        """Detected tags with ideal instead of detected corners."""
+        """Detected tags with corners projected from the true pose."""
         return [
             [replace(code, corners=camera_at(self.camera, pose).project(tag.corners)) for code, tag in pairs]
             for _, pairs, pose in self._known(run, detections)

@@ -140,17 +140,17 @@ def _record(settings: PlantSettings, folder: Path) -> None:
     """Record the settings in the folder. Raises InputError if other settings are recorded there."""
     file = folder / SETTINGS
     # the numbers of plants may be increased later
-    recorded = {name: value for name, value in asdict(settings).items() if name not in ("kind", "each")}
-    recorded["sources"] = code_hash()
+    requested = {name: value for name, value in asdict(settings).items() if name not in ("kind", "each")}
+    requested["sources"] = code_hash()
     try:
-        before = from_json(read_text(file)) if file.exists() else recorded
+        recorded = from_json(read_text(file)) if file.exists() else requested
     except ValueError as error:
         raise InputError(f"cannot read {file}: {error}; give another folder") from error
-    if before != recorded:
+    if recorded != requested:
         raise InputError(
-            f"plants in {folder} must be of the settings {recorded}, got {before}; give another folder"
+            f"plants in {folder} must have the settings {requested}, got {recorded}; give another folder"
         )
-    write_json(file, recorded)
+    write_json(file, requested)
 
 
 def _render(settings: PlantSettings, mesh: Mesh, out: Path, python: Path, progress: Progress) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.util.errors import InputError, unknown
-from fidsplat.util.response import to_light
+from fidsplat.util.response import linear_light
 
 SEED = 0
 MARKERS = 5
@@ -20,7 +20,7 @@ PLANE = 2.0
 """edge in metres of a marker's plane, including the quiet zone"""
 BACKGROUND = 128 / 255
 """grey background: a display value that 8 bits represent exactly"""
-BACKGROUND_LIGHT = float(to_light(np.array(BACKGROUND), "srgb"))
+BACKGROUND_LIGHT = float(linear_light(np.array(BACKGROUND), "srgb"))
 """linear light of the background"""
 
 

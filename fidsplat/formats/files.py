@@ -71,7 +71,7 @@ NAMED = {
 }
 """formats by file name"""
 _UNREAD = {
-    **dict.fromkeys((".ksplat", ".lcc", ".lcc2"), "convert it by splat-transform"),
+    **dict.fromkeys((".ksplat", ".lcc", ".lcc2"), "convert it with splat-transform"),
     ".ckpt": "convert it by ns-export gaussian-splat of nerfstudio",
     ".pt": "convert it by gsplat.export_splats",
     ".spx": "convert it by gsbox",

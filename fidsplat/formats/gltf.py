@@ -61,7 +61,7 @@ def load_gltf(path: Path) -> SplatCloud:
         used = ", ".join(map(str, document.get("extensionsUsed") or ["none"]))
         raise InputError(
             f"{path} must have splats, got no primitive with {EXTENSION} (extensions: {used}); export them "
-            "again by splat-transform"
+            "again with splat-transform"
         )
     return clouds[0] if len(clouds) == 1 else SplatCloud.concatenate(clouds)
 
@@ -160,7 +160,7 @@ def _check_version(path: Path, version: str) -> None:
     if version.partition(".")[0] != "2":
         raise InputError(
             f"{path}: the version of glTF must be 2, got {version}; convert it by gltf-pipeline, or export "
-            "it again by splat-transform"
+            "it again with splat-transform"
         )
 
 
@@ -292,7 +292,8 @@ class _Reader:
         wrong = values[~(np.abs(values) < 2**24) | (values % 1 != 0)]
         if len(wrong):
             raise InputError(
-                f"{self._path}: the attribute {name} must have whole numbers below 2^24, got {wrong[0]:.9g}"
+                f"{self._path}: the attribute {name} must have whole numbers below 2^24, got {wrong[0]:.9g}; "
+                "export the file with smaller ids, or without them"
             )
         return values.astype(np.int32)
 

@@ -12,7 +12,7 @@ from fidsplat.formats.gltf import gltf_document, pack_glb
 from fidsplat.formats.ply_header import header_bytes
 from fidsplat.util.errors import InputError, required_package
 from fidsplat.util.files import write_file
-from fidsplat.util.response import to_light
+from fidsplat.util.response import linear_light
 
 MESH_FORMATS = (".glb", ".ply", ".obj", ".stl", ".xml")
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -142,7 +142,7 @@ def _glb(mesh: TriangleMesh) -> bytes:
     points, faces = mesh.vertices.astype("<f4"), mesh.faces.astype("<u4")
     arrays = [(faces.reshape(-1, 1), 5125), (points, 5126)]
     if len(mesh.colors):
-        linear = to_light(np.clip(mesh.colors, 0, 1), "srgb")  # glTF requires linear colours
+        linear = linear_light(np.clip(mesh.colors, 0, 1), "srgb")  # glTF requires linear colours
         arrays.append((linear.astype("<f4"), 5126))
     attributes = {"POSITION": 1} | ({"COLOR_0": 2} if len(mesh.colors) else {})
     document, binary = gltf_document(

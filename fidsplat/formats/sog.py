@@ -69,7 +69,7 @@ def _cloud(path: Path, part: Parts) -> SplatCloud:
     version = meta.get("version", 1)
     if version not in (1, 2):
         raise InputError(
-            f"{path}: the version of SOG must be 1 or 2, got {version!r}; convert it by splat-transform"
+            f"{path}: the version of SOG must be 1 or 2, got {version!r}; convert it with splat-transform"
         )
     count = int(meta["count"] if version == 2 else meta["means"]["shape"][0])
     high_sh, palette = meta.get("shN"), None

@@ -83,7 +83,7 @@ def read_streamed(path: Path) -> StreamedSog:
         meta = from_json(read_input(path, _MAX_META))
         if meta.get("version", 1) != 1:
             raise InputError(
-                f"{path}: the version of streamed SOG must be 1, got {meta['version']!r}; convert it by "
+                f"{path}: the version of streamed SOG must be 1, got {meta['version']!r}; convert it with "
                 "splat-transform"
             )
         levels = int(meta["lodLevels"])

@@ -60,7 +60,7 @@ def _parse_qr(text: str, head: str, rest: str) -> QrSpec:
     if level not in _LEVELS:
         raise InputError(f"the error level of a QR code must be {', '.join(_LEVELS)}, got {level!r}")
     if not rest:
-        raise InputError(f"a QR spec must have a text, got {text!r}")
+        raise InputError(f"a QR spec must have a text, for example qr:hello, got {text!r}")
     return QrSpec(text=text, kind="qr", payload=rest, version=number, level=level)
 
 

@@ -59,7 +59,7 @@ class ImageMapping(Mapping[str, np.ndarray]):
         """The image on its device, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3); of a
         batch also a pyopencl.array.Array, (views, h, w) or (views, h, w, 3).
 
-        The frame or batch owns the array; the next one has a new array. `wp.to_torch`, DLPack and
+        The array belongs to this frame or batch; later frames do not overwrite it. `wp.to_torch`, DLPack and
         `__cuda_array_interface__` convert it to a tensor on the same device.
 
         Raises:
@@ -75,10 +75,10 @@ class ImageMapping(Mapping[str, np.ndarray]):
     @property
     def timings(self) -> Mapping[str, float]:
         """Milliseconds on the device by stage, for all views together: project, sort, bin, blend, resolve;
-        `error`: all stages of the reference image of the output `error`.
+        `error`: all stages of the second image that the output `error` renders.
 
-        On a GPU a replayed frame is rendered again to measure them, since timing each launch would slow down
-        all frames. Empty if its cloud has been released.
+        On a GPU, most frames replay a recorded command list, and are rendered again to measure these times,
+        since timing each launch would slow down all frames. Empty if the frame's cloud has been released.
         """
         return self._images.timings
 

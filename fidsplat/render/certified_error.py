@@ -25,8 +25,9 @@ where the first term is measured, for any requested quality, and the second is b
 4. Rounding T changes the colour behind a fragment by at most 2^-24 T C. Rounding the colour sum changes it by
    at most 2^-24 (1 - T) C. C is the largest absolute colour. Both together change it by at most 2^-24 C per
    fragment. Rounding the products T alpha and T alpha c adds at most 2^-24 C each for all fragments of a
-   pixel together. `rounding` therefore contains 1.5 x 2^-24 per fragment. The sums over samples, sub-frames
-   and spherical harmonics add 2^-24 C for each of their roundings (`error_reference`).
+   pixel together. The sum for n fragments, n + 2, is below 1.5 n, which `rounding` contains, plus 2, which
+   `error_reference` adds. It also adds 2^-24 C for each rounding of the sums over samples, over sub-frames
+   (the camera poses that a shutter averages) and over spherical harmonics.
 
 R and C are bounded by the colours of all splats and of the background. Q is composited in float64 if an
 effect is not in `_BOUNDED` or rgb is composited in float64. Then only the conversion of its image to float32
@@ -163,7 +164,8 @@ def error_reference(data: Any, capture: Capture, backend: Backend) -> ErrorRefer
         )
     quality = ideal_quality(capture.quality, cutoff_of(data.count))
     features, view = _prepared(data, capture, quality, backend)
-    # float32 roundings in the sums of samples, sub-frames and spherical harmonics
+    # float32 roundings outside of the blending loop: 8 for the products of step 4, the background and the
+    # conversions of the image; then the sums of samples, sub-frames and spherical harmonics
     roundings = 8 + features.samples**2 + len(view.sub_frames) + (32 if features.sh_degree else 0)
     low, high = data.color_range()
     for color in _colors_behind(view):
@@ -189,6 +191,7 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
     unbounded = sorted({*features.effects} - _BOUNDED)
     if not unbounded and quality.blend_precision != "float64":
         return replace(features, outputs=("rounding",)), view
+    # gradients and panoramas are evaluated along float32 rays, also with float64 blending
     float32_rays = any(name.startswith("background_") for name in unbounded)
     with suppress(InputError):
         in_float64 = prepare(data, replace(capture, quality=quality.with_(blend_precision="float64")))
@@ -217,7 +220,7 @@ def _refuse_unbounded(capture: Capture) -> None:
         name = next((name for prefix, name in _SENSOR_ARGUMENTS.items() if step.startswith(prefix)), step)
         effect, remedy = f"a sensor with {name}={getattr(capture.sensor, name)!r}", "with fs.Sensor()"
     elif camera is not None and math.isfinite(camera.far):
-        # whether `far` culls a splat depends on the cut-off
+        # a smaller cut-off enlarges splats: the reference image contains splats that `far` culls in rgb
         effect, remedy = f"a camera whose far is {camera.far:g} m", "with a camera whose far is infinite"
     else:
         return

@@ -1,4 +1,5 @@
-"""External depth images of simulators that render with Warp."""
+"""External depth images of simulators that render with Warp: colours and depths of meshes, which are
+composited with the splats."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from fidsplat.render.renderer import Renderer
 MESH_LABEL = -2
 """label of mesh 0 (geom or body) of a simulator; mesh i has MESH_LABEL - i"""
 MESH_OFFSET = 2e-3
-"""metres by which meshes of simulators are offset away from the camera"""
+"""metres by which meshes are offset away from the camera, so that markers on them are visible"""
 
 
 def device_external_depth(
@@ -28,7 +29,7 @@ def device_external_depth(
     images = [wp.empty(packed.shape, dtype=dtype, device=device) for dtype in (wp.vec3, wp.float32, wp.int32)]
     arguments = [packed, depths, ids, red_bit, MESH_LABEL, MESH_OFFSET]
     with quiet():
-        kernel = kernels("surfaces").unpack_surfaces
+        kernel = kernels("mesh_images").unpack_mesh_images
         wp.launch(kernel, packed.shape, arguments, images, device=device, record_tape=False)
     images = [image.reshape((len(packed), *size)) for image in images]
     if device == getattr(renderer.backend, "device", None):

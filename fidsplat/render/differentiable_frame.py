@@ -54,8 +54,8 @@ class DifferentiableFrame(Frame):
             (n, k, 3); `thickness` (n,) [1/m], the third scale, if there are 3D Gaussians, 0 for disks. Also
             `background` (3,); `pose` (6,), a rotation vector [1/rad] and a translation [1/m] applied after
             `world_to_camera`, in camera axes; `grad2d` (n,), the densification statistic of 2DGS trainers:
-            the norm of the derivative with respect to the projected centre, in half image sizes. Splats that
-            are not rendered have zeros.
+            the norm of the derivative with respect to the projected centre in normalised device coordinates
+            (-1 to 1 across the image). Splats that are not rendered have zeros.
 
         Raises:
             InputError: the device has rendered another frame since; the output of a gradient was not
@@ -66,7 +66,9 @@ class DifferentiableFrame(Frame):
         flag("on_device", on_device)
         instance("gradients", gradients, Mapping, "arrays by the name of their output")
         if not self._images.shares_arrays:
-            gradients = {name: host_array(f"the gradient of {name}", by) for name, by in gradients.items()}
+            gradients = {
+                name: host_array(f"the gradient of {name}", gradient) for name, gradient in gradients.items()
+            }
         arrays = {name: _numeric_array(name, value) for name, value in gradients.items()}
         with self._lock:
             results = self._pipeline.backward(self._forward, arrays)

@@ -99,7 +99,7 @@ class FlightFolder:
     and, for the lenses of nerfstudio, in transforms.json, which makes the folder a training data set.
 
     Args:
-        overwrite: whether frames of another flight are replaced.
+        overwrite: whether existing frames are deleted and rendered again.
         source: file of the scene, recorded for `fidsplat view`.
 
     Raises:
@@ -184,7 +184,7 @@ class FlightFolder:
         return write_video(path, (read_image(file) for file in self.previews()), rate)
 
     def _clear(self) -> None:
-        """Delete frames of another flight, which have the same file names."""
+        """Delete existing frames, also of another flight, which have the same file names."""
         for name in self.flight.capture.outputs:
             for suffix in suffixes_of(name):
                 for file in (self.folder / name).glob(f"[0-9][0-9][0-9][0-9][0-9][0-9]{suffix}"):

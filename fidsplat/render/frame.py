@@ -9,7 +9,7 @@ import numpy as np
 
 from fidsplat.backends.interface import HostImages, Images
 from fidsplat.capture.capture import Capture
-from fidsplat.capture.views import Views
+from fidsplat.capture.views import CaptureBatch
 from fidsplat.render.array_export import ImageMapping, SceneIndices, check_process, with_scene_indices
 from fidsplat.render.certified_error import ErrorImage
 from fidsplat.streaming.bands import BandData
@@ -23,10 +23,12 @@ class Frame(ImageMapping):
     Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median`, `depth_first` (h, w)
     metres along z, `distance`, `distance_median`, `distance_first` metres along the ray; `normal` (h, w, 3)
     unit, camera frame, towards the camera, `normal_world` the same in the world's axes; `label`, `splat_id`
-    (h, w) int32; `blended` (h, w) int32, number of composited splats; `error` (h, w), an upper bound of
-    |rgb - ideal| (fidsplat/render/certified_error.py). In pixels with an alpha below 1/255 (`_first`
-    outputs: below `Quality.first_hit`) `label` and `splat_id` are -1, and depths, distances and
-    normals are 0.
+    (h, w) int32, of the fragment with the largest weight; `blended` (h, w) int32, number of composited
+    splats; `error` (h, w), an upper bound of |rgb - ideal| (fidsplat/render/certified_error.py).
+    `depth_median` is where the transmittance falls to one half, `depth_first` where the accumulated opacity
+    reaches `Quality.first_hit` (docs/rendering.md has the definitions). In pixels with an alpha below 1/255
+    (`_first` outputs: below `first_hit`) `label` and `splat_id` are -1, and depths, distances and normals
+    are 0.
     """
 
     _noun = "frame"
@@ -132,13 +134,13 @@ class FrameBatch(ImageMapping):
     (views, h, w, channels), which are copied from the device on first use.
 
     Names, types and units are those of Frame. Masked views are -1 in `label` and `splat_id`, and 0 in all
-    other outputs. View i is bit-identical to `Renderer.render` of that view, except for scenes on disk with
-    `detail_error` above 0 (`Renderer.render_batch`).
+    other outputs. View i is bit-identical to `Renderer.render` of that view, except for scenes on disk whose
+    levels of detail are used (`Quality.detail_error` above 0; see `Renderer.render_batch`).
     """
 
     _noun = "batch"
 
-    def __init__(self, images: Images, views: Views, scene_indices: SceneIndices = None) -> None:
+    def __init__(self, images: Images, views: CaptureBatch, scene_indices: SceneIndices = None) -> None:
         super().__init__(images, views.captures[0].outputs, scene_indices)
         self._views, self.views = views, images.views
         """Number of views, including masked ones."""
@@ -165,7 +167,7 @@ class FrameBatch(ImageMapping):
 
 
 def _host_batch(
-    arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int], views: Views
+    arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int], views: CaptureBatch
 ) -> FrameBatch:
     return FrameBatch(HostImages(arrays, timings, stats), views)
 

@@ -18,13 +18,13 @@ from fidsplat.render.irradiance import LightField
 from fidsplat.render.reflection import GlossyBrdf, fit_harmonics, fresnel, view_directions
 from fidsplat.render.shadows import LightPoint, ReceiverPoints, light_points, shadow_casters, visibility
 from fidsplat.scenes import PlacedMarker, Scene
-from fidsplat.scenes.lights import GRIDS, Light, Lighting, PointLight
+from fidsplat.scenes.lights import PANORAMAS_PER_SIDE, Light, Lighting, PointLight
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import rotation_of_coefficients
 from fidsplat.splats.rotations import quaternion_to_matrix
 from fidsplat.util.directions import unit
 from fidsplat.util.errors import InputError
-from fidsplat.util.response import to_light
+from fidsplat.util.response import linear_light
 
 MAX_PARTS_PER_MODULE = 8
 """maximum number of parts per module, along each axis, into which a box splat of a marker is split"""
@@ -149,12 +149,16 @@ class _IncomingLight(NamedTuple):
     irradiance: np.ndarray
     """(m, 3) at each point"""
     field: LightField
-    points: list[tuple[LightPoint, np.ndarray]]
+    lights: list[tuple[LightPoint, np.ndarray]]
     """points of lights, with the visibility (m,) of each from the sample points"""
 
 
 def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
-    """The marker in the colours of its light, without `light`."""
+    """The marker in the colours of its light, without `light`.
+
+    Glossy markers: with view='camera' their colours hold for the scene's camera only, with 'any' they are
+    spherical harmonics.
+    """
     lighting = Lighting.of(placed.light)
     assert lighting is not None
     _check_roughness(lighting, environment)
@@ -162,14 +166,13 @@ def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
     points = _points(placed, lighting)
     incoming = _incoming_light(placed, lighting, points, environment)
     brdf = None if lighting.roughness is None else GlossyBrdf(lighting.roughness, lighting.reflectance)
-    diffuse = incoming.irradiance / np.pi
+    diffuse, specular = incoming.irradiance / np.pi, np.zeros(3)
     if brdf is not None and lighting.view == "camera":
-        reflected, transmitted = _reflection_to_camera(points, incoming, brdf, environment)
-        diffuse = np.concatenate([diffuse * transmitted[:, None], reflected], 1)
-    albedo = lighting.ink + (lighting.paper - lighting.ink) * to_light(_rgb(cloud), "srgb")
-    radiance = albedo[points.splat] * diffuse[:, :3]
-    if diffuse.shape[1] > 3:
-        radiance = radiance + diffuse[:, 3:]
+        specular, transmitted = _reflection_to_camera(points, incoming, brdf, environment)
+        diffuse = diffuse * transmitted[:, None]
+    albedo = lighting.ink + (lighting.paper - lighting.ink) * linear_light(_rgb(cloud), "srgb")
+    radiance = albedo[points.splat] * diffuse + specular
+    # highlights move over parts with harmonics, which are therefore at most a module wide
     max_points = None if brdf is None or lighting.view == "camera" else MAX_PARTS_PER_MODULE
     splat, extents, part = _split(points, radiance, lighting.step, max_points)
     means, scales = _placed_parts(cloud, points, splat, extents)
@@ -179,8 +182,8 @@ def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
     if brdf is None or lighting.view == "camera":
         colors["colors"] = lighting.encode(mean)
     else:
-        lights = [(point, np.bincount(part, visible) / count) for point, visible in incoming.points]
-        incoming = incoming._replace(points=lights)
+        lights = [(point, np.bincount(part, visible) / count) for point, visible in incoming.lights]
+        incoming = incoming._replace(lights=lights)
         sh = _harmonics_of_parts(placed, lighting, cloud, splat, means, mean, incoming)
         # back to the marker's frame, from which the scene rotates harmonics to the world
         colors["sh"] = rotation_of_coefficients(3, placed.pose[:3, :3].T) @ sh
@@ -272,7 +275,7 @@ def _field(
         frames = environment.panoramas(panorama_points, lighting.rows, 1e-4, **fields)
         panoramas = []
         for frame in frames:
-            radiance = to_light(frame["rgb"], lighting.response).reshape(-1, 3)
+            radiance = linear_light(frame["rgb"], lighting.response).reshape(-1, 3)
             if lighting.ambient is not None:
                 radiance = radiance + (1 - np.asarray(frame["alpha"]).reshape(-1, 1)) * lighting.ambient
             panoramas.append(radiance)
@@ -286,7 +289,9 @@ def _field(
             )
         return LightField.uniform(lighting.ambient or (0.0, 0.0, 0.0))
     normal = unit(surface.normals.mean(axis=0))
-    levels = tuple(count for count in GRIDS if 3 <= count <= lighting.panoramas) or (lighting.panoramas,)
+    levels = tuple(count for count in PANORAMAS_PER_SIDE if 3 <= count <= lighting.panoramas) or (
+        lighting.panoramas,
+    )
     field = LightField.measured(lighting.rows, levels, positions, radiance_at, normal, lighting.step)
     if lighting.ambient is None and field.radiance.max() < _DARK:
         raise InputError(
@@ -368,7 +373,7 @@ def _reflection_to_camera(
         viewers = np.broadcast_to(-camera.world_to_camera[2, :3], surface.points.shape)
     else:
         viewers = unit(camera.position - surface.points)
-    reflected = _highlights(surface.points, surface.normals, viewers[:, None], brdf, incoming.points)[:, 0]
+    reflected = _highlights(surface.points, surface.normals, viewers[:, None], brdf, incoming.lights)[:, 0]
     for start in range(0, len(viewers) if incoming.field.radiance.any() else 0, _POINTS_AT_ONCE):
         rows = slice(start, start + _POINTS_AT_ONCE)
         directions, weights = brdf.sample(viewers[rows, None], surface.normals[rows])
@@ -418,7 +423,7 @@ def _harmonics_of_parts(
         reflected = incoming.field.reflected(directions[0], weights[0])
         for start in range(0, len(members), _POINTS_AT_ONCE):
             rows = members[start : start + _POINTS_AT_ONCE]
-            lights = [(point, visible[rows]) for point, visible in incoming.points]
+            lights = [(point, visible[rows]) for point, visible in incoming.lights]
             viewers = np.broadcast_to(views, (len(rows), *views.shape))
             total = _highlights(positions[rows], normals[rows], viewers, brdf, lights)
             total += transmitted[:, None] * diffuse[rows, None]

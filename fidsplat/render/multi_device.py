@@ -55,7 +55,7 @@ class SeveralDevices:
     def __init__(self, devices: Iterable[str], memory_budget: int | None = None) -> None:
         names = items("devices", [devices] if isinstance(devices, str) else devices, str, "names of devices")
         if not names:
-            raise InputError("devices must be at least one device, got an empty list; give e.g. ['opencl']")
+            raise InputError("devices must name at least one device, got an empty list; give e.g. ['opencl']")
         self.renderers = [Renderer(name, memory_budget) for name in names]
         titles = {renderer.device.title for renderer in self.renderers}
         if len(titles) > 1:

@@ -40,7 +40,7 @@ def save_output(
     name: str, image: np.ndarray, name_of: Callable[[str, str], Path], bits: int | None = None
 ) -> list[Path]:
     """Write one output image (h, w) or (h, w, 3) and return the files. bits: 16 writes rgb as a 16-bit PNG.
-    name_of: file of an output's name and a suffix such as ".png" or "-turbo.png"."""
+    name_of: function that returns the file for an output's name and a suffix such as ".png"."""
     if name == "rgb" and bits == 16:
         image16 = np.rint(np.clip(np.nan_to_num(image, nan=0.0), 0, 1) * 65535).astype(np.uint16)
         return [write_png(name_of(name, ".png"), image16)]

@@ -49,12 +49,12 @@ class GlossyBrdf(NamedTuple):
         view, light = np.maximum(cosine, _MIN_COSINE), np.maximum(light, _MIN_COSINE)
         cosine_between = np.einsum("nvc,nc->nv", to_viewer, to_light)
         length = np.sqrt(np.maximum(2 + 2 * cosine_between, 1e-12))
-        half_cosine = (view + light) / length
-        distribution = square / (np.pi * (half_cosine**2 * (square - 1) + 1) ** 2)
-        masking = 0.5 / (light * _smith_root(view, square) + view * _smith_root(light, square))
+        cosine_half = (view + light) / length
+        distribution = square / (np.pi * (cosine_half**2 * (square - 1) + 1) ** 2)
+        visibility = 0.5 / (light * _smith_root(view, square) + view * _smith_root(light, square))
         # the cosine is between the viewer and the half vector
         factor = fresnel((1 + cosine_between) / length, self.reflectance)
-        return np.where(above, distribution * masking * factor * light, 0.0)
+        return np.where(above, distribution * visibility * factor * light, 0.0)
 
     def sample(self, to_viewer: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Importance samples of visible normals (Heitz 2018): directions (n, v, k, 3) to incoming light, and
@@ -72,13 +72,13 @@ class GlossyBrdf(NamedTuple):
         t1, s = radius * np.cos(phi), (1 + stretched[..., 2]) / 2
         t2 = (1 - s) * np.sqrt(1 - t1**2) + s * (radius * np.sin(phi))
         t3 = np.sqrt(np.maximum(1 - t1**2 - t2**2, 0))
-        microfacet = t1[:, None] * tangent + t2[..., None] * bitangent + t3[..., None] * stretched
-        microfacet *= (self.alpha, self.alpha, 1.0)
-        microfacet[..., 2] = np.maximum(microfacet[..., 2], 1e-9)
-        microfacet /= np.linalg.norm(microfacet, axis=-1, keepdims=True)
+        half_vector = t1[:, None] * tangent + t2[..., None] * bitangent + t3[..., None] * stretched
+        half_vector *= (self.alpha, self.alpha, 1.0)
+        half_vector[..., 2] = np.maximum(half_vector[..., 2], 1e-9)
+        half_vector /= np.linalg.norm(half_vector, axis=-1, keepdims=True)
         local = local[..., None, :]
-        cosine = np.sum(local * microfacet, axis=-1, keepdims=True)
-        reflected = 2 * cosine * microfacet - local
+        cosine = np.sum(local * half_vector, axis=-1, keepdims=True)
+        reflected = 2 * cosine * half_vector - local
         light, view = reflected[..., 2], np.maximum(local[..., 2], _MIN_COSINE)
         above = light > _MIN_COSINE
         masking = light * (view + _smith_root(view, square))

@@ -20,7 +20,7 @@ from fidsplat.capture.capture import Capture, CaptureFields, output_names
 from fidsplat.capture.environment import background_of
 from fidsplat.capture.quality import Quality
 from fidsplat.capture.sensor import Sensor
-from fidsplat.capture.views import Views, views_of
+from fidsplat.capture.views import CaptureBatch, capture_batch
 from fidsplat.effects.differentiable import check_gradients, with_distortion
 from fidsplat.render.array_export import check_process
 from fidsplat.render.certified_error import ErrorImage, error_reference
@@ -57,9 +57,9 @@ class Renderer:
     must open its own renderer.
 
     Args:
-        device: "opencl" (the best OpenCL device), "opencl:NAME" (part of a platform's or a GPU's name, or
-            cpu or gpu), "warp:cpu", "warp:cuda" (NVIDIA Warp), "reference" (NumPy, float64, slow), or "auto"
-            ("opencl", else "warp" with a warning). None: the variable FIDSPLAT_DEVICE, else "auto".
+        device: "opencl" (the best OpenCL device), "opencl:NAME" (NAME: cpu, gpu, or a part of a platform's
+            or a GPU's name), "warp:cpu", "warp:cuda" (NVIDIA Warp), "reference" (NumPy, float64, slow), or
+            "auto" ("opencl", else "warp" with a warning). None: the variable FIDSPLAT_DEVICE, else "auto".
         memory_budget: bytes of device memory for a frame and its cloud; by default nine tenths of the
             device's memory. Larger frames are rendered in bands of rows and, by OpenCL, in chunks of the
             cloud: slower, with bit-identical images.
@@ -142,8 +142,8 @@ class Renderer:
         """Wrap arrays on the device as a cloud, without a copy.
 
         Shapes and units are those of SplatCloud, float32 (labels int32): wp.array, or objects with DLPack
-        (torch, CuPy, JAX); NumPy arrays are copied. Scales (n, 3) make 3D Gaussians, disks
-        where the third is 0. Arrays are read when a frame is rendered, so a simulation may move the splats
+        (torch, CuPy, JAX); NumPy arrays are copied. Scales (n, 3) make 3D Gaussians; a splat whose third
+        scale is 0 is a disk. Arrays are read when a frame is rendered, so a simulation may move the splats
         between frames. Quaternions need no unit length; invalid splats (a value that is not finite, a scale
         below 0) are not rendered. `means` are relative to `origin` (3,), a world position.
 
@@ -152,7 +152,8 @@ class Renderer:
         """
         check_process(self._pid, "Renderer")
         if (colors is None) == (sh is None):
-            raise InputError("exactly one of colors (n, 3) and sh (n, k, 3) must be given, got both or none")
+            given = "none; give one" if colors is None else "both; leave one out"
+            raise InputError(f"exactly one of colors (n, 3) and sh (n, k, 3) must be given, got {given}")
         arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
         arrays |= {"colors": colors} if sh is None else {"sh": sh}
         arrays |= {} if labels is None else {"labels": labels}
@@ -357,28 +358,29 @@ class Renderer:
                 f"the output 'error' must be rendered one capture at a time, got a batch of {len(requested)}"
                 "; call render() for each capture, or leave out the output 'error'"
             )
-        views = views_of(requested, poses, groups, mask)
+        views = capture_batch(requested, poses, groups, mask)
         self._refuse_unknown_labels(resident, views)
         return self._render_batch(resident, views)
 
-    def _refuse_unknown_labels(self, resident: ResidentCloud, views: Views) -> None:
+    def _refuse_unknown_labels(self, resident: ResidentCloud, views: CaptureBatch) -> None:
         if views.groups and resident.labels is not None:
             for label in views.groups:
                 if label not in resident.labels:
                     known = map(str, sorted(resident.labels))
                     raise InputError(unknown("label of splats", str(label), known))
 
-    def _render_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
+    def _render_batch(self, resident: ResidentCloud, views: CaptureBatch) -> FrameBatch:
         interrupts.check()
         if any(capture.sensor.needs_metering for capture in views.captures):
             metered = (self._metered(resident, views.capture(number)) for number in range(len(views)))
-            views = Views(tuple(metered), mask=views.mask)
+            views = CaptureBatch(tuple(metered), mask=views.mask)
         features, batch = prepare_batch(resident.all_splats, views)
         with self._lock:
             rendered = (batch.view_at(number) for number in range(len(batch)))
             data, scene_indices = resident.gather(
                 rendered, features, (capture.quality for capture in views.captures)
             )
+            # tile size and work-groups for images of this size
             config = self.backend.frame_config(batch.view, len(batch))
             images = self.backend.pipeline(features, config).render(data, batch)
         return FrameBatch(images, views, scene_indices)

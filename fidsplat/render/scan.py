@@ -22,7 +22,7 @@ from fidsplat.formats.points import save_points
 from fidsplat.splats.rotations import check_similarity, pose_matrix
 from fidsplat.util.arguments import instance, invalid, number, whole_number
 from fidsplat.util.errors import InputError
-from fidsplat.util.response import to_light
+from fidsplat.util.response import linear_light
 
 if TYPE_CHECKING:
     from fidsplat.render.renderer import Renderer
@@ -312,7 +312,7 @@ def _intensity(
 ) -> np.ndarray:
     """Reflectivity times cosine of incidence, (rays,) float32, from rendered outputs (rays, ...)."""
     color = images["rgb"] / np.maximum(images["alpha"], 1e-6)[:, None]
-    light = to_light(np.minimum(color, 1), "srgb", np.float32) @ LUMINANCE.astype(np.float32)
+    light = linear_light(np.minimum(color, 1), "srgb", np.float32) @ LUMINANCE.astype(np.float32)
     for label, value in reflectivity.items():
         light[images["label"] == label] = value
     cosine = (directions.astype(np.float32) * images["normal"]) @ np.ones(3, np.float32)

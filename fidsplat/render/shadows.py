@@ -88,7 +88,7 @@ def light_points(light: Light, middle: np.ndarray) -> list[LightPoint]:
         offset = np.sin(size / 2) * (points @ perpendicular(axis))
         cosine = np.sqrt(1 - (offset**2).sum(axis=1))
         points = cosine[:, None] * axis + offset
-        fractions = fractions / cosine  # a surface that faces the sun receives its intensity
+        fractions = fractions / cosine  # so that the irradiance of a surface that faces the sun is `power`
     else:
         assert isinstance(light, PointLight)
         center = np.array(light.position)
@@ -101,6 +101,7 @@ def shadow_casters(
 ) -> np.ndarray:
     """Rows of the spheres, centres (n, 3) and radii (n,), that may cast shadows on a surface: in front of the
     surface, and inside the capsule from the surface to the light (a cone for a sun)."""
+    # heights are multiplied by the length of the mean normal
     middle, normal = surface.middle, surface.normals.mean(axis=0)
     radius = surface.radius + _MARGIN * surface.pitch
     length, offsets = float(np.linalg.norm(normal)), centres - middle
@@ -112,7 +113,7 @@ def shadow_casters(
         distance_from_axis = np.linalg.norm(offsets - along[:, None] * to_light, axis=1)
         max_distance = radius + np.tan(light.angle / 2) * np.maximum(along + radii, 0)
         inside = (distance_from_axis - radii <= max_distance) & (along + radii >= -radius)
-        above = to_light @ normal > np.sin(light.angle / 2) * length  # all rays rise from the surface
+        above = to_light @ normal > np.sin(light.angle / 2) * length  # all rays leave the front
         min_height = min_height if above else -np.inf
     else:
         assert isinstance(light, PointLight)
@@ -136,8 +137,8 @@ def visibility(
     faces away.
 
     The marker is an opaque white surface in an external depth image, and other splats are black, so that the
-    image rendered from the light is the transmittance. casters: the splats between both in black, moved by
-    `motion`; None: no splats. extent: largest distance of a splat from the marker.
+    image rendered from the light is the transmittance. casters: black splats between the surface and the
+    light, moved by `motion`; None: no splats. extent: largest distance of a splat from the marker.
     """
     to_light, irradiance = point.irradiance(surface.points)
     visible = np.zeros(len(to_light), np.float32)

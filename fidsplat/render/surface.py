@@ -72,14 +72,15 @@ def surface_at(
     def depth_of(patch: Camera) -> np.ndarray:
         return renderer.render(resident_scene, capture_of_depth.with_(camera=patch))["depth_first"]
 
-    pixels = default_radius(camera)
+    radius_px = default_radius(camera)
     if radius is not None:
-        metres = _metres_of(camera, pixel, pixels, _median_of(depth_of(_patch(camera, pixel, pixels))))
-        pixels = min(pixels * radius / metres, 2.0 * camera.width)
-    patch = _patch(camera, pixel, pixels)
+        default_depth = _median_of(depth_of(_patch(camera, pixel, radius_px)))
+        default_radius_m = _radius_in_metres(camera, pixel, radius_px, default_depth)
+        radius_px = min(radius_px * radius / default_radius_m, 2.0 * camera.width)
+    patch = _patch(camera, pixel, radius_px)
     depth = depth_of(patch)
-    metres = _metres_of(camera, pixel, pixels, _median_of(depth))
-    return _fit_patch(depth, patch, (PATCH_SIZE / 2, PATCH_SIZE / 2), PATCH_SIZE / 2, metres)
+    radius_m = _radius_in_metres(camera, pixel, radius_px, _median_of(depth))
+    return _fit_patch(depth, patch, (PATCH_SIZE / 2, PATCH_SIZE / 2), PATCH_SIZE / 2, radius_m)
 
 
 def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = None) -> Surface:
@@ -95,12 +96,12 @@ def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = 
         InputError: no plane in at least half of the patch; a pixel outside the image.
     """
     camera, pixel = _camera_and_pixel(camera, pixel, None)
-    pixels = default_radius(camera) if radius is None else radius
+    radius_px = default_radius(camera) if radius is None else radius
     x, y = (int(v) for v in pixel)
-    half_side, step = int(np.ceil(pixels)), max(1, int(pixels) // (PATCH_SIZE // 4))
+    half_side, step = int(np.ceil(radius_px)), max(1, int(radius_px) // (PATCH_SIZE // 4))
     left, top = max(x - half_side, 0), max(y - half_side, 0)
     patch = depth[top : y + half_side + 1 : step, left : x + half_side + 1 : step]
-    metres = _metres_of(camera, pixel, pixels, _median_of(patch))
+    radius_m = _radius_in_metres(camera, pixel, radius_px, _median_of(patch))
 
     def in_patch(coordinate: float, first: int) -> float:
         return (coordinate - first - 0.5) / step + 0.5
@@ -110,13 +111,14 @@ def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = 
     center = {"cx": in_patch(camera.cx, left), "cy": in_patch(camera.cy, top)}
     patch_camera = replace(camera, width=width, height=height, **focal, **center)
     patch_pixel = in_patch(pixel[0], left), in_patch(pixel[1], top)
-    return _fit_patch(patch, patch_camera, patch_pixel, pixels / step, metres)
+    return _fit_patch(patch, patch_camera, patch_pixel, radius_px / step, radius_m)
 
 
 def median_depth_capture(capture: Capture, *outputs: str) -> Capture:
     """The capture of the median depth, output as `depth_first`, and of other outputs: at the shutter's time,
     without sensor, fog and external depth image."""
-    # `depth_first` with first_hit = 0.5: the depth at which the opacity reaches one half
+    # `depth_first` with first_hit = 0.5: the depth at which the opacity reaches one half; unlike
+    # `depth_median`, it is 0 where the opacity is below one half
     quality = replace(capture.quality, samples=1, first_hit=MEDIAN_OPACITY)
     motion, shutter = Motion(None, capture.motion.groups), Shutter(time=capture.shutter.time)
     outputs = ("depth_first", *outputs)
@@ -177,19 +179,19 @@ def _median_of(depth: np.ndarray) -> float:
     return float(np.median(depths))
 
 
-def _metres_of(camera: Camera, pixel: tuple[float, float], pixels: float, depth: float) -> float:
+def _radius_in_metres(camera: Camera, pixel: tuple[float, float], radius_px: float, depth: float) -> float:
     """Convert a radius in pixels at a depth to metres."""
-    pixels_at = np.array([pixel, (pixel[0] + pixels, pixel[1]), (pixel[0] - pixels, pixel[1])])
+    pixels_at = np.array([pixel, (pixel[0] + radius_px, pixel[1]), (pixel[0] - radius_px, pixel[1])])
     center, *others = camera.unproject(pixels_at, np.full(3, depth))
     return float(np.nanmax(np.linalg.norm(others - center, axis=1)))
 
 
 def _fit_patch(
-    depth: np.ndarray, camera: Camera, pixel: tuple[float, float], pixels: float, metres: float
+    depth: np.ndarray, camera: Camera, pixel: tuple[float, float], radius_px: float, radius_m: float
 ) -> Surface:
     centres = camera.pixel_centres
-    mask = ((centres - pixel) ** 2).sum(2) <= max(pixels, 1.0) ** 2
+    mask = ((centres - pixel) ** 2).sum(2) <= max(radius_px, 1.0) ** 2
     depths = depth[mask].astype(np.float64)
     points = camera.unproject(centres[mask], np.where(depths > 0, depths, np.nan))
     origin, further = camera.unproject(np.array([pixel, pixel]), np.array([0.0, 1.0]))
-    return fit_surface(points, origin, further - origin, metres)
+    return fit_surface(points, origin, further - origin, radius_m)

@@ -29,7 +29,7 @@ _VOXELS = np.stack(np.meshgrid(*[np.arange(BLOCK_SIDE)] * 3, indexing="ij"), -1)
 
 class DistanceField:
     """A truncated signed distance field, positive outside. voxel: edge [m]. origin: (3,) world position of
-    voxel 0."""
+    the lower corner of voxel (0, 0, 0)."""
 
     def __init__(self, voxel: float, origin) -> None:
         self.voxel, self.origin = voxel, np.asarray(origin, np.float64)
@@ -39,7 +39,8 @@ class DistanceField:
         """(n, voxels, 6) sums of weight, weighted distance, weighted colour (3), and colour weight"""
 
     def allocate(self, depth: np.ndarray, camera: Camera) -> None:
-        """Add the blocks around the surface of a depth image (h, w), 0 where empty."""
+        """Add the blocks around the surface of a depth image (h, w), 0 where empty. Call it for all images
+        before the first `integrate`."""
         w = depth.shape[1]
         filled = np.flatnonzero(depth.ravel() > 0)
         pixels = np.stack([filled % w + 0.5, filled // w + 0.5], 1)

@@ -28,7 +28,7 @@ from fidsplat.util.response import to_colors
 SOURCES = ("scene", "lights")
 VIEWS = ("any", "camera")
 MAX_SAMPLES = 1024
-GRIDS = (1, 2, 3, 5, 9, 17)
+PANORAMAS_PER_SIDE = (1, 2, 3, 5, 9, 17)
 """allowed numbers of panoramas along a side; each grid contains the points of the coarser ones"""
 
 
@@ -88,8 +88,8 @@ class Lighting:
         ):
             number(f"light: {name}", getattr(self, name), f"a number from {low:g} to {high:g}", low, high)
         whole_number("light: rows", self.rows, 8, 1024)
-        if type(self.panoramas) is not int or self.panoramas not in GRIDS:
-            raise invalid("light: panoramas", ", ".join(map(str, GRIDS)), self.panoramas)
+        if type(self.panoramas) is not int or self.panoramas not in PANORAMAS_PER_SIDE:
+            raise invalid("light: panoramas", ", ".join(map(str, PANORAMAS_PER_SIDE)), self.panoramas)
         if self.ambient is not None:
             object.__setattr__(self, "ambient", _radiance("light: ambient", self.ambient))
         if self.response not in ("srgb", "linear") or isinstance(self.response, bool):

@@ -149,7 +149,7 @@ def b4(renderer: Renderer) -> Found:
     for degrees in (89.0, 89.99, 90.0):
         cloud = splats([[0.1, 0.05, 4]], rotation((0, 1, 0), degrees), (1e-3, 5e-3))
         yield FrameSpec(cloud, camera(), outputs=ALL_OUTPUTS)
-    # depth of a tilted wall against that of its plane, and no depth beyond that of the disk
+    # compare the depth of a tilted wall with its plane; no depth may exceed the largest of the disk
     view = camera()
     wall = rotation((0.3, 1, 0), 60)
     cloud = splats([[0, 0, 5]], wall, 1.0)

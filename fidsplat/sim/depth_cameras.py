@@ -22,7 +22,7 @@ from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.util.arguments import instance, number, whole_number
 from fidsplat.util.errors import InputError, unknown
-from fidsplat.util.response import to_light
+from fidsplat.util.response import linear_light
 
 DOT = 3.0
 """pixels between the random values of the projected pattern"""
@@ -297,7 +297,7 @@ def depth_camera(name: str, **pose: Any) -> tuple[DepthCamera, Camera]:
 def _view(renderer: Renderer, scene: Scene, camera: Camera) -> DepthView:
     """Depth, reflectance and incidence of a camera's image."""
     outputs = ("rgb", "depth_median", "normal")
-    motion = Motion(None, scene.capture.motion.groups)  # the cameras of a device differ in their poses
+    motion = Motion(None, scene.capture.motion.groups)  # none of the camera: each camera has its own pose
     capture: Capture = replace(
         scene.capture, camera=camera, motion=motion, outputs=outputs, sensor=Sensor(), fog=None
     )
@@ -305,7 +305,7 @@ def _view(renderer: Renderer, scene: Scene, camera: Camera) -> DepthView:
     rays = camera.rays(camera.pixel_centres.reshape(-1, 2)).reshape(camera.height, camera.width, 3)
     cosine = -(frame["normal"] * rays).sum(2) / np.linalg.norm(rays, axis=2)
     depth = frame["depth_median"].astype(np.float64)
-    grey = to_light(frame["rgb"], "srgb") @ LUMINANCE
+    grey = linear_light(frame["rgb"], "srgb") @ LUMINANCE
     return DepthView(depth, np.clip(grey, 0, 1), np.clip(cosine, 0, 1))
 
 

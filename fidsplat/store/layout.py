@@ -126,7 +126,8 @@ def read_header(folder: Path) -> Header:
     except InputError as error:
         if not file.exists():
             raise InputError(
-                f"{folder} is not a store: it has no {HEADER}; build one by `fidsplat store build`"
+                f"{folder} must be a store with {HEADER}, got a folder without it; build one with `fidsplat "
+                "store build`"
             ) from None
         raise error
     except ValueError:

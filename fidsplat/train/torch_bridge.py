@@ -124,6 +124,6 @@ class _Rendered(torch.autograd.Function):
 
 
 def _tensor(array: np.ndarray) -> Any:
-    """A tensor that shares the memory of an array without other readers."""
+    """A tensor that shares the memory of an array, which nothing else may read."""
     array.flags.writeable = True
     return torch.from_numpy(array)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def to_light(colors: np.ndarray, response: str | float, dtype: type = np.float64) -> np.ndarray:
+def linear_light(colors: np.ndarray, response: str | float, dtype: type = np.float64) -> np.ndarray:
     """Linear light of colours, computed in `dtype`; the sRGB curve is extended above 1."""
     colors = np.maximum(np.asarray(colors, dtype), 0)
     if response == "linear":
@@ -16,7 +16,7 @@ def to_light(colors: np.ndarray, response: str | float, dtype: type = np.float64
 
 
 def to_colors(light: np.ndarray, response: str | float) -> np.ndarray:
-    """Colours of linear light, the inverse of `to_light`."""
+    """Colours of linear light, the inverse of `linear_light`."""
     light = np.maximum(np.asarray(light, np.float64), 0)
     if response == "linear":
         return light

@@ -9,7 +9,7 @@ from agreement import ALL_OUTPUTS, random_splats
 from derivative_errors import stretched
 
 import fidsplat as fs
-from fidsplat.capture.views import views_of
+from fidsplat.capture.views import capture_batch
 from fidsplat.splats.rotations import rigid_matrix
 
 CAMERA = fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
@@ -137,7 +137,7 @@ def test_effects_are_those_of_single_views(renderer, cloud, lens):
     )  # fmt: skip
     batch = renderer.render_batch(cloud, capture, poses=POSES, groups={1: POSES})
     for number in range(3):
-        alone = views_of([capture], POSES[[number]], {1: POSES[[number]]}).capture(0)
+        alone = capture_batch([capture], POSES[[number]], {1: POSES[[number]]}).capture(0)
         frame = renderer.render(cloud, alone)
         assert all(np.array_equal(batch[name][number], frame[name]) for name in batch), number
 
@@ -158,7 +158,8 @@ def test_each_view_sees_the_background_in_its_own_direction(renderer, cloud, nam
     )  # fmt: skip
     batch = renderer.render_batch(cloud, capture, poses=TURNED)
     frames = [
-        renderer.render(cloud, views_of([capture], TURNED[[number]], None).capture(0)) for number in range(3)
+        renderer.render(cloud, capture_batch([capture], TURNED[[number]], None).capture(0))
+        for number in range(3)
     ]
     assert_same(batch, frames)
     corners = batch["rgb"][:, 0, 0]

@@ -10,7 +10,7 @@ from test_memory import CAMERA, as_on_a_gpu, machines, own_device
 
 import fidsplat as fs
 from fidsplat.backends.opencl import memory_plan
-from fidsplat.capture.views import views_of
+from fidsplat.capture.views import capture_batch
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +156,7 @@ def test_a_batch_in_parts_has_the_bits_of_its_views(opencl, monkeypatch, machine
         alone = renderer.render(resident, capture)
         for number in (0, 1, 2, 4, 5, 6):
             one = {"poses": poses[0, [number]], "groups": {2: poses[1, [number]]}}
-            expected = opencl.render(some, views_of([capture], **one).capture(0))
+            expected = opencl.render(some, capture_batch([capture], **one).capture(0))
             assert all(np.array_equal(rendered[name][number], expected[name]) for name in rendered), (
                 most,
                 number,

@@ -14,7 +14,7 @@ from fidsplat.backends.warp import memory_plan, runtime
 from fidsplat.backends.warp.frame import DeviceFrame
 from fidsplat.backends.warp.kernel_config import KernelConfig
 from fidsplat.backends.warp.pipeline import RecordedFrame
-from fidsplat.capture.views import views_of
+from fidsplat.capture.views import capture_batch
 
 BACKEND = "warp"
 WHOLE = random_scene(1, count=3000, degree=None, quality="surfel", outputs=("rgb",))
@@ -305,7 +305,7 @@ def test_views_together_in_blocks_of_threads(renderer):
     """The GPU's schedule of a batch: all views at once, more than the budget in bands of tiles."""
     backend = renderer.backend
     resident, captures = backend.upload(CLOUD), [CAPTURE.with_(camera=camera) for camera in CROSSING[:3]]
-    features, views = prepare_batch(resident, views_of(captures, None, None, None))
+    features, views = prepare_batch(resident, capture_batch(captures, None, None, None))
     pipeline = backend.pipeline(features, KernelConfig("group", 8, 8))
     full_frame = pipeline.render(resident, views).read("rgb")
     before, backend.pair_budget = backend.pair_budget, 4000

@@ -11,7 +11,7 @@ from fidsplat.experiments.methods import IDEAL, MarkerRenderer, method_names, mi
 from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS, novel_cameras
 from fidsplat.images.files import to_uint8, write_png
 from fidsplat.markers import marker
-from fidsplat.util.response import to_colors, to_light
+from fidsplat.util.response import linear_light, to_colors
 from fidsplat.vision.metrics import psnr
 
 pytestmark = pytest.mark.usefixtures("optimised")
@@ -227,7 +227,7 @@ def test_blenders_images_take_part_where_a_marker_has_all_of_them(pool, tmp_path
 
 def test_the_srgb_curve_and_its_inverse():
     values = np.linspace(0, 1, 101)
-    assert to_colors(to_light(values, "srgb"), "srgb") == pytest.approx(values, abs=1e-9)
+    assert to_colors(linear_light(values, "srgb"), "srgb") == pytest.approx(values, abs=1e-9)
     assert to_colors(np.array(0.2), "srgb") * 255 == pytest.approx(123.6, abs=0.1)
 
 

@@ -8,7 +8,7 @@ import shapely
 
 import fidsplat as fs
 from fidsplat.experiments.plane import plane_image
-from fidsplat.util.response import to_light
+from fidsplat.util.response import linear_light
 
 GRID = np.random.default_rng(5).integers(0, 2, (7, 9)).astype(np.uint8)
 MODULE = 0.2
@@ -122,5 +122,5 @@ def test_means_do_not_depend_on_how_the_image_is_cut():
 
 def test_display_values_are_straight_where_they_are_dark():
     """On both sides of the threshold of the sRGB curve, 0.04045 (IEC 61966-2-1)."""
-    light = to_light(np.array([0.04, 0.041, 0.0031]), "srgb")
+    light = linear_light(np.array([0.04, 0.041, 0.0031]), "srgb")
     assert light == pytest.approx([0.04 / 12.92, ((0.041 + 0.055) / 1.055) ** 2.4, 0.0031 / 12.92])

@@ -13,7 +13,7 @@ from fidsplat.backends.opencl import pipeline as pipeline_module
 from fidsplat.backends.opencl import tiling
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.view import View
-from fidsplat.capture.views import views_of
+from fidsplat.capture.views import capture_batch
 from fidsplat.effects import select
 from fidsplat.selftest.agreement import out_of_order
 
@@ -69,7 +69,7 @@ def test_views_of_a_batch_have_separate_lists(backend, monkeypatch, lists, budge
         fs.Capture(fs.Camera.look_at(161, 117, 1.0, (x, 0.0, -0.1), (0.0, 0.0, 3.0)), ALL_OUTPUTS, quality)
         for x in (-1.0, 0.5)
     ]
-    features, batch = prepare_batch(cloud, views_of(captures))
+    features, batch = prepare_batch(cloud, capture_batch(captures))
     shape = listing(backend, "bin_first" if lists == "bin_local" else lists)
     pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
     alone = [pipeline.render_view(resident, prepare(cloud, capture)[1]) for capture in captures]
@@ -125,7 +125,7 @@ def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
     # in bands each time; else twice, then replayed
     assert launched.count("count_local") == (3 if budget else 2)
     moved = replace(capture, camera=fs.Camera.look_at(641, 549, 1.0, (0.3, 0.0, 0.0), (0.0, 0.0, 3.0)))
-    batch_images = pipeline.render(resident, prepare_batch(cloud, views_of([moved, capture]))[1])
+    batch_images = pipeline.render(resident, prepare_batch(cloud, capture_batch([moved, capture]))[1])
     other = pipeline.render_view(backend.upload(cloud), prepare(cloud, moved)[1])
     for images, own in zip(batch_images.read("rgb"), (other, expected), strict=True):
         assert np.array_equal(images, own.read("rgb", 0))

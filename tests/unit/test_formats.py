@@ -270,7 +270,7 @@ def test_a_gltf_may_begin_with_as_many_spaces_as_it_likes(tmp_path):
         (
             "a.glb",
             struct.pack("<4sI", b"glTF", 3),
-            "the version of glTF must be 2, got 3; .* by splat-transform",
+            "the version of glTF must be 2, got 3; .* with splat-transform",
         ),
         ("a.gltf", b'{"asset": {"version": "1.0"}}', "must be 2, got 1.0; convert it by gltf-pipeline"),
         (
@@ -279,7 +279,7 @@ def test_a_gltf_may_begin_with_as_many_spaces_as_it_likes(tmp_path):
             r"must have splats, .* \(extensions: OLD\); .* splat-trans",
         ),
         ("a.usda", b"#usda 2.0\n", "usd-core can read, got '#usda 2.0'; convert a later version by usdcat"),
-        ("a.ksplat", b"", "unknown suffix of a splat file '.ksplat'.*; convert it by splat-transform"),
+        ("a.ksplat", b"", "unknown suffix of a splat file '.ksplat'.*; convert it with splat-transform"),
         ("a.spz", b"", "cannot read .*a.spz: it is empty"),
         ("a.spz", b"ply\n", "got b'ply.n'; its content is PLY: rename it to a.ply"),
         ("a.glb", b"NGSP" + bytes(99), "its content is SPZ: rename it to a.spz"),

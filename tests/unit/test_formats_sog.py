@@ -76,7 +76,7 @@ def test_a_sog_file_by_hand(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"version": 3}, "the version of SOG must be 1 or 2, got 3; convert it by splat-transform"),
+        ({"version": 3}, "the version of SOG must be 1 or 2, got 3; convert it with splat-transform"),
         ({"version": 1}, r"damaged \(KeyError"),
         ({"count": 5}, "l.webp must have a pixel for each of 5 splats, got 4"),
         ({"sh0": {}}, r"damaged \(KeyError"),

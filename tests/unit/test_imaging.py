@@ -11,7 +11,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.images.files import write_png
-from fidsplat.util.response import to_light
+from fidsplat.util.response import linear_light
 
 BACKEND = "opencl"
 
@@ -102,7 +102,7 @@ def test_an_image_is_exposed_by_its_light():
     """A uniform image has the requested luminance; grey after white balance, in linear light."""
     color, empty, renderer = (0.5, 0.7, 0.9), fs.SplatCloud.empty(), fs.Renderer("reference")
     camera = fs.Camera.look_at(200, 100, 1.0, (0, 0, 0), (0, 0, 1))
-    light = to_light(np.array(color), "srgb")
+    light = linear_light(np.array(color), "srgb")
 
     def seen(**sensor):
         frame = renderer.render(empty, camera, background=color, sensor=fs.Sensor(decode="srgb", **sensor))

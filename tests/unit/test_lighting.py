@@ -17,7 +17,7 @@ from fidsplat.render.reflection import (
 )
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.harmonics import sh_basis
-from fidsplat.util.response import to_colors, to_light
+from fidsplat.util.response import linear_light, to_colors
 
 TAG = fs.marker("aruco:4x4_50:7", size=0.16)
 UP = np.array([0.0, 0.0, 1.0])
@@ -32,7 +32,7 @@ def renderer():
 def lit(scene):
     """Linear light (n, 3) and splats of the first marker of a lit scene."""
     cloud = renderer().lit(scene).markers[0].marker.cloud
-    return to_light(cloud.colors, "srgb"), cloud
+    return linear_light(cloud.colors, "srgb"), cloud
 
 
 def of_lights(*lights, clouds=(), pose=None, **light):
@@ -49,7 +49,7 @@ def screen(x, y, z, half_x, half_y):
 
 
 def test_a_uniform_panorama_returns_the_reflectance():
-    radiance = to_light(np.array([0.5, 0.6, 0.7]), "srgb")
+    radiance = linear_light(np.array([0.5, 0.6, 0.7]), "srgb")
     placed = PlacedMarker(TAG, light="scene")
     light, cloud = lit(fs.Scene(markers=[placed], background=(0.5, 0.6, 0.7)))
     dark = TAG.is_dark
@@ -78,7 +78,7 @@ def test_light_is_measured_where_the_marker_is():
     light = [lit(fs.Scene(markers=[PlacedMarker(TAG, p, light="scene")], background=sky))[0].max(0)
              for p in (lying, pose)]  # fmt: skip
     direction, angles = panorama_directions(64)
-    radiance = to_light((1 - direction[:, 1]) / 2, "srgb")
+    radiance = linear_light((1 - direction[:, 1]) / 2, "srgb")
     for actual, normal in zip(light, ([0, -1, 0], [0, 0, -1]), strict=True):
         expected = 0.85 / math.pi * cosine_weights(np.array(normal), direction, angles) @ radiance
         assert np.allclose(actual, expected, rtol=0.01)
@@ -153,7 +153,7 @@ def test_a_shadow_has_its_edge_at_the_computed_place(quaternion):
     edge, finest = 0.1, TAG.module / 8
     scene = of_lights(replace(SUN, direction=tuple(direction)), clouds=[wall], pose=pose)
     _, cloud = lit(scene)
-    light = to_light(cloud.colors, "srgb")[:, 0]
+    light = linear_light(cloud.colors, "srgb")[:, 0]
     left, right = cloud.means[:, 0] - cloud.scales[:, 0], cloud.means[:, 0] + cloud.scales[:, 0]
     bright, black = light > 0.04 * math.cos(math.atan(0.5)), light < 1e-5
     assert bright.any()
@@ -190,7 +190,7 @@ def test_a_large_light_has_a_penumbra_of_its_size():
     """A sun of the angular diameter 0.4 behind an edge at 0.2 m: 0.2 tan(0.2) on both sides."""
     wall = screen(0.5, 0, -0.2, 0.5, 1)
     _, cloud = lit(of_lights(replace(SUN, angle=0.4), clouds=[wall], step=0.01))
-    white = to_light(cloud.colors, "srgb")[:, 0] / 0.85
+    white = linear_light(cloud.colors, "srgb")[:, 0] / 0.85
     at, wide = cloud.means[:, 0], 0.2 * math.tan(0.2)
     paper = white > 0.06  # ink is below
     inside = paper & (np.abs(at) < 0.9 * wide)
@@ -235,7 +235,7 @@ def test_an_obstacle_next_to_a_marker_darkens_its_half():
 def test_lights_and_panorama_add_up():
     placed = PlacedMarker(TAG, light="scene")
     scene = fs.Scene(markers=[placed], background=(0.5, 0.5, 0.5), lights=[SUN, SUN])
-    expected = 0.85 * (2 + to_light(np.array(0.5), "srgb"))
+    expected = 0.85 * (2 + linear_light(np.array(0.5), "srgb"))
     assert lit(scene)[0].max() == pytest.approx(expected, rel=1e-4)
     assert lit(replace(scene, lights=[]))[0].max() == pytest.approx(expected - 1.7, rel=1e-4)
 
@@ -252,7 +252,7 @@ def test_gaussians_and_rotated_boxes_are_lit():
     scene = of_lights(SUN, clouds=[wall])
     _, cloud = lit(replace(scene, markers=[replace(scene.markers[0], marker=fitted)]))
     assert len(cloud) == len(fitted.cloud)
-    light = to_light(cloud.colors, "srgb").max(axis=1)
+    light = linear_light(cloud.colors, "srgb").max(axis=1)
     assert (light[cloud.means[:, 0] > 0.005] < 1e-3).all()
     assert (light[cloud.means[:, 0] < -0.005] > 0.04).all()
 
@@ -343,7 +343,7 @@ def test_the_error_of_harmonics_of_degree_3():
 @pytest.mark.parametrize("response", ["srgb", "linear", 2.2])
 def test_responses_are_inverse_above_1_too(response):
     values = np.array([0.0, 0.001, 0.04, 0.5, 1.0, 7.0])
-    assert np.allclose(to_colors(to_light(values, response), response), values, rtol=1e-9)
+    assert np.allclose(to_colors(linear_light(values, response), response), values, rtol=1e-9)
 
 
 def test_a_scene_is_computed_once_and_deterministic():

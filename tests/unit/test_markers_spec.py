@@ -45,7 +45,7 @@ def test_parts_of_a_spec():
         ("apriltag:36h12:0", "36h10, 36h11"),
         ("aruco:36h11:0", "4x4_50"),
         ("aruco:4x4_50:50", "0 to 49"),
-        ("qr:", "a QR spec must have a text, got 'qr"),
+        ("qr:", "a QR spec must have a text, for example qr:hello, got 'qr"),
         ("qr-v0:x", "the version of a QR code must be 1 to 40"),
         ("qr-v41-L:x", "the version of a QR code must be 1 to 40"),
         ("qr-v2-X:x", "the error level of a QR code must be L, M, Q, H, got 'X"),

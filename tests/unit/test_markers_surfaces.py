@@ -12,7 +12,7 @@ from fidsplat.images.files import to_uint8
 from fidsplat.markers import BentSheet, BoxEdge, Cone, Crumpled, Cylinder
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import quaternion_to_matrix
-from fidsplat.util.response import to_light
+from fidsplat.util.response import linear_light
 from fidsplat.vision.detect import detect
 from fidsplat.vision.readback import read_back
 from fidsplat.vision.truth import truth_of
@@ -239,6 +239,6 @@ def test_light_of_a_worn_tag_on_a_cylinder_follows_its_normals(renderer):
     assert len(cloud) == len(marker.cloud)
     turn = np.arctan2(cloud.means[paper, 0], radius - cloud.means[paper, 2])
     cosine = np.maximum(-(0.8 * np.sin(turn) - 0.6 * np.cos(turn)), 0)
-    light = to_light(cloud.plain_colors[paper, 0], "srgb")
+    light = linear_light(cloud.plain_colors[paper, 0], "srgb")
     assert np.abs(light - 0.85 / math.pi * 3.0 * cosine).max() < 0.02
     assert (light == 0).any()

@@ -114,7 +114,7 @@ def test_bands_adapt_to_the_speed_of_devices(two):
 
 
 def test_unsupported_requests_are_refused(store, two):
-    with pytest.raises(fs.InputError, match="devices must be at least one device"):
+    with pytest.raises(fs.InputError, match="devices must name at least one device"):
         fs.SeveralDevices([])
     with pytest.raises(fs.InputError, match="devices must be of one model"):
         fs.SeveralDevices(["opencl", "reference"])

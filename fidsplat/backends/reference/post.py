@@ -7,7 +7,7 @@ import numpy as np
 from fidsplat.backends.reference.optics import rays_of
 from fidsplat.backends.view import View
 from fidsplat.capture.environment import Gradient, Panorama
-from fidsplat.util.response import to_colors, to_light
+from fidsplat.util.response import linear_light, to_colors
 
 _ROUND = 2e-6
 """relative rounding error of float32 before each step"""
@@ -77,7 +77,7 @@ def _step(name: str, value: np.ndarray, view: View, x: np.ndarray, y: np.ndarray
     inside = np.clip(value, 0, 1)
     match name:
         case "decode_srgb":
-            return to_light(value, "srgb")
+            return linear_light(value, "srgb")
         case "veiling_glare":
             rest, *light = sensor.uniforms_of("veiling_glare")
             return value * rest + np.array(light)

@@ -6,7 +6,7 @@ from .common import STRICT
 
 
 @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
-def unpack_surfaces(
+def unpack_mesh_images(
     packed: wp.array2d(dtype=wp.uint32),  # (views, pixels) 8 bits per colour
     depths: wp.array2d(dtype=wp.float32),  # [m] along z
     ids: wp.array2d(dtype=wp.int32),  # negative where there is no surface
