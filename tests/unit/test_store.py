@@ -126,7 +126,7 @@ def test_an_incomplete_store_is_refused(store, tmp_path):
     original = contents(folder)
     for name in original:
         (folder / name).unlink()
-        refused("no store.json|cannot read")
+        refused("a store with store.json|cannot read")
         (folder / name).write_bytes(original[name][: len(original[name]) * 2 // 3])
         refused("damaged|truncated")
         (folder / name).write_bytes(original[name])
