@@ -141,7 +141,7 @@ class Light:
                 object.__setattr__(self, name, vector)
 
     def _number(self, name: str, low: float, high: float) -> None:
-        requirement = f"a number from {low:g} to {high:g}"
+        requirement = f"a number from {low:g} to {high:g}" + " radians" * (name in _ANGLES)
         number(f"{self.kind}: {name}", getattr(self, name), requirement, low, high)
 
     @property

@@ -24,7 +24,8 @@ DEPTH_SCALE = 0.1
 
 class BopScene:
     """One scene of a BOP data set: rgb, depth and masks as images, intrinsics and poses as JSON. An object
-    is a marker; its obj_id is its label.
+    is a marker; its obj_id is its label, or the next free number where the data set has this label for
+    another marker.
 
     `save`, or the end of a `with` block, writes the JSON files.
 
@@ -97,24 +98,27 @@ class BopScene:
         """Write the JSON files.
 
         Raises:
-            InputError: a file that cannot be written, or a label that another scene of the data set uses for
-                another marker.
+            InputError: a file that cannot be written.
         """
         models = writable_folder(self._folder.resolve().parent.parent / "models") / "models_info.json"
-        known = _known(models)
+        known, ids = _known(models), {}
         for label, model in self._models.items():
+            ids[label] = label
             if known.get(label, model) != model:
-                raise InputError(
-                    f"{models}: object {label} must be {known[label].get('spec')}, got {model['spec']}; "
-                    "use the same labels in all scenes, or another data set"
-                )
+                equal = (number for number, other in known.items() if other == model)
+                ids[label] = next(equal, str(1 + max(map(int, (*known, *self._models)))))
+            known[ids[label]] = model
+        poses = {
+            image: [pose | {"obj_id": int(ids[str(pose["obj_id"])])} for pose in each]
+            for image, each in self._poses.items()
+        }
         for name, content in (
             ("scene_camera.json", self._cameras),
-            ("scene_gt.json", self._poses),
+            ("scene_gt.json", poses),
             ("scene_gt_info.json", self._info),
         ):
             _write(self._folder / name, content)
-        _write(models, known | self._models)
+        _write(models, known)
 
 
 def check_bop_camera(camera: Camera) -> None:

@@ -113,7 +113,7 @@ def test_flow_of_what_does_not_move_is_nothing(frame, scene):
 
 
 def test_flow_that_cannot_be(frame, scene):
-    with pytest.raises(fs.InputError, match="label must be an image with motions"):
+    with pytest.raises(fs.InputError, match="label must be given for the motions of groups"):
         optical_flow(frame["depth"], scene.camera, scene.camera, motions={1: np.eye(4)})
     with pytest.raises(fs.InputError, match="motion of label 1 must be rigid"):
         optical_flow(frame["depth"], scene.camera, scene.camera, frame["label"], {1: np.diag([2, 2, 2, 1])})
@@ -220,14 +220,16 @@ def test_bop_follows_its_format(tmp_path, truth, frame, scene):
     again = BopScene(tmp_path / "set/train/000001")
     again.add(frame, truth)
     again.save()
-    other = replace(scene.markers[0], marker=fs.marker("apriltag:36h11:6", size=0.4))
-    another = BopScene(tmp_path / "set/train/000002")
-    another.add(frame, truth_of(frame, replace(scene, markers=(other,))))
-    with pytest.raises(
-        fs.InputError, match="object 1 must be apriltag:36h11:5, got apriltag:36h11:6; use the same"
-    ):
-        another.save()
     assert json.loads((tmp_path / "set/models/models_info.json").read_text()) == models
+    other = replace(scene.markers[0], marker=fs.marker("apriltag:36h11:6", size=0.4))
+    for number in (2, 3):  # the label is the other marker's: a new object, the same one in both scenes
+        with BopScene(tmp_path / f"set/train/{number:06d}") as another:
+            another.add(frame, truth_of(frame, replace(scene, markers=(other,))))
+            another.save()  # as the end of the block does
+        gt = json.loads((tmp_path / f"set/train/{number:06d}/scene_gt.json").read_text())["0"]
+        assert [pose["obj_id"] for pose in gt] == [2]
+    after = json.loads((tmp_path / "set/models/models_info.json").read_text())
+    assert after == models | {"2": models["1"] | {"spec": "apriltag:36h11:6"}}
 
 
 def test_bop_has_no_lenses(tmp_path, truth, frame):
