@@ -271,6 +271,10 @@ def test_steps_on_the_device_agree_with_numpy(room, monkeypatch, far, sky):
     np.testing.assert_allclose(device.fit.offset, host.fit.offset, atol=1e-4)
     assert device.noise == pytest.approx(host.noise, rel=1e-3)
     assert sky == (pose_difference(scene.camera.with_pose(device.pose), scene.camera)[0] < 5)
+    kernels.sums(3, kernels.frame(3, start), at.fit)  # adds to the histogram of errors
+    again = kernels.minimise(3, at, 6, 0.02, 1e-3)
+    np.testing.assert_array_equal(again.pose, device.pose)
+    assert again.noise == device.noise
 
 
 def test_a_gpu_replays_renders_with_the_result_of_a_cpu(renderer, room, monkeypatch):

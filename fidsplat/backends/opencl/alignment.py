@@ -169,7 +169,7 @@ class OpenCLAlignment(AlignmentKernels):
                     perturbed.frame.images.buffer("rgb"), args, "perturbed frame", 3
                 )
                 args |= {"has_perturbed": 1, "step": perturbed.size, "axis": perturbed.axis}
-            cl.enqueue_fill_buffer(self._queue, args["counts"], _ZERO, 0, 4 * BINS)
+            self._clear_errors()
             self._upload_fit(fit)
             self._by_groups("align_errors", self._rows(args["height"]), args)
             self._by_groups("align_sums", groups, args)
@@ -185,7 +185,7 @@ class OpenCLAlignment(AlignmentKernels):
             if isinstance(frame, _ReplayedImages):
                 groups, totals = self._groups(level, False), []
                 args = self._sum_arguments(level, frame, fit, groups)
-                cl.enqueue_fill_buffer(self._queue, args["counts"], _ZERO, 0, 4 * BINS)
+                self._clear_errors()
                 self._upload_fit(fit)
                 self._by_groups("align_errors", self._rows(level["height"]), args)
                 for number, (pose, size, axis) in enumerate(motions):
@@ -222,6 +222,7 @@ class OpenCLAlignment(AlignmentKernels):
             buffer = self._upload("state", state)
             self._upload_fit(at.fit)
             lists = self._step_lists(stage, replayed, at.fit, settled)
+            self._clear_errors()
             found = np.empty(_COST, np.float32)
             for number in range(steps + (not at.noise)):  # the first sums may be for the exposure
                 if number:
@@ -263,7 +264,6 @@ class OpenCLAlignment(AlignmentKernels):
         self._launch("align_sums", *self._size(groups), args, sums)
         self._launch("align_totals", (256,), (256,), args, sums)
         self._launch("align_step", (1,), (1,), args, step)
-        cl.enqueue_fill_buffer(self._queue, args["counts"], _ZERO, 0, 4 * BINS)  # each frame leaves zeros
         sums.key = self._workspace.pool.generation, replayed, settled, level | {"min_bin": 0}
         return lists
 
@@ -285,10 +285,17 @@ class OpenCLAlignment(AlignmentKernels):
         return args | {
             **{"rgb": values, "depth": frame.images.buffer("depth"), "perturbed": values},
             **{"has_perturbed": 0, "step": 1.0, "axis": 0, "huber": int(fit.huber), "row": 0},
-            **{"counts": self._scratch("errors", 4 * BINS), "fit": self._scratch("fit", 28)},
+            **{"counts": self._errors(), "fit": self._scratch("fit", 28)},
             **{"result": self._scratch("sums", 4 * groups * _SUMS)},
             "noise_factor": noise_factor(len(fit.gain)),
         }
+
+    def _errors(self) -> cl.Buffer:
+        return self._scratch("errors", 4 * BINS)
+
+    def _clear_errors(self) -> None:
+        """Clear the histogram to which `align_errors` adds; `align_totals` clears it too."""
+        cl.enqueue_fill_buffer(self._queue, self._errors(), _ZERO, 0, 4 * BINS)
 
     def _upload_fit(self, fit: AlignmentFit) -> cl.Buffer:
         values = np.ones(7, np.float32)
