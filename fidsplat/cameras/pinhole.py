@@ -141,7 +141,8 @@ class Camera(PickledByFields, Summarised):
         """A camera from intrinsics in pixels, a pose world_to_camera (4, 4), by default the identity, and a
         lens.
 
-        position (3,): exact centre of projection in metres, for a pose that was computed from it.
+        position (3,): centre of projection in metres, if the pose was computed from it; it avoids a rounding
+        error.
         """
         pose = np.eye(4) if world_to_camera is None else world_to_camera
         return Camera(width, height, fx, fy, cx, cy, pose, near, far, position, lens)  # type: ignore[arg-type]

@@ -27,7 +27,7 @@ def register(kind: Kind) -> None:
     if not isinstance(instance("kind", kind, Kind).name, str):
         raise invalid("the name of a kind", "text", kind.name)
     if kind.name in _kinds:
-        raise InputError(f"the name of a kind must be new, got {kind.name!r}; use another name")
+        raise InputError(f"the name of a kind must not exist yet, got {kind.name!r}; use another name")
     if not kind.name.isalnum() or kind.name != kind.name.lower():
         raise InputError(f"the name of a kind must be lower-case letters and digits, got {kind.name!r}")
     _kinds[kind.name] = kind

@@ -184,7 +184,7 @@ def _indexed(sheet: Sheet) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _coarse(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
-    """Dots of a printer: each has the colour at its centre."""
+    """Print in square dots, each in the colour of the sheet at the dot's centre."""
     dot = DOT * severity * sheet.cells
 
     def centres(count: int) -> np.ndarray:

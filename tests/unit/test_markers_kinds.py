@@ -121,8 +121,8 @@ def test_a_kind_from_outside_is_a_marker_like_any_other(toy, tmp_path):
 
 def test_names_that_are_no_names_of_kinds(toy):
     for name, says in (
-        ("qr", "the name of a kind must be new"),
-        ("stripes", "the name of a kind must be new"),
+        ("qr", "the name of a kind must not exist yet"),
+        ("stripes", "the name of a kind must not exist yet"),
         ("a-b", "lower-case"),
         ("", "lower-case"),
     ):
