@@ -148,7 +148,7 @@ def _read_tags(
 ) -> None:
     """Detect further tags with a method of corner refinement.
 
-    Tags whose alignment converges are appended to `detections`, other tags, with OpenCV's corners, to `loose`.
+    Tags whose alignment converges are appended to `detections`, others, with OpenCV's corners, to `loose`.
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = refinement
