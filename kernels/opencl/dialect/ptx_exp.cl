@@ -1,5 +1,5 @@
 // Exponential of NVIDIA's GPUs instead of a polynomial: relative error at most 1e-6 for opacities above 1e-5; 0 below the smallest normal
-// float.
+// float. Their reciprocal, within 1 ulp, is not refined.
 //@ arithmetic
 static inline float ptx_exp(float x) {
     float y;
@@ -8,3 +8,5 @@ static inline float ptx_exp(float x) {
 }
 #undef EXP
 #define EXP ptx_exp
+#undef RECIPROCAL
+#define RECIPROCAL(x) ptx_fast_reciprocal(x)
