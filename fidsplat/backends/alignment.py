@@ -42,7 +42,8 @@ class AlignmentFit(NamedTuple):
     """True: Huber's loss, with the mean of the gradients of rendered frame and image; False: Tukey's loss,
     with the gradients of the frame"""
     noise: float = 0.0
-    """standard deviation of the residuals at the previous pose; 0: from the median of the residuals"""
+    """standard deviation of the residuals at the previous pose; 0: not known, and estimated from
+    the median of the residuals"""
 
 
 class Estimate(NamedTuple):
@@ -103,12 +104,12 @@ class AlignmentSums:
     block_matrices: np.ndarray
     """(blocks, c, 8, 8) `matrix` of each block; empty unless requested"""
     block_moments: np.ndarray
-    """(blocks, c, 6) unweighted sums of each block: image x with the exposure of the render, render y, x^2,
-    y^2, x y, and 1; empty unless requested"""
+    """(blocks, c, 6) unweighted sums of each block: p, r, p^2, r^2, p r and 1, with p the image without gain
+    and offset, and r the rendered value; empty unless requested"""
     cost: float
     """mean loss"""
     cost_before: float
-    """mean loss with `AlignmentFit.noise`"""
+    """mean loss with the noise of the previous pose (`AlignmentFit.noise`), for comparison with its `cost`"""
     inverse_depth: float
     """mean squared inverse depth [1 / m^2]"""
     noise: float

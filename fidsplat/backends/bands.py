@@ -9,8 +9,8 @@ import numpy as np
 
 
 def even_parts(count: int, most: int) -> Iterator[tuple[int, int]]:
-    """Ranges [first, end) of at most `most` items each, of equal size within one item, so that they share
-    buffers and recorded launches."""
+    """Ranges [first, end) of at most `most` items each, whose sizes differ by at most one, so that they
+    share buffers and recorded launches."""
     parts = -(-count // most)
     return pairwise([count * k // max(parts, 1) for k in range(parts + 1)])
 

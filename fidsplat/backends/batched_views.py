@@ -36,7 +36,7 @@ class ViewBatch:
     """(g + 1, v, 3) float64 metres"""
     eye: np.ndarray
     """(g + 1, v, 3) float64 metres"""
-    numbers: Mapping[str, np.ndarray] = field(default_factory=dict)
+    camera_parameters: Mapping[str, np.ndarray] = field(default_factory=dict)
     """(v,) or (v, k) float64: camera parameters that differ between views, by their names in View"""
     batch_indices: np.ndarray = field(default_factory=lambda: _INDEX_0)
     """(v,) uint32: position of each view in the batch"""
@@ -44,7 +44,7 @@ class ViewBatch:
     views: tuple[View, ...] = ()
     """the views, if they differ from `view` in more than their poses"""
     stacked: bool = True
-    """whether the views differ only in poses and `numbers`; if not, they are rendered one by one"""
+    """whether the views differ only in poses and `camera_parameters`; if not, they are rendered one by one"""
 
     def __len__(self) -> int:
         return len(self.batch_indices)
@@ -81,9 +81,13 @@ class ViewBatch:
                     views=tuple(views),
                     stacked=False,
                 )
-        numbers = {name: np.array([getattr(view, name) for view in views], np.float64) for name in _PER_VIEW}
-        numbers = {name: values for name, values in numbers.items() if (values != values[0]).any()}
-        return _stacked(views, numbers, batch_indices, total)
+        camera_parameters = {
+            name: np.array([getattr(view, name) for view in views], np.float64) for name in _PER_VIEW
+        }
+        camera_parameters = {
+            name: values for name, values in camera_parameters.items() if (values != values[0]).any()
+        }
+        return _stacked(views, camera_parameters, batch_indices, total)
 
     @staticmethod
     def of_poses(
@@ -135,7 +139,7 @@ class ViewBatch:
             self.rotation[:, first:end],
             self.translation[:, first:end],
             self.eye[:, first:end],
-            {name: values[first:end] for name, values in self.numbers.items()},
+            {name: values[first:end] for name, values in self.camera_parameters.items()},
             indices,
             self.total,
             self.views[first:end],
@@ -145,7 +149,9 @@ class ViewBatch:
         """One of the rendered views, by its number."""
         if self.views:
             return self.views[number]
-        own: dict[str, Any] = {name: _plain(values[number]) for name, values in self.numbers.items()}
+        own: dict[str, Any] = {
+            name: _plain(values[number]) for name, values in self.camera_parameters.items()
+        }
         external = self.view.external_depth
         if external and external.stacked:
             own["external_depth"] = external.of_views(number)
@@ -159,14 +165,16 @@ class ViewBatch:
 
 
 def _stacked(
-    views: Sequence[View], numbers: Mapping[str, np.ndarray], batch_indices: np.ndarray, total: int
+    views: Sequence[View], camera_parameters: Mapping[str, np.ndarray], batch_indices: np.ndarray, total: int
 ) -> ViewBatch:
     own = [[view, *(moved for _, moved in view.groups)] for view in views]
     rotation, translation, eye = (
         np.stack([[getattr(group, name) for group in each] for each in own], axis=1)
         for name in ("rotation", "translation", "eye")
     )
-    return ViewBatch(views[0], rotation, translation, eye, numbers, batch_indices, total, views=tuple(views))
+    return ViewBatch(
+        views[0], rotation, translation, eye, camera_parameters, batch_indices, total, views=tuple(views)
+    )
 
 
 def _plain(value: np.ndarray) -> float | tuple[float, ...]:

@@ -26,8 +26,8 @@ _CHECKSUM = "crc"
 _watched: set[Path] = set()
 
 Entry = list[int]
-"""checksum, size [bytes], modification time [ns], inode; a file is only read if one of the last three has
-changed"""
+"""checksum, size [bytes], time of the last status change [ns], inode; a file is only read if one of the
+last three has changed"""
 
 
 def check_once(folder: Path, is_loaded: Callable[[str], bool], is_complete: Callable[[Path], bool]) -> None:

@@ -19,7 +19,8 @@ NOT_LATEST_FRAME = (
 
 
 class CapacityExceeded(Exception):
-    """Error: a frame was submitted without waiting for its counts, and its pairs exceeded its buffers."""
+    """Error: the (splat, tile) pairs of a frame, submitted before their number was known, exceeded its
+    buffers."""
 
 
 class DifferentiableImages:

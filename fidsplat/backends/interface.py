@@ -67,7 +67,9 @@ class ResidentData(ABC):
     sh_degree: int
     has_coplanar_groups: bool
     footprint: str
+    """`gaussian`, `box` or `mixed`"""
     ellipsoids: str
+    """which splats are 3D Gaussians: `none`, `some` or `all`"""
 
     def copy_properties(self, cloud: PlacedTraits) -> None:
         """Copy the origin and the properties that select kernels from another cloud."""
@@ -258,9 +260,10 @@ class GradientPipeline(ABC):
     def forward(self, resident: Any, view: View, waits: bool = True) -> Any:
         """Render one view of an uploaded cloud, bit-identical to `Pipeline.render`, for a later `backward`.
 
-        waits: whether to wait until the counts show that the buffers were large enough. If not, `backward`
-        may raise CapacityExceeded, and the frame must be discarded. Raises DeviceError if the frame does not
-        fit the memory budget in one piece, as bands and chunks have no gradient.
+        waits: whether to wait until the number of (splat, tile) pairs shows that the buffers were large
+        enough. If not, `backward` may raise CapacityExceeded, and the frame must be discarded. Raises
+        DeviceError if the frame does not fit the memory budget in one piece, as a frame that is divided into
+        bands of tiles or chunks of splats has no gradient.
         """
 
     @abstractmethod
@@ -290,7 +293,8 @@ class GradientPipeline(ABC):
         """
 
     def backward_per_tile(self, images: Any, gradients: Mapping[str, Any]) -> Any:
-        """Gradients in the form that `Backend.training().step` accepts; by default the same as `backward`."""
+        """Gradients summed per tile, before the backward pass of the projection: the input of
+        `Backend.training().step`. By default the result of `backward`."""
         return self.backward(images, gradients)
 
 
@@ -341,8 +345,7 @@ class Backend(ABC):
         raise InputError(self.lacks("wrap arrays", "use a Warp device, or a SplatCloud"))
 
     def chunk_cache(self, scene: Any) -> Any:
-        """A device cache of the chunks of a `streaming.device_chunks.DeviceChunks`
-        (`opencl.chunk_cache.OpenCLChunkCache`)."""
+        """A device cache for a scene in chunks (`streaming.device_chunks.DeviceChunks`)."""
         raise DeviceError(self.lacks("cache chunks of a scene", "upload the scene"))
 
     def termination_depths(self, images: Any) -> TerminationDepths:
@@ -351,7 +354,7 @@ class Backend(ABC):
 
     def copy_tiles(self, images: Any, other: Any, tiles: np.ndarray) -> None:
         """Copy the tiles of a mask (rows, columns) bool from another frame of the same view into a frame, and
-        add its counts. A pixel must not span two tiles."""
+        add its `stats`. The sides of a tile must be multiples of the samples per pixel."""
         raise DeviceError(self.lacks("copy tiles", "render without occlusion culling"))
 
     def differentiate(self, features: FeatureSet, config: Any = None) -> GradientPipeline:
@@ -371,14 +374,14 @@ class Backend(ABC):
 
     def release_scratch(self) -> None:
         """Release the scratch buffers, so that the next frame allocates only what it needs."""
-        raise DeviceError(self.lacks("measure its memory", "use an OpenCL device"))
+        raise DeviceError(self.lacks("release its scratch buffers", "use an OpenCL device"))
 
     def rates(self) -> Rates:
         """Peak rates of the device, measured at each call."""
         raise DeviceError(self.lacks("measure its rates", "use an OpenCL device"))
 
     def probe(self) -> Probe:
-        raise DeviceError(self.lacks("have a probe", "use an OpenCL or Warp device"))
+        raise DeviceError(self.lacks("allow tests of its functions", "use an OpenCL or Warp device"))
 
     def configs(self, kind: str) -> dict[str, Any]:
         """Alternative build constants by name, with which tests compile the same features.

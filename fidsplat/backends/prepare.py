@@ -44,12 +44,12 @@ def prepare_batch(cloud: PlacedTraits, views: CaptureBatch) -> tuple[FeatureSet,
     if len(views.captures) == 1 and views.captures[0].motion.is_still:
         features, view = prepare(cloud, views.capture(0))
         if not view.sub_frames:
-            numbers, groups = indices.astype(np.intp), sorted((views.groups or {}).items())
-            poses = None if views.poses is None else views.poses[numbers]
-            moved = {label: each[numbers] for label, each in groups}
+            positions, groups = indices.astype(np.intp), sorted((views.groups or {}).items())
+            poses = None if views.poses is None else views.poses[positions]
+            moved = {label: each[positions] for label, each in groups}
             external = views.captures[0].external_depth
             if external and external.stacked:
-                own = external if len(rendered) == len(views) else external.of_views(numbers)
+                own = external if len(rendered) == len(views) else external.of_views(positions)
                 view = replace(view, external_depth=own)
             return features, ViewBatch.of_poses(view, cloud.origin, poses, moved, indices, len(views))
     own = [prepare(cloud, views.capture(number)) for number in range(len(views))]

@@ -50,7 +50,7 @@ class Probe(ABC):
         """Prefix sums modulo 2^32 of list lengths (n,) uint32: (n + 1,) uint32; and the total."""
 
     @abstractmethod
-    def boxes(self, pipeline: Any, buffers: Mapping[str, np.ndarray]) -> np.ndarray:
+    def bounding_boxes(self, pipeline: Any, buffers: Mapping[str, np.ndarray]) -> np.ndarray:
         """Bounding boxes (n, 4) int in samples of the splats, from a result of
         `Pipeline.render_intermediates`: columns [x0, x1), rows [y0, y1); undefined for culled splats."""
 

@@ -18,7 +18,7 @@ from fidsplat.util.errors import InputError
 
 FAR_EYE = 1e9
 """metres: distance of the eye from which view-dependent colours of a parallel projection are evaluated"""
-NO_CAMERA = "no camera: pass camera=fs.Camera... or give the scene a [camera] table"
+NO_CAMERA = "camera must be given, got none; pass camera=fs.Camera(...), or give the scene a [camera] table"
 MAX_GRID = 32767
 """largest side of the sample grid: kernels store rows and columns of samples in 16 bits"""
 _NO_SENSOR = Sensor()
@@ -62,7 +62,7 @@ class View:
     background: tuple[float, float, float]
     """background colour; with fog, the fog's colour"""
     first_hit_transmittance: float
-    """transmittance at which the first hit (`depth_first`) is taken"""
+    """transmittance behind which a fragment is the first hit of a pixel, the output `depth_first`"""
     sensor: Sensor = _NO_SENSOR
     fog_density: float = 0.0
     """fog density per metre"""
@@ -179,9 +179,9 @@ class View:
         intrinsics = camera.fx * n, camera.fy * n, camera.cx * n, camera.cy * n
         parallel = isinstance(lens, Orthographic)
         fx, fy, cx, cy = intrinsics
-        # 3DGS and gsplat: 0.3 half images outside the image
+        # as in 3DGS and gsplat: 0.3 times the half width, and half height, outside the image
         beyond_x, beyond_y = 0.15 * grid[0] / fx, 0.15 * grid[1] / fy
-        slopes = (
+        ewa_clamp = (
             *(cx / fx + beyond_x, (grid[0] - cx) / fx + beyond_x),
             *(cy / fy + beyond_y, (grid[1] - cy) / fy + beyond_y),
         )
@@ -210,7 +210,7 @@ class View:
             environment_map=None if plain else background,
             external_depth=external,
             raster=raster,
-            ewa_clamp=slopes,
+            ewa_clamp=ewa_clamp,
             along_ray=lens is not None and lens.along_ray,
             parallel=parallel,
         )

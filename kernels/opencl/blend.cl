@@ -19,7 +19,7 @@ typedef struct {
 } Pixel;
 
 typedef struct {            // uniforms of the blend stage
-    wide log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter;
+    wide log_alpha_cutoff, opacity_ceiling, transmittance_stop, sample_area;
 } BlendConstants;
 
 static inline void pixel_start(Pixel *pixel) {

@@ -8,7 +8,7 @@
 
 //@@ compose_types
 typedef struct {            // uniforms of the blend stage
-    wide log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter;
+    wide log_alpha_cutoff, opacity_ceiling, transmittance_stop, sample_area;
     float log_ceiling;
 } BlendConstants;
 

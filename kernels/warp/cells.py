@@ -130,7 +130,7 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
             far_x = wp.max(wp.abs(shift), wp.abs(shift - float(view.tile_w)))
             above = float(top) - s.c[0]
             c = conic_of(s, far_x, wp.max(wp.abs(above), wp.abs(above + float(view.tile_h))))
-        lowpass_square = s.half_r2 * fast_reciprocal(view.per_pixel) * (1.0 + _PAD_RELATIVE)
+        lowpass_square = s.half_r2 * fast_reciprocal(view.sample_area) * (1.0 + _PAD_RELATIVE)
         bits = wp.uint32(0)
         for row in range(first_row, end_row):
             y0 = float(top + row * CELL_H) - s.c[0]

@@ -47,7 +47,7 @@ class View:
     tiles_x: int
     tiles_y: int
     samples: int  # per pixel and axis
-    per_pixel: float  # (pixels per sample)^2: converts squared samples to squared pixels
+    sample_area: float  # (pixels per sample)^2: converts squared samples to squared pixels
     log_alpha_cutoff: float
     opacity_ceiling: float
     transmittance_stop: float

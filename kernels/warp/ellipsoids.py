@@ -94,7 +94,7 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
     @wp.func
     def widened(across: vec3, down: vec3, view: View):
         """Cholesky factor of the widened covariance on the image; determinants before and after."""
-        spread = widening / real(view.per_pixel)
+        spread = widening / real(view.sample_area)
         xx, xy, yy = wp.dot(across, across), wp.dot(across, down), wp.dot(down, down)
         crossed = wp.cross(across, down)  # so that the determinant does not cancel
         before = wp.dot(crossed, crossed)

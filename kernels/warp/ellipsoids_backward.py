@@ -70,7 +70,7 @@ def make_ellipsoids_backward(effects: tuple[str, ...]):
         """Gradients with respect to the scaled axes, in rows, to the centre, and to fx, fy, cx, cy."""
         across, down, per = ellipsoid.image(scaled[0], scaled[1], scaled[2], p, view)
         factor, before, after = ellipsoid.widened(across, down, view)
-        spread, ahead = _WIDENING / wp.float64(view.per_pixel), _ONE / p[2]
+        spread, ahead = _WIDENING / wp.float64(view.sample_area), _ONE / p[2]
         per_x, per_y, slope_x, slope_y = per[0], per[1], per[2], per[3]
         grad_l11, grad_l21, grad_l22 = grad_a[0] / per_x, grad_a[1] / per_y, grad_b[1] / per_y
         grad_per_x = -grad_l11 * factor[0] / per_x

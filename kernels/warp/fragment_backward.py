@@ -280,10 +280,10 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
             grad_nu += 2.0 * grad_z * grad_dot_depth[0] * nu
             grad_nv += 2.0 * grad_z * grad_dot_depth[0] * nv
         if wp.static(has_lowpass_disc):
-            grad_dot = 2.0 * view.per_pixel * grad_log
+            grad_dot = 2.0 * view.sample_area * grad_log
             if on_plane:
                 grad_dot = 0.0
-            grad_dot -= 2.0 * view.per_pixel * grad_z * grad_dot_depth[1]
+            grad_dot -= 2.0 * view.sample_area * grad_z * grad_dot_depth[1]
             m[wp.static(at.get("lowpass_x", 0))] = grad_dot * (x - s.lowpass_x)
             m[wp.static(at.get("lowpass_y", 0))] = grad_dot * (y - s.lowpass_y)
         if wp.static(normal):

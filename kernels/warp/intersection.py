@@ -144,7 +144,7 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
         if wp.static(has_lowpass_disc):
             ex = x - s.lowpass_x
             ey = y - s.lowpass_y
-            c.lowpass_half_rho = fma(ex, ex, ey * ey) * view.per_pixel
+            c.lowpass_half_rho = fma(ex, ex, ey * ey) * view.sample_area
             c.contributes = c.inside or c.lowpass_half_rho <= s.half_r2
         return c
 

@@ -35,7 +35,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         name in effects for name in ("stop_exclusive", "ray_depth", "order_pixel", "order_coplanar", "rays")
     )
     boxes, has_external_depth = any(name in effects for name in BOXES), "external_depth" in effects
-    rays = make_rays(has_lens, "rays_length" in effects, has_lens and boxes, has_external_depth)
+    rays = make_rays(has_lens, "lens_ray_length" in effects, has_lens and boxes, has_external_depth)
     Rays, length_of = rays.Rays, rays.length_of
     starts, attribute_readers, composites, covers, clears = (
         output.functions(outputs, part)

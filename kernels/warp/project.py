@@ -261,7 +261,7 @@ def make_project(
             if in_front:
                 box.lowpass_x = float(center_x)
                 box.lowpass_y = float(center_y)
-                box.lowpass_r = wp.sqrt(half_r2 / view.per_pixel) * (1.0 + PAD_RELATIVE) + PAD
+                box.lowpass_r = wp.sqrt(half_r2 / view.sample_area) * (1.0 + PAD_RELATIVE) + PAD
             if itself:
                 box.lowpass_r = -1.0
         view = views[reread(number)]

@@ -31,7 +31,7 @@ LENS_FILES = {
         "part/inverse_lens_lut",
         "part/polygon",
         "part/rays_box",
-        "part/rays_length",
+        "part/lens_ray_length",
         "part/world_ray",
     ),
 }

@@ -125,7 +125,7 @@ def started():
         pytest.param(lambda: blending("footprint_box", outputs=()), id="blend-boxes"),
         pytest.param(lambda: blending("rays", "footprint_box", outputs=()), id="blend-rays-boxes"),
         pytest.param(lambda: blending("rays", *MIXED), id="blend-rays-mixed", marks=LONG),
-        pytest.param(lambda: blending("rays", *RECORD, "rays_length"), id="blend-rays", marks=LONG),
+        pytest.param(lambda: blending("rays", *RECORD, "lens_ray_length"), id="blend-rays", marks=LONG),
         pytest.param(lambda: blending("camera_orthographic", *RECORD), id="blend-parallel", marks=LONG),
         pytest.param(lambda: blending("lowpass_screen", "stop_exclusive", outputs=()), id="blend-exclusive"),
         pytest.param(lambda: projecting_back(16, "ellipsoid_exact"), id="project-backward-exact"),

@@ -90,7 +90,9 @@ def test_bounds_contain_the_rims_of_huge_disks(backend):
     features, view = prepare(disks, fs.Capture(CAMERA, ALL_OUTPUTS, quality))
     assert np.array_equal(view.rotation, np.eye(3))
     pipeline = backend.pipeline(features)
-    boxes = backend.probe().boxes(pipeline, pipeline.render_intermediates(backend.upload(disks), view))
+    boxes = backend.probe().bounding_boxes(
+        pipeline, pipeline.render_intermediates(backend.upload(disks), view)
+    )
     rows, columns = np.mgrid[0 : view.height, 0 : view.width] + 0.5
     for (x0, x1, y0, y1), mean, radius in zip(boxes, disks.means, disks.scales[:, 0], strict=True):
         x, y, z = mean.astype(float) + view.translation
@@ -158,7 +160,7 @@ def test_splats_between_the_samples_are_culled(backend, lists):
     pipeline = backend.pipeline(features, listing(backend, lists))
     buffers = pipeline.render_intermediates(backend.upload(cloud), view)
     visible = buffers["keys"] != CULLED
-    x0, x1, y0, y1 = backend.probe().boxes(pipeline, buffers)[visible].T
+    x0, x1, y0, y1 = backend.probe().bounding_boxes(pipeline, buffers)[visible].T
     assert 5 < visible.sum() < 1000
     assert (x0 < x1).all()
     assert (y0 < y1).all()
@@ -185,7 +187,7 @@ def test_the_box_of_a_record_contains_all_fragments(backend, lowpass):
     view = View.of(fs.Capture(CAMERA, quality=quality), cloud.origin)
     pipeline = backend.pipeline(features)
     buffers = pipeline.render_intermediates(backend.upload(cloud), view)
-    boxes = backend.probe().boxes(pipeline, buffers)
+    boxes = backend.probe().bounding_boxes(pipeline, buffers)
     fragments = 0
     for index in np.flatnonzero(buffers["keys"] != CULLED):
         rows, columns = footprint(cloud, view, index, dot=lowpass == "screen")
@@ -201,7 +203,9 @@ def test_the_bounds_of_a_box_are_its_corners(backend):
     box = fs.SplatCloud([(0.2, 0.1, 3)], [(1, 0, 0, 0)], [(0.3, 0.2)], [1.0], colors=[(1, 1, 1)]).with_boxes()
     features, view = prepare(box, fs.Capture(CAMERA, ALL_OUTPUTS))
     pipeline = backend.pipeline(features)
-    bounds = backend.probe().boxes(pipeline, pipeline.render_intermediates(backend.upload(box), view))[0]
+    bounds = backend.probe().bounding_boxes(
+        pipeline, pipeline.render_intermediates(backend.upload(box), view)
+    )[0]
     low, high = (view.rotation @ (x, y, 3) + view.translation for x, y in ((-0.1, -0.1), (0.5, 0.3)))
     expected = [
         *(view.focal_x * corner[0] / corner[2] + view.center_x for corner in (low, high)),

@@ -465,7 +465,7 @@ class _Replayed:
     def is_complete(self) -> bool:
         """Whether the lists of the last frame were large enough; waits for its counts."""
         self._queue.flush()
-        counted = self._events[self._recorded.counted_launches - 1]
+        counted = self._events[self._recorded.launches_until_counts - 1]
         return self._recorded.capacity.holds(Counts.read(self._workspace.side_queue, self._counts, [counted]))
 
     def world_to_camera(self, numbers: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Kernel source assembly: flat program texts from a FeatureSet and a KernelConfig. Needs no OpenCL.
+"""Kernel source assembly: complete program texts, without #include, from a FeatureSet and a KernelConfig.
 
 A frame needs two programs, `lists` and `frame`: drivers cache compiled programs by their text, and most
 feature sets have the same `lists`. Gradients (`gradients`, `step`), `training` and `alignment` are
@@ -6,8 +6,9 @@ separate programs. An effect is a feature option: a camera model, compositing or
 step, for example.
 
 A line `//@@ name` in a stage's file is a hook: it is replaced by the sections `//@ name` of the chosen
-effects' files, or by an empty line. `//@@ struct NAME` and `//@@ arguments KERNEL` are replaced by
-declarations of kernel_interface.py. `#line` directives give the file and line of each line.
+effects' files, or by an empty line. `//@@ struct NAME`, `//@@ arguments KERNEL` and `//@@ passed KERNEL` (the
+arguments of a call) are replaced by declarations of kernel_interface.py. `#line` directives give the file and
+line of each line.
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ class ProgramSource:
 
 @dataclass
 class KernelSource:
-    """Flat kernel sources with their declarations for the host."""
+    """Sources of programs, with their declarations for the host."""
 
     programs: dict[str, ProgramSource]
     records: dict[str, np.dtype]
@@ -142,7 +143,7 @@ class KernelSource:
 
     def __post_init__(self) -> None:
         self.uniform_groups: dict[str, dict[int, str]] = {}
-        """kernel arguments by index, for each group of uniforms (`View.uniform`)"""
+        """kernel arguments by index, for each group of uniforms (`View.uniforms_of`)"""
         self.view_arrays: set[str] = set()
         """names of the arrays of the view (`View.array`) that kernels read"""
         self.cloud_arrays: list[str] = []
@@ -163,7 +164,8 @@ class KernelSource:
 
 
 def effect_code_of(features: FeatureSet) -> dict[str, EffectCode]:
-    """Code of all effects and of the parts that they require, by name, in the order of their text."""
+    """Code of all effects and of the parts that they require, by name, in the order in which they fill
+    hooks."""
     chosen = [*features.effects, *features.outputs, *features.post_steps]
     for name in EXTENSIONS.keys() & {*chosen} - EFFECT_CODE.keys():
         EFFECT_CODE[name] = extension_code(EXTENSIONS[name])
@@ -210,11 +212,11 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
         # several k-buffer passes over a tile's list; each needs a splat's minimum depth in the block or tile
         files += ["part/passes.cl", f"part/passes_{config.schedule}.cl"]
         files.append("part/blocks_nearest.cl" if config.schedule == "lanes" else "part/tile_nearest.cl")
-    if "termination_depths" in effects:  # after all passes through a list
+    if "termination_depths" in effects:  # its sections follow those of part/passes_*.cl
         order = "_pixel" if "order_pixel" in effects else ""
         files += ["part/termination_depth_pixel.cl"] if order else []
         files.append(f"part/termination_depth{order}_{config.schedule}.cl")
-    if "external_depth" in effects:  # after all passes
+    if "external_depth" in effects:  # its sections follow those of part/passes_*.cl
         files.append("part/external_depth_end.cl")
     stages = {
         "lists": (
@@ -236,8 +238,8 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
 
 
 def _frustum_parts(effects: Collection[str]) -> list[str]:
-    """The file with the test of bounding spheres; none for lenses, and for mixtures of disks and 3D
-    Gaussians, whose bounds are computed in another way."""
+    """The file with the test of bounding spheres; none for lenses, and for clouds with both disks
+    and 3D Gaussians, whose bounds are computed in another way."""
     if "camera_pinhole" not in effects:
         return []
     if "ellipsoids_only" in effects:
@@ -305,39 +307,39 @@ def kernels_of(config: KernelConfig) -> Mapping[str, tuple[Argument, ...]]:
 def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> KernelSource:
     """Assemble the kernels of loss, regularisation and optimiser, for vectors of `lanes` floats."""
     files = ("loss_values", "loss" if lanes == 1 else "loss_strips", *_TRAINING)
-    numbers = {"LANES": lanes, "FAST_FMA": int(fast_fma and lanes > 1), "PROJECTION_FP64": int(float64)}
+    constants = {"LANES": lanes, "FAST_FMA": int(fast_fma and lanes > 1), "PROJECTION_FP64": int(float64)}
     declared = Declarations(Scalars("double" if float64 else "float", "float"))
     stages = ("prelude", "math", *(f"train/{file}" for file in files))
-    return Assembler((), declared, numbers).source({"training": stages})
+    return Assembler((), declared, constants).source({"training": stages})
 
 
 @cache
 def assemble_alignment(items: int) -> KernelSource:
     """Assemble the kernels of direct image alignment, for work-groups of `items` work-items."""
-    numbers: dict[str, int | str] = {"ITEMS": items, "FIRST_BIN": alignment.FIRST_BIN}
+    constants: dict[str, int | str] = {"ITEMS": items, "FIRST_BIN": alignment.FIRST_BIN}
     for name in ("HUBER", "TUKEY", "MIN_NOISE", "MAX_NOISE"):
-        numbers[name] = f"{getattr(alignment, name)}f"
+        constants[name] = f"{getattr(alignment, name)}f"
     declared = Declarations(Scalars("float", "float"))
-    return Assembler((), declared, numbers).source({"alignment": ("alignment",)})
+    return Assembler((), declared, constants).source({"alignment": ("alignment",)})
 
 
 @cache
 def assemble_alignment_step(float64: bool) -> KernelSource:
     """Assemble the kernel of a step of Levenberg-Marquardt, for views in float64 or float32."""
     low, high = alignment.GAINS
-    numbers = {"PROJECTION_FP64": int(float64), "MIN_GAIN": f"{low}f", "MAX_GAIN": f"{high}f"}
+    constants = {"PROJECTION_FP64": int(float64), "MIN_GAIN": f"{low}f", "MAX_GAIN": f"{high}f"}
     declared = Declarations(Scalars("double" if float64 else "float", "float"))
-    return Assembler((), declared, numbers).source({"alignment": ("prelude", "alignment_step")})
+    return Assembler((), declared, constants).source({"alignment": ("prelude", "alignment_step")})
 
 
 def assemble_test(file: str, config: KernelConfig, float64: bool, effects: Iterable[str] = ()) -> str:
     """Text of prelude.cl, math.cl and a file of test kernels below kernels/opencl/ (empty: no file). effects:
     files whose sections fill the hooks."""
-    numbers = {"LANES": config.lanes, "FAST_FMA": int(config.fast_fma), "PROJECTION_FP64": int(float64)}
+    constants = {"LANES": config.lanes, "FAST_FMA": int(config.fast_fma), "PROJECTION_FP64": int(float64)}
     scalars = Scalars("double" if float64 else "float", "float")
     stages = ("prelude", "math", *([file.removesuffix(".cl")] if file else ()))
     files = [*effects, *_dialect(config, scalars)]
-    return Assembler(files, Declarations(scalars), numbers).source({"check": stages}).text
+    return Assembler(files, Declarations(scalars), constants).source({"check": stages}).text
 
 
 def backward_items(features: FeatureSet, config: KernelConfig) -> int:
@@ -362,7 +364,7 @@ def _scalars(features: FeatureSet) -> Scalars:
 
 def build_constants(features: FeatureSet, config: KernelConfig) -> dict[str, int]:
     """The build constants, by their names in the kernels."""
-    numbers = {
+    constants = {
         "BATCH": config.splats_per_item,
         "SORT_BLOCKS": config.sort_blocks,
         "FAST_FMA": int(config.fast_fma),
@@ -377,8 +379,8 @@ def build_constants(features: FeatureSet, config: KernelConfig) -> dict[str, int
         "K_BUFFER_SIZE": config.k_buffer_size,
     }
     if config.schedule == "group":
-        numbers["ROWS"] = config.rows
-    return numbers
+        constants["ROWS"] = config.rows
+    return constants
 
 
 class Assembler:

@@ -193,9 +193,11 @@ class RayBuffers:
             WeakKeyDictionary()
         )
 
-    def of(self, raster: RayRaster, rows: int, columns: int, slopes: bool = False) -> dict[str, cl.Buffer]:
-        """Buffers by name, for a sample grid padded to rows x columns. slopes: also the derivatives of the
-        rays with respect to the sample position, for box splats."""
+    def of(
+        self, raster: RayRaster, rows: int, columns: int, with_derivatives: bool = False
+    ) -> dict[str, cl.Buffer]:
+        """Buffers by name, for a sample grid padded to rows x columns. with_derivatives: also the
+        derivatives of the rays with respect to the sample position, for box splats."""
         sizes = self._buffers.setdefault(raster, {})
         if (rows, columns) not in sizes:
             sizes[rows, columns] = {"rays": self._planar("rays", raster.rays, rows, columns)}
@@ -205,7 +207,7 @@ class RayBuffers:
                     maps["inverse_lens_lut"] = self._upload("inverse_lens_lut", raster.bounds_pyramid[0])
                 sizes[rows, columns]["inverse_lens_lut"] = maps["inverse_lens_lut"]
         buffers = sizes[rows, columns]
-        if slopes and "ray_derivatives" not in buffers:
+        if with_derivatives and "ray_derivatives" not in buffers:
             flat = raster.ray_derivatives.reshape(raster.height, raster.width, 6)
             buffers["ray_derivatives"] = self._planar("ray_derivatives", flat, rows, columns)
             buffers["max_ray_derivative"] = self._upload(
@@ -220,11 +222,13 @@ class RayBuffers:
         return self._upload(name, channels)
 
     @staticmethod
-    def bytes_of(rasters: Collection[RayRaster], tile_height: int, columns: int, slopes: bool) -> int:
+    def bytes_of(
+        rasters: Collection[RayRaster], tile_height: int, columns: int, with_derivatives: bool
+    ) -> int:
         """Bytes of the ray buffers of a frame, for sample grids padded to complete tiles."""
         rows = sum(-(-raster.height // tile_height) * tile_height for raster in rasters)
         first = next(iter(rasters))
-        ray_bytes = 36 if slopes else 12
+        ray_bytes = 36 if with_derivatives else 12
         return ray_bytes * rows * columns + (
             first.bounds_pyramid[0].nbytes if first.lens.kind != "equirectangular" else 0
         )

@@ -113,7 +113,7 @@ class Argument:
     access: Access
     """access to a buffer: `in` if the kernel only reads it, else `out`; empty for a number"""
     source: ValueSource = "stage"
-    """source of the value: the launch or frame, the cloud, or the view (`View.uniform`, `View.array`)"""
+    """source of the value: the launch or frame, the cloud, or the view (`View.uniforms_of`, `View.array`)"""
     uniform: tuple[str, int] = ("", 0)
     """group of uniforms, and index in it"""
     note: str = ""
@@ -148,7 +148,7 @@ def args(*declared: str | tuple[Argument, ...]) -> tuple[Argument, ...]:
 
 
 def uniforms(group: str, *declarations: str, note: str = "") -> tuple[Argument, ...]:
-    """Arguments for all numbers of a group of uniforms (`View.uniform`), in the order of the group."""
+    """Arguments for all numbers of a group of uniforms (`View.uniforms_of`), in the order of the group."""
     words = [declaration.split() for declaration in declarations]
     named = [(ctype, name) for ctype, *names in words for name in names]
     return tuple(

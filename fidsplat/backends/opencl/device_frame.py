@@ -133,10 +133,10 @@ class DeviceFrame:
         self.buffers = FrameBuffers()
         self.named: dict[str, cl.Buffer] = vars(self.buffers)
         """all buffers, including those of effects and outputs, by the names of the kernel arguments"""
-        self.numbers: dict[str, Any] = scalar_arguments(view, self.source)
-        """numbers by the names of the kernel arguments"""
-        self.numbers |= {"width": view.width, "height": view.height, "stride": self.stride}
-        self.numbers["channel_stride"] = self.views * self.rows * self.stride
+        self.scalars: dict[str, Any] = scalar_arguments(view, self.source)
+        """scalar kernel arguments by name"""
+        self.scalars |= {"width": view.width, "height": view.height, "stride": self.stride}
+        self.scalars["channel_stride"] = self.views * self.rows * self.stride
         self.sample_buffers = RAW, *self.source.sample_buffers
         """sample buffers, which the blend stage writes"""
         self.is_sub_frame = False
@@ -149,7 +149,7 @@ class DeviceFrame:
         self.uploads: list[cl.Event] = []
         """events of copies to the device"""
         self.acquired: dict[str, cl.Buffer] = {}
-        self.counted_launches = 0
+        self.launches_until_counts = 0
         """number of launches after which the counts are complete"""
         self.counted: cl.Event | None = None
         """event after which the pairs are counted, if the host did not wait"""
@@ -170,7 +170,7 @@ class DeviceFrame:
 
     @property
     def capacity(self) -> Capacity:
-        return Capacity(self.numbers["big_capacity"], self.pairs)
+        return Capacity(self.scalars["big_capacity"], self.pairs)
 
     def count_pairs(self) -> int | None:
         """Wait for the number of pairs; None if it exceeded the capacity, so that the frame is empty."""
@@ -214,7 +214,7 @@ class DeviceFrame:
 
     def value(self, argument: Argument) -> Any:
         name = argument.name
-        for values in (self.named, self.numbers):
+        for values in (self.named, self.scalars):
             if name in values:
                 return values[name]
         if argument.source == "uniform":  # only kernels of gradients
@@ -276,7 +276,9 @@ class DeviceFrame:
         return Rendered(self.queue, self.acquired, self.stats, self.events, stages, self.uploads)
 
     def bind_rays(self) -> None:
-        """Bind the ray buffers of a lens, and its map from directions to samples."""
+        """Bind the rays of a lens, and its inverse lookup table."""
         assert self.view.raster is not None
-        slopes = self.source.has_argument("blend", "ray_derivatives")
-        self.named |= self.workspace.ray_buffers.of(self.view.raster, self.rows, self.stride, slopes)
+        with_derivatives = self.source.has_argument("blend", "ray_derivatives")
+        self.named |= self.workspace.ray_buffers.of(
+            self.view.raster, self.rows, self.stride, with_derivatives
+        )

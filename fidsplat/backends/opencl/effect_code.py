@@ -1,5 +1,8 @@
 """Kernel code of effects and outputs: their files, and additions to structs and kernel arguments.
 
+The type `real` is that of the projection, `wide` that of fragments (declare.Scalars). D is the denominator of
+the ray-splat intersection, the anchor the origin of a splat's sample coordinates (kernel_interface.SPLAT).
+
 Buffers are (channels, rows, columns) of the padded sample grid, unless a note has another shape.
 """
 
@@ -139,7 +142,9 @@ EFFECT_CODE: dict[str, EffectCode] = {
     ),
     "arithmetic_precise": EffectCode("effect/arithmetic_precise.cl"),
     "arithmetic_fast": EffectCode("effect/arithmetic_fast.cl"),
-    "arithmetic_approximate": EffectCode("effect/arithmetic_fast.cl"),  # without a dialect
+    "arithmetic_approximate": EffectCode(
+        "effect/arithmetic_fast.cl"
+    ),  # where no dialect has its instructions
     "motion_groups": EffectCode(
         "effect/motion_groups.cl",
         project=args("cloud int labels  // (n)", "in int moving  // number of groups, then their labels"),
@@ -177,10 +182,12 @@ EFFECT_CODE: dict[str, EffectCode] = {
         view=(
             member(
                 "real lens_lut[6]",
-                "`inverse_lens_lut`: low corner x, y, cells per unit along x, y, cells per side; first row",
+                "`inverse_lens_lut`: low corner x, y; cells per unit along x, y; cells per side; first row",
             ),
         ),
-        project=args("in short4 inverse_lens_lut  // columns and rows of the samples in a cell of rays"),
+        project=args(
+            "in short4 inverse_lens_lut  // first, last column and row of the samples in each cell of rays"
+        ),
     ),
     "rays": EffectCode(
         "part/rays.cl",
@@ -241,20 +248,22 @@ EFFECT_CODE: dict[str, EffectCode] = {
         project=args("cloud int coplanar_groups  // (n) index of the splat's group; -1: none"),
     ),
     "tile_keys": EffectCode("part/tile_keys.cl", emit=args("in Splat splats")),
-    "coverage": EffectCode("part/coverage.cl"),  # minimum alpha of masks
+    "minimum_alpha": EffectCode("part/minimum_alpha.cl"),  # depth, normal and label require alpha >= 1/255
     "ray": EffectCode(resolve=RAY_UNIFORMS),
     "row_rotation": EffectCode(
         "part/row_rotation.cl", resolve=args("array float row_rotations  // (h, 3, 3)")
     ),
     # rays of fisheyes and panoramas have a length of 1
-    "ray_length": EffectCode("part/ray_length.cl", replaced_by=(("camera_brown_conrady", "rays_length"),)),
-    "rays_length": EffectCode("part/rays_length.cl"),
-    "sample_length": EffectCode(
-        "part/sample_length.cl",
-        parts=("ray", "ray_length"),
-        replaced_by=(("camera_brown_conrady", "rays_sample_length"),),
+    "pinhole_ray_length": EffectCode(
+        "part/pinhole_ray_length.cl", replaced_by=(("camera_brown_conrady", "lens_ray_length"),)
     ),
-    "rays_sample_length": EffectCode("part/rays_sample_length.cl", parts=("rays_length",), resolve=_RAYS),
+    "lens_ray_length": EffectCode("part/lens_ray_length.cl"),
+    "pinhole_sample_length": EffectCode(
+        "part/pinhole_sample_length.cl",
+        parts=("ray", "pinhole_ray_length"),
+        replaced_by=(("camera_brown_conrady", "lens_sample_length"),),
+    ),
+    "lens_sample_length": EffectCode("part/lens_sample_length.cl", parts=("lens_ray_length",), resolve=_RAYS),
     "world_ray": EffectCode("part/world_ray.cl"),
     # outputs
     "alpha": EffectCode(
@@ -264,7 +273,7 @@ EFFECT_CODE: dict[str, EffectCode] = {
     ),
     "depth": EffectCode(
         "output/depth.cl",
-        parts=("ray_depth", "coverage"),
+        parts=("ray_depth", "minimum_alpha"),
         sample_buffers=(SampleBuffer("float", "depth_raw", 2, "sum w z, sum w"),),
         backward_file="output/depth_backward.cl",
         blend_backward=args("in float depth_raw  // 2 channels", "in float grad_depth  // (h, w)"),
@@ -280,7 +289,7 @@ EFFECT_CODE: dict[str, EffectCode] = {
     ),
     "depth_median": EffectCode(
         "output/depth_median.cl",
-        parts=("ray_depth", "coverage"),
+        parts=("ray_depth", "minimum_alpha"),
         sample_buffers=(SampleBuffer("float", "depth_median_raw"),),
     ),
     "depth_first": EffectCode(
@@ -289,12 +298,14 @@ EFFECT_CODE: dict[str, EffectCode] = {
         blend=uniforms("first_hit_transmittance", "float first_hit_transmittance"),
         sample_buffers=(SampleBuffer("float", "depth_first_raw"),),
     ),
-    "distance": EffectCode("output/distance.cl", parts=("depth", "sample_length")),
-    "distance_median": EffectCode("output/distance_median.cl", parts=("depth_median", "sample_length")),
-    "distance_first": EffectCode("output/distance_first.cl", parts=("depth_first", "sample_length")),
+    "distance": EffectCode("output/distance.cl", parts=("depth", "pinhole_sample_length")),
+    "distance_median": EffectCode(
+        "output/distance_median.cl", parts=("depth_median", "pinhole_sample_length")
+    ),
+    "distance_first": EffectCode("output/distance_first.cl", parts=("depth_first", "pinhole_sample_length")),
     "normal": EffectCode(
         "output/normal.cl",
-        parts=("coverage",),
+        parts=("minimum_alpha",),
         splat=(member("wide nx ny nz"),),
         sample_buffers=(SampleBuffer("float", "normal_raw", 3),),
         backward_file="output/normal_backward.cl",
@@ -304,25 +315,26 @@ EFFECT_CODE: dict[str, EffectCode] = {
     "normal_world": EffectCode("output/normal_world.cl", parts=("normal", "row_rotation")),
     "label": EffectCode(
         "output/label.cl",
-        parts=("coverage",),
+        parts=("minimum_alpha",),
         splat=(member("int label"),),
         project=args("cloud int labels  // (n)"),
         sample_buffers=(SampleBuffer("float", "label_raw"), SampleBuffer("int", "label_id_raw")),
     ),
     "splat_id": EffectCode(
         "output/splat_id.cl",
-        parts=("coverage",),
+        parts=("minimum_alpha",),
         splat=(member("int splat_id"),),
         project=args("cloud int splat_ids  // (n)"),
         sample_buffers=(SampleBuffer("float", "splat_id_raw"), SampleBuffer("int", "splat_id_index_raw")),
     ),
     "overdraw": EffectCode("output/overdraw.cl", sample_buffers=(SampleBuffer("int", "overdraw_raw"),)),
+    # bound of the rounding error, for the output `error`; number of composited splats
     "rounding": EffectCode("output/rounding.cl", sample_buffers=(SampleBuffer("float", "rounding_raw"),)),
     "blended": EffectCode("output/blended.cl", sample_buffers=(SampleBuffer("int", "blended_raw"),)),
     # effects on the resolved rgb
     "fog": EffectCode(
         "output/fog.cl",
-        parts=("ray_depth", "ray_length"),
+        parts=("ray_depth", "pinhole_ray_length"),
         blend=args(uniforms("fog_density", "float fog_density"), RAY_UNIFORMS),
         sample_buffers=(SampleBuffer("float", "fog_raw", averaged=True),),
     ),

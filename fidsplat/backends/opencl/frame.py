@@ -45,7 +45,7 @@ def allocate_samples(frame: DeviceFrame) -> None:
     """Bind the buffers that the blend stage writes."""
     for samples in frame.sample_buffers:
         if frame.source.has_argument("blend", samples.name):
-            frame.scratch(samples.name, 4 * frame.numbers["channel_stride"] * samples.channels)
+            frame.scratch(samples.name, 4 * frame.scalars["channel_stride"] * samples.channels)
     if frame.source.has_argument("blend", "termination_depths"):
         depths = frame.acquire("termination_depths", 4 * frame.tiles)
         if frame.view.band is not None:
@@ -61,7 +61,7 @@ def render_sort_first(frame: DeviceFrame) -> None:
         tiling.project(frame, 0, count)
         tiling.sort_by_depth(frame, count)
         counts = tiling.count_pairs(frame, count)
-        if counts.big <= frame.numbers["big_capacity"]:
+        if counts.big <= frame.scalars["big_capacity"]:
             break
         big = counts.big
         frame.discard_launches()
@@ -82,7 +82,7 @@ def render_bin_first(frame: DeviceFrame) -> None:
         capacity = min(capacity, frame.pair_limit)
     tiling.project_and_count(frame)
     counted = tiling.start_lists(frame, capacity)
-    frame.counted_launches = len(frame.events)
+    frame.launches_until_counts = len(frame.events)
     if capacity:
         all_tiles = TileBand(0, frame.tiles, capacity)
         tiling.list_and_sort(frame, all_tiles, capacity, first_band=True)
@@ -100,7 +100,7 @@ def render_bin_first(frame: DeviceFrame) -> None:
 def complete_bin_first(frame: DeviceFrame, counted: cl.Event, capacity: int) -> None:
     """Wait for the counts; if they exceed `capacity`, render again with larger buffers."""
     counts = frame.read_counts(counted)
-    while counts.big > frame.numbers["big_capacity"]:
+    while counts.big > frame.scalars["big_capacity"]:
         tiling.project_and_count(frame, counts.big)
         counted, capacity = tiling.start_lists(frame, 0), 0
         counts = frame.read_counts(counted)
@@ -146,6 +146,7 @@ def blend(frame: DeviceFrame, band: TileBand) -> None:
     arguments: dict[str, Any] = {"band_first": band.first}
     if frame.config.schedule == "group":
         ordered = frame.config.binning != "sort_first" and band.end - band.first == frame.tiles
+        # otherwise not read: any buffer
         arguments["tile_order"] = frame.named["tile_order"] if ordered else frame.buffers.starts
         arguments["longest_first"] = ordered
     frame.launch("blend", "blend", ((band.end - band.first) * group,), (group,), **arguments)

@@ -79,14 +79,13 @@ class OpenCLGradients(GradientPipeline):
             argument.name for argument in arguments["project_backward"] if argument.source == "cloud"
         ]
         self._pair_limit = 0
-        """list capacity of frames for whose counts the host does not wait"""
+        """capacity of the tile lists of frames that are submitted without waiting for their counts"""
         self._tile_commands, self.sum_commands = CommandList(self.program), CommandList(self.program)
         self.step_commands: dict[bool, CommandList] = {}
         """command lists of `TileGradients.step` by `with_camera`"""
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
-        """Render one frame. waits: whether to wait for its counts, which a GPU needs only for the first
-        frame."""
+        """Render one frame. waits: whether to wait for its counts, as the first frame on a GPU must."""
         pipeline = self._pipeline
         with pipeline.workspace.lock:
             if waits or not self._pair_limit:
@@ -150,7 +149,7 @@ class OpenCLGradients(GradientPipeline):
         frame.scratch("checkpoints", (8 * tile if in_groups else 4 * (tile + config.lanes)) * chunks)
         if not in_groups:
             rows = -(-frame.view.height // config.tile_height)
-            frame.scratch("big_rows", 4 * frame.numbers["big_capacity"] * rows)
+            frame.scratch("big_rows", 4 * frame.scalars["big_capacity"] * rows)
         if count := frame.resident.count:
             frame.launch("reserve", "reserve_gradients", (count,), (_GROUP,), count=count)
         groups = chunks if in_groups else min(frame.tiles, frame.workspace.info.compute_units)

@@ -34,7 +34,8 @@ def acquire_images(
     workspace: Workspace, outputs: tuple[Output, ...], views: ViewBatch
 ) -> list[tuple[str, cl.Buffer]]:
     """Buffers for the output images of a batch, (views, h, w, channels) each; `Output.empty_value` in masked
-    views. Raises DeviceError if they exceed the memory budget, or one the largest buffer of the device."""
+    views. Raises DeviceError if they exceed the memory budget, or one of them exceeds the device's largest
+    buffer."""
     pixels = views.total * views.size[0] * views.size[1]
     bytes_of = {output.name: 4 * pixels * output.channels for output in outputs}
     largest = max(bytes_of, key=bytes_of.__getitem__)

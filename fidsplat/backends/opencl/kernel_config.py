@@ -56,23 +56,35 @@ class KernelConfig:
 def cpu_config(lanes: int = 16, cores: int = 8, fast_fma: bool = True) -> KernelConfig:
     """The config for CPUs: a tile per work-item, in the widest vectors."""
     return KernelConfig(
-        "lanes",
-        "sort_first",
-        lanes,
-        lanes,
-        16,
-        min(max(4 * cores, 8), 256),
-        11,
-        1,
-        fast_fma,
-        32,
+        schedule="lanes",
+        binning="sort_first",
+        lanes=lanes,
+        tile_width=lanes,
+        tile_height=16,
+        sort_blocks=min(max(4 * cores, 8), 256),
+        radix_bits=11,
+        scan_items=1,
+        fast_fma=fast_fma,
+        k_buffer_size=32,
         splats_per_item=64,
     )
 
 
 def gpu_config(scan_items: int = 1024, fast_fma: bool = True, dialect: str = "") -> KernelConfig:
     """The config for GPUs: a work-group per tile of 16 x 16 pixels."""
-    return KernelConfig("group", "bin_first", 1, 16, 16, 1024, 8, scan_items, fast_fma, 8, dialect=dialect)
+    return KernelConfig(
+        schedule="group",
+        binning="bin_first",
+        lanes=1,
+        tile_width=16,
+        tile_height=16,
+        sort_blocks=1024,
+        radix_bits=8,
+        scan_items=scan_items,
+        fast_fma=fast_fma,
+        k_buffer_size=8,
+        dialect=dialect,
+    )
 
 
 @cache
@@ -100,7 +112,7 @@ def other_configs(own: KernelConfig, kind: str) -> dict[str, KernelConfig]:
     if kind == "schedule":
         return {"groups": _groups(own, 16 if own.schedule == "lanes" else 8)}
     if kind == "k_buffer":
-        # slightly more fragments than groups keep in registers
+        # one fragment, and one more than the three that the kernel keeps in registers (k_buffer_group.cl)
         few = replace(_groups(own, 8), k_buffer_size=1), replace(_groups(own, 8), k_buffer_size=4)
         return {
             **{f"own, k-buffer of {size}": replace(own, k_buffer_size=size) for size in (1, 3)},

@@ -1,5 +1,7 @@
 """Structs and kernel arguments, declared once for host and kernels.
 
+The type `real` is that of the projection, `wide` that of fragments: float or double (declare.Scalars).
+
 assemble.py prints them as C into kernels/opencl/, and the host binds arguments by name. Buffers are
 (channels, rows, columns) of the padded sample grid, unless a note has another shape.
 """
@@ -21,7 +23,7 @@ VIEW = Record(
         member("real near far", "[m]"),
         member("real log_alpha_cutoff", "ln(alpha cut-off)"),
         member("real width height", "of the sample grid"),
-        member("real filter", "(pixels per sample)^2, for filters that are defined in pixels"),
+        member("real sample_area", "area of a sample [pixels^2], for low-pass filters defined in pixels"),
         member("real band band_end", "rows of samples to render"),
     ),
 )
@@ -102,7 +104,7 @@ _RESERVED = args(
 )
 
 _BLENDED = args(
-    "wide log_alpha_cutoff opacity_ceiling transmittance_stop filter",
+    "wide log_alpha_cutoff opacity_ceiling transmittance_stop sample_area",
     *("float log_ceiling", "float background_r background_g background_b"),
     *("int stride  // of the padded image", "uint channel_stride", "in float grad_rgb  // (h, w, 3)"),
 )
@@ -110,14 +112,14 @@ _BLENDED = args(
 _BLEND = args(
     *("in Splat splats", "in uint lists starts"),
     "uint band_first  // the first tile of this launch; lists begin with its list",
-    *(_SIZE, "wide log_alpha_cutoff opacity_ceiling transmittance_stop filter"),
+    *(_SIZE, "wide log_alpha_cutoff opacity_ceiling transmittance_stop sample_area"),
     "uint channel_stride  // samples per channel of raw, of all views",
     "out float raw  // 4 channels: r, g, b, transmittance",
 )
 
 _EXPOSURE = "float gain_red gain_green gain_blue offset_red offset_green offset_blue"
 _LOSS_SIZE = args(
-    "int width height  // values of a row: three of a pixel; rows",
+    "int width height  // width: values of a row, three per pixel",
     "int stride  // floats of an image's row",
     "uint image_stride  // floats of an image",
 )
@@ -300,7 +302,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "loss_columns": args(_LOSS_SIZE, _IMAGES),
     "loss_rows_backward": args(_LOSS_SIZE, _IMAGES),
     "loss_columns_backward": args(
-        _LOSS_SIZE, "float l1_share ssim_share", _MASK, "in float images", "out float grad_rgb"
+        _LOSS_SIZE, "float l1_weight ssim_weight", _MASK, "in float images", "out float grad_rgb"
     ),
     "loss_sums": args("uint image_stride", "in float images", "out float sums  // (work-groups, 3)"),
     "loss_strips": args(
@@ -309,7 +311,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "loss_strips_backward": args(
         *(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK),
-        *("float l1_share ssim_share", "in float images", "out float grad_rgb"),
+        *("float l1_weight ssim_weight", "in float images", "out float grad_rgb"),
     ),
     "apply_exposure": args("uint count  // pixels", _EXPOSURE, "in float rgb", "out float exposed"),
     "exposure_backward": args(
@@ -322,7 +324,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "surface_normals": args(
         _SURFACE,
         _MASK,
-        "float normal_share  // weight of the loss of each pixel",
+        "float normal_weight  // weight of the loss of each pixel",
         "in float depth normal alpha",
         "out float grad_normal",
         "out float differences  // (rows, columns, 2, 3)",

@@ -70,7 +70,7 @@ class MemoryPlanner:
         self, device: Workspace, source: KernelSource, features: FeatureSet, config: KernelConfig
     ) -> None:
         self._device, self._source, self._config = device, source, config
-        self._has_ray_slopes = source.has_argument("blend", "ray_derivatives")
+        self._has_ray_derivatives = source.has_argument("blend", "ray_derivatives")
         self._has_camera_uniforms = not _CAMERA_UNIFORMS.isdisjoint(source.uniform_groups)
         self._channels = 0
         for samples in (RAW, *source.sample_buffers):
@@ -105,7 +105,7 @@ class MemoryPlanner:
                 *(sub_frame.view.raster for sub_frame in view.sub_frames if sub_frame.view.raster),
             }
             columns = -(-view.width // config.tile_width) * config.tile_width
-            fixed += RayBuffers.bytes_of(rasters, config.tile_height, columns, self._has_ray_slopes)
+            fixed += RayBuffers.bytes_of(rasters, config.tile_height, columns, self._has_ray_derivatives)
         record = self._source.records["Splat"].itemsize
         budget, largest = self._device.memory_budget, self._device.largest_buffer
         return plan_of(resident.capacity, record, upload_bytes, fixed, config.binning, budget, largest)
@@ -119,7 +119,7 @@ class MemoryPlanner:
         external = views.view.external_depth
         batched = views.stacked and not (resident.streamed or self._one_by_one)
         batched = batched and not (external and external.stacked)
-        if plan.chunk or not batched or (views.numbers and self._has_camera_uniforms):
+        if plan.chunk or not batched or (views.camera_parameters and self._has_camera_uniforms):
             for k in range(count):
                 yield Part(k, k + 1, self.frame(resident, views.view_at(k), other_images))
             return
@@ -165,6 +165,7 @@ def plan_of(
     if fits and count * record_bytes <= limit:
         return MemoryPlan(0, count, fixed_bytes + splat_bytes + pair_bytes)
     free = budget - fixed_bytes - pair_bytes
+    # a chunk takes at most 1/8 of the free memory, and grows only up to 1/64: the rest is for visible splats
     chunk, chunked_bytes = DEFAULT_CHUNK, projected_bytes + upload_bytes
     while chunk < _MAX_CHUNK and chunk * chunked_bytes < free // 64:
         chunk *= 2

@@ -47,7 +47,7 @@ class CachedFrame:
     buffer_key: tuple[Any, ...]
     """key of frames with equal buffer sizes"""
     raster: RayRaster | None
-    """ray table of the lens, referenced to keep its buffers on the device"""
+    """rays of the lens, referenced to keep their buffers on the device"""
     recorded: RecordedFrame | None = None
 
 

@@ -78,12 +78,12 @@ kernel void probe(global const float *a, global const float *b, global const flo
 }
 """
 NOT_A_NUMBER = """
-kernel void probe(global const float *x, global int *unequal, global int *named, global int *survives,
+kernel void probe(global const float *x, global int *unequal, global int *is_nan, global int *unordered,
                   global int *infinite) {
     int i = get_global_id(0);
     unequal[i] = x[i] != x[i];
-    named[i] = isnan(x[i]);
-    survives[i] = !(x[i] > 0.0f) && !(x[i] <= 0.0f);
+    is_nan[i] = isnan(x[i]);
+    unordered[i] = !(x[i] > 0.0f) && !(x[i] <= 0.0f);
     infinite[i] = isinf(x[i]);
 }
 """
@@ -143,13 +143,13 @@ class OpenCLProbe(Probe):
         sums = buffer_of(workspace, np.zeros(8, np.uint32))
         given = {"starts": starts}
         if pipeline.config.binning != "sort_first":
-            kernel, place, size = "tile_starts", 1, (3 * items[0],)
+            kernel, total_index, size = "tile_starts", 1, (3 * items[0],)
             given |= {"tiles": len(lengths), "capacity": 2**32 - 1, "counts": sums}
             counters = buffer_of(workspace, np.concatenate([np.zeros(8, np.uint32), lengths]))
             given |= {"counters": counters, "cursors": buffer_of(workspace, lengths)}
             given["tile_order"] = buffer_of(workspace, np.empty_like(lengths))
         else:
-            kernel, place, size = "scan_bins", 4, items
+            kernel, total_index, size = "scan_bins", 4, items
             given |= {
                 "bins": len(lengths),
                 "totals": buffer_of(workspace, lengths),
@@ -159,11 +159,11 @@ class OpenCLProbe(Probe):
         arguments = pipeline.source.arguments[kernel]
         values = [given[one.name] for one in arguments]
         CommandList(pipeline.program).launch(workspace.queue, kernel, size, items, values)
-        places = contents(workspace, starts).view(np.uint32)
+        positions = contents(workspace, starts).view(np.uint32)
         words = contents(workspace, sums).view(np.uint32)
-        return places, int(words[place]) | int(words[place + 1]) << 32
+        return positions, int(words[total_index]) | int(words[total_index + 1]) << 32
 
-    def boxes(self, pipeline: OpenCLPipeline, buffers: Mapping[str, np.ndarray]) -> np.ndarray:
+    def bounding_boxes(self, pipeline: OpenCLPipeline, buffers: Mapping[str, np.ndarray]) -> np.ndarray:
         return np.stack([buffers["records"][name].astype(int) for name in ("x0", "x1", "y0", "y1")], 1)
 
     def _poisoned_pool(self) -> BufferPool:

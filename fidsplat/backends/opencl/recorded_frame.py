@@ -44,7 +44,7 @@ class RecordedFrame:
         if frame.waits:
             pairs = min(frame.pool.size("lists") // 4, frame.workspace.pair_budget)
             self.capacity, self._counter_bytes = Capacity(self.capacity.big, pairs), 4 * COUNTERS
-        self.counted_launches = frame.counted_launches
+        self.launches_until_counts = frame.launches_until_counts
         self._stages = self.commands.stages
         self._source = frame.source
         self._view, self._arrays = frame.view, frame.arrays
@@ -87,14 +87,14 @@ class RecordedFrame:
             return Rendered(queue, acquired, stats, events, stages)
         counters = pool.scratch("counters", self._counter_bytes)
         cl.enqueue_fill_buffer(queue, counters, _ZERO, 0, self._counter_bytes)
-        events = commands.submit(queue, 0, self.counted_launches)
+        events = commands.submit(queue, 0, self.launches_until_counts)
         words = np.empty((1, COUNTERS), np.uint32)
         cl.enqueue_copy(queue, words, counters)
         counts = Counts.of_counters(words)
         if not (self.capacity.holds(counts) or self._enlarge_lists(counts)):
             pool.release(acquired.items())
             return None
-        events += commands.submit(queue, self.counted_launches)
+        events += commands.submit(queue, self.launches_until_counts)
         queue.flush()
         return Rendered(queue, acquired, partial(counts.stats, splats), events, self._stages)
 
@@ -116,9 +116,9 @@ class RecordedFrame:
             if (buffer := frame.pool.get(name)) is not None:
                 frame.bind(name, buffer)
         frame.named |= frame.acquired
-        frame.numbers["big_capacity"], frame.pairs = self.capacity.big, self.capacity.pairs
+        frame.scalars["big_capacity"], frame.pairs = self.capacity.big, self.capacity.pairs
         frame.events, frame.stages = events, self._stages.copy()
-        frame.counted, frame.stats = events[self.counted_launches - 1], rendered.stats
+        frame.counted, frame.stats = events[self.launches_until_counts - 1], rendered.stats
 
     def _cache_view(self, view: View) -> tuple[View, dict[str, np.ndarray], dict[str, Any]]:
         arrays = projection_arrays(ViewBatch.single(view), self._source, 0, self._rows)

@@ -107,7 +107,7 @@ class UploadedCloud(Resident):
             return 0, 0
         if self.streamed:
             return 0, self._bytes_of(names)
-        order = 0 if self._order is None else 5  # bytes per splat
+        order = 0 if self._order is None else 5  # bytes per splat: 4 of `splat_ids`, less than 1 of spheres
         return self.count * (order + self._bytes_of({*names, *self._buffers})), 0
 
     @property

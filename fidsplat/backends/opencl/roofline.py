@@ -12,7 +12,7 @@ from fidsplat.backends.opencl.program import compile_test_kernels
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.util.errors import DeviceError
 
-_CHAINS = 8  # equal to CHAINS in roofline.cl
+_CHAINS = 8  # independent chains of operations per work-item, to hide latency (CHAINS in roofline.cl)
 _REPEATS = 7
 _SHORTEST = 8e-3  # seconds: minimum duration of a timed launch
 _GROUP = 64

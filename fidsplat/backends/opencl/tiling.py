@@ -50,7 +50,7 @@ class TileBand(NamedTuple):
 def allocate_counters(frame: DeviceFrame, words: int, big: int = 0) -> None:
     """Allocate zeroed counters, and buffers for at least `big` splats that touch many tiles."""
     capacity = max(big * 5 // 4, frame.pool.size("big") // 4, MIN_BIG)
-    frame.numbers["big_capacity"] = capacity
+    frame.scalars["big_capacity"] = capacity
     frame.scratch("big", 4 * capacity)
     frame.scratch("big_bounds", frame.source.records["Bounds"].itemsize * capacity)
     if not frame.waits:  # the kernel sort_tiles clears them for the next replay
@@ -72,6 +72,7 @@ def cull(frame: DeviceFrame, big: int) -> None:
         frame.launch("project", "cull_groups", (groups,), (_ITEMS,), groups=groups, capacity=capacity)
         if not frame.waits:
             break
+        # with `culls_first` this counter is the number of groups that are not culled
         unculled = int(frame.read("counters", np.uint32, (COUNTERS,))[VISIBLE])
         if unculled <= capacity:
             break
@@ -118,18 +119,18 @@ def _splat_capacity(frame: DeviceFrame, count: int) -> int:
 
 def sort_by_depth(frame: DeviceFrame, count: int) -> None:
     """Radix sort of the visible splats by depth, ties by index."""
-    views, chunks, bins = frame.views, frame.config.sort_blocks, 1 << frame.config.radix_bits
-    table = frame.scratch("sort table", 4 * bins * chunks * views)
+    views, blocks, bins = frame.views, frame.config.sort_blocks, 1 << frame.config.radix_bits
+    table = frame.scratch("sort table", 4 * bins * blocks * views)
     size = 4 * _splat_capacity(frame, count)
     keys, order = frame.buffers.keys, frame.scratch("order 0", size)
     for number, shift in enumerate(range(0, 32, frame.config.radix_bits)):
         keys_out = frame.scratch(f"sorted keys {number % 2}", size)
         order_out = frame.scratch(f"order {(number + 1) % 2}", size)
         digit = {"keys": keys, "count": count, "first": number == 0, "shift": shift, "table": table}
-        frame.launch("sort", "sort_count", (chunks,), (1,), views, **digit)
+        frame.launch("sort", "sort_count", (blocks,), (1,), views, **digit)
         starts = _prefix_sums(frame, "sort", table, bins, VISIBLE, views)
         out = {"starts": starts, "indices": order, "keys_out": keys_out, "indices_out": order_out}
-        frame.launch("sort", "sort_scatter", (chunks,), (1,), views, **digit, **out)
+        frame.launch("sort", "sort_scatter", (blocks,), (1,), views, **digit, **out)
         keys, order = keys_out, order_out
     frame.buffers.order = order
 
@@ -141,7 +142,7 @@ def count_pairs(frame: DeviceFrame, count: int) -> Counts:
     frame.launch("bin", "bin_count", (frame.config.sort_blocks,), (1,), views, table=table, count=count)
     # tiles of all views are numbered consecutively, view after view
     frame.buffers.starts = _prefix_sums(frame, "bin", table, frame.tiles // views, PAIRS, 1)
-    frame.counted_launches = len(frame.events)
+    frame.launches_until_counts = len(frame.events)
     return Counts.of_counters(frame.read("counters", np.uint32, (views, COUNTERS)))
 
 
@@ -204,7 +205,7 @@ def pack_visible(frame: DeviceFrame, top: int, end: int) -> PackedCounts:
         sizes = {"splats": frame.source.records["Splat"].itemsize, "keys": KEY_BYTES, "windows": WINDOW_BYTES}
         packed = {name: frame.scratch(f"packed {name}", size * plan.capacity) for name, size in sizes.items()}
         counts, big = _pack_chunks(frame, packed)
-        if big <= frame.numbers["big_capacity"]:
+        if big <= frame.scalars["big_capacity"]:
             break
         big *= 2
     if counts.count <= plan.capacity:
@@ -216,25 +217,25 @@ def pack_visible(frame: DeviceFrame, top: int, end: int) -> PackedCounts:
 def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[PackedCounts, int]:
     """Project and pack chunks until a capacity is exceeded. Returns the packed splats, and the number of big
     splats if it exceeded the capacity, else 0."""
-    count, chunk, chunks = frame.resident.count, frame.plan.chunk, frame.config.sort_blocks
+    count, chunk, blocks = frame.resident.count, frame.plan.chunk, frame.config.sort_blocks
     out: dict[str, Any] = {f"{name}_out": buffer for name, buffer in packed.items()}
     total = visible = 0
     for start in range(0, count, chunk):
         stop = min(start + chunk, count)
         project(frame, start, stop)
-        frame.scratch("block_counts", 8 * chunks)
-        frame.launch("project", "pack_count", (chunks,), (1,), count=stop - start)
-        counts = frame.read("block_counts", np.uint32, (2, chunks)).astype(np.int64)
+        frame.scratch("block_counts", 8 * blocks)
+        frame.launch("project", "pack_count", (blocks,), (1,), count=stop - start)
+        counts = frame.read("block_counts", np.uint32, (2, blocks)).astype(np.int64)
         visible += int(counts[1].sum())
         offsets = np.concatenate([[0], np.cumsum(counts[0])]) + total
         total = int(offsets[-1])
         if total > frame.plan.capacity:
             return PackedCounts(-(-total * count // stop), visible), 0
         big = int(frame.read("counters", np.uint32, (COUNTERS,))[BIG])
-        if big > frame.numbers["big_capacity"]:
+        if big > frame.scalars["big_capacity"]:
             return PackedCounts(total, visible), big
         frame.upload("block_offsets", offsets[:-1].astype(np.uint32))
-        frame.launch("project", "pack_move", (chunks,), (1,), count=stop - start, **out)
+        frame.launch("project", "pack_move", (blocks,), (1,), count=stop - start, **out)
     return PackedCounts(total, visible), 0
 
 

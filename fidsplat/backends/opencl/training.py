@@ -264,12 +264,12 @@ class OpenCLTraining:
         gradient = self._array("grad_rgb", (height, columns, 3))
         args = {
             **{"rgb": rgb, "target": target.image, "mask": target.mask, "masked": int(target.masked)},
-            **{"l1_share": (1 - dssim_weight) / value_count, "sums": buffer, "grad_rgb": gradient.data},
+            **{"l1_weight": (1 - dssim_weight) / value_count, "sums": buffer, "grad_rgb": gradient.data},
         }
 
         def loss_launches() -> list[Launch]:
             values = args | {
-                "ssim_share": dssim_weight / size,
+                "ssim_weight": dssim_weight / size,
                 **{"width": 3 * columns, "height": height, "stride": stride},
                 **{"images": self._allocate_images(height, columns)},
                 "image_stride": stride * (height + 2 * _MARGIN_ROWS),
@@ -304,7 +304,7 @@ class OpenCLTraining:
         return value, gradient
 
     def _exposure_readback(self, args: Mapping[str, Any]) -> Callable[[], np.ndarray]:
-        """Continue the gradient through the exposure; returns a function that waits for the exposure's
+        """Backpropagate the gradient through the exposure; returns a function that waits for the exposure's
         gradient."""
         groups = _EXPOSURE_GROUPS
         sums, group_sums = self._scratch("exposure sums", 24 * groups), np.empty((groups, 6), np.float32)
@@ -333,7 +333,7 @@ class OpenCLTraining:
             **{"middle_x": camera.cx, "middle_y": camera.cy},
             **{name: images.device_array(name).data for name in ("depth", "normal", "alpha")},
             **{f"grad_{name}": array.data for name, array in results.items()},
-            "normal_share": weight / (width * height),
+            "normal_weight": weight / (width * height),
             "differences": self._scratch("differences", 24 * width * height),
         }
         for kernel in ("surface_normals", "surface_depths"):
@@ -347,8 +347,8 @@ class OpenCLTraining:
     def step(
         self,
         gradients: Any,
-        sizes: Mapping[str, float],
-        numbers: Mapping[str, float],
+        learning_rates: Mapping[str, float],
+        hyperparameters: Mapping[str, float],
         camera: Camera | None,
         origin: np.ndarray,
         with_camera: bool = False,
@@ -357,19 +357,25 @@ class OpenCLTraining:
 
         Args:
             gradients: the result of `GradientPipeline.backward_per_tile`.
-            sizes: learning rates of `means`, `scales`, `quats`, `logits`, `sh` (degree 0) and `rest` (higher
-                degrees).
-            numbers: `beta1`, `beta2`, `epsilon`, `sqrt_correction2` (square root of 1 - beta2^step);
+            learning_rates: of `means`, `scales`, `quats`, `logits`, `sh` (degree 0), `rest` (higher degrees).
+            hyperparameters: `beta1`, `beta2`, `epsilon`, `sqrt_correction2` (square root of 1 - beta2^step);
                 `scale_penalty` and `opacity_penalty`, added to the gradients; `sparse`: 1 to update only
                 splats that contribute to the frame.
             camera: if given, statistics are accumulated first.
             with_camera: whether to return a function that waits for the gradient (10,) with respect to pose
                 and intrinsics.
         """
-        args = {f"lr_{name}": size for name, size in sizes.items()} | dict(numbers)
-        args |= {"one_minus_beta1": 1 - numbers["beta1"], "one_minus_beta2": 1 - numbers["beta2"]}
+        args = {f"lr_{name}": rate for name, rate in learning_rates.items()} | dict(hyperparameters)
+        args |= {
+            "one_minus_beta1": 1 - hyperparameters["beta1"],
+            "one_minus_beta2": 1 - hyperparameters["beta2"],
+        }
         return self._step(
-            gradients, args | {"update": 1, "sparse": int(numbers["sparse"])}, camera, origin, with_camera
+            gradients,
+            args | {"update": 1, "sparse": int(hyperparameters["sparse"])},
+            camera,
+            origin,
+            with_camera,
         )
 
     def _step(
@@ -417,6 +423,7 @@ class OpenCLTraining:
     def _launch_of(
         self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], args: Mapping[str, Any]
     ) -> Launch:
+        """A launch with the values of its arguments, which is not submitted."""
         values = {**self._bound, "count": self._count, **args}
         names = (argument.name for argument in self._program.source.arguments[kernel])
         return kernel, size, group, [values[name] for name in names]

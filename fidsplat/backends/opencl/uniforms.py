@@ -17,19 +17,19 @@ def scalars_of(view: View) -> dict[str, float]:
     names = ("log_alpha_cutoff", "opacity_ceiling", "transmittance_stop")
     return {
         **{name: getattr(view, name) for name in names},
-        "filter": 1.0 / view.samples**2,
+        "sample_area": 1.0 / view.samples**2,
         **{"background_r": red, "background_g": green, "background_b": blue},
     }
 
 
 def scalar_arguments(view: View, source: KernelSource) -> dict[str, Any]:
     """All scalar kernel arguments of a view, by name."""
-    numbers: dict[str, Any] = scalars_of(view)
+    scalars: dict[str, Any] = scalars_of(view)
     for group, names in source.uniform_groups.items():
         values = view.uniforms_of(group)
         for index, name in names.items():
-            numbers[name] = values[index]
-    return numbers
+            scalars[name] = values[index]
+    return scalars
 
 
 def projection_arrays(views: ViewBatch, source: KernelSource, row: int, end: int) -> dict[str, np.ndarray]:
@@ -50,29 +50,29 @@ def view_records(views: ViewBatch, row: int, end: int, record: np.dtype) -> np.n
     """Structs `View` (kernel_interface.py), (moving groups + 1, views), for rows of samples [row, end)."""
     real = record[0].base  # all members have one type
     if len(views) == 1:
-        numbers = _numbers(views.view, row, end, record)
+        values = _record_values(views.view, row, end, record)
         for _, moved in views.view.groups:
-            numbers += _numbers(moved, row, end, record)
-        return np.array(numbers, real)
+            values += _record_values(moved, row, end, record)
+        return np.array(values, real)
     made = np.empty(views.translation.shape[:2], record)
-    made[:] = np.array(_numbers(views.view, row, end, record), real).view(record)
+    made[:] = np.array(_record_values(views.view, row, end, record), real).view(record)
     made["rotation"] = views.rotation.reshape(*made.shape, 9)
     made["translation"], made["eye"] = views.translation, views.eye
-    for name, values in views.numbers.items():
+    for name, values in views.camera_parameters.items():
         if name in (record.names or ()):
             made[name] = values
     return made
 
 
-def _numbers(view: View, row: int, end: int, record: np.dtype) -> list[float]:
+def _record_values(view: View, row: int, end: int, record: np.dtype) -> list[float]:
     values: dict[str, Any] = {
         **{"rotation": view.rotation.ravel().tolist(), "translation": view.translation.tolist()},
         **{"eye": view.eye.tolist(), "focal_x": view.focal_x, "focal_y": view.focal_y},
         **{"center_x": view.center_x, "center_y": view.center_y, "near": view.near, "far": view.far},
         **{"log_alpha_cutoff": view.log_alpha_cutoff, "width": view.width, "height": view.height},
-        **{"filter": 1.0 / view.samples**2, "band": row, "band_end": end, "ewa_clamp": view.ewa_clamp},
+        **{"sample_area": 1.0 / view.samples**2, "band": row, "band_end": end, "ewa_clamp": view.ewa_clamp},
     }
-    # then the members of a lens and its ray map
+    # then the members of a lens and its inverse lookup table
     lens = iter(() if view.raster is None else view.raster.uniforms)
     flat: list[float] = []
     for name in record.names or ():

@@ -62,7 +62,7 @@ class MemoryPlanner:
     def parts(self, resident: Resident, batch: ViewBatch, reserved: int) -> Iterator[tuple[int, int]]:
         """Ranges [first, end) of views that are rendered together. reserved: bytes of all their images."""
         count, workspace = len(batch), self.workspace
-        if not count or not batch.stacked or (self._same_settings and batch.numbers):
+        if not count or not batch.stacked or (self._same_settings and batch.camera_parameters):
             return even_parts(count, 1)
         each = resident.count * self._splat_bytes + self.sample_bytes(batch.view)
         external = batch.view.external_depth

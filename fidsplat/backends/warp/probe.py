@@ -53,7 +53,7 @@ class WarpProbe(Probe):
         places = np.concatenate([[0], ends.numpy()])
         return places.astype(np.uint32), int(places[-1])
 
-    def boxes(self, pipeline: WarpPipeline, buffers: Mapping[str, np.ndarray]) -> np.ndarray:
+    def bounding_boxes(self, pipeline: WarpPipeline, buffers: Mapping[str, np.ndarray]) -> np.ndarray:
         words = [pipeline.program.layout.word(name) for name in ("columns", "rows")]
         spans = buffers["records"].view(np.uint32)[:, words].astype(int)
         return np.stack([spans & 0xFFFF, spans >> 16], 2).reshape(-1, 4)

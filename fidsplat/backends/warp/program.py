@@ -40,7 +40,14 @@ _PROJECT = (
     *(*_RECORD, "lowpass_pixel", "motion_groups", "ellipsoid_ewa", "ellipsoid_ewa_antialiased"),
     *("camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
 )
-_SAMPLE = (*_RECORD, "ellipsoids_only", "stop_exclusive", "arithmetic_fast", "rays_length", "external_depth")
+_SAMPLE = (
+    *_RECORD,
+    "ellipsoids_only",
+    "stop_exclusive",
+    "arithmetic_fast",
+    "lens_ray_length",
+    "external_depth",
+)
 
 
 def known() -> frozenset[str]:
@@ -83,7 +90,7 @@ class _Requirements:
             effects.add("rays")
         # rays of other lenses have a length of 1
         if "camera_brown_conrady" in effects and measured:
-            effects.add("rays_length")
+            effects.add("lens_ray_length")
         if "arithmetic_approximate" in effects:
             effects.add("arithmetic_fast")
         if "order_coplanar_pixel" in effects:

@@ -30,8 +30,8 @@ def uniforms(batch: ViewBatch, config: KernelConfig, splats: int, has_ray_deriva
     derived = {
         **{"tile_w": config.tile_width, "tile_h": config.tile_height, "splats": splats},
         **{"tiles_x": -(-view.width // config.tile_width), "tiles_y": -(-view.height // config.tile_height)},
-        **{"per_pixel": 1.0 / view.samples**2, "rotation": batch.rotation[0]},
-        **{"translation": batch.translation[0], "eye": batch.eye[0], **batch.numbers},
+        **{"sample_area": 1.0 / view.samples**2, "rotation": batch.rotation[0]},
+        **{"translation": batch.translation[0], "eye": batch.eye[0], **batch.camera_parameters},
         # filled below
         **{"per_focal_x": 0.0, "per_focal_y": 0.0, "per_near": 0.0, "ray": 0.0, "max_ray_derivative": 0.0},
     }
@@ -166,7 +166,9 @@ def _arrays(raster: RayRaster, workspace: Workspace) -> dict[str, Any]:
     if not cached:
         cached["rays"] = _fresh("rays", raster.rays.reshape(-1, 3), wp.vec3, workspace)
         if raster.lens.kind != "equirectangular":
-            cached["cells"] = _fresh("ray map", raster.bounds_pyramid[0], wp.vec4s, workspace)
+            cached["cells"] = _fresh(
+                "inverse lens lookup table", raster.bounds_pyramid[0], wp.vec4s, workspace
+            )
     return cached
 
 

@@ -12,12 +12,12 @@
 //@ camera_lowpass
         // The low-pass disc never has the larger weight if the splat is wider than it in all of the disc: there D is at least `min_d`, in
         // front of the near plane, and (n_u^2 + n_v^2) / D^2 at most the squared distance.
-        real spread = sqrt((kx.z * kx.z + ky.z * ky.z) * (half_r2 / view->filter));
+        real spread = sqrt((kx.z * kx.z + ky.z * ky.z) * (half_r2 / view->sample_area));
         real ahead = (k0.z + kx.z * (center_x - anchor_x) + ky.z * (center_y - anchor_y)) * (determinant < 0 ? -1 : 1);
         real min_d = ahead - spread, steep = kx.x * kx.x + kx.y * kx.y + ky.x * ky.x + ky.y * ky.y;
         // margin for the rounding of the float32 record
         if (facing != 0 && min_d > 0 && (ahead + spread) * near < REAL(0.999) * fabs(determinant) &&
-            steep < REAL(1.99) * view->filter * min_d * min_d)
+            steep < REAL(1.99) * view->sample_area * min_d * min_d)
             record.lowpass_x = 1e18f;
 //@ camera_derivative
         real ahead = 1 / pz;

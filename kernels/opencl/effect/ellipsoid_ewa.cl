@@ -25,7 +25,7 @@ static inline Projected widened(real3_ across, real3_ down, real spread) {
         real3_ c = {unit_normal.x * sw, unit_normal.y * sw, unit_normal.z * sw}, across, down;    // projected axes [samples]
         real per_x, per_y;                                           // samples per metre at the centre
 //@@ camera_image
-        const Projected wide_image = widened(across, down, REAL(0.3) / view->filter);
+        const Projected wide_image = widened(across, down, REAL(0.3) / view->sample_area);
 //@@ ewa_opacity
         a.x = wide_image.l11 / per_x; a.y = wide_image.l21 / per_y; a.z = 0;
         b.x = 0; b.y = wide_image.l22 / per_y; b.z = 0;

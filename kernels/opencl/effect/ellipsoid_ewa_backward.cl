@@ -2,7 +2,7 @@
 // and `down`, and to the centre, which the Jacobian depends on.
 //@ ellipsoid_projection
     const real3_ depths = {a.z, b.z, c.z};
-    const real spread = REAL(0.3) / view->filter;
+    const real spread = REAL(0.3) / view->sample_area;
     real3_ across, down;
     real per_x, per_y;
 //@@ camera_image

@@ -1,6 +1,6 @@
 // No low-pass filter.
 //@ fragment_mask
-static inline vint fragment_mask(const Splat *s, Intersection c, vfloat x, vfloat y, wide half_r2, wide filter,
+static inline vint fragment_mask(const Splat *s, Intersection c, vfloat x, vfloat y, wide half_r2, wide sample_area,
                                  vfloat *lowpass_half_rho) {
     return c.inside;
 }

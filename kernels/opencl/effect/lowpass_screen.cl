@@ -4,7 +4,7 @@
 //@ bounds_make
         bounds.px = (float)center_x;
         bounds.py = (float)center_y;
-        bounds.pr = pz >= near ? sqrt(half_r2 / (float)view->filter) * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD : -1.0f;
+        bounds.pr = pz >= near ? sqrt(half_r2 / (float)view->sample_area) * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD : -1.0f;
 //@@ footprint_lowpass_bounds
 //@ bounds_span
     float lowpass_low = fmax(y0 - b->py, -b->pr), lowpass_high = fmin(y1 - b->py, b->pr);
@@ -25,7 +25,7 @@
 //@@ camera_lowpass
 //@@ footprint_lowpass
 //@ cells_start
-    const float lowpass_square = s->lowpass_x < 1e17f ? (float)(half_r2 / filter) * (1.0f + 1e-4f) : -1.0f;   // -1: no disc
+    const float lowpass_square = s->lowpass_x < 1e17f ? (float)(half_r2 / sample_area) * (1.0f + 1e-4f) : -1.0f;   // -1: no disc
 //@ cells_lowpass
             float lowpass_y = clamp((float)s->lowpass_y, y0, y1) - (float)s->lowpass_y, lowpass_rest = lowpass_square - lowpass_y * lowpass_y;
             if (lowpass_rest >= 0.0f) {
@@ -37,7 +37,7 @@
         if (HAS_LOWPASS(s)) {
             vfloat lowpass_x = fmax(fabs(x - s->lowpass_x) - half_x - BLOCKS_PAD, (vfloat)0.0f);
             vfloat lowpass_y = fmax(fabs(y - s->lowpass_y) - half_y - BLOCKS_PAD, (vfloat)0.0f);
-            outside &= VMASK(FMA(lowpass_x, lowpass_x, lowpass_y * lowpass_y) * filter > half_r2);
+            outside &= VMASK(FMA(lowpass_x, lowpass_x, lowpass_y * lowpass_y) * sample_area > half_r2);
         }
 //@ intersect_functions
 #define HAS_LOWPASS(s) ((s)->lowpass_x < 1e17f)       // lowpass_x is huge without a low-pass disc, NaN where the lens has no image of the centre
@@ -49,13 +49,13 @@
 #define SKIPS_LOWPASS(s) false
 #endif
 
-static inline vint fragment_mask(const Splat *s, Intersection c, vfloat x, vfloat y, wide half_r2, wide filter,
+static inline vint fragment_mask(const Splat *s, Intersection c, vfloat x, vfloat y, wide half_r2, wide sample_area,
                                  vfloat *lowpass_half_rho) {
     *lowpass_half_rho = 0.0f;
     if (SKIPS_LOWPASS(s)) return c.inside;
     vfloat ex = x - s->lowpass_x;
     vfloat ey = y - s->lowpass_y;
-    *lowpass_half_rho = FMA(ex, ex, ey * ey) * filter;
+    *lowpass_half_rho = FMA(ex, ex, ey * ey) * sample_area;
     return c.inside | VMASK(*lowpass_half_rho <= half_r2);
 }
 //@ fragment_half_rho

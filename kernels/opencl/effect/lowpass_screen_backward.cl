@@ -34,8 +34,8 @@ static inline vint fragment_on_plane(const Splat *s, Intersection c, vfloat half
     sums->lowpass_x = FMA(grad_lowpass, x - s->lowpass_x, sums->lowpass_x);
     sums->lowpass_y = FMA(grad_lowpass, y - s->lowpass_y, sums->lowpass_y);
 //@ record_gradients
-    STORE_SUM(lowpass_x, 2.0f * constants->filter * sums->lowpass_x);
-    STORE_SUM(lowpass_y, 2.0f * constants->filter * sums->lowpass_y);
+    STORE_SUM(lowpass_x, 2.0f * constants->sample_area * sums->lowpass_x);
+    STORE_SUM(lowpass_y, 2.0f * constants->sample_area * sums->lowpass_y);
 //@ camera_backward
         // the disc's position is tu.z / pz
         grad_tu.z += total.lowpass_x / pz;

@@ -5,7 +5,7 @@
 //@ splat_view
     if (opacities[i] <= 1.0f) {
         // maximum extent at any opacity, in scales and in samples
-        real most = -view->log_alpha_cutoff, disc = sqrt(most / view->filter) + 2;
+        real most = -view->log_alpha_cutoff, disc = sqrt(most / view->sample_area) + 2;
         real reach = sqrt(2 * most) * fmax(scales[2 * i], scales[2 * i + 1]), fy = view->focal_y;
         real x = means[3 * i], y = means[3 * i + 1], z = means[3 * i + 2];
         global const real *r = view->rotation;

@@ -33,7 +33,7 @@ static inline void add_rounding(Pixel *pixel, const Splat *s, Intersection c, vf
 #ifdef HAS_LOWPASS
     if (HAS_LOWPASS(s)) {
         vfloat away = sqrt(lowpass_half_rho);
-        vfloat off_lowpass = FORM_ROUNDING * (sqrt(constants->filter) * (1.0f + 2.0f * (across + down)) + 3.0f * away);
+        vfloat off_lowpass = FORM_ROUNDING * (sqrt(constants->sample_area) * (1.0f + 2.0f * (across + down)) + 3.0f * away);
         nearest = fmin(nearest, squared(fmax(away - off_lowpass, (vfloat)0.0f)));
         furthest = fmin(furthest, squared(away + off_lowpass));
     }

@@ -1,6 +1,6 @@
 // Composites the surface of the external depth image with the remaining transmittance, however low, after the last splat.
 //@ pass_end
-    const BlendConstants unstopped = {log_alpha_cutoff, opacity_ceiling, -1.0f, filter};
+    const BlendConstants unstopped = {log_alpha_cutoff, opacity_ceiling, -1.0f, sample_area};
     for (int row = 0; row < (int)(sizeof(pixels) / sizeof(pixels[0])); row++) {
         Pixel *pixel = &pixels[row];
         vint mask = VMASK(pixel->opaque_z < INFINITY);

@@ -117,7 +117,7 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
             behind += s.z_center >= rest_nearest;
             const vint key = (in_order(VAS_INT((vfloat)s.nearest)) & -CHUNK) | (int)which;
             for (int first = 0; first < BLOCKS; first += LANES) VSTORE(key, keys[which] + first);
-            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_alpha_cutoff, constants.filter
+            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_alpha_cutoff, constants.sample_area
 //@@ blocks_arguments
                 , (int)which, keys[which]);
         }

@@ -12,7 +12,7 @@
             PREFETCH(splats + lists[min(chunk + which + PREFETCH_SPLATS, end - 1)]);
             PREFETCH((global const char *)(splats + lists[min(chunk + which + PREFETCH_SPLATS, end - 1)]) + 64);
             const Splat s = splats[lists[chunk + which]];
-            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_alpha_cutoff, constants.filter
+            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_alpha_cutoff, constants.sample_area
 //@@ blocks_arguments
             );
         }

@@ -19,7 +19,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     local uint touched[CELLS_X * CELLS_Y][ITEMS];           // [cell][work-item]: bits of the splats in the work-item's share
     local uchar cell_splats[CELLS_X * CELLS_Y][CELLS_STRIDE];    // [cell]: staged splats that overlap it, in order
     local int alive;
-    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter};
+    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, sample_area};
     uint tile = longest_first ? tile_order[get_group_id(0)] : band_first + get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
     uint view_index = tile / (uint)(tiles_x * tiles_y), here = tile - view_index * (uint)(tiles_x * tiles_y);
@@ -79,7 +79,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
                 Intersection c = intersect_row(&s, nu_x, nv_x, d_x, y, half_r2);
 //@@ intersect
                 wide lowpass_half_rho;
-                int mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &lowpass_half_rho);
+                int mask = fragment_mask(&s, c, x, y, half_r2, constants.sample_area, &lowpass_half_rho);
 //@@ mask
                 if (!COLOURS_ONLY && !VANY(mask & pixel_transmits(&pixels[row], &constants))) continue;
                 pixel_blend(&pixels[row], &s, c, mask, lowpass_half_rho, &constants

@@ -33,7 +33,7 @@ static inline FragmentValues fragment_values(const Splat *s, int px, int py, con
     wide x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
     Intersection c = intersect_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     FragmentValues values;
-    values.mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &lowpass_half_rho);
+    values.mask = fragment_mask(s, c, x, y, half_r2, constants->sample_area, &lowpass_half_rho);
     values.alpha = fragment_alpha(s, fragment_half_rho(s, c, INVERSE_D(c), lowpass_half_rho), constants->opacity_ceiling);
     const Geometry g = geometry_of(s, c, nu_x, nv_x, y, lowpass_half_rho);
     values.grad_weight = fragment_by_weight(s, gradient, &g);
@@ -44,7 +44,7 @@ static inline FragmentValues fragment_values(const Splat *s, int px, int py, con
 static inline wide forward_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants) {
     wide x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
     Intersection c = intersect_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
-    int mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &lowpass_half_rho);
+    int mask = fragment_mask(s, c, x, y, half_r2, constants->sample_area, &lowpass_half_rho);
     if (!VANY(mask)) return 0.0f;
     return attenuate(pixel, fragment_alpha(s, fragment_half_rho(s, c, INVERSE_D(c), lowpass_half_rho), constants->opacity_ceiling), mask, constants);
 }
@@ -62,7 +62,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
     local float parts[3 * PARTS];
     local int alive;
     local uint max_reached;
-    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter, log_ceiling};
+    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, sample_area, log_ceiling};
     uint tile_index = get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W;
     int x0 = (int)(tile_index % (uint)tiles_x) * TILE_W, y0 = (int)(tile_index / (uint)tiles_x) * TILE_H;
@@ -198,7 +198,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     local float2 *fragments = (local float2 *)scratch;      // [splat][pixel]: transmittance, alpha; then weight, gradient of ln(opacity)
     local PixelGradient shared[PIXELS];
     local uint offsets[CHUNK], within[PATCHES];               // bits: splats whose bounds overlap a patch
-    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter, log_ceiling};
+    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, sample_area, log_ceiling};
     uint id = get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H, tiles = tiles_x * tiles_y;
     if (id >= starts[tiles] / CHUNK + tiles) return;
@@ -276,7 +276,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
                 const Splat s = staged[which].splat;
                 wide weight = here.x * here.y, x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
                 Intersection c = intersect_at(&s, px, y0 + top + 4 * k, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
-                fragment_mask(&s, c, x, y, half_r2, constants.filter, &lowpass_half_rho);
+                fragment_mask(&s, c, x, y, half_r2, constants.sample_area, &lowpass_half_rho);
                 const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, lowpass_half_rho);
                 *at = (float2)(weight, backward_alpha(&gradients[k], fragment_by_weight(&s, &gradients[k], &g), weight, here.y));
             } else
@@ -299,7 +299,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             if (here.x == 0.0f) continue;
             wide x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
             Intersection c = intersect_at(&s, x0 + column, y0 + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
-            fragment_mask(&s, c, x, y, half_r2, constants.filter, &lowpass_half_rho);
+            fragment_mask(&s, c, x, y, half_r2, constants.sample_area, &lowpass_half_rho);
             const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, lowpass_half_rho);
             const PixelGradient gradient = shared[at];
             add_fragment(&sums, &s, &gradient, &g, here.x, here.y, lowpass_half_rho, x, y, &constants);

@@ -33,7 +33,7 @@ typedef union {              // a staged record, as vectors for fewer reads
 
 // Cells of the tile at (left, top) that the splat overlaps, from `first_row` to `last_row`. Conservative; the test of each pixel
 // decides.
-static inline void touched_cells(local const Splat *s, int left, int top, wide half_r2, wide filter, CELL_BITS *cells
+static inline void touched_cells(local const Splat *s, int left, int top, wide half_r2, wide sample_area, CELL_BITS *cells
 //@@ cells_parameters
 ) {
     int first_row = max(s->y0 - top, 0) / CELL_H, last_row = (min(s->y1 - top, TILE_H) - 1) / CELL_H;
@@ -63,7 +63,7 @@ static inline void find_cells(local const Staged *staged, uint length, int left,
         uint which = share * SHARE + lane, bits = 0;
         local const Splat *s = &staged[which].splat;
         if (which < length) {
-            touched_cells(s, left, top, s->log_opacity - constants->log_alpha_cutoff, constants->filter, &bits
+            touched_cells(s, left, top, s->log_opacity - constants->log_alpha_cutoff, constants->sample_area, &bits
 //@@ cells_arguments
             );
         }
@@ -72,7 +72,7 @@ static inline void find_cells(local const Staged *staged, uint length, int left,
 #else
     for (uint which = get_local_id(0); which < length; which += GROUP) {
         local const Splat *s = &staged[which].splat;
-        touched_cells(s, left, top, s->log_opacity - constants->log_alpha_cutoff, constants->filter, (local uchar *)cells + which
+        touched_cells(s, left, top, s->log_opacity - constants->log_alpha_cutoff, constants->sample_area, (local uchar *)cells + which
 //@@ cells_arguments
         );
     }

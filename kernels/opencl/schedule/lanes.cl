@@ -9,7 +9,7 @@
 kernel void blend(
 //@@ arguments blend
 ) {
-    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter};
+    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, sample_area};
     uint tile = band_first + get_global_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
     const uint view_tiles = (uint)(tiles_x * tiles_y), view_index = tile / view_tiles, across = (uint)tiles_x;
@@ -44,7 +44,7 @@ kernel void blend(
             Intersection c = intersect_row(&s, nu_x, nv_x, d_x, y, half_r2);
 //@@ intersect
             vfloat lowpass_half_rho;
-            vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &lowpass_half_rho);
+            vint mask = fragment_mask(&s, c, x, y, half_r2, constants.sample_area, &lowpass_half_rho);
 //@@ mask
 //@@ skip_fragment
             pixel_blend(&pixel, &s, c, mask, lowpass_half_rho, &constants

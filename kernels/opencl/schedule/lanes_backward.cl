@@ -47,14 +47,14 @@ static inline Block block_of(const Splat *s, const Tile *tile, const BlockOrigin
     b.nu_x = FMA((vfloat)s->nux, b.x, (vfloat)s->nu0);
     b.nv_x = FMA((vfloat)s->nvx, b.x, (vfloat)s->nv0);
     b.intersection = intersect_row(s, b.nu_x, b.nv_x, FMA((vfloat)s->dx, b.x, (vfloat)s->d0), b.y, half_r2);
-    b.mask = fragment_mask(s, b.intersection, b.x, b.y, half_r2, tile->constants->filter, &b.lowpass_half_rho);
+    b.mask = fragment_mask(s, b.intersection, b.x, b.y, half_r2, tile->constants->sample_area, &b.lowpass_half_rho);
     return b;
 }
 
 // Attenuates the live blocks by the splat and records its fragments on the tape. Returns the blocks that are still live.
 static inline uint forward_splat(const Splat *s, const Tile *tile, Pixel *pixels, uint alive, global Tape *tape, uint tape_index) {
     const BlendConstants *constants = tile->constants;
-    uint touched = alive & touched_blocks(s, tile->x0, tile->y0, s->log_opacity - constants->log_alpha_cutoff, constants->filter), contributing = 0;
+    uint touched = alive & touched_blocks(s, tile->x0, tile->y0, s->log_opacity - constants->log_alpha_cutoff, constants->sample_area), contributing = 0;
     uint length = tape->length;
     const BlockOrigin at = block_origin(s, tile);
     for (; touched != 0; touched &= touched - 1) {
@@ -117,7 +117,7 @@ static inline void store_zero_gradient(global float *record_gradients, uint offs
 kernel void blend_backward(
 //@@ arguments blend_backward
 ) {
-    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, filter, log_ceiling};
+    const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, sample_area, log_ceiling};
     const int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
     global Tape *tape = (global Tape *)tapes + get_global_id(0);
     Tile tile;

@@ -108,7 +108,7 @@ kernel void loss_columns_backward(
     for (int row_offset = 0; row_offset < ROWS_PER_ITEM && row < height; row_offset++, row++, at += stride) {
         vfloat grad_mean = column_means[row_offset][0], grad_variance = column_means[row_offset][1], grad_shared = column_means[row_offset][2];
         vfloat a = VLOAD(images + at), b = VLOAD(images + image_stride + at);
-        vfloat slope = sign(a - b) * l1_share - (grad_mean + 2.0f * a * grad_variance + b * grad_shared) * ssim_share;
+        vfloat slope = sign(a - b) * l1_weight - (grad_mean + 2.0f * a * grad_variance + b * grad_shared) * ssim_weight;
         float values[LANES];
         VSTORE(slope, values);
         for (int k = 0; k < LANES && column + k < width; k++) {

@@ -145,7 +145,7 @@ kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips_backward(
                 grad_shared = FMA(w, terms[2], grad_shared);
             }
             vfloat x = VLOAD(a + MARGIN + vector * LANES), target_value = VLOAD(b + MARGIN + vector * LANES);
-            vfloat slope = sign(x - target_value) * l1_share - (grad_mean + 2.0f * x * grad_variance + target_value * grad_shared) * ssim_share;
+            vfloat slope = sign(x - target_value) * l1_weight - (grad_mean + 2.0f * x * grad_variance + target_value * grad_shared) * ssim_weight;
             if (!masked && column + LANES <= width) {
                 VSTORE(slope, grad_rgb + at + column);
                 continue;

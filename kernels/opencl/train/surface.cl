@@ -29,7 +29,7 @@ kernel void surface_normals(
         float size = sqrt(dot(crossed, crossed));
         if (size > 0.0f) {
             float3 unit_n = crossed / size, own = vload3(at, normal);
-            float share = normal_share * alpha[at];
+            float share = normal_weight * alpha[at];
             grad_n = -share * unit_n;
             float3 grad_crossed = (-share / size) * (own - dot(unit_n, own) * unit_n);
             grad_down = cross(across, grad_crossed);

@@ -40,7 +40,7 @@ def fragment(pixel: Any, s: Any, c: Any, x: float, y: float, disc: float, alpha:
         furthest = far * far
     if disc < wp.inf:
         away = wp.sqrt(disc)
-        off_dot = OF_FORM * (wp.sqrt(view.per_pixel) * (1.0 + 2.0 * (wp.abs(x) + wp.abs(y))) + 3.0 * away)
+        off_dot = OF_FORM * (wp.sqrt(view.sample_area) * (1.0 + 2.0 * (wp.abs(x) + wp.abs(y))) + 3.0 * away)
         least, most = wp.max(away - off_dot, 0.0), away + off_dot
         nearest = wp.min(nearest, least * least)
         furthest = wp.min(furthest, most * most)

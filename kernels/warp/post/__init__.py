@@ -16,7 +16,7 @@ class Step:
     """Sensor step: its inputs, and its function of one channel of a pixel."""
 
     uniforms: tuple[str, ...] = ()
-    """groups of uniforms of the view (`View.uniform`) that fill `numbers`, in this order"""
+    """groups of uniforms of the view (`View.uniforms_of`) that fill `numbers`, in this order"""
     numbers: Mapping[str, Any] = field(default_factory=dict)
     """number in `s`: type"""
     arrays: Mapping[str, Any] = field(default_factory=dict)

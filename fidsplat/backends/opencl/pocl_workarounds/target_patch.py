@@ -2,8 +2,8 @@
 
 PoCL 3.0 gets the processor's name from LLVM 14. For a newer processor (AMD Zen 5) the name is "generic", and
 every build fails ("unknown target CPU", pocl issues #512, #1049). For Zen 4 it is "znver3" (without AVX-512),
-and builds crash. PoCL 3.1 reads POCL_LLVM_CPU_NAME; 3.0 has no such setting. The name is replaced in
-the field `llvm_cpu` of PoCL's device record by the name for which PoCL built its kernel library.
+and builds fail or never end. PoCL 3.1 reads POCL_LLVM_CPU_NAME; 3.0 has no such setting. The name is replaced
+in the field `llvm_cpu` of PoCL's device record by the name for which PoCL built its kernel library.
 """
 
 from __future__ import annotations
