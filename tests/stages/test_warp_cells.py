@@ -21,7 +21,10 @@ MORE = {"around": 2.5, "needles": 1.06}
 def marked(frame):
     """(splats, tiles, cells of a tile): cells that blending marks."""
     wp, program = runtime.load(), frame.program
-    effects, outputs = program.needs.among(("lowpass_screen", "ray_depth")), program.needs.blending
+    effects, outputs = (
+        program.requirements.among(("lowpass_screen", "ray_depth")),
+        program.requirements.blending,
+    )
     cells = runtime.kernels("cells").make_cells(effects, outputs)
     staging = runtime.kernels("staging").make_staging(program.layout, 32, 4)
     staged = runtime.kernels("splat").make_splat(effects, outputs).reading(staging.line)
