@@ -61,7 +61,7 @@ class RenderedScene(Protocol):
 
     @property
     def key(self) -> tuple[Any, Any]:
-        """Resident cloud and capture, which are the same objects for equal frames."""
+        """Resident cloud and capture: the key under which command lists of frames are cached."""
         ...
 
     def render(self, camera: Camera) -> Any:
@@ -80,7 +80,8 @@ class PerturbedFrame(NamedTuple):
     size: float
     """size of the motion [rad or m]"""
     axis: int
-    """index of the ray's component by which the second column of `AlignmentSums.rhs` is multiplied"""
+    """component of the ray: the derivative by the motion along z (or about z) is -d times it, where d is the
+    derivative by this motion"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,17 +168,23 @@ class AlignmentKernels(ABC):
     def derivatives(
         self, stage: int, frame: Any, fit: AlignmentFit, motions: Sequence[tuple[np.ndarray, float, int]]
     ) -> list[np.ndarray]:
-        """`AlignmentSums.rhs` of each motion: pose after it, size and axis of `PerturbedFrame`."""
+        """`AlignmentSums.rhs` of each motion. motions: pose after the motion, and size and axis as in
+        PerturbedFrame."""
         perturbed = (
             PerturbedFrame(self.frame(stage, pose, True), size, axis) for pose, size, axis in motions
         )
         return [self.sums(stage, frame, fit, perturbed=each).rhs for each in perturbed]
 
     def minimise(
-        self, stage: int, at: Estimate, steps: int, settled: float, damping: float
+        self, stage: int, at: Estimate, steps: int, tolerance: float, damping: float
     ) -> Estimate | None:
-        """Levenberg-Marquardt on the device, as `direct_alignment.minimised` with Huber's loss; None if the
-        device cannot."""
+        """Minimise Huber's loss by at most `steps` iterations of Levenberg-Marquardt on the device; None on
+        devices without it.
+
+        at: start.
+        tolerance: motion in pixels below which the stage has converged.
+        damping: initial damping, relative to the diagonal.
+        """
         return None
 
 

@@ -140,16 +140,16 @@ static inline float median_of(global const uint *counts) {
 }
 
 // Set the weight, the weight of the second derivative, and the loss of an error.
-static inline void robust(float error, float noise, int huber, int channels, float *weight, float *curved, float *cost) {
-    float share = error / (huber ? HUBER * noise : TUKEY * fmin(noise, MAX_NOISE));
+static inline void robust(float error, float noise, int huber, int channels, float *weight, float *hessian_weight, float *cost) {
+    float normalised = error / (huber ? HUBER * noise : TUKEY * fmin(noise, MAX_NOISE));
     if (huber) {
-        *weight = *curved = 1.0f / fmax(share, 1.0f);
-        *cost = share < 1.0f ? 0.5f * share * share : share - 0.5f;
+        *weight = *hessian_weight = 1.0f / fmax(normalised, 1.0f);
+        *cost = normalised < 1.0f ? 0.5f * normalised * normalised : normalised - 0.5f;
         return;
     }
-    float inner = fmax(1.0f - share * share, 0.0f);
+    float inner = fmax(1.0f - normalised * normalised, 0.0f);
     *weight = inner * inner;
-    *curved = fmax(inner * inner - 4.0f * share * share * inner / channels, 0.0f);
+    *hessian_weight = fmax(inner * inner - 4.0f * normalised * normalised * inner / channels, 0.0f);
     *cost = 1.0f - inner * inner * inner;
 }
 
@@ -188,10 +188,10 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
             for (int x = left + item % ROW_ITEMS; x < right; x += ROW_ITEMS) {
                 int i = y * width + x;
                 if (bins[i] < min_bin) continue;
-                float residual[3], weight, curved, cost, before;
+                float residual[3], weight, hessian_weight, cost, before;
                 float error = residuals_of(i, channels, image, rgb, gain, offset, residual), inverse = nearest(depth, i, width);
-                robust(error, noise_before > 0.0f ? noise_before : noise, huber, channels, &weight, &curved, &before);
-                robust(error, noise, huber, channels, &weight, &curved, &cost);
+                robust(error, noise_before > 0.0f ? noise_before : noise, huber, channels, &weight, &hessian_weight, &before);
+                robust(error, noise, huber, channels, &weight, &hessian_weight, &cost);
                 float3 ray = {(x + 0.5f - center_x) / focal_x, (y + 0.5f - center_y) / focal_y, 1.0f};
                 float3 ray_dx = {1.0f / focal_x, 0.0f, 0.0f}, ray_dy = {0.0f, 1.0f / focal_y, 0.0f};
                 if (lens) {
@@ -199,13 +199,14 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                     ray_dx = (vload3(i + 1, rays) - vload3(i - 1, rays)) / 2.0f;
                     ray_dy = (vload3(i + width, rays) - vload3(i - width, rays)) / 2.0f;
                 }
-                // derivatives of pixel coordinates by the point: the dual basis of the rays' derivatives
+                // derivatives of pixel coordinates with respect to the point: the dual basis of the rays' derivatives
                 float3 across = cross(ray_dy, ray), down = cross(ray, ray_dx);
                 across /= dot(ray_dx, across);
                 down /= dot(ray_dy, down);
-                float3 turn_x = cross(ray, across), turn_y = cross(ray, down);
-                float8 motion_x = (float8)(turn_x, across * inverse, 0.0f, 0.0f), motion_y = (float8)(turn_y, down * inverse, 0.0f, 0.0f);
-                float scale = axis == 0 ? -ray.x : axis == 1 ? -ray.y : -ray.z, of_column = has_perturbed ? curved : weight;
+                float3 rotation_x = cross(ray, across), rotation_y = cross(ray, down);
+                float8 motion_x = (float8)(rotation_x, across * inverse, 0.0f, 0.0f), motion_y = (float8)(rotation_y, down * inverse, 0.0f, 0.0f);
+                // with `has_perturbed` the right-hand side is a column of the Hessian, else the gradient
+                float scale = axis == 0 ? -ray.x : axis == 1 ? -ray.y : -ray.z, column_weight = has_perturbed ? hessian_weight : weight;
                 float squares[3] = {0.0f, 0.0f, 0.0f};
                 for (int c = 0; c < channels; c++) {
                     float gx = (value_of(rgb, i + 1, c, channels) - value_of(rgb, i - 1, c, channels)) / 2.0f;
@@ -218,7 +219,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                     if (has_perturbed) column = (value_of(perturbed, i, c, channels) - value) / step;
                     float8 row = -(gx * motion_x + gy * motion_y), *total = totals + c * CHANNEL_ROWS;
                     row.s67 = (float2)(value, 1.0f);
-                    float8 weighted = curved * row, entry = of_column * column * row;
+                    float8 weighted = hessian_weight * row, entry = column_weight * column * row;
                     for (int k = 0; k < 8; k++) total[k] += ((const float *)&weighted)[k] * row;
                     total[8] += entry;
                     float own = value + residual[c];

@@ -34,13 +34,13 @@ from fidsplat.cameras.raster import raster_of
 
 _GROUPS = {1: 32, 32: 256}
 """maximum number of work-groups of a sum, by the size of a work-group"""
-_SUMS = 249
-"""numbers that a work-group writes"""
+_GROUP_FLOATS = 249
+"""floats that a work-group writes: SUMS of alignment.cl, and the noise"""
 _STATE = 192
-"""numbers of `state` in alignment_step.cl, of which the first are read"""
-_SETTLED, _NOISE, _POSE, _COST = 0, 1, 2, 20
+"""floats of the buffer `state` (alignment_step.cl); the host reads the first `_COST`"""
+_CONVERGED, _NOISE, _POSE, _COST = 0, 1, 2, 20
 _INCOMPLETE = 2
-"""value of `state[SETTLED]` if a frame exceeded its buffers"""
+"""indices in `state`, and value of `state[CONVERGED]` if a frame exceeded its buffers"""
 _MAX_REPLAYS = 16
 """maximum number of cached command lists of a cloud"""
 _ZERO = np.zeros(1, np.uint32)
@@ -55,7 +55,7 @@ class OpenCLAlignment(AlignmentKernels):
         self._program = Program(workspace, assemble_alignment(self._items))
         self._commands, self._pyramid = CommandList(self._program), CommandList(self._program)
         self._steps: dict[bool, Program] = {}
-        """program of `align_step`; whether the numbers of a view are float64"""
+        """programs of `align_step`, by whether view records are float64"""
         self._lists: dict[tuple[int, bool], tuple[CommandList, CommandList]] = {}
         self._replays: WeakKeyDictionary[Any, dict[Any, _Replayed]] = WeakKeyDictionary()
         self._levels: list[dict[str, Any]] = []
@@ -104,6 +104,7 @@ class OpenCLAlignment(AlignmentKernels):
             **{"full_width": full_width, "full_height": full_height},
             **{"ratio_x": full_width / width, "ratio_y": full_height / height},
             **{"focal_x": camera.fx, "focal_y": camera.fy, "center_x": camera.cx, "center_y": camera.cy},
+            # kernels have buffers of all inputs, also if they do not read them
             **{"lens": int(camera.lens is not None), "rays": finer, "taps": finer, "mask": finer},
             **{"masked": int(level.ignored is not None), "radius": len(level.taps) - 1, "row": number},
             "bins": self._scratch(f"bins {number}", size // 4),
@@ -173,7 +174,7 @@ class OpenCLAlignment(AlignmentKernels):
             self._upload_fit(fit)
             self._by_groups("align_errors", self._rows(args["height"]), args)
             self._by_groups("align_sums", groups, args)
-            packed = np.empty((groups, _SUMS), np.float32)
+            packed = np.empty((groups, _GROUP_FLOATS), np.float32)
             cl.enqueue_copy(self._queue, packed, args["result"])
         return _unpacked(packed, channels, blocks, perturbed is not None)
 
@@ -196,21 +197,23 @@ class OpenCLAlignment(AlignmentKernels):
                     args["perturbed"] = self._blurred(image, args, "perturbed frame", 3)
                     args |= {"has_perturbed": 1, "step": size, "axis": axis}
                     self._by_groups("align_sums", groups, args)
-                    totals.append(self._scratch(f"totals {number}", 4 * (_SUMS + 1)))
-                    counts = {"counts": self._scratch("unused", 4 * BINS)}  # keeps the histogram
+                    totals.append(self._scratch(f"totals {number}", 4 * (_GROUP_FLOATS + 1)))
+                    counts = {"counts": self._scratch("unused", 4 * BINS)}  # cleared instead of the histogram
                     self._launch(
                         *("align_totals", (256,), (256,)),
                         args | counts | replayed.arguments(groups, totals[-1]),
                     )
-                packed = np.empty((len(totals), _SUMS + 1), np.float32)
+                packed = np.empty((len(totals), _GROUP_FLOATS + 1), np.float32)
                 for row, buffer in zip(packed, totals, strict=True):
                     cl.enqueue_copy(self._queue, row, buffer)
-                if len(totals) == len(motions) and not packed[:, _SUMS].any():
-                    return [_unpacked(row[None, :_SUMS], len(fit.gain), False, True).rhs for row in packed]
+                if len(totals) == len(motions) and not packed[:, _GROUP_FLOATS].any():
+                    return [
+                        _unpacked(row[None, :_GROUP_FLOATS], len(fit.gain), False, True).rhs for row in packed
+                    ]
         return super().derivatives(stage, frame, fit, motions)
 
     def minimise(
-        self, stage: int, at: Estimate, steps: int, settled: float, damping: float
+        self, stage: int, at: Estimate, steps: int, tolerance: float, damping: float
     ) -> Estimate | None:
         channels = len(at.fit.gain)
         with self._workspace.rendering():
@@ -221,7 +224,7 @@ class OpenCLAlignment(AlignmentKernels):
             state[_COST : _COST + 4] = np.inf, 10 * damping, 0, at.noise > 0
             buffer = self._upload("state", state)
             self._upload_fit(at.fit)
-            lists = self._step_lists(stage, replayed, at.fit, settled)
+            lists = self._step_lists(stage, replayed, at.fit, tolerance)
             self._clear_errors()
             found = np.empty(_COST, np.float32)
             for number in range(steps + (not at.noise)):  # the first sums may be for the exposure
@@ -231,16 +234,16 @@ class OpenCLAlignment(AlignmentKernels):
                 for commands in lists:
                     commands.submit(self._queue)
                 cl.enqueue_copy(self._queue, found, buffer)
-                if found[_SETTLED]:
+                if found[_CONVERGED]:
                     break
-        if found[_SETTLED] == _INCOMPLETE:
+        if found[_CONVERGED] == _INCOMPLETE:
             return None
         gain, offset = found[_POSE + 12 :].reshape(2, 3)[:, :channels].astype(float)
         pose = replayed.world_to_camera(found[_POSE : _POSE + 12])
         return Estimate(pose, at.fit._replace(gain=gain, offset=offset), float(found[_NOISE]))
 
     def _step_lists(
-        self, stage: int, replayed: _Replayed, fit: AlignmentFit, settled: float
+        self, stage: int, replayed: _Replayed, fit: AlignmentFit, tolerance: float
     ) -> tuple[CommandList, CommandList]:
         """Command lists of the sums of a frame, and of a step."""
         level, double = self._levels[stage], replayed.record.dtype == np.float64
@@ -249,7 +252,7 @@ class OpenCLAlignment(AlignmentKernels):
         if (stage, double) not in self._lists:
             self._lists[stage, double] = CommandList(self._program), CommandList(self._steps[double])
         sums, step = lists = self._lists[stage, double]
-        key = self._workspace.pool.generation, replayed, settled, level | {"min_bin": 0}
+        key = self._workspace.pool.generation, replayed, tolerance, level | {"min_bin": 0}
         if sums.key == key:
             sums.set({"min_bin": level["min_bin"]})
             return lists
@@ -257,14 +260,14 @@ class OpenCLAlignment(AlignmentKernels):
         step.clear()
         groups = self._groups(level, False)
         args = self._sum_arguments(level, replayed.images[0], fit, groups, sums)
-        args |= replayed.arguments(groups, self._scratch("totals", 4 * (_SUMS + 1)))
-        args |= {"state": self._scratch("state", 4 * _STATE), "settled": settled}
+        args |= replayed.arguments(groups, self._scratch("totals", 4 * (_GROUP_FLOATS + 1)))
+        args |= {"state": self._scratch("state", 4 * _STATE), "tolerance": tolerance}
         args |= {"focal": max(args["focal_x"], args["focal_y"]), "pose": self._scratch("pose", 8 * 15)}
         self._launch("align_errors", *self._size(self._rows(level["height"])), args, sums)
         self._launch("align_sums", *self._size(groups), args, sums)
         self._launch("align_totals", (256,), (256,), args, sums)
         self._launch("align_step", (1,), (1,), args, step)
-        sums.key = self._workspace.pool.generation, replayed, settled, level | {"min_bin": 0}
+        sums.key = self._workspace.pool.generation, replayed, tolerance, level | {"min_bin": 0}
         return lists
 
     def _groups(self, args: dict[str, Any], blocks: bool) -> int:
@@ -286,7 +289,7 @@ class OpenCLAlignment(AlignmentKernels):
             **{"rgb": values, "depth": frame.images.buffer("depth"), "perturbed": values},
             **{"has_perturbed": 0, "step": 1.0, "axis": 0, "huber": int(fit.huber), "row": 0},
             **{"counts": self._errors(), "fit": self._scratch("fit", 28)},
-            **{"result": self._scratch("sums", 4 * groups * _SUMS)},
+            **{"result": self._scratch("sums", 4 * groups * _GROUP_FLOATS)},
             "noise_factor": noise_factor(len(fit.gain)),
         }
 
@@ -367,7 +370,10 @@ class OpenCLAlignment(AlignmentKernels):
 
 
 class _ReplayedImages:
-    """Images of a replayed frame, as `Frame.images`. owner: releases their buffers."""
+    """Images of a replayed frame. `images` is the object itself, so that it replaces a Frame.
+
+    owner: its release returns the buffers to the pool.
+    """
 
     def __init__(self, named: dict[str, cl.Buffer], owner: Any = None) -> None:
         self.named, self.images, self._owner = named, self, owner
@@ -394,7 +400,7 @@ class _Replayed:
         self._template, self.record = frame.view, arrays["view"]
         rotation, commands = frame.source.uniform_groups.get("rotation", {}), frame.commands
         self._rotation = [(at, index) for index, name in rotation.items() for at in commands.positions(name)]
-        """arguments that depend on the rotation, as of a sky, with indices of its numbers"""
+        """arguments that depend on the rotation, with indices of its elements"""
         self._counts = frame.acquired["counts"]
         own = {f"{name}_out": frame.acquired[f"{name}_out"] for name in ("rgb", "depth")}
         self.images = _ReplayedImages(own, owner), _ReplayedImages(perturbed)
@@ -429,7 +435,7 @@ class _Replayed:
         if workspace.frames != self._number:
             if not self._recorded.set_view(self._template, self._queue):
                 return False
-            # not known to the pool any more, since `align_step` writes it
+            # `scratch` discards the record of the contents, as `align_step` writes the buffer
             self.view = workspace.pool.scratch("view", self.record.nbytes)
             self._recorded.commands.set({"counts": self._counts})
         return True
@@ -450,7 +456,7 @@ class _Replayed:
         self.set_rotation(record)
 
     def set_rotation(self, rotation: np.ndarray) -> None:
-        """Set the kernel arguments that depend on the rotation (9,)."""
+        """Set the kernel arguments that depend on the rotation (9,), as of an environment map."""
         if self._rotation:
             values = rotation.tolist()
             for (command, argument), index in self._rotation:

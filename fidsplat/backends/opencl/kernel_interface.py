@@ -293,7 +293,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("out uint counts", "out float totals  // (SUMS + 2)"),
     ),
     "align_step": args(
-        *("int channels", "float focal settled  // pixels: a smaller motion ends the stage"),
+        *("int channels", "float focal tolerance  // pixels: a smaller motion has converged"),
         *("in float totals", "out float fit state", "out real pose view  // pose: the last accepted"),
     ),
     # training
