@@ -23,7 +23,7 @@ static inline SortBlock sort_block_of(uint length, int width, int height, global
     return c;
 }
 
-typedef struct {             // state of bin_emit; lists of the tiles of the band [first, end), from `base`
+typedef struct {             // state of bin_emit: tiles [first, end) of the band; base: start of its first list
     int first, end;
     uint base;
     global const uint *starts;
@@ -61,7 +61,7 @@ static inline void bin_splats(global const uint *restrict order, global const ui
     }
 }
 
-// Reads: order, counters' number of visible splats, windows, big_bounds. Writes: this block's row of table.
+// Reads: order, counters[COUNTER_VISIBLE], windows, big_bounds. Writes: this block's row of table.
 kernel void bin_count(
 //@@ arguments bin_count
 ) {

@@ -92,7 +92,7 @@ static inline Geometry geometry_of(const Splat *s, Intersection c, vfloat nu_x, 
 }
 
 // Gradient with respect to the fragment's weight: g c_k.
-static inline vfloat fragment_by_weight(const Splat *s, const PixelGradient *gradient, const Geometry *g) {
+static inline vfloat fragment_grad_weight(const Splat *s, const PixelGradient *gradient, const Geometry *g) {
     vfloat grad_weight = FMA(gradient->r, (vfloat)s->r, FMA(gradient->g, (vfloat)s->g, gradient->b * s->b));
 //@@ grad_weight
     return grad_weight;

@@ -46,7 +46,7 @@ INLINE Bounds ellipse_bounds(real3_ tu, real3_ tv, real3_ tw, real center_x, rea
     return b;
 }
 
-// Chord [*x0, *x1] of the bounds between heights y0 <= y1; empty if *x0 > *x1.
+// Columns [*x0, *x1] that the bounds cover in rows from y0 to y1; empty if *x0 > *x1.
 INLINE void bounds_span(const Bounds *b, float y0, float y1, float *x0, float *x1) {
     *x0 = INFINITY;
     *x1 = -INFINITY;

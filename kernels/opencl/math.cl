@@ -122,7 +122,7 @@ static inline vfloat VMAX(vfloat a, vfloat b) { return VSELECT(b, a, a > b); }
 #define FAST_RECIPROCAL(x) (1.0f / (x))
 #endif
 //@@ arithmetic
-// EXP and LOG (effect/arithmetic_*.cl) of one number.
+// Result of EXP or LOG (effect/arithmetic_*.cl) for a single number, which a vector function computes.
 #if LANES == 1
 #define FIRST_LANE(v) (v)
 #else
@@ -161,7 +161,7 @@ static inline real3_ cross3(real3_ a, real3_ b) {
 static inline real dot3(real3_ a, real3_ b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 
 // Bits of a float in an order that unsigned comparison preserves, negative values included. No depth is -0, which would sort
-// before +0: depth is a sum with a nonzero term of the view (tests/unit/test_prepare.py).
+// before +0: depth is a sum, and no term of the view is -0 (tests/unit/test_prepare.py).
 static inline uint sortable(float x) {
     uint bits = as_uint(x);
     return (bits & 0x80000000u) ? ~bits : (bits | 0x80000000u);

@@ -18,7 +18,7 @@ kernel void sort_by_cells(
     if (scatter) order[position] = (int)i;
 }
 
-// Index space: one work-item per word of `words` for each splat. Reads: source, order. Writes: gathered, zeros behind `size` words.
+// Index space: one work-item for each of the `words` words of each splat. Reads: source, order. Writes: gathered, zeros after `size` words.
 kernel void gather_splats(global const uint *source, global const int *order, ulong size, uint words, global uint *gathered) {
     ulong at = get_global_id(0);
     gathered[at] = at < size ? source[(ulong)order[at / words] * words + at % words] : 0;

@@ -7,10 +7,10 @@
 //
 // The projection is computed in `real` (double where the device has it) from float inputs.
 
-// [m]; invisible, and large enough that quotients are not float32 denormals
+// Minimum scale [m]: too small to be visible, and large enough that quotients are not float32 denormals.
 #define MIN_SCALE 1e-20f
 
-// Bounds of a disk that crosses the near plane: the box of a regular polygon around the R-sigma circle, clipped at the near
+// Bounds of a disk that crosses the near plane: the bounding rectangle of a regular polygon around the R-sigma circle, clipped at the near
 // plane and projected. Returns false if nothing is left.
 #define POLYGON 16
 //@@ polygon
@@ -60,8 +60,8 @@ typedef union {
 
 #define RETURN_CULLED return
 #if BATCH > 1
-// CPUs: projection of splat i, written to column k of `batch`, in a loop that compilers vectorise. Only splats that cross the near plane
-// need a loop of their own: with `crosses_near` unset, their key becomes CROSSES_NEAR.
+// CPUs: projection of splat i, written to column k of `batch`, in a loop that compilers vectorise. Splats that cross the near plane need
+// the loop over a polygon. It is left out if `crosses_near` is false: such splats get the key CROSSES_NEAR, and are projected again.
 #define CROSSES_NEAR 0xFFFFFFFDu
 #define KEY batch->keys[k]
 typedef struct {
@@ -135,6 +135,7 @@ kernel void project(
 //@@ footprint_reach
     if (!(pz + reach >= near) || !(pz - reach <= view->far)) return;
 
+    // these hooks declare center_x, center_y (projected centre), bounds, and the rows tu, tv, tw of M
 //@@ footprint_spread
 //@@ camera_bounds
 //@@ camera_box
@@ -158,6 +159,7 @@ kernel void project(
     int anchor_i = (int)fmin(fmax((float)center_x, 0.0f), (float)(width - 1));       // 0 for NaN
     int anchor_j = (int)fmin(fmax((float)center_y, 0.0f), (float)(height - 1));
     real anchor_x = anchor_i + REAL(0.5), anchor_y = anchor_j + REAL(0.5);
+    // declares k0, kx, ky (n_u, n_v, D: constant, per x, per y), and the determinant of M
 //@@ camera_forms
     real steepest = fmax(fmax(fabs(kx.x), fabs(ky.x)), fmax(fabs(kx.y), fabs(ky.y)));
 //@@ camera_steepest
@@ -202,8 +204,8 @@ static inline Bounds bounds_of(const Batch *batch, uint k) {
     return words.bounds;
 }
 
-// Writes the record, window and keys of a projected splat. No copies in memory: reading four words that were written one by one
-// would stall.
+// Writes the record, window and keys of a projected splat. Hooks write to `record`: here it is the record in memory, without a copy,
+// since reading four words that were written one by one would stall.
 #define record splats[at]
 #define bounds bounds_of(batch, k)
 INLINE void write_splat(
@@ -251,7 +253,8 @@ INLINE void write_splat(
 #undef bounds
 #endif
 #if BATCH > 1 || defined(CULLING_GROUP)
-// Key of splats that are culled by a bounding sphere; 0 for others. Their centres are at most `extent` from `mean`; infinite: not culled.
+// CULLED or OUT_OF_BAND for a group of splats outside of the frustum; 0: not culled. All centres are within `extent` of `mean`; infinite:
+// never culled.
 INLINE uint frustum_key(global const View *view, real3_ mean, real extent, real max_scale) {
     real3_ p = rotate_to_camera(view, mean);
     p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
@@ -263,7 +266,7 @@ INLINE uint frustum_key(global const View *view, real3_ mean, real extent, real 
 #if BATCH > 1
 #undef RETURN_CULLED
 #define RETURN_CULLED return CULLED
-#ifndef BOX_HERE
+#ifndef BOX_HERE       // whether splat i is a box (effect/footprint_*.cl)
 #define BOX_HERE false
 #endif
 INLINE uint splat_key(

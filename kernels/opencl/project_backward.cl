@@ -2,6 +2,7 @@
 // Index space: one work-item per splat, in groups of POSE_ITEMS.
 // Reads:  view, the cloud, splats, keys, windows, big_bounds, gradient_offsets, record_gradients.
 // Writes: gradients with respect to the cloud's arrays, 0 for culled splats; camera_sums, with respect to the camera.
+// CLOUD_COEFFICIENTS, GRAD_COEFFICIENTS, SH_COEFFICIENTS: from effect/color_*_backward.cl.
 #define POSE_ITEMS 64
 kernel __attribute__((reqd_work_group_size(POSE_ITEMS, 1, 1))) void project_backward(
 //@@ arguments project_backward

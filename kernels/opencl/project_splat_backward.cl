@@ -37,7 +37,7 @@ static inline real3_ rotate_to_world(global const View *view, real3_ v) {
 
 typedef struct {            // gradients with respect to the parameters of one splat
     float mean[3], quat[4], scale[2], opacity;
-    float color[3], basis[SH_COEFFICIENTS];    // by coefficient k of the colour: basis[k] times `color`
+    float color[3], basis[SH_COEFFICIENTS];    // with respect to coefficient k of the colour: basis[k] times `color`
     float grad2d;
     real grad_camera[10];     // contribution to the gradient of the pose, of fx, fy, cx and cy
 //@@ footprint_gradient
@@ -54,11 +54,11 @@ static inline SplatGradient splat_gradient(
     SplatGradient splat_grad = {{0}};
     if (keys[i] >= OUT_OF_BAND) return splat_grad;
     Totals total = {0};
-    global const float *slot = record_gradients + (size_t)gradient_offsets[i] * FIELDS;
+    global const float *tile_gradient = record_gradients + (size_t)gradient_offsets[i] * FIELDS;
     uint tiles = tile_count(windows[i], big_capacity, big_bounds, width, height);
-    for (uint tile = 0; tile < tiles; tile++, slot += FIELDS)
-        for (uint field = 0; field < FIELDS; field++) ((real *)&total)[field] += slot[field];
-    real3_ grad_ray = {0, 0, 0};       // by the vector from the camera to the centre, in world axes
+    for (uint tile = 0; tile < tiles; tile++, tile_gradient += FIELDS)
+        for (uint field = 0; field < FIELDS; field++) ((real *)&total)[field] += tile_gradient[field];
+    real3_ grad_ray = {0, 0, 0};       // with respect to the vector from the camera to the centre, in world axes
 //@@ color_backward
     real grad_log = total.log_opacity;
     real w = quats[4 * i], x = quats[4 * i + 1], y = quats[4 * i + 2], z = quats[4 * i + 3];
@@ -100,7 +100,7 @@ static inline SplatGradient splat_gradient(
     splat_grad.grad_camera[7] = dot3(grad_tv, row_y);
     splat_grad.grad_camera[8] = dot3(grad_tu, tw);
     splat_grad.grad_camera[9] = dot3(grad_tv, tw);
-    // by the projected centre, in half images
+    // with respect to the projected centre, in half images
     real across_x = grad_tu.z * view->width, across_y = grad_tv.z * view->height;
     splat_grad.grad2d = (float)(REAL(0.5) * pz * sqrt(across_x * across_x + across_y * across_y));
 //@@ disk_backward
@@ -124,12 +124,12 @@ static inline SplatGradient splat_gradient(
     // the tangents are 1 - s (y y + z z) etc. with s = 2 / |q|^2
     real grad_s = -grad_u.x * (y * y + z * z) + grad_u.y * (x * y + w * z) + grad_u.z * (x * z - w * y)
                 + grad_v.x * (x * y - w * z) - grad_v.y * (x * x + z * z) + grad_v.z * (y * z + w * x);
-    real inward = -s * grad_s;
-    splat_grad.quat[0] = (float)(s * (grad_u.y * z - grad_u.z * y - grad_v.x * z + grad_v.z * x + inward * w));
-    splat_grad.quat[1] = (float)(s * (grad_u.y * y + grad_u.z * z + grad_v.x * y - 2 * grad_v.y * x + grad_v.z * w + inward * x));
-    splat_grad.quat[2] = (float)(s * (-2 * grad_u.x * y + grad_u.y * x - grad_u.z * w + grad_v.x * x + grad_v.z * z + inward * y));
+    real grad_along_q = -s * grad_s;       // part along the quaternion q
+    splat_grad.quat[0] = (float)(s * (grad_u.y * z - grad_u.z * y - grad_v.x * z + grad_v.z * x + grad_along_q * w));
+    splat_grad.quat[1] = (float)(s * (grad_u.y * y + grad_u.z * z + grad_v.x * y - 2 * grad_v.y * x + grad_v.z * w + grad_along_q * x));
+    splat_grad.quat[2] = (float)(s * (-2 * grad_u.x * y + grad_u.y * x - grad_u.z * w + grad_v.x * x + grad_v.z * z + grad_along_q * y));
     splat_grad.quat[3] = (float)(s * (-2 * grad_u.x * z + grad_u.y * w + grad_u.z * x - grad_v.x * w - 2 * grad_v.y * z + grad_v.z * y
-                                       + inward * z));
+                                       + grad_along_q * z));
     splat_grad.mean[0] = (float)grad_mean.x;
     splat_grad.mean[1] = (float)grad_mean.y;
     splat_grad.mean[2] = (float)grad_mean.z;

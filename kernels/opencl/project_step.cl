@@ -2,6 +2,7 @@
 // Index space: one work-item per splat, in groups of STEP_ITEMS.
 // Reads:  view, splats, keys, windows, big_bounds, gradient_offsets, record_gradients. Updates: if `add_statistics`, the sums of screen-space gradients;
 // if `update`, the parameters, Adam's moments, and the activated parameters.
+// IS_RGB, SH_COEFFICIENTS: from effect/color_*_backward.cl.
 #define STEP_ITEMS 64
 #define VALUES (3 * SH_COEFFICIENTS)       // rendered colour values per splat
 #if LANES > 1 && !IS_RGB
@@ -60,10 +61,10 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
         }
 #endif
         for (uint k = 4 * item, at = 4 * i; k < 4 * item + 64; k += 16, at += 16) {
-            float16 q = vload16(0, quats + at), by = vload16(0, grad_quats + k);
-            float16 length = sqrt(sums_of_4(q * q)), turn = q / length;
-            by = (by - turn * sums_of_4(turn * by)) / length;
-            q = ADAM_16(quats, at, by, (float16)lr_quats);
+            float16 q = vload16(0, quats + at), grad_q = vload16(0, grad_quats + k);
+            float16 length = sqrt(sums_of_4(q * q)), unit_q = q / length;
+            grad_q = (grad_q - unit_q * sums_of_4(unit_q * grad_q)) / length;
+            q = ADAM_16(quats, at, grad_q, (float16)lr_quats);
             vstore16(q, 0, quats + at);
             vstore16(units(q), 0, activated_quats + at);
         }
@@ -93,14 +94,14 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
             activated_scales[at] = EXP(log_scales[at]);
         }
 #endif
-        float4 q = vload4(i, quats), by = vload4(item, grad_quats);
+        float4 q = vload4(i, quats), grad_q = vload4(item, grad_quats);
         float length = sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w);
-        float4 turn = q / length;
-        by = (by - turn * (turn.x * by.x + turn.y * by.y + turn.z * by.z + turn.w * by.w)) / length;
-        ADAM(quats, 4 * i, by.x, lr_quats);
-        ADAM(quats, 4 * i + 1, by.y, lr_quats);
-        ADAM(quats, 4 * i + 2, by.z, lr_quats);
-        ADAM(quats, 4 * i + 3, by.w, lr_quats);
+        float4 unit_q = q / length;
+        grad_q = (grad_q - unit_q * (unit_q.x * grad_q.x + unit_q.y * grad_q.y + unit_q.z * grad_q.z + unit_q.w * grad_q.w)) / length;
+        ADAM(quats, 4 * i, grad_q.x, lr_quats);
+        ADAM(quats, 4 * i + 1, grad_q.y, lr_quats);
+        ADAM(quats, 4 * i + 2, grad_q.z, lr_quats);
+        ADAM(quats, 4 * i + 3, grad_q.w, lr_quats);
         vstore4(unit(vload4(i, quats)), i, activated_quats);
         float opacity = activated_opacities[i];
         ADAM(logits, i, (grad_opacities[item] + opacity_penalty) * opacity * (1.0f - opacity), lr_logits);
@@ -112,10 +113,10 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
 #if LANES > 1 && !IS_RGB
     if (i < count && !skipped[item]) {
         size_t row = i * (size_t)(3 * stored_coefficients), out = i * (size_t)VALUES;
-        // value k belongs to term k / 3 and channel k % 3; values behind the last term are unused
+        // value k belongs to coefficient k / 3 and channel k % 3; values after the last coefficient are unused
         float16 b = vload16(0, basis + COEFFICIENTS_CAPACITY * item), c = 0.0f;
         c.s012 = vload3(item, grad_colors);
-        const float16 by[3] = {
+        const float16 gradients[3] = {
             b.s0001112223334445 * c.s0120120120120120,
             b.s55666777888999aa * c.s1201201201201201,
             b.sabbbcccdddeeefff * c.s2012012012012012,
@@ -124,12 +125,12 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
         for (; k + 16 <= VALUES; k += 16) {
             float16 lr = lr_rest;
             if (k == 0) lr.s012 = lr_sh;
-            float16 value = ADAM_16(sh, row + k, by[k / 16], lr);
+            float16 value = ADAM_16(sh, row + k, gradients[k / 16], lr);
             vstore16(value, 0, sh + row + k);
             if (separate) vstore16(value, 0, activated_sh + out + k);
         }
         float last[16];
-        vstore16(by[k / 16 % 3], 0, last);
+        vstore16(gradients[k / 16 % 3], 0, last);
         for (; k < VALUES; k++) {
             float value = ADAM(sh, row + k, last[k % 16], k < 3 ? lr_sh : lr_rest);
             if (separate) activated_sh[out + k] = value;

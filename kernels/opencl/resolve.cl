@@ -6,7 +6,7 @@ kernel void resolve(
     int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
     uint view_index = get_global_id(2);
-    // behind the samples of the preceding views
+    // after the samples of the preceding views
     size_t first = view_index * (channel_stride / get_global_size(2)) + (size_t)(y * SAMPLES) * stride + x * SAMPLES;
 //@@ resolve_pixel
 }

@@ -4,7 +4,7 @@
 
 #define RADIX_BINS (1u << RADIX_BITS)
 
-// Reads: keys, the view's number of visible splats unless `first`. Writes: this block's row of table.
+// Reads: keys, counters[COUNTER_VISIBLE] of the view unless `first`. Writes: this block's row of table.
 kernel void sort_count(
 //@@ arguments sort_count
 ) {

@@ -24,7 +24,7 @@ typedef struct {
 #endif
 //@@ footprint_functions
 
-// Affine forms at heights y; `*_x` hold the terms that depend on the column only.
+// Affine forms at row coordinates y; `*_x` hold the terms that depend on the column only.
 static inline Intersection intersect_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloat d_x, vfloat y, wide half_r2) {
     Intersection c;
     vfloat nu = FMA((vfloat)s->nuy, y, nu_x);

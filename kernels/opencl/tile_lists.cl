@@ -128,8 +128,8 @@ static inline int rect_tile(const TileRect *rect, int cell, const Bounds *b, int
 #define UNROLL 4                // atomics in flight per work-item
 #define TEAM 64                 // work-items that share a big splat
 #define TEAMS (BIN_ITEMS / TEAM)
-#define TEAM_CELLS (8 * TEAM)   // a splat of more cells is listed by the complete group,
-#define TEAM_DEFERRED 16        // for at most this many splats of each team
+#define TEAM_CELLS (8 * TEAM)   // the complete group lists a splat of more cells
+#define TEAM_DEFERRED 16        // maximum number of such splats of a team, which lists further ones itself
 
 // Lists of the tiles of a band [band_first, band_end), at most `capacity` pairs.
 typedef struct {
@@ -193,7 +193,7 @@ static inline void list_big_splats(const BigSplats *splats, uint group, uint gro
 
 // Adds the tiles of big splats to the counters.
 // Index space: any number of work-groups; each processes every n-th splat.
-// Reads: counters' number of big splats, big, big_bounds.
+// Reads: counters[COUNTER_BIG], big, big_bounds.
 kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void count_big(
 //@@ arguments count_big
 ) {
@@ -206,8 +206,8 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void count_big(
 // Writes the (splat, key) pairs of all tiles of a band.
 // Index space: for each view the same number of work-groups, which share the big splats, then `splat_groups` work-groups, one
 // work-item per splat.
-// Reads: windows, keys, starts, big, big_bounds. Consumes: cursors of the band. Writes: pairs; adds to counts' number of visible
-// splats.
+// Reads: windows, keys, starts, big, big_bounds. Consumes: cursors of the band. Writes: pairs; adds to
+// counts[COUNT_VISIBLE].
 kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
 //@@ arguments emit
 ) {
@@ -430,7 +430,7 @@ kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
     // blocks that fit local memory: all of a short list
     uint block = min(padded, (uint)SORT_LOCAL);
     for (uint size = block; size <= padded; size *= 2) {
-        bool all_stages = size == block;   // all stages of each block; afterwards the stages that a wider stage leaves within the blocks
+        bool all_stages = size == block;   // of each block in the first round; later only strides that fit a block
         for (uint stride = size / 2; stride >= SORT_LOCAL; stride /= 2) {
             SORT_STEP(list, length, padded / 2, stride, stride == size / 2, CLK_GLOBAL_MEM_FENCE);
         }

@@ -25,7 +25,7 @@ static inline Area area_of(const SplatRange *range, int tiles, int tiles_x, glob
     if (tiles <= LOCAL_TILES) return area;
     if (get_local_id(0) < 4) extents[get_local_id(0)] = 0xFFFF;
     barrier(CLK_LOCAL_MEM_FENCE);
-    int4 extent = 0xFFFF;          // left, top, -right, -bottom
+    int4 extent = 0xFFFF;          // minima of left, top, -left, -top of the windows' corners
     for (uint splat = range->first + get_local_id(0); splat < range->end; splat += SCAN_ITEMS) {
         if (keys[splat] == CULLED || windows[splat].y == 0) continue;
         int left = windows[splat].x & 0xFFFFu, top = windows[splat].x >> 16;
@@ -87,7 +87,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void count_local(
 }
 
 // Index space: as count_local.
-// Reads: windows, keys, starts. Consumes: cursors of the band. Writes: pairs; adds to counts' number of visible splats.
+// Reads: windows, keys, starts. Consumes: cursors of the band. Writes: pairs; adds to counts[COUNT_VISIBLE].
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
 //@@ arguments emit_local
 ) {

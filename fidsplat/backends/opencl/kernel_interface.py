@@ -55,7 +55,7 @@ BOUNDS = Record(
         member("float slope", "columns of the ellipse in row Y, relative to the centre:"),
         member("float half_width", "slope * Y +- half_width * sqrt(1 - Y^2 / hy^2)"),
         member("float inverse_hy2", "0 makes it a box"),
-        member("float tip", "height at which the ellipse is widest to the right"),
+        member("float tip", "row, relative to the centre, of the rightmost point of the ellipse"),
     ),
 )
 

@@ -1,4 +1,4 @@
-// Frustum culling under the low-pass `pixel`, which widens a disk by the sample's footprint on its plane, also in depth. A disk and
+// Frustum culling under the low-pass `pixel`, which widens a disk by the footprint of a sample on the disk's plane, also in depth. A disk and
 // a margin that are larger by 1 / sqrt(1 - (R k)^2), with R the cut-off radius and k = 1/8, contain the widened disk
 // (fidsplat/streaming/frustum_culling.py has the proof). Splats outside of the band of rows are culled too.
 //@ cull_frustum

@@ -36,7 +36,7 @@ static inline FragmentValues fragment_values(const Splat *s, int px, int py, con
     values.mask = fragment_mask(s, c, x, y, half_r2, constants->sample_area, &lowpass_half_rho);
     values.alpha = fragment_alpha(s, fragment_half_rho(s, c, INVERSE_D(c), lowpass_half_rho), constants->opacity_ceiling);
     const Geometry g = geometry_of(s, c, nu_x, nv_x, y, lowpass_half_rho);
-    values.grad_weight = fragment_by_weight(s, gradient, &g);
+    values.grad_weight = fragment_grad_weight(s, gradient, &g);
     return values;
 }
 
@@ -278,7 +278,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
                 Intersection c = intersect_at(&s, px, y0 + top + 4 * k, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
                 fragment_mask(&s, c, x, y, half_r2, constants.sample_area, &lowpass_half_rho);
                 const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, lowpass_half_rho);
-                *at = (float2)(weight, backward_alpha(&gradients[k], fragment_by_weight(&s, &gradients[k], &g), weight, here.y));
+                *at = (float2)(weight, backward_alpha(&gradients[k], fragment_grad_weight(&s, &gradients[k], &g), weight, here.y));
             } else
                 (*at).x = 0.0f;
         }

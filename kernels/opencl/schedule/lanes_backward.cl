@@ -85,7 +85,7 @@ static inline void backward_splat(const Splat *s, const Tile *tile, global Tape 
         const Block b = block_of(s, tile, &corner, block);
         const Geometry g = geometry_of(s, b.intersection, b.nu_x, b.nv_x, b.y, b.lowpass_half_rho);
         vfloat alpha = tape->alpha[at], weight = tape->transmittance[at] * alpha;
-        vfloat grad_log = backward_alpha(&gradients[block], fragment_by_weight(s, &gradients[block], &g), weight, alpha);
+        vfloat grad_log = backward_alpha(&gradients[block], fragment_grad_weight(s, &gradients[block], &g), weight, alpha);
         add_fragment(&sums, s, &gradients[block], &g, weight, grad_log, b.lowpass_half_rho, b.x, b.y, constants);
     }
     const Parts m = record_gradient_of(&sums, constants);
