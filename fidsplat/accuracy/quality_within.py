@@ -200,7 +200,7 @@ def _promised(
         if _supported(candidate, base, renderer)
     )
     raise InputError(
-        f"error must be at least {lowest:.2g} to be promised {scenes} on {name}, got {error:g}; allow a "
+        f"error must be at least {lowest:.2g}, the lowest bound {scenes} on {name}, got {error:g}; allow a "
         "larger error, lower faint_fragments, or give scene=... and capture=... to measure the error"
     )
 

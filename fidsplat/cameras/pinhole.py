@@ -268,9 +268,12 @@ class Camera(PickledByFields, Summarised):
         looks = position is not None or target is not None
         count = (world_to_camera is not None) + (camera_to_world is not None) + looks
         if count != 1:
+            named = {"world_to_camera": world_to_camera, "camera_to_world": camera_to_world}
+            named |= {"position": position, "target": target}
+            given = " and ".join(name for name, value in named.items() if value is not None) or "none"
             raise InputError(
                 "the pose of a camera must be given as world_to_camera, as camera_to_world, or as position, "
-                f"target or both, got {('none', '', 'both', 'all')[count]}"
+                f"target or both of these, got {given}"
             )
         if camera_to_world is not None:
             pose = pose_matrix(camera_to_world, "camera_to_world")

@@ -206,7 +206,7 @@ class Lidar:
             if kind not in RETURNS:
                 raise InputError(unknown("return of a lidar", kind, RETURNS))
         if not kinds or len(set(kinds)) < len(kinds):
-            raise invalid("lidar returns", "one or more different kinds of return", self.returns)
+            raise invalid("lidar returns", "one or more of first, strongest, last, each once", self.returns)
         if len(kinds) > 1 and self.rays == 1:
             raise InputError(
                 "lidar rays must be at least 2 for several returns, got 1; give for example rays=4"

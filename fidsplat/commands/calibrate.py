@@ -50,7 +50,8 @@ class Calibrate:
         detected = [board for board in views if board is not None]
         if len(detected) < 3:
             raise FidsplatError(
-                f"the board was found in {len(detected)} of {len(views)} views; use a larger size"
+                f"the board must be found in at least 3 views, got {len(detected)} of {len(views)}; use a "
+                "larger --size"
             )
         rows = list(errors_by_count(settings, [board.view for board in detected]))
         corner = float(np.sqrt(np.mean(np.concatenate([board.errors for board in detected]) ** 2)))

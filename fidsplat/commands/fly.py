@@ -87,8 +87,12 @@ class Fly(RenderInput):
         from fidsplat.vision.coco import CocoAnnotations
 
         self.check()
-        if self.workers is not None and (self.ray is None or self.workers < 1):
-            raise InputError(f"--workers must be at least 1 and given with --ray ADDRESS, got {self.workers}")
+        if self.workers is not None and self.workers < 1:
+            raise InputError(f"--workers must be at least 1, got {self.workers}")
+        if self.workers is not None and self.ray is None:
+            raise InputError(
+                "--workers must be given with --ray ADDRESS, got --workers alone; add --ray local"
+            )
         if self.out.endswith(".mcap"):
             self.log, self.out = self.log or self.out, self.out.removesuffix(".mcap")
         check_rate(self.rate)

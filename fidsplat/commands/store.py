@@ -256,7 +256,7 @@ class Verify:
 
 @dataclass
 class Store:
-    """Build, place and describe stores: scenes on disk that may be larger than memory.
+    """Build stores (scenes on disk that may be larger than memory), place instances of them, describe them.
 
     Every command that reads a splat file also reads a store (docs/large-scenes.md).
 

@@ -32,7 +32,8 @@ TEST, TRAINING = "test", "view"
 
 
 def image_file(folder: Path, view: str, category: str, index: int, kind: str, number: int) -> Path:
-    """File of a test image, or of a training image of the densest collection."""
+    """Path of an image of a marker. kind: `TEST`, or `TRAINING` (the largest training set); number: of the
+    image."""
     return folder / view / f"{category}-{index}" / f"{kind}-{number:02d}.png"
 
 

@@ -65,7 +65,10 @@ class StreamedSog:
     def _part(self, cloud: SplatCloud, span: Span) -> SplatCloud:
         path = self.files[span.file]
         if cloud.dropped:
-            raise InputError(f"{path} must have valid splats, got {sum(cloud.dropped.values())} invalid ones")
+            raise InputError(
+                f"{path} must have valid splats, got {sum(cloud.dropped.values())} invalid ones; write the "
+                "file again with splat-transform, which can drop them"
+            )
         if span.first + span.count > len(cloud):
             raise InputError(
                 f"{self.path}: a range of {path.name} must end by splat {len(cloud)}, got "

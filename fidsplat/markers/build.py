@@ -370,7 +370,7 @@ class _Sheet(NamedTuple):
     surface: SheetShape | None
 
     def boxes(self, printed: Printed, progress: Progress) -> SplatCloud:
-        """One box for each rectangle, or for each piece of it."""
+        """One box for each rectangle; on a bent marker one for each flat piece of it."""
         refuse_more(self.spec, len(printed.boxes), self.max_splats)
         if self.surface is None:
             return box_cloud(printed, progress)
@@ -380,7 +380,7 @@ class _Sheet(NamedTuple):
     def gaussians(
         self, printed: Printed, templates: tuple[Template, ...], growth: float, progress: Progress
     ) -> SplatCloud:
-        """Gaussians of each rectangle, or of each piece of it."""
+        """Gaussians of each rectangle; on a bent marker of each flat piece of it."""
         filled = without_slivers(printed)
         if self.surface is not None:
             along_modules = printed.regions is None

@@ -91,7 +91,7 @@ class Scan:
         return np.einsum("bij,rbj->rbi", poses[:, :3, :3], self.points) + poses[:, :3, 3]
 
     def image(self, name: str = "range") -> np.ndarray:
-        """range, intensity or label as (r, rings, columns), left (azimuth pi) to right, for a spinning
+        """range, intensity or label as (returns, rings, columns), left (azimuth pi) to right, for a spinning
         lidar."""
         pattern = self.lidar.pattern
         if not isinstance(pattern, Spinning):

@@ -81,7 +81,7 @@ class PlacedMarker(PickledByFields):
 
 @dataclass(frozen=True, eq=False)
 class SceneParts(PickledByFields):
-    """Data of a scene. Raises InputError for a field of the wrong type."""
+    """Base of `Scene`: its fields, without methods. Raises InputError for a field of the wrong type."""
 
     clouds: tuple[SplatCloud, ...] = ()
     """splats in the world, with their own labels"""

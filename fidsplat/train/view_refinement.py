@@ -71,9 +71,9 @@ class ViewRefinement:
         self._pose_adam, self._exposure_adam = (_Adam(len(self._initial), 6, settings) for _ in range(2))
         self._intrinsics_adam = _Adam(len(self.intrinsics), 4, settings)
 
-    def move(self, view: int, by_pose: np.ndarray, iteration: int) -> None:
-        """Apply a step to the pose of a view. by_pose: (6,) gradient `pose` of the loss."""
-        depth, gradient = self._depths[view], by_pose.astype(np.float64)
+    def move(self, view: int, grad_pose: np.ndarray, iteration: int) -> None:
+        """Apply a step to the pose of a view. grad_pose: (6,) gradient of the loss by the pose."""
+        depth, gradient = self._depths[view], grad_pose.astype(np.float64)
         pivot = np.array([0.0, 0.0, depth])
         gradient[:3] -= np.cross(pivot, gradient[3:])
         gradient[3:] *= depth

@@ -145,7 +145,10 @@ def _obtain(folder: Path, run: Callable[[list[str]], str]) -> None:
                 data = b"" if member is None else member.read()
                 sha256 = hashlib.sha256(data).hexdigest()
                 if sha256 != expected:
-                    raise InputError(f"{name} of playcanvas must have the SHA-256 {expected}, got {sha256}")
+                    raise InputError(
+                        f"{name} of playcanvas must have the SHA-256 {expected}, got {sha256}; download "
+                        "it again"
+                    )
                 write_file(folder / Path(name).name, data)
 
 

@@ -103,7 +103,9 @@ def truth_of(frame: Mapping[str, np.ndarray], scene: Scene, camera: Camera | Non
     )
     poses = (camera.world_to_camera @ placed.pose for placed in markers)
     truths = zip(markers, poses, corners, parts, strict=True)
-    return Truth(camera, [MarkerTruth(*facts, *part) for *facts, part in truths], groups)
+    return Truth(
+        camera, [MarkerTruth(placed, pose, points, *part) for placed, pose, points, part in truths], groups
+    )
 
 
 def at_shutter(

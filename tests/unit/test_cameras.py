@@ -143,7 +143,7 @@ def test_another_pose_by_position_and_target():
     ("pose", "words"),
     [
         ({}, "got none$"),
-        ({"world_to_camera": np.eye(4), "position": (0, 0, 0)}, "got both"),
+        ({"world_to_camera": np.eye(4), "position": (0, 0, 0)}, "got world_to_camera and position"),
         ({"world_to_camera": 2 * np.eye(4)}, "world_to_camera"),
         ({"position": (0, 0)}, "camera position must be three numbers"),
         ({"position": (0, 0, 1), "target": (0, 0, 1)}, "must be different points"),

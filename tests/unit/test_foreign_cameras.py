@@ -243,5 +243,5 @@ def test_poses_are_matrices_or_pairs():
 def test_pairs_that_are_no_poses(pose, words):
     with pytest.raises(fs.InputError, match=words):
         fs.Camera.pinhole(64, 48, 50, 50, 32, 24, pose)
-    with pytest.raises(fs.InputError, match="got both"):
+    with pytest.raises(fs.InputError, match="got world_to_camera and camera_to_world"):
         fs.Camera.pinhole(64, 48, 50, 50, 32, 24).with_pose(np.eye(4), camera_to_world=np.eye(4))

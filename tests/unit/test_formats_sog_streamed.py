@@ -74,7 +74,7 @@ def test_streamed_sog_of_splat_transform(exported, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"version": 2}, "the version of streamed SOG must be 1, got 2; convert it by splat-transform"),
+        ({"version": 2}, "the version of streamed SOG must be 1, got 2; convert it with splat-transform"),
         ({"lodLevels": 10**9}, "lodLevels must be 1 to 64"),
         ({"filenames": ["../../a/meta.json"]}, "must be in its folder"),
         ({"filenames": []}, "a leaf must refer to levels"),

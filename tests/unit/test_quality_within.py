@@ -362,7 +362,7 @@ def test_frames_are_timed(renderer, scene):
 
 @pytest.mark.parametrize("error", [0, -1e-3, 1e-9])
 def test_an_impossible_error(renderer, scene, error):
-    with pytest.raises(InputError, match=r"error must be at least \d.* to be promised"):
+    with pytest.raises(InputError, match=r"error must be at least \d.*, the lowest bound"):
         fs.quality_within(error=error, device=renderer)
     with pytest.raises(InputError, match=r"error must be at least \d.*allow \d"):
         within(renderer, scene, error)

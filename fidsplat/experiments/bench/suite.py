@@ -175,7 +175,7 @@ def adapter_renderers(folder: Path) -> dict[str, Opener]:
 
 
 class Measurement:
-    """A setting of a renderer in a scene: its result so far and the timer of its frames."""
+    """Measurement of one setting of a renderer in a scene: the result so far, and the timer of its frames."""
 
     def __init__(
         self, process: RendererProcess, setting: str, result: dict[str, Any], submissions: list[list[int]]
