@@ -150,6 +150,10 @@ class AlignmentKernels(ABC):
         scene; returns the number of pixels of each. A stage uses about `max_pixels` pixels, those with the
         largest gradients."""
 
+    def release_scene(self) -> None:
+        """Release the cloud of `load`, after the last `sums`."""
+        del self._scene
+
     def frame(self, stage: int, pose: np.ndarray, perturbed: bool = False) -> Any:
         """Frame of the scene at a pose, valid until the next frame with this value of `perturbed`."""
         return self._scene.render(self._stages[stage].camera.with_pose(pose))

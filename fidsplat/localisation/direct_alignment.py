@@ -148,13 +148,16 @@ def align(
     kernels = scene.kernels()
     with kernels.lock:
         counts = kernels.load(image, [stage for stage, _ in stages], MAX_PIXELS, scene)
-        if not all(counts):
-            camera = stages[counts.index(0)][0].camera
-            raise InputError(
-                "localisation must have pixels away from the border and from ignored pixels, got none at "
-                f"{camera.width} x {camera.height}; give a larger image or a mask that ignores less"
-            )
-        found = _align(image, finest, kernels, stages, coarse)
+        try:
+            if not all(counts):
+                camera = stages[counts.index(0)][0].camera
+                raise InputError(
+                    "localisation must have pixels away from the border and from ignored pixels, got none at "
+                    f"{camera.width} x {camera.height}; give a larger image or a mask that ignores less"
+                )
+            found = _align(image, finest, kernels, stages, coarse)
+        finally:
+            kernels.release_scene()
     return replace(found, camera=start.with_pose(found.camera.world_to_camera))
 
 

@@ -1,8 +1,10 @@
 """Localisation: recovered poses, their covariance, initial poses and errors."""
 
+import gc
 import json
 import math
 import runpy
+import weakref
 from functools import partial
 from pathlib import Path
 
@@ -296,6 +298,10 @@ def test_a_gpu_replays_renders_with_the_result_of_a_cpu(renderer, room, monkeypa
         assert pose_difference(actual.camera, expected.camera)[0] < 2e-3
         np.testing.assert_allclose(actual.covariance, expected.covariance, rtol=0.02, atol=1e-9)
         gpu.render(resident, outputs=("rgb", "depth"))
+    cloud = weakref.ref(resident.data)
+    del resident
+    gc.collect()
+    assert cloud() is None
 
 
 def test_a_store_is_localised_in(renderer, room, tmp_path):
