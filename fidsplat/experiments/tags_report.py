@@ -46,7 +46,7 @@ def statistics_of(rows: Table, seed: int, by: Sequence[str] = _GROUP) -> Table:
 
 def _statistics(group: Table, seed: int) -> dict[str, Any]:
     read = group[group["read"]]
-    row: dict[str, Any] = {"amount": len(group)}
+    row: dict[str, Any] = {"images": len(group)}
     for name, hits in (("rate", len(read)), ("precise", int((read["corner_px"] <= PRECISE).sum()))):
         row[name] = hits / len(group)
         row[f"{name}_low"], row[f"{name}_high"] = wilson(hits, len(group))
@@ -173,7 +173,7 @@ def write_report(records: Sequence[Record], folder: Path, out: Path, seed: int) 
         "detectors": [f"`{name}`: {TITLES[name]}" for name in detectors if name in TITLES],
         "scenes": " and ".join(dict.fromkeys(views["scene"])),
         "images": int(
-            table.rows.groupby([name for name in _GROUP if name != "detector"])["amount"].max().sum()
+            table.rows.groupby([name for name in _GROUP if name != "detector"])["images"].max().sum()
         ),
         "runs": provenance({"`experiment tags`": summary}),
     }

@@ -201,7 +201,7 @@ def _bled(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
     """Ink spreads, unevenly along the edges, and keeps the colour of the nearest ink."""
     distances = SMEAR * severity * sheet.cells * (0.7 + 0.6 * _noise(sheet, 0.4, rng))
     ink = sheet.present & (sheet.color != sheet.paper).any(2)
-    max_distance = math.ceil(distances.max())
+    max_distance = math.ceil(distances.max() + 0.5)
     steps = np.arange(-max_distance, max_distance + 1)
     dy, dx = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
     distance = np.hypot(dy, dx)
@@ -209,7 +209,7 @@ def _bled(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
     todo, (h, w) = sheet.present & ~ink, ink.shape
     colors = np.pad(sheet.color, ((max_distance, max_distance), (max_distance, max_distance), (0, 0)))
     for i in np.argsort(distance, kind="stable"):
-        if distance[i] > distances.max():
+        if distance[i] - 0.5 > distances.max():
             break
         shifted = np.s_[
             max_distance + dy[i] : max_distance + dy[i] + h, max_distance + dx[i] : max_distance + dx[i] + w

@@ -5,6 +5,7 @@ which markers consist) are split where the light changes.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -55,6 +56,11 @@ def lit_scene(scene: Scene, renderer: Any) -> Scene:
     for number, light in enumerate(scene.lights):
         if isinstance(light, PointLight) and number not in environment.reaching_lights and light.power.any():
             environment.refuse_inside(number, light)
+            warnings.warn(
+                f"lights[{number}] must reach a marker with light, got the position {light.position}, which "
+                "is behind the markers, occluded or directed away; move it",
+                stacklevel=4,
+            )
     return replace(scene, markers=markers, lights=())
 
 
@@ -161,7 +167,7 @@ def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
     """
     lighting = Lighting.of(placed.light)
     assert lighting is not None
-    _check_roughness(lighting, environment)
+    _check_roughness(placed, lighting, environment)
     cloud = placed.marker.cloud
     points = _points(placed, lighting)
     incoming = _incoming_light(placed, lighting, points, environment)
@@ -191,15 +197,15 @@ def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
     return replace(placed, marker=replace(placed.marker, cloud=lit), light=None)
 
 
-def _check_roughness(lighting: Lighting, environment: _Environment) -> None:
+def _check_roughness(placed: PlacedMarker, lighting: Lighting, environment: _Environment) -> None:
     """Raise InputError if spherical harmonics cannot represent the reflection, or it requires a camera."""
     if lighting.roughness is None:
         return
     if lighting.view == "any" and lighting.roughness < MIN_HARMONIC_ROUGHNESS:
         raise InputError(
-            f"roughness of a marker's light must be at least {MIN_HARMONIC_ROUGHNESS:g} with view='any', as "
-            f"harmonics of degree 3 cannot represent sharper reflections, got {lighting.roughness:g}; use "
-            "view='camera'"
+            f"roughness of the light of marker {placed.label}, {placed.marker.spec}, must be at least "
+            f"{MIN_HARMONIC_ROUGHNESS:g} with view='any', as harmonics of degree 3 cannot represent sharper "
+            f"reflections, got {lighting.roughness:g}; use view='camera'"
         )
     if lighting.view == "camera" and environment.camera is None:
         raise InputError(
@@ -249,10 +255,12 @@ def _incoming_light(
             motion, renderer = environment.scene.motion, environment.renderer
             visible = visibility(point, surface, casters, motion, extent, renderer)
             if visible.any():
-                environment.reaching_lights.add(number)
                 directions, unshadowed = point.irradiance(surface.points)
                 cosine = np.einsum("mc,mc->m", directions, surface.normals)
-                irradiance += unshadowed * (np.maximum(cosine, 0) * visible)[:, None]
+                arriving = unshadowed * (np.maximum(cosine, 0) * visible)[:, None]
+                if arriving.any():
+                    environment.reaching_lights.add(number)
+                irradiance += arriving
                 lights.append((point, visible))
     return _IncomingLight(irradiance, field, lights)
 
@@ -275,10 +283,11 @@ def _field(
         frames = environment.panoramas(panorama_points, lighting.rows, 1e-4, **fields)
         panoramas = []
         for frame in frames:
-            radiance = linear_light(frame["rgb"], lighting.response).reshape(-1, 3)
-            if lighting.ambient is not None:
-                radiance = radiance + (1 - np.asarray(frame["alpha"]).reshape(-1, 1)) * lighting.ambient
-            panoramas.append(radiance)
+            colors, empty = frame["rgb"].reshape(-1, 3), 1 - frame["alpha"].reshape(-1, 1)
+            if lighting.ambient is not None and (fog := environment.scene.capture).has_fog:
+                colors = np.maximum(colors - empty * np.array(fog.rendered_background), 0)
+            radiance = linear_light(colors, lighting.response)
+            panoramas.append(radiance if lighting.ambient is None else radiance + empty * lighting.ambient)
         return np.stack(panoramas)
 
     if lighting.source == "lights":

@@ -27,7 +27,7 @@ def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
 
     IPPE (Collins and Bartoli 2014) has two solutions for a nearly ambiguous square; Levenberg-Marquardt
     minimizes the reprojection error of both, and the pose with the lower error is returned. NaN if neither is
-    in front of the camera.
+    in front of the camera, or if corners coincide.
 
     Args:
         corners: (4, 2) pixels, TL, TR, BR, BL as printed.
@@ -79,7 +79,10 @@ def _pose(points: np.ndarray, corners: np.ndarray, camera: Camera, method: int) 
     spread = float(np.linalg.norm(observed - observed.mean(0)))
     # OpenCV's IPPE divides by almost 0 for a frontal marker: its poses can be NaN or arbitrary
     for way in dict.fromkeys((method, cv2.SOLVEPNP_SQPNP)):
-        count, rotations, translations, _ = cv2.solvePnPGeneric(points, observed, matrix, None, flags=way)
+        try:
+            count, rotations, translations, _ = cv2.solvePnPGeneric(points, observed, matrix, None, flags=way)
+        except cv2.error:  # corners that coincide
+            continue
         for rotation, translation in zip(rotations[:count], translations[:count], strict=True):
             rotation, translation = cv2.solvePnPRefineLM(
                 points, observed, matrix, None, rotation, translation

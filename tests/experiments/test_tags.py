@@ -58,6 +58,10 @@ def test_severity_0_is_the_view_without_a_cause(view):
         assert np.allclose(none.placed.marker.cloud.opacities, view.placed.marker.cloud.opacities), name
 
 
+def test_corners_that_coincide_are_not_read(view):
+    assert errors_of(np.full((4, 2), 5.0), view) is None
+
+
 def test_amounts_are_physical(view):
     far = CAUSES["distance"].apply(view, 1.0)
     assert edge_pixels(view) / edge_pixels(far) == pytest.approx(60 / EDGES, rel=0.1)

@@ -92,6 +92,22 @@ def test_a_sun_follows_the_cosine(degrees):
     assert np.allclose(light.max(0), 0.85 * max(math.cos(angle), 0) * np.array([1, 0.5, 0.25]), rtol=1e-5)
 
 
+def test_ambient_light_replaces_the_colour_of_fog():
+    placed = PlacedMarker(TAG, light=fs.Lighting(response="linear", ambient=(1, 1, 1)))
+    cloud = (
+        renderer().lit(fs.Scene(markers=[placed], fog=fs.Fog(1e-9, (0.5, 0.5, 0.5)))).markers[0].marker.cloud
+    )
+    assert np.allclose(cloud.colors.max(0), 0.85, rtol=1e-5)
+
+
+@pytest.mark.parametrize("z", [0.0, 0.3])
+def test_a_light_behind_the_marker_is_reported(z):
+    lamp = fs.PointLight(position=(0, 0, z))
+    with pytest.warns(UserWarning, match=r"lights\[1\] must reach a marker with light"):
+        light, _ = lit(of_lights(SUN, lamp))
+    assert light.max() == pytest.approx(0.85, rel=1e-5)
+
+
 def test_a_wide_sun_has_its_intensity_on_a_surface_that_faces_it():
     light, _ = lit(of_lights(replace(SUN, angle=3.0, samples=64)))
     assert light.max() == pytest.approx(0.85, rel=1e-5)

@@ -78,6 +78,11 @@ def test_areas_are_those_of_the_severity(severity):
     assert SHEET - legs**2 / 2 - 0.002 * SHEET < folded < SHEET - 0.6 * legs**2 / 2 + 0.002 * SHEET
 
 
+def test_ink_bleeds_by_less_than_a_cell():
+    ink = [areas(worn(severity, "bleed"))[0.0, 0.0, 0.0] for severity in (0.08, 0.1, 0.13)]
+    assert all(np.diff([INK, *ink]) > 0)
+
+
 def test_ink_bleeds_by_a_distance_on_average(tmp_path):
     """A square of ink grows by a rounded rim: 4 a r + pi r^2."""
     file = write_png(tmp_path / "square.png", np.pad(np.zeros((4, 4), np.uint8), 1, constant_values=255))
