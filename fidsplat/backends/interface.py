@@ -138,7 +138,8 @@ class Images(ABC):
     def device_array(self, name: str, index: int | None = None) -> Any:
         """The images as a device array in the shape of `read`, without a copy."""
         raise InputError(
-            f"device_array({name!r}) must be called on a device that shares its arrays, got another one; "
+            f"device_array({name!r}) must be called for images of a device that shares its arrays, got "
+            f"{type(self).__name__}; "
             f"render with device='warp:cuda' or 'warp:cpu', or copy to the host with frame[{name!r}]"
         )
 

@@ -27,7 +27,7 @@ _EXTRA = {
 
 
 class RecordLayout:
-    """RecordLayout of a record: number of lines of four floats, and position of each number.
+    """Memory layout of a record: number of lines of four floats (16 bytes), and position of each number.
 
     nu0 + nux x + nuy y is n_u, likewise n_v and D, with x, y in samples relative to the centre of the anchor
     sample (ax, ay); D is at most d_near beyond the near plane. lowpass_x, lowpass_y: projected centre

@@ -33,7 +33,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     splat |= {"w": wp.vec4, "origin": wp.vec3} if has_lens else {}
     # plane_z0, plane_zx, plane_zy, plane_near
     splat |= {"plane": wp.vec4} if parallel else {}
-    Splat = struct_of("Splat", "What of a record each sample needs.", splat)
+    Splat = struct_of("Splat", "Fields of a record that each sample reads.", splat)
     lowpass_line, lowpass_lane = layout.position("lowpass_x")
     lowpass_y_lane = layout.position("lowpass_y")[1]  # on the same line
     edge_line = layout.position("edge_u0")[0]
