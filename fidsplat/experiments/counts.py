@@ -54,7 +54,7 @@ def _by_colour(grid: np.ndarray, boxes: np.ndarray) -> dict[str, int]:
 
 
 def _gaussians(mixture: str, boxes: np.ndarray) -> int | None:
-    """Number of Gaussians of a mixture for other rectangles; None for mixtures that are made from modules."""
+    """Number of Gaussians of a mixture for these rectangles; None for mixtures that are made from modules."""
     if mixture == "exact":
         return len(boxes)
     if mixture == "paper":

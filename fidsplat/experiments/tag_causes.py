@@ -249,7 +249,7 @@ def _distance(view: MarkerView, edges: float) -> MarkerView:
 
 
 def _angle(view: MarkerView, degrees: float) -> MarkerView:
-    """Tilt the camera by degrees from the marker's normal."""
+    """Move the camera to this angle [degrees] from the marker's normal."""
     return replace(view, tilt=math.copysign(math.radians(degrees), view.tilt))
 
 

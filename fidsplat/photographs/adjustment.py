@@ -126,8 +126,8 @@ def _check_sizes(scales: Mapping[str, tuple[float, float]], sizes: Mapping[str, 
         if difference > max(SAME_SIZE, SIGMAS * float(np.hypot(da, db))):
             raise InputError(
                 f"sizes of tags must agree, got {sizes[tag]:g} m for {tag} and {sizes[other]:g} m for "
-                f"{other}, which has {sizes[other] * a / b:.4g} m by the first; measure their black "
-                "squares"
+                f"{other}, which would be {sizes[other] * a / b:.4g} m if the first is right; measure their "
+                "black squares"
             )
 
 

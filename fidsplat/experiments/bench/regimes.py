@@ -55,7 +55,8 @@ class Views:
     def save(self, file: Path) -> Path:
         """Write an npz file for adapters: `ARRAYS`, poses, matrix (3, 3), size (2,) and near.
 
-        scales: (n, 2) of disks and boxes, (n, 3) of ellipsoids. boxes and coplanar_groups are optional.
+        The array `scales` is (n, 2) for disks and boxes, (n, 3) for ellipsoids. The arrays `boxes` and
+        `coplanar_groups` are optional.
         """
         cloud, camera = self.cloud, self.camera
         arrays = {name: getattr(cloud, name) for name in ARRAYS}
