@@ -89,7 +89,7 @@ def test_a_wrong_detection_is_rejected():
 
 def test_tags_that_contradict_are_errors():
     cameras, views, sizes, _ = photographed(3, scale=2.0, tags=2)
-    with pytest.raises(InputError, match=r"sizes of tags must agree.*has 0\.1(5|499|501) m"):
+    with pytest.raises(InputError, match=r"sizes of tags must agree.*would be 0\.1(5|499|501) m"):
         adjust(cameras, views, sizes | {"tag 1": 0.25})
     moved = [view if view.image % 2 else TagView(view.tag, view.image, view.corners + 50) for view in views]
     with pytest.raises(InputError, match="at one place"):
