@@ -65,14 +65,16 @@ def seconds_of(work: Callable[[], object], repeats: int) -> float:
     return float(np.median(taken[1:]))
 
 
-def measure(renderer: fs.Renderer, name: str, batch: int, repeats: int, width: int, height: int) -> dict:
+def measure(
+    renderer: fs.Renderer, name: str, batch: int, repeats: int, threads: int, width: int, height: int
+) -> dict:
     """Seconds per image by step, and images per hour."""
     scene, cameras = views_of(name, batch, width, height)
     resident = renderer.upload(scene)
     captures = [
         fs.Capture(camera, outputs=("rgb", "label"), background=scene.background) for camera in cameras
     ]
-    pool = ThreadPoolExecutor(os.cpu_count() or 1)
+    pool = ThreadPoolExecutor(threads)
 
     def submitted() -> fs.FrameBatch:
         return renderer.render_batch(resident, captures)
@@ -140,12 +142,16 @@ def main() -> int:
     parser.add_argument("--size", type=int, nargs=2, default=(1920, 1080), help="pixels")
     parser.add_argument("--batch", type=int, default=4, help="views of a submission")
     parser.add_argument("--batches", type=int, default=3)
+    threads = min(4, os.cpu_count() or 1)
+    parser.add_argument("--threads", type=int, default=threads, help="that compute truth and masks")
     parser.add_argument("--json", default=None, help="file for the figures")
     arguments = parser.parse_args()
     renderer = fs.Renderer(arguments.device)
     figures = []
     for name in arguments.scene or [GREENHOUSE]:
-        figures.append(measure(renderer, name, arguments.batch, arguments.batches, *arguments.size))
+        figures.append(
+            measure(renderer, name, arguments.batch, arguments.batches, arguments.threads, *arguments.size)
+        )
         print(
             "{scene}, {splats} splats, {markers} markers, {visible_markers:.1f} visible".format(**figures[-1])
         )

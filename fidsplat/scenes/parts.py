@@ -68,11 +68,13 @@ class PlacedMarker(PickledByFields):
         pose.flags.writeable = False
         object.__setattr__(self, "pose", pose)
 
-    @property
+    @cached_property
     def corners(self) -> np.ndarray:
         """Corners (4, 3) float64 of the code's outer edge in the world: top left, top right, bottom right,
-        bottom left."""
-        return np.asarray(self.marker.corners, np.float64) @ self.pose[:3, :3].T + self.pose[:3, 3]
+        bottom left; read-only."""
+        corners = np.asarray(self.marker.corners, np.float64) @ self.pose[:3, :3].T + self.pose[:3, 3]
+        corners.flags.writeable = False
+        return corners
 
     def cloud(self) -> SplatCloud:
         """The marker's splats in the world, all with its label."""
