@@ -1,8 +1,8 @@
 """Shapes of a marker's sheet: parametric surfaces over the flat sheet, with unit tangents.
 
 A surface maps positions (x, y) of the flat sheet, in metres from its centre, to positions in the marker's
-frame. The centre stays at the origin. All surfaces but `Crumpled` are developable: the map preserves lengths,
-and the tangent plane of the centre is the plane of the flat marker.
+frame. All surfaces but `Crumpled` are developable: the map preserves lengths, the centre stays at the origin,
+and its tangent plane is the plane of the flat marker. The mean height of a crumpled sheet is 0.
 """
 
 from __future__ import annotations

@@ -142,8 +142,8 @@ def worn(spec: str, printed: Printed, wear: Wear) -> Printed:
     """
     if printed.regions is not None:
         raise InputError(
-            f"a marker with wear must consist of modules, got a drawing with slanted edges, {spec}; use "
-            "image:FILE of the drawing"
+            f"a marker with wear must consist of modules, got {spec}, which has slanted edges; use another "
+            "family, or image:FILE of a drawing"
         )
     cells = max(1, min(CELLS, WIDEST // max(printed.grid.shape)))
     fine = printed.grid.repeat(cells, 0).repeat(cells, 1)

@@ -244,8 +244,10 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progre
 
     limit = {} if max_splats is None else {"max_splats": max_splats}
     limit |= {name: table.numbers(name, 3) for name in ("black", "white") if name in table}
-    limit |= {"shape": _shape(table)} if "shape" in table else {}
-    if "wear" in table:
+    limit |= {name: table.text(name) for name in ("shape", "wear") if table.is_text(name)}
+    if "shape" in table and "shape" not in limit:
+        limit["shape"] = _shape(table)
+    if "wear" in table and "wear" not in limit:
         own_wear = table.table("wear", names_of(Wear))
         with own_wear.at():
             limit["wear"] = Wear(**own_wear.values(Wear))

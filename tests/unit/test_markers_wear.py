@@ -142,8 +142,12 @@ def test_wrong_wear_is_refused(tmp_path):
         fs.marker(SPEC, mixture="facets", wear="fading=0.5")
     drawing = tmp_path / "a.svg"
     drawing.write_text('<svg viewBox="0 0 9 9"><path d="M1 1L8 2L4 8Z" fill="black"/></svg>')
-    with pytest.raises(fs.InputError, match="a drawing with slanted edges"):
+    with pytest.raises(fs.InputError, match="which has slanted edges; use another family"):
         fs.marker(f"svg-16:{drawing}", wear="fading=0.5")
     (tmp_path / "scene.toml").write_text(f'[[markers]]\nspec = "{SPEC}"\nsize = 1.0\nwear = {{dirt = 2}}\n')
     with pytest.raises(fs.InputError, match=r"markers\[0\]\.wear: dirt must be a severity"):
         fs.Scene.load(tmp_path / "scene.toml")
+    text = 'shape = "cylinder,radius=0.9"\nwear = "dirt=0.2"\n'
+    (tmp_path / "text.toml").write_text(f'[[markers]]\nspec = "{SPEC}"\nsize = 1.0\n{text}')
+    made = fs.Scene.load(tmp_path / "text.toml").markers[0].marker
+    assert (made.shape, made.wear) == (Cylinder(0.9), Wear(dirt=0.2))
