@@ -142,10 +142,8 @@ def test_every_decision_occurs():
     assert (images["edge-on"].missed & images["edge-on"].contributes).any()
     # depths between the centre's and the plane's
     assert {*both.mirrored[both.contributes & ~both.missed].tolist()} == {True, False}
-    assert {*images["edge-on"].wide[images["edge-on"].mirrored & images["edge-on"].contributes].tolist()} == {
-        True,
-        False,
-    }
+    edge_on = images["edge-on"]
+    assert {*edge_on.at_disc[edge_on.mirrored & edge_on.contributes].tolist()} == {True, False}
     assert not images["opaque"].contributes.all()
 
 

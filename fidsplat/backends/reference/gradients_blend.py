@@ -38,12 +38,13 @@ class Decisions:
     """whether the ray does not meet the plane beyond `near`, so that the fragment has the depth of the
     centre"""
     mirrored: np.ndarray
-    """whether the depth is mirrored at a circle"""
-    wide: np.ndarray
-    """whether it is mirrored at the disc's circle instead of the circle where the splat is 1/255 of its
-    opacity"""
+    """whether the point on the plane is outside a circle around the centre: the fragment then has the depth
+    of the point inverted in this circle (at radius R^2 / r instead of r)"""
+    at_disc: np.ndarray
+    """whether this circle is the low-pass disc at the sample, instead of the circle where alpha is 1/255 of
+    the opacity"""
     covered: np.ndarray
-    """(k,): whether the coverage suffices for depths and normals"""
+    """(k,): whether a sample's accumulated alpha suffices for a depth and a normal"""
 
 
 def decide(s: ProjectedSplats, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
@@ -62,7 +63,7 @@ def decide(s: ProjectedSplats, view: View, x: np.ndarray, y: np.ndarray) -> Deci
         clamped=s.log_opacity - np.minimum(plane, disc) > np.log(view.opacity_ceiling),
         missed=(d <= 0) | (d * view.near > f.dz),
         mirrored=s.screen & (q > 2 * np.maximum(f.offset, HALF_RHO_OF_RANGE) * d**2),
-        wide=f.offset > HALF_RHO_OF_RANGE,
+        at_disc=f.offset > HALF_RHO_OF_RANGE,
         covered=1 - final >= MIN_ALPHA,
     )
 
@@ -113,13 +114,13 @@ class Blend:
             disc = self._disc_x**2 + self._disc_y**2
             half_rho = np.where(decisions.by_lowpass, disc, plane)
             # interpolation factor from the centre's depth to the depth on the plane
-            circle = np.where(decisions.wide, disc, HALF_RHO_OF_RANGE)
-            self._share = np.where(decisions.mirrored, circle / plane, 1.0)
-            z = self._pz + self._share * (z_plane - self._pz)
-            opacity = np.where(decisions.clamped, view.opacity_ceiling, np.exp(log_opacity - half_rho))
+            circle = np.where(decisions.at_disc, disc, HALF_RHO_OF_RANGE)
+            self._depth_factor = np.where(decisions.mirrored, circle / plane, 1.0)
+            z = self._pz + self._depth_factor * (z_plane - self._pz)
+            alpha = np.where(decisions.clamped, view.opacity_ceiling, np.exp(log_opacity - half_rho))
         self._z = np.where(decisions.contributes, np.where(decisions.missed, self._pz, z), 0.0)
         self._inverse = np.where(decisions.contributes, inverse_depth(self._z), 0.0)
-        self._alpha = np.where(decisions.contributes, opacity, 0.0)
+        self._alpha = np.where(decisions.contributes, alpha, 0.0)
         after = np.cumprod(1 - self._alpha, axis=1)
         self._before = np.concatenate([np.ones((len(x), 1)), after], axis=1)
         self._weight = self._before[:, :-1] * self._alpha
@@ -142,24 +143,28 @@ class Blend:
         grad_inverse = grads.inverse[:, None] + 2 * grads.squares[:, None] * self._inverse
         grad_inverse = np.where(self._z > SPREAD_NEAR, grad_inverse, 0.0)
         grad_z = self._weight * (grads.depth[:, None] - grad_inverse * self._inverse**2 / INVERSE_DEPTH)
-        grad_alpha = np.where(decisions.contributes, self._opacity_gradients(grads), 0.0)
+        grad_alpha = np.where(decisions.contributes, self._alpha_gradients(grads), 0.0)
         grad_log = np.where(decisions.clamped, 0.0, grad_alpha * self._alpha)
 
         met = decisions.contributes & ~decisions.missed
         on_plane, mirrored = decisions.contributes & ~decisions.by_lowpass, met & decisions.mirrored
-        share = np.where(met, self._share, 0.0)
+        depth_factor = np.where(met, self._depth_factor, 0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            grad_share = np.where(mirrored, grad_z * (self._z_plane - self._pz), 0.0)
+            grad_depth_factor = np.where(mirrored, grad_z * (self._z_plane - self._pz), 0.0)
             # derivative with respect to rho / 2 of the ray-plane intersection
-            grad_plane = np.where(mirrored, -grad_share * share / self._plane, 0.0)
+            grad_plane = np.where(mirrored, -grad_depth_factor * depth_factor / self._plane, 0.0)
             grad_plane -= np.where(on_plane, grad_log, 0.0)
             grad_lowpass = np.where(decisions.contributes & decisions.by_lowpass, grad_log, 0.0)
-            grad_lowpass -= np.where(mirrored & decisions.wide, grad_share / self._plane, 0.0)
+            grad_lowpass -= np.where(mirrored & decisions.at_disc, grad_depth_factor / self._plane, 0.0)
         grad_facing, grad_log_opacity = self._weight.T @ grads.normal, grad_log.sum(0)
         splat_grads = CameraSplats.zeros(len(self._pz))
         for rows, shape in self._shapes:
             results = CameraSplats.zeros(len(rows))
-            grad_rays = (grad_plane[:, rows], grad_z[:, rows] * share[:, rows], (on_plane | met)[:, rows])
+            grad_rays = (
+                grad_plane[:, rows],
+                grad_z[:, rows] * depth_factor[:, rows],
+                (on_plane | met)[:, rows],
+            )
             shape.backward(results, *grad_rays, grad_facing[rows], grad_log_opacity[rows])
             for name, array in vars(results).items():
                 getattr(splat_grads, name)[rows] = array
@@ -167,14 +172,14 @@ class Blend:
             splat_grads.center[:, axis] += 2 * np.where(grad_lowpass != 0, grad_lowpass * distance, 0.0).sum(
                 0
             )
-        splat_grads.p[:, 2] += (grad_z * (1 - share)).sum(0)
+        splat_grads.p[:, 2] += (grad_z * (1 - depth_factor)).sum(0)
         splat_grads.log_opacity, splat_grads.rgb = grad_log_opacity, self._weight.T @ grads.rgb
         out = CameraSplats.zeros(self._count)
         for name, array in vars(splat_grads).items():
             getattr(out, name)[decisions.order] = array
         return out
 
-    def _opacity_gradients(self, grads: Samples) -> np.ndarray:
+    def _alpha_gradients(self, grads: Samples) -> np.ndarray:
         """Derivatives (k, m) with respect to the fragments' opacities: the term of a fragment's own colour
         minus the term of the colour behind it, from back to front."""
         own_term = grads.rgb @ self._rgb.T + grads.normal @ self._facing.T + grads.depth[:, None] * self._z
