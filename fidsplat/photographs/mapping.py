@@ -122,12 +122,19 @@ def match(database: Path, ordered: bool, progress: Progress) -> None:
             if not data.exists_two_view_geometry(one.image_id, other.image_id)
         ]
     options = pycolmap.ImportedPairingOptions()
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
     listed = database.with_name("pairs.txt")
     options.match_list_path = listed
     for first in range(0, len(pairs), PAIRS):
         progress("matches", first / len(pairs))
         listed.write_text("".join(f"{one} {other}\n" for one, other in pairs[first : first + PAIRS]))
-        pycolmap.match_image_pairs(database, pairing_options=options, device=pycolmap.Device.cpu)
+        pycolmap.match_image_pairs(
+            database,
+            pairing_options=options,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
 
 
 def _pairs(images: Sequence[Any], ordered: bool) -> list[tuple[Any, Any]]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from fidsplat.markers import marker
 from fidsplat.photographs.adjustment import Adjustment, adjust
-from fidsplat.photographs.dataset import scaled, write_images, write_model
+from fidsplat.photographs.dataset import PHOTOGRAPHS, scaled, write_images, write_model
 from fidsplat.photographs.frame import WorldFrame, world_frame
 from fidsplat.photographs.mapping import (
     Model,
@@ -32,6 +32,9 @@ from fidsplat.util.files import from_json, path_of, read_text, writable_folder, 
 from fidsplat.util.progress import Progress, no_progress
 
 INPUTS = "inputs.json"
+WRITTEN = "written"
+"""empty file in `work` once OUTPUTS are of this command"""
+OUTPUTS = "images", "masks", "sparse", "dataset.json", "scene.toml", PHOTOGRAPHS
 SNAP = 0.02
 """largest distance of a picked pixel from a feature, as a fraction of the image's width"""
 
@@ -83,6 +86,7 @@ def photographs_to_scene(
     require_pycolmap()
     files = source_files(path_of(source))
     folder = writable_folder(out)
+    _refuse_foreign(folder, files, overwrite)
     work = _work_folder(folder, files, settings, overwrite)
     video = len(files) == 1
 
@@ -118,6 +122,7 @@ def photographs_to_scene(
         scale = 1.0 if picks is None else scale_of(model, *picks)
         frame = world_frame(pinholes, scale, middle=np.median(model.points, axis=0))
     cameras = [frame.camera(camera) for camera in model.cameras]
+    (work / WRITTEN).touch()
     small, placed = write_images(folder, photos, model.names, cameras, placed, settings.max_side, report)
     used = () if adjustment is None else adjustment.used
     visible = [[model.names[view.image] for view in used if view.tag == tag.marker.spec] for tag in placed]
@@ -154,6 +159,23 @@ def _step(folder: Path, make: Callable[[Path], None]) -> Path:
     return folder
 
 
+def _refuse_foreign(folder: Path, files: list[Path], overwrite: bool) -> None:
+    """Raise InputError if the capture would replace the photographs, or files that it did not write."""
+    work, sources = folder / "work", {parent for file in files for parent in file.resolve().parents}
+    for path in (work, *(folder / name for name in OUTPUTS)):
+        if path.is_dir() and any(parent.samefile(path) for parent in sources):
+            raise InputError(
+                f"photographs must be outside of {path}, which is replaced, got {files[0]}; give another "
+                "folder with -o"
+            )
+        mark = INPUTS if path == work else WRITTEN
+        if path.exists() and not (overwrite or (work / mark).exists()):
+            raise InputError(
+                f"{folder} must be a new folder or of an earlier capture, got {path.name} of something "
+                "else; give another folder, or --overwrite to replace it"
+            )
+
+
 def _work_folder(folder: Path, files: list[Path], settings: CaptureSettings, overwrite: bool) -> Path:
     """The folder of completed steps. Raises InputError if it belongs to other photographs."""
     work = folder / "work"
@@ -162,6 +184,8 @@ def _work_folder(folder: Path, files: list[Path], settings: CaptureSettings, ove
     if overwrite:
         shutil.rmtree(work, ignore_errors=True)
     work.mkdir(exist_ok=True)
+    if overwrite:
+        (work / WRITTEN).touch()
     known = work / INPUTS
     if not known.exists():
         write_json(known, inputs)

@@ -1,5 +1,10 @@
 """`fidsplat capture` on small photographs of two textured walls with two tags, whose cameras are known."""
 
+import contextlib
+import shutil
+import sqlite3
+from itertools import combinations
+
 import cv2
 import numpy as np
 import pytest
@@ -8,9 +13,12 @@ from command_line import fails, prints_json
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.images.files import read_image
+from fidsplat.photographs.mapping import match
 from fidsplat.train import load_dataset
 
-pytest.importorskip("pycolmap", reason="pycolmap finds the cameras of photographs; pip install pycolmap")
+pycolmap = pytest.importorskip(
+    "pycolmap", reason="pycolmap finds the cameras of photographs; pip install pycolmap"
+)
 
 PER_METRE = 300
 TAGS = {"apriltag:36h11:5": (0.5, 0.5), "apriltag:36h11:9": (1.2, 0.7)}
@@ -181,6 +189,51 @@ def test_too_few_or_unrelated_photographs_are_one_clear_line(photos, captured, t
     assert (status, "of the same photographs" in message) == (2, True)
     status, message = fails(capsys, "capture", photos, "-o", tmp_path / "c", "--up", "qr:a")
     assert (status, "--up must be a tag of --tag" in message) == (2, True)
+
+
+def test_only_folders_of_an_earlier_capture_are_replaced(photos, tmp_path, capsys):
+    garden = tmp_path / "garden"
+    shutil.copytree(photos, garden / "images")
+    before = {file: file.read_bytes() for file in (garden / "images").iterdir()}
+    for more in ([], ["--overwrite"]):
+        status, message = fails(capsys, "capture", garden / "images", "-o", garden, *more)
+        assert (status, "photographs must be outside of" in message) == (2, True)
+    (tmp_path / "link").symlink_to(garden / "images")
+    status, message = fails(capsys, "capture", tmp_path / "link", "-o", garden, "--overwrite")
+    assert (status, "photographs must be outside of" in message) == (2, True)
+    status, message = fails(capsys, "capture", photos, "-o", garden)
+    assert (status, "got images of something else" in message) == (2, True)
+    assert before == {file: file.read_bytes() for file in garden.rglob("*") if file.is_file()}
+    for name in ("masks/mine.png", "work/photos/mine.txt", "scene.toml"):
+        file = tmp_path / name.replace("/", "-") / name
+        file.parent.mkdir(parents=True)
+        file.write_text("mine")
+        status, message = fails(capsys, "capture", photos, "-o", tmp_path / name.replace("/", "-"))
+        assert (status, "of something else; give another folder" in message) == (2, True)
+        assert file.read_text() == "mine"
+
+
+def test_the_verification_of_matches_does_not_depend_on_earlier_pairs(tmp_path):
+    """RANSAC has the same seed for each pair, so that the same photographs have the same matches."""
+    rng, file, counts = np.random.default_rng(0), tmp_path / "database.db", []
+    points = rng.uniform(-1, 1, (60, 3))
+    with pycolmap.Database.open(file) as data:
+        pinhole = {"model": "PINHOLE", "width": 640, "height": 480, "params": [500, 500, 320, 240]}
+        camera = data.write_camera(pycolmap.Camera(**pinhole))
+        for i in range(4):
+            pixels = fs.Camera.look_at(640, 480, 1.0, (i / 2, 0, -4), (0, 0, 0)).project(points)
+            image = data.write_image(pycolmap.Image(name=f"{i}.png", camera_id=camera))
+            data.write_keypoints(image, (pixels + rng.normal(0, 2, (60, 2))).astype(np.float32))
+        order = np.r_[:40, 59:39:-1]  # a third of the matches is wrong
+        for pair in combinations(range(1, 5), 2):
+            data.write_matches(*pair, np.stack([np.arange(60), order], 1).astype(np.uint32))
+    for _ in range(2):
+        match(file, False, lambda step, fraction: None)
+        with contextlib.closing(sqlite3.connect(file)) as data:
+            counts.append(data.execute("select pair_id, rows from two_view_geometries order by 1").fetchall())
+            data.executescript("delete from two_view_geometries where pair_id % 2")  # 4 of 6
+    assert len(counts[0]) == 6
+    assert counts[0] == counts[1]
 
 
 def test_a_rolling_shutter_and_a_still_video_are_one_clear_line(captured, tmp_path, monkeypatch, capsys):
