@@ -15,6 +15,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.cameras.lenses import Orthographic
+from fidsplat.capture.environment import Panorama
 from fidsplat.render.irradiance import LightField
 from fidsplat.render.reflection import GlossyBrdf, fit_harmonics, fresnel, view_directions
 from fidsplat.render.shadows import LightPoint, ReceiverPoints, light_points, shadow_casters, visibility
@@ -25,7 +26,7 @@ from fidsplat.splats.harmonics import rotation_of_coefficients
 from fidsplat.splats.rotations import quaternion_to_matrix
 from fidsplat.util.directions import unit
 from fidsplat.util.errors import InputError
-from fidsplat.util.response import linear_light
+from fidsplat.util.response import linear_light, to_colors
 
 MAX_PARTS_PER_MODULE = 8
 """maximum number of parts per module, along each axis, into which a box splat of a marker is split"""
@@ -33,8 +34,8 @@ MAX_POINTS = 256
 """maximum number of sample points along a side of a square marker"""
 MIN_HARMONIC_ROUGHNESS = 0.5
 """minimum roughness for which spherical harmonics of degree 3 represent reflections (docs/effects.md)"""
-PANORAMA_QUALITY = "fast,lowpass=none,samples=2"
-"""quality of panoramas; a low-pass filter would enlarge small splats to the size of their coarse pixels"""
+PANORAMA_QUALITY = "fast,lowpass=pixel,samples=2"
+"""quality of panoramas; the filter conserves the energy of splats below their coarse pixels"""
 _DARK = 1e-6
 """radiance below which a panorama is black"""
 _POINTS_AT_ONCE = 256
@@ -197,6 +198,22 @@ def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
     return replace(placed, marker=replace(placed.marker, cloud=lit), light=None)
 
 
+def averaged_background(background: Any, rows: int, response: str | float) -> Any:
+    """A background whose panorama is reduced to 2 rows x rows pixels by means of linear light. Otherwise a
+    small bright source, such as the sun, would be missed or counted several times."""
+    if not isinstance(background, Panorama) or background.image.shape[0] <= rows:
+        return background
+    light = linear_light(background.image, response).astype(np.float64)
+    height = len(light)
+    solid_angle = np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None, None]
+    weighted = np.concatenate([light * solid_angle, np.broadcast_to(solid_angle, light.shape)], 2)
+    for axis, count in enumerate((rows, 2 * rows)):
+        size = weighted.shape[axis]
+        starts = np.unique(np.arange(count) * size // count)
+        weighted = np.add.reduceat(weighted, starts, axis)
+    return Panorama(to_colors(weighted[..., :3] / weighted[..., 3:], response))
+
+
 def _check_roughness(placed: PlacedMarker, lighting: Lighting, environment: _Environment) -> None:
     """Raise InputError if spherical harmonics cannot represent the reflection, or it requires a camera."""
     if lighting.roughness is None:
@@ -277,7 +294,8 @@ def _field(
         local_points[:, :2] = grid_positions  # a grid point between splats has the z of the nearest one
         panorama_points = local_points @ placed.pose[:3, :3].T + placed.pose[:3, 3]
         panorama_points = panorama_points + max(surface.clearance, 1e-6) * surface.normals[nearest]
-        fields: dict[str, Any] = {"outputs": ("rgb", "alpha")}
+        background = averaged_background(environment.scene.background, lighting.rows, lighting.response)
+        fields: dict[str, Any] = {"outputs": ("rgb", "alpha"), "background": background}
         if lighting.ambient is not None:
             fields["background"] = (0.0, 0.0, 0.0)
         frames = environment.panoramas(panorama_points, lighting.rows, 1e-4, **fields)

@@ -84,6 +84,30 @@ def test_light_is_measured_where_the_marker_is():
         assert np.allclose(actual, expected, rtol=0.01)
 
 
+@pytest.mark.parametrize(("row", "column"), [(300, 200), (251, 77)])
+def test_a_small_bright_source_in_the_background_has_its_irradiance(row, column):
+    """One pixel of a panorama that is finer than those at the marker, in linear light."""
+    image = np.full((512, 1024, 3), 0.1, np.float32)
+    image[row, column] = 3e4
+    latitude, longitude = np.pi * (row + 0.5) / 512 - np.pi / 2, 2 * np.pi * (column + 0.5) / 1024 - np.pi
+    cosine = -math.cos(latitude) * math.cos(longitude)
+    expected = 0.1 + 3e4 * cosine * math.cos(latitude) * (math.pi / 512) ** 2 / math.pi
+    placed = PlacedMarker(TAG, light=fs.Lighting(response="linear"))
+    _, cloud = lit(fs.Scene(markers=[placed], background=fs.Panorama(image)))
+    assert cloud.colors.max() == pytest.approx(0.85 * expected, rel=0.05)
+
+
+@pytest.mark.parametrize("x", [0.13, 0.7])
+def test_a_small_lamp_of_a_gaussian_has_its_irradiance(x):
+    """Half a degree wide, a fifth of a pixel of the panorama."""
+    lamp = fs.SplatCloud([[x, 0.4, -5]], [[1, 0, 0, 0]], [[0.022, 0.022]], [1.0], colors=[[1e3] * 3])
+    light = fs.Lighting(response="linear", ambient=(0, 0, 0), panoramas=1)
+    _, cloud = lit(fs.Scene((lamp,), markers=[PlacedMarker(TAG, light=light)]))
+    distance = x**2 + 0.4**2 + 25
+    expected = 1e3 * 2 * math.pi * 0.022**2 * 25 / distance**2 / math.pi
+    assert cloud.colors.max() == pytest.approx(0.85 * expected, rel=0.12)
+
+
 @pytest.mark.parametrize("degrees", [0, 40, 80, 100])
 def test_a_sun_follows_the_cosine(degrees):
     angle = math.radians(degrees)
