@@ -8,6 +8,10 @@ import numpy as np
 
 Neighbour = tuple[tuple[np.ndarray, np.ndarray], np.ndarray]
 """index (row, column) and weight of a cell, for bilinear interpolation"""
+_CHUNK = 256
+"""normals whose irradiance is computed at once, which bounds memory"""
+_EQUAL_NORMALS = 1e-4
+"""angle [rad] within which normals have the same irradiance"""
 
 
 def panorama_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
@@ -24,10 +28,11 @@ def panorama_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
     return directions.reshape(-1, 3), angles
 
 
-def cosine_weights(normal: np.ndarray, directions: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Weights (d,) with which the radiance from directions (d, 3) sums to irradiance; their sum is pi."""
-    weights = np.maximum(directions @ normal, 0) * angles
-    return weights * (np.pi / weights.sum())
+def cosine_weights(normals: np.ndarray, directions: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Weights (..., d) with which the radiance from directions (d, 3) sums to the irradiance of surfaces with
+    normals (..., 3); their sum is pi."""
+    weights = np.maximum(normals @ directions.T, 0) * angles
+    return weights * (np.pi / weights.sum(axis=-1, keepdims=True))
 
 
 def neighbours(x: np.ndarray, y: np.ndarray) -> Iterator[Neighbour]:
@@ -139,10 +144,22 @@ class LightField:
             for pixel, weight in self._pixel_neighbours(directions)
         )
 
-    def irradiance(self, normal: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """Irradiance (m, 3) of surfaces with a normal (3,) at positions (m, 2)."""
-        weights = cosine_weights(normal, self.directions, self.angles)
-        return self.interpolated(np.einsum("d,yxdc->yxc", weights, self.radiance), positions)
+    def irradiance(self, normals: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """Irradiance (m, 3) of surfaces with normals (m, 3) at positions (m, 2)."""
+        _, first, group = np.unique(
+            np.rint(normals / _EQUAL_NORMALS), axis=0, return_index=True, return_inverse=True
+        )
+        rows, columns, directions, _ = self.radiance.shape
+        radiance = np.moveaxis(self.radiance, 2, 0).reshape(directions, -1)
+        grids = [
+            cosine_weights(normals[first[start : start + _CHUNK]], self.directions, self.angles) @ radiance
+            for start in range(0, len(first), _CHUNK)
+        ]
+        irradiance = np.concatenate(grids).reshape(-1, rows, columns, 3)
+        return sum(  # type: ignore[return-value]
+            irradiance[group.ravel(), row, column] * weight[:, None]
+            for (row, column), weight in self._grid_neighbours(positions)
+        )
 
 
 def _difference(a: np.ndarray, b: np.ndarray) -> float:

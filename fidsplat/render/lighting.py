@@ -262,9 +262,7 @@ def _incoming_light(
     """Measure the light at the sample points: panoramas for the field, shadow maps for the lights."""
     surface, positions = points.surface, points.local[:, :2]
     field = _field(placed, lighting, points, environment)
-    irradiance = np.empty((len(positions), 3))
-    for rows in _by_normal(surface.normals):
-        irradiance[rows] = field.irradiance(surface.normals[rows[0]], positions[rows])
+    irradiance = field.irradiance(surface.normals, positions)
     lights = []
     for number, light in enumerate(environment.lights):
         casters, extent = environment.casters(light, surface)
@@ -329,7 +327,7 @@ def _field(
     return field
 
 
-def _by_normal(normals: np.ndarray, within: float = 1e-4) -> Iterator[np.ndarray]:
+def _by_normal(normals: np.ndarray, within: float) -> Iterator[np.ndarray]:
     """Groups of row indices whose normals are equal within an angle [rad]."""
     _, group = np.unique(np.rint(normals / within), axis=0, return_inverse=True)
     order = np.argsort(group.ravel(), kind="stable")
