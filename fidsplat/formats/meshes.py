@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +121,8 @@ def check_mesh_file(path: Path) -> Path:
     suffix = path.suffix.lower()
     if suffix not in MESH_FORMATS:
         raise InputError(f"the suffix of a mesh must be {', '.join(MESH_FORMATS)}, got {path}")
-    if suffix == ".xml":
+    # not imported yet: PoCL's compiler, which fusing needs, fails if coacd was loaded before it
+    if suffix == ".xml" and find_spec("coacd") is None:
         _package("coacd")
     return path
 

@@ -1,6 +1,7 @@
 """Meshes of scenes with closed forms, read back by trimesh and MuJoCo."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from analytic_surfaces import leaves, plane, sphere
 from command_line import fails, prints_json
 
 import fidsplat as fs
-from fidsplat.formats.meshes import TriangleMesh, save_mesh
+from fidsplat.formats.meshes import TriangleMesh, check_mesh_file, save_mesh
 from fidsplat.render import mesh
 from fidsplat.render.mesh import scene_mesh
 from fidsplat.render.tsdf import DistanceField
@@ -150,6 +151,17 @@ def test_convex_parts_collide_in_mujoco(tmp_path):
     while data.time < 1.0:
         mujoco.mj_step(model, data)
     assert data.body(2).xpos[2] == pytest.approx(-0.2, abs=0.02)
+
+
+def test_the_package_of_convex_parts_is_loaded_after_the_mesh_is_fused(tmp_path, monkeypatch):
+    """Once it is loaded, PoCL's compiler no longer finds its headers."""
+    (tmp_path / "coacd.py").write_text("raise AssertionError('loaded too early')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "coacd", raising=False)
+    assert check_mesh_file(tmp_path / "l.xml") == tmp_path / "l.xml"
+    monkeypatch.setitem(sys.modules, "coacd", None)
+    with pytest.raises(fs.InputError, match=r"coacd must be installed.*fidsplat\[mesh\]"):
+        check_mesh_file(tmp_path / "l.xml")
 
 
 def test_the_command_writes_a_mesh(tmp_path, capsys):
