@@ -331,9 +331,13 @@ def _to_rgba(image: np.ndarray, name: str | os.PathLike[str]) -> np.ndarray:
 
 
 def _read(path: str | os.PathLike[str], flags: int) -> np.ndarray:
-    image = _decode(read_input(path), path, flags)
+    data = read_input(path)
+    image = _decode(data, path, flags)
     if image is None:
-        raise InputError(f"cannot read {path} as an image; give a PNG, JPEG, BMP, TIFF or WebP file")
+        known = "it is truncated or damaged; copy it again" if declared_pixels(data) else ""
+        raise InputError(
+            f"cannot read {path} as an image; {known or 'give a PNG, JPEG, BMP, TIFF or WebP file'}"
+        )
     return image
 
 

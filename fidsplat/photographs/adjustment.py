@@ -91,7 +91,7 @@ def adjust(cameras: Sequence[Camera], views: Sequence[TagView], sizes: Mapping[s
         counts = ", ".join(f"{tag} in {len(found)}" for tag, found in seen.items())
         raise InputError(
             f"a tag must be detected in photographs from at least 2 positions, got {counts}; take more sharp "
-            "photographs with the complete tag"
+            "photographs with the complete tag, and compare its id with that of `fidsplat detect PHOTO`"
         )
     typical, used, rejected, scales, poses = float(np.median(known)), [], [], {}, {}
     for tag, unit in units.items():

@@ -3,7 +3,6 @@ file."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -46,9 +45,10 @@ def write_images(
     """
     undistorted: list[Camera] = []
     inks: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in tags]
-    for name in ("images", "masks"):
-        shutil.rmtree(folder / name, ignore_errors=True)
-        (folder / name).mkdir()
+    for name, suffix in ("images", ""), ("masks", ".png"):
+        (folder / name).mkdir(exist_ok=True)
+        for photo in photos.iterdir():  # other files are of the user
+            (folder / name / f"{_image_name(photo.name)}{suffix}").unlink(missing_ok=True)
     for number, (name, camera) in enumerate(zip(names, cameras, strict=True)):
         progress("images", number / len(names))
         image, inside = read_image(photos / name), np.ones((camera.height, camera.width), bool)

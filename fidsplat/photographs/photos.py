@@ -51,7 +51,7 @@ def copy_photos(files: Sequence[Path], folder: Path, progress: Progress) -> None
     """Copy photographs into a folder, rotated upright by their EXIF orientation, under names without blanks.
     Files other than JPEG become PNG, since COLMAP reads no WebP.
 
-    Raises InputError for an image that cannot be read, or two names that differ by the suffix only.
+    Raises InputError for an image that cannot be read, or two names with one `name_key`.
     """
     names: dict[str, str] = {}
     for number, file in enumerate(files):
@@ -59,19 +59,24 @@ def copy_photos(files: Sequence[Path], folder: Path, progress: Progress) -> None
         data = read_input(file)
         if not declared_pixels(data):
             raise InputError(f"cannot read {file} as an image; give a PNG, JPEG, BMP, TIFF or WebP file")
-        name = "_".join(file.stem.split())
+        image, key = read_image(file), name_key(file.name)
         exif, suffix = read_exif(data), file.suffix.lower()
         if suffix not in (".jpg", ".jpeg"):
-            data, suffix = encode_image(read_image(file), "png"), ".png"
+            data, suffix = encode_image(image, "png"), ".png"
         elif exif.orientation != 1:
-            data = with_exif(encode_image(read_image(file), "jpeg", _QUALITY), exif)
-        if name in names:  # their undistorted images would replace each other
+            data = with_exif(encode_image(image, "jpeg", _QUALITY), exif)
+        if key in names:  # their undistorted images would replace each other
             raise InputError(
-                "photographs must have names that differ before the suffix, got "
-                f"{names[name]} and {file.name}; rename or remove one"
+                "photographs must have names that differ before the suffix by more than case, got "
+                f"{names[key]} and {file.name}; rename or remove one"
             )
-        names[name] = file.name
-        (folder / f"{name}{suffix}").write_bytes(data)
+        names[key] = file.name
+        (folder / f"{'_'.join(file.stem.split())}{suffix}").write_bytes(data)
+
+
+def name_key(name: str) -> str:
+    """Key that a photograph and its copy share: the name without suffix, in lower case, "_" for blanks."""
+    return "_".join(Path(name).stem.split()).lower()
 
 
 def copy_frames(video: Path, folder: Path, count: int, progress: Progress) -> tuple[int, int]:

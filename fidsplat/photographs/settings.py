@@ -23,7 +23,8 @@ class CaptureSettings:
     up: str | None = None
     """SPEC: tag with a vertical axis, on a wall or flat; else cameras are held level on average"""
     scale: str | None = None
-    """A,B=METRES: distance of two points, each as NAME:X:Y, a pixel of a photograph"""
+    """A,B=METRES: distance of two points, each as NAME:X:Y, a pixel of the upright
+    photograph"""
     lens: str = "opencv"
     """NAME: pinhole, radial (k1, k2), opencv (k1, k2, p1, p2) or fisheye"""
     frames: int = 150

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from fidsplat.photographs.mapping import (
     require_pycolmap,
     unregistered,
 )
-from fidsplat.photographs.photos import camera_groups, copy_frames, copy_photos, source_files
+from fidsplat.photographs.photos import camera_groups, copy_frames, copy_photos, name_key, source_files
 from fidsplat.photographs.rolling_shutter import MIN_DISPLACEMENT, MIN_FRACTION, readout_motion
 from fidsplat.photographs.settings import CaptureSettings
 from fidsplat.photographs.tags import detect_tags, parse_tags, same_tag
@@ -83,12 +84,16 @@ def photographs_to_scene(
     if settings.up is not None and up is None:
         raise InputError(f"--up must be a tag of --tag, got {settings.up}; give its size by --tag too")
     picks = None if settings.scale is None else parse_scale(settings.scale)
-    require_pycolmap()
+    pycolmap = require_pycolmap()
     files = source_files(path_of(source))
+    video, names = len(files) == 1, {name_key(file.name): file.name for file in files}
+    if picks is not None and not video:
+        for name, _, _ in picks[:2]:
+            if name_key(name) not in names:
+                raise InputError(unknown("photograph of --scale", name, names.values()))
     folder = writable_folder(out)
     _refuse_foreign(folder, files, overwrite)
     work = _work_folder(folder, files, settings, overwrite)
-    video = len(files) == 1
 
     def prepare(part: Path) -> None:
         if video:
@@ -97,13 +102,19 @@ def photographs_to_scene(
             copy_photos(files, part, report)
 
     photos, database = _step(work / "photos", prepare), work / "database.db"
-    groups = camera_groups(photos)
+    with _completed(work):
+        groups = camera_groups(photos)
+        count = sum(map(len, groups))
+        if not video and count != len(files):
+            raise ValueError(f"{count} of {len(files)} photographs")
+        pycolmap.Database.open(database).close()
     if not (work / "model").exists():
         extract(database, photos, groups, settings.lens, report)
         match(database, video, report)
         model = map_incrementally(database, photos, work / "model", report)
     else:
-        model = read_model(work / "model")
+        with _completed(work):
+            model = read_model(work / "model")
     adjustment, frame = None, None
     pinholes = [scaled(camera, camera.width, camera.height) for camera in model.cameras]
     if tags:
@@ -111,7 +122,10 @@ def photographs_to_scene(
         adjustment = adjust(pinholes, views, {spec: made.size for spec, made in tags.items()})
         first = next(iter(adjustment.poses)) if up is None else up.spec
         if first not in adjustment.poses:
-            raise InputError(f"--up must be a tag in the photographs, got {first}, which was not detected")
+            raise InputError(
+                f"--up must be a tag in the photographs, got {first}, which was not detected; detected are "
+                f"{', '.join(adjustment.poses)}"
+            )
         frame = world_frame(pinholes, adjustment.scale, adjustment.poses[first], up is not None)
         placed = [
             PlacedMarker(tags[spec], frame.pose(pose), label=i + 1)
@@ -128,8 +142,7 @@ def photographs_to_scene(
     visible = [[model.names[view.image] for view in used if view.tag == tag.marker.spec] for tag in placed]
     points = frame.points(model.points)
     scene = write_model(folder, model.names, small, points, model.colors, placed, visible, cameras[0])
-    missing = unregistered(database, model.names)
-    count = sum(map(len, groups))
+    missing = [(names.get(name_key(name), name), why) for name, why in unregistered(database, model.names)]
     metric = adjustment is not None or picks is not None
     fraction, displaced = readout_motion(model)
     readout = displaced if fraction > MIN_FRACTION and displaced > MIN_DISPLACEMENT else 0.0
@@ -148,6 +161,15 @@ def photographs_to_scene(
     )
 
 
+@contextmanager
+def _completed(work: Path) -> Iterator[None]:
+    """Convert errors within the block, which reads completed steps, to an InputError with the remedy."""
+    try:
+        yield
+    except (ValueError, RuntimeError, LookupError) as error:
+        raise InputError(f"{work} is damaged ({error}); --overwrite restarts") from error
+
+
 def _step(folder: Path, make: Callable[[Path], None]) -> Path:
     """Run a step, unless its folder exists; the folder is renamed to its final name after the step."""
     if not folder.exists():
@@ -161,7 +183,8 @@ def _step(folder: Path, make: Callable[[Path], None]) -> Path:
 
 def _refuse_foreign(folder: Path, files: list[Path], overwrite: bool) -> None:
     """Raise InputError if the capture would replace the photographs, or files that it did not write."""
-    work, sources = folder / "work", {parent for file in files for parent in file.resolve().parents}
+    work, targets = folder / "work", [path for file in files for path in (file, file.parent / "x")]
+    sources = {parent for path in targets for parent in path.resolve().parents}
     for path in (work, *(folder / name for name in OUTPUTS)):
         if path.is_dir() and any(parent.samefile(path) for parent in sources):
             raise InputError(
@@ -182,14 +205,17 @@ def _work_folder(folder: Path, files: list[Path], settings: CaptureSettings, ove
     stats = [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in files]
     inputs = {"files": stats, "lens": settings.lens, "frames": settings.frames if len(files) == 1 else None}
     if overwrite:
-        shutil.rmtree(work, ignore_errors=True)
+        for name in ("work", "images", "masks"):
+            shutil.rmtree(folder / name, ignore_errors=True)
     work.mkdir(exist_ok=True)
     if overwrite:
         (work / WRITTEN).touch()
     known = work / INPUTS
-    if not known.exists():
+    with _completed(work):
+        same = known.exists() and from_json(read_text(known)) == inputs
+    if not (work / "photos").exists():
         write_json(known, inputs)
-    elif from_json(read_text(known)) != inputs:
+    elif not same:
         raise InputError(
             f"{folder} must be a new folder or of the same photographs and lens, got others; give another "
             "folder, or --overwrite"
@@ -209,13 +235,17 @@ def parse_scale(text: str) -> tuple[Pick, Pick, float]:
             (name, float(x), float(y)) for name, x, y in (point.rsplit(":", 2) for point in points.split(","))
         )
         length = float(metres)
-        if not 0 < length < np.inf:
+        if not (0 < length < np.inf and np.isfinite([*first[1:], *second[1:]]).all()):
             raise ValueError
     except ValueError:
         raise InputError(
             f"--scale must be two pixels of photographs and their distance in metres, got {text!r}; write "
             "for example a.jpg:812:430,b.jpg:120:655=1.25"
         ) from None
+    if first == second:
+        raise InputError(
+            f"--scale must be two different points, got {points}; pick corners far from each other"
+        )
     return first, second, length
 
 
@@ -234,9 +264,10 @@ def scale_of(model: Model, first: Pick, second: Pick, metres: float) -> float:
 def _picked(model: Model, pick: Pick) -> np.ndarray:
     """The point of the feature nearest to a pixel."""
     name, x, y = pick
-    if name not in model.names:
-        raise InputError(unknown("photograph of --scale", name, model.names))
-    number = model.names.index(name)
+    keys = [name_key(each) for each in model.names]
+    if name_key(name) not in keys:
+        raise InputError(unknown("photograph with a camera, of --scale,", name, model.names))
+    number = keys.index(name_key(name))
     distances = np.hypot(*(model.pixels[number] - (x, y)).T)
     nearest = int(np.argmin(distances))
     if distances[nearest] > SNAP * model.cameras[number].width:

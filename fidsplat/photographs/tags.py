@@ -10,6 +10,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.images.files import read_image
 from fidsplat.markers import Marker, marker
+from fidsplat.markers.kinds import detectors
 from fidsplat.photographs.adjustment import TagView
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.util.errors import InputError
@@ -28,17 +29,22 @@ def parse_tags(texts: Sequence[str]) -> dict[str, Marker]:
     """Markers of `SPEC=METRES`, by their specs. Raises InputError."""
     tags: dict[str, Marker] = {}
     for text in texts:
-        spec, equals, size = text.rpartition("=")
+        spec, _, size = text.rpartition("=")
         try:
             metres = float(size)
         except ValueError:
-            equals = ""
-        if not equals:
+            metres = 0.0
+        if not (spec and 0.001 <= metres <= 100):
             raise InputError(
-                f"--tag must be a marker spec and the edge of its black square in metres, got {text!r}; "
-                "write for example apriltag:36h11:5=0.16"
+                "--tag must be a marker spec and the edge of its black square, 0.001 to 100 metres, got "
+                f"{text!r}; write for example apriltag:36h11:5=0.16"
             )
         printed = marker(spec, metres)
+        kinds = "apriltag", "aruco", "qr", *detectors()
+        if printed.kind not in kinds:
+            raise InputError(
+                f"--tag must be of a detected kind ({', '.join(kinds)}), got {spec}; print another"
+            )
         other = same_tag(tags, printed)
         if other is not None:
             raise InputError(

@@ -206,9 +206,7 @@ def test_the_limit_follows_the_size_of_a_file_and_is_raised_by_the_environment(t
     path = tmp_path / "a.png"
     path.write_bytes(png_header(16384, 16384))
     monkeypatch.setenv(VARIABLE, str(2**40))
-    with pytest.raises(
-        fs.InputError, match="as an image; give a PNG, JPEG, BMP, TIFF or WebP file"
-    ):  # it was tried
+    with pytest.raises(fs.InputError, match="as an image; it is truncated or damaged"):  # it was tried
         read_image(path)
     monkeypatch.setenv(VARIABLE, "lots")
     with pytest.raises(fs.InputError, match=f"{VARIABLE} must be a number of bytes above 0, got 'lots'"):

@@ -154,7 +154,13 @@ def test_the_region_of_a_tag_is_masked_and_its_inks_are_measured():
     [
         ({"tag": ("apriltag:36h11:5",)}, "--tag must be a marker spec and the edge"),
         ({"tag": ("apriltag:36h11:5=0.1", "tag36h11:5=0.2")}, "one size, got 0.1 and 0.2 m"),
-        ({"tag": ("apriltag:36h11:5=0",)}, "size must be"),
+        (
+            {"tag": ("apriltag:36h11:5=0",)},
+            r"--tag must be .* 0\.001 to 100 metres, got 'apriltag:36h11:5=0'",
+        ),
+        ({"tag": ("apriltag:36h11:5=1e-9",)}, "--tag must be"),
+        ({"tag": ("apriltag:36h11:5=nan",)}, "--tag must be"),
+        ({"tag": ("charuco:7x5:4x4_50=0.2",)}, "--tag must be of a detected kind"),
         ({"lens": "wide"}, "unknown lens 'wide'"),
         ({"frames": 2}, "--frames must be"),
         ({"tag": ("qr:a=1",), "scale": "a:1:1,b:2:2=1"}, "--scale must be given without --tag"),
@@ -180,12 +186,20 @@ def test_two_picked_features_give_the_scale():
     pixels = tuple(camera.project(points[track]) for track in tracks)
     model = Model(("a.jpg", "b.jpg"), (camera, camera), points, np.zeros((3, 3), np.uint8), pixels, tracks)
     (x, y), (u, v) = pixels[0][1] + 4, pixels[1][0] - 3  # picks are near features, not at them
-    assert scale_of(model, *parse_scale(f"a.jpg:{x}:{y},b.jpg:{u}:{v}=5")) == pytest.approx(5 / 2.6925824)
+    assert scale_of(model, *parse_scale(f"A.JPG:{x}:{y},b.tif:{u}:{v}=5")) == pytest.approx(5 / 2.6925824)
     with pytest.raises(InputError, match=r"a\.jpg:330:300; the nearest feature is at 320:240"):
         scale_of(model, *parse_scale(f"a.jpg:330:300,b.jpg:{u}:{v}=5"))
-    with pytest.raises(InputError, match=r"unknown photograph of --scale 'c\.jpg'"):
+    with pytest.raises(InputError, match=r"unknown photograph with a camera, of --scale, 'c\.jpg'"):
         scale_of(model, *parse_scale(f"a.jpg:{x}:{y},c.jpg:1:1=5"))
-    for text in ("a.jpg:1:1,b.jpg:2:2", "a.jpg:1:1=2", "a.jpg:1:1,b.jpg:2:2=0", "a:b:c,d:1:2=3"):
+    with pytest.raises(InputError, match="two different points"):
+        parse_scale("a.jpg:1:1,a.jpg:1:1=2")
+    for text in (
+        "a.jpg:nan:1,b.jpg:2:2=1",
+        "a.jpg:1:1,b.jpg:2:2",
+        "a.jpg:1:1=2",
+        "a.jpg:1:1,b.jpg:2:2=0",
+        "a:b:c,d:1:2=3",
+    ):
         with pytest.raises(InputError, match="--scale must be two pixels"):
             parse_scale(text)
 
@@ -260,10 +274,15 @@ def test_exif_is_kept_with_upright_pixels(order, tmp_path):
     copied = read_image(tmp_path / "upright copies" / "a.jpg")
     np.testing.assert_allclose(copied, read_image(tmp_path / "a.jpg"), atol=3)
     assert read_exif((tmp_path / "upright copies" / "a.jpg").read_bytes()).orientation == 1
-    (tmp_path / "b.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    (tmp_path / "B.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
     (tmp_path / "twice").mkdir()
-    with pytest.raises(InputError, match=r"differ before the suffix, got b\.jpg and b\.png"):
-        copy_photos([*files, tmp_path / "b.png"], tmp_path / "twice", lambda step, fraction: None)
+    with pytest.raises(
+        InputError, match=r"differ before the suffix by more than case, got b\.jpg and B\.png"
+    ):
+        copy_photos([*files, tmp_path / "B.png"], tmp_path / "twice", lambda step, fraction: None)
+    (tmp_path / "c.jpg").write_bytes(rotated[: len(rotated) // 2])
+    with pytest.raises(InputError, match=r"cannot read .*tmp.*c\.jpg as an image; it is truncated"):
+        copy_photos([tmp_path / "c.jpg"], tmp_path / "twice", lambda step, fraction: None)
     # portrait and landscape have different cameras
     assert camera_groups(tmp_path / "upright copies") == [["a.jpg"], ["b.jpg"]]
     for damaged in (rotated[:40], jpeg, b"", rotated.replace(b"II", b"XX").replace(b"MM", b"XX")):

@@ -157,9 +157,12 @@ def test_training_reads_the_data_set_without_the_tags(captured):
 def test_the_same_command_resumes_with_other_tags(captured, capsys):
     out, words = captured
     before = (out / "work" / "model" / "images.bin").stat().st_mtime_ns
+    (out / "images" / "mine.txt").write_text("mine")
     half = [word.replace("=0.2", "=0.1") if isinstance(word, str) else word for word in words]
     facts = prints_json(capsys, "capture", *half)
     assert (out / "work" / "model" / "images.bin").stat().st_mtime_ns == before
+    assert (out / "images" / "mine.txt").read_text() == "mine"
+    (out / "images" / "mine.txt").unlink()
     markers = fs.Scene.load(without_splats(out)).markers
     np.testing.assert_allclose(markers[0].pose[:3, 3], (-0.35, 0, 0.1), atol=0.005)
     assert facts["tags"].keys() == TAGS.keys()
@@ -187,6 +190,13 @@ def test_too_few_or_unrelated_photographs_are_one_clear_line(photos, captured, t
     assert "0.png: " in message
     status, message = fails(capsys, "capture", unrelated, "-o", captured[0])
     assert (status, "of the same photographs" in message) == (2, True)
+    words = "--scale", "View 1.PNG:100:100,view 9.png:100:100=1"
+    status, message = fails(capsys, "capture", photos, "-o", tmp_path / "c", *words)
+    assert (status, "unknown photograph of --scale 'view 9.png'" in message) == (2, True)
+    assert not (tmp_path / "c").exists()
+    words = captured[1][1:-1], "--tag", "qr:a=0.1", "--up", "qr:a"
+    status, message = fails(capsys, "capture", photos, *words[0][:-1], *words[1:])
+    assert (status, f"detected are {', '.join(TAGS)}" in message) == (2, True)
     status, message = fails(capsys, "capture", photos, "-o", tmp_path / "c", "--up", "qr:a")
     assert (status, "--up must be a tag of --tag" in message) == (2, True)
 
@@ -211,6 +221,40 @@ def test_only_folders_of_an_earlier_capture_are_replaced(photos, tmp_path, capsy
         status, message = fails(capsys, "capture", photos, "-o", tmp_path / name.replace("/", "-"))
         assert (status, "of something else; give another folder" in message) == (2, True)
         assert file.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("damaged", "length"),
+    [
+        ("inputs.json", 0),
+        ("database.db", 100),
+        ("model/images.bin", 100),
+        ("model/images.bin", None),
+        ("photos/view_3.png", 0),
+        ("photos/view_3.png", None),
+    ],
+)
+def test_a_damaged_work_folder_is_one_clear_line(damaged, length, captured, photos, tmp_path, capsys):
+    shutil.copytree(captured[0] / "work", tmp_path / "work")
+    file = tmp_path / "work" / damaged
+    if length is None:
+        file.unlink()
+    else:
+        file.write_bytes(file.read_bytes()[:length])
+    status, message = fails(capsys, "capture", photos, "-o", tmp_path)
+    assert (status, "work is damaged" in message, "--overwrite restarts" in message) == (2, True, True)
+
+
+def test_after_a_damaged_photograph_the_same_folder_is_used(photos, tmp_path, capsys):
+    copies = tmp_path / "copies"
+    shutil.copytree(photos, copies)
+    damaged = copies / "view 1.png", copies / "view 3.png"
+    for file in damaged:
+        file.write_bytes(file.read_bytes()[:1000])
+    for file in damaged:
+        status, message = fails(capsys, "capture", copies, "-o", tmp_path / "out")
+        assert (status, f"cannot read {file}" in message) == (2, True)
+        file.unlink()
 
 
 def test_the_verification_of_matches_does_not_depend_on_earlier_pairs(tmp_path):
