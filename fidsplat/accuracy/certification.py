@@ -28,13 +28,14 @@ def certify(
     renderer: Renderer,
     report: Callable[[str], None] = lambda message: None,
 ) -> Choice:
-    """Refine a choice until the output `error` of a frame is at most `error` at every pixel.
+    """Lower the cut-off of a chosen quality until the output `error` of a frame is at most `error` at every
+    pixel.
 
-    If the output is not available, returns the choice with the reason as its remark.
+    If the output is not available, returns the given choice with the reason as its remark.
 
     Raises:
         InputError: the finest quality is not certified, or takes longer than `ms`; the message names the
-            smallest possible value.
+            smallest possible error, or time.
     """
     plain = replace(capture, outputs=("error",), sensor=Sensor())
     resident, quality = renderer.upload(scene), choice.quality

@@ -171,7 +171,7 @@ Render.__doc__ = (Render.__doc__ or "").replace("    {outputs}", indent(outputs_
 
 @contextmanager
 def _scene_key(source: str, key: str, from_scene: bool) -> Iterator[None]:
-    """Prefix errors with the scene file and the key if the scene file has the value."""
+    """Prefix errors with the scene file and the key if the value is from the scene file."""
     try:
         yield
     except FidsplatError as error:

@@ -274,7 +274,8 @@ class _Reader:
         )
 
     def _check_expansion(self, primitives: list[dict[str, Any]]) -> None:
-        """Check the memory of all primitives, since nodes may share a mesh, and attributes an accessor."""
+        """Check that all primitives fit in memory as separate arrays: nodes may share a mesh, and attributes
+        an accessor."""
         accessors = [
             self._document["accessors"][number]
             for primitive in primitives

@@ -74,7 +74,7 @@ def _ros2_topics(store: Any, host: str) -> Any:
 
 
 class _LogFiles(list[LogFile]):
-    """A `LogFile` that passes messages to several."""
+    """Log files that are written as one: each message goes to all, with the methods of `LogFile`."""
 
     def write(self, topic: str, kind: str, time: int, data: bytes) -> None:
         for file in self:

@@ -4,8 +4,8 @@ A template has the Gaussians of a rectangle with half sizes of 1: rows of x, y, 
 `paper` (`paper_template`) is the construction of the paper's section 3.2. `fitted` (`fitted_templates`) are
 templates optimised by tools/fit_templates.py for complete markers; see docs/markers.md. `nested_gaussians`
 computes templates of many Gaussians by a formula: along each axis a central Gaussian, and pairs at the
-distances d = ratio^-k from the ends, whose widths follow from their decay at their overhang beyond the end. A
-template is the product over both axes, so that every interior point is in the cores of several Gaussians.
+distances d = ratio^-k from the ends, each so wide that it has decayed at a small distance beyond the end. A
+template is the product over both axes: every interior point is near the centres of several Gaussians.
 """
 
 from __future__ import annotations

@@ -160,7 +160,7 @@ def partition(grid: np.ndarray) -> np.ndarray:
 
 
 def partition_colors(grid: np.ndarray) -> np.ndarray:
-    """Minimum partition of an (h, w) uint8 grid of any number of colours."""
+    """Partition an (h, w) uint8 grid of colours into the minimum number of rectangles of one colour."""
     if grid.max() <= 1:
         return partition(grid)
     boxes = []

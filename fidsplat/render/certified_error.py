@@ -25,8 +25,8 @@ where the first term is measured, for any requested quality, and the second is b
 4. Rounding T changes the colour behind a fragment by at most 2^-24 T C. Rounding the colour sum changes it by
    at most 2^-24 (1 - T) C. C is the largest absolute colour. Both together change it by at most 2^-24 C per
    fragment. Rounding the products T alpha and T alpha c adds at most 2^-24 C each for all fragments of a
-   pixel together. The sum for n fragments, n + 2, is below 1.5 n, which `rounding` contains, plus 2, which
-   `error_reference` adds. It also adds 2^-24 C for each rounding of the sums over samples, over sub-frames
+   pixel together. The sum for m fragments is (m + 2) 2^-24 C: `rounding` contains 1.5 per fragment, and
+   `error_reference` adds 2. It also adds 2^-24 C for each rounding of the sums over samples, over sub-frames
    (the camera poses that a shutter averages) and over spherical harmonics.
 
 R and C are bounded by the colours of all splats and of the background. Q is composited in float64 if an

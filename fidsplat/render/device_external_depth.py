@@ -18,7 +18,7 @@ MESH_OFFSET = 2e-3
 def device_external_depth(
     renderer: Renderer, packed: Any, depths: Any, ids: Any, size: tuple[int, int], red_bit: int
 ) -> ExternalDepth:
-    """External depth images of all views, in the memory of the renderer's device.
+    """External depth images of all views: on the renderer's device if the arrays are there, else on the host.
 
     Args:
         packed, depths, ids: wp.arrays (views, pixels): colours in uint32, with red from the bit `red_bit`;

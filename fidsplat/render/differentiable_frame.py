@@ -50,8 +50,9 @@ class DifferentiableFrame(Frame):
 
         Returns:
             Derivatives of the loss with respect to the n splats: `means` (n, 3) [1/m]; `quats` (n, 4),
-            w x y z, not normalised; `scales` (n, 2) [1/m]; `opacities` (n,); `colors` (n, 3) or `sh`
-            (n, k, 3); `thickness` (n,) [1/m], the third scale, if there are 3D Gaussians, 0 for disks. Also
+            w x y z, with respect to the quaternions before they are normalised; `scales` (n, 2) [1/m];
+            `opacities` (n,); `colors` (n, 3) or `sh` (n, k, 3); `thickness` (n,) [1/m], the third scale, if
+            there are 3D Gaussians, 0 for disks. Also
             `background` (3,); `pose` (6,), a rotation vector [1/rad] and a translation [1/m] applied after
             `world_to_camera`, in camera axes; `grad2d` (n,), the densification statistic of 2DGS trainers:
             the norm of the derivative with respect to the projected centre in normalised device coordinates

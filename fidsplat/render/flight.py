@@ -41,8 +41,8 @@ _COLUMNS, _ROWS = 4, 3
 class Flight:
     """Frames of a scene at given times, from a camera that moves along a trajectory.
 
-    Moving groups of the scene use the same clock. A shutter with an exposure time or a readout blurs or
-    skews the image by the camera's motion.
+    Groups of splats that the scene's `Motion` moves use the same clock. A shutter with an exposure time or a
+    readout blurs or skews the image by the camera's motion.
 
     Raises:
         InputError: no times, times that do not increase, or a scene without a camera.

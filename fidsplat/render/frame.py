@@ -46,7 +46,8 @@ class Frame(ImageMapping):
         `error`, computed when it is read; None if it was not requested."""
         super().__init__(images, capture.outputs, scene_indices, index)
         self._error, self.capture = error, capture
-        """The capture of this frame. `read_back` and `truth_of` use its camera, shutter and motion."""
+        """The capture of this frame. `read_back` and `truth_of` of fidsplat.vision use its camera, shutter
+        and motion."""
 
     @property
     def images(self) -> Images:
@@ -142,11 +143,11 @@ class FrameBatch(ImageMapping):
 
     def __init__(self, images: Images, views: CaptureBatch, scene_indices: SceneIndices = None) -> None:
         super().__init__(images, views.captures[0].outputs, scene_indices)
-        self._views, self.views = views, images.views
+        self._captures, self.views = views, images.views
         """Number of views, including masked ones."""
 
     def __repr__(self) -> str:
-        camera = self._views.captures[0].camera
+        camera = self._captures.captures[0].camera
         size = "" if camera is None else f", {camera.width} x {camera.height}"
         return f"FrameBatch({self.views} views, {', '.join(self.outputs)}{size})"
 
@@ -157,12 +158,12 @@ class FrameBatch(ImageMapping):
             InputError: the number of the view is out of range.
         """
         number = whole_number("number of the view", number, 0, self.views - 1)
-        return Frame(self._images, self._views.capture(number), self._scene_indices, index=number)
+        return Frame(self._images, self._captures.capture(number), self._scene_indices, index=number)
 
     def __reduce__(self):
         """Pickle and copy as NumPy arrays."""
-        captures = tuple(capture.picklable() for capture in self._views.captures)
-        views = replace(self._views, captures=captures)
+        captures = tuple(capture.picklable() for capture in self._captures.captures)
+        views = replace(self._captures, captures=captures)
         return _host_batch, (dict(self), dict(self.timings), dict(self.stats), views)
 
 

@@ -43,8 +43,8 @@ class GalleryScene:
 
 
 def gallery_scene(source: Path, scene: Scene) -> GalleryScene:
-    """A scene with the text of its file. The title is the comment on the first line, up to a command after it
-    (". fidsplat ...")."""
+    """A scene with the text of its file. The title is the comment on the first line, without a command that
+    follows it, as in `# Fog. fidsplat render fog.toml`."""
     text = read_text(source, "replace") if source.suffix.lower() == ".toml" else ""
     first = text.partition("\n")[0]
     title = first.lstrip("# ").partition(". fidsplat")[0] if first.startswith("#") else source.stem

@@ -68,7 +68,7 @@ class LightField:
         normal: np.ndarray,
         step: float,
     ) -> LightField:
-        """Refine the grid until the interpolated irradiance is within `step` times the maximum.
+        """Refine the grid until the error of the interpolated irradiance is at most `step` times the maximum.
 
         levels: numbers of panoramas along a side, ascending; the last is accepted without a check.
         positions: (m, 2) on the marker. radiance_at: function of positions (k, 2) that returns

@@ -19,7 +19,7 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.progress import Progress, no_progress
 
 VIEWS, IMAGE_SIDE, FOV = 64, 512, math.radians(50.0)
-"""views around a scene: their number, pixels per side and field of view [rad]"""
+"""views around a scene: their maximum number, pixels per side and field of view [rad]"""
 RESOLUTION = 200
 """voxels along the longest side of a scene"""
 _TINY = 1e-300
@@ -41,7 +41,8 @@ def scene_mesh(
     below one half are empty. Surfaces that are thinner than two voxels and visible from both sides are lost.
 
     Args:
-        cameras: views; by default 64 views from a sphere around the scene.
+        cameras: views; by default up to 64 views from a sphere around the scene: none from below the ground,
+            if it has one.
         voxel: metres; by default a 200th of the longest side of the scene.
         renderer: by default one on the scene's device.
         progress: called with the name of the current step and its completed fraction.
@@ -95,7 +96,8 @@ def _cosine(normal: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def views_around(scene: Scene, low: np.ndarray, high: np.ndarray) -> list[Camera]:
-    """Cameras on a sphere around a bounding box, spaced by the golden angle; none below level ground."""
+    """Cameras on a sphere around a bounding box, spaced by the golden angle; if the scene has a
+    ground, none less than 6 degrees above the horizontal."""
     up_axis = guess_up(scene.cloud())
     center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     distance = radius / math.sin(FOV / 2)

@@ -40,7 +40,8 @@ class SeveralDevices:
     """Several devices of one model that share each frame: every device renders a band of rows.
 
     Frames are bit-identical to those of one device. Bands are balanced by the times of the previous frame. A
-    cloud in memory is copied to every device; a store's chunks are cached only where their band needs them.
+    cloud in memory is copied to every device; each device caches only the
+    chunks of a store that its band needs.
 
     Args:
         devices: names as for `fs.Renderer`, e.g. ["opencl:nvidia", "opencl:nvidia-2"]; a name may be

@@ -256,7 +256,9 @@ class Renderer:
         resident = self._resident(scene)
         if not self.backend.renders_subsampled:
             raise InputError(
-                self.backend.lacks("render subsets of pixels", "use device='reference', or render")
+                self.backend.lacks(
+                    "render subsets of pixels", "use device='reference', or render complete frames"
+                )
             )
         return self._render(resident, requested, subsampling=(step, progress))
 

@@ -32,7 +32,7 @@ class ResidentCloud:
         """data: an uploaded cloud, or the device chunk cache of a store."""
         self.backend, self.data, self._labels = backend, data, labels
         self.all_splats: Any = data.scene if isinstance(data, DeviceChunkCache) else data
-        """all splats of the scene: on the device, or, for stores, only partly on the device"""
+        """all splats of the scene: the uploaded cloud, or the store on disk"""
         self.capture = capture
         """capture of the uploaded scene, the default of `render`"""
 

@@ -331,8 +331,8 @@ def _pose_of(pose: Any, camera: Camera | None) -> np.ndarray:
 
 
 def _returns(rays: dict[str, np.ndarray], lidar: Lidar) -> dict[str, np.ndarray]:
-    """Returns (r, beams) of beams of n rays, (beams, n). Rays within `separation` of each other form one
-    return: its range is their mean weighted by signal, its intensity their sum / n, its label that of the
+    """Group rays (beams, n) into the LiDAR's returns (r, beams). Rays within `separation` of each other form
+    one return: its range is their mean weighted by signal, its intensity their sum / n, its label that of the
     nearest ray."""
     count = lidar.rays
     if count == 1:

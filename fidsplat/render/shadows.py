@@ -113,7 +113,7 @@ def shadow_casters(
         distance_from_axis = np.linalg.norm(offsets - along[:, None] * to_light, axis=1)
         max_distance = radius + np.tan(light.angle / 2) * np.maximum(along + radii, 0)
         inside = (distance_from_axis - radii <= max_distance) & (along + radii >= -radius)
-        above = to_light @ normal > np.sin(light.angle / 2) * length  # all rays leave the front
+        above = to_light @ normal > np.sin(light.angle / 2) * length  # the whole sun is in front
         min_height = min_height if above else -np.inf
     else:
         assert isinstance(light, PointLight)

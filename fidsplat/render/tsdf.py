@@ -77,13 +77,15 @@ class DistanceField:
                 rows = np.flatnonzero((x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))
             x, y = x[rows].astype(np.int64), y[rows].astype(np.int64)
             distances = np.linalg.norm(local[rows], axis=1) if along_ray else local[rows, 2]
-            measured, slant = depth[y, x].astype(np.float64), cosine[y, x]
+            measured, pixel_cosine = depth[y, x].astype(np.float64), cosine[y, x]
             distance = (measured - distances) / (TRUNCATION * self.voxel)
-            used = (measured > 0) & (distance > -1) & (slant >= MIN_COSINE)
-            rows, x, y, distance, slant = (array[used] for array in (rows, x, y, distance, slant))
+            used = (measured > 0) & (distance > -1) & (pixel_cosine >= MIN_COSINE)
+            rows, x, y, distance, pixel_cosine = (
+                array[used] for array in (rows, x, y, distance, pixel_cosine)
+            )
             near_surface = distance < 1
             distance = np.minimum(distance, 1.0)
-            weight = np.where(near_surface, slant, FREE_SPACE_WEIGHT)
+            weight = np.where(near_surface, pixel_cosine, FREE_SPACE_WEIGHT)
             values = np.empty((len(rows), 6), np.float32)
             values[:, 0], values[:, 1] = weight, weight * distance
             values[:, 5] = weight * near_surface

@@ -243,7 +243,7 @@ def _sha256(*arrays: np.ndarray) -> str:
 
 
 def read_table() -> dict[int, Digest]:
-    """The digests in the repository, by seed."""
+    """Read the SHA-256 digests of the random scenes in the repository, by seed."""
     with TABLE.open() as stream:
         return {
             int(row["seed"]): Digest(row["sha256"], {name: row[name] for name in OUTPUTS})

@@ -72,7 +72,7 @@ kernel void bin_count(
     bin_splats(order, windows, big_capacity, big_bounds, &c, 0);
 }
 
-// Reads: the inputs of bin_count, and starts. Consumes: table, of the tiles in the band. Writes: lists.
+// Reads: the inputs of bin_count, and starts. Reads and overwrites: table, of the tiles in the band. Writes: lists.
 kernel void bin_emit(
 //@@ arguments bin_emit
 ) {

@@ -20,7 +20,7 @@ kernel void sort_count(
         if (keys[k] != CULLED) row[(keys[k] >> shift) & (RADIX_BINS - 1)]++;
 }
 
-// Reads: keys, indices (in the first pass the index is the position), starts. Consumes: table.
+// Reads: keys, indices (in the first pass the index is the position), starts. Reads and overwrites: table.
 // Writes: keys_out, indices_out.
 kernel void sort_scatter(
 //@@ arguments sort_scatter

@@ -206,7 +206,7 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void count_big(
 // Writes the (splat, key) pairs of all tiles of a band.
 // Index space: for each view the same number of work-groups, which share the big splats, then `splat_groups` work-groups, one
 // work-item per splat.
-// Reads: windows, keys, starts, big, big_bounds. Consumes: cursors of the band. Writes: pairs; adds to
+// Reads: windows, keys, starts, big, big_bounds. Reads and overwrites: cursors of the band. Writes: pairs; adds to
 // counts[COUNT_VISIBLE].
 kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
 //@@ arguments emit
@@ -260,7 +260,7 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
 
 // Sorts each tile's list by (depth key, splat); all keys differ.
 // Index space: work-groups of SORT_ITEMS, one per tile of the band.
-// Reads: starts. Consumes: pairs. Writes: lists; counters, zeroed for the next frame if `clear`.
+// Reads: starts. Reads and overwrites: pairs. Writes: lists; counters, zeroed for the next frame if `clear`.
 //
 // A list is bucket-sorted by depth if its pairs, or their indices within the list, fit local memory. Longer and short lists, and those
 // with an overfull bucket, go through a bitonic network; every comparator moves the smaller key to the front, as if the list were

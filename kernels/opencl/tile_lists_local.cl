@@ -87,7 +87,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void count_local(
 }
 
 // Index space: as count_local.
-// Reads: windows, keys, starts. Consumes: cursors of the band. Writes: pairs; adds to counts[COUNT_VISIBLE].
+// Reads: windows, keys, starts. Reads and overwrites: cursors of the band. Writes: pairs; adds to counts[COUNT_VISIBLE].
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
 //@@ arguments emit_local
 ) {

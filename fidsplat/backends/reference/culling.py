@@ -70,7 +70,7 @@ def _outside(at: np.ndarray, center: np.ndarray) -> np.ndarray:
 
 
 def _steps(view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Upper bound of the change of each coordinate (3,) from a sample to its neighbours."""
+    """Upper bound of the change of a ray's coordinates (3,) from a sample to its neighbours."""
     if view.raster is None:
         return np.array([0.0, 1.0, 1.0])
     slopes = np.nan_to_num(view.raster.ray_derivatives[y.astype(int), x.astype(int)].astype(np.float64))

@@ -124,7 +124,7 @@ class _Solid:
         grad_axes = grad_axes + (self._along * self._shares)[..., None] * grad_normal[:, None]
         grad_axes += grad_along[..., None] * self._p[:, None]
         out.p += np.einsum("nk,nkc->nc", grad_along, self._axes)
-        # the length of the normal has no derivative, so that the shortest axis is a constant
+        # the normal is normalised: the shortest scale, a factor of all shares, has no derivative
         out.scales += -2 * grad_along * self._along / self._scales
         a, b, c = grad_axes.transpose(1, 0, 2)
         out.unit_a += a + np.cross(self._axes[:, 1], c)

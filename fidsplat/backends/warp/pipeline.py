@@ -49,7 +49,8 @@ class RecordedFrame:
 
 @dataclass(eq=False)
 class _CachedFrame:
-    """Cached frame of a cloud, for one image size and number of views."""
+    """Input arrays, list capacity and recorded launches of a cloud, for frames of one size and number
+    of views."""
 
     inputs: ArrayPool
     """pool of the input arrays that the host fills for the views"""

@@ -103,7 +103,7 @@ class Point:
     quality: Quality
 
     def key(self) -> dict:
-        """Part of a result's key, with the quality as its differences from the base."""
+        """Key of a result without scene and device, with the differences of the quality from `BASE`."""
         changes = _changes(asdict(self.quality), asdict(BASE))
         return {"knob": self.setting, "value": self.value, "quality": changes}
 

@@ -112,7 +112,7 @@ class DeviceResults:
     def same_definition(self, scene: str) -> Table:
         """Rows with the low-pass, samples and order of the base setting, whose errors are comparable."""
         rows = self.of(scene)
-        # gsplat's stop requires the order of centres, which equals the base's without coplanar groups
+        # gsplat's stop requires order=centre, which renders as the base's order without coplanar groups
         constants = rows["quality"].str.replace("order=centre ", "")
         changed = rows["quality"].where(rows["knob"] == "order", constants).str.split(r"[ =]")
         return rows[[not set(DEFINITION) & set(words) for words in changed]]

@@ -1,5 +1,5 @@
-// Exponential of NVIDIA's GPUs instead of a polynomial: relative error at most 1e-6 for opacities above 1e-5; 0 below the smallest normal
-// float. Their reciprocal, within 1 ulp, is not refined.
+// The hardware exponential of NVIDIA's GPUs instead of a polynomial: relative error at most 1e-6 for alphas above 1e-5; 0 below the smallest
+// normal float. The hardware reciprocal, within 1 ulp, is used without a Newton step.
 //@ arithmetic
 static inline float ptx_exp(float x) {
     float y;
