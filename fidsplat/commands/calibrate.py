@@ -9,6 +9,7 @@ from fidsplat.commands.options import Device, Json, Overwrite, repeatable, requi
 from fidsplat.commands.output import console, json_text, print_lines, report, run_sweeps, show_progress
 from fidsplat.experiments.calibrate import CalibrationSettings
 from fidsplat.experiments.tags import TagSettings
+from fidsplat.util.errors import InputError
 from fidsplat.util.files import new_file
 
 
@@ -115,6 +116,12 @@ class Tags(TagSettings):
 
         check(self)
         if self.labels is not None:
+            given = {"-o": self.out, "--page": self.page, "--detector": self.detector}
+            if names := [name for name, value in given.items() if value]:
+                raise InputError(
+                    f"--labels must be given without options of measurements, got {', '.join(names)}; "
+                    "measure in another run"
+                )
             points = write_labels(self, self.labels)
             names = [str(folder) for folder in show_progress("points", points, len(points_of(self)))]
             return report(self.json, {"folders": names}, f"{len(names)} folders in {self.labels}")

@@ -13,7 +13,7 @@ import pandas as pd
 
 from fidsplat.experiments.charts import COLOURS, chart, legend_above
 from fidsplat.experiments.pages import NOTHING, page_and_folder, write_page
-from fidsplat.experiments.summary import Summary, Table, provenance, summarise
+from fidsplat.experiments.summary import Summary, Table, summarise
 from fidsplat.experiments.sweep import Record
 from fidsplat.experiments.tag_causes import CAUSES
 from fidsplat.experiments.tags import FAMILIES, NAME, NONE, OWN, rows_of
@@ -23,7 +23,7 @@ _ERRORS = ("corner_px", "rotation_deg", "translation_percent")
 _GROUP = ("scene", "family", "detector", "cause", "severity")
 PRECISE = 1.0
 """maximum RMS error in pixels of the corners of a precise detection"""
-NEVER = "never"
+UNBROKEN = "none"
 """cell of a detector that reads at least half of the views at all severities"""
 ALWAYS = "always"
 """cell of a detector that reads less than half of the views without a cause"""
@@ -82,12 +82,12 @@ def breaks_of(rates: Table) -> Table:
         selected = rates[rates["cause"].isin((cause, NONE))]
         for family in (name for name in FAMILIES if name in set(rates["family"])):
             row = {"cause": f"{CAUSES[cause].title} [{CAUSES[cause].unit}]"}
-            row |= {"to": CAUSES[cause].text(1.0), "family": family.rpartition(":")[2]}
+            row |= {"up to": CAUSES[cause].text(1.0), "family": family.rpartition(":")[2]}
             for detector in _detectors(rates):
                 measured = selected[(selected["family"] == family) & (selected["detector"] == detector)]
                 severity = breaking_severity(measured["severity"].tolist(), measured["rate"].tolist())
                 cell = CAUSES[cause].text(severity) if severity else ALWAYS
-                cell = NEVER if severity is None else cell
+                cell = UNBROKEN if severity is None else cell
                 row[detector] = cell if len(measured) else NOTHING
             table.append(row)
     return pd.DataFrame(table)
@@ -101,7 +101,7 @@ def compact(breaks: Table) -> Table:
         for family, rows in breaks.groupby("family", sort=False)
     }
     return pd.DataFrame(
-        {"cause": cause, "to": rows["to"].iloc[0]}
+        {"cause": cause, "up to": rows["up to"].iloc[0]}
         | {
             f"{row['family']}: {'/'.join(names[row['family']])}": "/".join(row[names[row["family"]]])
             for _, row in rows.iterrows()
@@ -165,17 +165,20 @@ def write_report(records: Sequence[Record], folder: Path, out: Path, seed: int) 
             files.append((group, file))
     breaks = breaks_of(pooled)
     detectors = _detectors(pooled)
+    undegraded = pooled[pooled["cause"] == NONE]
+    points = table.rows.groupby([name for name in _GROUP if name != "detector"])["images"].max()
     context = {
         "figures": [{"title": group, "file": file.name} for group, file in files],
         "breaks": compact(breaks),
         "precise": PRECISE,
-        "errors": _errors(pooled[pooled["cause"] == NONE]),
+        "errors": _errors(undegraded),
         "detectors": [f"`{name}`: {TITLES[name]}" for name in detectors if name in TITLES],
         "scenes": " and ".join(dict.fromkeys(views["scene"])),
-        "images": int(
-            table.rows.groupby([name for name in _GROUP if name != "detector"])["images"].max().sum()
-        ),
-        "runs": provenance({"`experiment tags`": summary}),
+        "undegraded": int(undegraded["images"].max()),
+        "severities": pooled[pooled["cause"] != NONE].groupby("cause")["severity"].nunique().max(),
+        "views": points.max(),
+        "points": f"{len(points):,}",
+        "images": f"{points.sum():,}",
     }
     write_page(page, charts, "tags.md.j2", context)
     return [page, folder / f"{NAME}.csv", *(file for _, file in files)], breaks

@@ -268,7 +268,8 @@ def marker(
         growth: distance in modules, 0 to 1, by which a rectangle extends into neighbours of its own colour,
             to close seams; default: the value for which the fitted templates are optimised, 0 for paper.
         black, white: RGB of the dark and light modules in [0, 1], black darker than white; default (0, 0, 0)
-            and (1, 1, 1). Printed ink and paper are nearer to (0.05, 0.05, 0.05) and (0.85, 0.85, 0.85).
+            and (1, 1, 1). Printed ink and paper are nearer to (0.05, 0.05, 0.05) and (0.85, 0.85, 0.85);
+            with `light`, which has reflectances of its own, keep the defaults.
         quality: defaults of mixture, levels, density, growth and template (`Quality.marker`); settings of
             other mixtures are ignored.
         shape: surface that the sheet is bent to, such as `fidsplat.markers.Cylinder(radius=0.05)`, or its

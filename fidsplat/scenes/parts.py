@@ -216,9 +216,10 @@ _INSTEAD = {
     "PlacedMarker": "write markers=[...]",
     "SplatCloud": "write clouds=[...]",
     "Store": "write stores=[...]",
+    "lights": "write e.g. lights=[fs.Sun(direction=(0, 0, 1))], fs.PointLight or fs.SpotLight",
     "str": "Scene.load reads a scene file, load_splats a splat file, Store a store; marker makes a marker",
 }
-"""remedies for values of the wrong class, by its name"""
+"""remedies for values of the wrong class, by its name or that of the argument"""
 
 
 def _all_of(values: Iterable, kind: type[T], name: str) -> tuple[T, ...]:
@@ -231,6 +232,7 @@ def _all_of(values: Iterable, kind: type[T], name: str) -> tuple[T, ...]:
         items = (values,)
     for value in items:
         if not isinstance(value, kind):
-            hint = _INSTEAD.get("str" if isinstance(value, PathLike) else type(value).__name__, "")
+            found = "str" if isinstance(value, PathLike) else type(value).__name__
+            hint = _INSTEAD.get(found, _INSTEAD.get(name, ""))
             raise invalid(name, f"a list of {kind.__name__}", value, hint)
     return items

@@ -24,8 +24,8 @@ DEPTH_SCALE = 0.1
 
 class BopScene:
     """One scene of a BOP data set: rgb, depth and masks as images, intrinsics and poses as JSON. An object
-    is a marker; its obj_id is its label, or the next free number where the data set has this label for
-    another marker.
+    is a marker by spec, extents and shape; its obj_id is its label, or the next free number where the data
+    set has this label for another marker.
 
     `save`, or the end of a `with` block, writes the JSON files.
 
@@ -83,7 +83,7 @@ class BopScene:
             label = marker.placed.label
             self._poses[str(number)].append(
                 {
-                    "obj_id": label,
+                    "obj_id": _add_model(self._models, label, _model(marker)),
                     "cam_R_m2c": marker.truth[:3, :3].ravel().tolist(),
                     "cam_t_m2c": (1000 * marker.truth[:3, 3]).tolist(),
                 }
@@ -92,7 +92,6 @@ class BopScene:
             mask = np.zeros((camera.height, camera.width), bool) if group is None else group.mask
             write_png(self._folder / "mask_visib" / f"{name}_{i:06d}.png", mask)
             self._info[str(number)].append(_visibility(marker, truth, mask))
-            self._models[str(label)] = _model(marker)
 
     def save(self) -> None:
         """Write the JSON files.
@@ -101,15 +100,10 @@ class BopScene:
             InputError: a file that cannot be written.
         """
         models = writable_folder(self._folder.resolve().parent.parent / "models") / "models_info.json"
-        known, ids = _known(models), {}
-        for label, model in self._models.items():
-            ids[label] = label
-            if known.get(label, model) != model:
-                equal = (number for number, other in known.items() if other == model)
-                ids[label] = next(equal, str(1 + max(map(int, (*known, *self._models)))))
-            known[ids[label]] = model
+        known = _known(models)
+        ids = {int(key): _add_model(known, int(key), model) for key, model in self._models.items()}
         poses = {
-            image: [pose | {"obj_id": int(ids[str(pose["obj_id"])])} for pose in each]
+            image: [pose | {"obj_id": ids[pose["obj_id"]]} for pose in each]
             for image, each in self._poses.items()
         }
         for name, content in (
@@ -154,10 +148,20 @@ def _model(marker: MarkerTruth) -> dict[str, Any]:
     names = "xyz"
     return {
         "spec": printed.spec,
+        **({} if printed.shape is None else {"shape": repr(printed.shape)}),
         "diameter": float(np.linalg.norm(high - low)),
         **{f"min_{n}": float(v) for n, v in zip(names, low, strict=True)},
         **{f"size_{n}": float(v) for n, v in zip(names, high - low, strict=True)},
     }
+
+
+def _add_model(models: dict[str, dict[str, Any]], wanted: int, model: dict[str, Any]) -> int:
+    """Add a model to `models` under the wanted obj_id, or the next free one; returns the model's obj_id."""
+    if models.get(str(wanted), model) != model:
+        equal = (int(key) for key, other in models.items() if other == model)
+        wanted = next(equal, 1 + max(map(int, models)))
+    models[str(wanted)] = model
+    return wanted
 
 
 def _known(path: Path) -> dict[str, dict[str, Any]]:

@@ -178,6 +178,7 @@ def run(capsys, *words) -> tuple[int, str, str]:
         (("--views", "0"), "--views"),
         (("--seed", "-1"), "--seed must be a whole number from 0"),
         (("--family", "qr", "--detector", "pupil"), "--detector must read one of qr"),
+        (("--labels", "data", "--detector", "aruco"), "without options of measurements, got -o, --detector;"),
     ],
 )
 def test_wrong_options_are_one_line(capsys, tmp_path, words, expected):
@@ -221,7 +222,11 @@ def test_own_detectors_shards_and_the_page(capsys, tmp_path, monkeypatch):
     (row,) = json.loads(out)["breaks"]
     assert row["mine_of_this_test:blind"] == "always"
     assert float(row["fidsplat"]) > 6
-    assert "![" in (tmp_path / "page.md").read_text()
+    page = (tmp_path / "page.md").read_text()
+    assert "![" in page
+    assert "experiment tags --severities 1 --views 2 --page" in page
+    assert "2 points of scene, family, cause and severity with 2 views each are 4 images." in page
+    assert "intervals of 2 views (p99 is nearly their maximum)." in page
     assert (tmp_path / "page" / "geometry.png").is_file()
     assert "corner_px_rms" in (tmp_path / "joined" / "tags.csv").read_text()
 

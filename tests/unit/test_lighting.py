@@ -452,7 +452,7 @@ def test_errors_of_scene_files(tmp_path, text, words):
             "inner, 45.8366 degrees, got 45 degrees",
         ),
         (lambda: PlacedMarker(TAG, light=1), "a marker's light must be"),
-        (lambda: fs.Scene(lights=[1]), "lights must be a list of Light"),
+        (lambda: fs.Scene(lights=[{}]), r"lights must be a list of Light, got \{\}; write .*fs\.Sun\("),
     ],
 )
 def test_errors_of_values(make, words):

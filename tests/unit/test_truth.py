@@ -11,6 +11,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.images.files import read_image
+from fidsplat.markers import Cylinder
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.vision.bop import DEPTH_SCALE, BopScene
@@ -230,6 +231,21 @@ def test_bop_follows_its_format(tmp_path, truth, frame, scene):
         assert [pose["obj_id"] for pose in gt] == [2]
     after = json.loads((tmp_path / "set/models/models_info.json").read_text())
     assert after == models | {"2": models["1"] | {"spec": "apriltag:36h11:6"}}
+    bent = [  # of equal extents
+        replace(other, marker=fs.marker("apriltag:36h11:6", size=0.4, shape=Cylinder(0.2, axis=(1, y))))
+        for y in (1, -1)
+    ]
+    with BopScene(tmp_path / "set/train/000004") as last:  # one label for three objects in one scene
+        for placed in (*bent, other):
+            last.add(frame, truth_of(frame, replace(scene, markers=(placed,))))
+    gt = json.loads((tmp_path / "set/train/000004/scene_gt.json").read_text())
+    assert [pose["obj_id"] for poses in gt.values() for pose in poses] == [3, 4, 2]
+    after = json.loads((tmp_path / "set/models/models_info.json").read_text())
+    assert [after[key].get("shape") for key in "234"] == [
+        None,
+        repr(bent[0].marker.shape),
+        repr(bent[1].marker.shape),
+    ]
 
 
 def test_bop_has_no_lenses(tmp_path, truth, frame):
