@@ -150,7 +150,10 @@ def write_report(records: Sequence[Record], folder: Path, out: Path, seed: int) 
     summary, (page, charts) = view_table(records), page_and_folder(out, "tags.md.j2")
     views = summary.rows
     views["read"] = views["read"].astype(bool)
-    table = Summary(statistics_of(views, seed).assign(run=0), summary.runs)
+    rates = statistics_of(views, seed)
+    points = zip(rates["cause"], rates["severity"], strict=True)
+    amounts = ["" if cause == NONE else CAUSES[cause].text(severity) for cause, severity in points]
+    table = Summary(rates.assign(amount=amounts, run=0), summary.runs)
     table.write(folder / f"{NAME}.csv")
     pooled = statistics_of(views, seed, _GROUP[1:])
     files = []

@@ -1,5 +1,6 @@
 """The test bench of tag detectors: causes, measurements, intervals and the command."""
 
+import csv
 import json
 import math
 import sys
@@ -229,6 +230,10 @@ def test_own_detectors_shards_and_the_page(capsys, tmp_path, monkeypatch):
     assert "intervals of 2 views (p99 is nearly their maximum)." in page
     assert (tmp_path / "page" / "geometry.png").is_file()
     assert "corner_px_rms" in (tmp_path / "joined" / "tags.csv").read_text()
+    lines = (tmp_path / "joined" / "tags.csv").read_text().splitlines()
+    rows = csv.DictReader(line for line in lines if not line.startswith("#"))
+    points = {(float(row["severity"]), row["amount"], row["images"]) for row in rows}
+    assert points == {(0.0, "", "2"), (1.0, "60", "2")}
 
 
 def test_labels_are_scenes_of_bop_with_coco(capsys, tmp_path):
