@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from fidsplat.commands.options import Device, Json, parse_numbers
+from fidsplat.commands.options import Device, Json, Overwrite, parse_numbers
 from fidsplat.commands.output import console, report
 from fidsplat.commands.scenes import load_scene_file
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import path_of
+from fidsplat.util.files import path_of, refuse_existing
 
 if TYPE_CHECKING:
     from fidsplat.cameras import Camera
@@ -47,6 +47,7 @@ class Localise:
     max_side: int = 320
     """N: reduce larger photographs to this number of pixels along the larger side; more are more accurate and
     take longer"""
+    overwrite: Overwrite = False
     device: Device = None
     json: Json = False
 
@@ -72,6 +73,7 @@ class Localise:
         assert camera is not None
         if self.out is not None:
             check_trajectory_file(self.out, camera)
+            refuse_existing(path_of(self.out), self.overwrite)
         candidates = [] if self.candidates is None else cameras_of(self.candidates, scene)
         with console(self.json).status("opening the device"):
             renderer = fs.Renderer(self.device)
@@ -100,7 +102,7 @@ class Localise:
                 previous = [localised.camera] if localised.found else []
         if missing and not any(results.values()):
             raise InputError(f"{', '.join(results)} and {self.scene}: {missing}")
-        files = [] if self.out is None else [_write(self.out, results, camera)]
+        files = [] if self.out is None else _write(self.out, results, camera)
         facts = [
             {"image": name, "found": False, "start": None} | ({} if result is None else result.as_dict())
             for name, result in results.items()
@@ -116,7 +118,10 @@ class Localise:
             )
         device = renderer.device.title
         values = {"device": device, "images": facts, "files": files}
-        return report(self.json, values, *notes, *files, table=table)
+        status = report(self.json, values, *notes, *files, table=table)
+        if self.out is not None and not files:
+            raise InputError(f"a pose must be found to write {self.out}, got none of {len(results)} images")
+        return status
 
 
 def _row(facts: dict[str, Any]) -> tuple[str, ...]:
@@ -133,8 +138,8 @@ def _row(facts: dict[str, Any]) -> tuple[str, ...]:
     )
 
 
-def _write(out: str, results: dict[str, Localisation | None], camera: Camera) -> str:
-    """Write the found poses as a trajectory, one per second; returns the file's name."""
+def _write(out: str, results: dict[str, Localisation | None], camera: Camera) -> list[str]:
+    """Write the found poses as a trajectory, one per second; returns the files' names."""
     import numpy as np
 
     from fidsplat.cameras import Trajectory
@@ -144,7 +149,7 @@ def _write(out: str, results: dict[str, Localisation | None], camera: Camera) ->
         name: result.camera.camera_to_world for name, result in results.items() if result and result.found
     }
     if not poses:
-        raise InputError(f"a pose must be found to write {out}, got none of {len(results)} images")
+        return []
     trajectory = Trajectory(np.arange(len(poses)), np.array(list(poses.values())))
     save_trajectory(trajectory, out, camera, list(poses))
-    return out
+    return [out]

@@ -26,8 +26,10 @@ from fidsplat.store.store import Store
 from fidsplat.util.arguments import instance, invalid, whole_number
 from fidsplat.util.errors import InputError
 
-MAX_VALUE = 1e4
-"""maximum display value of an image: sums of squares are float32"""
+MAX_VALUE = 100.0
+"""maximum display value of an image: floats from 0 to 255 are an error"""
+MAX_DEVIATION = 0.1
+"""radians: maximum standard deviation of the rotation of a found pose"""
 TRIED = 3
 """number of candidates that are aligned coarsely"""
 
@@ -60,8 +62,9 @@ class Localisation:
 
     @property
     def found(self) -> bool:
-        """Whether the image determines the pose, and at least 0.6 of its textured blocks match the scene."""
-        return self.inliers >= MIN_INLIERS and bool(np.isfinite(self.covariance).all())
+        """Whether the image determines the pose (`angle_deviation` is at most 0.1 radians), and at least 0.6
+        of its textured blocks match the scene."""
+        return self.inliers >= MIN_INLIERS and self.angle_deviation <= MAX_DEVIATION
 
     @property
     def position_deviation(self) -> float:
@@ -145,8 +148,12 @@ def localise(
             f"the image must have the camera's size, {camera.width} x {camera.height} pixels, got "
             f"{pixels.shape[1]} x {pixels.shape[0]}; give the camera that took the image"
         )
-    if mask is not None and (np.shape(mask) != pixels.shape[:2] or np.asarray(mask).dtype != bool):
-        raise invalid("mask", f"an array {pixels.shape[:2]} of bool, False for ignored pixels", mask)
+    if mask is not None:
+        given, mask = mask, np.asarray(mask)
+        if mask.shape != pixels.shape[:2] or mask.dtype != bool:
+            raise invalid("mask", f"an array {pixels.shape[:2]} of bool, False for ignored pixels", given)
+    if resident is not None:
+        instance("resident", resident, ResidentCloud)
     capture = _plain(capture)
     uploaded = (
         resident

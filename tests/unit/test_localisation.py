@@ -16,7 +16,7 @@ from fidsplat.backends.alignment import AlignmentFit, Estimate, PerturbedFrame
 from fidsplat.cameras.pose_offset import offset_camera
 from fidsplat.cli import main
 from fidsplat.images.files import write_png
-from fidsplat.localisation import direct_alignment
+from fidsplat.localisation import Localisation, direct_alignment
 from fidsplat.localisation.direct_alignment import stages_of
 from fidsplat.localisation.normal_equations import HostAlignment, Source
 from fidsplat.splats.rotations import rigid_matrix
@@ -381,12 +381,14 @@ def test_errors_of_localisation(renderer, room, tmp_path, capsys):
         fs.localise(image[:, :60], scene, scene.camera, renderer=renderer, resident=resident)
     with pytest.raises(fs.InputError, match="the image must have a camera, got none"):
         fs.localise(image, scene.clouds[0], np.eye(4), renderer=renderer)
-    for value, got in ((np.nan, "nan"), (np.inf, "inf"), (1e30, "1e"), (-1e6, "[0-9]")):
-        with pytest.raises(fs.InputError, match=f"must be finite and at most 10000, got {got}"):
+    for value, got in ((np.nan, "nan"), (np.inf, "inf"), (1e30, "1e"), (-1e6, "[0-9]"), (200.0, "200")):
+        with pytest.raises(fs.InputError, match=f"must be finite and at most 100, got {got}"):
             fs.localise(np.full((48, 64), value), scene, scene.camera, renderer=renderer)
-    ignored = np.zeros((48, 64), bool)
+    ignored = [[False] * 64] * 48
     with pytest.raises(fs.InputError, match="pixels away from the border and from ignored pixels, got none"):
         fs.localise(image, scene, scene.camera, mask=ignored, renderer=renderer, resident=resident)
+    with pytest.raises(fs.InputError, match="resident must be a ResidentCloud"):
+        fs.localise(image, scene, scene.camera, renderer=renderer, resident=scene)
     scene.save(tmp_path / "scene.toml")
     write_png(tmp_path / "photo.png", image)
     words = ["localise", str(tmp_path / "photo.png"), "--scene", str(tmp_path / "scene.toml")]
@@ -398,6 +400,23 @@ def test_errors_of_localisation(renderer, room, tmp_path, capsys):
     assert "must be a scene file (.toml) with the camera of the photographs" in capsys.readouterr().err
     assert main(words) == 2
     assert capsys.readouterr().err.count("\n") == 1
+    file = tmp_path / "poses.tum"
+    words += ["--start", "3.1,-2.05,4.7,0,1,0,0", "-o", str(file)]  # away from the scene
+    assert main(words) == 2
+    printed = capsys.readouterr()
+    assert "Poses in" in printed.out
+    assert "a pose must be found to write" in printed.err
+    file.write_text("mine")
+    assert main(words) == 2
+    assert "already exists" in capsys.readouterr().err
+    assert file.read_text() == "mine"
+
+
+def test_a_pose_with_a_large_deviation_is_not_found(room):
+    covariance = np.diag([1e-6] * 6)
+    camera = room[0].camera
+    assert Localisation(camera, covariance, 1.0, 0.01, "start").found
+    assert not Localisation(camera, 1e5 * covariance, 1.0, 0.01, "start").found
 
 
 def test_the_example_of_gtsam(capsys):
