@@ -102,12 +102,12 @@ def read_scene(
     on_disk = [table for table in tables if table.text("file").lower().endswith(SUFFIX)]
     load = cache(lambda name: load_splats(file.parent / name, progress))
     splats, markers, total = [], [], 0
-    for table in tables:
-        if table not in on_disk:
-            splats.append(_splats(table, load))
+    for splat_table in tables:
+        if splat_table not in on_disk:
+            splats.append(_splats(splat_table, load))
             total = _checked_total(file, total, splats[-1][0])
-    for table in top.tables("markers", MARKERS):
-        markers.append(_marker(table, file.parent, marker_quality, progress))
+    for marker_table in top.tables("markers", MARKERS):
+        markers.append(_marker(marker_table, file.parent, marker_quality, progress))
         total = _checked_total(file, total, markers[-1].marker.cloud)
     return dict(
         clouds=tuple(cloud for cloud, _ in splats),
