@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import json
 import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -33,7 +34,7 @@ from fidsplat.markers.spec import Detector
 from fidsplat.render.renderer import Renderer
 from fidsplat.util.arguments import whole_number
 from fidsplat.util.errors import InputError, unknown
-from fidsplat.util.files import writable_folder
+from fidsplat.util.files import read_text, writable_folder, write_file
 from fidsplat.vision.bop import BopScene
 from fidsplat.vision.coco import CocoAnnotations
 from fidsplat.vision.detect import detect
@@ -284,17 +285,28 @@ def errors_of(corners: np.ndarray | None, view: MarkerView) -> Errors:
 def write_labels(options: TagSettings, folder: Path) -> Iterator[Path]:
     """Write images and ground truth of all points; yields the folder of each point.
 
-    FOLDER/train/000000 and so on are scenes of a BOP data set, each with a `coco.json`; with a lens, which
-    BOP lacks, only COCO annotations are written. Existing folders are unchanged.
+    FOLDER/train/000000 and so on are scenes of a BOP data set, each with a `coco.json` and its point in
+    `point.json`; with a lens, which BOP lacks, only COCO annotations are written. Existing folders of the
+    same points are unchanged.
+
+    Raises InputError if the folder of a point has another point.
     """
     renderer = Renderer(options.device)
-    for number, key in enumerate(points_of(options)):
-        yield _write_point(key, writable_folder(folder / "train" / f"{number:06d}"), renderer, options.seed)
+    every = points_of(replace(options, shard=None))
+    for key in points_of(options):
+        place = writable_folder(folder / "train" / f"{every.index(key):06d}")
+        yield _write_point(key, place, renderer, options.seed)
 
 
 def _write_point(key: Key, folder: Path, renderer: Renderer, seed: int) -> Path:
-    done = folder / "coco.json"
+    done = folder / "point.json"
+    point = json.dumps({name: key[name] for name in key if name != "detectors"} | {"seed": seed})
     if done.is_file():
+        if read_text(done) != point:
+            raise InputError(
+                f"{done} must have the point {point}, got another one; repeat the earlier options, "
+                "or give another folder"
+            )
         return folder
     (folder / "scene_gt.json").unlink(missing_ok=True)  # of an interrupted run
     coco, bop = CocoAnnotations(), BopScene(folder)
@@ -313,7 +325,8 @@ def _write_point(key: Key, folder: Path, renderer: Renderer, seed: int) -> Path:
             write_png(folder / "rgb" / f"{k:06d}.png", images["rgb"])
     if flat:
         bop.save()
-    coco.save(done)
+    coco.save(folder / "coco.json")
+    write_file(done, point)
     return folder
 
 

@@ -252,3 +252,10 @@ def test_labels_are_scenes_of_bop_with_coco(capsys, tmp_path):
     written = (folder / "rgb" / "000000.png").stat().st_mtime_ns
     assert run(capsys, *words)[0] == 0
     assert (folder / "rgb" / "000000.png").stat().st_mtime_ns == written
+    other = ["2/2" if word == "1/2" else word for word in words]  # the other point of the same folder
+    (second,) = map(Path, json.loads(run(capsys, *other)[1])["folders"])
+    points = [json.loads((place / "point.json").read_text()) for place in (folder, second)]
+    assert points[1] == points[0] | {"cause": "distance", "severity": 1.0}
+    status, _, err = run(capsys, *words, "--seed", "1")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "got another one; repeat the earlier options" in err
