@@ -152,8 +152,11 @@ def _ray_camera(ray) -> Camera:
         origin, direction = (real_array("ray", part, "three numbers") for part in ray)
     except (TypeError, ValueError):
         raise InputError(f"ray must be an origin (3,) and a non-zero direction (3,), got {ray!r}") from None
-    if origin.shape != (3,) or direction.shape != (3,) or not direction.any():
-        raise InputError(f"ray must be an origin (3,) and a non-zero direction (3,), got {ray!r}")
+    parts = origin, direction
+    if any(part.shape != (3,) or not np.isfinite(part).all() for part in parts) or not direction.any():
+        raise InputError(
+            f"ray must be a finite origin (3,) and a finite non-zero direction (3,), got {ray!r}"
+        )
     up = np.eye(3)[np.argmin(np.abs(direction))]
     unit_direction = direction / np.linalg.norm(direction)
     return Camera.look_at(PATCH_SIZE, PATCH_SIZE, _RAY_FOV, origin, origin + unit_direction, up, near=1e-3)
@@ -173,8 +176,8 @@ def _median_of(depth: np.ndarray) -> float:
     depths = depth[depth > 0]
     if not len(depths):
         raise InputError(
-            f"the image near the pixel must have an opacity of at least {MEDIAN_OPACITY}, got less; give "
-            "another pixel"
+            f"the scene near the pixel or ray must have an opacity of at least {MEDIAN_OPACITY}, got less "
+            "in all of the patch; give another one"
         )
     return float(np.median(depths))
 

@@ -135,7 +135,8 @@ def test_the_scenes_camera_is_at_the_time_of_the_shutter(renderer):
         ({}, "exactly one of pixel and ray must be given, got neither"),
         ({"pixel": (80.0, 60.0), "radius": -1.0}, "radius must be a positive length"),
         ({"pixel": (80.0, 60.0), "radius": "1"}, "radius must be a positive length"),
-        ({"ray": (AT, (0.0, 0.0, 0.0))}, r"a non-zero direction \(3,\)"),
+        ({"ray": (AT, (0.0, 0.0, 0.0))}, r"a finite non-zero direction \(3,\)"),
+        ({"ray": (AT, (0.0, math.nan, 0.0))}, "ray must be a finite origin"),
         ({"ray": 3}, "ray must be an origin"),
     ],
 )
