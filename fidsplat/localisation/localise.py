@@ -146,7 +146,7 @@ def localise(
     if pixels.shape[:2] != (camera.height, camera.width):
         raise InputError(
             f"the image must have the camera's size, {camera.width} x {camera.height} pixels, got "
-            f"{pixels.shape[1]} x {pixels.shape[0]}; give the camera that took the image"
+            f"{pixels.shape[1]} x {pixels.shape[0]}; give the image in its original size, or its camera"
         )
     if mask is not None:
         given, mask = mask, np.asarray(mask)

@@ -377,7 +377,7 @@ def test_errors_of_localisation(renderer, room, tmp_path, capsys):
     scene, resident, image = room
     with pytest.raises(fs.InputError, match="initial pose, got no start, no marker of the scene"):
         fs.localise(image, scene, renderer=renderer, resident=resident)
-    with pytest.raises(fs.InputError, match="camera's size, 64 x 48 pixels, got 60 x 48; give the camera"):
+    with pytest.raises(fs.InputError, match="camera's size, 64 x 48 pixels, got 60 x 48; give the image"):
         fs.localise(image[:, :60], scene, scene.camera, renderer=renderer, resident=resident)
     with pytest.raises(fs.InputError, match="the image must have a camera, got none"):
         fs.localise(image, scene.clouds[0], np.eye(4), renderer=renderer)
