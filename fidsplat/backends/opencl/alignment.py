@@ -227,7 +227,7 @@ class OpenCLAlignment(AlignmentKernels):
             lists = self._step_lists(stage, replayed, at.fit, tolerance)
             self._clear_errors()
             found = np.empty(_COST, np.float32)
-            for number in range(steps + (not at.noise)):  # the first sums may be for the exposure
+            for number in range(steps + (not at.noise)):  # the first one estimates a missing noise
                 if number:
                     replayed.set_rotation(found[_POSE : _POSE + 9])
                     replayed.submit()
@@ -435,7 +435,7 @@ class _Replayed:
         if workspace.frames != self._number:
             if not self._recorded.set_view(self._template, self._queue):
                 return False
-            # `scratch` discards the record of the contents, as `align_step` writes the buffer
+            # `align_step` overwrites this buffer: after `scratch`, the next `upload` copies the view again
             self.view = workspace.pool.scratch("view", self.record.nbytes)
             self._recorded.commands.set({"counts": self._counts})
         return True

@@ -238,8 +238,8 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
 
 
 def _frustum_parts(effects: Collection[str]) -> list[str]:
-    """The file with the test of bounding spheres; none for lenses, and for clouds with both disks
-    and 3D Gaussians, whose bounds are computed in another way."""
+    """The file with the test of bounding spheres; none for lenses, for lowpass="none", and for clouds with
+    both disks and 3D Gaussians, whose bounds are computed in another way."""
     if "camera_pinhole" not in effects:
         return []
     if "ellipsoids_only" in effects:

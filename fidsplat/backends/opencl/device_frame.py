@@ -217,7 +217,7 @@ class DeviceFrame:
         for values in (self.named, self.scalars):
             if name in values:
                 return values[name]
-        if argument.source == "uniform":  # only kernels of gradients
+        if argument.source == "uniform":  # of the backward pass; others are in `scalars`
             group, index = argument.uniform
             return self.view.uniforms_of(group)[index]
         return self.upload(name, self.view.array(name))

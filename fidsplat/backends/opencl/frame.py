@@ -146,7 +146,7 @@ def blend(frame: DeviceFrame, band: TileBand) -> None:
     arguments: dict[str, Any] = {"band_first": band.first}
     if frame.config.schedule == "group":
         ordered = frame.config.binning != "sort_first" and band.end - band.first == frame.tiles
-        # otherwise not read: any buffer
+        # without an order the kernel does not read it, but an argument must be a buffer
         arguments["tile_order"] = frame.named["tile_order"] if ordered else frame.buffers.starts
         arguments["longest_first"] = ordered
     frame.launch("blend", "blend", ((band.end - band.first) * group,), (group,), **arguments)

@@ -166,9 +166,8 @@ class OpenCLGradients(GradientPipeline):
         frame.launch("blend backward", "blend_backward", (groups * items,), (items,), log_ceiling=log_ceiling)
 
     def _tape_bytes(self) -> int:
-        """Bytes of the struct `Tape` (schedule/lanes_backward.cl): transmittance and opacity of each pixel
-        for a chunk of splats, two words for each splat of eight chunks, and one more word, rounded up to
-        vectors."""
+        """Bytes of the struct `Tape` (schedule/lanes_backward.cl): for each pixel and
+        splat of a chunk, transmittance and alpha; then 2 * 8 * chunk + 1 words, rounded up to vectors."""
         config = self._pipeline.config
         chunk, vector = backward_chunk(self.features, config), 4 * config.lanes
         words = 2 * 8 * chunk + 1

@@ -37,7 +37,7 @@ SPLAT = Record(
         member("wide nu0 nux nuy", "n_u = nu0 + nux x + nuy y"),
         member("wide nv0 nvx nvy"),
         member("wide d0 dx dy", "D"),
-        member("wide d_near", "D at depth `near`: a fragment is in front of the near plane if D <= d_near"),
+        member("wide d_near", "D at depth `near`: a fragment is beyond the near plane if D <= d_near"),
         member("wide log_opacity"),
         member("wide r g b"),
         member("float ax ay", "anchor: pixel, an integer, that is the origin of x and y"),
@@ -215,7 +215,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_gradients": args(
         *(
             _RESERVED,
-            "out uint big_rows  // (rows of tiles, big splats): tiles in higher rows, minus first column",
+            "out uint big_rows  // (rows of tiles, big splats): plus a column = index of the splat's tile",
         )
     ),
     "blend_backward": args(

@@ -94,7 +94,7 @@ class MemoryPlanner:
         samples, tables = self._samples_and_tables(view)
         fixed = reserved + resident_bytes + UNIFORM_BYTES + tables
         fixed += MIN_BIG * (4 + self._source.records["Bounds"].itemsize)
-        # each sub-frame has its own samples
+        # with sub-frames: the samples of the current one, and those accumulated
         fixed += 4 * samples * self._channels * (2 if view.sub_frames else 1)
         fixed += self._image_bytes(view)
         for name in self._source.view_arrays:

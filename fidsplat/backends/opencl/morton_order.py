@@ -63,7 +63,7 @@ class MortonOrder:
         return gathered
 
     def bound(self, arrays: Mapping[str, cl.Buffer]) -> None:
-        """Compute the bounding spheres of all groups: `spheres` (n, 4) float32 and `max_scales` (n,)."""
+        """Compute the bounding spheres of all groups, `spheres` (groups, 4), and `max_scales` (groups,)."""
         optional = ("thickness", "boxes")
         inputs = [arrays.get(name, arrays["scales"]) for name in ("means", "scales", "opacities", *optional)]
         sizes = (

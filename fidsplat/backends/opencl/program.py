@@ -45,7 +45,7 @@ def build_options(device: cl.Device) -> list[str]:
     version, target = device.version, device.version
     if needs_correction(version):
         target = correct_target(device.int_ptr, version)
-    # make the processor's name part of pyopencl's cache key: PoCL's version string does not contain it
+    # pyopencl's cache key has the version string, which names the processor; a corrected name must be added
     target = "".join(c if c.isalnum() else "_" for c in target)
     options = ["-cl-std=CL1.2", "-w", f"-DTARGET_{target}"]
     rounds = device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT

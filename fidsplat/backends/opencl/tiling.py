@@ -1,10 +1,11 @@
 """Tile binning: the splats of each tile, in depth order.
 
-`sort_first` (CPU): all visible splats are sorted by depth, then appended to tile lists in that order, by
-counting sorts over a few contiguous blocks: long sequential loops, no atomics. `bin_first` (GPU): the
-projection counts the splats of each tile, (splat, tile) pairs are written in any order, and each tile's list
-is sorted in local memory. `bin_local`: like `bin_first`, with counters in local memory, for many small views
-and for chunked scenes on disk, where atomics of neighbouring splats on one tile's counter would serialise.
+`sort_first` (CPUs, and all devices for projection in chunks): all visible splats are sorted by depth, then
+appended to tile lists in that order, by counting sorts over a few contiguous blocks: long sequential loops,
+no atomics. `bin_first` (GPU): the projection counts the splats of each tile, (splat, tile) pairs are written
+in any order, and each tile's list is sorted in local memory. `bin_local`: like `bin_first`, with counters in
+local memory, for many small views and for chunked scenes on disk, where atomics of neighbouring splats on one
+tile's counter would serialise.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ _START_TILES, _MAX_START_GROUPS = 512, 32
 lengths"""
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 _LISTS = ("lists", "windows")
-"""scratch buffer of the lists; those of large clouds replace the tile windows, which only `emit` reads"""
+"""scratch buffer of the lists, without and with culling first: with it, they overwrite the tile windows, which
+are not read after `emit`"""
 
 
 class TileBand(NamedTuple):
@@ -183,7 +185,7 @@ def _prefix_sums(
     return starts
 
 
-# on CPUs with a small memory budget: project in chunks, and store only the visible splats
+# with a small memory budget: project in chunks, and store only the visible splats
 
 
 class PackedCounts(NamedTuple):

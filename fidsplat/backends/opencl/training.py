@@ -209,7 +209,8 @@ class OpenCLTraining:
         return arrays
 
     def resident(self, degree: int, origin: np.ndarray) -> ResidentArrays:
-        """The splats in training as a cloud, with SH up to `degree`; it shares and changes with the state."""
+        """The splats in training as a cloud, with SH up to `degree`; it shares the buffers of the
+        state and changes with them."""
         if self._resident is None or self._resident[0] != degree:
             count, rendered, stored = self._count, (degree + 1) ** 2, self._shapes["sh"][1]
             shared = degree > 0 and rendered == stored  # the coefficients are rendered as they are

@@ -1,6 +1,6 @@
 """Declarations of OpenCL's built-in functions for PoCL 3.0, limited to functions that a program may call.
 
-PoCL's compiler reads 14,000 declarations with each program, which takes half of the build time.
+PoCL's compiler reads 14,000 declarations with each program, a third of the compile time of a new feature set.
 """
 
 import importlib.util
@@ -18,8 +18,8 @@ OPTION = "-D_OPENCL_H_"
 
 
 def declared(text: str, version: str) -> str | None:
-    """A program text after the declarations of functions whose names and types are in it, to be compiled with
-    `OPTION`. None: the header of this version of PoCL is not known."""
+    """Prepend to a program text the declarations of the built-in functions that it names; compile the result
+    with `OPTION`. None: the header of this version of PoCL is not known."""
     lines = _lines() if "PoCL 3.0" in version else None
     if lines is None:
         return None

