@@ -37,8 +37,8 @@ _START_TILES, _MAX_START_GROUPS = 512, 32
 lengths"""
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 _LISTS = ("lists", "windows")
-"""scratch buffer of the lists, without and with culling first: with it, they overwrite the tile windows, which
-are not read after `emit`"""
+"""scratch buffer of the lists, without and with culling first: with it, they overwrite the tile windows,
+which are not read after `emit`"""
 
 
 class TileBand(NamedTuple):
