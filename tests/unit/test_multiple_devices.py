@@ -118,7 +118,7 @@ def test_unsupported_requests_are_refused(store, two):
         fs.SeveralDevices([])
     with pytest.raises(fs.InputError, match="devices must be of one model"):
         fs.SeveralDevices(["opencl", "reference"])
-    with pytest.raises(fs.InputError, match="no camera"):
+    with pytest.raises(fs.InputError, match="camera must be given, got none"):
         two.render(store)
     with pytest.raises(fs.InputError, match="scene must be uploaded to all 2 devices, got 1"):
         two.render(two.upload(store)[:1], look())
@@ -148,14 +148,14 @@ def test_frames_precede_a_failure_of_the_captures(store, two):
             expected = alone.render(store.cloud(), look(at=(0.1 * x, 0, 0)))["rgb"]
             assert np.array_equal(frame["rgb"], expected)
     frames, results = two.render_views(store, [look(), look(), fs.Capture(), look()]), []
-    with pytest.raises(fs.InputError, match="no camera"):
+    with pytest.raises(fs.InputError, match="camera must be given, got none"):
         results.extend(frames)
     assert len(results) == 2
     with pytest.raises(fs.InputError, match="must be a list of Capture or Camera"):
         list(two.render_views(store, 3))
     frames = two.render_views(store, [look(), None, look()])  # type: ignore[list-item]
     assert next(frames).outputs
-    with pytest.raises(fs.InputError, match="no camera"):
+    with pytest.raises(fs.InputError, match="camera must be given, got none"):
         next(frames)
 
 
