@@ -12,7 +12,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.backends.opencl.pocl_workarounds import linker, target_patch
-from fidsplat.backends.opencl.pocl_workarounds.declarations import OPTION, declared
+from fidsplat.backends.opencl.pocl_workarounds.declarations import OPTION, with_builtin_declarations
 from fidsplat.backends.opencl.program import build
 
 RENDER = """
@@ -94,7 +94,7 @@ def test_programs_are_built_with_the_declarations_that_they_need():
     ):
         text = f"kernel void f(global float *a) {{ vstore3((float3)({expression}), 0, a); }}"
         text = f"#define PASTE(a, b) a##b\n{text}"
-        short = declared(text, backend.device.platform.version)
+        short = with_builtin_declarations(text, backend.device.platform.version)
         assert (short.count("tgamma(") > 1) == few
         assert len(short) < 250_000
         out = cl.Buffer(backend.context, cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR, hostbuf=values)
@@ -104,10 +104,11 @@ def test_programs_are_built_with_the_declarations_that_they_need():
         np.testing.assert_allclose(actual, [math.gamma(values[0]), values[1], 3], rtol=1e-6)
     version = backend.device.platform.version
     bytes_only = "kernel void h(global uchar *a) { a[get_global_id(0)] = 0; }"
-    cl.Program(backend.context, declared(bytes_only, version)).build([OPTION])  # else PoCL prints an error
+    short = with_builtin_declarations(bytes_only, version)
+    cl.Program(backend.context, short).build([OPTION])  # else PoCL prints an error
     with pytest.raises(fs.DeviceError, match="no_such_name"):
         build(backend, "kernel void g(global float *a) { a[0] = no_such_name(a[0]); }")
-    assert declared(text, "OpenCL 3.0 PoCL 5.0") is None
+    assert with_builtin_declarations(text, "OpenCL 3.0 PoCL 5.0") is None
 
 
 LEAK = """

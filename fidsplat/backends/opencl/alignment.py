@@ -53,12 +53,13 @@ class OpenCLAlignment(AlignmentKernels):
         self._workspace = workspace
         self._items = 1 if workspace.config.schedule == "lanes" else 32
         self._program = Program(workspace, assemble_alignment(self._items))
-        self._commands, self._pyramid = CommandList(self._program), CommandList(self._program)
+        self._commands, self._pyramid_commands = CommandList(self._program), CommandList(self._program)
         self._steps: dict[bool, Program] = {}
         """programs of `align_step`, by whether view records are float64"""
         self._lists: dict[tuple[int, bool], tuple[CommandList, CommandList]] = {}
         self._replays: WeakKeyDictionary[Any, dict[Any, _Replayed]] = WeakKeyDictionary()
-        self._levels: list[dict[str, Any]] = []
+        self._stage_arguments: list[dict[str, Any]] = []
+        """kernel arguments of each stage"""
         self._uploads: deque[cl.Event | None] = deque(maxlen=16)
         """keeps arrays alive until the device has read them"""
 
@@ -69,62 +70,64 @@ class OpenCLAlignment(AlignmentKernels):
             self._scene = scene
             histograms = self._scratch("textures", 4 * BINS * len(stages))
             full = self._upload("image", image), image.shape
-            key = self._workspace.pool.generation, image.shape, [id(level) for level in stages]
-            if self._pyramid.key != key:
-                self._pyramid.clear()
-                self._stages, self._levels, source = stages, [], full
-                for number, level in reversed([*enumerate(stages)]):  # each level from the next finer one
-                    args, source = self._prepared(number, level, source, full, histograms)
-                    self._levels.insert(0, args)
-                self._pyramid.key = self._workspace.pool.generation, *key[1:]
+            key = self._workspace.pool.generation, image.shape, [id(stage) for stage in stages]
+            if self._pyramid_commands.key != key:
+                self._pyramid_commands.clear()
+                self._stages, self._stage_arguments, source = stages, [], full
+                for number, stage in reversed([*enumerate(stages)]):  # each image from the next finer one
+                    args, source = self._prepared(number, stage, source, full, histograms)
+                    self._stage_arguments.insert(0, args)
+                self._pyramid_commands.key = self._workspace.pool.generation, *key[1:]
             cl.enqueue_fill_buffer(self._queue, histograms, _ZERO, 0, 4 * BINS * len(stages))
-            self._pyramid.submit(self._queue)
-            counts = np.empty((len(stages), BINS), np.uint32)
-            cl.enqueue_copy(self._queue, counts, histograms)
+            self._pyramid_commands.submit(self._queue)
+            texture_histograms = np.empty((len(stages), BINS), np.uint32)
+            cl.enqueue_copy(self._queue, texture_histograms, histograms)
         pixels = []
-        for args, histogram in zip(self._levels, counts.astype(np.int64), strict=True):
-            args["min_bin"] = min_bin = lowest_bin(histogram, max_pixels)
-            pixels.append(int(histogram[min_bin:].sum()))
+        for args, texture_histogram in zip(
+            self._stage_arguments, texture_histograms.astype(np.int64), strict=True
+        ):
+            args["min_bin"] = min_bin = lowest_bin(texture_histogram, max_pixels)
+            pixels.append(int(texture_histogram[min_bin:].sum()))
         return pixels
 
     def _prepared(
-        self, number: int, level: CoarseToFineStage, source: _Image, full: _Image, histograms: cl.Buffer
+        self, number: int, stage: CoarseToFineStage, source: _Image, full: _Image, histograms: cl.Buffer
     ) -> tuple[dict[str, Any], _Image]:
-        """Record the kernels of a level; returns their arguments, and the image before blur.
+        """Record the kernels of a stage; returns their arguments, and the image before blur.
 
-        source: the next finer image.
+        number: index of the stage. source: the next finer image.
         """
-        camera = level.camera
+        camera = stage.camera
         finer, (full_height, full_width, channels) = source
         if full_width % camera.width or full_height % camera.height:
             finer, (full_height, full_width, _) = full
         width, height, size = camera.width, camera.height, 4 * camera.width * camera.height
         args = {
-            **{"width": width, "height": height, "channels": channels, "block_size": level.block_size},
+            **{"width": width, "height": height, "channels": channels, "block_size": stage.block_size},
             **{"full_width": full_width, "full_height": full_height},
             **{"ratio_x": full_width / width, "ratio_y": full_height / height},
             **{"focal_x": camera.fx, "focal_y": camera.fy, "center_x": camera.cx, "center_y": camera.cy},
-            # kernels have buffers of all inputs, also if they do not read them
+            # an argument must be a buffer, even where the kernel does not read it
             **{"lens": int(camera.lens is not None), "rays": finer, "taps": finer, "mask": finer},
-            **{"masked": int(level.ignored is not None), "radius": len(level.taps) - 1, "row": number},
+            **{"masked": int(stage.ignored is not None), "radius": len(stage.taps) - 1, "row": number},
             "bins": self._scratch(f"bins {number}", size // 4),
             "counts": histograms,
         }
         if camera.lens is not None:
             raster = raster_of(camera.lens, width, height, camera.fx, camera.fy, camera.cx, camera.cy)
             args["rays"] = self._upload(f"rays {number}", raster.rays)
-        if level.ignored is not None:
-            args["mask"] = self._upload(f"mask {number}", level.ignored.astype(np.uint8))
+        if stage.ignored is not None:
+            args["mask"] = self._upload(f"mask {number}", stage.ignored.astype(np.uint8))
         if args["radius"]:
-            args["taps"] = self._upload(f"taps {number}", level.taps)
+            args["taps"] = self._upload(f"taps {number}", stage.taps)
         image = finer
         if (width, height) != (full_width, full_height):
             image = self._scratch(f"image {number}", channels * size)
             grid = -(-width // 64) * 64, height
             arguments = {**args, "image": finer, "result": image}
-            self._launch("align_downsample", grid, (64, 1), arguments, self._pyramid)
-        args["image"] = self._blurred(image, args, f"image {number}", channels, self._pyramid)
-        self._launch("align_texture", *self._size(self._rows(height)), args, self._pyramid)
+            self._launch("align_downsample", grid, (64, 1), arguments, self._pyramid_commands)
+        args["image"] = self._blurred(image, args, f"image {number}", channels, self._pyramid_commands)
+        self._launch("align_texture", *self._size(self._rows(height)), args, self._pyramid_commands)
         return args, (image, (height, width, channels))
 
     def frame(self, stage: int, pose: np.ndarray, perturbed: bool = False) -> Any:
@@ -135,8 +138,8 @@ class OpenCLAlignment(AlignmentKernels):
         return super().frame(stage, pose)
 
     def _replay(self, stage: int, pose: np.ndarray, perturbed: bool = False) -> _Replayed | None:
-        """Submit a frame of a pyramid level without waiting; None on CPUs, and for clouds with moving groups
-        or in chunks."""
+        """Submit a frame of a stage without waiting. None if it cannot be replayed: on CPUs, in chunks, for
+        an empty cloud, with moving groups, a shutter or parallel rays."""
         camera, (resident, capture) = self._stages[stage].camera, self._scene.key
         sizes = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
         key = capture, *sizes, camera.near, camera.far, camera.lens
@@ -161,7 +164,7 @@ class OpenCLAlignment(AlignmentKernels):
         perturbed: PerturbedFrame | None = None,
         blocks: bool = False,
     ) -> AlignmentSums:
-        channels, args = len(fit.gain), self._levels[stage]
+        channels, args = len(fit.gain), self._stage_arguments[stage]
         groups = self._groups(args, blocks)
         with self._workspace.lock, self._workspace.device_errors("localising"):
             args = self._sum_arguments(args, frame, fit, groups)
@@ -181,14 +184,14 @@ class OpenCLAlignment(AlignmentKernels):
     def derivatives(
         self, stage: int, frame: Any, fit: AlignmentFit, motions: Sequence[tuple[np.ndarray, float, int]]
     ) -> list[np.ndarray]:
-        workspace, level = self._workspace, self._levels[stage]
+        workspace, stage_arguments = self._workspace, self._stage_arguments[stage]
         with workspace.rendering():
             if isinstance(frame, _ReplayedImages):
-                groups, totals = self._groups(level, False), []
-                args = self._sum_arguments(level, frame, fit, groups)
+                groups, totals = self._groups(stage_arguments, False), []
+                args = self._sum_arguments(stage_arguments, frame, fit, groups)
                 self._clear_errors()
                 self._upload_fit(fit)
-                self._by_groups("align_errors", self._rows(level["height"]), args)
+                self._by_groups("align_errors", self._rows(stage_arguments["height"]), args)
                 for number, (pose, size, axis) in enumerate(motions):
                     replayed = self._replay(stage, pose, True)
                     if replayed is None:
@@ -198,7 +201,8 @@ class OpenCLAlignment(AlignmentKernels):
                     args |= {"has_perturbed": 1, "step": size, "axis": axis}
                     self._by_groups("align_sums", groups, args)
                     totals.append(self._scratch(f"totals {number}", 4 * (_GROUP_FLOATS + 1)))
-                    counts = {"counts": self._scratch("unused", 4 * BINS)}  # cleared instead of the histogram
+                    # `align_totals` clears `counts`: another buffer, so that the histogram of residuals stays
+                    counts = {"counts": self._scratch("unused", 4 * BINS)}
                     self._launch(
                         *("align_totals", (256,), (256,)),
                         args | counts | replayed.arguments(groups, totals[-1]),
@@ -227,7 +231,8 @@ class OpenCLAlignment(AlignmentKernels):
             lists = self._step_lists(stage, replayed, at.fit, tolerance)
             self._clear_errors()
             found = np.empty(_COST, np.float32)
-            for number in range(steps + (not at.noise)):  # the first one estimates a missing noise
+            # one more iteration if the noise is unknown: the first one estimates it
+            for number in range(steps + (not at.noise)):
                 if number:
                     replayed.set_rotation(found[_POSE : _POSE + 9])
                     replayed.submit()
@@ -246,28 +251,28 @@ class OpenCLAlignment(AlignmentKernels):
         self, stage: int, replayed: _Replayed, fit: AlignmentFit, tolerance: float
     ) -> tuple[CommandList, CommandList]:
         """Command lists of the sums of a frame, and of a step."""
-        level, double = self._levels[stage], replayed.record.dtype == np.float64
+        stage_arguments, double = self._stage_arguments[stage], replayed.record.dtype == np.float64
         if double not in self._steps:
             self._steps[double] = Program(self._workspace, assemble_alignment_step(double))
         if (stage, double) not in self._lists:
             self._lists[stage, double] = CommandList(self._program), CommandList(self._steps[double])
         sums, step = lists = self._lists[stage, double]
-        key = self._workspace.pool.generation, replayed, tolerance, level | {"min_bin": 0}
+        key = self._workspace.pool.generation, replayed, tolerance, stage_arguments | {"min_bin": 0}
         if sums.key == key:
-            sums.set({"min_bin": level["min_bin"]})
+            sums.set({"min_bin": stage_arguments["min_bin"]})
             return lists
         sums.clear()
         step.clear()
-        groups = self._groups(level, False)
-        args = self._sum_arguments(level, replayed.images[0], fit, groups, sums)
+        groups = self._groups(stage_arguments, False)
+        args = self._sum_arguments(stage_arguments, replayed.images[0], fit, groups, sums)
         args |= replayed.arguments(groups, self._scratch("totals", 4 * (_GROUP_FLOATS + 1)))
         args |= {"state": self._scratch("state", 4 * _STATE), "tolerance": tolerance}
         args |= {"focal": max(args["focal_x"], args["focal_y"]), "pose": self._scratch("pose", 8 * 15)}
-        self._launch("align_errors", *self._size(self._rows(level["height"])), args, sums)
+        self._launch("align_errors", *self._size(self._rows(stage_arguments["height"])), args, sums)
         self._launch("align_sums", *self._size(groups), args, sums)
         self._launch("align_totals", (256,), (256,), args, sums)
         self._launch("align_step", (1,), (1,), args, step)
-        sums.key = self._workspace.pool.generation, replayed, tolerance, level | {"min_bin": 0}
+        sums.key = self._workspace.pool.generation, replayed, tolerance, stage_arguments | {"min_bin": 0}
         return lists
 
     def _groups(self, args: dict[str, Any], blocks: bool) -> int:
@@ -294,10 +299,11 @@ class OpenCLAlignment(AlignmentKernels):
         }
 
     def _errors(self) -> cl.Buffer:
+        """Histogram of the residuals (BINS,) uint32."""
         return self._scratch("errors", 4 * BINS)
 
     def _clear_errors(self) -> None:
-        """Clear the histogram to which `align_errors` adds; `align_totals` clears it too."""
+        """Clear the histogram of residuals, to which `align_errors` adds; `align_totals` clears it too."""
         cl.enqueue_fill_buffer(self._queue, self._errors(), _ZERO, 0, 4 * BINS)
 
     def _upload_fit(self, fit: AlignmentFit) -> cl.Buffer:
@@ -322,7 +328,7 @@ class OpenCLAlignment(AlignmentKernels):
         channels: int,
         commands: CommandList | None = None,
     ) -> cl.Buffer:
-        """An image convolved with the taps of a pyramid level; the image itself without blur."""
+        """An image convolved with the taps of a stage; the image itself without blur."""
         if not args["radius"]:
             return image
         for vertical in (0, 1):
@@ -372,7 +378,7 @@ class OpenCLAlignment(AlignmentKernels):
 class _ReplayedImages:
     """Images of a replayed frame. `images` is the object itself, so that it replaces a Frame.
 
-    owner: its release returns the buffers to the pool.
+    owner: object that owns the image buffers; they return to the pool when it is released.
     """
 
     def __init__(self, named: dict[str, cl.Buffer], owner: Any = None) -> None:
@@ -383,7 +389,7 @@ class _ReplayedImages:
 
 
 class _Replayed:
-    """Frames of a pyramid level at any pose, by one command list."""
+    """Frames of a stage at any pose, by one command list."""
 
     def __init__(
         self,
@@ -393,7 +399,8 @@ class _Replayed:
         origin: np.ndarray,
         perturbed: dict[str, cl.Buffer],
     ) -> None:
-        """owner: releases the frame's images. perturbed: buffers of the images of `PerturbedFrame`."""
+        """owner: object that owns the image buffers; they return to the pool when it is released. perturbed:
+        buffers of the images of `PerturbedFrame`."""
         pool = workspace.pool
         self._workspace, self._recorded, self._origin = workspace, frame.recorded, origin
         arrays = projection_arrays(frame.batch, frame.source, 0, frame.rows)

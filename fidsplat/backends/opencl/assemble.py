@@ -238,8 +238,8 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
 
 
 def _frustum_parts(effects: Collection[str]) -> list[str]:
-    """The file with the test of bounding spheres; none for lenses, for lowpass="none", and for clouds with
-    both disks and 3D Gaussians, whose bounds are computed in another way."""
+    """The file with the test of bounding spheres; none for cameras other than the pinhole, for disks with
+    lowpass="none", for box splats, and for clouds with 3D Gaussians unless all are rendered by EWA."""
     if "camera_pinhole" not in effects:
         return []
     if "ellipsoids_only" in effects:
@@ -412,9 +412,9 @@ class Assembler:
         body = with_scalars(body, self._declared.scalars.wide)
         bare = _COMMENT.sub("", body)
         head = ""
-        for number, value in sorted(self._defines.items()):
-            if number in bare:  # an unused number must not change the text
-                head += f"#define {number} {value}\n"
+        for constant, value in sorted(self._defines.items()):
+            if constant in bare:  # a constant that the text does not use must not change it
+                head += f"#define {constant} {value}\n"
         return ProgramSource(f"// the program `{name}`\n{head}{body}", f"\n{head}{bare}")
 
     def _fill(self, hook: str, subject: str) -> Iterator[str]:

@@ -203,6 +203,7 @@ class RayBuffers:
             sizes[rows, columns] = {"rays": self._planar("rays", raster.rays, rows, columns)}
             if raster.lens.kind != "equirectangular":
                 maps = self._buffers.setdefault(raster.full_raster or raster, {}).setdefault((0, 0), {})
+                # one table: `bounds_pyramid` on the host, `inverse_lens_lut` in kernels
                 if "inverse_lens_lut" not in maps:
                     maps["inverse_lens_lut"] = self._upload("inverse_lens_lut", raster.bounds_pyramid[0])
                 sizes[rows, columns]["inverse_lens_lut"] = maps["inverse_lens_lut"]

@@ -91,7 +91,8 @@ class OpenCLChunkCache:
         return GatheredChunks(self, chunks, first_id)
 
     def prefetch(self, chunks: Sequence[Chunk]) -> None:
-        """Load chunks of the next frame from another thread, as far as there are free slots."""
+        """Load chunks of the next frame from another thread, into free slots and those of chunks that neither
+        the current nor the next frame uses."""
         requested = {chunk.key for chunk in chunks}  # pinned: requested chunks must not evict each other
         for chunk in chunks:
             with self._lock:

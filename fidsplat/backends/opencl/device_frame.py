@@ -40,7 +40,8 @@ class FrameBuffers:
     windows: cl.Buffer
     """tiles that a splat overlaps (v, n) uint2: a bit mask of 8 x 4 tiles at most, or its index in `big`"""
     counters: cl.Buffer
-    """totals of the frame, then the length of each tile's list (COUNTERS + t) uint32"""
+    """totals of the frame, then the length of each tile's list (COUNTERS + t) uint32; totals of each view
+    (v, COUNTERS) with `sort_first`"""
     big: cl.Buffer
     """splats whose tiles do not fit into a window (big_capacity) uint32"""
     big_bounds: cl.Buffer
@@ -62,7 +63,7 @@ class FrameBuffers:
     batch_indices: cl.Buffer
     """index of each view in the output images (v) uint32"""
     termination_depths: cl.Buffer
-    """termination depth of each tile (t) uint32"""
+    """depth key at which each tile was terminated (t) uint32"""
 
 
 @dataclass

@@ -162,7 +162,12 @@ EFFECT_CODE: dict[str, EffectCode] = {
     "blend_double": EffectCode(),
     "blend_half": EffectCode(
         "effect/blend_half.cl",
-        splat=(member("uint rg b1", "two float16 each: (r, g) and (b, -1)"),),
+        splat=(
+            member(
+                "uint rg b1",
+                "(r, g) and (b, -1) in float16; blending adds weight * (b, -1) to (blue, transmittance)",
+            ),
+        ),
         packed=(("r", "WORDS_LOW({}rg)"), ("g", "WORDS_HIGH({}rg)"), ("b", "WORDS_LOW({}b1)")),
     ),
     "termination_depths": EffectCode(

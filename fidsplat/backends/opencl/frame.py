@@ -74,7 +74,7 @@ def render_sort_first(frame: DeviceFrame) -> None:
 
 def render_bin_first(frame: DeviceFrame) -> None:
     """Render on a GPU: submit all stages with the list capacity of previous frames, and again with larger
-    lists if they exceeded it."""
+    lists if the pairs exceed it."""
     frame.upload_view(0, frame.rows)
     frame.acquire("counts", 4 * COUNTS)
     capacity = tiling.pair_capacity(frame.workspace, frame.config)

@@ -33,8 +33,8 @@ class KernelConfig:
     rows: int = 2
     """pixels in a column that a work-item blends (`group`)"""
     tape: int = 1024
-    """splats of a tile whose fragments are stored for the backward pass (`lanes`), 2 KiB each; other
-    fragments are computed twice"""
+    """splats of a tile whose fragments are stored for the backward pass (`lanes`), 8 bytes per pixel
+    each; other fragments are computed twice"""
     splats_per_item: int = 1
     """splats that a work-item of the project stage projects, vectorised if more than 1 (`lanes`)"""
     culls_first: bool = False

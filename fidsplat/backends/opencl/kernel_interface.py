@@ -180,7 +180,9 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "count_big": args("uint count", _SIZE, _BIG, "in uint big", "out uint counters"),
     "emit": args(
         *(
-            "uint count splat_groups first_band",
+            "uint count",
+            "uint splat_groups  // work-groups with one work-item per splat, after those of the big splats",
+            "uint first_band  // whether to add the visible splats to counts",
             _SIZE,
             "int band_first band_end",
             "uint capacity big_capacity",
@@ -190,11 +192,15 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "count_local": args("uint count", _SIZE, "in uint2 windows", "in uint keys", "out uint counters"),
     "emit_local": args(
-        *("uint count first_band", _SIZE, "int band_first band_end", "uint capacity"),
+        "uint count",
+        "uint first_band  // whether to add the visible splats to counts",
+        *(_SIZE, "int band_first band_end", "uint capacity"),
         *("in uint2 windows", "in uint keys starts", "out uint counts cursors", "out uint2 pairs"),
     ),
     "sort_tiles": args(
-        "int band_first", "uint clear", "in uint starts", "out ulong pairs", "out uint lists counters"
+        "int band_first",
+        "uint clear  // whether to zero the counters for the next frame",
+        *("in uint starts", "out ulong pairs", "out uint lists counters"),
     ),
     "blend": _BLEND,
     "accumulate": args(_ACCUMULATED, "float weight", "int first", "in float raw", "out float accumulated"),
@@ -277,7 +283,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "align_texture": args(
         *("int width height channels row", _MASK, "in float image", "out uchar bins"),
-        "out uint counts  // (stages, BINS); row: the stage",
+        "out uint counts  // (stages, BINS); row: index of the stage",
     ),
     "align_errors": args(_ALIGNED, "out uint counts  // (BINS)"),
     "align_sums": args(

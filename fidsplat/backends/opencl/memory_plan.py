@@ -26,7 +26,7 @@ from fidsplat.util.errors import DeviceError, bytes_words
 DEFAULT_CHUNK = 1 << 20
 """splats of a chunk; a power of two, so that the chunks of every array start at aligned addresses"""
 _MAX_CHUNK = 1 << 23
-"""maximum splats of a chunk if memory is ample: larger chunks need fewer launches"""
+"""splats up to which chunks are enlarged if memory is ample, for fewer launches"""
 _MIN_CHUNK = 1 << 10
 KEY_BYTES, WINDOW_BYTES, SORT_BYTES = 4, 8, 16
 """bytes per splat of sort keys, of tile windows, and of keys and indices during the sort"""
@@ -165,7 +165,8 @@ def plan_of(
     if fits and count * record_bytes <= limit:
         return MemoryPlan(0, count, fixed_bytes + splat_bytes + pair_bytes)
     free = budget - fixed_bytes - pair_bytes
-    # a chunk takes at most 1/8 of the free memory, and grows only up to 1/64: the rest is for visible splats
+    # chunks are enlarged while they take less than 1/64 of the free memory, and reduced above 1/8; the rest
+    # is for visible splats
     chunk, chunked_bytes = DEFAULT_CHUNK, projected_bytes + upload_bytes
     while chunk < _MAX_CHUNK and chunk * chunked_bytes < free // 64:
         chunk *= 2

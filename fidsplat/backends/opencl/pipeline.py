@@ -52,7 +52,7 @@ class CachedFrame:
 
 
 class OpenCLPipeline(Pipeline):
-    """Compiled stages."""
+    """Stages compiled for one feature set; renders views and batches, and replays their command lists."""
 
     def __init__(
         self,
@@ -146,8 +146,9 @@ class OpenCLPipeline(Pipeline):
             return frame
 
     def replay_undivided(self, resident: Resident, view: View, pair_limit: int) -> DeviceFrame:
-        """Render one frame like `render_undivided` without waiting for its counts (`DeviceFrame.count_pairs`
-        does), by a replay if possible. pair_limit: maximum capacity of the lists."""
+        """Render one frame like `render_undivided` without waiting for its counts, which
+        `DeviceFrame.count_pairs` reads later; replayed if possible. pair_limit: maximum capacity of the
+        lists."""
         if self.config.binning == "sort_first" or not resident.count:
             return self.render_undivided(resident, view)
         workspace, key = self.workspace, (*self._key(view), pair_limit)

@@ -26,13 +26,13 @@ def evaluate(
     outputs. Without float64, PROJECTION_FP64 is 0 and `real` is float.
     """
     kernel = compile_test_kernels(workspace, text=text, lanes=1)["probe"]
-    given = [buffer_of(workspace, array) for array in inputs]
-    made = [np.empty(len(inputs[0]), dtype) for dtype in outputs]
-    taken = [buffer_of(workspace, array) for array in made]
-    kernel(workspace.queue, (len(inputs[0]),), None, *given, *taken)
-    for array, buffer in zip(made, taken, strict=True):
+    input_buffers = [buffer_of(workspace, array) for array in inputs]
+    results = [np.empty(len(inputs[0]), dtype) for dtype in outputs]
+    result_buffers = [buffer_of(workspace, array) for array in results]
+    kernel(workspace.queue, (len(inputs[0]),), None, *input_buffers, *result_buffers)
+    for array, buffer in zip(results, result_buffers, strict=True):
         cl.enqueue_copy(workspace.queue, array, buffer)
-    return made
+    return results
 
 
 class _PoisonedPool(BufferPool):
@@ -70,7 +70,8 @@ CONTRACTION = """
 kernel void probe(global const float *a, global const float *b, global const float *c,
                   global float *difference, global float *sum, global real *wide, global float *fused) {
     int i = get_global_id(0);
-    difference[i] = a[i] * b[i] - c[i] * b[i];      // a is c: 0 unless one product is not rounded
+    // a equals c: 0, unless the compiler fuses one of the products into the subtraction
+    difference[i] = a[i] * b[i] - c[i] * b[i];
     sum[i] = a[i] * b[i] + c[i];
     wide[i] = (real)a[i] / 3 * ((real)b[i] / 3) - (real)c[i] / 3 * ((real)b[i] / 3);
     float product = a[i] * b[i];
@@ -111,18 +112,18 @@ class OpenCLProbe(Probe):
             workspace, "check/arithmetic.cl", effects=("effect/arithmetic_fast.cl",)
         )
 
-        def run(kernel: str, items: int, made: np.ndarray, *given: Any) -> np.ndarray:
-            values = [buffer_of(workspace, one) if isinstance(one, np.ndarray) else one for one in given]
-            out = buffer_of(workspace, made)
+        def run(kernel: str, items: int, result: np.ndarray, *inputs: Any) -> np.ndarray:
+            values = [buffer_of(workspace, one) if isinstance(one, np.ndarray) else one for one in inputs]
+            out = buffer_of(workspace, result)
             kernels[kernel](workspace.queue, (items,), None, *values, out)
-            cl.enqueue_copy(workspace.queue, made, out)
-            return made
+            cl.enqueue_copy(workspace.queue, result, out)
+            return result
 
         single = [array.astype(np.float32) for array in (exponents, fractions, dividends, divisors)]
         names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log", "reciprocal")
-        made, count, items = np.empty((8, n), np.float32), np.uint32(n), n // workspace.config.lanes
+        single_results, count, items = np.empty((8, n), np.float32), np.uint32(n), n // workspace.config.lanes
         try:
-            parts = run("arithmetic_float", items, made, count, *single)
+            parts = run("arithmetic_float", items, single_results, count, *single)
             results: dict[str, np.ndarray] = dict(zip(names, parts, strict=True))
             if workspace.info.float64:
                 parts = run("arithmetic_real", n, np.empty((3, n)), count, dividends, divisors)
@@ -141,23 +142,22 @@ class OpenCLProbe(Probe):
         workspace, items = pipeline.workspace, (pipeline.config.scan_items,)
         starts = buffer_of(workspace, np.empty(len(lengths) + 1, np.uint32))
         sums = buffer_of(workspace, np.zeros(8, np.uint32))
-        given = {"starts": starts}
+        arguments = {"starts": starts}
         if pipeline.config.binning != "sort_first":
             kernel, total_index, size = "tile_starts", 1, (3 * items[0],)
-            given |= {"tiles": len(lengths), "capacity": 2**32 - 1, "counts": sums}
+            arguments |= {"tiles": len(lengths), "capacity": 2**32 - 1, "counts": sums}
             counters = buffer_of(workspace, np.concatenate([np.zeros(8, np.uint32), lengths]))
-            given |= {"counters": counters, "cursors": buffer_of(workspace, lengths)}
-            given["tile_order"] = buffer_of(workspace, np.empty_like(lengths))
+            arguments |= {"counters": counters, "cursors": buffer_of(workspace, lengths)}
+            arguments["tile_order"] = buffer_of(workspace, np.empty_like(lengths))
         else:
             kernel, total_index, size = "scan_bins", 4, items
-            given |= {
+            arguments |= {
                 "bins": len(lengths),
                 "totals": buffer_of(workspace, lengths),
                 "counters": sums,
                 "counter": 4,
             }
-        arguments = pipeline.source.arguments[kernel]
-        values = [given[one.name] for one in arguments]
+        values = [arguments[one.name] for one in pipeline.source.arguments[kernel]]
         CommandList(pipeline.program).launch(workspace.queue, kernel, size, items, values)
         positions = contents(workspace, starts).view(np.uint32)
         words = contents(workspace, sums).view(np.uint32)

@@ -22,7 +22,7 @@ from fidsplat.util import interrupts
 from fidsplat.util.errors import DeviceError, FidsplatError
 
 in_background = threading.local()
-"""`on` in compile threads, for which `BackgroundCompiler.begin` has set the warning filters"""
+"""thread-local; `on` is True in threads of BackgroundCompiler, which must not change the warning filters"""
 
 
 class _InvokerCache(dict[Any, Any]):

@@ -1,5 +1,5 @@
 """Frame replay: the command list of a frame is submitted again for another view of the same cloud. Only
-output images and numbers of the view are set, which is much faster than planning a frame. On a CPU the host
+output images and arguments of the view are set, which is much faster than planning a frame. On a CPU the host
 reads the counts before the lists are written, as in `render_sort_first`.
 """
 
@@ -51,7 +51,7 @@ class RecordedFrame:
         self._views: dict[int, tuple[View, dict[str, np.ndarray], dict[str, Any]]] = {
             id(frame.view): (frame.view, frame.arrays, scalar_arguments(frame.view, frame.source))
         }
-        """rendered views with their arrays and numbers"""
+        """rendered views with their arrays and scalar arguments"""
         self._bytes = 0
         self._uploads: deque[cl.Event] = deque(frame.uploads, maxlen=_UPLOADS)
         self._acquired_sizes = [(name, buffer.size) for name, buffer in frame.acquired.items()]
@@ -63,8 +63,8 @@ class RecordedFrame:
         if pool.generation is not self.generation:
             return False
         if view is not self._view:
-            _, arrays, numbers = self._views.get(id(view)) or self._cache_view(view)
-            self.commands.set(numbers)
+            _, arrays, scalars = self._views.get(id(view)) or self._cache_view(view)
+            self.commands.set(scalars)
             self._view, self._arrays = view, arrays
         for name, array in self._arrays.items():
             _, event = pool.upload(queue, name, array)

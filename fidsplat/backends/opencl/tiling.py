@@ -36,9 +36,10 @@ _START_TILES, _MAX_START_GROUPS = 512, 32
 """tiles per work-group of the kernel `tile_starts`, and maximum number of work-groups: each reads all list
 lengths"""
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
+"""window of a splat without tiles: an index beyond the end of `big`, and no bits"""
 _LISTS = ("lists", "windows")
-"""scratch buffer of the lists, without and with culling first: with it, they overwrite the tile windows,
-which are not read after `emit`"""
+"""name of the lists' scratch buffer, by `culls_first`: True reuses the buffer of the windows, which no kernel
+reads after `emit`"""
 
 
 class TileBand(NamedTuple):
@@ -64,21 +65,22 @@ def allocate_counters(frame: DeviceFrame, words: int, big: int = 0) -> None:
 
 def cull(frame: DeviceFrame, big: int) -> None:
     """List the groups of splats that are not culled by their bounding spheres, and set `frame.projected`."""
-    pool, groups = frame.pool, -(-frame.resident.count // CULLING_GROUP)
+    pool, culling_groups = frame.pool, -(-frame.resident.count // CULLING_GROUP)
     frame.scratch("unculled", 4 * MIN_BIG // CULLING_GROUP)
     for name in ("spheres", "max_scales", "splat_ids"):
         frame.bind(name, frame.resident.sorted_array(name))
     while True:
-        capacity = min(pool.size("unculled") // 4, groups)
+        capacity = min(pool.size("unculled") // 4, culling_groups)
         frame.projected = CULLING_GROUP * capacity
-        frame.launch("project", "cull_groups", (groups,), (_ITEMS,), groups=groups, capacity=capacity)
+        arguments = {"groups": culling_groups, "capacity": capacity}
+        frame.launch("project", "cull_groups", (culling_groups,), (_ITEMS,), **arguments)
         if not frame.waits:
             break
         # with `culls_first` this counter is the number of groups that are not culled
         unculled = int(frame.read("counters", np.uint32, (COUNTERS,))[VISIBLE])
         if unculled <= capacity:
             break
-        frame.scratch("unculled", 4 * min(unculled * 33 // 32, groups))
+        frame.scratch("unculled", 4 * min(unculled * 33 // 32, culling_groups))
         allocate_counters(frame, COUNTERS + frame.tiles, big)
 
 
@@ -281,16 +283,16 @@ def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
     frame.scratch("starts", 4 * (frame.tiles + 1))
     frame.scratch("cursors", 4 * frame.tiles)
     frame.scratch("tile_order", 4 * frame.tiles)
-    groups = 1 + min(-(-frame.tiles // _START_TILES), _MAX_START_GROUPS)
+    work_groups = 1 + min(-(-frame.tiles // _START_TILES), _MAX_START_GROUPS)
     arguments = {"tiles": frame.tiles, "capacity": capacity}
-    return frame.launch("bin", "tile_starts", (groups * items,), (items,), **arguments)
+    return frame.launch("bin", "tile_starts", (work_groups * items,), (items,), **arguments)
 
 
 def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band: bool) -> None:
     frame.scratch("pairs", 8 * capacity)
     shared = frame.config.culls_first and not frame.in_bands
     frame.bind("lists", frame.pool.scratch(_LISTS[shared], 4 * capacity))
-    count, views, groups = frame.projected, frame.views, _big_groups(frame)
+    count, views, work_groups = frame.projected, frame.views, _big_groups(frame)
     arguments = {
         "band_first": band.first,
         "band_end": band.end,
@@ -299,12 +301,12 @@ def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band:
     }
     if frame.config.binning == "bin_local":  # big splats, then all others
         frame.launch(
-            "bin", "emit", (groups * _ITEMS,), (_ITEMS,), views, count=count, splat_groups=0, **arguments
+            "bin", "emit", (work_groups * _ITEMS,), (_ITEMS,), views, count=count, splat_groups=0, **arguments
         )
         launch_local(frame, "emit_local", **arguments)
     else:
         splat_groups = -(-count // _ITEMS)
-        items = (splat_groups + -(-groups // views)) * _ITEMS
+        items = (splat_groups + -(-work_groups // views)) * _ITEMS
         frame.launch(
             "bin", "emit", (items,), (_ITEMS,), views, count=count, splat_groups=splat_groups, **arguments
         )
@@ -326,8 +328,8 @@ def launch_local(frame: DeviceFrame, kernel: str, **arguments: Any) -> None:
     """Submit a kernel of tile_lists_local.cl."""
     count, items = frame.resident.count, frame.config.scan_items
     if count:
-        groups = -(-count // _WORK_GROUP_SPLATS)
-        frame.launch("bin", kernel, (groups * items,), (items,), frame.views, count=count, **arguments)
+        work_groups = -(-count // _WORK_GROUP_SPLATS)
+        frame.launch("bin", kernel, (work_groups * items,), (items,), frame.views, count=count, **arguments)
 
 
 def _big_groups(frame: DeviceFrame) -> int:

@@ -5,7 +5,7 @@ from functools import cache
 
 import pyopencl as cl
 
-from fidsplat.backends.opencl.pocl_workarounds.declarations import OPTION, declared
+from fidsplat.backends.opencl.pocl_workarounds.declarations import OPTION, with_builtin_declarations
 
 
 def is_pocl(device: cl.Device) -> bool:
@@ -26,7 +26,7 @@ def shared_context(device: cl.Device) -> cl.Context:
 @cache
 def shared_program(context: cl.Context, text: str, options: tuple[str, ...]) -> cl.Program:
     """The program of a text compiled with these options, in this call or an earlier one."""
-    short = declared(text, context.devices[0].platform.version)
+    short = with_builtin_declarations(text, context.devices[0].platform.version)
     if short is not None:
         # the build fails if the text calls a function that the header does not declare, or is invalid
         with suppress(cl.RuntimeError):

@@ -17,7 +17,7 @@ OPTION = "-D_OPENCL_H_"
 """option by which PoCL does not read its own declarations"""
 
 
-def declared(text: str, version: str) -> str | None:
+def with_builtin_declarations(text: str, version: str) -> str | None:
     """Prepend to a program text the declarations of the built-in functions that it names; compile the result
     with `OPTION`. None: the header of this version of PoCL is not known."""
     lines = _lines() if "PoCL 3.0" in version else None
