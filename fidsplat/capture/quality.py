@@ -267,8 +267,8 @@ def _read(kind: type[Quality] | type[MarkerQuality], name: str, text: str) -> An
 
 
 # gsplat: `rasterization_2dgs` of gsplat 1.5 and 1.6; surfel: diff-surfel-rasterization of the 2DGS authors.
-# Both clamp alpha at 0.99, cut at 1/255 and drop the fragment whose transmittance would be below 1e-4. They
-# differ in bounding boxes, low-pass centre and near plane, which are defects (docs/conventions.md).
+# Both clamp alpha at 0.99, cut at 1/255 and drop the fragment whose transmittance would be below 1e-4. Their
+# defects in bounding boxes, low-pass centre and near plane are not reproduced (devlog/hard-cases.md).
 _PARITY = Quality(
     alpha_cutoff=1.0 / 255.0,
     transmittance_stop=1e-4,

@@ -116,7 +116,7 @@ def check(options: TagSettings) -> None:
 
 
 def points_of(options: TagSettings) -> list[Key]:
-    """Points of the run's shard, starting with the points without a cause.
+    """Points (scene, family, cause, severity) of this shard; those without degradation come first.
 
     Raises InputError for detectors that cannot be used.
     """

@@ -195,7 +195,7 @@ class _Stage:
     image_noise: float = 0.0
 
     def frame(self, pose: np.ndarray) -> Any:
-        """The scene at a pose (4, 4)."""
+        """Render the stage's frame at a pose (4, 4)."""
         return self.kernels.frame(self.number, pose)
 
     def sums(self, frame: Any, at: Estimate, noise: float = 0.0, **options: Any) -> AlignmentSums:

@@ -62,8 +62,8 @@ class Localisation:
 
     @property
     def found(self) -> bool:
-        """Whether the image determines the pose (`angle_deviation` is at most 0.1 radians), and at least 0.6
-        of its textured blocks match the scene."""
+        """Whether `angle_deviation` is at most 0.1 radians and at least 0.6 of the image's textured blocks
+        match the scene."""
         return self.inliers >= MIN_INLIERS and self.angle_deviation <= MAX_DEVIATION
 
     @property

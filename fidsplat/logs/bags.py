@@ -37,7 +37,7 @@ def bag_metadata(folder: Path) -> dict[str, Any]:
     path = folder / "metadata.yaml"
     text = read_input(path, max_bytes=MAX_METADATA).decode("utf-8")
     if "<<" in text:  # nested merges take exponential time
-        raise InputError(f"{path} must not merge YAML tables, got '<<'; write the tables out")
+        raise InputError(f"{path} must not contain YAML merge keys, got '<<'; write the mappings out")
     return YAML(typ="safe", pure=True).load(text)["rosbag2_bagfile_information"]
 
 

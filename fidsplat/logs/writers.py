@@ -98,7 +98,10 @@ def _target(path: str | os.PathLike[str], overwrite: bool) -> Path:
     refuse_existing(target, overwrite)
     if target.exists() and target.is_dir() != (target.suffix != ".mcap"):
         kind = "folder" if target.is_dir() else "file"
-        raise InputError(f"{target} must be a log to be replaced, got another {kind}; give another name")
+        raise InputError(
+            f"{target} must be a file for .mcap and a folder for rosbag2, got an existing {kind}; give "
+            "another name"
+        )
     if target.is_dir() and not (target / "metadata.yaml").exists():
         raise InputError(
             f"{target} must have metadata.yaml to be overwritten as a bag, got none; give another name"

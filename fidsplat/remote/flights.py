@@ -1,4 +1,5 @@
-"""Rendering of flights by workers, which return the bytes of image files, as they may share no disk."""
+"""Rendering of flights by workers, which send image files to the caller, because they may not share a disk
+with it."""
 
 from __future__ import annotations
 

@@ -1,1 +1,3 @@
-"""Rendering of scenes: renderer, frames, batches, several devices."""
+"""Rendering of scenes: renderer, frames, several devices, flights, LiDAR scans, lighting of markers,
+meshes.
+"""

@@ -57,7 +57,7 @@ from fidsplat.util.errors import InputError
 MAX_OMITTED = 2.0**-23
 """maximum sum of the alphas of a pixel's fragments that the reference image omits"""
 _SLACK = 1.01
-"""relative safety margin for the rounding of the bounds"""
+"""factor on the bounds, for their own rounding"""
 _UNIT_ROUNDOFF = 2.0**-24
 """unit roundoff of float32"""
 
@@ -94,7 +94,7 @@ _REMEDIES = {
     ),
     "blend_double": ("blend_precision='float64'", "blend_precision='float32'"),
 }
-"""option that requests an unbounded effect, and the alternative to use, by the prefix of the effect's name"""
+"""prefix of an effect's name: (option that requests the effect, what to use instead)"""
 _SENSOR_ARGUMENTS = {"noise": "full_well", "quantise": "bits", "response": "response"}
 """arguments of `Sensor` whose names differ from the names of their steps, by the prefix of the step"""
 
@@ -124,7 +124,7 @@ class ErrorReference:
     features: FeatureSet
     view: View
     color_bound: float
-    """maximum of the range of all colours and the largest absolute colour"""
+    """max(R, C): range and largest absolute value of all colours"""
     relative_bound: float
     """error bound per unit of colour, without the bound of the output `rounding`"""
 
@@ -155,7 +155,7 @@ class ErrorImage:
 
 def error_reference(data: Any, capture: Capture, backend: Backend) -> ErrorReference:
     """Prepare the reference image of an uploaded cloud: its features, view and error bound. Raises
-    InputError for an effect without a bound."""
+    InputError for an effect without a bound, a store, or a device without float64."""
     _refuse_unbounded(capture)
     if not isinstance(data, ResidentData):
         raise InputError(

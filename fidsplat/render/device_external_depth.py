@@ -21,8 +21,8 @@ def device_external_depth(
     """External depth images of all views: on the renderer's device if the arrays are there, else on the host.
 
     Args:
-        packed, depths, ids: wp.arrays (views, pixels): colours in uint32, with red from the bit `red_bit`;
-            depths along z [m]; int32 ids of meshes, negative where there is none.
+        packed, depths, ids: wp.arrays (views, pixels): RGB in uint32, 8 bits each, red starts at bit
+            `red_bit`; depths along z [m]; int32 ids of meshes, negative where there is none.
         size: height and width of the images.
     """
     wp, device = load(), packed.device

@@ -25,10 +25,10 @@ class Frame(ImageMapping):
     unit, camera frame, towards the camera, `normal_world` the same in the world's axes; `label`, `splat_id`
     (h, w) int32, of the fragment with the largest weight; `blended` (h, w) int32, number of composited
     splats; `error` (h, w), an upper bound of |rgb - ideal| (fidsplat/render/certified_error.py).
-    `depth_median` is where the transmittance falls to one half, `depth_first` where the accumulated opacity
-    reaches `Quality.first_hit` (docs/rendering.md has the definitions). In pixels with an alpha below 1/255
-    (`_first` outputs: below `first_hit`) `label` and `splat_id` are -1, and depths, distances and normals
-    are 0.
+    `depth_median` is the depth of the last fragment in front of which the transmittance is above one half,
+    `depth_first` that of the first fragment at which the accumulated opacity reaches `Quality.first_hit`
+    (docs/rendering.md has the definitions). In pixels with an alpha below 1/255 (`_first` outputs: below
+    `first_hit`) `label` and `splat_id` are -1, and depths, distances and normals are 0.
     """
 
     _noun = "frame"

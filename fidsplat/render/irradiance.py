@@ -68,11 +68,12 @@ class LightField:
         normal: np.ndarray,
         step: float,
     ) -> LightField:
-        """Refine the grid until the error of the interpolated irradiance is at most `step` times the maximum.
+        """Refine the grid until the interpolated irradiance is within a relative tolerance.
 
         levels: numbers of panoramas along a side, ascending; the last is accepted without a check.
         positions: (m, 2) on the marker. radiance_at: function of positions (k, 2) that returns
-        radiance (k, d, 3). normal: (3,) surface normal of the compared irradiance.
+        radiance (k, d, 3). normal: (3,) surface normal of the compared irradiance. step: relative tolerance,
+        as a fraction of the maximum irradiance.
         """
         field = LightField(*panorama_directions(rows))
         field.low, field.high = positions.min(axis=0), positions.max(axis=0)
@@ -93,7 +94,7 @@ class LightField:
                 _difference(irradiance[::2, 1::2], (coarse[:, 1:] + coarse[:, :-1]) / 2),
                 _difference(irradiance[1::2, ::2], (coarse[1:] + coarse[:-1]) / 2),
             )
-            # `error` is that of the previous, coarser grid; halving the spacing at least halves it
+            # the error of the coarser grid: this grid, with half the spacing, has at most half of it
             if error <= step * irradiance.max():
                 break
         return field

@@ -28,8 +28,8 @@ from fidsplat.util.directions import unit
 from fidsplat.util.errors import InputError
 from fidsplat.util.response import linear_light, to_colors
 
-MAX_PARTS_PER_MODULE = 8
-"""maximum number of parts per module, along each axis, into which a box splat of a marker is split"""
+POINTS_PER_MODULE = 8
+"""maximum number of sample points per module along each axis; a part of a box splat has at least one"""
 MAX_POINTS = 256
 """maximum number of sample points along a side of a square marker"""
 MIN_HARMONIC_ROUGHNESS = 0.5
@@ -45,7 +45,7 @@ _MAX_NORMAL_ANGLE = 0.03
 _SHADOW_SIGMAS = 3.5
 """standard deviations of a Gaussian beyond which it casts no shadow (opacity below 1 / 255)"""
 _INSIDE_RADIUS = 0.1
-"""metres: a light is inside an object if splats are within this distance on all sides"""
+"""metres: a light is inside an object if splats are within this distance in most directions"""
 
 
 def lit_scene(scene: Scene, renderer: Any) -> Scene:
@@ -96,8 +96,8 @@ class _Environment:
         return cloud.world_means(), np.where(boxes, radii, _SHADOW_SIGMAS * radii)
 
     def casters(self, light: Light, surface: ReceiverPoints) -> tuple[Any, float]:
-        """Black splats on the device that may cast shadows of a light on a surface, or None, and their
-        largest distance from the surface, at most 1 km."""
+        """Upload the splats that may shadow a surface from a light, in black. Returns them (None if there
+        are none) and their largest distance [m] from the middle of the surface, at most 1 km."""
         centres, radii = self.spheres
         rows = np.arange(len(centres))
         if self.scene.motion.is_still:
@@ -109,7 +109,10 @@ class _Environment:
         return self.renderer.upload(black), float(min(distances.max(), 1e3))
 
     def panoramas(self, points: np.ndarray, rows: int, near: float, **fields: Any) -> list[Any]:
-        """Render panoramas at points (k, 3), in the axes of the world. fields: of the capture."""
+        """Render panoramas at points (k, 3), in the axes of the world.
+
+        fields: fields of `Capture` that replace the scene's, such as outputs.
+        """
         cameras = []
         for point in points:
             pose = np.eye(4)
@@ -120,7 +123,8 @@ class _Environment:
         return list(self.renderer.render_views(self.resident, captures))
 
     def refuse_inside(self, number: int, light: PointLight) -> None:
-        """Raise InputError for a light that reaches no marker and has splats near it on all sides."""
+        """Raise InputError for a light that reaches no marker and has splats near it in most
+        directions."""
         position = np.array(light.position)
         (frame,) = self.panoramas(position[None], 16, 1e-4, outputs=("alpha", "depth_median"))
         near = max(light.radius, _INSIDE_RADIUS)
@@ -128,13 +132,13 @@ class _Environment:
         if blocked.mean() > 0.7:
             raise InputError(
                 f"lights[{number}] must be outside of surfaces, got the position {tuple(light.position)}, "
-                f"which has splats within {near:g} m on all sides; move it"
+                f"which has splats within {near:g} m in most directions; move it"
             )
 
 
 class _SamplePoints(NamedTuple):
     """Sample points on the splats of a marker, at which light is measured: a grid on each box splat, row by
-    row."""
+    row, and the centre of each Gaussian."""
 
     local: np.ndarray
     """(m, 3) in the marker's frame"""
@@ -161,7 +165,7 @@ class _IncomingLight(NamedTuple):
 
 
 def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
-    """The marker in the colours of its light, without `light`.
+    """The marker with the colours computed for its light; its field `light` is None.
 
     Glossy markers: with view='camera' their colours hold for the scene's camera only, with 'any' they are
     spherical harmonics.
@@ -179,8 +183,8 @@ def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
         diffuse = diffuse * transmitted[:, None]
     albedo = lighting.ink + (lighting.paper - lighting.ink) * linear_light(_rgb(cloud), "srgb")
     radiance = albedo[points.splat] * diffuse + specular
-    # highlights move over parts with harmonics, which are therefore at most a module wide
-    max_points = None if brdf is None or lighting.view == "camera" else MAX_PARTS_PER_MODULE
+    # highlights move over parts with harmonics: at most 8 points wide (a module, or 1/32 of a large marker)
+    max_points = None if brdf is None or lighting.view == "camera" else POINTS_PER_MODULE
     splat, extents, part = _split(points, radiance, lighting.step, max_points)
     means, scales = _placed_parts(cloud, points, splat, extents)
     count = np.bincount(part)
@@ -234,7 +238,7 @@ def _points(placed: PlacedMarker, lighting: Lighting) -> _SamplePoints:
     """Sample points of a marker: a grid on each box splat, the centre of each Gaussian."""
     cloud, pose = placed.marker.cloud, placed.pose
     area = 4 * float((cloud.scales[:, 0] * cloud.scales[:, 1]).sum(dtype=np.float64))
-    pitch = max(placed.marker.module / MAX_PARTS_PER_MODULE, np.sqrt(area) / MAX_POINTS)
+    pitch = max(placed.marker.module / POINTS_PER_MODULE, np.sqrt(area) / MAX_POINTS)
     sides = 2 * cloud.scales.astype(np.float64)
     is_box = np.ones(len(cloud), bool) if cloud.boxes is None else cloud.boxes
     is_box = is_box & (cloud.footprint != "gaussian")
@@ -337,8 +341,8 @@ def _by_normal(normals: np.ndarray, within: float) -> Iterator[np.ndarray]:
 def _split(
     points: _SamplePoints, radiance: np.ndarray, step: float, max_points: int | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split splats into parts whose radiance (m, 3) differs from their mean by at most `step` times the mean
-    of all channels. max_points: maximum number of points along a side of a part.
+    """Split splats into parts whose radiance (m, 3) differs from their mean by at most the relative tolerance
+    `step` times the mean of all channels. max_points: maximum number of points along a side of a part.
 
     Returns:
         splat (p,): index of the splat of each part.

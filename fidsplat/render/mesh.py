@@ -41,8 +41,8 @@ def scene_mesh(
     below one half are empty. Surfaces that are thinner than two voxels and visible from both sides are lost.
 
     Args:
-        cameras: views; by default up to 64 views from a sphere around the scene: none from below the ground,
-            if it has one.
+        cameras: views; by default up to 64 views from a sphere around the scene; if it has a ground, only
+            from at least 6 degrees above the horizontal.
         voxel: metres; by default a 200th of the longest side of the scene.
         renderer: by default one on the scene's device.
         progress: called with the name of the current step and its completed fraction.
@@ -118,7 +118,8 @@ def views_around(scene: Scene, low: np.ndarray, high: np.ndarray) -> list[Camera
 
 
 def _bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the bounding box of the middle 99 % of the centres along each axis."""
+    """Corners of the bounding box of the middle 99 % of the centres along each axis, enlarged by the 90th
+    percentile of the scales."""
     cloud = scene.cloud()
     if not len(cloud):
         raise InputError("the scene of a mesh must have at least one splat, got none; add splats or markers")

@@ -1,4 +1,4 @@
-"""Multi-device rendering: each device renders a band of rows, from the splats that are visible there."""
+"""Multi-device rendering: `render` splits a frame into bands of rows, `render_views` distributes frames."""
 
 from __future__ import annotations
 
@@ -37,11 +37,12 @@ _IN_FLIGHT = 3
 
 
 class SeveralDevices:
-    """Several devices of one model that share each frame: every device renders a band of rows.
+    """Several devices of one model: `render` splits a frame into bands of rows, `render_views` distributes
+    frames.
 
     Frames are bit-identical to those of one device. Bands are balanced by the times of the previous frame. A
-    cloud in memory is copied to every device; each device caches only the
-    chunks of a store that its band needs.
+    cloud in memory is copied to every device; each device caches only the chunks of a store that its bands
+    and frames need.
 
     Args:
         devices: names as for `fs.Renderer`, e.g. ["opencl:nvidia", "opencl:nvidia-2"]; a name may be

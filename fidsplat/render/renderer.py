@@ -61,8 +61,9 @@ class Renderer:
             or a GPU's name), "warp:cpu", "warp:cuda" (NVIDIA Warp), "reference" (NumPy, float64, slow), or
             "auto" ("opencl", else "warp" with a warning). None: the variable FIDSPLAT_DEVICE, else "auto".
         memory_budget: bytes of device memory for a frame and its cloud; by default nine tenths of the
-            device's memory. Larger frames are rendered in bands of rows and, by OpenCL, in chunks of the
-            cloud: slower, with bit-identical images.
+            device's memory. Tile lists that exceed it are split into bands of tiles. OpenCL also projects
+            larger clouds in chunks, and renders in bands of rows; a larger cloud is an error on Warp.
+            Smaller budgets are slower, with bit-identical images.
 
     Raises:
         DeviceError: the device cannot be used; UnknownDeviceError: no device has this name.

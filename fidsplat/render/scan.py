@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 _REFLECTIVITY = 0.1
 """reflectivity of the surface that is detected at `Lidar.detection_range`"""
 _ODDS_AT_RANGE = 9
-"""odds of a detection at that range, a probability of 90 %; odds are proportional to signal^4, so that a
-third of the signal is detected with a probability of 10 %"""
+"""odds of detection at `Lidar.detection_range`: 9 to 1, 90 %. Odds are proportional to signal^4: a third of
+the signal is detected with a probability of 10 %"""
 _ALPHA_CUTOFF = 1e-3
 """minimum alpha of a fragment; fainter ones hardly change the distance at which the accumulated opacity
 reaches `Lidar.opacity`"""

@@ -101,7 +101,7 @@ def shadow_casters(
 ) -> np.ndarray:
     """Rows of the spheres, centres (n, 3) and radii (n,), that may cast shadows on a surface: in front of the
     surface, and inside the capsule from the surface to the light (a cone for a sun)."""
-    # heights are multiplied by the length of the mean normal
+    # heights are dot products with `normal`, which is not a unit vector
     middle, normal = surface.middle, surface.normals.mean(axis=0)
     radius = surface.radius + _MARGIN * surface.pitch
     length, offsets = float(np.linalg.norm(normal)), centres - middle

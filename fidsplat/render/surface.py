@@ -115,8 +115,8 @@ def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = 
 
 
 def median_depth_capture(capture: Capture, *outputs: str) -> Capture:
-    """The capture of the median depth, output as `depth_first`, and of other outputs: at the shutter's time,
-    without sensor, fog and external depth image."""
+    """Capture whose `depth_first` is the median depth, with further outputs; one pose, splats at the
+    shutter's time, no sensor, fog or external depth image."""
     # `depth_first` with first_hit = 0.5: the depth at which the opacity reaches one half; unlike
     # `depth_median`, it is 0 where the opacity is below one half
     quality = replace(capture.quality, samples=1, first_hit=MEDIAN_OPACITY)

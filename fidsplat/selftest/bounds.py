@@ -132,7 +132,8 @@ def a5(renderer: Renderer) -> Found:
     for x in (15.0, 15.9, 31.3):
         yield _speck(x)
     yield _spec(_specks(), width=93, height=77)
-    # the first pixel of the next tile is 1.5 px from x = 15.0 and gets exp(-1.5^2)
+    # the first pixel of the next tile is 1.5 px from x = 15.0: its alpha is exp(-1.5^2), as the low-pass has
+    # a variance of 1/2
     alpha = render(renderer, _speck(15.0))["alpha"]
     yield Finding("alpha error across the tile border", abs(float(alpha[20, 16]) - math.exp(-2.25)), 2e-5)
 

@@ -345,7 +345,8 @@ class Viewer:
         self._refresh()  # images include the depth that occludes overlays only if these are visible
 
     def _move(self, pose: np.ndarray, released: bool) -> None:
-        """Move the target while the gizmo is dragged; on release write its pose to the scene file."""
+        """Move the selected marker or cloud while its gizmo is dragged; on release write its pose to the
+        scene file."""
         with self._lock:
             scene, _ = self.session.requested()
             target = self._target

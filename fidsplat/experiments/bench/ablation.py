@@ -61,7 +61,8 @@ def middle_camera(capture: Capture) -> Camera:
 
 
 def _without_lens(camera: Camera | None) -> Camera | None:
-    """A pinhole with the same focal lengths; 53 degrees wide instead of parallel rays."""
+    """The camera without its lens: a pinhole with the same focal lengths, or 53 degrees wide for an
+    orthographic camera."""
     if camera is None or not isinstance(camera.lens, Orthographic):
         return camera and replace(camera, lens=None)
     return replace(camera, lens=None, fx=float(camera.width), fy=float(camera.width))

@@ -174,7 +174,7 @@ def ellipsoid_points(settings: Iterable[str]) -> list[Point]:
 
 
 def preset(name: str) -> Quality:
-    """A preset with the marker quality of the base."""
+    """A preset with the marker quality of `BASE`."""
     return PRESETS[name].with_(marker=BASE.marker)
 
 
