@@ -182,7 +182,7 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     ),
     "Store": lambda folder: (fs.Store, {"path": _store(folder).path}, None),
     "Store.bounds": lambda folder: (_store(folder).bounds, {"sigmas": 3.0}, None),
-    "Store.boxes": lambda folder: (_store(folder).boxes, {"sigmas": 3.0}, None),
+    "Store.bounding_boxes": lambda folder: (_store(folder).bounding_boxes, {"sigmas": 3.0}, None),
     "Store.load": lambda folder: (_store(folder).load, {"number": 0, "placed": True}, None),
     "Store.counts": lambda folder: (_store(folder).counts, {"numbers": np.array([0])}, None),
     "Store.first_of": lambda folder: (_store(folder).first_of, {"numbers": np.array([0])}, None),
