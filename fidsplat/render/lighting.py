@@ -81,6 +81,7 @@ class _Environment:
         )
         self.reaching_lights: set[int] = set()
         """indices of the lights that reach a marker"""
+        self._backgrounds: dict[tuple[int, str | float], Any] = {}
 
     @cached_property
     def resident(self) -> Any:
@@ -107,6 +108,13 @@ class _Environment:
         distances = np.linalg.norm(centres[rows] - surface.middle, axis=1) + radii[rows]
         black = _rebuilt(self.scene.cloud(), rows, colors=np.zeros((len(rows), 3), np.float32))
         return self.renderer.upload(black), float(min(distances.max(), 1e3))
+
+    def background(self, rows: int, response: str | float) -> Any:
+        """The background of panorama images of 2 rows x rows pixels, computed once for all markers."""
+        key = rows, response
+        if key not in self._backgrounds:
+            self._backgrounds[key] = _averaged_background(self.scene.background, rows, response)
+        return self._backgrounds[key]
 
     def panoramas(self, points: np.ndarray, rows: int, near: float, **fields: Any) -> list[Any]:
         """Render panoramas at points (k, 3), in the axes of the world.
@@ -202,7 +210,7 @@ def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
     return replace(placed, marker=replace(placed.marker, cloud=lit), light=None)
 
 
-def averaged_background(background: Any, rows: int, response: str | float) -> Any:
+def _averaged_background(background: Any, rows: int, response: str | float) -> Any:
     """A background whose panorama is reduced to 2 rows x rows pixels by means of linear light. Otherwise a
     small bright source, such as the sun, would be missed or counted several times."""
     if not isinstance(background, Panorama) or background.image.shape[0] <= rows:
@@ -289,6 +297,7 @@ def _field(
 ) -> LightField:
     """Radiance around the marker from splats and background. Raises InputError if it is black."""
     surface, positions = points.surface, points.local[:, :2]
+    capture, rows = environment.scene.capture, lighting.rows
 
     def radiance_at(grid_positions: np.ndarray) -> np.ndarray:
         nearest = np.array([np.argmin(((positions - grid) ** 2).sum(axis=1)) for grid in grid_positions])
@@ -296,16 +305,15 @@ def _field(
         local_points[:, :2] = grid_positions  # a grid point between splats has the z of the nearest one
         panorama_points = local_points @ placed.pose[:3, :3].T + placed.pose[:3, 3]
         panorama_points = panorama_points + max(surface.clearance, 1e-6) * surface.normals[nearest]
-        background = averaged_background(environment.scene.background, lighting.rows, lighting.response)
-        fields: dict[str, Any] = {"outputs": ("rgb", "alpha"), "background": background}
-        if lighting.ambient is not None:
-            fields["background"] = (0.0, 0.0, 0.0)
-        frames = environment.panoramas(panorama_points, lighting.rows, 1e-4, **fields)
+        black = (0.0, 0.0, 0.0)
+        background = environment.background(rows, lighting.response) if lighting.ambient is None else black
+        fields = {"outputs": ("rgb", "alpha"), "background": background}
+        frames = environment.panoramas(panorama_points, rows, 1e-4, **fields)
         panoramas = []
         for frame in frames:
             colors, empty = frame["rgb"].reshape(-1, 3), 1 - frame["alpha"].reshape(-1, 1)
-            if lighting.ambient is not None and (fog := environment.scene.capture).has_fog:
-                colors = np.maximum(colors - empty * np.array(fog.rendered_background), 0)
+            if lighting.ambient is not None and capture.has_fog:  # `ambient` replaces the fog's colour
+                colors = np.maximum(colors - empty * np.array(capture.rendered_background), 0)
             radiance = linear_light(colors, lighting.response)
             panoramas.append(radiance if lighting.ambient is None else radiance + empty * lighting.ambient)
         return np.stack(panoramas)
