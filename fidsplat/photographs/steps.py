@@ -183,8 +183,10 @@ def _step(folder: Path, make: Callable[[Path], None]) -> Path:
 
 def _refuse_foreign(folder: Path, files: list[Path], overwrite: bool) -> None:
     """Raise InputError if the capture would replace the photographs, or files that it did not write."""
-    work, targets = folder / "work", [path for file in files for path in (file, file.parent / "x")]
-    sources = {parent for path in targets for parent in path.resolve().parents}
+    work = folder / "work"
+    # of links: the folder of the link, and that of its target
+    folders = {place for file in files for place in (file.parent.resolve(), file.resolve().parent)}
+    sources = {parent for place in folders for parent in (place, *place.parents)}
     for path in (work, *(folder / name for name in OUTPUTS)):
         if path.is_dir() and any(parent.samefile(path) for parent in sources):
             raise InputError(
