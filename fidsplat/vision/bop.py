@@ -155,13 +155,13 @@ def _model(marker: MarkerTruth) -> dict[str, Any]:
     }
 
 
-def _add_model(models: dict[str, dict[str, Any]], wanted: int, model: dict[str, Any]) -> int:
-    """Add a model to `models` under the wanted obj_id, or the next free one; returns the model's obj_id."""
-    if models.get(str(wanted), model) != model:
+def _add_model(models: dict[str, dict[str, Any]], preferred: int, model: dict[str, Any]) -> int:
+    """Add a model to `models` under the preferred obj_id, or the next free one; returns its obj_id."""
+    if models.get(str(preferred), model) != model:
         equal = (int(key) for key, other in models.items() if other == model)
-        wanted = next(equal, 1 + max(map(int, models)))
-    models[str(wanted)] = model
-    return wanted
+        preferred = next(equal, 1 + max(map(int, models)))
+    models[str(preferred)] = model
+    return preferred
 
 
 def _known(path: Path) -> dict[str, dict[str, Any]]:

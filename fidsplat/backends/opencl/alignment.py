@@ -272,7 +272,7 @@ class OpenCLAlignment(AlignmentKernels):
         self._launch("align_sums", *self._size(groups), args, sums)
         self._launch("align_totals", (256,), (256,), args, sums)
         self._launch("align_step", (1,), (1,), args, step)
-        sums.key = self._workspace.pool.generation, replayed, tolerance, stage_arguments | {"min_bin": 0}
+        sums.key = self._workspace.pool.generation, *key[1:]
         return lists
 
     def _groups(self, args: dict[str, Any], blocks: bool) -> int:
