@@ -1,6 +1,7 @@
 """Kernels contain only the effects that a scene requests: their source text, arguments and memory."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,12 @@ from agreement import random_splats
 from traits import Traits
 
 import fidsplat as fs
-from fidsplat.backends.opencl import assemble as assembly
-from fidsplat.backends.opencl.assemble import assemble
+from fidsplat.backends.opencl.assemble import assemble, sections_of
 from fidsplat.backends.opencl.effect_code import EFFECT_CODE
 from fidsplat.backends.opencl.kernel_config import cpu_config, gpu_config
 from fidsplat.capture.quality import ELLIPSOID
 from fidsplat.effects import OUTPUTS, select
+from fidsplat.effects.extensions import EXTENSIONS, Extension
 
 BACKEND = "opencl"
 
@@ -134,10 +135,21 @@ def test_clouds_of_3d_gaussians_only_have_smaller_records():
     assert record_bytes(select(Traits(ellipsoids="some"), fs.Capture())) == 80
 
 
-def test_a_section_of_an_unknown_hook_is_refused(monkeypatch):
-    monkeypatch.setattr(assembly, "sections_of", lambda path: {"no_such_hook": [(1, ("x",))]})
+def test_an_extension_that_fills_an_unknown_hook_is_refused(monkeypatch, tmp_path):
+    (tmp_path / "toy.cl").write_text("//@ no_such_hook\nx\n")
+    monkeypatch.setitem(EXTENSIONS, "toy", Extension("toy", tmp_path / "toy.cl"))
+    features = replace(select(COLORS, fs.Capture(quality=PLAIN)), post_steps=("toy",))
     with pytest.raises(fs.DeviceError, match="no_such_hook"):
-        assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE)
+        assemble(features, SHAPE)
+    assert "toy" not in EFFECT_CODE
+
+
+def test_each_section_of_a_kernel_file_fills_a_hook():
+    files = sorted((Path(__file__).resolve().parents[2] / "kernels" / "opencl").rglob("*.cl"))
+    texts = [file.read_text() for file in files]
+    hooks = {hook for text in texts for hook in re.findall(r"^[ \t]*//@@ (\w+)", text, re.MULTILINE)}
+    for file in files:
+        assert sections_of(str(file)).keys() <= hooks, file
 
 
 def test_order_by_centres_has_no_layers():

@@ -94,9 +94,10 @@ def test_kernels_have_the_declared_arguments(renderer, shape):
             )
             for k in range(kernel.num_args)
         ]
+        scalars = {"real": source.scalars.real, "wide": source.scalars.wide}
         declared = [
-            (source.scalars.of(one.ctype) + ("*" if one.access else ""), one.name, bool(one.access))
-            for one in source.arguments[name]
+            (scalars.get(one.ctype, one.ctype) + ("*" if one.access else ""), one.name, bool(one.access))
+            for one in source.arguments[name].values()
         ]
         assert actual == declared, name
 

@@ -32,13 +32,13 @@ def assert_well_formed(names, shapes=SHAPES):
         assert heads.keys() == source.arguments.keys()
         for kernel, arguments in source.arguments.items():
             lines = [line.strip(" ,") for line in heads[kernel].splitlines() if line and line[0] != "#"]
-            declared = [one.text.replace("wide", source.scalars.wide) for one in arguments]
+            declared = [one.text.replace("wide", source.scalars.wide) for one in arguments.values()]
             assert lines == declared, kernel
         # resolve may be fused into blend
-        argument_names = {one.name for one in source.arguments.get("resolve", source.arguments["blend"])}
+        argument_names = source.arguments.get("resolve", source.arguments["blend"]).keys()
         assert {f"{output.name}_out" for output in features.images} <= argument_names
         assert {one.name for one in source.sample_buffers} <= argument_names
-        assert {one.name for one in source.sample_buffers} <= {one.name for one in source.arguments["blend"]}
+        assert {one.name for one in source.sample_buffers} <= source.arguments["blend"].keys()
 
 
 def test_texts_of_each_effect():

@@ -357,7 +357,7 @@ class OpenCLAlignment(AlignmentKernels):
     ) -> None:
         """Submit a kernel; with `commands` record it instead."""
         own = commands or self._commands
-        values = [args[argument.name] for argument in own.program.source.arguments[kernel]]
+        values = [args[name] for name in own.program.source.arguments[kernel]]
         if commands is not None:
             commands.record(kernel, size, group, values)
             return

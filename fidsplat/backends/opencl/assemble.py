@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import chain
@@ -86,22 +86,11 @@ _SECTION = re.compile(r"//@ (\w+)[ \t]*")
 # times as fast as a word boundary
 _WIDE_CONSTANT = re.compile(r"WIDE\(([^()]+)\)")
 _WIDE = re.compile(r"wide(?<=\bwide)\b")
-_EFFECT_ARGUMENTS = {
-    **{
-        name: name
-        for name in (
-            "project",
-            "emit",
-            "blend",
-            "composite_background",
-            "resolve",
-            "project_backward",
-            "project_step",
-        )
-    },
-    **{"blend_checkpoints": "blend_backward", "blend_backward": "blend_backward"},
-}
-"""fields of `EffectCode` with the arguments that effects add to these kernels"""
+_EFFECT_KERNELS = (
+    *("project", "emit", "blend", "composite_background", "resolve"),
+    *("blend_backward", "project_backward", "project_step"),
+)
+"""kernels to which effects add arguments: fields of `EffectCode`"""
 
 
 @dataclass(frozen=True)
@@ -121,7 +110,8 @@ class KernelSource:
     programs: dict[str, ProgramSource]
     records: dict[str, np.dtype]
     """structs of the texts, as NumPy types"""
-    arguments: dict[str, tuple[Argument, ...]]
+    arguments: dict[str, dict[str, Argument]]
+    """by kernel, then by the argument's name, in the order of the kernel's signature"""
     sample_buffers: tuple[SampleBuffer, ...]
     """sample buffers of the effects"""
     scalars: Scalars
@@ -149,7 +139,7 @@ class KernelSource:
         self.cloud_arrays: list[str] = []
         """names of the arrays of the cloud that the projection reads"""
         for kernel, arguments in self.arguments.items():
-            for argument in arguments:
+            for argument in arguments.values():
                 if argument.source == "uniform":
                     group, index = argument.uniform
                     self.uniform_groups.setdefault(group, {})[index] = argument.name
@@ -158,17 +148,15 @@ class KernelSource:
                 elif argument.source == "cloud" and kernel == "project":
                     self.cloud_arrays.append(argument.name)
 
-    def has_argument(self, kernel: str, argument: str) -> bool:
-        """Whether a kernel has an argument of this name."""
-        return any(declared.name == argument for declared in self.arguments.get(kernel, ()))
-
 
 def effect_code_of(features: FeatureSet) -> dict[str, EffectCode]:
     """Code of all effects and of the parts that they require, by name, in the order in which they fill
     hooks."""
     chosen = [*features.effects, *features.outputs, *features.post_steps]
     for name in EXTENSIONS.keys() & {*chosen} - EFFECT_CODE.keys():
-        EFFECT_CODE[name] = extension_code(EXTENSIONS[name])
+        code = extension_code(EXTENSIONS[name])
+        _refuse_unknown_hooks(code.file)
+        EFFECT_CODE[name] = code
     parts: set[str] = set()
     pending = chosen.copy()
     while pending:
@@ -232,9 +220,11 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
             if not (stage == "pack" and config.binning != "sort_first") and not (stage == "resolve" and fused)
         ],
     }
-    _refuse_unknown_hooks(files)
-    declared = Declarations(_scalars(features), effects, features.images, fused, kernels_of(config))
-    return Assembler(files, declared, build_constants(features, config)).source(stages)
+    constants, kernels = build_constants(features, config), kernels_of(config)
+    assembler = Assembler(
+        _scalars(features), constants, files, effects.values(), features.images, fused, kernels
+    )
+    return assembler.source(stages)
 
 
 def _frustum_parts(effects: Collection[str]) -> list[str]:
@@ -244,9 +234,11 @@ def _frustum_parts(effects: Collection[str]) -> list[str]:
         return []
     if "ellipsoids_only" in effects:
         return ["part/cull_frustum_ewa.cl"]
-    filters = {"lowpass_screen": "", "lowpass_pixel": "_pixel"}
-    thin = "thickness" not in effects
-    return [f"part/cull_frustum{suffix}.cl" for name, suffix in filters.items() if thin and name in effects]
+    if "thickness" in effects:
+        return []
+    if "lowpass_screen" in effects:
+        return ["part/cull_frustum.cl"]
+    return ["part/cull_frustum_pixel.cl"] if "lowpass_pixel" in effects else []
 
 
 def culls_before_projection(features: FeatureSet) -> bool:
@@ -276,12 +268,11 @@ def _assemble_backward(
     files += _dialect(config, _scalars(features), features.effects)
     files += [effect.backward_file for effect in effects.values()]
     files += [EFFECT_CODE[part].file for part in parts]
-    kernels = kernels_of(config)
-    declared = Declarations(_scalars(features), effects, kernels=kernels)
     backward = {"BACKWARD_ITEMS": backward_items(features, config), "CHUNK": backward_chunk(features, config)}
     if stages is _STEP:
         backward["AXES"] = 3 if "thickness" in effects else 2
-    assembler = Assembler(files, declared, build_constants(features, config) | backward)
+    constants = build_constants(features, config) | backward
+    assembler = Assembler(_scalars(features), constants, files, effects.values(), kernels=kernels_of(config))
     return assembler.source({name: [stage.format(config.schedule) for stage in stages]})
 
 
@@ -308,9 +299,9 @@ def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> KernelSource
     """Assemble the kernels of loss, regularisation and optimiser, for vectors of `lanes` floats."""
     files = ("loss_values", "loss" if lanes == 1 else "loss_strips", *_TRAINING)
     constants = {"LANES": lanes, "FAST_FMA": int(fast_fma and lanes > 1), "PROJECTION_FP64": int(float64)}
-    declared = Declarations(Scalars("double" if float64 else "float", "float"))
+    scalars = Scalars("double" if float64 else "float", "float")
     stages = ("prelude", "math", *(f"train/{file}" for file in files))
-    return Assembler((), declared, constants).source({"training": stages})
+    return Assembler(scalars, constants).source({"training": stages})
 
 
 @cache
@@ -319,8 +310,7 @@ def assemble_alignment(items: int) -> KernelSource:
     constants: dict[str, int | str] = {"ITEMS": items, "FIRST_BIN": alignment.FIRST_BIN}
     for name in ("HUBER", "TUKEY", "MIN_NOISE", "MAX_NOISE"):
         constants[name] = f"{getattr(alignment, name)}f"
-    declared = Declarations(Scalars("float", "float"))
-    return Assembler((), declared, constants).source({"alignment": ("alignment",)})
+    return Assembler(Scalars("float", "float"), constants).source({"alignment": ("alignment",)})
 
 
 @cache
@@ -328,8 +318,8 @@ def assemble_alignment_step(float64: bool) -> KernelSource:
     """Assemble the kernel of a step of Levenberg-Marquardt, for views in float64 or float32."""
     low, high = alignment.GAINS
     constants = {"PROJECTION_FP64": int(float64), "MIN_GAIN": f"{low}f", "MAX_GAIN": f"{high}f"}
-    declared = Declarations(Scalars("double" if float64 else "float", "float"))
-    return Assembler((), declared, constants).source({"alignment": ("prelude", "alignment_step")})
+    scalars = Scalars("double" if float64 else "float", "float")
+    return Assembler(scalars, constants).source({"alignment": ("prelude", "alignment_step")})
 
 
 def assemble_test(file: str, config: KernelConfig, float64: bool, effects: Iterable[str] = ()) -> str:
@@ -339,7 +329,7 @@ def assemble_test(file: str, config: KernelConfig, float64: bool, effects: Itera
     scalars = Scalars("double" if float64 else "float", "float")
     stages = ("prelude", "math", *([file.removesuffix(".cl")] if file else ()))
     files = [*effects, *_dialect(config, scalars)]
-    return Assembler(files, Declarations(scalars), constants).source({"check": stages}).text
+    return Assembler(scalars, constants, files).source({"check": stages}).text
 
 
 def backward_items(features: FeatureSet, config: KernelConfig) -> int:
@@ -384,84 +374,34 @@ def build_constants(features: FeatureSet, config: KernelConfig) -> dict[str, int
 
 
 class Assembler:
-    """Assembles programs from stage files; effects' files and declarations fill their hooks."""
-
-    def __init__(
-        self, files: Iterable[str], declared: Declarations, defines: Mapping[str, int | str]
-    ) -> None:
-        """files: effect files below kernels/opencl/, in the order in which they fill a hook."""
-        self._sections = {file: sections_of(file) for file in files if file}
-        self._declared, self._defines = declared, defines
-        self._used: dict[str, list[str]] = {"struct": [], "arguments": [], "passed": []}
-        """names of the structs and kernels of the texts"""
-
-    def source(self, programs: Mapping[str, Iterable[str]]) -> KernelSource:
-        """Assemble programs from their stages, by the names of the programs."""
-        declared = self._declared
-        texts = {name: self._program(name, stages) for name, stages in programs.items()}
-        records = {name: declared.structs[name].dtype(declared.scalars) for name in self._used["struct"]}
-        arguments = {kernel: declared.arguments(kernel) for kernel in self._used["arguments"]}
-        return KernelSource(texts, records, arguments, declared.sample_buffers, declared.scalars)
-
-    def _program(self, name: str, stages: Iterable[str]) -> ProgramSource:
-        body = ""
-        for stage in stages:
-            file = f"{stage}.cl"
-            body += f"#line 1 {_line_file(file)}\n{self._expand(file, 1, lines_of(file))}"
-        body = with_packed(with_constants(body, self._declared.constants), self._declared.packed)
-        body = with_scalars(body, self._declared.scalars.wide)
-        bare = _COMMENT.sub("", body)
-        head = ""
-        for constant, value in sorted(self._defines.items()):
-            if constant in bare:  # a constant that the text does not use must not change it
-                head += f"#define {constant} {value}\n"
-        return ProgramSource(f"// the program `{name}`\n{head}{body}", f"\n{head}{bare}")
-
-    def _fill(self, hook: str, subject: str) -> Iterator[str]:
-        if hook in self._used:
-            self._used[hook].append(subject)
-            yield f'#line 1 "kernel_interface.py: {subject}"\n{self._declared.text(hook, subject)}'
-        for file, by_hook in self._sections.items():
-            for first, lines in by_hook.get(hook, ()):
-                yield f"#line {first} {_line_file(file)}\n{self._expand(file, first, lines)}"
-
-    def _expand(self, file: str, first: int, lines: tuple[str, ...]) -> str:
-        expanded = []
-        for number, line in enumerate(lines, first):
-            hook = _HOOK.fullmatch(line) if "//@@" in line else None
-            if hook is None:
-                expanded.append(line)
-                continue
-            filled = "".join(self._fill(hook[1], hook[2] or ""))
-            expanded.append(f"{filled}#line {number + 1} {_line_file(file)}" if filled else "")
-        return "\n".join(expanded) + "\n"
-
-
-class Declarations:
-    """The declarations of kernel_interface.py merged with those of the chosen effects."""
+    """Assembles programs from stage files. Effects' files and the declarations of kernel_interface.py, merged
+    with those of the effects, fill their hooks."""
 
     def __init__(
         self,
         scalars: Scalars,
-        effects: Mapping[str, EffectCode] | None = None,
+        defines: Mapping[str, int | str],
+        files: Iterable[str] = (),
+        effects: Iterable[EffectCode] = (),
         outputs: Sequence[Output] = (),
         fused: bool = False,
         kernels: Mapping[str, tuple[Argument, ...]] = KERNELS,
     ) -> None:
-        """fused: whether the blend kernel also resolves, with the arguments of both."""
-        self.scalars = scalars
-        self.sample_buffers: tuple[SampleBuffer, ...] = ()
-        self.constants: dict[str, str] = {}
-        """fields of `Splat` that all splats share, and their values"""
-        self.packed: dict[str, str] = {}
-        """packed fields of `Splat`, with the expressions that read them"""
-        self._effects = list((effects or {}).values())
+        """files: effect files below kernels/opencl/, in the order in which they fill a hook. fused: whether
+        the blend kernel also resolves, with the arguments of both."""
+        self._scalars, self._defines, self._effects = scalars, defines, list(effects)
         self._outputs, self._fused, self._kernels = outputs, fused, kernels
+        self._sections = {file: sections_of(file) for file in files if file}
+        self._sample_buffers: tuple[SampleBuffer, ...] = ()
+        self._constants: dict[str, str] = {}
+        """fields of `Splat` that all splats share, and their values"""
+        self._packed: dict[str, str] = {}
+        """packed fields of `Splat`, with the expressions that read them"""
         view, splat, bounds, record_gradient = VIEW, SPLAT, BOUNDS, RECORD_GRADIENT
         for effect in self._effects:
-            self.sample_buffers += effect.sample_buffers
-            self.constants |= dict(effect.constant)
-            self.packed |= dict(effect.packed)
+            self._sample_buffers += effect.sample_buffers
+            self._constants |= dict(effect.constant)
+            self._packed |= dict(effect.packed)
             view, splat = view.with_members(effect.view), splat.with_members(effect.splat)
             bounds = bounds.with_members(effect.bounds)
             record_gradient = record_gradient.with_members(effect.record_gradient)
@@ -469,88 +409,109 @@ class Declarations:
         alignment = record_gradient.alignment // 4 * scalars.dtype("real").itemsize
         fields = tuple(chain.from_iterable(member.names for member in record_gradient.members))
         totals = Record("Totals", (Member("real", fields, "of all tiles"),), alignment)
-        records = view, splat.without({**self.constants, **self.packed}), bounds, record_gradient, totals
-        self.structs = {record.name: record for record in records}
+        splat = splat.without({**self._constants, **self._packed})
+        self._structs = {record.name: record for record in (view, splat, bounds, record_gradient, totals)}
+        self._used_structs: dict[str, np.dtype] = {}
+        self._used_arguments: dict[str, dict[str, Argument]] = {}
 
-    def arguments(self, kernel: str) -> tuple[Argument, ...]:
-        """A kernel's own arguments, then the arguments of effects in effect order, each name once."""
-        merged = {argument.name: argument for argument in self._kernels[kernel]}
-        if field := _EFFECT_ARGUMENTS.get(kernel):
-            for effect in self._effects:
-                for argument in getattr(effect, field):
-                    merged[argument.name] = argument
-        if kernel in ("blend", "resolve"):
-            access = "out" if kernel == "blend" else "in"
-            for samples in self.sample_buffers:
-                merged[samples.name] = Argument(samples.ctype, samples.name, access, note=samples.note)
-        if kernel == "resolve":
-            for output in self._outputs:
-                merged[f"{output.name}_out"] = output_argument(output)
-        if kernel == "blend" and self._fused:
-            for argument in self.arguments("resolve"):
-                if argument.name != "stride":
-                    merged.setdefault(argument.name, argument)
-            if GROUP_KERNELS.keys() <= self._kernels.keys():
-                del merged["raw"]  # in registers (part/resolve_fused_group.cl)
-        return tuple(merged.values())
+    def source(self, programs: Mapping[str, Iterable[str]]) -> KernelSource:
+        """Assemble programs from their stages, by the names of the programs."""
+        texts = {name: self._program(name, stages) for name, stages in programs.items()}
+        return KernelSource(
+            texts, self._used_structs, self._used_arguments, self._sample_buffers, self._scalars
+        )
 
-    def text(self, hook: str, subject: str) -> str:
+    def _program(self, name: str, stages: Iterable[str]) -> ProgramSource:
+        body = ""
+        for stage in stages:
+            body += self._expand(f"{stage}.cl", 1, lines_of(f"{stage}.cl"))
+        body = self._with_values(body)
+        bare = _COMMENT.sub("", body)
+        head = ""
+        for constant, value in sorted(self._defines.items()):
+            if constant in bare:  # a constant that the text does not use must not change it
+                head += f"#define {constant} {value}\n"
+        return ProgramSource(f"// the program `{name}`\n{head}{body}", f"\n{head}{bare}")
+
+    def _expand(self, file: str, first: int, lines: tuple[str, ...]) -> str:
+        """Lines of a file from number `first`, with its hooks filled."""
+        path = Path(file).name if Path(file).is_absolute() else f"opencl/{file}"
+        text = f'#line {first} "{path}"\n'
+        for number, line in enumerate(lines, first):
+            hook = _HOOK.fullmatch(line) if "//@@" in line else None
+            if hook is None:
+                text += f"{line}\n"
+                continue
+            filled = self._declaration(hook[1], hook[2]) if hook[2] else ""
+            for effect_file, sections in self._sections.items():
+                for start, section in sections.get(hook[1], ()):
+                    filled += self._expand(effect_file, start, section)
+            text += f'{filled}#line {number + 1} "{path}"\n' if filled else "\n"
+        return text
+
+    def _declaration(self, kind: str, subject: str) -> str:
         """C for `//@@ struct NAME`, `//@@ arguments KERNEL` or `//@@ passed KERNEL`."""
-        if hook == "struct":
-            return self.structs[subject].text(self.scalars)
-        text, arguments = "", self.arguments(subject)
-        for argument in arguments:
-            comma = "," if argument is not arguments[-1] else ""
-            if hook == "passed":
-                text += f"        {argument.name}{comma}\n"
+        text = f'#line 1 "kernel_interface.py: {subject}"\n'
+        if kind == "struct":
+            record = self._structs[subject]
+            self._used_structs[subject] = dtype = record.dtype(self._scalars)
+            return text + record.text(dtype.itemsize)
+        arguments = self._arguments(subject)
+        if kind == "arguments":
+            self._used_arguments[subject] = arguments
+        for name, argument in arguments.items():
+            comma = "," if name != next(reversed(arguments)) else ""
+            if kind == "passed":
+                text += f"        {name}{comma}\n"
             else:
                 note = f"  // {argument.note}" if argument.note else ""
                 text += f"    {argument.text}{comma}{note}\n"
         return text
 
+    def _arguments(self, kernel: str) -> dict[str, Argument]:
+        """A kernel's own arguments, then the arguments of effects in effect order, each name once."""
+        merged = {argument.name: argument for argument in self._kernels[kernel]}
+        field = "blend_backward" if kernel == "blend_checkpoints" else kernel
+        for effect in self._effects if field in _EFFECT_KERNELS else ():
+            for argument in getattr(effect, field):
+                merged[argument.name] = argument
+        if kernel in ("blend", "resolve"):
+            access = "out" if kernel == "blend" else "in"
+            for samples in self._sample_buffers:
+                merged[samples.name] = Argument(samples.ctype, samples.name, access, note=samples.note)
+        if kernel == "resolve":
+            for output in self._outputs:
+                argument = output_argument(output)
+                merged[argument.name] = argument
+        if kernel == "blend" and self._fused:
+            for name, argument in self._arguments("resolve").items():
+                if name != "stride":
+                    merged.setdefault(name, argument)
+            if GROUP_KERNELS.keys() <= self._kernels.keys():
+                del merged["raw"]  # in registers (part/resolve_fused_group.cl)
+        return merged
 
-@cache
-def _line_file(file: str) -> str:
-    """The file name for `#line`: the path below kernels/, or the plain name of another file."""
-    return f'"{Path(file).name}"' if Path(file).is_absolute() else f'"opencl/{file}"'
+    def _with_values(self, text: str) -> str:
+        """Replace fields of `Splat` that are not stored as such, and the type `wide`, in kernel text."""
+        constants, packed, wide = self._constants, self._packed, self._scalars.wide
+        if constants:  # reads become the values; writes are removed
+            names = "|".join(constants)
+            text = re.sub(rf"\brecord\.(?:{names}) = [^;\n]*;", "", text)
+            text = re.sub(rf"\bs(?:->|\.)({names})\b", lambda read: constants[read[1]], text)
+        if packed:  # reads become the expression, with the record in place of `{}`
+            names = "|".join(packed)
+            text = re.sub(rf"\brecord\.({names})\b", r"unpacked_\1", text)
+            text = re.sub(rf"\b(s(?:->|\.))({names})\b", lambda read: packed[read[2]].format(read[1]), text)
+        return _WIDE.sub(wide, _WIDE_CONSTANT.sub(r"\1" if wide == "double" else r"\1f", text))
 
 
-def with_scalars(text: str, wide: str = "float") -> str:
-    """Replace the type `wide`, and the suffix of its constants, in kernel text by "float" or "double"."""
-    return _WIDE.sub(wide, _WIDE_CONSTANT.sub(r"\1" if wide == "double" else r"\1f", text))
-
-
-def with_constants(text: str, constants: Mapping[str, str]) -> str:
-    """Replace constant fields of `Splat` by their values in kernel text, and remove writes to them."""
-    if not constants:
-        return text
-    names = "|".join(constants)
-    text = re.sub(rf"\brecord\.(?:{names}) = [^;\n]*;", "", text)
-    return re.sub(rf"\bs(?:->|\.)({names})\b", lambda read: constants[read[1]], text)
-
-
-def with_packed(text: str, packed: Mapping[str, str]) -> str:
-    """Replace packed fields of `Splat` in kernel text: a write goes to a variable `unpacked_NAME`; a read
-    becomes the expression of the field, with the record in place of `{}`."""
-    if not packed:
-        return text
-    names = "|".join(packed)
-    text = re.sub(rf"\brecord\.({names})\b", r"unpacked_\1", text)
-    return re.sub(rf"\b(s(?:->|\.))({names})\b", lambda read: packed[read[2]].format(read[1]), text)
-
-
-def _refuse_unknown_hooks(files: list[str]) -> None:
-    """Raise DeviceError if a file fills a hook that neither a stage nor an effect has."""
-    stages = [stage.format(schedule) for stage in _FRAME for schedule in ("lanes", "group")]
-    hook_files = {f"{stage}.cl" for stage in chain(stages, *_LISTS.values())}
-    hook_files |= {effect.file for effect in EFFECT_CODE.values() if effect.file}
-    hook_files |= {f"part/{path.name}" for path in (kernels_folder() / "opencl/part").glob("*.cl")}
-    known = set(chain.from_iterable(map(_hooks, hook_files)))
-    for file in files:
-        if unknown := set(sections_of(file)) - known:
-            raise DeviceError(
-                f"hooks filled by {file} must exist, got {sorted(unknown)}; correct their names"
-            )
+def _refuse_unknown_hooks(file: str) -> None:
+    """Raise DeviceError if a file fills a hook that no kernel file has."""
+    known: set[str] = set()
+    for path in (kernels_folder() / "opencl").rglob("*.cl"):
+        known.update(_HOOKS.findall(path.read_text(encoding="utf-8")))
+    if unknown := sections_of(file).keys() - known:
+        raise DeviceError(f"hooks filled by {file} must exist, got {sorted(unknown)}; correct their names")
 
 
 def kernel_text(path: str) -> str:
@@ -562,11 +523,6 @@ def kernel_text(path: str) -> str:
 def lines_of(path: str) -> tuple[str, ...]:
     """The lines of a file below kernels/opencl/."""
     return tuple((kernels_folder() / "opencl" / path).read_text(encoding="utf-8").splitlines())
-
-
-@cache
-def _hooks(path: str) -> list[str]:
-    return _HOOKS.findall("\n".join(lines_of(path)))
 
 
 @cache

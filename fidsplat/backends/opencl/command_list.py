@@ -150,5 +150,5 @@ class CommandList:
             (command, index)
             for command in self._commands
             for index, argument in enumerate(arguments[command.name])
-            if argument.name == name
+            if argument == name
         ]

@@ -30,12 +30,6 @@ class Member:
     """(name, number of elements); 1: not an array"""
     note: str = ""
 
-    @property
-    def text(self) -> str:
-        """The C declaration."""
-        names = ", ".join([name if length == 1 else f"{name}[{length}]" for name, length in self.names])
-        return f"    {self.ctype} {names};" + (f"  // {self.note}" if self.note else "") + "\n"
-
 
 def member(declaration: str, note: str = "") -> Member:
     """Parse a type and names, as in C but without commas: `real rotation[9]`, `wide r g b`."""
@@ -52,10 +46,6 @@ class Scalars:
     """type of the per-splat projection: float or double"""
     wide: str
     """type of fragments in the blend stage: float or double"""
-
-    def of(self, ctype: str) -> str:
-        """The C type of `ctype`."""
-        return {"real": self.real, "wide": self.wide}.get(ctype, ctype)
 
     def dtype(self, ctype: str) -> np.dtype:
         """The NumPy type of a C type."""
@@ -96,13 +86,15 @@ class Record:
         formats, offsets = zip(*(plain.fields or {}).values(), strict=True) if names else ((), ())
         return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
 
-    def text(self, scalars: Scalars) -> str:
-        """The C struct, with a compile-time check of its size."""
+    def text(self, size: int) -> str:
+        """The C struct, with a compile-time check of its size in bytes."""
         aligned = f" __attribute__((aligned({self.alignment})))" if self.alignment > 1 else ""
-        size = self.dtype(scalars).itemsize
         check = f"typedef char {self.name}_has_the_size_of_its_numpy_type"
         check += f"[(sizeof({self.name}) == {size}) ? 1 : -1];"
-        body = "".join([member.text for member in self.members])
+        body = ""
+        for member in self.members:
+            names = ", ".join([name if length == 1 else f"{name}[{length}]" for name, length in member.names])
+            body += f"    {member.ctype} {names};" + (f"  // {member.note}" if member.note else "") + "\n"
         return f"typedef struct{aligned} {{\n{body}}} {self.name};\n{check}\n"
 
 
@@ -182,7 +174,7 @@ class EffectCode:
     constant: tuple[tuple[str, str], ...] = ()
     """(field of `Splat`, value): fields that are equal for all splats and become constants in the kernels"""
     packed: tuple[tuple[str, str], ...] = ()
-    """(field of `Splat`, expression that reads it): packed fields (`assemble.with_packed`)"""
+    """(field of `Splat`, expression that reads it): packed fields (assemble.py)"""
     bounds: tuple[Member, ...] = ()
     view: tuple[Member, ...] = ()
     project: tuple[Argument, ...] = ()

@@ -200,8 +200,8 @@ class DeviceFrame:
         if views > 1:
             size, group = (*size, views), (*group, 1)
         values = [
-            arguments[declared.name] if declared.name in arguments else self.value(declared)
-            for declared in self.source.arguments[kernel]
+            arguments[name] if name in arguments else self.value(declared)
+            for name, declared in self.source.arguments[kernel].items()
         ]
         event = self.commands.launch(self.queue, kernel, size, group, values, stage)
         self.events.append(event)
@@ -279,7 +279,7 @@ class DeviceFrame:
     def bind_rays(self) -> None:
         """Bind the rays of a lens, and its inverse lookup table."""
         assert self.view.raster is not None
-        with_derivatives = self.source.has_argument("blend", "ray_derivatives")
+        with_derivatives = "ray_derivatives" in self.source.arguments["blend"]
         self.named |= self.workspace.ray_buffers.of(
             self.view.raster, self.rows, self.stride, with_derivatives
         )

@@ -44,9 +44,9 @@ def render(frame: DeviceFrame) -> None:
 def allocate_samples(frame: DeviceFrame) -> None:
     """Bind the buffers that the blend stage writes."""
     for samples in frame.sample_buffers:
-        if frame.source.has_argument("blend", samples.name):
+        if samples.name in frame.source.arguments["blend"]:
             frame.scratch(samples.name, 4 * frame.scalars["channel_stride"] * samples.channels)
-    if frame.source.has_argument("blend", "termination_depths"):
+    if "termination_depths" in frame.source.arguments["blend"]:
         depths = frame.acquire("termination_depths", 4 * frame.tiles)
         if frame.view.band is not None:
             cl.enqueue_fill_buffer(frame.queue, depths, _NO_DEPTH, 0, 4 * frame.tiles)
@@ -174,8 +174,8 @@ def render_sub_frames(frame: DeviceFrame) -> None:
         size = 4 * frame.rows * frame.stride * samples.channels
         frame.bind(samples.name, frame.pool.scratch(f"accumulated {samples.name}", size))
     background_arrays = {
-        argument.name: frame.upload(argument.name, frame.view.array(argument.name))
-        for argument in frame.source.arguments.get("composite_background", ())
+        name: frame.upload(name, frame.view.array(name))
+        for name, argument in frame.source.arguments.get("composite_background", {}).items()
         if argument.source == "array"
     }
     stats = {"splats": frame.resident.count, "visible": 0, "pairs": 0}
@@ -190,7 +190,7 @@ def render_sub_frames(frame: DeviceFrame) -> None:
             stats[name] = max(stats[name], value)
         frame.uploads += part.uploads
         frame.pool.release(part.acquired.items())
-    if frame.source.has_argument("resolve", "rays"):
+    if "rays" in frame.source.arguments.get("resolve", {}):
         frame.bind_rays()
     resolve(frame)
     frame.stats = partial(dict, stats)

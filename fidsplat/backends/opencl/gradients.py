@@ -71,12 +71,10 @@ class OpenCLGradients(GradientPipeline):
         self.program = Program(pipeline.workspace, self.source)
         arguments = self.source.arguments
         self._output_gradients = [
-            name
-            for name in GRADIENT_OUTPUTS
-            if any(argument.name == f"grad_{name}" for argument in arguments["blend_backward"])
+            name for name in GRADIENT_OUTPUTS if f"grad_{name}" in arguments["blend_backward"]
         ]
         self.cloud_arrays = [
-            argument.name for argument in arguments["project_backward"] if argument.source == "cloud"
+            name for name, argument in arguments["project_backward"].items() if argument.source == "cloud"
         ]
         self._pair_limit = 0
         """capacity of the tile lists of frames that are submitted without waiting for their counts"""
@@ -247,10 +245,8 @@ class TileGradients:
             arguments = {**arguments, "count": (count := frame.resident.count)}
             groups = self._allocate_camera_sums(frame) if with_camera else 0
             values = {
-                declared.name: arguments[declared.name]
-                if declared.name in arguments
-                else frame.value(declared)
-                for declared in commands.program.source.arguments["project_step"]
+                name: arguments[name] if name in arguments else frame.value(declared)
+                for name, declared in commands.program.source.arguments["project_step"].items()
             }
             if commands.key != count:
                 commands.clear()

@@ -70,12 +70,12 @@ class MemoryPlanner:
         self, device: Workspace, source: KernelSource, features: FeatureSet, config: KernelConfig
     ) -> None:
         self._device, self._source, self._config = device, source, config
-        self._has_ray_derivatives = source.has_argument("blend", "ray_derivatives")
+        self._has_ray_derivatives = "ray_derivatives" in source.arguments["blend"]
         self._has_camera_uniforms = not _CAMERA_UNIFORMS.isdisjoint(source.uniform_groups)
         self._channels = 0
         for samples in (RAW, *source.sample_buffers):
-            self._channels += samples.channels if source.has_argument("blend", samples.name) else 0
-        resolve_rays = source.has_argument("resolve", "rays")
+            self._channels += samples.channels if samples.name in source.arguments["blend"] else 0
+        resolve_rays = "rays" in source.arguments.get("resolve", {})
         self._one_by_one = (
             bool(source.view_arrays) or resolve_rays or "composite_background" in source.arguments
         )

@@ -292,7 +292,7 @@ class OpenCLPipeline(Pipeline):
         with self.workspace.rendering():
             frame = self._render_frame(resident, view, MemoryPlan(0, resident.count, 0))
         images, raw = self.images_of(frame), {}
-        if self.source.has_argument("blend", "raw"):
+        if "raw" in self.source.arguments["blend"]:
             raw["raw"] = frame.read("raw", np.float32, (4, frame.rows, frame.stride))
         return raw | {
             "keys": frame.read("keys", np.uint32, (resident.count,)),

@@ -157,7 +157,7 @@ class OpenCLProbe(Probe):
                 "counters": sums,
                 "counter": 4,
             }
-        values = [arguments[one.name] for one in pipeline.source.arguments[kernel]]
+        values = [arguments[name] for name in pipeline.source.arguments[kernel]]
         CommandList(pipeline.program).launch(workspace.queue, kernel, size, items, values)
         positions = contents(workspace, starts).view(np.uint32)
         words = contents(workspace, sums).view(np.uint32)

@@ -84,7 +84,7 @@ class Program:
         """NumPy type of each argument of a kernel; None for a buffer"""
         for kernel, arguments in source.arguments.items():
             self.types[kernel] = types = []
-            for argument in arguments:
+            for argument in arguments.values():
                 types.append(None if argument.access else source.scalars.dtype(argument.ctype).type)
 
 

@@ -426,7 +426,7 @@ class OpenCLTraining:
     ) -> Launch:
         """A launch with the values of its arguments, which is not submitted."""
         values = {**self._bound, "count": self._count, **args}
-        names = (argument.name for argument in self._program.source.arguments[kernel])
+        names = self._program.source.arguments[kernel]
         return kernel, size, group, [values[name] for name in names]
 
     def _enqueue(self, launch: Launch) -> None:
