@@ -148,7 +148,7 @@ def whole(opencl, cloud):
 
 
 @pytest.mark.usefixtures("optimised")
-@pytest.mark.parametrize("mebibytes", [3.7, 4, 4.75])
+@pytest.mark.parametrize("mebibytes", [3.7, 4, 4.5])
 @pytest.mark.parametrize("streamed", [False, True])
 def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, streamed):
     """Chunks of splats, bands of rows, and a cloud that is copied chunk by chunk or stays where it is. With a

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 
 import pyopencl as cl
 
@@ -12,8 +13,13 @@ from fidsplat.backends.interface import DeviceInfo
 from fidsplat.backends.opencl.buffers import BufferPool, RayBuffers
 from fidsplat.backends.opencl.host_memory import HostMemory
 from fidsplat.backends.opencl.kernel_config import KernelConfig
-from fidsplat.backends.opencl.pocl_workarounds import is_pocl, shared_context
 from fidsplat.util.errors import DeviceError
+
+
+@cache
+def shared_context(device: cl.Device) -> cl.Context:
+    """Context of a device, shared by its workspaces, since NVIDIA needs 0.3 s to create one."""
+    return cl.Context([device])
 
 
 class Workspace:
@@ -24,7 +30,7 @@ class Workspace:
 
     def __init__(self, device: cl.Device, info: DeviceInfo, config: KernelConfig) -> None:
         self.device, self.info, self.config = device, info, config
-        self.context = shared_context(device) if is_pocl(device) else cl.Context([device])
+        self.context = shared_context(device)
         self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
         self.side_queue = cl.CommandQueue(self.context)
         """queue for counts that the host reads while the stages run"""

@@ -14,13 +14,7 @@ def is_pocl(device: cl.Device) -> bool:
 
 
 # PoCL does not free a program that has run: each renderer would leak 3 MB. The renderers of a process share
-# programs and their context; each has its own kernels, queues and buffers.
-
-
-@cache
-def shared_context(device: cl.Device) -> cl.Context:
-    """The context of a device."""
-    return cl.Context([device])
+# programs; each has its own kernels, queues and buffers.
 
 
 @cache
