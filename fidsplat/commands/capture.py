@@ -62,6 +62,10 @@ def _facts(captured: Captured) -> dict[str, Any]:
         "reprojection_px": captured.model.reprojection,
         "metric": captured.metric,
         "readout_px": captured.readout,
+        "cameras": [
+            {"scene": str(file), "size": [camera.width, camera.height], "fx": camera.fx, "photographs": count}
+            for file, camera, count in captured.cameras
+        ],
     }
     if adjusted is None:
         return facts
@@ -89,6 +93,11 @@ def _words(captured: Captured, facts: dict[str, Any], out: str, lens: str) -> li
         f"reprojection error {facts['reprojection_px']:.2f} px"
     ]
     lines += [f"no camera for {name}: {reason}" for name, reason in captured.missing]
+    if len(captured.cameras) > 1:
+        lines += [
+            f"{file.name}: {camera.width} x {camera.height}, fx {camera.fx:.0f} px, {count} photographs"
+            for file, camera, count in captured.cameras
+        ]
     if captured.adjustment is not None:
         lines.append(
             f"scale {facts['metres_per_unit']:.6g} m per unit with a standard error of "

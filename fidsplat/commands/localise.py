@@ -55,7 +55,6 @@ class Localise:
         import fidsplat as fs
         from fidsplat.formats.trajectories import check_trajectory_file
         from fidsplat.images.files import read_images
-        from fidsplat.localisation.localise import NoInitialPose
         from fidsplat.scenes.sources import cameras_of
 
         if not self.images:
@@ -79,10 +78,10 @@ class Localise:
             renderer = fs.Renderer(self.device)
             resident = renderer.upload(scene)
         results: dict[str, Localisation | None] = {}
+        reasons: dict[str, str] = {}
         previous: list[Camera] = []
-        missing = ""
         for path in self.images:
-            for name, image in read_images(path):
+            for name, image in read_images(path, reasons):
                 try:
                     localised = fs.localise(
                         image,
@@ -93,28 +92,33 @@ class Localise:
                         renderer=renderer,
                         resident=resident,
                     )
-                except NoInitialPose as error:
-                    results[name], previous, missing = None, [], str(error)
-                    continue
                 except InputError as error:
-                    raise InputError(f"{name} and {self.scene}: {error}") from None
+                    results[name], reasons[name] = None, str(error)
+                    continue
                 results[name] = localised
                 previous = [localised.camera] if localised.found else []
-        if missing and not any(results.values()):
-            raise InputError(f"{', '.join(results)} and {self.scene}: {missing}")
+        results |= dict.fromkeys(reasons)
+        if not any(results.values()):
+            different = list(dict.fromkeys(reasons.values()))[:3]
+            raise InputError(f"{', '.join(self.images)} and {self.scene}: {'; '.join(different)}")
         files = [] if self.out is None else _write(self.out, results, camera)
         facts = [
-            {"image": name, "found": False, "start": None} | ({} if result is None else result.as_dict())
+            {"image": name, "found": False, "start": None}
+            | ({"reason": reasons[name]} if result is None else result.as_dict())
             for name, result in results.items()
         ]
         heads = ("image", "found", "position [m]", "deviation [mm]", "[deg]", "inliers", "start")
         table = (f"Poses in {self.scene}", heads, [_row(result) for result in facts])
-        absent = sum(not result["found"] for result in facts)
         notes = []
-        if absent:
+        for reason in dict.fromkeys(reasons.values()):
+            names = [name for name in reasons if reasons[name] == reason]
+            more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+            notes.append(f"{', '.join(names[:3])}{more}: {reason}")
+        refused = sum(result is not None and not result.found for result in results.values())
+        if refused:
             notes.append(
-                f"{absent} of {len(facts)} photographs without a pose: no initial pose, or less than 60 % of "
-                "the textured blocks match; check the camera's size, intrinsics and lens, and the splats"
+                f"{refused} of {len(facts)} photographs without a pose: less than 60 % of the textured "
+                "blocks match; check the camera's size, intrinsics and lens, and the splats"
             )
         device = renderer.device.title
         values = {"device": device, "images": facts, "files": files}
@@ -125,8 +129,8 @@ class Localise:
 
 
 def _row(facts: dict[str, Any]) -> tuple[str, ...]:
-    if facts["start"] is None:
-        return (facts["image"], "no", "", "", "", "", "no initial pose")
+    if (start := facts["start"]) is None:
+        return (facts["image"], "no", "", "", "", "", "none")
     return (
         facts["image"],
         "yes" if facts["found"] else "no",
@@ -134,7 +138,7 @@ def _row(facts: dict[str, Any]) -> tuple[str, ...]:
         f"{facts['position_deviation_mm']:.2f}",
         f"{facts['angle_deviation_deg']:.4f}",
         f"{100 * facts['inliers']:.0f} %",
-        facts["start"],
+        start if ", " not in start else f"{start.count(', ') + 1} markers",
     )
 
 

@@ -77,8 +77,12 @@ def is_video(path: str | os.PathLike[str]) -> bool:
     return file.suffix.lower() in VIDEO_SUFFIXES and file.is_file()
 
 
-def read_images(path: str | os.PathLike[str]) -> Iterator[tuple[str, np.ndarray]]:
+def read_images(
+    path: str | os.PathLike[str], skipped: dict[str, str] | None = None
+) -> Iterator[tuple[str, np.ndarray]]:
     """Names and images (h, w, 3) uint8 RGB of a file, of a folder's files sorted by name, or of a video.
+
+    skipped: if given, receives the reason for each file of a folder that cannot be read, by its name.
 
     Raises InputError if there is no image, or one cannot be read.
     """
@@ -90,7 +94,14 @@ def read_images(path: str | os.PathLike[str]) -> Iterator[tuple[str, np.ndarray]
                 f"{file} must contain an image file, got none; known suffixes are {', '.join(IMAGE_SUFFIXES)}"
             )
         for name in names:
-            yield str(name), read_image(name)
+            try:
+                image = read_image(name)
+            except InputError as error:
+                if skipped is None:
+                    raise
+                skipped[str(name)] = str(error)
+                continue
+            yield str(name), image
     elif is_video(file):
         yield from _frames(file)
     else:

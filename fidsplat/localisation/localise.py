@@ -34,10 +34,6 @@ TRIED = 3
 """number of candidates that are aligned coarsely"""
 
 
-class NoInitialPose(InputError):
-    """Missing initial pose: no start, no marker of the scene in the image and no candidate."""
-
-
 @dataclass(frozen=True, eq=False)
 class Localisation:
     """Pose of a camera in a scene."""
@@ -171,7 +167,7 @@ def localise(
         starts, source = [detected[0]], ", ".join(detected[1])
     if not starts:
         if not len(candidates):
-            raise NoInitialPose(
+            raise InputError(
                 "localisation must have an initial pose, got no start, no marker of the scene in the image "
                 "and no candidates; give start= or candidates="
             )

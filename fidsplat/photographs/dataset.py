@@ -25,7 +25,9 @@ from fidsplat.vision.undistort import undistort_masked
 SPLATS = "splats.ply"
 """file of the trained splats, which the scene files name"""
 PHOTOGRAPHS = "photographs.toml"
-"""scene file with the camera of the photographs and its lens, to localise other photographs"""
+"""scene file with the camera of most photographs and its lens, to localise other photographs"""
+OTHER_PHOTOGRAPHS = "photographs-[0-9]*.toml"
+"""pattern of the scene files of further cameras"""
 _QUALITY = 95
 
 
@@ -115,12 +117,13 @@ def write_model(
     colors: np.ndarray,
     tags: Sequence[PlacedMarker],
     visible: Sequence[Sequence[str]],
-    photographed: Camera,
-) -> Path:
+    photographed: Sequence[Camera],
+) -> tuple[Path, list[tuple[Path, Camera, int]]]:
     """Write COLMAP's model of the undistorted images, without points in the boxes of tags, dataset.json with
-    these boxes, and scene files with the tags; returns that of the undistorted images.
+    these boxes, and scene files with the tags. Returns the scene file of the undistorted images, and of each
+    camera of the photographs the scene file, the camera and its number of photographs.
 
-    photographed: camera of a photograph.
+    photographed: cameras of the photographs.
     visible: for each tag the names of the photographs in which it was detected.
     """
     boxes = [box_of(tag) for tag in tags]
@@ -133,8 +136,17 @@ def write_model(
     save_colmap(
         folder / "sparse" / "0", [_image_name(name) for name in names], cameras, points[free], colors[free]
     )
-    for file, camera in (folder / PHOTOGRAPHS, photographed), (folder / "scene.toml", cameras[0]):
+    for file in folder.glob(OTHER_PHOTOGRAPHS):
+        file.unlink()
+    shared: dict[tuple, list[Camera]] = {}
+    for camera in photographed:
+        shared.setdefault((camera.width, camera.height, camera.fx, camera.fy, camera.lens), []).append(camera)
+    groups = sorted(shared.values(), key=len, reverse=True)
+    stem, suffix = Path(PHOTOGRAPHS).stem, Path(PHOTOGRAPHS).suffix
+    files = [folder / PHOTOGRAPHS, *(folder / f"{stem}-{i}{suffix}" for i in range(2, len(groups) + 1))]
+    scene = folder / "scene.toml"
+    for file, camera in (scene, cameras[0]), *zip(files, (group[0] for group in groups), strict=True):
         Scene(camera=camera, markers=tuple(tags)).save(file)
         with atomic_write(file) as stream:
             stream.write(file.read_bytes() + f'\n[[splats]]\nfile = "{SPLATS}"\n'.encode())
-    return file
+    return scene, [(file, group[0], len(group)) for file, group in zip(files, groups, strict=True)]

@@ -47,19 +47,26 @@ def source_files(source: Path) -> list[Path]:
     return files
 
 
-def copy_photos(files: Sequence[Path], folder: Path, progress: Progress) -> None:
+def copy_photos(files: Sequence[Path], folder: Path, progress: Progress) -> list[tuple[str, str]]:
     """Copy photographs into a folder, rotated upright by their EXIF orientation, under names without blanks.
     Files other than JPEG become PNG, since COLMAP reads no WebP.
 
-    Raises InputError for an image that cannot be read, or two names with one `name_key`.
+    Returns the names of skipped files, which cannot be read, each with the reason.
+
+    Raises InputError if fewer than MIN_PHOTOS can be read, or for two names with one `name_key`.
     """
     names: dict[str, str] = {}
+    skipped: list[tuple[str, str]] = []
     for number, file in enumerate(files):
         progress("photographs", number / len(files))
-        data = read_input(file)
-        if not declared_pixels(data):
-            raise InputError(f"cannot read {file} as an image; give a PNG, JPEG, BMP, TIFF or WebP file")
-        image, key = read_image(file), name_key(file.name)
+        try:
+            data = read_input(file)
+            if not declared_pixels(data):
+                raise InputError(f"cannot read {file} as an image; give a PNG, JPEG, BMP, TIFF or WebP file")
+            image, key = read_image(file), name_key(file.name)
+        except InputError as error:
+            skipped.append((file.name, str(error)))
+            continue
         exif, suffix = read_exif(data), file.suffix.lower()
         if suffix not in (".jpg", ".jpeg"):
             data, suffix = encode_image(image, "png"), ".png"
@@ -72,6 +79,12 @@ def copy_photos(files: Sequence[Path], folder: Path, progress: Progress) -> None
             )
         names[key] = file.name
         (folder / f"{'_'.join(file.stem.split())}{suffix}").write_bytes(data)
+    if skipped and len(names) < MIN_PHOTOS:
+        raise InputError(
+            f"a capture must have at least {MIN_PHOTOS} photographs that can be read, got {len(names)} of "
+            f"{len(files)}: {skipped[0][1]}"
+        )
+    return skipped
 
 
 def name_key(name: str) -> str:

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from fidsplat.cameras import Camera
 from fidsplat.markers import marker
 from fidsplat.photographs.adjustment import Adjustment, adjust
-from fidsplat.photographs.dataset import PHOTOGRAPHS, scaled, write_images, write_model
+from fidsplat.photographs.dataset import OTHER_PHOTOGRAPHS, PHOTOGRAPHS, scaled, write_images, write_model
 from fidsplat.photographs.frame import WorldFrame, world_frame
 from fidsplat.photographs.mapping import (
     Model,
@@ -33,6 +34,8 @@ from fidsplat.util.files import from_json, path_of, read_text, writable_folder, 
 from fidsplat.util.progress import Progress, no_progress
 
 INPUTS = "inputs.json"
+SKIPPED = "skipped.json"
+"""file in `work` with the photographs that cannot be read, each with the reason"""
 WRITTEN = "written"
 """empty file in `work` once OUTPUTS are of this command"""
 OUTPUTS = "images", "masks", "sparse", "dataset.json", "scene.toml", PHOTOGRAPHS
@@ -59,6 +62,8 @@ class Captured:
     """whether lengths are in metres"""
     readout: float
     """displacement of rows by motion during the readout [px]; 0 unless a rolling shutter is likely"""
+    cameras: tuple[tuple[Path, Camera, int], ...]
+    """scene file of each camera of the photographs, the camera, and its number of photographs"""
 
 
 def photographs_to_scene(
@@ -99,12 +104,13 @@ def photographs_to_scene(
         if video:
             copy_frames(files[0], part, settings.frames, report)
         else:
-            copy_photos(files, part, report)
+            write_json(work / SKIPPED, copy_photos(files, part, report))
 
     photos, database = _step(work / "photos", prepare), work / "database.db"
     with _completed(work):
+        skipped = [] if video else from_json(read_text(work / SKIPPED))
         groups = camera_groups(photos)
-        count = sum(map(len, groups))
+        count = sum(map(len, groups)) + len(skipped)
         if not video and count != len(files):
             raise ValueError(f"{count} of {len(files)} photographs")
         pycolmap.Database.open(database).close()
@@ -141,8 +147,11 @@ def photographs_to_scene(
     used = () if adjustment is None else adjustment.used
     visible = [[model.names[view.image] for view in used if view.tag == tag.marker.spec] for tag in placed]
     points = frame.points(model.points)
-    scene = write_model(folder, model.names, small, points, model.colors, placed, visible, cameras[0])
-    missing = [(names.get(name_key(name), name), why) for name, why in unregistered(database, model.names)]
+    scene, photographed = write_model(
+        folder, model.names, small, points, model.colors, placed, visible, cameras
+    )
+    missing = [(name, reason) for name, reason in skipped]
+    missing += [(names.get(name_key(name), name), why) for name, why in unregistered(database, model.names)]
     metric = adjustment is not None or picks is not None
     fraction, displaced = readout_motion(model)
     readout = displaced if fraction > MIN_FRACTION and displaced > MIN_DISPLACEMENT else 0.0
@@ -158,6 +167,7 @@ def photographs_to_scene(
         tuple(missing),
         metric,
         readout,
+        tuple(photographed),
     )
 
 
@@ -187,7 +197,7 @@ def _refuse_foreign(folder: Path, files: list[Path], overwrite: bool) -> None:
     # of links: the folder of the link, and that of its target
     folders = {place for file in files for place in (file.parent.resolve(), file.resolve().parent)}
     sources = {parent for place in folders for parent in (place, *place.parents)}
-    for path in (work, *(folder / name for name in OUTPUTS)):
+    for path in (work, *(folder / name for name in OUTPUTS), *folder.glob(OTHER_PHOTOGRAPHS)):
         if path.is_dir() and any(parent.samefile(path) for parent in sources):
             raise InputError(
                 f"photographs must be outside of {path}, which is replaced, got {files[0]}; give another "

@@ -329,12 +329,26 @@ def test_a_tag_gives_the_initial_pose(renderer, tmp_path, capsys):
     scene.save(tmp_path / "scene.toml")
     write_png(tmp_path / "photo.png", image)
     write_png(tmp_path / "blank.png", 0 * image)  # without a tag: the other photograph is found all the same
-    files = ["--scene", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "poses.tum")]
-    photos = [str(tmp_path / name) for name in ("blank.png", "photo.png")]
-    assert main(["localise", *photos, *files, "--device", "opencl", "--json"]) == 0
-    blank, facts = json.loads(capsys.readouterr().out)["images"]
-    assert (blank["found"], blank["start"]) == (False, None)
+    write_png(tmp_path / "turned.png", np.rot90(image))  # of another camera
+    (tmp_path / "torn.png").write_bytes((tmp_path / "photo.png").read_bytes()[:500])
+    words = ["localise", str(tmp_path), "--scene", str(tmp_path / "scene.toml"), "--device", "opencl"]
+    assert main([*words, "-o", str(tmp_path / "poses.tum"), "--json"]) == 0
+    images = json.loads(capsys.readouterr().out)["images"]
+    results = {Path(each["image"]).stem: each for each in images}
+    facts = results.pop("photo")
     assert facts["found"]
+    for name, reason in (
+        ("blank", "no marker of the scene"),
+        ("turned", "64 x 48 pixels, got 48 x 64"),
+        ("torn", "cannot read"),
+    ):
+        assert (results[name]["found"], results[name]["start"]) == (False, None)
+        assert reason in results[name]["reason"]
+    assert main(words) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "turned.png: the image must have the camera's size" in printed
+    assert main(["localise", str(tmp_path / "torn.png"), str(tmp_path / "turned.png"), *words[2:]]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
     assert np.shape(facts["covariance"]) == (6, 6)
     assert facts["position"] == pytest.approx(scene.camera.position, abs=2e-3)
     written = fs.load_trajectory(tmp_path / "poses.tum").poses[0]

@@ -270,7 +270,8 @@ def test_exif_is_kept_with_upright_pixels(order, tmp_path):
     np.testing.assert_array_equal(read_image(tmp_path / "b.jpg").shape, image.shape)
     (tmp_path / "upright copies").mkdir()
     files = [tmp_path / name for name in ("a.jpg", "b.jpg")]
-    copy_photos(files, tmp_path / "upright copies", lambda step, fraction: None)
+    (tmp_path / "d.jpg").write_bytes(rotated)
+    copy_photos([*files, tmp_path / "d.jpg"], tmp_path / "upright copies", lambda step, fraction: None)
     copied = read_image(tmp_path / "upright copies" / "a.jpg")
     np.testing.assert_allclose(copied, read_image(tmp_path / "a.jpg"), atol=3)
     assert read_exif((tmp_path / "upright copies" / "a.jpg").read_bytes()).orientation == 1
@@ -281,10 +282,10 @@ def test_exif_is_kept_with_upright_pixels(order, tmp_path):
     ):
         copy_photos([*files, tmp_path / "B.png"], tmp_path / "twice", lambda step, fraction: None)
     (tmp_path / "c.jpg").write_bytes(rotated[: len(rotated) // 2])
-    with pytest.raises(InputError, match=r"cannot read .*tmp.*c\.jpg as an image; it is truncated"):
-        copy_photos([tmp_path / "c.jpg"], tmp_path / "twice", lambda step, fraction: None)
+    with pytest.raises(InputError, match=r"got 2 of 3: cannot read .*c\.jpg as an image; it is truncated"):
+        copy_photos([*files, tmp_path / "c.jpg"], tmp_path / "twice", lambda step, fraction: None)
     # portrait and landscape have different cameras
-    assert camera_groups(tmp_path / "upright copies") == [["a.jpg"], ["b.jpg"]]
+    assert camera_groups(tmp_path / "upright copies") == [["a.jpg", "d.jpg"], ["b.jpg"]]
     for damaged in (rotated[:40], jpeg, b"", rotated.replace(b"II", b"XX").replace(b"MM", b"XX")):
         assert read_exif(damaged).orientation in (1, 6)
 

@@ -85,7 +85,9 @@ def photos(tmp_path_factory):
 @pytest.fixture(scope="module")
 def captured(photos, tmp_path_factory):
     out = tmp_path_factory.mktemp("scene")
-    return out, [photos, "-o", out, *ARGUMENTS, "--up", "apriltag:36h11:9"]
+    words = [photos, "-o", out, *ARGUMENTS, "--up", "apriltag:36h11:9"]
+    assert main(["capture", *map(str, words)]) == 0
+    return out, words
 
 
 def test_photographs_become_a_metric_data_set(captured, capsys):
@@ -245,16 +247,43 @@ def test_a_damaged_work_folder_is_one_clear_line(damaged, length, captured, phot
     assert (status, "work is damaged" in message, "--overwrite restarts" in message) == (2, True, True)
 
 
-def test_after_a_damaged_photograph_the_same_folder_is_used(photos, tmp_path, capsys):
+def test_damaged_photographs_are_skipped_unless_too_few_are_left(photos, tmp_path, capsys):
     copies = tmp_path / "copies"
     shutil.copytree(photos, copies)
-    damaged = copies / "view 1.png", copies / "view 3.png"
-    for file in damaged:
+    files = [copies / f"view {i}.png" for i in range(5)]
+    for file in (files[0], copies / "notes.jpg"):
+        file.write_bytes(files[0].read_bytes()[:1000])
+    (copies / "notes.jpg").write_text("mine")
+    for _ in range(2):  # also when it resumes
+        facts = prints_json(capsys, "capture", copies, "-o", tmp_path / "out", *ARGUMENTS)
+        assert (facts["photographs"], facts["registered"]) == (6, 4)
+        assert facts["missing"].keys() == {"view 0.png", "notes.jpg"}
+        assert f"cannot read {files[0]}" in facts["missing"]["view 0.png"]
+    for file in files[1:3]:
         file.write_bytes(file.read_bytes()[:1000])
-    for file in damaged:
-        status, message = fails(capsys, "capture", copies, "-o", tmp_path / "out")
-        assert (status, f"cannot read {file}" in message) == (2, True)
-        file.unlink()
+    status, message = fails(capsys, "capture", copies, "-o", tmp_path / "few")
+    assert (status, "photographs that can be read, got 2 of 6: cannot read" in message) == (2, True)
+    files[2].write_bytes((photos / files[2].name).read_bytes())
+    assert prints_json(capsys, "capture", copies, "-o", tmp_path / "few")["photographs"] == 6
+
+
+def test_each_camera_of_the_photographs_has_a_scene_file(photos, tmp_path, capsys):
+    mixed, out = tmp_path / "mixed", tmp_path / "out"
+    mixed.mkdir()
+    for i in range(5):
+        image = cv2.imread(str(photos / f"view {i}.png"))
+        cv2.imwrite(str(mixed / f"{i}.png"), np.ascontiguousarray(np.rot90(image)) if i == 0 else image)
+    facts = prints_json(capsys, "capture", mixed, "-o", out, *ARGUMENTS)
+    assert facts["registered"] == 5
+    expected = {"photographs.toml": (320, 240), "photographs-2.toml": (240, 320)}
+    assert [each["photographs"] for each in facts["cameras"]] == [4, 1]
+    for name, size in expected.items():
+        camera = fs.Scene.load(without_splats(out, name)).camera
+        assert (camera.width, camera.height) == size
+    assert main(["capture", *map(str, (mixed, "-o", out, *ARGUMENTS))]) == 0
+    assert "photographs-2.toml: 240 x 320" in " ".join(capsys.readouterr().out.split())
+    prints_json(capsys, "capture", photos, "-o", out, *ARGUMENTS, "--overwrite")
+    assert not (out / "photographs-2.toml").exists()
 
 
 def test_the_verification_of_matches_does_not_depend_on_earlier_pairs(tmp_path):
