@@ -80,8 +80,8 @@ class PerturbedFrame(NamedTuple):
     size: float
     """size of the motion [rad or m]"""
     axis: int
-    """component of the ray: the derivative by the motion along z (or about z) is -d times it, where d is the
-    derivative by this motion"""
+    """index (0 or 1) of a component r of the ray: with d the derivative with respect to this motion, the
+    derivative with respect to the motion along (or about) z is -r d"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +96,9 @@ class AlignmentSums:
     matrix: np.ndarray
     """(c, 8, 8) outer product of a row with itself, weighted by the second derivative of the loss"""
     rhs: np.ndarray
-    """(c, 8, 1) row times residual. With a PerturbedFrame (c, 8, 2): row times d, and row times -d times a
-    component of the ray, where d is the derivative of the rendered value with respect to the motion"""
+    """(c, 8, 1) row times residual. With a PerturbedFrame (c, 8, 2): row times d, and row times -r d, with d
+    the derivative of the rendered value with respect to the motion, and r the component of the ray with the
+    index `PerturbedFrame.axis`"""
     squared_residuals: np.ndarray
     """(c,)"""
     block_rhs: np.ndarray
@@ -110,7 +111,8 @@ class AlignmentSums:
     cost: float
     """mean loss"""
     cost_before: float
-    """mean loss with the noise of the previous pose (`AlignmentFit.noise`), for comparison with its `cost`"""
+    """mean loss with the noise of the previous pose (`AlignmentFit.noise`), for comparison with the `cost` of
+    the previous pose"""
     inverse_depth: float
     """mean squared inverse depth [1 / m^2]"""
     noise: float
@@ -121,14 +123,14 @@ HUBER, TUKEY = 1.5, 4.685
 """robust thresholds in standard deviations of the noise"""
 MIN_NOISE, MAX_NOISE = 1e-2, 0.03
 """limits of the noise, display values; residuals above TUKEY * MAX_NOISE never fit"""
-GAINS = 0.05, 20.0
+MIN_GAIN, MAX_GAIN = 0.05, 20.0
 """limits of the gain of the image relative to the render"""
 _MEDIAN = {1: 0.4549, 3: 2.3660}
 """median of the chi-squared distribution, by degrees of freedom"""
 
 
 def noise_factor(channels: int) -> float:
-    """Standard deviation of the residuals divided by the median over pixels of their RMS over channels."""
+    """Factor from the median over pixels of the residuals' RMS over channels to their standard deviation."""
     return (channels / _MEDIAN[channels]) ** 0.5
 
 
@@ -174,10 +176,8 @@ class AlignmentKernels(ABC):
     ) -> list[np.ndarray]:
         """`AlignmentSums.rhs` of each motion. motions: pose after the motion, and size and axis as in
         PerturbedFrame."""
-        perturbed = (
-            PerturbedFrame(self.frame(stage, pose, True), size, axis) for pose, size, axis in motions
-        )
-        return [self.sums(stage, frame, fit, perturbed=each).rhs for each in perturbed]
+        frames = (PerturbedFrame(self.frame(stage, pose, True), size, axis) for pose, size, axis in motions)
+        return [self.sums(stage, frame, fit, perturbed=perturbed).rhs for perturbed in frames]
 
     def minimise(
         self, stage: int, at: Estimate, steps: int, tolerance: float, damping: float

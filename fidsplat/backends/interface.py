@@ -345,8 +345,8 @@ class Backend(ABC):
         """Use arrays that are already on the device (`means`, `quats`, ...) as a cloud, without a copy."""
         raise InputError(self.lacks("wrap arrays", "use a Warp device, or a SplatCloud"))
 
-    def chunk_cache(self, scene: Any) -> Any:
-        """A device cache for a scene in chunks (`streaming.device_chunks.DeviceChunks`)."""
+    def chunk_cache(self, chunks: Any) -> Any:
+        """A device cache for the chunks of a scene, a `streaming.device_chunks.DeviceChunks`."""
         raise DeviceError(self.lacks("cache chunks of a scene", "upload the scene"))
 
     def termination_depths(self, images: Any) -> TerminationDepths:

@@ -1,4 +1,4 @@
-"""Registry of devices: opens and lists them by name. A family is a module with `devices` and
+"""Registry of devices: opens and lists them by name. A family is a module or package with `devices` and
 `open_device`."""
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from importlib import import_module
 from fidsplat.backends.caches import ensure_caches
 from fidsplat.backends.interface import Backend, DeviceInfo
 from fidsplat.util.errors import DeviceError, UnknownDeviceError, unknown
-from fidsplat.util.limits import check_driver
+from fidsplat.util.limits import check_driver_limits
 from fidsplat.util.markup import html_table
 
 FAMILIES = {
@@ -76,16 +76,16 @@ def _open_first() -> Backend:
 
 
 def _prepare(family: str, selector: str = "") -> None:
-    """Check that a family's driver can be used in this process, and provide folders for its caches."""
+    """Refuse a family whose driver cannot be used in this process, and provide folders for its caches."""
     if family == "reference":
         return
     if (family, selector.lower()) != ("warp", "cpu"):  # warp:cpu has no driver
-        _check_driver(family)
-    check_driver(family)
+        _refuse_fork(family)
+    check_driver_limits(family)
     ensure_caches()
 
 
-def _check_driver(family: str) -> None:
+def _refuse_fork(family: str) -> None:
     """Raise DeviceError in a fork, where the driver would wait for threads of the parent."""
     started = _STARTED_BY.setdefault(family, os.getpid())
     if started != os.getpid():

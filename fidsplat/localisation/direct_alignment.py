@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.alignment import (
-    GAINS,
+    MAX_GAIN,
+    MIN_GAIN,
     MIN_NOISE,
     AlignmentFit,
     AlignmentKernels,
@@ -182,7 +183,7 @@ def _moved(at: Estimate, sums: AlignmentSums, step: np.ndarray) -> Estimate:
     """The estimate after a step (6 + 2 c,) of pose and exposure."""
     gains, offsets = _exposure_of(sums) if at.fit.huber else (1 + step[6::2], step[7::2])
     fit = at.fit._replace(
-        gain=np.clip(at.fit.gain * gains, *GAINS), offset=at.fit.offset + at.fit.gain * offsets
+        gain=np.clip(at.fit.gain * gains, MIN_GAIN, MAX_GAIN), offset=at.fit.offset + at.fit.gain * offsets
     )
     return Estimate(offset_pose(at.pose, step[:6]), fit, sums.noise)
 

@@ -10,8 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from fidsplat.backends.bands import split_by_cost
 from fidsplat.backends.interface import Images, ResidentData
+from fidsplat.backends.ranges import split_by_cost
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet

@@ -44,7 +44,7 @@ class DeviceChunks:
             chunks.append(Chunk(("in memory", first), end - first, partial(self._in_memory, first, end)))
         return chunks
 
-    def distinct(self, applies_poses: bool) -> int:
+    def count_distinct(self, applies_poses: bool) -> int:
         """Number of different chunk keys. applies_poses: whether the device applies poses of instances."""
         keys = (
             len(store.nodes) * (1 if applies_poses and self._can_pose(store) else store.instances)

@@ -104,7 +104,7 @@ def check_imports() -> None:
 
 
 @cache
-def check_driver(family: str) -> None:
+def check_driver_limits(family: str) -> None:
     """Raise DeviceError if a limit is so low that the driver of a device family would abort the process.
     Checked only once, as a loaded driver already uses its memory."""
     if (largest := _limit("RLIMIT_FSIZE")) < _FILE:

@@ -11,10 +11,10 @@ from agreement import ALL_OUTPUTS, random_splats, some_thick
 from sampling import alternate
 
 import fidsplat as fs
-from fidsplat.backends.bands import split_by_cost
 from fidsplat.backends.opencl import tiling
 from fidsplat.backends.opencl.kernel_config import gpu_config
 from fidsplat.backends.opencl.memory_plan import plan_of
+from fidsplat.backends.ranges import split_by_cost
 
 UNTOUCHED = 0xFFFFFFFF
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))

@@ -117,7 +117,7 @@ def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
     monkeypatch.setattr(tiling, "launch_local", launch)
     monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
     resident = backend.upload(cloud)
-    resident.coherent = True
+    resident.is_spatially_sorted = True
     for _ in range(3):
         images = pipeline.render_view(resident, view)
         assert images.stats == expected.stats

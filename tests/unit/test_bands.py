@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fidsplat.backends.bands import split_by_cost
+from fidsplat.backends.ranges import split_by_cost
 
 
 @pytest.mark.parametrize(

@@ -144,8 +144,8 @@ def test_target_is_corrected_only_where_the_record_looks_as_expected():
         return Record(*words)
 
     good = record(1, 2, ctypes.addressof(triplet), ctypes.addressof(generic), 5)
-    assert target_patch.why_not(ctypes.addressof(good), POCL + "generic") == ""
-    name = target_patch.correct_target(ctypes.addressof(good), POCL + "generic")
+    assert target_patch.why_unpatchable(ctypes.addressof(good), POCL + "generic") == ""
+    name = target_patch.patch_target(ctypes.addressof(good), POCL + "generic")
     assert name in [level for level, _ in target_patch._LEVELS]
     assert ctypes.string_at(good[3]) == name.encode()
     assert list(good[:3]) == [1, 2, ctypes.addressof(triplet)]
@@ -157,8 +157,8 @@ def test_target_is_corrected_only_where_the_record_looks_as_expected():
         record(8, 1 << 63),
     ):
         before = list(bad)
-        assert "not that of PoCL 3.0" in target_patch.why_not(ctypes.addressof(bad), POCL + "generic")
-        assert target_patch.correct_target(ctypes.addressof(bad), POCL + "generic") == "generic"
+        assert "not that of PoCL 3.0" in target_patch.why_unpatchable(ctypes.addressof(bad), POCL + "generic")
+        assert target_patch.patch_target(ctypes.addressof(bad), POCL + "generic") == "generic"
         assert list(bad) == before
 
 
@@ -171,10 +171,10 @@ def test_target_is_corrected_only_where_the_record_looks_as_expected():
         ("haswell", "generic", True),
     ],
 )
-def test_only_pocl_that_mistakes_the_processor_is_corrected(monkeypatch, processor, llvm, needed):
+def test_only_pocl_that_mistakes_the_processor_is_patched(monkeypatch, processor, llvm, needed):
     monkeypatch.setattr(target_patch, "_processor_name", lambda: processor)
-    assert target_patch.needs_correction(POCL + llvm) == needed
-    assert not target_patch.needs_correction("OpenCL 3.0 CUDA")
+    assert target_patch.needs_patch(POCL + llvm) == needed
+    assert not target_patch.needs_patch("OpenCL 3.0 CUDA")
 
 
 def pocl_that_mistakes(record):
@@ -192,7 +192,7 @@ def record(monkeypatch):
     words = [ctypes.create_string_buffer(text) for text in (b"x86_64-unknown-linux-gnu", b"generic")]
     addresses = (ctypes.c_uint64 * 512)(*map(ctypes.addressof, words))
     addresses.kept = words
-    monkeypatch.setattr(target_patch, "_corrected", {})  # of records that had its address before
+    monkeypatch.setattr(target_patch, "_patched", {})  # of records that had its address before
     return addresses
 
 
@@ -229,7 +229,7 @@ def test_where_the_patch_may_not_or_cannot_be_made_another_device_is_taken_or_a_
     assert "\n" not in str(caught.value)
     monkeypatch.setattr(device, "_all_devices", lambda: iter([pocl, other]))
     assert device.open_device() == "a newer PoCL"
-    assert target_patch.correct_target(pocl.int_ptr, pocl.version) == "generic"
+    assert target_patch.patch_target(pocl.int_ptr, pocl.version) == "generic"
     assert list(record) == before
 
 

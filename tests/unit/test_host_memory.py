@@ -15,7 +15,7 @@ def renderer(monkeypatch):
     monkeypatch.setattr(host_memory, "_MINIMUM", 1)
     renderer = fs.Renderer("opencl")
     memory = renderer.backend.host_memory
-    monkeypatch.setattr(memory, "locks", True)  # as GPUs do
+    monkeypatch.setattr(memory, "pins_memory", True)  # as GPUs do
     return renderer
 
 
@@ -53,7 +53,7 @@ def test_images_of_about_the_same_size_take_the_same_memory(renderer):
         places.add(array.ctypes.data)
         del array
     assert len(places) == 1
-    assert memory._locked < 1.25 * 4 * 100 * 102
+    assert memory._pinned < 1.25 * 4 * 100 * 102
 
 
 def test_no_more_is_locked_than_allowed(renderer, monkeypatch):
@@ -70,5 +70,5 @@ def test_no_more_is_locked_than_allowed(renderer, monkeypatch):
     assert memory.empty((9, 9), np.int32).base is None
     other = memory.empty((9, 9), np.int32)  # what lies idle makes room
     assert other.base is not None
-    assert memory._locked <= 900
+    assert memory._pinned <= 900
     assert math.prod(other.shape) == 81

@@ -316,8 +316,10 @@ def assemble_alignment(items: int) -> KernelSource:
 @cache
 def assemble_alignment_step(float64: bool) -> KernelSource:
     """Assemble the kernel of a step of Levenberg-Marquardt, for views in float64 or float32."""
-    low, high = alignment.GAINS
-    constants = {"PROJECTION_FP64": int(float64), "MIN_GAIN": f"{low}f", "MAX_GAIN": f"{high}f"}
+    constants = {
+        **{"PROJECTION_FP64": int(float64)},
+        **{name: f"{getattr(alignment, name)}f" for name in ("MIN_GAIN", "MAX_GAIN")},
+    }
     scalars = Scalars("double" if float64 else "float", "float")
     return Assembler(scalars, constants).source({"alignment": ("prelude", "alignment_step")})
 

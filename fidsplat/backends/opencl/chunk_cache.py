@@ -1,7 +1,7 @@
 """Device chunk cache with prefetch: chunks of a scene in device buffers, and clouds gathered from them.
 
-Each array has a buffer with slots of one size. The chunks of a frame are copied from there into arrays in
-scene order, which decides ties of depth, so that images are bit-identical to those of the complete scene.
+Each array has a buffer with slots of one size. A frame copies its chunks from the slots into arrays in scene
+order. This order decides ties of depth, so images are bit-identical to those of the complete scene.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ _NO_POSE = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
-class Copies:
+class CopyParameters:
     """Parameters of the kernels that copy rows of cached chunks."""
 
-    parameters: cl.Buffer
-    """parameters in the layout of `gather_chunks.cl`"""
+    table: cl.Buffer
+    """the array `copies` of `gather_chunks.cl`"""
     poses: cl.Buffer | None
     count: int
     rows: int
@@ -50,9 +50,9 @@ class Copies:
 class OpenCLChunkCache:
     """Device cache of a scene's chunks, bounded by the memory budget; the least recently used are evicted."""
 
-    def __init__(self, workspace: Workspace, scene: Any) -> None:
-        """scene: a `streaming.device_chunks.DeviceChunks`."""
-        self.workspace, self.scene, self._rows = workspace, scene, max(scene.largest_chunk, 1)
+    def __init__(self, workspace: Workspace, chunks: Any) -> None:
+        """chunks: the `streaming.device_chunks.DeviceChunks` of a scene."""
+        self.workspace, self.chunks, self._rows = workspace, chunks, max(chunks.largest_chunk, 1)
         self.applies_poses = workspace.info.float64
         """whether the device applies `Chunk.pose`; else it must be None"""
         self.row_bytes: dict[str, int] = {}
@@ -72,7 +72,7 @@ class OpenCLChunkCache:
         self._last_copy: cl.Event | None = None
         """event of the last copy out of the cache"""
         program = build(
-            workspace, kernel_text("store/gather_chunks.cl"), f"-DINSTANCED={int(self.applies_poses)}"
+            workspace, kernel_text("store/gather_chunks.cl"), f"-DAPPLIES_POSES={int(self.applies_poses)}"
         )
         self._kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
 
@@ -91,7 +91,7 @@ class OpenCLChunkCache:
         return GatheredChunks(self, chunks, first_id)
 
     def prefetch(self, chunks: Sequence[Chunk]) -> None:
-        """Load chunks of the next frame from another thread, into free slots and those of chunks that neither
+        """Load chunks of the next frame from another thread, into free slots; evict only chunks that neither
         the current nor the next frame uses."""
         requested = {chunk.key for chunk in chunks}  # pinned: requested chunks must not evict each other
         for chunk in chunks:
@@ -105,20 +105,25 @@ class OpenCLChunkCache:
                     return
 
     def copy(
-        self, name: str, chunks: Sequence[Chunk], spans: np.ndarray, target: cl.Buffer, cached: Copies | None
-    ) -> Copies | None:
+        self,
+        name: str,
+        chunks: Sequence[Chunk],
+        spans: np.ndarray,
+        target: cl.Buffer,
+        previous: CopyParameters | None,
+    ) -> CopyParameters | None:
         """Copy rows of chunks into an array. spans: (k, 3) first row of each chunk, its destination, number
-        of rows. cached: result of this method for the same rows of another array."""
+        of rows. previous: result of this method for the same rows of another array."""
         with self._lock, self.workspace.device_errors("copying splats"):
-            if cached is not None and cached.evictions == self._evictions:
-                self._launch(name, cached, target)
-                return cached
+            if previous is not None and previous.evictions == self._evictions:
+                self._launch(name, previous, target)
+                return previous
             ranges = list(self._ranges(chunks))
-            copies = None
+            parameters = None
             for first, end in ranges:
-                copies = self._copies(chunks[first:end], spans[first:end])
-                self._launch(name, copies, target)
-            return copies if len(ranges) == 1 else None
+                parameters = self._copy_parameters(chunks[first:end], spans[first:end])
+                self._launch(name, parameters, target)
+            return parameters if len(ranges) == 1 else None
 
     def wait(self) -> None:
         with self._lock, self.workspace.device_errors("copying splats"):
@@ -135,7 +140,7 @@ class OpenCLChunkCache:
                 first, keys = index, {chunk.key}
         yield first, len(chunks)
 
-    def _copies(self, chunks: Sequence[Chunk], spans: np.ndarray) -> Copies:
+    def _copy_parameters(self, chunks: Sequence[Chunk], spans: np.ndarray) -> CopyParameters:
         """Load chunks into slots, and return the parameters of their copies."""
         slots = self._load_missing(chunks)
         table = np.full((len(chunks), 4), _NO_POSE, np.uint32)
@@ -144,8 +149,8 @@ class OpenCLChunkCache:
         table[:, 1:3] = spans[:, 1:]
         poses = [(index, chunk.pose) for index, chunk in enumerate(chunks) if chunk.pose is not None]
         table[[index for index, _ in poses], 3] = np.arange(len(poses))
-        return Copies(
-            parameters=self._constant(table),
+        return CopyParameters(
+            table=self._constant(table),
             poses=self._constant(np.stack([pose for _, pose in poses])) if poses else None,
             count=len(chunks),
             rows=int(table[:, 2].max(initial=0)),
@@ -156,16 +161,16 @@ class OpenCLChunkCache:
         flags = cl.mem_flags
         return cl.Buffer(self.workspace.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=array)
 
-    def _launch(self, name: str, copies: Copies, target: cl.Buffer) -> None:
+    def _launch(self, name: str, parameters: CopyParameters, target: cl.Buffer) -> None:
         words = self.row_bytes[name] // 4
-        posed = copies.poses is not None and name in ("means", "quats")
-        items = copies.rows * (1 if posed else words)
+        posed = parameters.poses is not None and name in ("means", "quats")
+        items = parameters.rows * (1 if posed else words)
         if not items:
             return
         kernel = self._kernels["gather_posed" if posed else "gather"]
-        poses = (copies.poses,) if posed else ()
-        kernel.set_args(self._arrays[name], copies.parameters, np.uint32(words), *poses, target)
-        size = -(-items // 64) * 64, copies.count
+        poses = (parameters.poses,) if posed else ()
+        kernel.set_args(self._arrays[name], parameters.table, np.uint32(words), *poses, target)
+        size = -(-items // 64) * 64, parameters.count
         self._last_copy = cl.enqueue_nd_range_kernel(self.workspace.queue, kernel, size, (64, 1))
 
     def _load_missing(self, chunks: Sequence[Chunk]) -> list[int]:
@@ -221,7 +226,8 @@ class OpenCLChunkCache:
     def _max_slots(self) -> int:
         fitting = self.workspace.memory_budget // _CACHE_DIVISOR // self._slot_bytes
         allocatable = self.workspace.device.max_mem_alloc_size // (self._rows * max(self.row_bytes.values()))
-        return max(1, self._size, min(fitting, allocatable, self.scene.distinct(self.applies_poses)))
+        chunks = self.chunks.count_distinct(self.applies_poses)
+        return max(1, self._size, min(fitting, allocatable, chunks))
 
     def _grow(self, size: int) -> None:
         if self._last_copy is not None:
@@ -240,7 +246,7 @@ class OpenCLChunkCache:
 class GatheredChunks(Resident):
     """A cloud assembled from cached chunks; `streamed` if it exceeds its fraction of the memory budget."""
 
-    coherent = True
+    is_spatially_sorted = True
 
     def __init__(self, cache: OpenCLChunkCache, chunks: Sequence[Chunk], first_id: int) -> None:
         workspace = cache.workspace
@@ -248,12 +254,12 @@ class GatheredChunks(Resident):
         self._first_id, self.buffer_key = first_id, cache.token
         self._ends = np.cumsum([chunk.count for chunk in chunks], dtype=np.int64)
         super().__init__(int(self._ends[-1]))
-        self.copy_properties(cache.scene.scene)
+        self.copy_properties(cache.chunks.scene)
         self.capacity = rounded_up(self.count, 4)  # so that the next view reuses the buffers
         self._acquired: list[tuple[str, cl.Buffer]] = []
         weakref.finalize(self, workspace.pool.release, self._acquired)
-        self._copies: tuple[int, int, Copies | None] = (0, 0, None)
-        """parameters of the last copy, with its splats [first, end)"""
+        self._previous_copy: tuple[int, int, CopyParameters | None] = (0, 0, None)
+        """the last copy: its splats [first, end), and its parameters"""
         row_bytes = cache.row_bytes.values()
         total, widest = self.capacity * sum(row_bytes), self.capacity * max(row_bytes)
         self.streamed = (
@@ -305,8 +311,7 @@ class GatheredChunks(Resident):
         starts = ends - [chunk.count for chunk in chunks]
         from_splat, to_splat = np.maximum(starts, first), np.minimum(ends, end)
         spans = np.stack([from_splat - starts, from_splat - first, to_splat - from_splat], axis=1)
-        *cached_range, cached = self._copies
-        copies = self._cache.copy(
-            name, chunks, spans, target, cached if cached_range == [first, end] else None
-        )
-        self._copies = first, end, copies
+        *previous_range, previous = self._previous_copy
+        if previous_range != [first, end]:
+            previous = None
+        self._previous_copy = first, end, self._cache.copy(name, chunks, spans, target, previous)

@@ -111,8 +111,8 @@ class OpenCLBackend(Workspace, Backend):
     def upload(self, cloud: SplatCloud) -> UploadedCloud:
         return UploadedCloud(self, cloud)
 
-    def chunk_cache(self, scene: Any) -> OpenCLChunkCache:
-        return OpenCLChunkCache(self, scene)
+    def chunk_cache(self, chunks: Any) -> OpenCLChunkCache:
+        return OpenCLChunkCache(self, chunks)
 
     def termination_depths(self, images: OpenCLImages) -> TerminationDepths:
         return images.termination_depths()
@@ -260,13 +260,13 @@ def _why_unusable(device: cl.Device) -> str:
         return "it is big-endian"
     if is_pocl(device) and (why := linker.why_no_linker()):
         return why
-    if _needs_patch(device) and (why := target_patch.why_not(device.int_ptr, device.version)):
+    if _needs_patch(device) and (why := target_patch.why_unpatchable(device.int_ptr, device.version)):
         return f"this PoCL's compiler does not know the processor, and {why}; {_NO_PATCH_NEEDED}"
     return ""
 
 
 def _needs_patch(device: cl.Device) -> bool:
-    return target_patch.needs_correction(device.version)
+    return target_patch.needs_patch(device.version)
 
 
 def _describe(device: cl.Device, name: str) -> DeviceInfo:

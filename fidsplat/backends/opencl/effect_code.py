@@ -13,7 +13,7 @@ from fidsplat.backends.opencl.kernel_interface import RAY_UNIFORMS
 from fidsplat.effects.extensions import Extension
 
 _RAYS = args("in float rays  // 3 channels X, Y, Z; NaN outside the field of view")
-_OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
+_LENS_CAMERAS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
 
 EFFECT_CODE: dict[str, EffectCode] = {
     # effects: one of each kind
@@ -227,14 +227,12 @@ EFFECT_CODE: dict[str, EffectCode] = {
                 "1 / |grad| of the edge functions D + n_u, D - n_u, D + n_v, D - n_v",
             ),
         ),
-        replaced_by=tuple((camera, "rays_box") for camera in _OWN_RAYS),
+        replaced_by=tuple((camera, "rays_box") for camera in _LENS_CAMERAS),
     ),
     "rays_box": EffectCode(
         "part/rays_box.cl",
         parts=("box_cover",),
-        project=args(
-            "in float max_ray_derivative  // (1) maximum angle between the rays of neighbouring samples"
-        ),
+        project=args("in float max_ray_derivative  // (1) maximum length of the derivative of a ray"),
         blend=args("in float ray_derivatives  // 6 channels dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy"),
     ),
     "ray_depth": EffectCode(

@@ -1,7 +1,7 @@
-"""Page-locked host memory for images of a GPU: a copy to it runs at the full rate of the bus, during
+"""Pinned (page-locked) host memory for images of a GPU: a copy to it runs at the full rate of the bus, during
 rendering.
 
-Locking takes longer than copying, so that memory is reused for images of about the same size.
+Pinning takes longer than copying, so memory is reused for images of about the same size.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import numpy as np
 import pyopencl as cl
 
 _MINIMUM = 1 << 18
-"""minimum bytes of locked memory: smaller images are copied to ordinary memory at the same speed"""
+"""minimum bytes of pinned memory: smaller images are copied to ordinary memory at the same speed"""
 _MAXIMUM = 1 << 30
-"""maximum bytes that are locked at once; further images use ordinary memory"""
+"""maximum bytes that are pinned at once; further images use ordinary memory"""
 
 
 @dataclass(frozen=True, eq=False)
-class _LockedBuffer:
+class _PinnedBuffer:
     """A buffer that stays mapped during its lifetime."""
 
     buffer: cl.Buffer
@@ -30,9 +30,9 @@ class _LockedBuffer:
 
 
 class _ArrayMemory:
-    """The base object of an array in locked memory, which is reused once the array is released."""
+    """The base object of an array in pinned memory, which is reused once the array is released."""
 
-    def __init__(self, memory: _LockedBuffer, shape: tuple[int, ...], dtype: Any) -> None:
+    def __init__(self, memory: _PinnedBuffer, shape: tuple[int, ...], dtype: Any) -> None:
         self._memory = memory
         self.__array_interface__ = {
             "data": (memory.mapped.ctypes.data, False),
@@ -47,18 +47,18 @@ class HostMemory:
 
     def __init__(self, context: cl.Context, device: cl.Device) -> None:
         self._context = context
-        self.locks = not device.type & cl.device_type.CPU
-        """whether to lock memory; on a CPU it saves no time"""
+        self.pins_memory = not device.type & cl.device_type.CPU
+        """whether to pin memory; on a CPU it saves no time"""
         self._requested: set[int] = set()
         """capacities that were requested before"""
-        self._spare: dict[int, list[_LockedBuffer]] = {}
+        self._spare: dict[int, list[_PinnedBuffer]] = {}
         """unused buffers by their capacity"""
-        self._locked, self._lock = 0, threading.Lock()
+        self._pinned, self._lock = 0, threading.Lock()
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-        """An array with undefined contents; locked memory from the second request of its size on."""
+        """An array with undefined contents; pinned memory from the second request of its size on."""
         size = math.prod(shape) * np.dtype(dtype).itemsize
-        if not self.locks or size < _MINIMUM:
+        if not self.pins_memory or size < _MINIMUM:
             return np.empty(shape, dtype)
         capacity = rounded_up(size, 3)
         with self._lock:
@@ -70,31 +70,31 @@ class HostMemory:
         weakref.finalize(base, self._spare.setdefault(capacity, []).append, memory).atexit = False
         return np.asarray(base)
 
-    def _acquire(self, capacity: int) -> _LockedBuffer | None:
-        """An unused or new locked buffer; None for ordinary memory."""
+    def _acquire(self, capacity: int) -> _PinnedBuffer | None:
+        """An unused or new pinned buffer; None for ordinary memory."""
         if capacity not in self._requested:
             self._requested.add(capacity)
             return None
         spare = self._spare.setdefault(capacity, [])
         if spare:
             return spare.pop()
-        if self._locked + capacity > _MAXIMUM:
+        if self._pinned + capacity > _MAXIMUM:
             for other, buffers in self._spare.items():
                 while buffers:
                     buffers.pop()
-                    self._locked -= other
-        if self._locked + capacity > _MAXIMUM:
+                    self._pinned -= other
+        if self._pinned + capacity > _MAXIMUM:
             return None
         flags, queue = cl.mem_flags, cl.CommandQueue(self._context)
         access: Any = cl.map_flags.READ | cl.map_flags.WRITE
         try:
             buffer = cl.Buffer(self._context, flags.READ_WRITE | flags.ALLOC_HOST_PTR, capacity)
             mapped, _ = cl.enqueue_map_buffer(queue, buffer, access, 0, (capacity,), np.dtype(np.uint8))
-        except cl.Error:  # the system refuses to lock more memory
-            self.locks = False
+        except cl.Error:  # the system refuses to pin more memory
+            self.pins_memory = False
             return None
-        self._locked += capacity
-        return _LockedBuffer(buffer, mapped)
+        self._pinned += capacity
+        return _PinnedBuffer(buffer, mapped)
 
 
 def rounded_up(count: int, bits: int) -> int:

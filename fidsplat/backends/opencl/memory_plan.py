@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from fidsplat.backends.bands import even_parts
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.assemble import KernelSource
 from fidsplat.backends.opencl.buffers import RayBuffers
@@ -19,6 +18,7 @@ from fidsplat.backends.opencl.kernel_config import KernelConfig
 from fidsplat.backends.opencl.kernel_interface import RAW
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.backends.ranges import even_ranges
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import DeviceError, bytes_words
@@ -129,7 +129,7 @@ class MemoryPlanner:
         view_bytes = resident.capacity * splat_bytes + tables + 4 * self._channels * samples
         free = min(self._device.memory_budget - plan.total + view_bytes, self._device.largest_buffer)
         max_views = min(free, PART_BYTES.get(self._device.info.kind, OTHER_PART_BYTES)) // view_bytes
-        for first, end in even_parts(count, max(1, min(max_views, _PART_SAMPLES // samples))):
+        for first, end in even_ranges(count, max(1, min(max_views, _PART_SAMPLES // samples))):
             yield Part(first, end, MemoryPlan(0, resident.count, plan.total + (end - first - 1) * view_bytes))
 
     def _image_bytes(self, view: View) -> int:

@@ -87,7 +87,7 @@ class OpenCLPipeline(Pipeline):
             cached = resident.cached_frames.get(key) if view.band is None else None
             if cached is not None and (images := self._replay(resident, view, cached)) is not None:
                 return images
-            if resident.coherent and self.config.binning == "bin_first":
+            if resident.is_spatially_sorted and self.config.binning == "bin_first":
                 return self._with_binning("bin_local").render_view(resident, view)
             if resident.count >= MIN_CULLED and resident.sortable and self._culls:
                 culling = self._pipeline_for(self.features, replace(self.config, culls_first=True))
@@ -283,7 +283,7 @@ class OpenCLPipeline(Pipeline):
         if plan.chunk:
             return self._with_binning("sort_first")  # the only strategy of frames in chunks
         few = len(views) > 1 and self._planner.tiles(views.view) <= tiling.LOCAL_TILES
-        return self._with_binning("bin_local") if few or resident.coherent else self
+        return self._with_binning("bin_local") if few or resident.is_spatially_sorted else self
 
     def render_intermediates(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Render one view; returns the buffers between the stages: keys (n,) uint32; starts (tiles + 1,)

@@ -16,7 +16,7 @@ import pyopencl as cl
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.opencl.assemble import KernelSource, assemble_test
 from fidsplat.backends.opencl.pocl_workarounds import is_pocl, shared_program
-from fidsplat.backends.opencl.pocl_workarounds.target_patch import correct_target, needs_correction
+from fidsplat.backends.opencl.pocl_workarounds.target_patch import needs_patch, patch_target
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.util import interrupts
 from fidsplat.util.errors import DeviceError, FidsplatError
@@ -43,9 +43,9 @@ def load_invoker() -> None:
 def build_options(device: cl.Device) -> list[str]:
     """Compiler options of all programs, without options that relax IEEE arithmetic."""
     version, target = device.version, device.version
-    if needs_correction(version):
-        target = correct_target(device.int_ptr, version)
-    # pyopencl's cache key has the version string, which names the processor; a corrected name must be added
+    if needs_patch(version):
+        target = patch_target(device.int_ptr, version)
+    # pyopencl's cache key has the version string, which names the processor; a patched name must be added
     target = "".join(c if c.isalnum() else "_" for c in target)
     options = ["-cl-std=CL1.2", "-w", f"-DTARGET_{target}"]
     rounds = device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
@@ -97,8 +97,8 @@ def _compile(workspace: Workspace, source: KernelSource) -> dict[str, cl.Program
     load_invoker()
     for attempt in range(3):
         options, programs = [f"-DATTEMPT_{attempt}"] if attempt else [], {}
-        for each in source.programs.values():
-            program = build(workspace, each.text, *options)
+        for program_source in source.programs.values():
+            program = build(workspace, program_source.text, *options)
             for kernel in program.all_kernels():
                 programs[kernel.function_name] = program
         if source.arguments.keys() <= programs.keys():

@@ -33,7 +33,7 @@ class Resident(ResidentData):
     """whether the arrays never change, so that a frame can be rendered again later"""
     buffer_key: object = None
     """key of clouds whose frames may share buffers"""
-    coherent = False
+    is_spatially_sorted = False
     """whether splats with neighbouring indices are close to each other, as in chunked scenes on disk"""
     sortable = False
     """whether `sorted_array` is available"""

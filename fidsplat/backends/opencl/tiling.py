@@ -17,13 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.bands import split_by_cost
 from fidsplat.backends.opencl.counts import BIG, COUNTERS, PAIRS, VISIBLE, Counts, enlarged
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.kernel_config import KernelConfig
 from fidsplat.backends.opencl.memory_plan import KEY_BYTES, MIN_BIG, WINDOW_BYTES
 from fidsplat.backends.opencl.morton_order import CULLING_GROUP
 from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.backends.ranges import split_by_cost
 from fidsplat.util.errors import DeviceError
 
 LOCAL_TILES = 4096

@@ -49,8 +49,8 @@ def processor_flags() -> frozenset[str]:
 
 @contextmanager
 def intel_registered() -> Iterator[None]:
-    """A context in which the loader, when it first lists platforms, finds Intel's runtime too. A vendors
-    folder set by the user is not replaced."""
+    """Let the loader find Intel's runtime when it first lists platforms. A vendors folder set by the user is
+    not replaced."""
     library = None if _VENDORS in os.environ else intel_library()
     if library is None:
         yield

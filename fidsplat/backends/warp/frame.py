@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fidsplat.backends.bands import split_by_cost
 from fidsplat.backends.batched_views import ViewBatch
+from fidsplat.backends.ranges import split_by_cost
 from fidsplat.backends.view import SubFrame
 from fidsplat.backends.warp.command_list import BLOCK, Launcher
 from fidsplat.backends.warp.memory_plan import MemoryPlanner

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from fidsplat.backends.bands import even_parts
 from fidsplat.backends.batched_views import ViewBatch
+from fidsplat.backends.ranges import even_ranges
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
@@ -63,7 +63,7 @@ class MemoryPlanner:
         """Ranges [first, end) of views that are rendered together. reserved: bytes of all their images."""
         count, workspace = len(batch), self.workspace
         if not count or not batch.stacked or (self._same_settings and batch.camera_parameters):
-            return even_parts(count, 1)
+            return even_ranges(count, 1)
         each = resident.count * self._splat_bytes + self.sample_bytes(batch.view)
         external = batch.view.external_depth
         each += external.nbytes // count if external and external.stacked else 0
@@ -71,4 +71,4 @@ class MemoryPlanner:
         # half of the budget is for the lists
         fitting = min(free // 2, _MAX_PART_BYTES[workspace.device.is_cuda]) // each
         numbered = _MAX_NUMBERED // max(self._samples(batch.view), resident.count * self._lines)
-        return even_parts(count, max(1, min(fitting, numbered)))
+        return even_ranges(count, max(1, min(fitting, numbered)))

@@ -1,7 +1,7 @@
 // Gathers resident chunks of stores into the arrays of the rendered cloud, in scene order, and transforms chunks of posed
-// stores. INSTANCED: the device has float64 for the transform.
+// stores. APPLIES_POSES: the device has float64 for the transform.
 #pragma OPENCL FP_CONTRACT OFF
-#if INSTANCED
+#if APPLIES_POSES
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 #endif
 
@@ -14,7 +14,7 @@ kernel void gather(global const uint *source, global const uint4 *copies, uint w
     target[(ulong)copy.y * words + word] = source[(ulong)copy.x * words + word];
 }
 
-#if INSTANCED
+#if APPLIES_POSES
 #define NO_POSE 0xffffffffu
 
 // A row of means (width 3) or quaternions (width 4). Bit-identical to `moved` (fidsplat/store/subset.py): sums have the same

@@ -38,11 +38,11 @@ def _is_complete_elf(stream: BinaryIO, size: int) -> bool:
     if len(head) < 64 or not head.startswith(_ELF):
         return False
     (table,) = struct.unpack_from("<Q", head, 0x28)
-    each, count = struct.unpack_from("<HH", head, 0x3A)
-    if each != _SECTION.size or table + each * count > size:
+    entry_bytes, count = struct.unpack_from("<HH", head, 0x3A)
+    if entry_bytes != _SECTION.size or table + entry_bytes * count > size:
         return False
     stream.seek(table)
-    sections = _SECTION.iter_unpack(stream.read(each * count))
+    sections = _SECTION.iter_unpack(stream.read(entry_bytes * count))
     return all(kind == _NO_BITS or offset + length <= size for kind, offset, length in sections)
 
 

@@ -1,4 +1,4 @@
-"""Correction of PoCL 3.0's target processor in memory: the last resort; FIDSPLAT_NO_POCL_PATCH forbids it.
+"""Patch of PoCL 3.0's target processor in memory: the last resort; FIDSPLAT_NO_POCL_PATCH forbids it.
 
 PoCL 3.0 gets the processor's name from LLVM 14. For a newer processor (AMD Zen 5) the name is "generic", and
 every build fails ("unknown target CPU", pocl issues #512, #1049). For Zen 4 it is "znver3" (without AVX-512),
@@ -32,10 +32,10 @@ FORBID = "FIDSPLAT_NO_POCL_PATCH"
 """environment variable: any value except 0 forbids the patch"""
 _NAME = re.compile(r"PoCL.*-x86_64-[\w-]*gnu-([\w-]+)$")
 _RECORD_BYTES = 2048
-_corrected: dict[int, ctypes.Array] = {}  # kept alive, as PoCL's records point to these strings
+_patched: dict[int, ctypes.Array] = {}  # kept alive, as PoCL's records point to these strings
 
 
-def needs_correction(device_version: str) -> bool:
+def needs_patch(device_version: str) -> bool:
     """Whether a device is driven by PoCL 3.0 and LLVM misidentified its processor."""
     if platform.system() != "Linux" or platform.machine() != "x86_64":
         return False
@@ -43,11 +43,11 @@ def needs_correction(device_version: str) -> bool:
     return name == "generic" or (name.startswith("znver") and _processor_name() == _LEVELS[-1][0])
 
 
-def why_not(device_address: int, device_version: str) -> str:
+def why_unpatchable(device_address: int, device_version: str) -> str:
     """Why the PoCL device with its record at this address must not or cannot be patched; empty if it can."""
     if os.environ.get(FORBID, "0") not in ("", "0"):
         return f"the environment variable {FORBID} forbids the patch"
-    if device_address in _corrected:
+    if device_address in _patched:
         return ""
     try:
         return "" if _field_address(device_address, device_version) else "its record is not that of PoCL 3.0"
@@ -55,20 +55,20 @@ def why_not(device_address: int, device_version: str) -> str:
         return f"/proc/self/mem cannot be read ({error.strerror or error})"
 
 
-def correct_target(device_address: int, device_version: str) -> str:
-    """Correct the processor name of a PoCL device unless `why_not` forbids it; returns the name."""
-    if device_address not in _corrected:
+def patch_target(device_address: int, device_version: str) -> str:
+    """Patch the processor name of a PoCL device unless `why_unpatchable` forbids it; returns the name."""
+    if device_address not in _patched:
         address = (
             None
-            if why_not(device_address, device_version)
+            if why_unpatchable(device_address, device_version)
             else _field_address(device_address, device_version)
         )
         if address is None:
             return _name_of_llvm(device_version)
         name = ctypes.create_string_buffer(_processor_name().encode())
-        _corrected[device_address] = name
+        _patched[device_address] = name
         ctypes.c_uint64.from_address(address).value = ctypes.addressof(name)
-    return _corrected[device_address].value.decode()
+    return _patched[device_address].value.decode()
 
 
 def announce_once(cache: Path, text: str) -> None:
