@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import tyro
@@ -60,13 +61,18 @@ def _facts(captured: Captured) -> dict[str, Any]:
         "missing": dict(captured.missing),
         "points": len(captured.model.points),
         "reprojection_px": captured.model.reprojection,
-        "metric": captured.metric,
+        "metric": captured.scale_error is not None,
         "readout_px": captured.readout,
         "cameras": [
             {"scene": str(file), "size": [camera.width, camera.height], "fx": camera.fx, "photographs": count}
             for file, camera, count in captured.cameras
         ],
     }
+    if captured.scale_error is not None:
+        facts |= {
+            "metres_per_unit": captured.frame.scale,
+            "scale_standard_error": captured.scale_error,
+        }
     if adjusted is None:
         return facts
     tags = {}
@@ -79,12 +85,7 @@ def _facts(captured: Captured) -> dict[str, Any]:
             "scale_alone": None if scale is None else scale[0] / adjusted.scale,
             "pose": pose.pose,
         }
-    return facts | {
-        "metres_per_unit": adjusted.scale,
-        "scale_standard_error": adjusted.scale_error,
-        "corner_rms_px": adjusted.rms,
-        "tags": tags,
-    }
+    return facts | {"corner_rms_px": adjusted.rms, "tags": tags}
 
 
 def _words(captured: Captured, facts: dict[str, Any], out: str, lens: str) -> list[str]:
@@ -98,11 +99,15 @@ def _words(captured: Captured, facts: dict[str, Any], out: str, lens: str) -> li
             f"{file.name}: {camera.width} x {camera.height}, fx {camera.fx:.0f} px, {count} photographs"
             for file, camera, count in captured.cameras
         ]
-    if captured.adjustment is not None:
+    if captured.scale_error is None:
+        lines.append("lengths are not in metres; give --tag SPEC=METRES, or --scale A,B=METRES")
+    else:
+        corners = f"; corners of tags {facts['corner_rms_px']:.2f} px" if captured.adjustment else ""
         lines.append(
             f"scale {facts['metres_per_unit']:.6g} m per unit with a standard error of "
-            f"{100 * facts['scale_standard_error']:.2g} %; corners of tags {facts['corner_rms_px']:.2f} px"
+            f"{100 * captured.scale_error:.2g} %{corners}"
         )
+    if captured.adjustment is not None:
         for spec, tag in facts["tags"].items():
             alone = (
                 ""
@@ -111,8 +116,10 @@ def _words(captured: Captured, facts: dict[str, Any], out: str, lens: str) -> li
             )
             others = f", {tag['rejected']} rejected" if tag["rejected"] else ""
             lines.append(f"{spec}: {tag['views']} photographs{others}{alone}")
-    elif not captured.metric:
-        lines.append("lengths are not in metres; give --tag SPEC=METRES, or --scale A,B=METRES")
+        lines += [
+            f"sizes of {tag} and {other} disagree by {100 * difference:.2g} %; measure their black squares"
+            for tag, other, difference in captured.adjustment.disagreements
+        ]
     if captured.readout:
         lines.append(
             f"rows are displaced by motion during the readout (rolling shutter), or the lens is not {lens}: "
@@ -122,8 +129,9 @@ def _words(captured: Captured, facts: dict[str, Any], out: str, lens: str) -> li
     lines += [f"{spec} was not detected" for spec in captured.undetected]
     splats = Path(out) / "splats.ply"
     again = " again if tags, --up or --scale changed" if splats.exists() else ""
+    folder, file, scene = (quote(str(path)) for path in (out, splats, captured.scene))
     lines.append(
-        f"train it{again}: fidsplat train {out} -o {splats}{' --overwrite' if again else ''}; then view it: "
-        f"fidsplat view {captured.scene}"
+        f"train it{again}: fidsplat train {folder} -o {file}{' --overwrite' if again else ''}; then view it: "
+        f"fidsplat view {scene}"
     )
     return lines

@@ -346,6 +346,7 @@ def _read(path: str | os.PathLike[str], flags: int) -> np.ndarray:
     image = _decode(data, path, flags)
     if image is None:
         known = "it is truncated or damaged; copy it again" if declared_pixels(data) else ""
+        known = known if data else "it is empty; copy it again"
         raise InputError(
             f"cannot read {path} as an image; {known or 'give a PNG, JPEG, BMP, TIFF or WebP file'}"
         )

@@ -30,6 +30,8 @@ MAX_REJECTED = 0.3
 """largest fraction of rejected detections of a tag"""
 SAME_SIZE, SIGMAS = 0.05, 5.0
 """scales of two tags contradict each other beyond this relative difference and number of standard errors"""
+SIMILAR_SIZE = 0.005
+"""relative difference from which a contradiction of less than SAME_SIZE is reported"""
 MIN_PARALLAX = 0.02
 """minimum distance of two cameras relative to the distance of the tag"""
 _SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
@@ -64,13 +66,19 @@ class Adjustment:
     scales: dict[str, tuple[float, float]]
     """tag -> scale and relative standard error from this tag alone, where its views determine one"""
 
+    @property
+    def disagreements(self) -> list[tuple[str, str, float]]:
+        """Pairs of tags with the relative difference of their scales, where it is above SIMILAR_SIZE and
+        SIGMAS standard errors."""
+        return _differences(self.scales, SIMILAR_SIZE)
+
 
 def adjust(cameras: Sequence[Camera], views: Sequence[TagView], sizes: Mapping[str, float]) -> Adjustment:
     """Adjust the scale and the poses of tags to their corners in all photographs.
 
     Args:
         cameras: pinhole cameras in the unit of the model.
-        views: detections; detections; at least one tag in photographs from two positions.
+        views: detections; at least one tag in photographs from two positions.
         sizes: edge of each tag in metres.
 
     Raises InputError if no tag is detected from two positions, if a tag has two positions, or if the sizes of
@@ -102,9 +110,9 @@ def adjust(cameras: Sequence[Camera], views: Sequence[TagView], sizes: Mapping[s
                 good = _inliers(cameras, found, sizes, unit, poses)
                 if len(found) - len(good) > MAX_REJECTED * len(found) or len(good) < 2:
                     raise InputError(
-                        f"{tag} must be at one place in all photographs, got {len(found) - len(good)} of "
-                        f"{len(found)} detections elsewhere; remove photographs of a second copy of the tag, "
-                        "or in which it was moved"
+                        f"{tag} must be at one place in all photographs, got {len(found)} detections that "
+                        "contradict each other; remove photographs of a second copy of the tag, or in which "
+                        "it was moved"
                     )
                 unit, moved, error = _solve(cameras, good, sizes, unit, {tag: poses[tag]})
                 poses |= moved
@@ -120,15 +128,23 @@ def adjust(cameras: Sequence[Camera], views: Sequence[TagView], sizes: Mapping[s
     return Adjustment(1 / unit, error, poses, rms, tuple(used), tuple(rejected), scales)
 
 
+def _differences(scales: Mapping[str, tuple[float, float]], smallest: float) -> list[tuple[str, str, float]]:
+    """Pairs of tags, and the logarithm of the ratio of their scales, above `smallest` and SIGMAS standard
+    errors."""
+    return [
+        (tag, other, difference)
+        for (tag, (a, da)), (other, (b, db)) in combinations(scales.items(), 2)
+        if (difference := abs(float(np.log(a / b)))) > max(smallest, SIGMAS * float(np.hypot(da, db)))
+    ]
+
+
 def _check_sizes(scales: Mapping[str, tuple[float, float]], sizes: Mapping[str, float]) -> None:
-    for (tag, (a, da)), (other, (b, db)) in combinations(scales.items(), 2):
-        difference = abs(np.log(a / b))
-        if difference > max(SAME_SIZE, SIGMAS * float(np.hypot(da, db))):
-            raise InputError(
-                f"sizes of tags must agree, got {sizes[tag]:g} m for {tag} and {sizes[other]:g} m for "
-                f"{other}, which would be {sizes[other] * a / b:.4g} m if the first is right; measure their "
-                "black squares"
-            )
+    for tag, other, _ in _differences(scales, SAME_SIZE):
+        raise InputError(
+            f"sizes of tags must agree, got {sizes[tag]:g} m for {tag} and {sizes[other]:g} m for {other}, "
+            f"which would be {sizes[other] * scales[tag][0] / scales[other][0]:.4g} m if the first is right; "
+            "measure their black squares"
+        )
 
 
 def _tag_in_axes_of_world(camera: Camera, view: TagView, size: float) -> np.ndarray:

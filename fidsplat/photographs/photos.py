@@ -61,7 +61,7 @@ def copy_photos(files: Sequence[Path], folder: Path, progress: Progress) -> list
         progress("photographs", number / len(files))
         try:
             data = read_input(file)
-            if not declared_pixels(data):
+            if data and not declared_pixels(data):
                 raise InputError(f"cannot read {file} as an image; give a PNG, JPEG, BMP, TIFF or WebP file")
             image, key = read_image(file), name_key(file.name)
         except InputError as error:

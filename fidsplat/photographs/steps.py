@@ -25,6 +25,7 @@ from fidsplat.photographs.mapping import (
     unregistered,
 )
 from fidsplat.photographs.photos import camera_groups, copy_frames, copy_photos, name_key, source_files
+from fidsplat.photographs.picks import parse_scale, scale_of
 from fidsplat.photographs.rolling_shutter import MIN_DISPLACEMENT, MIN_FRACTION, readout_motion
 from fidsplat.photographs.settings import CaptureSettings
 from fidsplat.photographs.tags import detect_tags, parse_tags, same_tag
@@ -39,8 +40,6 @@ SKIPPED = "skipped.json"
 WRITTEN = "written"
 """empty file in `work` once OUTPUTS are of this command"""
 OUTPUTS = "images", "masks", "sparse", "dataset.json", "scene.toml", PHOTOGRAPHS
-SNAP = 0.02
-"""largest distance of a picked pixel from a feature, as a fraction of the image's width"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +57,8 @@ class Captured:
     """specs of tags that no photograph contains"""
     missing: tuple[tuple[str, str], ...]
     """photographs without a camera, each with the reason"""
-    metric: bool
-    """whether lengths are in metres"""
+    scale_error: float | None
+    """relative standard error of the scale; None if lengths are not in metres"""
     readout: float
     """displacement of rows by motion during the readout [px]; 0 unless a rolling shutter is likely"""
     cameras: tuple[tuple[Path, Camera, int], ...]
@@ -121,7 +120,7 @@ def photographs_to_scene(
     else:
         with _completed(work):
             model = read_model(work / "model")
-    adjustment, frame = None, None
+    adjustment, picked_error = None, None
     pinholes = [scaled(camera, camera.width, camera.height) for camera in model.cameras]
     if tags:
         views = detect_tags(photos, model.names, model.cameras, tags, report)
@@ -139,7 +138,7 @@ def photographs_to_scene(
         ]
     else:
         placed = []
-        scale = 1.0 if picks is None else scale_of(model, *picks)
+        scale, picked_error = (1.0, None) if picks is None else scale_of(model, *picks)
         frame = world_frame(pinholes, scale, middle=np.median(model.points, axis=0))
     cameras = [frame.camera(camera) for camera in model.cameras]
     (work / WRITTEN).touch()
@@ -152,7 +151,6 @@ def photographs_to_scene(
     )
     missing = [(name, reason) for name, reason in skipped]
     missing += [(names.get(name_key(name), name), why) for name, why in unregistered(database, model.names)]
-    metric = adjustment is not None or picks is not None
     fraction, displaced = readout_motion(model)
     readout = displaced if fraction > MIN_FRACTION and displaced > MIN_DISPLACEMENT else 0.0
     undetected = tuple(spec for spec in tags if adjustment is None or spec not in adjustment.poses)
@@ -165,7 +163,7 @@ def photographs_to_scene(
         tuple(placed),
         undetected,
         tuple(missing),
-        metric,
+        picked_error if adjustment is None else adjustment.scale_error,
         readout,
         tuple(photographed),
     )
@@ -204,7 +202,8 @@ def _refuse_foreign(folder: Path, files: list[Path], overwrite: bool) -> None:
                 "folder with -o"
             )
         mark = INPUTS if path == work else WRITTEN
-        if path.exists() and not (overwrite or (work / mark).exists()):
+        empty = path == work and path.is_dir() and not any(path.iterdir())  # interrupted at the start
+        if path.exists() and not (overwrite or empty or (work / mark).exists()):
             raise InputError(
                 f"{folder} must be a new folder or of an earlier capture, got {path.name} of something "
                 "else; give another folder, or --overwrite to replace it"
@@ -233,58 +232,3 @@ def _work_folder(folder: Path, files: list[Path], settings: CaptureSettings, ove
             "folder, or --overwrite"
         )
     return work
-
-
-Pick = tuple[str, float, float]
-"""a photograph, and x and y in pixels"""
-
-
-def parse_scale(text: str) -> tuple[Pick, Pick, float]:
-    """Two picks and their distance in metres, from `NAME:X:Y,NAME:X:Y=METRES`. Raises InputError."""
-    points, _, metres = text.rpartition("=")
-    try:
-        first, second = (
-            (name, float(x), float(y)) for name, x, y in (point.rsplit(":", 2) for point in points.split(","))
-        )
-        length = float(metres)
-        if not (0 < length < np.inf and np.isfinite([*first[1:], *second[1:]]).all()):
-            raise ValueError
-    except ValueError:
-        raise InputError(
-            f"--scale must be two pixels of photographs and their distance in metres, got {text!r}; write "
-            "for example a.jpg:812:430,b.jpg:120:655=1.25"
-        ) from None
-    if first == second:
-        raise InputError(
-            f"--scale must be two different points, got {points}; pick corners far from each other"
-        )
-    return first, second, length
-
-
-def scale_of(model: Model, first: Pick, second: Pick, metres: float) -> float:
-    """Metres per unit of the model, from the distance of two features. first, second: pixels of photographs
-    near these features.
-
-    Raises InputError for an unknown photograph, or a pixel without a feature nearby.
-    """
-    distance = float(np.linalg.norm(_picked(model, first) - _picked(model, second)))
-    if not distance > 0:
-        raise InputError("--scale must be two different points, got one; pick corners far from each other")
-    return metres / distance
-
-
-def _picked(model: Model, pick: Pick) -> np.ndarray:
-    """The point of the feature nearest to a pixel."""
-    name, x, y = pick
-    keys = [name_key(each) for each in model.names]
-    if name_key(name) not in keys:
-        raise InputError(unknown("photograph with a camera, of --scale,", name, model.names))
-    number = keys.index(name_key(name))
-    distances = np.hypot(*(model.pixels[number] - (x, y)).T)
-    nearest = int(np.argmin(distances))
-    if distances[nearest] > SNAP * model.cameras[number].width:
-        raise InputError(
-            f"--scale must have pixels at features, got {name}:{x:g}:{y:g}; the nearest feature is at "
-            "{:.0f}:{:.0f}".format(*model.pixels[number][nearest])
-        )
-    return model.points[model.tracks[number][nearest]]

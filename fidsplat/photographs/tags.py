@@ -48,8 +48,8 @@ def parse_tags(texts: Sequence[str]) -> dict[str, Marker]:
         other = same_tag(tags, printed)
         if other is not None:
             raise InputError(
-                f"each tag must have one size, got {other.size:g} and {printed.size:g} m for {printed.spec}; "
-                "measure the edge of the black square and give it once"
+                f"each tag must be given once, got {other.size:g} and {printed.size:g} m for {printed.spec}; "
+                "measure the edge of its black square and omit the other"
             )
         tags[printed.spec] = printed
     return tags

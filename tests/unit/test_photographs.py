@@ -11,15 +11,17 @@ import pytest
 
 import fidsplat as fs
 from fidsplat import InputError
+from fidsplat.cameras import BrownConrady
 from fidsplat.images.exif import ORIENTATION, read_exif, with_exif
 from fidsplat.images.files import read_image
 from fidsplat.photographs.adjustment import TagView, adjust
 from fidsplat.photographs.frame import camera_up, world_frame
 from fidsplat.photographs.mapping import Model
 from fidsplat.photographs.photos import camera_groups, copy_photos
+from fidsplat.photographs.picks import parse_scale, scale_of
 from fidsplat.photographs.rolling_shutter import MIN_DISPLACEMENT, MIN_FRACTION, readout_motion
 from fidsplat.photographs.settings import CaptureSettings
-from fidsplat.photographs.steps import parse_scale, photographs_to_scene, scale_of
+from fidsplat.photographs.steps import photographs_to_scene
 from fidsplat.photographs.tags import box_of, module_colors, parse_tags, same_tag
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import quaternion_to_matrix, rigid_matrix
@@ -89,6 +91,9 @@ def test_a_wrong_detection_is_rejected():
 
 def test_tags_that_contradict_are_errors():
     cameras, views, sizes, _ = photographed(3, scale=2.0, tags=2)
+    slightly = adjust(cameras, views, sizes | {"tag 1": sizes["tag 1"] * 1.03})
+    assert slightly.disagreements == [("tag 0", "tag 1", pytest.approx(math.log(1.03), abs=0.005))]
+    assert not adjust(cameras, views, sizes).disagreements
     with pytest.raises(InputError, match=r"sizes of tags must agree.*would be 0\.1(5|499|501) m"):
         adjust(cameras, views, sizes | {"tag 1": 0.25})
     moved = [view if view.image % 2 else TagView(view.tag, view.image, view.corners + 50) for view in views]
@@ -153,7 +158,7 @@ def test_the_region_of_a_tag_is_masked_and_its_inks_are_measured():
     ("options", "message"),
     [
         ({"tag": ("apriltag:36h11:5",)}, "--tag must be a marker spec and the edge"),
-        ({"tag": ("apriltag:36h11:5=0.1", "tag36h11:5=0.2")}, "one size, got 0.1 and 0.2 m"),
+        ({"tag": ("apriltag:36h11:5=0.1", "tag36h11:5=0.2")}, "given once, got 0.1 and 0.2 m"),
         (
             {"tag": ("apriltag:36h11:5=0",)},
             r"--tag must be .* 0\.001 to 100 metres, got 'apriltag:36h11:5=0'",
@@ -178,17 +183,31 @@ def test_a_tag_has_many_specs():
     assert same_tag(tags, fs.marker("qr-v2-L:a", 1.0)) is tags["qr:a"]
 
 
-def test_two_picked_features_give_the_scale():
-    points = np.array([[0.0, 0, 2], [1, 0, 2], [0, 1.5, 4]])
-    camera = fs.Camera.pinhole(640, 480, 500, 500, 320, 240)
-    pixels = camera.project(points)
-    tracks = (np.array([0, 1]), np.array([2]))
-    pixels = tuple(camera.project(points[track]) for track in tracks)
-    model = Model(("a.jpg", "b.jpg"), (camera, camera), points, np.zeros((3, 3), np.uint8), pixels, tracks)
-    (x, y), (u, v) = pixels[0][1] + 4, pixels[1][0] - 3  # picks are near features, not at them
-    assert scale_of(model, *parse_scale(f"A.JPG:{x}:{y},b.tif:{u}:{v}=5")) == pytest.approx(5 / 2.6925824)
-    with pytest.raises(InputError, match=r"a\.jpg:330:300; the nearest feature is at 320:240"):
-        scale_of(model, *parse_scale(f"a.jpg:330:300,b.jpg:{u}:{v}=5"))
+def test_two_picked_pixels_give_the_scale():
+    """In two slanted planes, at pixels between features, one of them wrong, through a lens."""
+    rng, lens = np.random.default_rng(0), BrownConrady(k1=-0.1)
+    camera = fs.Camera.look_at(640, 480, 1.0, (0.3, 0.2, -2), (0.2, 0.1, 0))
+    camera = fs.Camera.pinhole(640, 480, 500, 510, 320, 240, camera.world_to_camera, lens=lens)
+    x, y = rng.uniform(-0.9, 0.9, (2, 400))
+    points = np.stack([x, y, np.where(x < 0, 0.5 * x + 0.2 * y, 1 - 0.3 * x)], 1)
+    ends = np.array([[-0.4, 0.1, -0.18], [0.5, -0.2, 0.85]])
+    points = points[(np.linalg.norm(points[:, None] - ends, axis=2) > 0.025).all(1)]
+    nearest = int(np.argmin(np.linalg.norm(points - ends[0], axis=1)))
+    pixels, track = camera.project(points), np.arange(len(points))
+    points[nearest] *= 0.8  # a wrong point
+    model = Model(("a.jpg",), (camera,), points, np.zeros(points.shape, np.uint8), (pixels,), (track,))
+    (x, y), (u, v) = camera.project(ends)
+    length = float(np.linalg.norm(ends[0] - ends[1]))
+    scale, error = scale_of(model, *parse_scale(f"A.JPG:{x}:{y},a.tif:{u}:{v}={3 * length}"))
+    assert scale == pytest.approx(3, rel=1e-4)
+    assert error < 1e-3
+    moved = points + 0.01 * rng.normal(size=points.shape) * (0, 0, 1)
+    noisy = Model(("a.jpg",), (camera,), moved, np.zeros(points.shape, np.uint8), (pixels,), (track,))
+    scale, error = scale_of(noisy, *parse_scale(f"a.jpg:{x}:{y},a.jpg:{u}:{v}={3 * length}"))
+    assert 0.0005 < error < 0.02
+    assert abs(scale / 3 - 1) < 3 * error
+    with pytest.raises(InputError, match=r"among features, got a\.jpg:0:0 with the nearest at"):
+        scale_of(model, *parse_scale(f"a.jpg:0:0,a.jpg:{u}:{v}=5"))
     with pytest.raises(InputError, match=r"unknown photograph with a camera, of --scale, 'c\.jpg'"):
         scale_of(model, *parse_scale(f"a.jpg:{x}:{y},c.jpg:1:1=5"))
     with pytest.raises(InputError, match="two different points"):

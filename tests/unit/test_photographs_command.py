@@ -203,6 +203,32 @@ def test_too_few_or_unrelated_photographs_are_one_clear_line(photos, captured, t
     assert (status, "--up must be a tag of --tag" in message) == (2, True)
 
 
+def test_the_scale_of_picked_pixels_has_an_error_and_the_next_command_is_quoted(photos, tmp_path, capsys):
+    out, length = tmp_path / "my bench", 0.7
+    camera = list(cameras())[2]
+    wall = np.array([[0.6, 0.85, 0], [0.6 + length, 0.85, 0]])
+    (x, y), (u, v) = camera.project(wall)
+    words = ["--scale", f"view 2.png:{x}:{y},view 2.png:{u}:{v}={length}"]
+    facts = prints_json(capsys, "capture", photos, "-o", out, *words)
+    assert facts["metric"]
+    assert facts["scale_standard_error"] < 0.01
+    known = list(cameras())
+    loaded = fs.load_cameras(out / "sparse" / "0")
+    apart = np.linalg.norm(loaded["view_0.png"].position - loaded["view_4.png"].position)
+    true = np.linalg.norm(known[0].position - known[4].position)
+    assert apart == pytest.approx(true, rel=0.01)
+    assert main(["capture", *map(str, (photos, "-o", out, *ARGUMENTS))]) == 0
+    assert f"fidsplat train '{out}'" in " ".join(capsys.readouterr().out.split())
+    sizes = [word.replace("5=0.2", "5=0.206") for word in ARGUMENTS]
+    assert main(["capture", *map(str, (photos, "-o", out, *sizes))]) == 0
+    assert "disagree by" in capsys.readouterr().out
+
+
+def test_a_capture_that_was_interrupted_at_its_start_resumes(photos, tmp_path, capsys):
+    (tmp_path / "out" / "work").mkdir(parents=True)
+    assert prints_json(capsys, "capture", photos, "-o", tmp_path / "out")["registered"] == 5
+
+
 def test_only_folders_of_an_earlier_capture_are_replaced(photos, tmp_path, capsys):
     garden = tmp_path / "garden"
     shutil.copytree(photos, garden / "images")
