@@ -63,7 +63,7 @@ def write_report(folders: Sequence[Path], page: Path) -> list[Path]:
             for name, device in devices.items()
         ],
         "choices": recommendations(every),
-        "refused": sorted({f"{row.knob} {row.value} ({row.error})" for row in refused}),
+        "refused": sorted({f"{row.setting} {row.value} ({row.error})" for row in refused}),
         "runs": provenance({titles[name]: device.summary for name, device in devices.items()}),
         "notes": [note for device in every for note in device.summary.notes],
         "marker": f"{SHOWN_MARKER} at {TILT} degrees",
@@ -95,7 +95,7 @@ def settings_table(device: DeviceResults) -> Table:
     rows: dict[tuple[str, str], dict[str, str]] = {}
     for scene in (name for name in device.scenes if not is_marker(name)):
         for _, point in device.of(scene).iterrows():
-            key = point["knob"], point["value"]
+            key = point["setting"], point["value"]
             row = rows.setdefault(
                 key, {"setting": key[0], "value": key[1], "verdict": verdict(device, point)}
             )
@@ -107,11 +107,11 @@ def settings_table(device: DeviceResults) -> Table:
 def verdict(device: DeviceResults, point: Row, base: tuple[str, str] | None = None) -> str:
     """Verdict on a setting relative to another one, by default to the base, or to the exact image if it is
     changed there; empty for another definition of the image."""
-    base = base or (EXACT if point["knob"] == ABLATION else BASE)
+    base = base or (EXACT if point["setting"] == ABLATION else BASE)
     other = device.at(point["scene"], *base)
     if (
         other is None
-        or (point["knob"], point["value"]) == base
+        or (point["setting"], point["value"]) == base
         or point.name not in device.same_definition(point["scene"]).index
     ):
         return ""
@@ -126,7 +126,7 @@ def markers_table(device: DeviceResults) -> Table:
     if view not in device.scenes:
         return pd.DataFrame()
     points = device.of(view)
-    for _, point in points[points["knob"] == MARKER].iterrows():
+    for _, point in points[points["setting"] == MARKER].iterrows():
         name, sharp, _ = point["value"].partition(", 3 x 3")
         if (sharp or name == "exact") and "growth" not in name:
             rows.append(
@@ -151,7 +151,7 @@ def recommendations(devices: Sequence[DeviceResults]) -> list[dict[str, str]]:
             best = cheapest_within(device, scenes, INVISIBLE) if scenes else []
             if best:
                 costs = ", ".join(f"{row['scene']} {percent(row['ratio'])}" for row in best)
-                setting, value = best[0]["knob"], best[0]["value"]
+                setting, value = best[0]["setting"], best[0]["value"]
                 name = value if setting in ("base", PRESET, COMBINED) else f"{setting} {value}"
                 found.append({"kind": device.kind, "on": text, "setting": name, "costs": costs})
     return found
@@ -198,7 +198,7 @@ def cheapest_within(device: DeviceResults, scenes: Iterable[str], bound: float) 
     scenes = list(scenes)
     rows: Table = pd.concat([device.same_definition(scene) for scene in scenes])
     best: tuple[float, list[Row]] = (math.inf, [])
-    for _, found in rows.groupby(["knob", "value"], sort=False):
+    for _, found in rows.groupby(["setting", "value"], sort=False):
         error = found["beyond"].fillna(found["maximum"]).max()
         own = [row for _, row in found.iterrows()]
         product = math.prod(cost(device, row) for row in own)

@@ -16,7 +16,7 @@ from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet, declared_output
 from fidsplat.splats.cloud import SplatCloud
-from fidsplat.splats.traits import PlacedTraits
+from fidsplat.splats.properties import CloudLike
 from fidsplat.util.errors import DeviceError, InputError, bytes_words
 
 
@@ -57,7 +57,7 @@ class Rates:
 
 
 class ResidentData(ABC):
-    """A cloud on a device, with the properties that select its kernels (splats/traits.py)."""
+    """A cloud on a device, with the properties that select its kernels (splats/properties.py)."""
 
     count: int
     origin: np.ndarray
@@ -71,7 +71,7 @@ class ResidentData(ABC):
     ellipsoids: str
     """which splats are 3D Gaussians: `none`, `some` or `all`"""
 
-    def copy_properties(self, cloud: PlacedTraits) -> None:
+    def copy_properties(self, cloud: CloudLike) -> None:
         """Copy the origin and the properties that select kernels from another cloud."""
         for name in ("origin", "sh_degree", "has_coplanar_groups", "footprint", "ellipsoids"):
             setattr(self, name, getattr(cloud, name))

@@ -13,15 +13,15 @@ from fidsplat.capture.capture import Capture
 from fidsplat.capture.views import CaptureBatch
 from fidsplat.effects import FeatureSet, select
 from fidsplat.splats.cloud import SplatCloud
-from fidsplat.splats.traits import PlacedTraits
+from fidsplat.splats.properties import CloudLike
 from fidsplat.util.errors import InputError
 
 _Prepared = tuple[FeatureSet, View]
-_prepared: WeakKeyDictionary[Capture, WeakKeyDictionary[PlacedTraits, _Prepared]] = WeakKeyDictionary()
+_prepared: WeakKeyDictionary[Capture, WeakKeyDictionary[CloudLike, _Prepared]] = WeakKeyDictionary()
 """cached for static captures only: the functions of a motion may return other poses next time"""
 
 
-def prepare(cloud: PlacedTraits, capture: Capture) -> _Prepared:
+def prepare(cloud: CloudLike, capture: Capture) -> _Prepared:
     """The features that a capture of a cloud requires, and its view; cached for uploaded clouds. Raises
     InputError for a missing camera, an unknown output, effects that exclude each other, or a pose that is not
     rigid."""
@@ -35,7 +35,7 @@ def prepare(cloud: PlacedTraits, capture: Capture) -> _Prepared:
     return cached[cloud]
 
 
-def prepare_batch(cloud: PlacedTraits, views: CaptureBatch) -> tuple[FeatureSet, ViewBatch]:
+def prepare_batch(cloud: CloudLike, views: CaptureBatch) -> tuple[FeatureSet, ViewBatch]:
     """The features that the views of a batch require, and the batch of rendered views. Raises InputError as
     `prepare`, and if the views have different effects."""
     rendered = views.active

@@ -24,7 +24,8 @@ class MeshOptions:
     voxel: float | None = None
     """M: voxel size of the mesh in metres (default: a 200th of the longest side)"""
     cameras: str | None = None
-    """FILE: cameras whose depth images are fused: COLMAP, transforms.json, a trajectory (default: around)"""
+    """FILE: cameras whose depth images are fused: COLMAP, transforms.json, a trajectory (default: up to 64
+    views around the scene)"""
     faces: int | None = None
     """N: maximum number of triangles (extra: mesh)"""
     parts: int = 32

@@ -124,7 +124,7 @@ def _print_results(sweeps: Sequence[Sweep], as_json: bool) -> None:
         by_scene: dict[tuple[str, str], list[dict[str, Any]]] = {}
         for record in sweep.records:
             if not record.failed:
-                by_scene.setdefault((record.key["knob"], record.key["value"]), []).append(record.result)
+                by_scene.setdefault((record.key["setting"], record.key["value"]), []).append(record.result)
         if by_scene:
             rows = [
                 (

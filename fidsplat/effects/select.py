@@ -12,7 +12,7 @@ from fidsplat.capture.environment import Gradient, Panorama
 from fidsplat.capture.quality import Quality
 from fidsplat.effects.catalogue import CATALOGUE, DERIVED_OUTPUTS, OUTPUTS, RGB, Output
 from fidsplat.effects.extensions import EXTENSIONS, load_extensions
-from fidsplat.splats.traits import CloudTraits
+from fidsplat.splats.properties import CloudProperties
 from fidsplat.util.errors import InputError, unknown
 
 _BACKGROUND_KINDS = {Gradient: "gradient", Panorama: "panorama"}
@@ -53,7 +53,7 @@ class FeatureSet:
         return tuple(images)
 
 
-def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
+def select(cloud: CloudProperties, capture: Capture) -> FeatureSet:
     """Select the effects that a capture of a cloud requires, for a pinhole if the capture has no camera.
     Raises InputError for an unknown output or incompatible effects."""
     _load_extensions_of(capture)
@@ -135,7 +135,7 @@ def with_termination_depths(features: FeatureSet) -> FeatureSet:
     return replace(features, effects=(*features.effects, "termination_depths"))
 
 
-def _compositing(cloud: CloudTraits, order: str, equal_depths: bool) -> str:
+def _compositing(cloud: CloudProperties, order: str, equal_depths: bool) -> str:
     """Select the compositing effect: by centre depth or by fragment depth, with or without layers of coplanar
     groups. equal_depths: whether all fragments of a splat have the depth of its centre; both orders are equal
     then, and the effect without a k-buffer suffices."""
@@ -145,7 +145,7 @@ def _compositing(cloud: CloudTraits, order: str, equal_depths: bool) -> str:
     return "order_pixel" if order == "pixel" and not equal_depths else "order_centre"
 
 
-def _ellipsoid(cloud: CloudTraits, quality: Quality, lens: Lens | None) -> str:
+def _ellipsoid(cloud: CloudProperties, quality: Quality, lens: Lens | None) -> str:
     """Projection of 3D Gaussians; empty for a cloud without 3D Gaussians."""
     if cloud.ellipsoids == "none":
         return ""

@@ -15,7 +15,7 @@ from fidsplat.capture.sensor import Sensor
 from fidsplat.images.tag_dictionaries import families, parse_family
 from fidsplat.markers import Marker, marker
 from fidsplat.render.renderer import Renderer
-from fidsplat.render.surface import median_depth_capture, surface_of
+from fidsplat.render.surface import median_depth_capture, surface_from_depth
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.surface import Surface
 from fidsplat.scenes.up import scene_up
@@ -317,7 +317,7 @@ def surface_candidates(
             if radius < 4 or radius > camera.width / 4:
                 continue
             try:
-                surface = surface_of(depth, camera, (x, y), radius)
+                surface = surface_from_depth(depth, camera, (x, y), radius)
             except InputError:
                 continue
             if surface.inlier_fraction >= MIN_INLIERS and surface.roughness <= FLAT * tag.size:

@@ -105,8 +105,8 @@ def cutoff_of(splats: int) -> float:
 
 
 def ideal_quality(quality: Quality, cutoff: float) -> Quality:
-    """The quality of a reference image: a smaller cut-off, no early termination, alphas up to 1, and a
-    float64 projection."""
+    """The quality of a reference image: the alpha cut-off `cutoff`, no early termination, alphas up to 1, no
+    level of detail, and a float64 projection."""
     return quality.with_(
         alpha_cutoff=cutoff,
         detail_error=0.0,
@@ -163,7 +163,7 @@ def error_reference(data: Any, capture: Capture, backend: Backend) -> ErrorRefer
             "render store.cloud() if it fits into memory, or leave out the output 'error'"
         )
     quality = ideal_quality(capture.quality, cutoff_of(data.count))
-    features, view = _prepared(data, capture, quality, backend)
+    features, view = _reference_features(data, capture, quality, backend)
     # float32 roundings outside of the blending loop: 8 for the products of step 4, the background and the
     # conversions of the image; then the sums of samples, sub-frames and spherical harmonics
     roundings = 8 + features.samples**2 + len(view.sub_frames) + (32 if features.sh_degree else 0)
@@ -174,8 +174,12 @@ def error_reference(data: Any, capture: Capture, backend: Backend) -> ErrorRefer
     return ErrorReference(features, view, color_bound, _SLACK * (_UNIT_ROUNDOFF * roundings + MAX_OMITTED))
 
 
-def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -> tuple[FeatureSet, View]:
-    """Features and view of the reference image: float32 with the output `rounding`, or else float64."""
+def _reference_features(
+    data: Any, capture: Capture, quality: Quality, backend: Backend
+) -> tuple[FeatureSet, View]:
+    """Features and view of the reference image. It is composited in float32 with the output `rounding` if the
+    rounding of all effects is bounded, otherwise in float64. Raises InputError if the device can do
+    neither."""
     capture = capture.with_(outputs=("rgb",), quality=quality)
     info = backend.info
     if info.always_float64:
@@ -184,10 +188,10 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
         raise InputError(
             f"the device of the output 'error' must have float64, got {info.name}; use another device"
         )
-    single = quality.with_(blend_precision="float32")
-    if single.arithmetic == "approximate":
-        single = single.with_(arithmetic="fast")
-    features, view = prepare(data, replace(capture, quality=single))
+    in_float32 = quality.with_(blend_precision="float32")
+    if in_float32.arithmetic == "approximate":
+        in_float32 = in_float32.with_(arithmetic="fast")
+    features, view = prepare(data, replace(capture, quality=in_float32))
     unbounded = sorted({*features.effects} - _BOUNDED)
     if not unbounded and quality.blend_precision != "float64":
         return replace(features, outputs=("rounding",)), view
@@ -198,7 +202,7 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
         if not float32_rays and not backend.unsupported(in_float64[0]):
             return in_float64
     alternatives = dict(_remedy_of(name) for name in unbounded or ["blend_double"])
-    options, remedies = (" and ".join(words) for words in (alternatives, alternatives.values()))
+    options, remedies = (" and ".join(texts) for texts in (alternatives, alternatives.values()))
     raise InputError(
         f"the output 'error' must be requested with effects whose rounding is bounded on {info.name}, got "
         f"{options}; render with {remedies}, leave out the output 'error', or use device='reference'"
@@ -206,8 +210,9 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
 
 
 def _remedy_of(effect: str) -> tuple[str, str]:
-    words = (words for prefix, words in _REMEDIES.items() if effect.startswith(prefix))
-    return next(words, (effect, "other settings"))
+    """The option that requests an effect, and what to use instead."""
+    matches = (remedy for prefix, remedy in _REMEDIES.items() if effect.startswith(prefix))
+    return next(matches, (effect, "other settings"))
 
 
 def _refuse_unbounded(capture: Capture) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fidsplat.backends.warp.runtime import kernels, load, quiet
+from fidsplat.backends.warp import runtime
 from fidsplat.capture.environment import DeviceExternalDepth, ExternalDepth
 from fidsplat.render.renderer import Renderer
 
@@ -25,11 +25,11 @@ def device_external_depth(
             `red_bit`; depths along z [m]; int32 ids of meshes, negative where there is none.
         size: height and width of the images.
     """
-    wp, device = load(), packed.device
+    wp, device = runtime.load(), packed.device
     images = [wp.empty(packed.shape, dtype=dtype, device=device) for dtype in (wp.vec3, wp.float32, wp.int32)]
     arguments = [packed, depths, ids, red_bit, MESH_LABEL, MESH_OFFSET]
-    with quiet():
-        kernel = kernels("mesh_images").unpack_mesh_images
+    with runtime.quiet():
+        kernel = runtime.kernels("mesh_images").unpack_mesh_images
         wp.launch(kernel, packed.shape, arguments, images, device=device, record_tape=False)
     images = [image.reshape((len(packed), *size)) for image in images]
     if device == getattr(renderer.backend, "device", None):

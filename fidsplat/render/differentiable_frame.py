@@ -29,7 +29,7 @@ class DifferentiableFrame(Frame):
         distortion: bool = False,
     ) -> None:
         super().__init__(images.images if isinstance(images, DifferentiableImages) else images, capture)
-        self._forward, self._pipeline, self._lock = images, pipeline, lock
+        self._forward_images, self._pipeline, self._lock = images, pipeline, lock
         if distortion:
             self.outputs = (*capture.outputs, "distortion")
 
@@ -52,8 +52,8 @@ class DifferentiableFrame(Frame):
             Derivatives of the loss with respect to the n splats: `means` (n, 3) [1/m]; `quats` (n, 4),
             w x y z, with respect to the quaternions before they are normalised; `scales` (n, 2) [1/m];
             `opacities` (n,); `colors` (n, 3) or `sh` (n, k, 3); `thickness` (n,) [1/m], the third scale, if
-            there are 3D Gaussians, 0 for disks. Also
-            `background` (3,); `pose` (6,), a rotation vector [1/rad] and a translation [1/m] applied after
+            there are 3D Gaussians, 0 for disks. Also `background` (3,); `intrinsics` (4,), fx, fy, cx and cy
+            [1/pixel]; `pose` (6,), a rotation vector [1/rad] and a translation [1/m] applied after
             `world_to_camera`, in camera axes; `grad2d` (n,), the densification statistic of 2DGS trainers:
             the norm of the derivative with respect to the projected centre in normalised device coordinates
             (-1 to 1 across the image). Splats that are not rendered have zeros.
@@ -72,7 +72,7 @@ class DifferentiableFrame(Frame):
             }
         arrays = {name: _numeric_array(name, value) for name, value in gradients.items()}
         with self._lock:
-            results = self._pipeline.backward(self._forward, arrays)
+            results = self._pipeline.backward(self._forward_images, arrays)
             return results if on_device else {name: on_host(array) for name, array in results.items()}
 
 

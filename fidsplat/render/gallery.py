@@ -64,23 +64,22 @@ def write_gallery(folder: Path, scenes: Sequence[GalleryScene], device: str | No
     """
     writable_folder(folder)
     renderers: dict[str | None, Renderer] = {}
-    parts = []
+    figures = []
     for entry in scenes:
-        name = device or entry.scene.device
-        if name not in renderers:
-            renderers[name] = Renderer(name)
-        renderer = renderers[name]
-        names = entry.scene.capture.outputs
+        device_name = device or entry.scene.device
+        if device_name not in renderers:
+            renderers[device_name] = Renderer(device_name)
+        renderer = renderers[device_name]
         key = digest_of((entry.scene.content, entry.scene.capture, renderer.device.title, __version__))
-        files = [folder / f"{entry.name[:60]}-{name}-{key}.png" for name in names]
+        files = [folder / f"{entry.name[:60]}-{name}-{key}.png" for name in entry.scene.capture.outputs]
         if not all(file.exists() for file in files):
             frame = renderer.render(entry.scene)
             for name, file in zip(frame.outputs, files, strict=True):
                 write_png(file, visualisation_of(name, frame[name]))
-        parts.append(_figure(entry, files, renderer.device.title))
+        figures.append(_figure(entry, files, renderer.device.title))
         yield files[0]
     with atomic_write(folder / PAGE) as stream:
-        stream.write(printable(_page(parts)).encode())
+        stream.write(printable(_page(figures)).encode())
     yield folder / PAGE
 
 
@@ -98,10 +97,10 @@ def _figure(entry: GalleryScene, files: Sequence[Path], device: str) -> str:
     )
 
 
-def _page(parts: Sequence[str]) -> str:
+def _page(figures: Sequence[str]) -> str:
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8"><title>fidsplat</title>'
         '<meta name="viewport" content="width=device-width">'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
-        f"<style>{_STYLE}</style><h1>fidsplat</h1><main>{''.join(parts)}</main></html>\n"
+        f"<style>{_STYLE}</style><h1>fidsplat</h1><main>{''.join(figures)}</main></html>\n"
     )

@@ -8,10 +8,10 @@ import numpy as np
 
 Neighbour = tuple[tuple[np.ndarray, np.ndarray], np.ndarray]
 """index (row, column) and weight of a cell, for bilinear interpolation"""
-_CHUNK = 256
+_NORMALS_AT_ONCE = 256
 """normals whose irradiance is computed at once, which bounds memory"""
 _EQUAL_NORMALS = 1e-4
-"""angle [rad] within which normals have the same irradiance"""
+"""step to which normals are rounded; equal ones have one irradiance"""
 
 
 def panorama_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
@@ -43,6 +43,13 @@ def neighbours(x: np.ndarray, y: np.ndarray) -> Iterator[Neighbour]:
             yield (top + dy, left + dx), np.abs(x - left - 1 + dx) * np.abs(y - top - 1 + dy)
 
 
+def normal_groups(normals: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Group normals (n, 3) that round to the same multiple of `step`: the index of the first member of each
+    group, and the group (n,) of each normal."""
+    _, first, group = np.unique(np.rint(normals / step), axis=0, return_index=True, return_inverse=True)
+    return first, group.ravel()
+
+
 class LightField:
     """Radiance from all directions, measured on a grid over a marker and interpolated between its points."""
 
@@ -66,14 +73,14 @@ class LightField:
         positions: np.ndarray,
         radiance_at: Callable[[np.ndarray], np.ndarray],
         normal: np.ndarray,
-        step: float,
+        tolerance: float,
     ) -> LightField:
-        """Refine the grid until the interpolated irradiance is within a relative tolerance.
+        """Measure radiance on a grid that is refined until its interpolated irradiance is within a tolerance.
 
         levels: numbers of panoramas along a side, ascending; the last is accepted without a check.
         positions: (m, 2) on the marker. radiance_at: function of positions (k, 2) that returns
-        radiance (k, d, 3). normal: (3,) surface normal of the compared irradiance. step: relative tolerance,
-        as a fraction of the maximum irradiance.
+        radiance (k, d, 3). normal: (3,) surface normal of the compared irradiance. tolerance: fraction of
+        the maximum irradiance.
         """
         field = LightField(*panorama_directions(rows))
         field.low, field.high = positions.min(axis=0), positions.max(axis=0)
@@ -94,8 +101,9 @@ class LightField:
                 _difference(irradiance[::2, 1::2], (coarse[:, 1:] + coarse[:, :-1]) / 2),
                 _difference(irradiance[1::2, ::2], (coarse[1:] + coarse[:-1]) / 2),
             )
-            # the error of the coarser grid: this grid, with half the spacing, has at most half of it
-            if error <= step * irradiance.max():
+            # `error` is that of the coarser grid; the error of this grid, with half the spacing, is at most
+            # half of it
+            if error <= tolerance * irradiance.max():
                 break
         return field
 
@@ -147,18 +155,18 @@ class LightField:
 
     def irradiance(self, normals: np.ndarray, positions: np.ndarray) -> np.ndarray:
         """Irradiance (m, 3) of surfaces with normals (m, 3) at positions (m, 2)."""
-        _, first, group = np.unique(
-            np.rint(normals / _EQUAL_NORMALS), axis=0, return_index=True, return_inverse=True
-        )
+        first, group = normal_groups(normals, _EQUAL_NORMALS)
         rows, columns, directions, _ = self.radiance.shape
         radiance = np.moveaxis(self.radiance, 2, 0).reshape(directions, -1)
+        distinct = normals[first]
         grids = [
-            cosine_weights(normals[first[start : start + _CHUNK]], self.directions, self.angles) @ radiance
-            for start in range(0, len(first), _CHUNK)
+            cosine_weights(distinct[start : start + _NORMALS_AT_ONCE], self.directions, self.angles)
+            @ radiance
+            for start in range(0, len(first), _NORMALS_AT_ONCE)
         ]
         irradiance = np.concatenate(grids).reshape(-1, rows, columns, 3)
         return sum(  # type: ignore[return-value]
-            irradiance[group.ravel(), row, column] * weight[:, None]
+            irradiance[group, row, column] * weight[:, None]
             for (row, column), weight in self._grid_neighbours(positions)
         )
 

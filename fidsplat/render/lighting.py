@@ -6,7 +6,6 @@ which markers consist) are split where the light changes.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -16,7 +15,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.cameras.lenses import Orthographic
 from fidsplat.capture.environment import Panorama
-from fidsplat.render.irradiance import LightField
+from fidsplat.render.irradiance import LightField, normal_groups
 from fidsplat.render.reflection import GlossyBrdf, fit_harmonics, fresnel, view_directions
 from fidsplat.render.shadows import LightPoint, ReceiverPoints, light_points, shadow_casters, visibility
 from fidsplat.scenes import PlacedMarker, Scene
@@ -35,13 +34,13 @@ MAX_POINTS = 256
 MIN_HARMONIC_ROUGHNESS = 0.5
 """minimum roughness for which spherical harmonics of degree 3 represent reflections (docs/effects.md)"""
 PANORAMA_QUALITY = "fast,lowpass=pixel,samples=2"
-"""quality of panoramas; the filter conserves the energy of splats below their coarse pixels"""
+"""quality of panoramas; the low-pass filter conserves the energy of splats smaller than a panorama pixel"""
 _DARK = 1e-6
 """radiance below which a panorama is black"""
 _POINTS_AT_ONCE = 256
 """points whose reflections are computed at once, which bounds memory"""
-_MAX_NORMAL_ANGLE = 0.03
-"""maximum angle [rad] between normals of a bent marker that share reflections"""
+_NORMAL_STEP = 0.03
+"""step to which normals of a bent marker are rounded; equal ones share reflections"""
 _SHADOW_SIGMAS = 3.5
 """standard deviations of a Gaussian beyond which it casts no shadow (opacity below 1 / 255)"""
 _INSIDE_RADIUS = 0.1
@@ -100,32 +99,32 @@ class _Environment:
         """Upload the splats that may shadow a surface from a light, in black. Returns them (None if there
         are none) and their largest distance [m] from the middle of the surface, at most 1 km."""
         centres, radii = self.spheres
-        rows = np.arange(len(centres))
+        casters = np.arange(len(centres))
         if self.scene.motion.is_still:
-            rows = rows[shadow_casters(light, surface, centres, radii)]
-        if not len(rows):
+            casters = shadow_casters(light, surface, centres, radii)
+        if not len(casters):
             return None, 0.0
-        distances = np.linalg.norm(centres[rows] - surface.middle, axis=1) + radii[rows]
-        black = _rebuilt(self.scene.cloud(), rows, colors=np.zeros((len(rows), 3), np.float32))
+        distances = np.linalg.norm(centres[casters] - surface.middle, axis=1) + radii[casters]
+        black = _rebuilt(self.scene.cloud(), casters, colors=np.zeros((len(casters), 3), np.float32))
         return self.renderer.upload(black), float(min(distances.max(), 1e3))
 
-    def background(self, rows: int, response: str | float) -> Any:
-        """The background of panorama images of 2 rows x rows pixels, computed once for all markers."""
-        key = rows, response
+    def background(self, height: int, response: str | float) -> Any:
+        """The background of panoramas of 2 height x height pixels, computed once for all markers."""
+        key = height, response
         if key not in self._backgrounds:
-            self._backgrounds[key] = _averaged_background(self.scene.background, rows, response)
+            self._backgrounds[key] = _averaged_background(self.scene.background, height, response)
         return self._backgrounds[key]
 
-    def panoramas(self, points: np.ndarray, rows: int, near: float, **fields: Any) -> list[Any]:
-        """Render panoramas at points (k, 3), in the axes of the world.
+    def panoramas(self, positions: np.ndarray, height: int, near: float, **fields: Any) -> list[Any]:
+        """Render panoramas of 2 height x height pixels at positions (k, 3), in the axes of the world.
 
         fields: fields of `Capture` that replace the scene's, such as outputs.
         """
         cameras = []
-        for point in points:
+        for position in positions:
             pose = np.eye(4)
-            pose[:3, 3] = -point
-            cameras.append(Camera.equirectangular(2 * rows, rows, pose, near=near))
+            pose[:3, 3] = -position
+            cameras.append(Camera.equirectangular(2 * height, height, pose, near=near))
         base = self.scene.capture.with_(quality=PANORAMA_QUALITY, **fields)
         captures = [base.with_(camera=camera) for camera in cameras]
         return list(self.renderer.render_views(self.resident, captures))
@@ -182,26 +181,27 @@ def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
     assert lighting is not None
     _check_roughness(placed, lighting, environment)
     cloud = placed.marker.cloud
-    points = _points(placed, lighting)
-    incoming = _incoming_light(placed, lighting, points, environment)
+    samples = _sample_points(placed, lighting)
+    incoming = _incoming_light(placed, lighting, samples, environment)
     brdf = None if lighting.roughness is None else GlossyBrdf(lighting.roughness, lighting.reflectance)
     diffuse, specular = incoming.irradiance / np.pi, np.zeros(3)
     if brdf is not None and lighting.view == "camera":
-        specular, transmitted = _reflection_to_camera(points, incoming, brdf, environment)
+        specular, transmitted = _reflection_to_camera(samples, incoming, brdf, environment)
         diffuse = diffuse * transmitted[:, None]
     albedo = lighting.ink + (lighting.paper - lighting.ink) * linear_light(_rgb(cloud), "srgb")
-    radiance = albedo[points.splat] * diffuse + specular
-    # highlights move over parts with harmonics: at most 8 points wide (a module, or 1/32 of a large marker)
+    radiance = albedo[samples.splat] * diffuse + specular
+    # parts with harmonics show moving highlights, so they are at most 8 points wide: a module, or 1/32 of a
+    # large marker
     max_points = None if brdf is None or lighting.view == "camera" else POINTS_PER_MODULE
-    splat, extents, part = _split(points, radiance, lighting.step, max_points)
-    means, scales = _placed_parts(cloud, points, splat, extents)
+    splat, extents, part = _split(samples, radiance, lighting.step, max_points)
+    means, scales = _part_geometry(cloud, samples, splat, extents)
     count = np.bincount(part)
     mean = np.stack([np.bincount(part, values) / count for values in radiance.T], 1)
     colors: dict[str, np.ndarray] = {}
     if brdf is None or lighting.view == "camera":
         colors["colors"] = lighting.encode(mean)
     else:
-        lights = [(point, np.bincount(part, visible) / count) for point, visible in incoming.lights]
+        lights = [(source, np.bincount(part, visible) / count) for source, visible in incoming.lights]
         incoming = incoming._replace(lights=lights)
         sh = _harmonics_of_parts(placed, lighting, cloud, splat, means, mean, incoming)
         # back to the marker's frame, from which the scene rotates harmonics to the world
@@ -210,16 +210,16 @@ def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
     return replace(placed, marker=replace(placed.marker, cloud=lit), light=None)
 
 
-def _averaged_background(background: Any, rows: int, response: str | float) -> Any:
-    """A background whose panorama is reduced to 2 rows x rows pixels by means of linear light. Otherwise a
+def _averaged_background(background: Any, height: int, response: str | float) -> Any:
+    """A background whose panorama is averaged in linear light to 2 height x height pixels. Without this, a
     small bright source, such as the sun, would be missed or counted several times."""
-    if not isinstance(background, Panorama) or background.image.shape[0] <= rows:
+    if not isinstance(background, Panorama) or background.image.shape[0] <= height:
         return background
     light = linear_light(background.image, response).astype(np.float64)
-    height = len(light)
-    solid_angle = np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None, None]
+    full_height = len(light)
+    solid_angle = np.sin((np.arange(full_height) + 0.5) / full_height * np.pi)[:, None, None]
     weighted = np.concatenate([light * solid_angle, np.broadcast_to(solid_angle, light.shape)], 2)
-    for axis, count in enumerate((rows, 2 * rows)):
+    for axis, count in enumerate((height, 2 * height)):
         size = weighted.shape[axis]
         starts = np.unique(np.arange(count) * size // count)
         weighted = np.add.reduceat(weighted, starts, axis)
@@ -242,7 +242,7 @@ def _check_roughness(placed: PlacedMarker, lighting: Lighting, environment: _Env
         )
 
 
-def _points(placed: PlacedMarker, lighting: Lighting) -> _SamplePoints:
+def _sample_points(placed: PlacedMarker, lighting: Lighting) -> _SamplePoints:
     """Sample points of a marker: a grid on each box splat, the centre of each Gaussian."""
     cloud, pose = placed.marker.cloud, placed.pose
     area = 4 * float((cloud.scales[:, 0] * cloud.scales[:, 1]).sum(dtype=np.float64))
@@ -269,46 +269,46 @@ def _points(placed: PlacedMarker, lighting: Lighting) -> _SamplePoints:
 
 
 def _incoming_light(
-    placed: PlacedMarker, lighting: Lighting, points: _SamplePoints, environment: _Environment
+    placed: PlacedMarker, lighting: Lighting, samples: _SamplePoints, environment: _Environment
 ) -> _IncomingLight:
     """Measure the light at the sample points: panoramas for the field, shadow maps for the lights."""
-    surface, positions = points.surface, points.local[:, :2]
-    field = _field(placed, lighting, points, environment)
+    surface, positions = samples.surface, samples.local[:, :2]
+    field = _field(placed, lighting, samples, environment)
     irradiance = field.irradiance(surface.normals, positions)
     lights = []
     for number, light in enumerate(environment.lights):
         casters, extent = environment.casters(light, surface)
-        for point in light_points(light, surface.middle):
+        for light_point in light_points(light, surface.middle):
             motion, renderer = environment.scene.motion, environment.renderer
-            visible = visibility(point, surface, casters, motion, extent, renderer)
+            visible = visibility(light_point, surface, casters, motion, extent, renderer)
             if visible.any():
-                directions, unshadowed = point.irradiance(surface.points)
+                directions, unshadowed = light_point.irradiance(surface.positions)
                 cosine = np.einsum("mc,mc->m", directions, surface.normals)
                 arriving = unshadowed * (np.maximum(cosine, 0) * visible)[:, None]
                 if arriving.any():
                     environment.reaching_lights.add(number)
                 irradiance += arriving
-                lights.append((point, visible))
+                lights.append((light_point, visible))
     return _IncomingLight(irradiance, field, lights)
 
 
 def _field(
-    placed: PlacedMarker, lighting: Lighting, points: _SamplePoints, environment: _Environment
+    placed: PlacedMarker, lighting: Lighting, samples: _SamplePoints, environment: _Environment
 ) -> LightField:
     """Radiance around the marker from splats and background. Raises InputError if it is black."""
-    surface, positions = points.surface, points.local[:, :2]
-    capture, rows = environment.scene.capture, lighting.rows
+    surface, positions = samples.surface, samples.local[:, :2]
+    capture, height = environment.scene.capture, lighting.rows
 
     def radiance_at(grid_positions: np.ndarray) -> np.ndarray:
         nearest = np.array([np.argmin(((positions - grid) ** 2).sum(axis=1)) for grid in grid_positions])
-        local_points = points.local[nearest].copy()
-        local_points[:, :2] = grid_positions  # a grid point between splats has the z of the nearest one
-        panorama_points = local_points @ placed.pose[:3, :3].T + placed.pose[:3, 3]
-        panorama_points = panorama_points + max(surface.clearance, 1e-6) * surface.normals[nearest]
+        local_positions = samples.local[nearest].copy()
+        local_positions[:, :2] = grid_positions  # a grid point between splats has the z of the nearest one
+        panorama_positions = local_positions @ placed.pose[:3, :3].T + placed.pose[:3, 3]
+        panorama_positions = panorama_positions + max(surface.clearance, 1e-6) * surface.normals[nearest]
         black = (0.0, 0.0, 0.0)
-        background = environment.background(rows, lighting.response) if lighting.ambient is None else black
+        background = environment.background(height, lighting.response) if lighting.ambient is None else black
         fields = {"outputs": ("rgb", "alpha"), "background": background}
-        frames = environment.panoramas(panorama_points, rows, 1e-4, **fields)
+        frames = environment.panoramas(panorama_positions, height, 1e-4, **fields)
         panoramas = []
         for frame in frames:
             colors, empty = frame["rgb"].reshape(-1, 3), 1 - frame["alpha"].reshape(-1, 1)
@@ -339,36 +339,30 @@ def _field(
     return field
 
 
-def _by_normal(normals: np.ndarray, within: float) -> Iterator[np.ndarray]:
-    """Groups of row indices whose normals are equal within an angle [rad]."""
-    _, group = np.unique(np.rint(normals / within), axis=0, return_inverse=True)
-    order = np.argsort(group.ravel(), kind="stable")
-    yield from np.split(order, np.flatnonzero(np.diff(group.ravel()[order])) + 1)
-
-
 def _split(
-    points: _SamplePoints, radiance: np.ndarray, step: float, max_points: int | None
+    samples: _SamplePoints, radiance: np.ndarray, tolerance: float, max_points: int | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split splats into parts whose radiance (m, 3) differs from their mean by at most the relative tolerance
-    `step` times the mean of all channels. max_points: maximum number of points along a side of a part.
+    """Split box splats into parts until the radiance (m, 3) of each part's points differs from its mean by at
+    most `tolerance` times the mean of all channels. max_points: maximum number of points along a side of a
+    part; None: no limit.
 
     Returns:
         splat (p,): index of the splat of each part.
         extents (p, 4): x0, y0, x1, y1 of each part on the splat's grid, ends exclusive.
         part (m,): index of the part of each point.
     """
-    splat, part = np.arange(len(points.grid_sizes)), points.splat.copy()
-    extents = np.pad(points.grid_sizes, ((0, 0), (2, 0)))
-    row, column = np.divmod(np.arange(len(part)) - points.starts[part], points.grid_sizes[part, 0])
+    splat, part = np.arange(len(samples.grid_sizes)), samples.splat.copy()
+    extents = np.pad(samples.grid_sizes, ((0, 0), (2, 0)))
+    row, column = np.divmod(np.arange(len(part)) - samples.starts[part], samples.grid_sizes[part, 0])
     cell = np.stack([column, row], 1)
-    rows = np.arange(len(part))  # points of the parts that may still be split
+    active = np.arange(len(part))  # points of the parts that may still be split
     while True:
-        rows = rows[np.argsort(part[rows], kind="stable")]
-        parts, starts, counts = np.unique(part[rows], return_index=True, return_counts=True)
-        mean = np.add.reduceat(radiance[rows], starts) / counts[:, None]
-        high, low = (reduce.reduceat(radiance[rows], starts) for reduce in (np.maximum, np.minimum))
+        active = active[np.argsort(part[active], kind="stable")]
+        parts, starts, counts = np.unique(part[active], return_index=True, return_counts=True)
+        mean = np.add.reduceat(radiance[active], starts) / counts[:, None]
+        high, low = (reduce.reduceat(radiance[active], starts) for reduce in (np.maximum, np.minimum))
         size = extents[parts, 2:] - extents[parts, :2]
-        too_large = np.maximum(high - mean, mean - low).max(axis=1) > step * mean.mean(axis=1)
+        too_large = np.maximum(high - mean, mean - low).max(axis=1) > tolerance * mean.mean(axis=1)
         if max_points is not None:
             too_large |= size.max(axis=1) > max_points
         too_large &= size.max(axis=1) > 1
@@ -380,18 +374,18 @@ def _split(
         extents[parts, axis + 2] = upper_half[np.arange(len(parts)), axis] = middle
         index_of = np.full(len(splat), -1)
         index_of[parts] = np.arange(len(parts))
-        rows = rows[index_of[part[rows]] >= 0]
-        index = index_of[part[rows]]
-        in_upper = cell[rows, axis[index]] >= middle[index]
-        part[rows[in_upper]] = len(splat) + index[in_upper]
+        active = active[index_of[part[active]] >= 0]
+        index = index_of[part[active]]
+        in_upper = cell[active, axis[index]] >= middle[index]
+        part[active[in_upper]] = len(splat) + index[in_upper]
         splat, extents = np.concatenate([splat, splat[parts]]), np.concatenate([extents, upper_half])
 
 
-def _placed_parts(
-    cloud: SplatCloud, points: _SamplePoints, splat: np.ndarray, extents: np.ndarray
+def _part_geometry(
+    cloud: SplatCloud, samples: _SamplePoints, splat: np.ndarray, extents: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (p, 3) in the marker's frame, and scales (p, 2), of parts."""
-    edges = extents.reshape(-1, 2, 2) / points.grid_sizes[splat][:, None]
+    """Centres (p, 3) in the marker's frame and scales (p, 2) of the parts of box splats."""
+    edges = extents.reshape(-1, 2, 2) / samples.grid_sizes[splat][:, None]
     offset = (edges.sum(axis=1) - 1) * cloud.scales[splat]
     scales = (edges[:, 1] - edges[:, 0]) * cloud.scales[splat]
     rotations = quaternion_to_matrix(cloud.quats)[splat]
@@ -400,22 +394,22 @@ def _placed_parts(
 
 
 def _reflection_to_camera(
-    points: _SamplePoints, incoming: _IncomingLight, brdf: GlossyBrdf, environment: _Environment
+    samples: _SamplePoints, incoming: _IncomingLight, brdf: GlossyBrdf, environment: _Environment
 ) -> tuple[np.ndarray, np.ndarray]:
     """Specular radiance (m, 3) from points to the scene's camera, and factor (m,) of their diffuse colour."""
-    surface = points.surface
+    surface = samples.surface
     camera = environment.camera
     assert camera is not None
     if isinstance(camera.lens, Orthographic):
-        viewers = np.broadcast_to(-camera.world_to_camera[2, :3], surface.points.shape)
+        viewers = np.broadcast_to(-camera.world_to_camera[2, :3], surface.positions.shape)
     else:
-        viewers = unit(camera.position - surface.points)
-    reflected = _highlights(surface.points, surface.normals, viewers[:, None], brdf, incoming.lights)[:, 0]
+        viewers = unit(camera.position - surface.positions)
+    reflected = _highlights(surface.positions, surface.normals, viewers[:, None], brdf, incoming.lights)[:, 0]
     for start in range(0, len(viewers) if incoming.field.radiance.any() else 0, _POINTS_AT_ONCE):
-        rows = slice(start, start + _POINTS_AT_ONCE)
-        directions, weights = brdf.sample(viewers[rows, None], surface.normals[rows])
-        radiance = incoming.field.incoming_radiance(directions[:, 0], points.local[rows, :2])
-        reflected[rows] += np.einsum("nk,nkc->nc", weights[:, 0], radiance)
+        batch = slice(start, start + _POINTS_AT_ONCE)
+        directions, weights = brdf.sample(viewers[batch, None], surface.normals[batch])
+        radiance = incoming.field.incoming_radiance(directions[:, 0], samples.local[batch, :2])
+        reflected[batch] += np.einsum("nk,nkc->nc", weights[:, 0], radiance)
     cosine = np.einsum("mc,mc->m", viewers, surface.normals)
     return reflected, 1 - fresnel(cosine, brdf.reflectance)
 
@@ -430,8 +424,8 @@ def _highlights(
     """Specular radiance (n, v, 3) of lights from positions (n, 3) in the directions (n, v, 3) of viewers."""
     total = np.zeros(viewers.shape)
     cosine = np.einsum("nvc,nc->nv", viewers, normals)
-    for point, visible in lights:
-        directions, irradiance = point.irradiance(positions)
+    for light_point, visible in lights:
+        directions, irradiance = light_point.irradiance(positions)
         reflected = brdf.reflected(cosine, viewers, directions, normals)
         total += reflected[..., None] * (irradiance * visible[:, None])[:, None]
     return total
@@ -452,20 +446,21 @@ def _harmonics_of_parts(
     positions = (means + cloud.origin) @ rotation.T + placed.pose[:3, 3]
     normals = -quaternion_to_matrix(cloud.quats)[splat, :, 2] @ rotation.T
     sh = np.empty((len(splat), 16, 3))
-    for members in _by_normal(normals, _MAX_NORMAL_ANGLE):
-        normal = normals[members[0]]
+    first, group = normal_groups(normals, _NORMAL_STEP)
+    for number, normal in enumerate(normals[first]):
+        members = np.flatnonzero(group == number)
         views = view_directions(normal)
         directions, weights = brdf.sample(views[None], normal[None])
         transmitted = 1 - fresnel(views @ normal, brdf.reflectance)
         reflected = incoming.field.reflected(directions[0], weights[0])
         for start in range(0, len(members), _POINTS_AT_ONCE):
-            rows = members[start : start + _POINTS_AT_ONCE]
-            lights = [(point, visible[rows]) for point, visible in incoming.lights]
-            viewers = np.broadcast_to(views, (len(rows), *views.shape))
-            total = _highlights(positions[rows], normals[rows], viewers, brdf, lights)
-            total += transmitted[:, None] * diffuse[rows, None]
-            total += incoming.field.interpolated(reflected, means[rows, :2])
-            sh[rows] = fit_harmonics(views, lighting.encode(total))
+            batch = members[start : start + _POINTS_AT_ONCE]
+            lights = [(light_point, visible[batch]) for light_point, visible in incoming.lights]
+            viewers = np.broadcast_to(views, (len(batch), *views.shape))
+            total = _highlights(positions[batch], normals[batch], viewers, brdf, lights)
+            total += transmitted[:, None] * diffuse[batch, None]
+            total += incoming.field.interpolated(reflected, means[batch, :2])
+            sh[batch] = fit_harmonics(views, lighting.encode(total))
     return sh
 
 
@@ -487,7 +482,7 @@ def _rebuilt(
     scales: np.ndarray | None = None,
     **colors: np.ndarray,
 ) -> SplatCloud:
-    """Copy of a cloud with new colours; with `splat` (p,), one row for each part of a splat."""
+    """Copy of a cloud with new colours. splat: (p,) index of the copied splat of each row; None: all."""
     rows = np.arange(len(cloud)) if splat is None else splat
     scales = cloud.scales[rows] if scales is None else scales
     if cloud.thickness is not None:

@@ -41,8 +41,8 @@ def scene_mesh(
     below one half are empty. Surfaces that are thinner than two voxels and visible from both sides are lost.
 
     Args:
-        cameras: views; by default up to 64 views from a sphere around the scene; if it has a ground, only
-            from at least 6 degrees above the horizontal.
+        cameras: views; by default up to 64 views from a sphere around the scene; if the scene has a ground,
+            only views at least 6 degrees above the horizontal.
         voxel: metres; by default a 200th of the longest side of the scene.
         renderer: by default one on the scene's device.
         progress: called with the name of the current step and its completed fraction.

@@ -100,7 +100,7 @@ class Scan:
             )
         if name not in ("range", "intensity", "label") or getattr(self, name) is None:
             raise InputError(
-                f"name must be range, intensity or, for scans with label=True, label, got {name!r}"
+                f"name must be 'range', 'intensity' or (for scans with label=True) 'label', got {name!r}"
             )
         values = getattr(self, name)
         return values.reshape(len(values), pattern.columns, pattern.rings).swapaxes(1, 2)

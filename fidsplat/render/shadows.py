@@ -31,7 +31,7 @@ _MAX_TANGENT = np.tan(np.radians(80))
 class ReceiverPoints:
     """Points of a surface that receives light."""
 
-    points: np.ndarray
+    positions: np.ndarray
     """(m, 3) in the world"""
     normals: np.ndarray
     """(m, 3) unit, towards the viewer"""
@@ -42,12 +42,12 @@ class ReceiverPoints:
 
     @cached_property
     def middle(self) -> np.ndarray:
-        return (self.points.min(axis=0) + self.points.max(axis=0)) / 2
+        return (self.positions.min(axis=0) + self.positions.max(axis=0)) / 2
 
     @cached_property
     def radius(self) -> float:
         """Largest distance of a point from the middle [m], at least the pitch."""
-        return max(float(np.linalg.norm(self.points - self.middle, axis=1).max()), self.pitch)
+        return max(float(np.linalg.norm(self.positions - self.middle, axis=1).max()), self.pitch)
 
     @cached_property
     def is_flat(self) -> bool:
@@ -63,12 +63,13 @@ class LightPoint(NamedTuple):
     power_fraction: float
     """fraction of the light's power"""
 
-    def irradiance(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Unit directions (m, 3) to the light, and unshadowed irradiance (m, 3) of facing surfaces."""
+    def irradiance(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Unit directions (m, 3) from positions (m, 3) to the light, and the unshadowed irradiance (m, 3) of
+        surfaces that face it."""
         power = self.power_fraction * self.light.power
         if isinstance(self.light, Sun):
-            return np.broadcast_to(-self.position, points.shape), np.broadcast_to(power, points.shape)
-        to_light = self.position - points
+            return np.broadcast_to(-self.position, positions.shape), np.broadcast_to(power, positions.shape)
+        to_light = self.position - positions
         distance = np.maximum(np.linalg.norm(to_light, axis=1, keepdims=True), 1e-9)
         to_light, irradiance = to_light / distance, power / distance**2
         if isinstance(self.light, SpotLight):
@@ -105,7 +106,7 @@ def shadow_casters(
     middle, normal = surface.middle, surface.normals.mean(axis=0)
     radius = surface.radius + _MARGIN * surface.pitch
     length, offsets = float(np.linalg.norm(normal)), centres - middle
-    receivers = surface.points + surface.clearance * surface.normals
+    receivers = surface.positions + surface.clearance * surface.normals
     min_height = ((receivers - middle) @ normal).min() - surface.pitch
     if isinstance(light, Sun):
         to_light = -unit(np.array(light.direction))
@@ -140,13 +141,13 @@ def visibility(
     image rendered from the light is the transmittance. casters: black splats between the surface and the
     light, moved by `motion`; None: no splats. extent: largest distance of a splat from the marker.
     """
-    to_light, irradiance = point.irradiance(surface.points)
+    to_light, irradiance = point.irradiance(surface.positions)
     visible = np.zeros(len(to_light), np.float32)
     facing = (np.einsum("mc,mc->m", to_light, surface.normals) > 0) & (irradiance @ np.ones(3) > 0)
     if casters is None:
         visible[facing] = 1
     elif facing.any():
-        points, normals = surface.points[facing], surface.normals[facing]
+        points, normals = surface.positions[facing], surface.normals[facing]
         camera = _camera(point, surface, extent + surface.clearance)
         surface_points = points + surface.clearance * normals
         if surface.is_flat:  # three points of its plane

@@ -83,7 +83,7 @@ def surface_at(
     return _fit_patch(depth, patch, (PATCH_SIZE / 2, PATCH_SIZE / 2), PATCH_SIZE / 2, radius_m)
 
 
-def surface_of(depth: np.ndarray, camera: Camera, pixel, radius: float | None = None) -> Surface:
+def surface_from_depth(depth: np.ndarray, camera: Camera, pixel, radius: float | None = None) -> Surface:
     """Fit a plane around a pixel of a median depth image.
 
     Args:

@@ -44,10 +44,10 @@ class DistanceField:
         w = depth.shape[1]
         filled = np.flatnonzero(depth.ravel() > 0)
         pixels = np.stack([filled % w + 0.5, filled // w + 0.5], 1)
-        depths, band = depth.ravel()[filled].astype(np.float64), TRUNCATION * self.voxel
+        depths, truncation = depth.ravel()[filled].astype(np.float64), TRUNCATION * self.voxel
         keys = [self.keys]
-        for step in (-band, 0.0, band):
-            points = camera.unproject(pixels, depths + step)
+        for offset in (-truncation, 0.0, truncation):
+            points = camera.unproject(pixels, depths + offset)
             points = points[np.isfinite(points).all(1)]
             blocks = np.floor((points - self.origin) / (BLOCK_SIDE * self.voxel)).astype(np.int64)
             keys.append(np.unique(_key(blocks)))
@@ -66,8 +66,8 @@ class DistanceField:
         steps = (_VOXELS + 0.5) * self.voxel @ rotation.T
         for start in range(0, len(in_front), BLOCKS_AT_ONCE):
             interrupts.check()
-            chunk = in_front[start : start + BLOCKS_AT_ONCE]
-            local = (corners[chunk, None] + steps).reshape(-1, 3)
+            batch = in_front[start : start + BLOCKS_AT_ONCE]
+            local = (corners[batch, None] + steps).reshape(-1, 3)
             with np.errstate(invalid="ignore", divide="ignore"):
                 if camera.lens is None:
                     image = local[:, :2] / np.where(local[:, 2:] > 0, local[:, 2:], np.nan)
@@ -91,7 +91,7 @@ class DistanceField:
             values[:, 5] = weight * near_surface
             values[:, 2:5] = rgb[y, x] * values[:, 5:]
             block, voxel = np.divmod(rows, BLOCK_SIDE**3)
-            self._sums[chunk[block], voxel] += values
+            self._sums[batch[block], voxel] += values
 
     def mesh(self) -> TriangleMesh:
         """The zero level of the field by surface nets: a vertex for each cell that the surface crosses, the

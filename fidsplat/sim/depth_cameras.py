@@ -119,7 +119,7 @@ class ActiveStereo(DepthCamera):
     def _measured(
         self, renderer: Renderer, scene: Scene, camera: Camera, rng: np.random.Generator
     ) -> np.ndarray:
-        # the nearest surface that can be matched is in the view of the projector
+        # the projector is aimed so that it illuminates the nearest depth that stereo matching can find
         nearest = max(self.near, camera.fx * self.baseline / self.max_disparity)
         middle = _projector(camera, self.baseline / 2, nearest)
         cameras = (camera, _shifted(camera, self.baseline), middle)

@@ -299,8 +299,9 @@ class SplatCloud(PickledByFields, Summarised):
         within = all(rows_beyond(array, LARGEST) is None for array in (means, scales))
         if not (within and (scales > 0).all()):
             raise InputError(
-                f"transformed means and scales must be at most {LARGEST:g}, and scales above 0, got others "
-                f"from a transform of scale {scale:g}"
+                f"transformed means and scales must be at most {LARGEST:g} and scales above 0, got means up "
+                f"to {np.abs(means).max():g} and scales from {scales.min():g} to {scales.max():g} after a "
+                f"transform of scale {scale:g}; use another scale or translation"
             )
         return self._replaced(
             means=means, quats=quats, scales=scales, thickness=thickness, sh=sh, origin=origin

@@ -1,6 +1,6 @@
 """On-disk format of a store: a folder of NumPy files that can be memory-mapped, and a JSON header.
 
-    city.fss/store.json       format version, counts, origin, traits, names of the sources
+    city.fss/store.json       format version, counts, origin, kinds of splats, names of the sources
     city.fss/nodes.npy        a record for each chunk and each node of the levels of detail (`NODE`)
     city.fss/means.npy ...    a column for each array: the splats of all chunks in their order, then the
                               merged splats of the levels of detail

@@ -1,4 +1,4 @@
-"""Partial clouds: a subset of a scene's splats, with the traits of the complete scene."""
+"""Partial clouds: a subset of a scene's splats, with the kernels of the complete scene."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ import numpy as np
 from fidsplat.splats.arrays import OPTIONAL
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import rotation_of_coefficients
+from fidsplat.splats.properties import CloudLike
 from fidsplat.splats.rotations import matrix_to_quaternion, quaternion_multiply
-from fidsplat.splats.traits import PlacedTraits
 
 
 class PartialCloud(SplatCloud):
-    """A subset of a scene's splats in its order, rendered with the traits of the complete scene."""
+    """A subset of a scene's splats in its order, rendered by the kernels of the complete scene."""
 
-    _scene: PlacedTraits
+    _scene: CloudLike
 
     @classmethod
     def of(
-        cls, arrays: Mapping[str, np.ndarray], scene: PlacedTraits, dropped: Mapping[str, int] | None = None
+        cls, arrays: Mapping[str, np.ndarray], scene: CloudLike, dropped: Mapping[str, int] | None = None
     ) -> PartialCloud:
         """A cloud of valid arrays, without a copy. dropped: number of omitted splats by the reason."""
         part = object.__new__(cls)

@@ -125,7 +125,7 @@ class Store(Summarised):
             facts["levels"].append({"level": level, **row, "cell_m": float(np.median(level_nodes["size"]))})
         return facts | {"bounds": list(self.bounds()) if len(self) else None}
 
-    # properties that select kernels (`CloudTraits`)
+    # properties that select kernels (`CloudProperties`)
 
     @property
     def sh_degree(self) -> int:

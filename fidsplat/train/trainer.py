@@ -67,8 +67,8 @@ class Step(NamedTuple):
     """number of splats after the step"""
 
 
-class _Traits(NamedTuple):
-    """`CloudTraits` of splats in training."""
+class _Properties(NamedTuple):
+    """`CloudProperties` of splats in training."""
 
     sh_degree: int
     ellipsoids: str
@@ -463,8 +463,10 @@ class Trainer:
         if (change := self.settings.changes_after(iteration)) is None:
             return
         by_normals, by_distortions = self.settings.surface_weights_at(change)
-        traits = _Traits(self.settings.degree_at(change), "all" if self.settings.axes == 3 else "none")
-        features = select(traits, surface if by_normals else plain)
+        properties = _Properties(
+            self.settings.degree_at(change), "all" if self.settings.axes == 3 else "none"
+        )
+        features = select(properties, surface if by_normals else plain)
         self.renderer.backend.compile_in_background(with_distortion(features) if by_distortions else features)
 
     def _checked_splats(self) -> Splats:

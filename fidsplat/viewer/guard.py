@@ -130,8 +130,8 @@ def policy() -> str:
         program = zstandard.ZstdDecompressor().decompress(_decoded(packed, json.loads(alphabet)), size)
     except (OSError, ValueError, zstandard.ZstdError) as error:
         raise FidsplatError(
-            "this version of viser must have a page for which fidsplat has a content security policy, got "
-            "another form; pip install 'viser==1.1.1'"
+            f"viser must be version 1.1.1, for whose page fidsplat has a content security policy, got "
+            f"{viser.__version__} with another page; pip install 'viser==1.1.1'"
         ) from error
     hashes = [b64encode(sha256(text).digest()).decode() for text in (loader.encode(), program[int(style) :])]
     scripts = " ".join(f"'sha256-{digest}'" for digest in hashes)

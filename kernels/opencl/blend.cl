@@ -11,7 +11,7 @@ typedef union {
     vfloat fields[sizeof(Attributes) / sizeof(vfloat)];
 } AttributeFields;
 
-//@@ compose_types
+//@@ blend_types
 typedef struct {
     vfloat t;               // transmittance in front of the next fragment
 //@@ color_state
@@ -19,7 +19,7 @@ typedef struct {
 } Pixel;
 
 typedef struct {            // uniforms of the blend stage
-    wide log_alpha_cutoff, opacity_ceiling, transmittance_stop, sample_area;
+    blend_real log_alpha_cutoff, opacity_ceiling, transmittance_stop, sample_area;
 } BlendConstants;
 
 static inline void pixel_start(Pixel *pixel) {
@@ -64,7 +64,7 @@ static inline vint pixel_unfinished(const Pixel *pixel, const BlendConstants *co
         ;
 }
 
-//@@ compose_functions
+//@@ blend_functions
 // Renders a fragment where `mask` is set: composites it, or inserts it into the k-buffer.
 static inline void pixel_blend(Pixel *pixel, const Splat *s, Intersection c, vint mask, vfloat lowpass_half_rho,
                                const BlendConstants *constants
@@ -77,7 +77,7 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Intersection c, vin
     const Attributes attributes = fragment_attributes(s, c, inverse_d);
 //@@ occlude
 //@@ layers
-//@@ compose
+//@@ blend_fragment
 }
 
 //@@ color_functions

@@ -6,9 +6,9 @@
 // The schedules (schedule/*_backward.cl) process a tile's list forward for T, with the arithmetic and decisions of blending, and
 // then backward, CHUNK splats at a time.
 
-//@@ compose_types
+//@@ blend_types
 typedef struct {            // uniforms of the blend stage
-    wide log_alpha_cutoff, opacity_ceiling, transmittance_stop, sample_area;
+    blend_real log_alpha_cutoff, opacity_ceiling, transmittance_stop, sample_area;
     float log_ceiling;
 } BlendConstants;
 

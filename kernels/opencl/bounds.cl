@@ -6,6 +6,13 @@
 #define BOUNDS_PAD 0.02f
 #define BOUNDS_PAD_RELATIVE 2e-4f
 
+// Row of M of an image axis (OpenCV axes), relative to an anchor on it; offset: principal point minus anchor.
+static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ z_row) {
+    real3_ row = {focal * axis_row.x + offset * z_row.x, focal * axis_row.y + offset * z_row.y,
+                  focal * axis_row.z + offset * z_row.z};
+    return row;
+}
+
 static inline Bounds box_bounds(real x0, real x1, real y0, real y1) {
     Bounds b;
     b.ex = (float)((x0 + x1) * REAL(0.5));
@@ -84,7 +91,7 @@ INLINE TileSpan tile_span(const Bounds *b, int tile_row, int width, int height) 
 
 #define WINDOW_W 8
 #define WINDOW_H 4
-#if BATCH > 1       // a constant number of rows, for vectors across splats
+#if SPLATS_PER_ITEM > 1       // a constant number of rows, for vectors across splats
 #define WINDOW_ROWS(rows) WINDOW_H
 #else
 #define WINDOW_ROWS(rows) rows
@@ -106,7 +113,7 @@ INLINE uint tile_window(const Bounds *b, int x0, int x1, int y0, int y1, int wid
         int first = max(span.first - left, 0), last = min(span.last - left, columns - 1);
         if (first <= last) mask |= ((2u << (last - first)) - 1u) << first << (row * WINDOW_W);
     }
-#if BATCH > 1
+#if SPLATS_PER_ITEM > 1
     mask &= 0xFFFFFFFFu >> (WINDOW_W * (WINDOW_H - rows));
 #endif
     return mask;

@@ -1,11 +1,11 @@
-// Vectors of LANES pixels, and functions with different names for vectors and scalars. `wide` is the scalar type of fragments: the host
-// prints float, or double for the effect blend_double (one lane). WIDE(1.5) is a constant of that type.
+// Vectors of LANES pixels, and functions with different names for vectors and scalars. `blend_real` is the scalar type of fragments: the host
+// prints float, or double for the effect blend_double (one lane). BLEND_REAL(1.5) is a constant of that type.
 
 #define GLUE_(a, b) a##b
 #define GLUE(a, b) GLUE_(a, b)
 
 #if LANES == 1
-typedef wide vfloat;
+typedef blend_real vfloat;
 typedef int vint;
 #define VSELECT(no, yes, mask) ((mask) ? (yes) : (no))
 #define VANY(mask) (mask)

@@ -2,7 +2,7 @@
 // numeric types derived from them. Words of these files are explained in kernels/README.md.
 // LANES          pixels that one work-item computes as a vector (1 on a GPU, 8 or 16 on a CPU)
 // TILE_W TILE_H  pixels of a tile; the schedule `lanes` (CPUs: one work-item per tile) requires TILE_W == LANES
-// BATCH          splats that a work-item of `project` projects (1 on a GPU)
+// SPLATS_PER_ITEM  splats that a work-item of `project` projects (1 on a GPU)
 // SORT_BLOCKS    contiguous blocks into which the stable counting sorts divide a list
 // RADIX_BITS     digit width of the depth sort
 // SCAN_ITEMS     work-items of the single work-group of a scan
@@ -23,7 +23,7 @@ typedef float real;
 #endif
 
 // Functions and loops that CPU compilers vectorise across a batch of splats.
-#if BATCH > 1
+#if SPLATS_PER_ITEM > 1
 #define INLINE static inline __attribute__((always_inline))
 #define VECTORISE _Pragma("clang loop vectorize(enable) vectorize_width(8) interleave_count(1)")
 #define UNROLLED _Pragma("unroll")

@@ -49,7 +49,7 @@ static inline real3_ rotate_to_camera(global const View *view, real3_ v) {
 typedef union {
     Splat splat;
     float4 words[sizeof(Splat) / 16];
-#if BATCH > 1
+#if SPLATS_PER_ITEM > 1
     uint scalars[sizeof(Splat) / 4];
 #endif
 } SplatWords;
@@ -59,13 +59,13 @@ typedef union {
 //@@ footprint_here
 
 #define RETURN_CULLED return
-#if BATCH > 1
+#if SPLATS_PER_ITEM > 1
 // CPUs: projection of splat i, written to column k of `batch`, in a loop that compilers vectorise. Splats that cross the near plane need
 // the loop over a polygon. It is left out if `crosses_near` is false: such splats get the key CROSSES_NEAR, and are projected again.
 #define CROSSES_NEAR 0xFFFFFFFDu
 #define KEY batch->keys[k]
 typedef struct {
-    uint keys[BATCH], corners[BATCH], windows[BATCH], records[sizeof(Splat) / 4][BATCH], bounds[sizeof(Bounds) / 4][BATCH];
+    uint keys[SPLATS_PER_ITEM], corners[SPLATS_PER_ITEM], windows[SPLATS_PER_ITEM], records[sizeof(Splat) / 4][SPLATS_PER_ITEM], bounds[sizeof(Bounds) / 4][SPLATS_PER_ITEM];
 } Batch;
 typedef union {
     Bounds bounds;
@@ -83,7 +83,7 @@ kernel void project(
 )
 #endif
 {
-#if BATCH == 1
+#if SPLATS_PER_ITEM == 1
     uint i = get_global_id(0), view_index = get_global_id(1);
     if (i >= count) return;
 #endif
@@ -95,7 +95,7 @@ kernel void project(
 
     // read before the first test, so that memory latency is paid once; arrays are aligned for vector loads (Resident)
     real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
-#if BATCH > 1       // scalars: vector types here prevent vectorization across splats
+#if SPLATS_PER_ITEM > 1       // scalars: vector types here prevent vectorization across splats
     struct { float x, y, z, w; } quat = {quats[4 * i], quats[4 * i + 1], quats[4 * i + 2], quats[4 * i + 3]};
     struct { float x, y; } scale_uv = {scales[2 * i], scales[2 * i + 1]};
 #else
@@ -105,8 +105,8 @@ kernel void project(
     float opacity = opacities[i];
     real3_ p = rotate_to_camera(view, mean);
     p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
-    wide log_opacity = (wide)ln((real)opacity);
-    wide half_r2 = log_opacity - (wide)view->log_alpha_cutoff;
+    blend_real log_opacity = (blend_real)ln((real)opacity);
+    blend_real half_r2 = log_opacity - (blend_real)view->log_alpha_cutoff;
     if (!(half_r2 > 0.0f && opacity > 0.0f && opacity < INFINITY)) return;        // also culls NaN
 
     // columns of the rotation of an unnormalised quaternion
@@ -174,10 +174,10 @@ kernel void project(
     real z_numerator = determinant * facing;                               // depth = z_numerator / D
 
     Splat record;
-    record.nu0 = (wide)(k0.x * n_scale); record.nux = (wide)(kx.x * n_scale); record.nuy = (wide)(ky.x * n_scale);
-    record.nv0 = (wide)(k0.y * n_scale); record.nvx = (wide)(kx.y * n_scale); record.nvy = (wide)(ky.y * n_scale);
-    record.d0 = (wide)(k0.z * facing); record.dx = (wide)(kx.z * facing); record.dy = (wide)(ky.z * facing);
-    record.d_near = (wide)(z_numerator / near);
+    record.nu0 = (blend_real)(k0.x * n_scale); record.nux = (blend_real)(kx.x * n_scale); record.nuy = (blend_real)(ky.x * n_scale);
+    record.nv0 = (blend_real)(k0.y * n_scale); record.nvx = (blend_real)(kx.y * n_scale); record.nvy = (blend_real)(ky.y * n_scale);
+    record.d0 = (blend_real)(k0.z * facing); record.dx = (blend_real)(kx.z * facing); record.dy = (blend_real)(ky.z * facing);
+    record.d_near = (blend_real)(z_numerator / near);
     record.log_opacity = log_opacity;
     record.ax = (float)anchor_i;
     record.ay = (float)anchor_j;
@@ -185,7 +185,7 @@ kernel void project(
     record.y1 = (short)y1;
     record.x0 = (short)max(first, 0);
     record.x1 = (short)min(last + 1, width);
-#if BATCH > 1
+#if SPLATS_PER_ITEM > 1
 //@@ project
     float key = (float)pz;
 //@@ key
@@ -217,7 +217,7 @@ INLINE void write_splat(
     view += view_index;
 //@@ splat_view
     real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
-    const uint (*word)[BATCH] = batch->records;
+    const uint (*word)[SPLATS_PER_ITEM] = batch->records;
     for (uint n = 0; n < sizeof(Splat) / 4; n += 4)
         ((global uint4 *)(splats + at))[n / 4] = (uint4)(word[n][k], word[n + 1][k], word[n + 2][k], word[n + 3][k]);
 //@@ color
@@ -239,7 +239,7 @@ INLINE void write_splat(
         }
     }
     windows[at] = (uint2)(corner, window);
-#if BATCH == 1
+#if SPLATS_PER_ITEM == 1
 //@@ list
     float key = (float)pz;
 //@@ key
@@ -248,11 +248,11 @@ INLINE void write_splat(
 #endif
 }
 
-#if BATCH > 1
+#if SPLATS_PER_ITEM > 1
 #undef record
 #undef bounds
 #endif
-#if BATCH > 1 || defined(CULLING_GROUP)
+#if SPLATS_PER_ITEM > 1 || defined(CULLING_GROUP)
 // CULLED or OUT_OF_BAND for a group of splats outside of the frustum; 0: not culled. All centres are within `extent` of `mean`; infinite:
 // never culled.
 INLINE uint frustum_key(global const View *view, real3_ mean, real extent, real max_scale) {
@@ -263,7 +263,7 @@ INLINE uint frustum_key(global const View *view, real3_ mean, real extent, real 
 }
 #endif
 //@@ project_kernels
-#if BATCH > 1
+#if SPLATS_PER_ITEM > 1
 #undef RETURN_CULLED
 #define RETURN_CULLED return CULLED
 #ifndef BOX_HERE       // whether splat i is a box (effect/footprint_*.cl)
@@ -283,14 +283,14 @@ INLINE uint splat_key(
 kernel void project(
 //@@ arguments project
 ) {
-    uint view_index = get_global_id(1), first = get_global_id(0) * BATCH, visible[BATCH], length = 0;
+    uint view_index = get_global_id(1), first = get_global_id(0) * SPLATS_PER_ITEM, visible[SPLATS_PER_ITEM], length = 0;
     if (first >= count) return;
     Batch batch;
-    VECTORISE for (uint k = 0; k < BATCH; k++)
+    VECTORISE for (uint k = 0; k < SPLATS_PER_ITEM; k++)
         batch.keys[k] = splat_key(
 //@@ passed project
             , min(first + k, count - 1), view_index);
-    for (uint k = 0; k < min(count - first, (uint)BATCH); k++) {
+    for (uint k = 0; k < min(count - first, (uint)SPLATS_PER_ITEM); k++) {
         keys[view_index * count + first + k] = batch.keys[k];
         visible[length] = first + k;
         length += batch.keys[k] == 0;

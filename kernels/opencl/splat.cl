@@ -25,7 +25,7 @@ typedef struct {
 //@@ footprint_functions
 
 // Affine forms at row coordinates y; `*_x` hold the terms that depend on the column only.
-static inline Intersection intersect_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloat d_x, vfloat y, wide half_r2) {
+static inline Intersection intersect_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloat d_x, vfloat y, blend_real half_r2) {
     Intersection c;
     vfloat nu = FMA((vfloat)s->nuy, y, nu_x);
     vfloat nv = FMA((vfloat)s->nvy, y, nv_x);
@@ -39,6 +39,6 @@ static inline Intersection intersect_row(const Splat *s, vfloat nu_x, vfloat nv_
 
 //@@ intersect_functions
 // Alpha of a fragment: the splat's opacity times exp(-rho / 2), at most the opacity ceiling.
-static inline vfloat fragment_alpha(const Splat *s, vfloat half_rho, wide opacity_ceiling) {
+static inline vfloat fragment_alpha(const Splat *s, vfloat half_rho, blend_real opacity_ceiling) {
     return VMIN(EXP(s->log_opacity - half_rho), (vfloat)opacity_ceiling);
 }

@@ -86,12 +86,12 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
     }
 }
 
-// Work-items of a group of the per-splat kernels. A splat that overlaps more tiles than a window is shared by a team of them.
+// Work-items of a work-group of the per-splat kernels. A splat that overlaps more tiles than a window is shared by a team of them.
 #define BIN_ITEMS 256
 
 // Rectangle of tiles that a big splat may overlap. Counting and listing both call this, so they agree, and `tile_count`
 // (record_gradients.cl), which numbers the gradient buffer offsets, agrees with both.
-typedef struct { int top, left, columns, cells, tiles_x; } TileRect;
+typedef struct { int top, left, columns, tiles, tiles_x; } TileRect;
 
 static inline TileRect tile_rect(const Bounds *b, int width, int height) {
     int y0, y1;
@@ -103,7 +103,7 @@ static inline TileRect tile_rect(const Bounds *b, int width, int height) {
     x1 = fmax(x1, b->ex + b->hx);
     int first = clamp(pixel_above(x0 - 0.5f, width), 0, width - 1), last = clamp(pixel_below(x1 - 0.5f, width), first, width - 1);
     TileRect rect = {y0 / TILE_H, first / TILE_W, last / TILE_W - first / TILE_W + 1, 0, (width + TILE_W - 1) / TILE_W};
-    rect.cells = ((y1 - 1) / TILE_H - rect.top + 1) * rect.columns;
+    rect.tiles = ((y1 - 1) / TILE_H - rect.top + 1) * rect.columns;
     return rect;
 }
 
@@ -112,9 +112,9 @@ static inline int tiles_of(int width, int height) {
     return ((width + TILE_W - 1) / TILE_W) * ((height + TILE_H - 1) / TILE_H);
 }
 
-// Tile of a cell of the rectangle; -1 if the splat does not overlap it.
-static inline int rect_tile(const TileRect *rect, int cell, const Bounds *b, int width, int height) {
-    int row = rect->top + cell / rect->columns, column = rect->left + cell % rect->columns;
+// Index in the image of tile `k` of the rectangle; -1 if the splat does not overlap it.
+static inline int rect_tile(const TileRect *rect, int k, const Bounds *b, int width, int height) {
+    int row = rect->top + k / rect->columns, column = rect->left + k % rect->columns;
     TileSpan span = tile_span(b, row, width, height);
     return column >= span.first && column <= span.last ? row * rect->tiles_x + column : -1;
 }
@@ -128,7 +128,7 @@ static inline int rect_tile(const TileRect *rect, int cell, const Bounds *b, int
 #define UNROLL 4                // atomics in flight per work-item
 #define TEAM 64                 // work-items that share a big splat
 #define TEAMS (BIN_ITEMS / TEAM)
-#define TEAM_CELLS (8 * TEAM)   // the complete group lists a splat of more cells
+#define TEAM_TILES (8 * TEAM)   // the complete work-group lists a splat whose rectangle has more tiles
 #define TEAM_DEFERRED 16        // maximum number of such splats of a team, which lists further ones itself
 
 // Lists of the tiles of a band [band_first, band_end), at most `capacity` pairs.
@@ -153,13 +153,13 @@ typedef struct {
 } BigSplats;
 
 // Advances the cursors of all tiles that a big splat overlaps, and writes its pairs where the band has capacity for them.
-// `items` work-items share the cells, of which this is `item`.
+// `items` work-items share the tiles of the rectangle; this one is number `item`.
 static inline void list_big_splat(const BigSplats *splats, uint k, const TileRect *rect, const Bounds *b, int item, int items,
                                   const Band *band, global uint *restrict cursors, global uint2 *restrict pairs) {
     uint splat = splats->big[k];
     int before = (int)(splat / splats->count) * tiles_of(splats->width, splats->height);
-    for (int cell = item; cell < rect->cells; cell += items) {
-        int tile = rect_tile(rect, cell, b, splats->width, splats->height);
+    for (int n = item; n < rect->tiles; n += items) {
+        int tile = rect_tile(rect, n, b, splats->width, splats->height);
         uint position = tile < 0 ? NO_OFFSET : next_offset(before + tile, band, cursors, false);
         if (position >= band->capacity) continue;
         uint key = splats->keys[splat];
@@ -168,7 +168,7 @@ static inline void list_big_splat(const BigSplats *splats, uint k, const TileRec
     }
 }
 
-// Lists every `groups`-th of the first `big_count` big splats, by a complete group: a team for each splat, then all teams for
+// Lists every `groups`-th of the first `big_count` big splats, by a complete work-group: a team for each splat, then all teams for
 // each splat of very many tiles. deferred: scratch.
 static inline void list_big_splats(const BigSplats *splats, uint group, uint groups, uint big_count, const Band *band,
                                    global uint *restrict cursors, global uint2 *restrict pairs, local uint (*deferred)[TEAM_DEFERRED + 1]) {
@@ -176,7 +176,7 @@ static inline void list_big_splats(const BigSplats *splats, uint group, uint gro
     for (uint k = group * TEAMS + team; k < big_count; k += groups * TEAMS) {
         const Bounds b = splats->bounds[k];
         const TileRect rect = tile_rect(&b, splats->width, splats->height);
-        if (rect.cells > TEAM_CELLS && deferred_count < TEAM_DEFERRED) {
+        if (rect.tiles > TEAM_TILES && deferred_count < TEAM_DEFERRED) {
             deferred_count++;
             if (item % TEAM == 0) deferred[team][deferred_count] = k;
         } else list_big_splat(splats, k, &rect, &b, item % TEAM, TEAM, band, cursors, pairs);

@@ -151,12 +151,17 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
         inverse_d: float,
         lowpass_half_rho: float,
     ):
-        """Depth of a fragment, and its derivatives with respect to z_numerator; z_center; D at constant
-        z_numerator - z_center D; q; `lowpass_half_rho`, rho / 2 of the low-pass disc; and the
-        ellipsoid_term of a 3D Gaussian. Beyond a circle, which may be the disc's, depth is
-        z_center + circle (z_numerator - z_center D) D / q. A depth that rounding moves out of the splat's
-        range has the derivatives of the centre's depth. For a 3D Gaussian, D and q in `c` are D and q of its
-        disk times 1 + t, t = ellipsoid_term q / D^2."""
+        """Depth z of a fragment and its derivatives.
+
+        c: D and q of the intersection, rho / 2 = q / D^2. For a 3D Gaussian, D and q are those of its disk
+        times 1 + t, t = ellipsoid_term q / D^2. lowpass_half_rho: rho / 2 of the low-pass disc. Up to
+        rho / 2 = circle = max(lowpass_half_rho, ln 255), z is z_numerator / D; if rounding moves it out of
+        the splat's depth range, it has the derivatives of z_center. Beyond, z is
+        z_center + circle (z_numerator - z_center D) D / q.
+
+        Returns z; the derivatives with respect to z_numerator, z_center, and D at constant
+        z_numerator - z_center D; with respect to q and lowpass_half_rho; and with respect to ellipsoid_term.
+        """
         position = index * each
         center = line_of(lines, position + zc_line)[zc_lane]
         reach = line_of(lines, position + zr_line)[zr_lane]

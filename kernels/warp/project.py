@@ -87,7 +87,8 @@ def make_project(
     def bounds_of(
         a: vec3, b: vec3, p: vec3, radius: real, reach: real, x: real, y: real, view: View, lens: Lens
     ):
-        """Image bounds of a disk for any camera; x, y: projected centre for parallel rays."""
+        """Image bounds of a disk p + u a + v b, u^2 + v^2 <= radius^2, for any camera. reach: half of its
+        depth range [m]. x, y: projected centre, which only parallel rays use."""
         if wp.static(parallel):
             return disk.parallel(a, b, x, y, radius, view)
         elif wp.static(ray_depths):

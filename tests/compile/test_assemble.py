@@ -8,7 +8,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 from agreement import random_splats
-from traits import Traits
+from cloud_properties import CloudProperties
 
 import fidsplat as fs
 from fidsplat.backends.opencl.assemble import assemble, sections_of
@@ -45,7 +45,7 @@ SCHEDULE_FILES = {
 LOWPASS_FILES = {"none": {"effect/lowpass_none"}, "screen": {"effect/lowpass_screen"}}
 
 
-COLORS = Traits()
+COLORS = CloudProperties()
 
 
 def record_bytes(features):
@@ -76,7 +76,9 @@ def test_an_output_adds_its_own_text_only(output):
 
 def test_only_a_scene_of_both_footprints_selects_per_splat():
     features = {
-        kind: select(Traits(has_coplanar_groups=True, footprint=kind), fs.Capture(outputs=("depth", "label")))
+        kind: select(
+            CloudProperties(has_coplanar_groups=True, footprint=kind), fs.Capture(outputs=("depth", "label"))
+        )
         for kind in ("gaussian", "box", "mixed")
     }
     texts = {kind: assemble(each, SHAPE).text for kind, each in features.items()}
@@ -90,7 +92,7 @@ def test_only_a_scene_of_both_footprints_selects_per_splat():
 
 def test_record_sizes_follow_from_the_effects():
     def record(outputs, quality=PLAIN, degree=-1):
-        return record_bytes(select(Traits(degree), fs.Capture(outputs=outputs, quality=quality)))
+        return record_bytes(select(CloudProperties(degree), fs.Capture(outputs=outputs, quality=quality)))
 
     # 72 bytes and 4 for each word that an effect adds, in whole vectors of 16
     assert record(("rgb",)) == record(("alpha",)) == record(("rgb",), degree=3) == 80
@@ -98,7 +100,7 @@ def test_record_sizes_follow_from_the_effects():
     assert record(("rgb",), fs.Quality()) == record(("label",)) == 80
     assert record(("depth",)) == record(("depth", "depth_median")) == record(("normal",)) == 96
     assert record(("depth", "normal")) == record(("depth", "label"), fs.Quality()) == 96
-    assert record_bytes(select(Traits(has_coplanar_groups=True), fs.Capture(quality=PLAIN))) == 96
+    assert record_bytes(select(CloudProperties(has_coplanar_groups=True), fs.Capture(quality=PLAIN))) == 96
 
 
 def test_options_of_3d_gaussians_do_not_change_other_scenes():
@@ -118,7 +120,9 @@ def test_options_of_3d_gaussians_do_not_change_other_scenes():
         for way in ELLIPSOID:
             requested = fs.Capture(outputs=outputs, quality=fs.Quality(ellipsoid=way))
             assert assemble(select(COLORS, requested), shape).digest == plain.digest
-            assert assemble(select(Traits(ellipsoids="some"), requested), shape).digest != plain.digest
+            assert (
+                assemble(select(CloudProperties(ellipsoids="some"), requested), shape).digest != plain.digest
+            )
 
 
 def test_clouds_of_3d_gaussians_only_have_smaller_records():
@@ -126,13 +130,13 @@ def test_clouds_of_3d_gaussians_only_have_smaller_records():
     constant = {"nuy", "d0", "dx", "dy", "d_near"}
     for shape in (SHAPE, GROUP):
         alone, among = (
-            assemble(select(Traits(ellipsoids=which), fs.Capture(outputs=("depth",))), shape)
+            assemble(select(CloudProperties(ellipsoids=which), fs.Capture(outputs=("depth",))), shape)
             for which in ("all", "some")
         )
         assert constant <= set(among.records["Splat"].names or ())
         assert not constant & set(alone.records["Splat"].names or ())
-    assert record_bytes(select(Traits(ellipsoids="all"), fs.Capture())) == 64
-    assert record_bytes(select(Traits(ellipsoids="some"), fs.Capture())) == 80
+    assert record_bytes(select(CloudProperties(ellipsoids="all"), fs.Capture())) == 64
+    assert record_bytes(select(CloudProperties(ellipsoids="some"), fs.Capture())) == 80
 
 
 def test_an_extension_that_fills_an_unknown_hook_is_refused(monkeypatch, tmp_path):
@@ -153,7 +157,7 @@ def test_each_section_of_a_kernel_file_fills_a_hook():
 
 
 def test_order_by_centres_has_no_layers():
-    layered = Traits(has_coplanar_groups=True)
+    layered = CloudProperties(has_coplanar_groups=True)
     in_order = fs.Capture(outputs=tuple(FURTHER), quality=PLAIN.with_(order="centre"))
     plain = fs.Capture(outputs=tuple(FURTHER), quality=PLAIN)
     texts = [assemble(select(*each), SHAPE).text for each in ((layered, in_order), (COLORS, plain))]
@@ -166,8 +170,8 @@ def test_text_does_not_depend_on_numbers():
 
 
 def test_features_are_the_same_whatever_the_order_of_outputs():
-    assert select(Traits(2), fs.Capture(outputs=["rgb", "label", "depth"], quality=PLAIN)) == select(
-        Traits(2), fs.Capture(outputs=("depth", "label"), quality=PLAIN)
+    assert select(CloudProperties(2), fs.Capture(outputs=["rgb", "label", "depth"], quality=PLAIN)) == select(
+        CloudProperties(2), fs.Capture(outputs=("depth", "label"), quality=PLAIN)
     )
 
 
@@ -283,7 +287,7 @@ def test_only_pinhole_frames_of_several_poses_are_culled_by_spheres():
         (False, "gaussian", fs.Quality(lowpass="pixel"), None, True),
     ):
         chosen = select(
-            Traits(footprint=footprint),
+            CloudProperties(footprint=footprint),
             fs.Capture(
                 camera, quality=quality, motion=MOVING, shutter=fs.Shutter(exposure_time=0.1 * exposed)
             ),

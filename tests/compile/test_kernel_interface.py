@@ -246,7 +246,8 @@ def test_line_directives_match_the_lines_of_the_files():
                 continue
             if file.startswith("opencl/") and line.strip():
                 written = (kernels_folder() / file).read_text("utf-8").splitlines()[number - 1]
-                assert re.sub(r"WIDE\(([^()]+)\)", r"\1f", written).replace("wide ", "float ")[:4] == line[:4]
+                written = re.sub(r"BLEND_REAL\(([^()]+)\)", r"\1f", written).replace("blend_real ", "float ")
+                assert written[:4] == line[:4]
                 compared += 1
             number += 1
     assert compared > 800

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from agreement import random_splats
+from cloud_properties import CloudProperties
 from sampling import sampled
 from test_assemble import COLORS, GROUP, PLAIN, SHAPE, kernel_files, record_bytes
-from traits import Traits
 
 import fidsplat as fs
 from fidsplat.backends.opencl.assemble import assemble
@@ -40,7 +40,7 @@ LENS_FILES = {
 @pytest.mark.parametrize("shape", [SHAPE, GROUP], ids=["lanes", "group"])
 @pytest.mark.parametrize("outputs", [("rgb",), OUTPUTS], ids=str)
 def test_pinhole_frames_have_no_line_of_a_lens_or_shutter(shape, outputs):
-    source = assemble(select(Traits(2, True), fs.Capture(outputs=outputs)), shape)
+    source = assemble(select(CloudProperties(2, True), fs.Capture(outputs=outputs)), shape)
     assert not kernel_files(source) & LENS_FILES
 
 

@@ -32,7 +32,8 @@ def assert_well_formed(names, shapes=SHAPES):
         assert heads.keys() == source.arguments.keys()
         for kernel, arguments in source.arguments.items():
             lines = [line.strip(" ,") for line in heads[kernel].splitlines() if line and line[0] != "#"]
-            declared = [one.text.replace("wide", source.scalars.wide) for one in arguments.values()]
+            real = source.scalars.blend_real
+            declared = [one.text.replace("blend_real", real) for one in arguments.values()]
             assert lines == declared, kernel
         # resolve may be fused into blend
         argument_names = source.arguments.get("resolve", source.arguments["blend"]).keys()

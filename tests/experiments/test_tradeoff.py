@@ -93,10 +93,10 @@ def test_parts_are_all_different_and_the_informative_ones_come_first():
     for quick in (False, True):
         parts = run.all_points((), (), quick)
         assert len({json.dumps(part, sort_keys=True) for part in parts}) == len(parts)
-        assert parts[0]["knob"] == "base"
+        assert parts[0]["setting"] == "base"
     full = run.all_points((), (), False)
     assert {part["scene"].partition("@")[0] for part in full} == set(NAMES)
-    settings = [part.get("knob") for part in full]
+    settings = [part.get("setting") for part in full]
     last_cutoff = max(i for i, setting in enumerate(settings) if setting == "alpha_cutoff")
     assert settings.index("blend_precision") > last_cutoff
     for point in points(SETTINGS, True):

@@ -220,7 +220,7 @@ def test_names_in_a_chart_cover_neither_each_other_nor_the_legend(tmp_path):
     every = [record("hard", point, result(1.0, 0.02)) for point in points(SETTINGS, False)]
     numbered = {**dict.fromkeys(NUMBERS), **NUMBERS}
     for each in every:
-        ratio, maximum = numbered.get((each.key["knob"], each.key["value"]), (1.05, 0.02))
+        ratio, maximum = numbered.get((each.key["setting"], each.key["value"]), (1.05, 0.02))
         each.result.update(result(ratio, maximum))
     plot.write_chart([device(every)], "hard", tmp_path / "a.svg")
     plot.write_chart([device(every)], "hard", tmp_path / "b.svg")
@@ -307,7 +307,7 @@ def test_a_few_results_are_enough(tmp_path):
 
 def test_other_results_are_refused_by_name(tmp_path):
     write(tmp_path / "a", [Record({"category": "small"}, {}, {"device": "x"})])
-    with pytest.raises(fs.InputError, match="must be of fidsplat tradeoff, got another command"):
+    with pytest.raises(fs.InputError, match="must be of fidsplat tradeoff, got those of another command"):
         load([tmp_path / "a"])
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "notes.csv").write_text("milk,bread\n1,2\n")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from traits import Traits
+from cloud_properties import CloudProperties
 
 import fidsplat as fs
 from fidsplat.effects import select
@@ -105,39 +105,44 @@ def test_a_capture_and_its_parts_render_the_same():
 ROLLING = {"motion": MOVING, "shutter": fs.Shutter(readout=0.1, rows_per_band=4)}
 
 
-OF_PLANES, OF_BOXES = Traits(has_coplanar_groups=True), Traits(footprint="box")
+OF_PLANES, OF_BOXES = CloudProperties(has_coplanar_groups=True), CloudProperties(footprint="box")
 ORDERED, FLOAT64 = fs.Quality(order="centre"), fs.Quality(blend_precision="float64")
-BY_PIXEL, THICK = fs.Quality(order="pixel"), Traits(ellipsoids="all")
+BY_PIXEL, THICK = fs.Quality(order="pixel"), CloudProperties(ellipsoids="all")
 GROUP = fs.Motion(None, {1: lambda time: np.eye(4)})
 
 
 @pytest.mark.parametrize(
     ("cloud", "parts", "called", "not_called"),
     [
-        (Traits(sh_degree=0), {}, "color_rgb", "color_sh"),
-        (Traits(sh_degree=1), {}, "color_sh", "color_rgb"),
-        (Traits(), {}, "order_centre", "order_pixel"),
+        (CloudProperties(sh_degree=0), {}, "color_rgb", "color_sh"),
+        (CloudProperties(sh_degree=1), {}, "color_sh", "color_rgb"),
+        (CloudProperties(), {}, "order_centre", "order_pixel"),
         (OF_PLANES, {}, "order_coplanar", "order_centre"),
         (OF_PLANES, {"quality": ORDERED}, "order_centre", "order_coplanar"),
         (OF_PLANES, {"quality": BY_PIXEL}, "order_coplanar_pixel", "order_coplanar"),
-        (Traits(), {"quality": BY_PIXEL}, "order_pixel", "order_centre"),
+        (CloudProperties(), {"quality": BY_PIXEL}, "order_pixel", "order_centre"),
         (THICK, {"quality": BY_PIXEL}, "order_centre", "order_pixel"),  # of one depth each
-        (Traits(ellipsoids="some"), {"quality": BY_PIXEL}, "order_pixel", "order_centre"),
+        (CloudProperties(ellipsoids="some"), {"quality": BY_PIXEL}, "order_pixel", "order_centre"),
         (THICK, {"quality": BY_PIXEL.with_(ellipsoid="exact")}, "order_pixel", "order_centre"),
         (THICK, {"quality": BY_PIXEL.with_(blend_precision="float64")}, "order_pixel", "order_centre"),
         (THICK, {}, "ellipsoid_ewa", "ellipsoid_exact"),
         (THICK, {"camera": PANORAMIC}, "ellipsoid_exact", "ellipsoid_ewa"),  # 3DGS has no such lens
         (OF_BOXES, {}, "lowpass_none", "lowpass_screen"),  # they are filtered by themselves
-        (Traits(footprint="mixed"), {}, "lowpass_screen", "lowpass_none"),
-        (Traits(), {"motion": GROUP}, "motion_groups", "shutter_exposure"),
-        (Traits(), {"motion": MOVING}, "camera_pinhole", "shutter_exposure"),
-        (Traits(), ROLLING, "shutter_rows", "motion_groups"),
+        (CloudProperties(footprint="mixed"), {}, "lowpass_screen", "lowpass_none"),
+        (CloudProperties(), {"motion": GROUP}, "motion_groups", "shutter_exposure"),
+        (CloudProperties(), {"motion": MOVING}, "camera_pinhole", "shutter_exposure"),
+        (CloudProperties(), ROLLING, "shutter_rows", "motion_groups"),
         (OF_BOXES, ROLLING, "shutter_exposure", "shutter_rows"),
-        (Traits(), ROLLING | {"quality": fs.Quality(lowpass="pixel")}, "shutter_exposure", "shutter_rows"),
-        (Traits(), ROLLING | {"camera": PANORAMIC}, "shutter_exposure", "shutter_rows"),
-        (Traits(), {"quality": FLOAT64}, "arithmetic_precise", "arithmetic_fast"),
-        (Traits(), {"fog": fs.Fog(0.0)}, "background_constant", "fog"),
-        (Traits(), {"fog": fs.Fog(0.1)}, "fog", "shutter_rows"),
+        (
+            CloudProperties(),
+            ROLLING | {"quality": fs.Quality(lowpass="pixel")},
+            "shutter_exposure",
+            "shutter_rows",
+        ),
+        (CloudProperties(), ROLLING | {"camera": PANORAMIC}, "shutter_exposure", "shutter_rows"),
+        (CloudProperties(), {"quality": FLOAT64}, "arithmetic_precise", "arithmetic_fast"),
+        (CloudProperties(), {"fog": fs.Fog(0.0)}, "background_constant", "fog"),
+        (CloudProperties(), {"fog": fs.Fog(0.1)}, "fog", "shutter_rows"),
     ],
 )
 def test_a_scene_calls_for_what_it_needs_and_nothing_else(cloud, parts, called, not_called):

@@ -11,7 +11,7 @@ from command_line import fails, prints_json
 import fidsplat as fs
 from fidsplat.cameras.lenses import BrownConrady, Fisheye, Orthographic
 from fidsplat.cli import main
-from fidsplat.render.surface import surface_of
+from fidsplat.render.surface import surface_from_depth
 from fidsplat.vision import read_back
 
 AT = np.array([5.0, -3.0, 7.0])
@@ -80,7 +80,7 @@ def test_shares_count_the_leaves(wall, renderer):
     view = camera()
     pixel = tuple(view.project(AT[None])[0])
     depth = renderer.render(wall, outputs=("depth_first",), quality="first_hit=0.5")["depth_first"]
-    surface = surface_of(depth, view, pixel, 20.0)
+    surface = surface_from_depth(depth, view, pixel, 20.0)
     y, x = np.mgrid[:120, :160] + 0.5
     rays = np.stack([(x - 70.0) / 150.0, (y - 63.0) / 110.0, np.ones_like(x)], 2) @ POSE[:3, :3]
     plane_depth = ((AT - view.position) @ NORMAL) / (rays @ NORMAL)

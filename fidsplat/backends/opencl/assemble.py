@@ -82,10 +82,10 @@ _HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")
 _HOOKS = re.compile(r"^[ \t]*//@@ (\w+)(?: \w+)?[ \t]*$", re.MULTILINE)
 _COMMENT = re.compile(r"[ \t]*//.*")
 _SECTION = re.compile(r"//@ (\w+)[ \t]*")
-# the type `wide` (`Scalars.wide`) and its constants; both patterns begin with a literal, which `re` finds 20
+# the type `blend_real` and its constants (`Scalars`); both patterns begin with a literal, which `re` finds 20
 # times as fast as a word boundary
-_WIDE_CONSTANT = re.compile(r"WIDE\(([^()]+)\)")
-_WIDE = re.compile(r"wide(?<=\bwide)\b")
+_BLEND_CONSTANT = re.compile(r"BLEND_REAL\(([^()]+)\)")
+_BLEND_REAL = re.compile(r"blend_real(?<=\bblend_real)\b")
 _EFFECT_KERNELS = (
     *("project", "emit", "blend", "composite_background", "resolve"),
     *("blend_backward", "project_backward", "project_step"),
@@ -279,7 +279,7 @@ def _assemble_backward(
 def _dialect(config: KernelConfig, scalars: Scalars, effects: Iterable[str] = ()) -> list[str]:
     """Files with a vendor's instructions for float32 fragments: one for all frames, then the files of
     effects."""
-    if not config.dialect or scalars.wide != "float":
+    if not config.dialect or scalars.blend_real != "float":
         return []
     suffixes = {"arithmetic_approximate": "_exp", "blend_half": "_half"}
     return [
@@ -494,8 +494,8 @@ class Assembler:
         return merged
 
     def _with_values(self, text: str) -> str:
-        """Replace fields of `Splat` that are not stored as such, and the type `wide`, in kernel text."""
-        constants, packed, wide = self._constants, self._packed, self._scalars.wide
+        """Replace the type `blend_real` and fields of `Splat` that are not stored as such in kernel text."""
+        constants, packed, real = self._constants, self._packed, self._scalars.blend_real
         if constants:  # reads become the values; writes are removed
             names = "|".join(constants)
             text = re.sub(rf"\brecord\.(?:{names}) = [^;\n]*;", "", text)
@@ -504,7 +504,7 @@ class Assembler:
             names = "|".join(packed)
             text = re.sub(rf"\brecord\.({names})\b", r"unpacked_\1", text)
             text = re.sub(rf"\b(s(?:->|\.))({names})\b", lambda read: packed[read[2]].format(read[1]), text)
-        return _WIDE.sub(wide, _WIDE_CONSTANT.sub(r"\1" if wide == "double" else r"\1f", text))
+        return _BLEND_REAL.sub(real, _BLEND_CONSTANT.sub(r"\1" if real == "double" else r"\1f", text))
 
 
 def _refuse_unknown_hooks(file: str) -> None:

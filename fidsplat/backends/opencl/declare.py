@@ -32,7 +32,7 @@ class Member:
 
 
 def member(declaration: str, note: str = "") -> Member:
-    """Parse a type and names, as in C but without commas: `real rotation[9]`, `wide r g b`."""
+    """Parse a type and names, as in C but without commas: `real rotation[9]`, `blend_real r g b`."""
     ctype, *names = declaration.split()
     matches = [_NAME.fullmatch(name) for name in names]
     return Member(ctype, tuple((match[1], int(match[2] or 1)) for match in matches if match), note)
@@ -44,12 +44,12 @@ class Scalars:
 
     real: str
     """type of the per-splat projection: float or double"""
-    wide: str
+    blend_real: str
     """type of fragments in the blend stage: float or double"""
 
     def dtype(self, ctype: str) -> np.dtype:
         """The NumPy type of a C type."""
-        return np.dtype(_TYPES[{"real": self.real, "wide": self.wide}.get(ctype, ctype)])
+        return np.dtype(_TYPES[{"real": self.real, "blend_real": self.blend_real}.get(ctype, ctype)])
 
 
 @dataclass(frozen=True)

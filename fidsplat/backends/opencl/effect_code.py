@@ -1,7 +1,7 @@
 """Kernel code of effects and outputs: their files, and additions to structs and kernel arguments.
 
-The type `real` is that of the projection, `wide` that of fragments (declare.Scalars). D is the denominator of
-the ray-splat intersection, the anchor the origin of a splat's sample coordinates (kernel_interface.SPLAT).
+The type of the projection is `real`, of blending `blend_real` (declare.Scalars). D is the denominator of the
+ray-splat intersection, the anchor the origin of a splat's sample coordinates (kernel_interface.SPLAT).
 
 Buffers are (channels, rows, columns) of the padded sample grid, unless a note has another shape.
 """
@@ -35,7 +35,7 @@ EFFECT_CODE: dict[str, EffectCode] = {
     "camera_orthographic": EffectCode(
         "effect/camera_orthographic.cl",
         parts=("chord", "conic"),
-        splat=(member("wide z0 zx zy", "depth * D = z0 + zx x + zy y"), member("wide z_near")),
+        splat=(member("blend_real z0 zx zy", "depth * D = z0 + zx x + zy y"), member("blend_real z_near")),
     ),
     "color_rgb": EffectCode(
         "effect/color_rgb.cl",
@@ -57,7 +57,7 @@ EFFECT_CODE: dict[str, EffectCode] = {
         "effect/lowpass_screen.cl",
         splat=(
             member(
-                "wide lowpass_x lowpass_y",
+                "blend_real lowpass_x lowpass_y",
                 "centre of the low-pass disc relative to the anchor pixel; far away if there is none",
             ),
         ),
@@ -77,7 +77,7 @@ EFFECT_CODE: dict[str, EffectCode] = {
     "order_pixel": EffectCode(
         "effect/order_pixel.cl",
         parts=("ray_depth",),
-        splat=(member("wide nearest", "minimum depth of the splat's fragments"),),
+        splat=(member("blend_real nearest", "minimum depth of the splat's fragments"),),
     ),
     "order_coplanar": EffectCode("effect/order_coplanar.cl", parts=("order_centre", "coplanar_layers")),
     "order_coplanar_pixel": EffectCode(parts=("order_pixel", "coplanar_layers")),
@@ -95,7 +95,7 @@ EFFECT_CODE: dict[str, EffectCode] = {
         parts=("thickness",),
         splat=(
             member(
-                "wide ellipsoid_term",
+                "blend_real ellipsoid_term",
                 "thickness term: 2 / m^2, m: Mahalanobis distance of the camera; 0: a disk",
             ),
         ),
@@ -120,7 +120,12 @@ EFFECT_CODE: dict[str, EffectCode] = {
     "ellipsoids_only": EffectCode(
         "effect/ellipsoids_only.cl",
         constant=(
-            *(("nuy", "WIDE(0.0)"), ("d0", "WIDE(1.0)"), ("dx", "WIDE(0.0)"), ("dy", "WIDE(0.0)")),
+            *(
+                ("nuy", "BLEND_REAL(0.0)"),
+                ("d0", "BLEND_REAL(1.0)"),
+                ("dx", "BLEND_REAL(0.0)"),
+                ("dy", "BLEND_REAL(0.0)"),
+            ),
             ("d_near", "INFINITY"),
         ),
     ),
@@ -197,8 +202,8 @@ EFFECT_CODE: dict[str, EffectCode] = {
     "rays": EffectCode(
         "part/rays.cl",
         splat=(
-            member("wide nuz nvz dz", "n_u = nu0 + nux X + nuy Y + nuz Z, likewise n_v, D (SPLAT)"),
-            member("wide ray_x ray_y ray_z", "X, Y, Z are relative to this ray"),
+            member("blend_real nuz nvz dz", "n_u = nu0 + nux X + nuy Y + nuz Z, likewise n_v, D (SPLAT)"),
+            member("blend_real ray_x ray_y ray_z", "X, Y, Z are relative to this ray"),
         ),
         project=_RAYS,
         blend=_RAYS,
@@ -223,7 +228,7 @@ EFFECT_CODE: dict[str, EffectCode] = {
         parts=("box_cover",),
         splat=(
             member(
-                "wide edge_u0 edge_u1 edge_v0 edge_v1",
+                "blend_real edge_u0 edge_u1 edge_v0 edge_v1",
                 "1 / |grad| of the edge functions D + n_u, D - n_u, D + n_v, D - n_v",
             ),
         ),
@@ -238,8 +243,8 @@ EFFECT_CODE: dict[str, EffectCode] = {
     "ray_depth": EffectCode(
         "part/ray_depth.cl",
         splat=(
-            member("wide z_numerator", "depth = z_numerator / D"),
-            member("wide z_center z_reach", "depths are clamped to z_center +- z_reach"),
+            member("blend_real z_numerator", "depth = z_numerator / D"),
+            member("blend_real z_center z_reach", "depths are clamped to z_center +- z_reach"),
         ),
         backward_file="part/ray_depth_backward.cl",
         record_gradient=(member("float z_numerator z_center"),),
@@ -309,7 +314,7 @@ EFFECT_CODE: dict[str, EffectCode] = {
     "normal": EffectCode(
         "output/normal.cl",
         parts=("minimum_alpha",),
-        splat=(member("wide nx ny nz"),),
+        splat=(member("blend_real nx ny nz"),),
         sample_buffers=(SampleBuffer("float", "normal_raw", 3),),
         backward_file="output/normal_backward.cl",
         record_gradient=(member("float nx ny nz"),),

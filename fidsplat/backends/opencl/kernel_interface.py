@@ -1,6 +1,6 @@
 """Structs and kernel arguments, declared once for host and kernels.
 
-The type `real` is that of the projection, `wide` that of fragments: float or double (declare.Scalars).
+The projection computes in the type `real`, blending in `blend_real`: float or double (declare.Scalars).
 
 assemble.py prints them as C into kernels/opencl/, and the host binds arguments by name. Buffers are
 (channels, rows, columns) of the padded sample grid, unless a note has another shape.
@@ -34,12 +34,12 @@ VIEW = Record(
 SPLAT = Record(
     "Splat",
     (
-        member("wide nu0 nux nuy", "n_u = nu0 + nux x + nuy y"),
-        member("wide nv0 nvx nvy"),
-        member("wide d0 dx dy", "D"),
-        member("wide d_near", "D at depth `near`: a fragment is beyond the near plane if D <= d_near"),
-        member("wide log_opacity"),
-        member("wide r g b"),
+        member("blend_real nu0 nux nuy", "n_u = nu0 + nux x + nuy y"),
+        member("blend_real nv0 nvx nvy"),
+        member("blend_real d0 dx dy", "D"),
+        member("blend_real d_near", "D at depth `near`: a fragment is beyond the near plane if D <= d_near"),
+        member("blend_real log_opacity"),
+        member("blend_real r g b"),
         member("float ax ay", "anchor: pixel, an integer, that is the origin of x and y"),
         member("short y0 y1", "rows [y0, y1) that the splat can touch"),
         member("short x0 x1", "columns [x0, x1)"),
@@ -104,7 +104,7 @@ _RESERVED = args(
 )
 
 _BLENDED = args(
-    "wide log_alpha_cutoff opacity_ceiling transmittance_stop sample_area",
+    "blend_real log_alpha_cutoff opacity_ceiling transmittance_stop sample_area",
     *("float log_ceiling", "float background_r background_g background_b"),
     *("int stride  // of the padded image", "uint channel_stride", "in float grad_rgb  // (h, w, 3)"),
 )
@@ -112,7 +112,7 @@ _BLENDED = args(
 _BLEND = args(
     *("in Splat splats", "in uint lists starts"),
     "uint band_first  // the first tile of this launch; lists begin with its list",
-    *(_SIZE, "wide log_alpha_cutoff opacity_ceiling transmittance_stop sample_area"),
+    *(_SIZE, "blend_real log_alpha_cutoff opacity_ceiling transmittance_stop sample_area"),
     "uint channel_stride  // samples per channel of raw, of all views",
     "out float raw  // 4 channels: r, g, b, transmittance",
 )

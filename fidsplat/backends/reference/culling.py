@@ -51,7 +51,7 @@ def may_contribute(s: ProjectedSplats, view: View, x: np.ndarray, y: np.ndarray)
         # for a 3D Gaussian rho is divided by 1 + rho / m^2: below r2 everywhere if m^2 is
         r2_of_disk = np.where(s.inverse_m2 * r2 < 1, r2 / (1 - s.inverse_m2 * r2), np.inf)
         contributing = (d_high > 0) & np.where(s.box, meets, q_low <= d_high**2 * r2_of_disk)
-    if s.screen:
+    if s.has_screen_lowpass:
         across, down = _outside(x, s.center_x), _outside(y, s.center_y)
         off = ROUND * (
             1 + sum(np.abs(_ends(at) - to).max(0) for at, to in ((x, s.anchor_x), (y, s.anchor_y)))

@@ -79,7 +79,7 @@ def span_of(s: ProjectedSplats, view: View, f: Fragments) -> Span:
         near_dz, far_dz = (f.dz, f.dz) if s.depth_forms is None else (f.dz - e_dz, f.dz + e_dz)
         z_low = np.where(d_high > 0, near_dz / np.where(near_dz < 0, d_low, d_high), np.inf)
         z_high = np.where(d_low > 0, far_dz / np.where(far_dz < 0, d_high, d_low), np.inf)
-    if s.screen:
+    if s.has_screen_lowpass:
         away, off = np.sqrt(f.offset), _ROUND * (1 + f.dx + f.dy)
         lowpass_low, lowpass_high = np.maximum(away - off, 0) ** 2, (away + off) ** 2
         nearest = np.minimum(nearest, np.where(lowpass_low <= s.half_r2 + slack, lowpass_low, np.inf))
@@ -102,7 +102,7 @@ def span_of(s: ProjectedSplats, view: View, f: Fragments) -> Span:
         low = np.where(s.box, np.where(must, lowest, 0.0), low)
         high = np.where(s.box, np.where(may, highest, 0.0), high)
     z_low = np.where(d_low > 0, z_low, -np.inf)
-    if s.screen:
+    if s.has_screen_lowpass:
         # depths outside the circle are mirrored; where rounding decides, the interval has both (equal on the
         # circle)
         circle = np.maximum(lowpass_low, HALF_RHO_OF_RANGE), np.maximum(lowpass_high, HALF_RHO_OF_RANGE)

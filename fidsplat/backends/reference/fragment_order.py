@@ -72,6 +72,7 @@ _COLUMNS = (
 
 
 def by_center(s: ProjectedSplats, f: Fragments, span: Span) -> OrderedFragments:
+    """Fragments in the order of the splats' centres."""
     # colours and normals are stored once, not for each sample
     return replace(_plain(s, f, span, slice(None)), colors=s.colors, normal=s.normal)
 
@@ -110,8 +111,8 @@ def by_layers(s: ProjectedSplats, f: Fragments, span: Span) -> OrderedFragments:
 def _with_layers(
     s: ProjectedSplats, f: Fragments, span: Span
 ) -> tuple[OrderedFragments, np.ndarray, np.ndarray]:
-    """Fragments (k, n) of splats without a group, then layers (k, p); the depth bias of each [m]; and the
-    order of ties (n + p,), negative for layers."""
+    """Fragments (k, n) of splats without a group, then layers (k, p); the depth bias of each [m]; and a key
+    (n + p,) that orders fragments of equal depth: the splat's index, or a negative number for a layer."""
     groups = np.full(f.alpha.shape[1], -1) if s.coplanar_groups is None else s.coplanar_groups
     plain = np.flatnonzero(groups < 0)
     members = [np.flatnonzero(groups == group) for group in np.unique(groups[groups >= 0])]
@@ -128,6 +129,7 @@ def _rank(may: np.ndarray, tie_order: np.ndarray, key: np.ndarray) -> np.ndarray
 
 
 def _plain(s: ProjectedSplats, f: Fragments, span: Span, splats: np.ndarray | slice) -> OrderedFragments:
+    """Fragments (k, m) of m splats, in the order of the splats."""
     ids = np.arange(f.alpha.shape[1])[splats]
     k, m = len(f.alpha), len(ids)
     nothing = np.zeros((k, m))

@@ -23,7 +23,7 @@ class Fragments:
     """Intersections of the rays of k samples with n splats; arrays (k, n) float64."""
 
     dx: np.ndarray
-    """distance from the anchor, samples"""
+    """distance in samples from the splat's anchor, the pixel nearest to its projected centre"""
     dy: np.ndarray
     away: np.ndarray
     """(3, k, n) upper bound of the distance from the anchor, by coordinate"""
@@ -33,7 +33,7 @@ class Fragments:
     dz: np.ndarray
     """depth times d; (n,) unless rays are parallel"""
     offset: np.ndarray
-    """squared distance from the projected centre, pixels; infinite where the sample has no ray"""
+    """squared distance from the projected centre, square pixels; infinite where the sample has no ray"""
     alpha: np.ndarray
     z: np.ndarray
     edges: np.ndarray
@@ -57,12 +57,12 @@ def fragments_of(s: ProjectedSplats, view: View, x: np.ndarray, y: np.ndarray) -
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         half_rho = np.where(inside, q / (2 * d_solid * d_solid), np.inf)
         z = dz / d_solid
-        if s.screen:
+        if s.has_screen_lowpass:
             # depths beyond the disc's circle are mirrored at it
             circle = np.maximum(offset, HALF_RHO_OF_RANGE)
             mirrored = s.pz + circle * (dz - s.pz * d_solid) * (2 * d_solid / q)
             z = np.where((q <= 2 * circle * d_solid**2) | s.coplanar, z, mirrored)
-    if s.screen:
+    if s.has_screen_lowpass:
         half_rho = np.minimum(half_rho, np.where(offset <= s.half_r2, offset, np.inf))
     alpha = np.minimum(np.exp(s.log_opacity - half_rho), view.opacity_ceiling)
     if s.box.any():

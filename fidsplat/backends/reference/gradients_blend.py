@@ -55,14 +55,14 @@ def decide(s: ProjectedSplats, view: View, x: np.ndarray, y: np.ndarray) -> Deci
     inside = (q <= 2 * s.half_r2 * d**2) & (d > 0) & (d * view.near <= f.dz)
     with np.errstate(divide="ignore", invalid="ignore"):
         plane = np.where(inside, q / (2 * d**2), np.inf)
-    disc = np.where(f.offset <= s.half_r2, f.offset, np.inf) if s.screen else np.full_like(plane, np.inf)
+    disc = np.where(s.has_screen_lowpass & (f.offset <= s.half_r2), f.offset, np.inf)
     return Decisions(
         order=s.order,
         contributes=live & (f.alpha > 0),
         by_lowpass=disc < plane,
         clamped=s.log_opacity - np.minimum(plane, disc) > np.log(view.opacity_ceiling),
         missed=(d <= 0) | (d * view.near > f.dz),
-        mirrored=s.screen & (q > 2 * np.maximum(f.offset, HALF_RHO_OF_RANGE) * d**2),
+        mirrored=s.has_screen_lowpass & (q > 2 * np.maximum(f.offset, HALF_RHO_OF_RANGE) * d**2),
         at_disc=f.offset > HALF_RHO_OF_RANGE,
         covered=1 - final >= MIN_ALPHA,
     )
@@ -160,12 +160,11 @@ class Blend:
         splat_grads = CameraSplats.zeros(len(self._pz))
         for rows, shape in self._shapes:
             results = CameraSplats.zeros(len(rows))
-            grad_rays = (
-                grad_plane[:, rows],
-                grad_z[:, rows] * depth_factor[:, rows],
-                (on_plane | met)[:, rows],
+            grad_half_rho, grad_depth = grad_plane[:, rows], grad_z[:, rows] * depth_factor[:, rows]
+            used = (on_plane | met)[:, rows]
+            shape.backward(
+                results, grad_half_rho, grad_depth, used, grad_facing[rows], grad_log_opacity[rows]
             )
-            shape.backward(results, *grad_rays, grad_facing[rows], grad_log_opacity[rows])
             for name, array in vars(results).items():
                 getattr(splat_grads, name)[rows] = array
         for axis, distance in enumerate((self._disc_x, self._disc_y)):

@@ -107,7 +107,7 @@ class _Solid:
         self._p, self._scales = splats.p, splats.scales
         third = np.cross(splats.unit_a, splats.unit_b)
         self._axes = np.stack([splats.unit_a, splats.unit_b, third], axis=1)
-        """(n, 3, 3), in rows"""
+        """(n, 3, 3) unit axes, one per row"""
         # relative to the shortest axis, which does not change the direction
         self._shares = (splats.scales.min(axis=1)[:, None] / splats.scales) ** 2
         self._along = np.einsum("nkc,nc->nk", self._axes, splats.p)

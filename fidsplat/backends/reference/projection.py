@@ -120,7 +120,7 @@ class ProjectedSplats:
         """rounding error of a form in float32, relative to its terms"""
         self.colors = _colors(cloud, order, outward[order])
         self.normal = shape.surface[order] * np.where(plane_distance > 0, -1.0, 1.0)[:, None]
-        self.screen = "lowpass_screen" in features.effects
+        self.has_screen_lowpass = "lowpass_screen" in features.effects
         self.exclusive = "stop_exclusive" in features.effects
         self.coplanar_groups = groups[order] if layered else None
         """dense index of the group whose layer a splat is part of, -1 for none, or None without layers"""

@@ -69,10 +69,10 @@ def _plot(axes: Axes, device: DeviceResults, scene: str) -> list[tuple[float, fl
     points = points[points["value"] != "float64"]  # only for reference images, and much slower
     points = points.assign(
         error=points["maximum"].clip(lower=SMALLEST),
-        label=[_LABELS.get(key) for key in zip(points["knob"], points["value"], strict=True)],
+        label=[_LABELS.get(key) for key in zip(points["setting"], points["value"], strict=True)],
     )
     labelled = points[points["label"].notna()]
-    cutoffs = points[points["knob"].isin(("base", "alpha_cutoff"))].sort_values("error")
+    cutoffs = points[points["setting"].isin(("base", "alpha_cutoff"))].sort_values("error")
     axes.set(xscale="log", yscale="log", xlabel="milliseconds per frame")
     axes.plot(points["ms"], points["error"], ".", color="#bbbbbb", label="every setting")
     axes.plot(cutoffs["ms"], cutoffs["error"], "-", color="#00798c", label="only the cut-off")
@@ -81,7 +81,7 @@ def _plot(axes: Axes, device: DeviceResults, scene: str) -> list[tuple[float, fl
         ("alpha_cutoff", "o", "#00798c", None),
         (ABLATION, "s", "#edae49", "one constant in an exact image"),
     ):
-        chosen = labelled[labelled["knob"] == setting]
+        chosen = labelled[labelled["setting"] == setting]
         axes.plot(chosen["ms"], chosen["error"], style, color=colour, label=text)
     axes.axhline(INVISIBLE, color="#777777", linestyle="--", linewidth=0.8)
     axes.annotate(

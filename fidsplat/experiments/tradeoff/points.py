@@ -105,7 +105,7 @@ class Point:
     def key(self) -> dict:
         """Key of a result without scene and device, with the differences of the quality from `BASE`."""
         changes = _changes(asdict(self.quality), asdict(BASE))
-        return {"knob": self.setting, "value": self.value, "quality": changes}
+        return {"setting": self.setting, "value": self.value, "quality": changes}
 
 
 BASE_POINT = Point("base", "base", BASE)

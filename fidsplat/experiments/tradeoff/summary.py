@@ -18,7 +18,7 @@ from fidsplat.experiments.tradeoff.scenes import NAMES, is_marker, views_of
 from fidsplat.experiments.tradeoff.session import DEFINITION
 from fidsplat.util.errors import InputError
 
-KEYS = ("scene", "knob", "value")
+KEYS = ("scene", "setting", "value")
 COLUMNS = (
     *KEYS, "quality", "amount", "base_ms", "ratio", "ratio_low", "ratio_high", "maximum", "beyond",
     "rmse", "per_rectangle", "ideal_psnr", "corners_px", "error",
@@ -57,10 +57,10 @@ def load(folders: Iterable[Path]) -> list[DeviceResults]:
     for folder in folders:
         records: dict[str, list[Record]] = {}
         for record in folder_records(folder, NAME):
-            if "knob" not in record.key:
+            if "setting" not in record.key:
                 raise InputError(
-                    f"results in {folder} must be of fidsplat tradeoff, got another command's; give another "
-                    "folder"
+                    f"results in {folder} must be of fidsplat tradeoff, got those of another command or an "
+                    "earlier version; give another folder"
                 )
             records.setdefault(record.run["device"], []).append(record)
         summaries = [summarise(device_records, rows_of, COLUMNS) for device_records in records.values()]
@@ -85,9 +85,9 @@ class DeviceResults:
         run, rows = summary.runs[0], summary.rows
         self.summary, self.name = summary, run["device"]
         self.title, self.kind = run.get("title", self.name), run.get("kind", "device")
-        stale = (rows["knob"] == PRESET) & (rows["quality"] != rows["value"].map(_current_quality))
+        stale = (rows["setting"] == PRESET) & (rows["quality"] != rows["value"].map(_current_quality))
         points: Table = rows[rows["error"].isna() & ~stale]
-        names = pd.MultiIndex.from_frame(points[["scene", "knob", "value"]], names=[None] * 3)
+        names = pd.MultiIndex.from_frame(points[["scene", "setting", "value"]], names=[None] * 3)
         self.points = points.set_index(names)
         known = [view for name in NAMES for view in views_of(name)]
         self.own = [view for view in points["scene"].unique() if view not in known]
@@ -105,7 +105,7 @@ class DeviceResults:
         `ms` is the ratio of the time to the base's, times the median time of the base.
         """
         rows: Table = self.points[self.points["scene"] == scene]
-        order = rows["knob"].map(list(("base", *SETTINGS)).index)
+        order = rows["setting"].map(list(("base", *SETTINGS)).index)
         rows = rows.iloc[order.argsort(kind="stable")]
         return rows.assign(ms=self.base_ms(scene) * rows["ratio"])
 
@@ -114,7 +114,7 @@ class DeviceResults:
         rows = self.of(scene)
         # gsplat's stop requires order=centre, which renders as the base's order without coplanar groups
         constants = rows["quality"].str.replace("order=centre ", "")
-        changed = rows["quality"].where(rows["knob"] == "order", constants).str.split(r"[ =]")
+        changed = rows["quality"].where(rows["setting"] == "order", constants).str.split(r"[ =]")
         return rows[[not set(DEFINITION) & set(words) for words in changed]]
 
     def base_ms(self, scene: str) -> float:

@@ -57,7 +57,7 @@ static inline uint pack_halves(float low, float high) {
 #endif
 static inline float within_half(float color) { return clamp(color, -65504.0f, 65504.0f); }     // the range of halves
 //@ splat_view
-    wide unpacked_r, unpacked_g, unpacked_b;
+    blend_real unpacked_r, unpacked_g, unpacked_b;
 //@ color
     record.rg = pack_halves(within_half(unpacked_r), within_half(unpacked_g));
     record.b1 = pack_halves(within_half(unpacked_b), -1.0f);

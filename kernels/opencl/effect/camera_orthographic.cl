@@ -2,12 +2,6 @@
 // times D is another affine form of the pixel.
 //@ intersection
     vfloat z;               // depth times D, at the ray-plane intersection
-//@ camera
-static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ z_row) {
-    real3_ row = {focal * axis_row.x + offset * z_row.x, focal * axis_row.y + offset * z_row.y,
-                  focal * axis_row.z + offset * z_row.z};
-    return row;
-}
 //@ camera_offset
     offset = unit_normal.z;       // the visible side: the camera is infinitely far away
 //@ camera_bounds
@@ -27,11 +21,11 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
 //@ camera_facing
     facing = fabs(offset) > (PROJECTION_FP64 ? REAL(1e-13) : REAL(1e-6)) ? scale : 0;
 //@ project
-    record.z0 = (wide)((a.z * k0.x + b.z * k0.y + pz * k0.z) * facing);
-    record.zx = (wide)((a.z * kx.x + b.z * kx.y) * facing);
-    record.zy = (wide)((a.z * ky.x + b.z * ky.y) * facing);
+    record.z0 = (blend_real)((a.z * k0.x + b.z * k0.y + pz * k0.z) * facing);
+    record.zx = (blend_real)((a.z * kx.x + b.z * kx.y) * facing);
+    record.zy = (blend_real)((a.z * ky.x + b.z * ky.y) * facing);
     record.d_near = INFINITY;
-    record.z_near = (wide)near;
+    record.z_near = (blend_real)near;
 //@ intersect
     c.z = FMA((vfloat)s.zy, (vfloat)y, FMA((vfloat)s.zx, x, (vfloat)s.z0));
     c.inside &= VMASK(c.z >= s.z_near * c.d);

@@ -67,7 +67,7 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
     radius = cutoff_radius;
 //@ footprint_lowpass
         // the disk's test does not account for fragments of the ellipsoid that `near` removes
-        if (THICK_HERE && pz >= near && pz - reach < near) record.lowpass_x = (wide)(center_x - anchor_x);
+        if (THICK_HERE && pz >= near && pz - reach < near) record.lowpass_x = (blend_real)(center_x - anchor_x);
 //@ footprint_intersect
     if (s->ellipsoid_term > 0.0f) {
         vfloat squared = FMA((vfloat)s->ellipsoid_term, c.q, c.d * c.d);      // D^2 (1 + rho_disk / m^2)
@@ -81,4 +81,4 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
     // q <= h (D^2 + ellipsoid_term q); near 1 the rounding of the difference exceeds CONIC_SLACK
     if (s->ellipsoid_term > 0.0f) conic_h = (float)s->ellipsoid_term * conic_h < 0.95f ? conic_h / (1.0f - (float)s->ellipsoid_term * conic_h) : INFINITY;
 //@ project
-    record.ellipsoid_term = (wide)(2 * inverse_m2);
+    record.ellipsoid_term = (blend_real)(2 * inverse_m2);

@@ -1,6 +1,6 @@
 // No low-pass filter.
 //@ fragment_mask
-static inline vint fragment_mask(const Splat *s, Intersection c, vfloat x, vfloat y, wide half_r2, wide sample_area,
+static inline vint fragment_mask(const Splat *s, Intersection c, vfloat x, vfloat y, blend_real half_r2, blend_real sample_area,
                                  vfloat *lowpass_half_rho) {
     return c.inside;
 }

@@ -29,8 +29,8 @@
         real area = gx.x * gy.y - gx.y * gy.x, along_x = gx.x * dv - gx.y * du, along_y = gy.x * dv - gy.y * du;
         real area2 = area * area + along_x * along_x + along_y * along_y;
         real grown = 1 + variance * (m11 + m22 + variance) / area2;      // (area after / area before)^2
-        log_opacity -= (wide)(REAL(0.5) * ln(grown));
-        half_r2 = log_opacity - (wide)view->log_alpha_cutoff;
+        log_opacity -= (blend_real)(REAL(0.5) * ln(grown));
+        half_r2 = log_opacity - (blend_real)view->log_alpha_cutoff;
         if (!(half_r2 > 0.0f)) return;              // also for edge-on splats under parallel rays: infinitely thin and faint
         real c11 = 1 + variance * m22 / area2, c12 = -variance * m12 / area2;
         real l11 = sqrt(c11), l21 = c12 / l11, l22 = sqrt(grown) / l11;    // L L^T = 1 + s^2 (G^T G)^-1

@@ -20,8 +20,8 @@
         high = fmax(high, b->py + b->pr);
     }
 //@ project
-        record.lowpass_x = pz >= near ? (wide)(center_x - anchor_x) : 1e18f;
-        record.lowpass_y = pz >= near ? (wide)(center_y - anchor_y) : 1e18f;
+        record.lowpass_x = pz >= near ? (blend_real)(center_x - anchor_x) : 1e18f;
+        record.lowpass_y = pz >= near ? (blend_real)(center_y - anchor_y) : 1e18f;
 //@@ camera_lowpass
 //@@ footprint_lowpass
 //@ cells_start
@@ -49,7 +49,7 @@
 #define SKIPS_LOWPASS(s) false
 #endif
 
-static inline vint fragment_mask(const Splat *s, Intersection c, vfloat x, vfloat y, wide half_r2, wide sample_area,
+static inline vint fragment_mask(const Splat *s, Intersection c, vfloat x, vfloat y, blend_real half_r2, blend_real sample_area,
                                  vfloat *lowpass_half_rho) {
     *lowpass_half_rho = 0.0f;
     if (SKIPS_LOWPASS(s)) return c.inside;
@@ -73,7 +73,7 @@ static inline vfloat fragment_half_rho(const Splat *s, Intersection c, vfloat in
     // 2 ln 255 / rho and tends to 0 at the plane's horizon. Where the disc's rho is larger it defines the circle, which makes depth
     // continuous at the disc's border (docs/correctness.md).
     if (HAS_LOWPASS(s)) {
-        vfloat circle = VMAX(c.lowpass_half_rho, (vfloat)WIDE(5.5412635451584261));
+        vfloat circle = VMAX(c.lowpass_half_rho, (vfloat)BLEND_REAL(5.5412635451584261));
         vint on_plane = VMASK((c.q * inverse_d) * inverse_d <= circle), beyond_near = VMASK(c.d <= s->d_near);
 //@@ camera_lowpass_depth
 //@@ coplanar_lowpass_depth

@@ -8,7 +8,7 @@ static inline vint fragment_on_plane(const Splat *s, Intersection c, vfloat half
     vfloat circle, q;
 //@ lowpass_geometry_make
     g.q = c.q;
-    g.circle = HAS_LOWPASS(s) ? max(lowpass_half_rho, (vfloat)WIDE(5.5412635451584261)) : (vfloat)1e30f;
+    g.circle = HAS_LOWPASS(s) ? max(lowpass_half_rho, (vfloat)BLEND_REAL(5.5412635451584261)) : (vfloat)1e30f;
     vint ahead = VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
     flat = ahead & VMASK(g.half_rho <= g.circle);
     g.lowpass = ahead & ~flat;

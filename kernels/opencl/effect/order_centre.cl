@@ -1,3 +1,3 @@
 // Alpha compositing in the order of the lists: by the depth of splat centres.
-//@ compose
+//@ blend_fragment
     composite(pixel, &attributes, alpha, mask, constants);

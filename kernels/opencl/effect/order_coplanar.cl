@@ -3,6 +3,6 @@
     if (!pixel->layers) {
         const Attributes attributes = fragment_attributes(s, c, inverse_d);
 //@@ occlude
-//@@ compose
+//@@ blend_fragment
         return;
     }

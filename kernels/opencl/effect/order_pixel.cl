@@ -14,7 +14,7 @@
 //@ depth_reach
     depth_reach = BOX_HERE ? reach : reach * (RANGE_RADIUS / radius);
 //@ depth_nearest
-    record.nearest = (wide)convert_float_rtn(record.z_center - record.z_reach);
+    record.nearest = (blend_real)convert_float_rtn(record.z_center - record.z_reach);
 //@@ coplanar_nearest
 //@ key
     key = (float)record.nearest;
@@ -24,5 +24,5 @@
     k_buffer_start(&pixel->k_buffer);
 //@ blend_parameters
                                , global const Splat *splats, uint splat, uint position, vfloat next_nearest
-//@ compose
+//@ blend_fragment
     k_buffer_insert(pixel, next_nearest, attributes.z, alpha, &attributes, splat, position, mask, splats, constants);

@@ -2,9 +2,9 @@
 // 0.2 and 100 m: m = constant - INVERSE_DEPTH / z. Depths below 0.2 m are clamped: 1 / z is unbounded, and one edge-on disk
 // would dominate the loss. Computed as W sum w m^2 - (sum w m)^2, which does not depend on the origin of m. The first
 // fragment is the origin, so that little cancels.
-//@ compose_types
-#define INVERSE_DEPTH WIDE(0.2004008016032064)  // 0.2 * 100 / (100 - 0.2)
-#define SPREAD_NEAR WIDE(0.2)
+//@ blend_types
+#define INVERSE_DEPTH BLEND_REAL(0.2004008016032064)  // 0.2 * 100 / (100 - 0.2)
+#define SPREAD_NEAR BLEND_REAL(0.2)
 //@ state
     vfloat spread_first, spread_weight, spread_sum, spread_squares;
 //@ start

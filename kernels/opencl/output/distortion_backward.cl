@@ -1,7 +1,7 @@
 // Gradient of W sum w m^2 - (sum w m)^2: dL / dw = g (sum w m^2 + W m^2 - 2 m sum w m), dL / dm = 2 g w (W m - sum w m).
-//@ compose_types
-#define INVERSE_DEPTH WIDE(0.2004008016032064)  // as in distortion.cl
-#define SPREAD_NEAR WIDE(0.2)
+//@ blend_types
+#define INVERSE_DEPTH BLEND_REAL(0.2004008016032064)  // as in distortion.cl
+#define SPREAD_NEAR BLEND_REAL(0.2)
 //@ pixel_gradient
     vfloat distortion, spread_first, spread_weight, spread_sum, spread_squares;
 //@ pixel_gradient_start

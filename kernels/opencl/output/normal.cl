@@ -4,9 +4,9 @@
 //@@ ellipsoid_normal
     // one sign per splat, since the camera is on one side of the complete plane
     real towards = offset > 0 ? -1 : 1;
-    record.nx = (wide)(unit_normal.x * towards);
-    record.ny = (wide)(unit_normal.y * towards);
-    record.nz = (wide)(unit_normal.z * towards);
+    record.nx = (blend_real)(unit_normal.x * towards);
+    record.ny = (blend_real)(unit_normal.y * towards);
+    record.nz = (blend_real)(unit_normal.z * towards);
 //@ state
     vfloat normal_x, normal_y, normal_z;
 //@ start

@@ -8,7 +8,7 @@
     vfloat rounding;
 //@ start
     pixel->rounding = 0.0f;
-//@ compose_functions
+//@ blend_functions
 #define UNIT 0x1p-24f
 #define FORM_ROUNDING (4.0f * UNIT)        // relative rounding of a form: three coefficients, and its sums
 #define FORM_TERMS(n0, nx, ny) (fabs((vfloat)(n0)) + fabs((vfloat)(nx)) * across + fabs((vfloat)(ny)) * down)

@@ -10,7 +10,7 @@
 //@ footprint_intersection
     vfloat cover;           // covered share of the sample
 //@ footprint_functions
-#define SQRT_2 WIDE(1.41421356237309504880)   // the numerators have the factor sqrt(1/2)
+#define SQRT_2 BLEND_REAL(1.41421356237309504880)   // the numerators have the factor sqrt(1/2)
 //@ footprint_reach
     if (BOX_HERE) {
         radius = REAL(1.41421356237309504880);

@@ -1,6 +1,6 @@
 // Edges of boxes (part/box_cover.cl) whose edge functions D +- n_u, D +- n_v are affine in the sample: straight lines with one inverse gradient each.
 //@ footprint_functions
-static inline vfloat slab_coverage(vfloat d, vfloat n, wide edge_0, wide edge_1) {
+static inline vfloat slab_coverage(vfloat d, vfloat n, blend_real edge_0, blend_real edge_1) {
     vfloat above = clamp(FMA(FMA((vfloat)SQRT_2, n, d), (vfloat)edge_0, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
     vfloat below = clamp(FMA(FMA((vfloat)-SQRT_2, n, d), (vfloat)edge_1, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
     return fmax(above + below - 1.0f, (vfloat)0.0f);
@@ -81,7 +81,7 @@ static inline bool box_touches(real3_ k0, real3_ kx, real3_ ky, real facing, rea
     }
 //@ project
     real edge_line[3];
-    record.edge_u0 = (wide)box_edge(k0, kx, ky, scale, scale, false, edge_line);
-    record.edge_u1 = (wide)box_edge(k0, kx, ky, scale, -scale, false, edge_line);
-    record.edge_v0 = (wide)box_edge(k0, kx, ky, scale, scale, true, edge_line);
-    record.edge_v1 = (wide)box_edge(k0, kx, ky, scale, -scale, true, edge_line);
+    record.edge_u0 = (blend_real)box_edge(k0, kx, ky, scale, scale, false, edge_line);
+    record.edge_u1 = (blend_real)box_edge(k0, kx, ky, scale, -scale, false, edge_line);
+    record.edge_v0 = (blend_real)box_edge(k0, kx, ky, scale, scale, true, edge_line);
+    record.edge_v1 = (blend_real)box_edge(k0, kx, ky, scale, -scale, true, edge_line);

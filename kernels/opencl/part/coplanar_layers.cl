@@ -35,7 +35,7 @@
         if (until) outside |= VMASK(min_depth >= VLOAD(until + first));
 //@ coplanar_lowpass_depth
         if (s->group >= 0) on_plane = -1;           // also in the low-pass disc
-//@ compose_types
+//@ blend_types
 #define IN_LAYER(s) ((s)->group >= 0)
 typedef struct {
     int group;                  // -1: no layer
@@ -87,7 +87,7 @@ static inline Layer no_layer(void) {
 //@ group_start
     local uint layer_depth, any_layer;
     Layers layers[ROWS];
-    wide until = INFINITY;      // behind it no fragment belongs to this pass; infinite until all layers are complete
+    blend_real until = INFINITY;      // behind it no fragment belongs to this pass; infinite until all layers are complete
     bool complete = false;
 //@ staged
         // splats of groups have batches of their own; all work-items branch alike
@@ -113,7 +113,7 @@ static inline Layer no_layer(void) {
                 for (int row = 0; row < ROWS; row++) pixels[row].layers = 0;
         }
 //@ cells_parameters
-                                 , wide until
+                                 , blend_real until
 //@ cells_arguments
                           , until
 //@ cells_occluded
@@ -122,7 +122,7 @@ static inline Layer no_layer(void) {
             && !pixels[0].layers
 //@ pass_unfinished
         & VMASK(!pixel->layers || pixel->layers->from < INFINITY)
-//@ compose_functions
+//@ blend_functions
 static inline void layers_start(Pixel *pixel, Layers *layers) {
     const Layers none = {{-1}};     // all other fields 0
     *layers = none;

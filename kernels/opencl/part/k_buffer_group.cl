@@ -1,7 +1,7 @@
 // Per-pixel k-buffer for GPUs: sorts fragments by depth before compositing (effect/order_pixel.cl). The farthest IN_REGISTERS
 // fragments are in registers, sorted by depth. A new fragment is inserted there, and the nearest is pushed out: it can nearly always be
 // composited, else it enters a queue in memory, which is short and mostly empty.
-//@ compose_types
+//@ blend_types
 #ifndef TIE_IN_FRONT
 #define TIE_IN_FRONT(splat, other) true         // fragments of equal depths arrive in their order
 #define BEFORE_NEXT(z, nearest) ((z) <= (nearest))
@@ -11,16 +11,16 @@
 #define IN_REGISTERS (K_BUFFER_SIZE < 3 ? K_BUFFER_SIZE : 3)
 #define QUEUE_CAPACITY (K_BUFFER_SIZE - IN_REGISTERS)
 typedef struct {                    // in memory: an index that is not constant moves a complete struct out of registers
-    wide z[QUEUE_CAPACITY + 1], alpha[QUEUE_CAPACITY + 1];    // ring buffer, sorted by depth
+    blend_real z[QUEUE_CAPACITY + 1], alpha[QUEUE_CAPACITY + 1];    // ring buffer, sorted by depth
     uint splat[QUEUE_CAPACITY + 1];
 } Queue;
 typedef struct {
-    wide z[IN_REGISTERS], alpha[IN_REGISTERS];
+    blend_real z[IN_REGISTERS], alpha[IN_REGISTERS];
     uint splat[IN_REGISTERS];
     Queue *queue;
     uint head, count;               // of the queue
     bool bounded;                   // fragments outside of [from, until) are skipped
-    wide from, until;               // depths; at depth `from` only splats from `from_splat` on, at depth `until` only splats before
+    blend_real from, until;               // depths; at depth `from` only splats from `from_splat` on, at depth `until` only splats before
     uint from_splat, until_splat;   // `until_splat`
 } KBuffer;
 
@@ -44,14 +44,14 @@ static inline void k_buffer_start(KBuffer *k_buffer) {
     for (int row = 0; row < ROWS; row++) pixels[row].k_buffer.queue = &queues[row];
 //@ pass_unfinished
         & VMASK(pixel->k_buffer.from < INFINITY)
-//@ compose_functions
+//@ blend_functions
 // Order of two splats in the list.
 static inline bool precedes(global const Splat *splats, uint splat, uint other) {
-    wide nearest = splats[splat].nearest, than = splats[other].nearest;
+    blend_real nearest = splats[splat].nearest, than = splats[other].nearest;
     return nearest < than || (nearest == than && splat < other);
 }
 
-static inline void k_buffer_composite(Pixel *pixel, wide z, wide alpha, uint splat, global const Splat *splats,
+static inline void k_buffer_composite(Pixel *pixel, blend_real z, blend_real alpha, uint splat, global const Splat *splats,
                                      const BlendConstants *constants) {
     const Splat s = splats[splat];
     const Intersection nowhere = {1.0f};
@@ -67,7 +67,7 @@ static inline uint queue_index(const KBuffer *k_buffer, uint k) {
 }
 
 // Composites all queued fragments up to depth `nearest`.
-static inline void k_buffer_flush(Pixel *pixel, wide nearest, global const Splat *splats, const BlendConstants *constants) {
+static inline void k_buffer_flush(Pixel *pixel, blend_real nearest, global const Splat *splats, const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
     Queue *queue = k_buffer->queue;
     while (k_buffer->count > 0 && BEFORE_NEXT(queue->z[k_buffer->head], nearest)) {
@@ -79,7 +79,7 @@ static inline void k_buffer_flush(Pixel *pixel, wide nearest, global const Splat
 }
 
 // Enqueues a fragment that is not behind those in registers. If the queue is full, the farthest fragment of all is dropped.
-static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide alpha, uint splat, global const Splat *splats) {
+static inline void k_buffer_enqueue(Pixel *pixel, blend_real z, blend_real alpha, uint splat, global const Splat *splats) {
     KBuffer *k_buffer = &pixel->k_buffer;
     Queue *queue = k_buffer->queue;
     if (k_buffer->count == QUEUE_CAPACITY) {
@@ -116,7 +116,7 @@ static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide alpha, uint splat
 }
 
 // Inserts a fragment; no later fragment is nearer than `nearest`.
-static inline void k_buffer_push(Pixel *pixel, wide nearest, wide z, wide alpha, uint splat, global const Splat *splats,
+static inline void k_buffer_push(Pixel *pixel, blend_real nearest, blend_real z, blend_real alpha, uint splat, global const Splat *splats,
                                 const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
     // the new fragment may be nearer than queued ones
@@ -132,7 +132,7 @@ static inline void k_buffer_push(Pixel *pixel, wide nearest, wide z, wide alpha,
         for (int k = 0; k < IN_REGISTERS; k++) in_front[k] = IN_FRONT(k_buffer->z[k], k_buffer->splat[k], z, splat);
     }
     bool first = !in_front[0];
-    wide first_z = first ? z : k_buffer->z[0], first_alpha = first ? alpha : k_buffer->alpha[0];
+    blend_real first_z = first ? z : k_buffer->z[0], first_alpha = first ? alpha : k_buffer->alpha[0];
     uint first_splat = first ? splat : k_buffer->splat[0];
 #pragma unroll
     for (int k = 0; k < IN_REGISTERS; k++) {
@@ -150,7 +150,7 @@ static inline void k_buffer_push(Pixel *pixel, wide nearest, wide z, wide alpha,
 }
 
 // Inserts a fragment of a splat, none of whose fragments is nearer than `nearest`. position: index that gives its position in the list.
-static inline void k_buffer_insert(Pixel *pixel, wide nearest, wide z, wide alpha, const Attributes *attributes, uint splat, uint position,
+static inline void k_buffer_insert(Pixel *pixel, blend_real nearest, blend_real z, blend_real alpha, const Attributes *attributes, uint splat, uint position,
                                 int mask, global const Splat *splats, const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
     if (k_buffer->bounded) {

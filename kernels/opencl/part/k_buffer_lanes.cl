@@ -11,7 +11,7 @@
 // - Lookahead: where many fragments are queued at a block, the depths of the next splats are evaluated before blending, so that
 //   the bound at each pixel is the exact depth of the next fragment.
 // Neither changes the order of fragments, which is by depth, then by position in the list.
-//@ compose_types
+//@ blend_types
 #define CHUNK 128                   // splats; a multiple of 64 and a power of two
 #define DEFERRED_CAPACITY 2048                  // deferred splats; when full, the nearest are processed early
 #define DEFER_THRESHOLD (CHUNK / 4)            // splats of a chunk behind the next one, from which on the tile defers
@@ -54,7 +54,7 @@ static inline void queue_start(Queue *queue) {
 static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFFF); }
 
 // Sort key of a depth, rounded down like depths in blocks.
-static inline uint rounded_key(wide depth) { return sortable((float)depth) & -CHUNK; }
+static inline uint rounded_key(blend_real depth) { return sortable((float)depth) & -CHUNK; }
 
 // Rounded sort key of the minimum depth in `blocks`; keys: depths of a splat in each block.
 static inline uint min_key(const int *keys, uint blocks) {
@@ -100,7 +100,7 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
             for (; length < CHUNK && read < end; length++) positions[length] = read++;
         else
             for (; length < CHUNK && deferred_count > 0; length++) positions[length] = (uint)deferred[--deferred_count];
-        wide rest_nearest = read < end ? splats[lists[read]].nearest : INFINITY;
+        blend_real rest_nearest = read < end ? splats[lists[read]].nearest : INFINITY;
         if (!reads && deferred_count > 0) rest_nearest = fmin(rest_nearest, key_depth((uint)(deferred[deferred_count - 1] >> 32)));
 //@@ chunk_of_layers_sorted
         for (uint which = 0; which < length; which++) listed[which] = lists[positions[which]];
@@ -156,7 +156,7 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
                 for (int lane = 0; lane < min(count - first, LANES); lane++) sorted[((int *)&ranks)[lane]] = unsorted[first + lane];
             }
             sorted[count] = 0x7F800000;         // infinity
-            wide nearest[CHUNK + LANES];        // nearest[k]: lower bound of the depths of all fragments after splat k
+            blend_real nearest[CHUNK + LANES];        // nearest[k]: lower bound of the depths of all fragments after splat k
             for (int first = 0; first < count; first += LANES)
                 VSTORE(VMIN(VAS_FLOAT(in_order(VLOAD(sorted + first + 1) & -CHUNK)), (vfloat)rest_nearest), nearest + first);
             vfloat depths[CHUNK];               // per pixel, for splats before `evaluated`
@@ -179,14 +179,14 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
                 }
                 const int which = sorted[lookahead] & (CHUNK - 1);
                 const Splat s = splats[listed[which]];
-                wide half_r2 = s.log_opacity - constants.log_alpha_cutoff;
+                blend_real half_r2 = s.log_opacity - constants.log_alpha_cutoff;
 //@ tile_loop_end
                 lookahead = ++next;
             }
             pixels[block] = pixel;
         }
     }
-//@ compose_functions
+//@ blend_functions
 // Composites queued fragments nearer than `nearest`, except entries that also hold a farther one.
 static inline void k_buffer_flush(Pixel *pixel, vfloat nearest, const BlendConstants *constants) {
     Queue *queue = pixel->k_buffer.queue;

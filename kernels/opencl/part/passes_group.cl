@@ -2,22 +2,22 @@
 // end in front of the depth at which it begins (`from`).
 //@ unfinished
 //@@ pass_unfinished
-//@ compose_types
+//@ blend_types
 #ifndef IN_LAYER
 #define IN_LAYER(s) false
 #endif
-//@ compose_functions
+//@ blend_functions
 // Fragments in front of this depth belong to earlier passes.
-static inline wide pass_from(const Pixel *pixel) {
-    wide from = -INFINITY;
+static inline blend_real pass_from(const Pixel *pixel) {
+    blend_real from = -INFINITY;
 //@@ pass_from
     return from;
 }
 //@ group_start
     local uint next_from;
-    wide from = -INFINITY;
+    blend_real from = -INFINITY;
 //@ cells_parameters
-                                 , wide from
+                                 , blend_real from
 //@ cells_arguments
                           , from
 //@ cells_occluded

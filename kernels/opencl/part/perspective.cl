@@ -1,11 +1,4 @@
-// Perspective projection, shared by the pinhole and lenses. OpenCV axes: the row of M of an image axis, relative to an anchor on that
-// axis, is focal * axis_row + (principal - anchor) * z_row.
-//@ camera
-static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ z_row) {
-    real3_ row = {focal * axis_row.x + offset * z_row.x, focal * axis_row.y + offset * z_row.y,
-                  focal * axis_row.z + offset * z_row.z};
-    return row;
-}
+// Bounds of a disk by perspective projection, for the pinhole and for lenses with distortion coefficients.
 //@ camera_bounds
     real3_ row_x = {a.x, b.x, p.x}, row_y = {a.y, b.y, p.y}, tw = {a.z, b.z, p.z};
     real3_ tu = image_row(view->focal_x, view->center_x, row_x, tw);
@@ -18,7 +11,7 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
         real3_ cu = image_row(view->focal_x, view->center_x - center_x, row_x, tw);
         real3_ cv = image_row(view->focal_y, view->center_y - center_y, row_y, tw);
         bounds = ellipse_bounds(cu, cv, tw, center_x, center_y, radius * radius);
-#if BATCH > 1
+#if SPLATS_PER_ITEM > 1
     } else if (!crosses_near) {
         KEY = CROSSES_NEAR;
         return;

@@ -15,9 +15,9 @@
         depth_center = REAL(0.5) * (furthest + near);
         depth_reach = REAL(0.5) * (furthest - near);
     }
-    record.z_numerator = (wide)z_numerator;
-    record.z_center = (wide)depth_center;
-    record.z_reach = (wide)depth_reach;
+    record.z_numerator = (blend_real)z_numerator;
+    record.z_center = (blend_real)depth_center;
+    record.z_reach = (blend_real)depth_reach;
 //@@ depth_nearest
 //@ attributes
     vfloat z;

@@ -36,9 +36,9 @@ static inline Intersection intersect_ray(const Splat *s, vfloat ray_x, vfloat ra
 //@ camera_steepest
     steepest = fmax(steepest, fmax(fabs(kz.x), fabs(kz.y)));
 //@ project
-    record.nuz = (wide)(kz.x * n_scale);
-    record.nvz = (wide)(kz.y * n_scale);
-    record.dz = (wide)(kz.z * facing);
+    record.nuz = (blend_real)(kz.x * n_scale);
+    record.nvz = (blend_real)(kz.y * n_scale);
+    record.dz = (blend_real)(kz.z * facing);
     record.ray_x = anchor_ray[0];
     record.ray_y = anchor_ray[1];
     record.ray_z = anchor_ray[2];

@@ -15,7 +15,7 @@ static inline vfloat slab_coverage(vfloat d, vfloat n, vfloat d_x, vfloat d_y, v
     return fmax(above + below - 1.0f, (vfloat)0.0f);
 }
 
-static inline vfloat along_ray(wide x, wide y, wide z, vfloat to_x, vfloat to_y, vfloat to_z) {
+static inline vfloat along_ray(blend_real x, blend_real y, blend_real z, vfloat to_x, vfloat to_y, vfloat to_z) {
     return FMA((vfloat)z, to_z, FMA((vfloat)y, to_y, (vfloat)x * to_x));
 }
 //@ ray_intersect_parameters

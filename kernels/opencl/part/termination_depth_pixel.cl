@@ -7,7 +7,7 @@
     pixel->termination_depth = -INFINITY;
 //@ composite
     pixel->termination_depth = VSELECT(pixel->termination_depth, FMA(fabs(attributes->z), (vfloat)0x1p-14f, attributes->z), live);
-//@ compose_functions
+//@ blend_functions
 // Depth behind which nothing contributes to a pixel.
 static inline vfloat pixel_termination(const Pixel *pixel, const BlendConstants *constants) {
     return VSELECT(pixel->termination_depth, (vfloat)INFINITY, pixel_transmits(pixel, constants));

@@ -15,7 +15,7 @@
                 s->nearest = tile_nearest(*s, x0, y0);
         }
         barrier(CLK_LOCAL_MEM_FENCE);
-//@ compose_types
+//@ blend_types
 // Equal depths are ordered by the keys of splats, then by index, as in lists without keys by tile.
 #define TIE_IN_FRONT(splat, other) precedes(splats, splat, other)
 #define BEFORE_NEXT(z, nearest) ((z) < (nearest))

@@ -1,5 +1,5 @@
 // Loop through a tile's list in chunks, for CPUs: each chunk block by block, so that a block's pixels stay in registers.
-//@ compose_types
+//@ blend_types
 #define CHUNK 64
 //@ tile_loop
     for (uint chunk = starts[tile] - base, end = starts[tile + 1] - base, length; chunk < end && alive; chunk += length) {
@@ -25,7 +25,7 @@
             for (; own != 0; own &= own - 1) {
                 const uint k = chunk + 63 - (uint)clz(own & -own);
                 const Splat s = splats[lists[k]];
-                wide half_r2 = s.log_opacity - constants.log_alpha_cutoff;
+                blend_real half_r2 = s.log_opacity - constants.log_alpha_cutoff;
 //@ tile_loop_end
             }
             pixels[block] = pixel;

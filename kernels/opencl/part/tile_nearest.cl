@@ -3,7 +3,7 @@
 #define BLOCKS_SLACK 1e-6f              // above the rounding error, relative to the terms of the affine forms
 static inline float tile_nearest(const Splat splat, int left, int top) {
     const Splat *s = &splat;
-    const wide half_r2 = 1.0f;                  // hooks change it for 3D Gaussians only
+    const blend_real half_r2 = 1.0f;                  // hooks change it for 3D Gaussians only
     float conic_h = (float)half_r2;
 //@@ footprint_conic
     const vfloat half_x = 0.5f * (TILE_W - 1), half_y = 0.5f * (TILE_H - 1), x = left + half_x - s->ax, y = top + half_y - s->ay;

@@ -71,14 +71,14 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
             Staged copy;
             for (int part = 0; part < VECTORS; part++) copy.words[part] = staged[which].words[part];
             const Splat s = copy.splat;
-            wide half_r2 = s.log_opacity - constants.log_alpha_cutoff;
-            wide x = (wide)(px - s.ax);
-            wide nu_x = FMA(s.nux, x, s.nu0), nv_x = FMA(s.nvx, x, s.nv0), d_x = FMA(s.dx, x, s.d0);
+            blend_real half_r2 = s.log_opacity - constants.log_alpha_cutoff;
+            blend_real x = (blend_real)(px - s.ax);
+            blend_real nu_x = FMA(s.nux, x, s.nu0), nv_x = FMA(s.nvx, x, s.nv0), d_x = FMA(s.dx, x, s.d0);
             for (int row = 0; row < ROWS; row++) {
-                wide y = (wide)(py + row - s.ay);
+                blend_real y = (blend_real)(py + row - s.ay);
                 Intersection c = intersect_row(&s, nu_x, nv_x, d_x, y, half_r2);
 //@@ intersect
-                wide lowpass_half_rho;
+                blend_real lowpass_half_rho;
                 int mask = fragment_mask(&s, c, x, y, half_r2, constants.sample_area, &lowpass_half_rho);
 //@@ mask
                 if (!COLOURS_ONLY && !VANY(mask & pixel_transmits(&pixels[row], &constants))) continue;

@@ -14,10 +14,10 @@ static inline Splat copy_of(local const Staged *staged) {
     return copy.splat;
 }
 
-static inline Intersection intersect_at(const Splat *s, int px, int py, const BlendConstants *constants, wide *x, wide *y,
-                                wide *nu_x, wide *nv_x, wide *half_r2) {
-    *x = (wide)(px - s->ax);
-    *y = (wide)(py - s->ay);
+static inline Intersection intersect_at(const Splat *s, int px, int py, const BlendConstants *constants, blend_real *x, blend_real *y,
+                                blend_real *nu_x, blend_real *nv_x, blend_real *half_r2) {
+    *x = (blend_real)(px - s->ax);
+    *y = (blend_real)(py - s->ay);
     *nu_x = FMA(s->nux, *x, s->nu0);
     *nv_x = FMA(s->nvx, *x, s->nv0);
     *half_r2 = s->log_opacity - constants->log_alpha_cutoff;
@@ -25,12 +25,12 @@ static inline Intersection intersect_at(const Splat *s, int px, int py, const Bl
 }
 
 typedef struct {            // a splat at a pixel, before transmittance is known
-    wide alpha, grad_weight;
+    blend_real alpha, grad_weight;
     int mask;
 } FragmentValues;
 
 static inline FragmentValues fragment_values(const Splat *s, int px, int py, const PixelGradient *gradient, const BlendConstants *constants) {
-    wide x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
+    blend_real x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
     Intersection c = intersect_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     FragmentValues values;
     values.mask = fragment_mask(s, c, x, y, half_r2, constants->sample_area, &lowpass_half_rho);
@@ -41,8 +41,8 @@ static inline FragmentValues fragment_values(const Splat *s, int px, int py, con
 }
 
 // Attenuates a pixel by the splat; returns the alpha there.
-static inline wide forward_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants) {
-    wide x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
+static inline blend_real forward_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants) {
+    blend_real x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
     Intersection c = intersect_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     int mask = fragment_mask(s, c, x, y, half_r2, constants->sample_area, &lowpass_half_rho);
     if (!VANY(mask)) return 0.0f;
@@ -134,8 +134,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
                     }
                 if (k + next >= listed) break;
                 for (int row = 0; row < ROWS; row++) {
-                    wide transmittance = pixels[row].t;
-                    wide composited = attenuate(&pixels[row], values[next][row].alpha, values[next][row].mask, &constants);
+                    blend_real transmittance = pixels[row].t;
+                    blend_real composited = attenuate(&pixels[row], values[next][row].alpha, values[next][row].mask, &constants);
                     grad_weights[row] = FMA(transmittance * composited, values[next][row].grad_weight, grad_weights[row]);
                 }
             }
@@ -257,7 +257,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
         const Splat s = copy_of(&staged[which]);
         for (int k = 0; k < PIXELS_PER_ITEM; k++) {
             int y = y0 + top + 4 * k;
-            wide transmittance = 0.0f, alpha = 0.0f;
+            blend_real transmittance = 0.0f, alpha = 0.0f;
             if (pixels[k].t > transmittance_stop && px >= s.x0 && px < s.x1 && y >= s.y0 && y < s.y1) {
                 transmittance = pixels[k].t;
                 alpha = forward_fragment(&s, px, y, &pixels[k], &constants);
@@ -274,7 +274,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             float2 here = *at;
             if (here.y > 0.0f) {
                 const Splat s = staged[which].splat;
-                wide weight = here.x * here.y, x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
+                blend_real weight = here.x * here.y, x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
                 Intersection c = intersect_at(&s, px, y0 + top + 4 * k, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
                 fragment_mask(&s, c, x, y, half_r2, constants.sample_area, &lowpass_half_rho);
                 const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, lowpass_half_rho);
@@ -297,7 +297,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             uint at = row * TILE_W + column;
             float2 here = fragments[which * STRIDE + at];
             if (here.x == 0.0f) continue;
-            wide x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
+            blend_real x, y, nu_x, nv_x, half_r2, lowpass_half_rho;
             Intersection c = intersect_at(&s, x0 + column, y0 + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
             fragment_mask(&s, c, x, y, half_r2, constants.sample_area, &lowpass_half_rho);
             const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, lowpass_half_rho);

@@ -33,7 +33,7 @@ typedef union {              // a staged record, as vectors for fewer reads
 
 // Cells of the tile at (left, top) that the splat overlaps, from `first_row` to `last_row`. Conservative; the test of each pixel
 // decides.
-static inline void touched_cells(local const Splat *s, int left, int top, wide half_r2, wide sample_area, CELL_BITS *cells
+static inline void touched_cells(local const Splat *s, int left, int top, blend_real half_r2, blend_real sample_area, CELL_BITS *cells
 //@@ cells_parameters
 ) {
     int first_row = max(s->y0 - top, 0) / CELL_H, last_row = (min(s->y1 - top, TILE_H) - 1) / CELL_H;

@@ -41,7 +41,7 @@ static inline BlockOrigin block_origin(const Splat *s, const Tile *tile) {
 
 static inline Block block_of(const Splat *s, const Tile *tile, const BlockOrigin *origin, int block) {
     Block b;
-    wide half_r2 = s->log_opacity - tile->constants->log_alpha_cutoff;
+    blend_real half_r2 = s->log_opacity - tile->constants->log_alpha_cutoff;
     b.x = origin->x + tile->left[block];
     b.y = origin->y + tile->top[block];
     b.nu_x = FMA((vfloat)s->nux, b.x, (vfloat)s->nu0);

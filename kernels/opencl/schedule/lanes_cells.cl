@@ -30,7 +30,7 @@ static inline uint blocks_within(int x0, int x1, int y0, int y1) {
 
 //@@ blocks_functions
 // Blocks of the tile at (left, top) that the splat overlaps. Conservative; the test of each pixel decides.
-static inline uint touched_blocks(const Splat *s, int left, int top, wide half_r2, wide sample_area
+static inline uint touched_blocks(const Splat *s, int left, int top, blend_real half_r2, blend_real sample_area
 //@@ blocks_parameters
 ) {
     uint touched = blocks_within(s->x0 - left, s->x1 - left, s->y0 - top, s->y1 - top);

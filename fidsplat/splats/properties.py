@@ -1,4 +1,4 @@
-"""Properties of a cloud that select the kernels of its frames."""
+"""Interfaces of clouds, resident clouds and stores: the properties that select their kernels."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Protocol
 import numpy as np
 
 
-class CloudTraits(Protocol):
-    """Properties of a cloud that select kernels."""
+class CloudProperties(Protocol):
+    """Properties of a cloud that select kernels: SH degree, coplanar groups, boxes and 3D Gaussians."""
 
     @property
     def sh_degree(self) -> int:
@@ -31,8 +31,8 @@ class CloudTraits(Protocol):
         ...
 
 
-class PlacedTraits(CloudTraits, Protocol):
-    """`CloudTraits` and the origin of a cloud."""
+class CloudLike(CloudProperties, Protocol):
+    """A cloud, a resident cloud or a store: the properties that select its kernels, and its origin."""
 
     @property
     def origin(self) -> np.ndarray:

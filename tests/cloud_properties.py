@@ -1,10 +1,10 @@
-"""A cloud without splats that has only the traits by which features are selected."""
+"""Properties of a cloud that select kernels, without splats."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Traits:
+class CloudProperties:
     """In place of a SplatCloud, for `select`."""
 
     sh_degree: int = -1
