@@ -357,7 +357,7 @@ def _scalars(features: FeatureSet) -> Scalars:
 def build_constants(features: FeatureSet, config: KernelConfig) -> dict[str, int]:
     """The build constants, by their names in the kernels."""
     constants = {
-        "BATCH": config.splats_per_item,
+        "SPLATS_PER_ITEM": config.splats_per_item,
         "SORT_BLOCKS": config.sort_blocks,
         "FAST_FMA": int(config.fast_fma),
         "LANES": config.lanes,
