@@ -25,8 +25,9 @@ class Localise:
     The scene's camera has the size, intrinsics and lens of the photographs. The initial pose is --start, else
     the pose from the scene's markers in the photograph, else the most similar view of --candidates and of the
     previous photograph. Direct image alignment refines it, independently of exposure and white balance.
-    Deviations are standard deviations. A pose is found if most of the textured blocks of the image match the
-    scene.
+    Deviations are standard deviations. A pose is found if 60 % of the textured blocks of the image match the
+    scene, or 40 % and detected markers or a small deviation confirm the pose. The exit status is 1 if no pose
+    is found.
 
     Examples:
       fidsplat localise photo.jpg --scene scene.toml
@@ -43,7 +44,8 @@ class Localise:
     candidates: str | None = None
     """FILE: candidates of the initial pose: COLMAP, transforms.json or a trajectory, e.g. of training"""
     out: str | None = None
-    """FILE: also write the found poses: .tum, .kitti, .json (transforms.json) or a folder (COLMAP)"""
+    """FILE: also write the found poses: .tum (times are numbers of images, from 0), .kitti, .json
+    (transforms.json) or a folder (COLMAP)"""
     max_side: int = 320
     """N: reduce larger photographs to this number of pixels along the larger side; more are more accurate and
     take longer"""
@@ -82,6 +84,7 @@ class Localise:
         previous: list[Camera] = []
         for path in self.images:
             for name, image in read_images(path, reasons):
+                results |= dict.fromkeys(reasons.keys() - results.keys())
                 try:
                     localised = fs.localise(
                         image,
@@ -97,7 +100,7 @@ class Localise:
                     continue
                 results[name] = localised
                 previous = [localised.camera] if localised.found else []
-        results |= dict.fromkeys(reasons)
+        results |= dict.fromkeys(reasons.keys() - results.keys())
         if not any(results.values()):
             different = list(dict.fromkeys(reasons.values()))[:3]
             raise InputError(f"{', '.join(self.images)} and {self.scene}: {'; '.join(different)}")
@@ -107,7 +110,7 @@ class Localise:
             | ({"reason": reasons[name]} if result is None else result.as_dict())
             for name, result in results.items()
         ]
-        heads = ("image", "found", "position [m]", "deviation [mm]", "[deg]", "inliers", "start")
+        heads = ("image", "found", "position [m]", "± [mm]", "[deg]", "inliers", "start")
         table = (f"Poses in {self.scene}", heads, [_row(result) for result in facts])
         notes = []
         for reason in dict.fromkeys(reasons.values()):
@@ -118,42 +121,49 @@ class Localise:
         if refused:
             notes.append(
                 f"{refused} of {len(facts)} photographs without a pose: less than 60 % of the textured "
-                "blocks match; check the camera's size, intrinsics and lens, and the splats"
+                "blocks match (40 % where markers or a small deviation confirm the pose); check the camera's "
+                "size, intrinsics and lens, and the splats"
             )
+        if files and path_of(files[0]).suffix.lower() == ".kitti" and (refused or reasons):
+            notes.append(f"{files[0]} has only the found poses, without names and times; write .tum instead")
         device = renderer.device.title
         values = {"device": device, "images": facts, "files": files}
-        status = report(self.json, values, *notes, *files, table=table)
+        report(self.json, values, *notes, *files, table=table)
         if self.out is not None and not files:
             raise InputError(f"a pose must be found to write {self.out}, got none of {len(results)} images")
-        return status
+        return 0 if any(result["found"] for result in facts) else 1
 
 
 def _row(facts: dict[str, Any]) -> tuple[str, ...]:
     if (start := facts["start"]) is None:
         return (facts["image"], "no", "", "", "", "", "none")
+    found = facts["found"]
     return (
         facts["image"],
-        "yes" if facts["found"] else "no",
-        " ".join(f"{value:.4f}" for value in facts["position"]),
-        f"{facts['position_deviation_mm']:.2f}",
-        f"{facts['angle_deviation_deg']:.4f}",
+        "yes" if found else "no",
+        " ".join(f"{value:.3f}" for value in facts["position"]),
+        f"{facts['position_deviation_mm']:.2f}" if found else "",
+        f"{facts['angle_deviation_deg']:.3f}" if found else "",
         f"{100 * facts['inliers']:.0f} %",
         start if ", " not in start else f"{start.count(', ') + 1} markers",
     )
 
 
 def _write(out: str, results: dict[str, Localisation | None], camera: Camera) -> list[str]:
-    """Write the found poses as a trajectory, one per second; returns the files' names."""
+    """Write the found poses as a trajectory, with the numbers of the images as times; returns the files'
+    names."""
     import numpy as np
 
     from fidsplat.cameras import Trajectory
     from fidsplat.formats import save_trajectory
 
     poses = {
-        name: result.camera.camera_to_world for name, result in results.items() if result and result.found
+        name: (number, result.camera.camera_to_world)
+        for number, (name, result) in enumerate(results.items())
+        if result and result.found
     }
     if not poses:
         return []
-    trajectory = Trajectory(np.arange(len(poses)), np.array(list(poses.values())))
-    save_trajectory(trajectory, out, camera, list(poses))
+    times, matrices = zip(*poses.values(), strict=True)
+    save_trajectory(Trajectory(times, np.array(matrices)), out, camera, list(poses))
     return [out]

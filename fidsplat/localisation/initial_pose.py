@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,9 +21,27 @@ DESCRIPTOR_WIDTH = 32
 DESCRIPTOR_BLUR = 1.0
 
 
-def pose_of_markers(image: np.ndarray, scene: Scene, camera: Camera) -> tuple[Camera, list[str]] | None:
-    """Estimate the pose of a camera from detected markers of a scene; returns the camera and the markers'
-    names, or None without any.
+@dataclass(frozen=True, eq=False)
+class DetectedMarkers:
+    """Markers of a scene in an image, and the pose of the camera that they determine."""
+
+    camera: Camera
+    names: list[str]
+    points: np.ndarray
+    """(n, 3) corners in the world"""
+    corners: np.ndarray
+    """(n, 2) detected corners, pixels"""
+
+    def error(self, camera: Camera) -> float:
+        """Root mean square of the angles [rad] between detected and projected corners; infinite behind the
+        camera."""
+        apart = (camera.project(self.points) - self.corners) / (camera.fx, camera.fy)
+        error = float(np.sqrt((apart**2).sum(1).mean()))
+        return error if np.isfinite(error) else np.inf
+
+
+def pose_of_markers(image: np.ndarray, scene: Scene, camera: Camera) -> DetectedMarkers | None:
+    """Estimate the pose of a camera from detected markers of a scene; None without any.
 
     Tags and QR codes whose content occurs once in the scene are used.
     """
@@ -40,15 +59,16 @@ def pose_of_markers(image: np.ndarray, scene: Scene, camera: Camera) -> tuple[Ca
     pairs = [(code, known[content_of(code)]) for code in detections if content_of(code) in known]
     if not pairs:
         return None
+    points = np.concatenate([placed.corners for _, placed in pairs])
+    corners = np.concatenate([code.corners for code, _ in pairs])
     if len(pairs) == 1:
         code, placed = pairs[0]
         pose = marker_pose(code.corners, placed.marker.size, camera) @ np.linalg.inv(placed.pose)
     else:
-        points = np.concatenate([placed.corners for _, placed in pairs])
-        pose = points_pose(points, np.concatenate([code.corners for code, _ in pairs]), camera)
+        pose = points_pose(points, corners, camera)
     if not np.isfinite(pose).all():
         return None
-    return camera.with_pose(pose), [code.name for code, _ in pairs]
+    return DetectedMarkers(camera.with_pose(pose), [code.name for code, _ in pairs], points, corners)
 
 
 def most_similar(

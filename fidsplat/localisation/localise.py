@@ -30,6 +30,9 @@ MAX_VALUE = 100.0
 """maximum display value of an image: floats from 0 to 255 are an error"""
 MAX_DEVIATION = 0.1
 """radians: maximum standard deviation of the rotation of a found pose"""
+MIN_CONFIRMED_INLIERS, CONFIRMED = 0.4, 2e-3
+"""minimum fraction of matching blocks of a found pose whose marker error or standard deviation of the
+rotation is at most this angle [rad]"""
 TRIED = 3
 """number of candidates that are aligned coarsely"""
 
@@ -50,6 +53,9 @@ class Localisation:
     """standard deviation of the residuals of a pixel, display values"""
     start: str
     """source of the initial pose: `start`, `candidates`, or names of the detected markers"""
+    marker_error: float | None = None
+    """RMS angle [rad] between detected corners of markers and their projections at the pose; None if the
+    pose did not start from markers"""
 
     @property
     def pose(self) -> np.ndarray:
@@ -59,8 +65,12 @@ class Localisation:
     @property
     def found(self) -> bool:
         """Whether `angle_deviation` is at most 0.1 radians and at least 0.6 of the image's textured blocks
-        match the scene."""
-        return self.inliers >= MIN_INLIERS and self.angle_deviation <= MAX_DEVIATION
+        match the scene, or 0.4 if `angle_deviation` or `marker_error` is at most 2 milliradians."""
+        angle = self.angle_deviation
+        confirmed = angle <= CONFIRMED or (self.marker_error is not None and self.marker_error <= CONFIRMED)
+        return (
+            self.inliers >= (MIN_CONFIRMED_INLIERS if confirmed else MIN_INLIERS) and angle <= MAX_DEVIATION
+        )
 
     @property
     def position_deviation(self) -> float:
@@ -85,6 +95,7 @@ class Localisation:
             "angle_deviation_deg": math.degrees(self.angle_deviation),
             "inliers": self.inliers,
             "noise": self.noise,
+            "marker_error_deg": None if self.marker_error is None else math.degrees(self.marker_error),
         }
 
 
@@ -159,12 +170,12 @@ def localise(
         else scene
     )
     rendered = Source(renderer, uploaded, capture)
-    source, starts = "start", []
+    source, starts, detected = "start", [], None
     if start is not None:
         pose = start.world_to_camera if isinstance(start, Camera) else start
         starts = [camera.with_pose(pose)]
     elif isinstance(scene, Scene) and (detected := pose_of_markers(pixels, scene, camera)) is not None:
-        starts, source = [detected[0]], ", ".join(detected[1])
+        starts, source = [detected.camera], ", ".join(detected.names)
     if not starts:
         if not len(candidates):
             raise InputError(
@@ -182,7 +193,10 @@ def localise(
         tried = [align(pixels, mask, start, rendered, coarse=True) for start in best]
         starts = [min(tried, key=lambda alignment: alignment.noise).camera]
     alignment = align(pixels, mask, starts[0], rendered, max_side=max_side)
-    return Localisation(alignment.camera, alignment.covariance, alignment.inliers, alignment.noise, source)
+    error = None if detected is None else detected.error(alignment.camera)
+    return Localisation(
+        alignment.camera, alignment.covariance, alignment.inliers, alignment.noise, source, error
+    )
 
 
 @lru_cache(maxsize=8)

@@ -5,6 +5,7 @@ import json
 import math
 import runpy
 import weakref
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -351,8 +352,12 @@ def test_a_tag_gives_the_initial_pose(renderer, tmp_path, capsys):
     assert capsys.readouterr().err.count("\n") == 1
     assert np.shape(facts["covariance"]) == (6, 6)
     assert facts["position"] == pytest.approx(scene.camera.position, abs=2e-3)
-    written = fs.load_trajectory(tmp_path / "poses.tum").poses[0]
-    assert written == pytest.approx(scene.camera.camera_to_world, abs=5e-3)
+    written = fs.load_trajectory(tmp_path / "poses.tum")
+    assert written.poses[0] == pytest.approx(scene.camera.camera_to_world, abs=5e-3)
+    assert written.times[0] == 1  # "blank" is the first of the folder
+    assert [Path(each["image"]).stem for each in images] == ["blank", "photo", "torn", "turned"]
+    assert main([*words, "-o", str(tmp_path / "poses.kitti")]) == 0
+    assert "only the found poses" in " ".join(capsys.readouterr().out.split())
 
 
 def test_the_most_similar_candidate_is_the_start(renderer, room):
@@ -426,11 +431,47 @@ def test_errors_of_localisation(renderer, room, tmp_path, capsys):
     assert file.read_text() == "mine"
 
 
-def test_a_pose_with_a_large_deviation_is_not_found(room):
-    covariance = np.diag([1e-6] * 6)
-    camera = room[0].camera
-    assert Localisation(camera, covariance, 1.0, 0.01, "start").found
-    assert not Localisation(camera, 1e5 * covariance, 1.0, 0.01, "start").found
+@pytest.mark.parametrize(
+    ("deviation", "inliers", "marker_error", "found"),
+    [
+        (1e-2, 0.6, None, True),
+        (1e-2, 0.59, None, False),
+        (1e-2, 0.59, 3e-3, False),
+        (1e-2, 0.4, 1e-3, True),
+        (1e-2, 0.39, 1e-3, False),
+        (1e-3, 0.4, None, True),
+        (1e-3, 0.39, None, False),
+        (0.2, 1.0, 1e-3, False),
+    ],
+)
+def test_matching_blocks_deviation_and_markers_decide_whether_a_pose_is_found(
+    room, deviation, inliers, marker_error, found
+):
+    covariance = np.diag([deviation**2 / 3] * 6)
+    localisation = Localisation(room[0].camera, covariance, inliers, 0.01, "start", marker_error)
+    assert localisation.found == found
+
+
+def test_markers_confirm_a_pose_unless_they_were_moved(renderer):
+    """A third of the image shows something else."""
+    tag, other = fs.marker("apriltag:36h11:5", size=0.25), np.random.default_rng(0).uniform(0, 1, (40, 20, 3))
+    scene, moved = (
+        replace(
+            scene_with(150, fs.scenes.PlacedMarker(tag, rigid_matrix((x, -2, 5.7)))),
+            camera=scene_with().camera.resampled(160, 120),
+        )
+        for x in (3.15, 3.25)
+    )
+    found = []
+    for photographed in (scene, moved):
+        image = np.array(renderer.render(photographed)["rgb"])
+        image[:, :60] = other.repeat(3, 0).repeat(3, 1)
+        found.append(fs.localise(image, scene, renderer=renderer))
+    assert [each.found for each in found] == [True, False]
+    assert found[0].inliers < 0.6
+    assert pose_difference(found[0].camera, scene.camera)[0] < 1
+    assert found[0].marker_error < 2e-3 < found[1].marker_error
+    assert fs.localise(image, scene, scene.camera, renderer=renderer).marker_error is None
 
 
 def test_the_example_of_gtsam(capsys):
